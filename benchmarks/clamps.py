@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site
+from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
 from limbfit.fe import History, Indenter, Problem, StepControl, solve
 from limbfit.indentation import materials
 from limbfit.indentation.clamps import clamped
@@ -93,7 +93,7 @@ def main() -> None:
     limb = make_limb(SEED)
     anatomy = true_anatomy(limb)
     settings = replace(MESH, layers=limb.layers)
-    base = base_mesh(anatomy, settings)
+    base = build_base_mesh(anatomy, settings)
     rows = []
     for site in true_sites(limb, SEED):
         if site.name in options.sites:

@@ -25,8 +25,8 @@ from foreign_meshes import named_bodies
 from numpy.typing import NDArray
 
 from limbfit.anatomy.imaging import LabelMap, write_labels
-from limbfit.anatomy.sites.under import tissue_under
-from limbfit.anatomy.surfaces.mending import closed_anatomy
+from limbfit.anatomy.sites.under import measure_tissue_under
+from limbfit.anatomy.surfaces.mending import build_closed_anatomy
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, write_surface
 from limbfit.bench.limbs import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, amputated_calf, random_sites
 from limbfit.phantom.build import true_parameters
@@ -72,7 +72,9 @@ def write_bodies(folder: Path, parts: Mapping[str, Surface]) -> tuple[str, Anato
         write_surface(folder / f"{name}.stl", surface)
     bones = {name: surface for name, surface in parts.items() if name != "skin"}
     listed = ", ".join(f'{name} = "{name}.stl"' for name in bones)
-    return f'[surfaces]\nskin = "skin.stl"\nbones = {{ {listed} }}\n', closed_anatomy(parts["skin"], bones)[0]
+    return f'[surfaces]\nskin = "skin.stl"\nbones = {{ {listed} }}\n', build_closed_anatomy(
+        parts["skin"], bones
+    )[0]
 
 
 def write_calf(folder: Path, source: Path) -> tuple[str, Anatomy]:
@@ -90,7 +92,9 @@ def plan_sites(anatomy: Anatomy) -> list[dict[str, Any]]:
             "name": str(i + 1),
             "region": f"quarter {i + 1}",
             "position": np.round(position, 2).tolist(),
-            "depth_mm": round(min(DEEPEST_MM, SHARE * tissue_under(anatomy, position, axis, INDENTER_MM)), 2),
+            "depth_mm": round(
+                min(DEEPEST_MM, SHARE * measure_tissue_under(anatomy, position, axis, INDENTER_MM)), 2
+            ),
         }
         for i, (position, axis) in enumerate(random_sites(anatomy, SITES, SEED))
     ]

@@ -36,13 +36,13 @@ from numpy.typing import NDArray
 
 from limbfit.anatomy.imaging import read_volume
 from limbfit.anatomy.meshing.layers import LayerSpec
-from limbfit.anatomy.meshing.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
-from limbfit.anatomy.segmentation.amputation import amputate
+from limbfit.anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
+from limbfit.anatomy.segmentation.amputation import amputate_limb
 from limbfit.anatomy.segmentation.segmentation import segment
-from limbfit.anatomy.sites.under import tissue_under
-from limbfit.anatomy.surfaces.mending import closed_anatomy, open_loops
-from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, bodies, build_anatomy, read_surface
-from limbfit.anatomy.surfaces.thickness import fat_depth
+from limbfit.anatomy.sites.under import measure_tissue_under
+from limbfit.anatomy.surfaces.mending import build_closed_anatomy, open_loops
+from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, build_anatomy, find_bodies, read_surface
+from limbfit.anatomy.surfaces.thickness import measure_fat_depth
 from limbfit.anatomy.surfaces.triangles import from_pyvista
 from limbfit.bench.limbs import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, random_sites
 from limbfit.bench.meshing import cpu_seconds
@@ -80,7 +80,7 @@ def limb_files(shared: Path) -> dict[str, Path]:
 
 def named_bodies(file: Path) -> dict[str, Surface]:
     """The five bodies of a file as they are, loose triangles with the skin."""
-    parts = bodies(read_surface(file))
+    parts = find_bodies(read_surface(file))
     solid, loose = parts[:5], parts[5:]
     size = [float(np.prod(np.ptp(part.points, axis=0))) for part in solid]
     skin, *bones = [solid[i] for i in np.argsort(size)[::-1]]
@@ -107,13 +107,13 @@ def read_limb(name: str, file: Path, roughen_mm: float, decimate: bool) -> Limb:
     if roughen_mm > 0 or decimate:
         parts = {part: damaged(one, roughen_mm, decimate, 7) for part, one in parts.items()}
     skin = parts.pop("skin")
-    return Limb(name, *closed_anatomy(skin, parts))
+    return Limb(name, *build_closed_anatomy(skin, parts))
 
 
 def read_calf(folder: Path) -> Limb:
-    labels = amputate(segment(read_volume(folder)), *CALF_PLANE, pad_mm=CALF_PAD_MM)
+    labels = amputate_limb(segment(read_volume(folder)), *CALF_PLANE, pad_mm=CALF_PAD_MM)
     anatomy = build_anatomy(labels)
-    return Limb("calf", anatomy, (), fat_depth(labels, anatomy))
+    return Limb("calf", anatomy, (), measure_fat_depth(labels, anatomy))
 
 
 def default_settings() -> dict[str, MeshSettings]:
@@ -213,12 +213,12 @@ def rows(limb: Limb, asked: argparse.Namespace, wanted: set[str]) -> Iterator[tu
         names = [f"{limb.name}/{i}/{kind}" for i in range(asked.sites)]
         if not wanted & set(names):
             continue
-        base = base_mesh(limb.anatomy, settings, limb.fat_depth_mm)
+        base = build_base_mesh(limb.anatomy, settings, limb.fat_depth_mm)
         for name, site, part in zip(names, sites, share, strict=True):
             if name not in wanted:
                 continue
             row = site_row(limb, base, settings, site)
-            row["depth_mm"] = float(part * tissue_under(limb.anatomy, *site, INDENTER_MM))
+            row["depth_mm"] = float(part * measure_tissue_under(limb.anatomy, *site, INDENTER_MM))
             mesh = row.pop("mesh", None)
             if asked.simulate and mesh is not None and kind == "own":
                 row |= simulated(mesh, site, row["depth_mm"], None if asked.whole else WITHIN_MM)

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site
-from limbfit.anatomy.sites.sites import indenter_axis, project_to_skin
+from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
+from limbfit.anatomy.sites.sites import compute_indenter_axis, project_to_skin
 from limbfit.anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from limbfit.fe import StepControl, solve
 from limbfit.indentation import Parameters, SiteModel, build_problem
@@ -112,13 +112,13 @@ def make_records(folder: Path, stump: Stump, parameters: Parameters, spots: tupl
     """What the robot writes at some sites of a limb, one CSV each."""
     folder.mkdir(parents=True, exist_ok=True)
     anatomy = stump.anatomy(TRUE_SPACING_MM)
-    base = base_mesh(anatomy, TRUE_MESH)
+    base = build_base_mesh(anatomy, TRUE_MESH)
     for spot in spots:
         file = folder / f"{spot.name}.csv"
         if file.is_file():
             continue
         position, _ = project_to_skin(anatomy, stump.at(spot.degrees, spot.height))
-        axis = indenter_axis(anatomy.skin, position, INDENTER.width_mm)
+        axis = compute_indenter_axis(anatomy.skin, position, INDENTER.width_mm)
         mesh, _ = mesh_site(anatomy, position, axis, TRUE_MESH, base)
         place, along = tuple(map(float, position)), tuple(map(float, axis))
         model = SiteModel(spot.name, Path(), "", place, along, *spot.ramp.knots, indenter=INDENTER)

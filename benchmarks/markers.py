@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbfit.anatomy.imaging import LabelMap, Volume
-from limbfit.anatomy.sites.marked import marked_skin, without_markers
+from limbfit.anatomy.sites.marked import extract_marked_skin, remove_markers
 from limbfit.anatomy.sites.markers import Marker, find_markers, match_markers
-from limbfit.anatomy.sites.registration import limb_motion
+from limbfit.anatomy.sites.registration import register_limb
 from limbfit.anatomy.surfaces.surfaces import Surface, build_anatomy
 from limbfit.errors import SiteError
 from limbfit.phantom.geometry import Limb, make_limb, rotation_about
@@ -60,7 +60,7 @@ def coarser(grid: ScanGrid, factor: float) -> ScanGrid:
 
 def skin_of(volume: Volume) -> tuple[Surface, NDArray[np.bool_]]:
     """The model's skin of an image without markers, and the limb's mask; bones do not matter here."""
-    limb = marked_skin(volume)[1]
+    limb = extract_marked_skin(volume)[1]
     labels = LabelMap(limb.astype(np.uint8), volume.spacing, volume.origin, volume.direction)
     return build_anatomy(labels, EDGE_MM).skin, limb
 
@@ -85,12 +85,12 @@ def measure(seed: int, coarseness: float) -> dict[str, Any]:
     marked = image_of(second, grid, markers_of(moved_sites), seed=seed)
     start = _seconds()
     skin, mask = skin_of(plain)
-    outline = marked_skin(marked)[0]
-    motion = limb_motion(plain, marked, mask)
+    outline = extract_marked_skin(marked)[0]
+    motion = register_limb(plain, marked, mask)
     two = find_markers(replace(outline, points=motion.apply(outline.points)), skin)
     between = _seconds()
-    outline = marked_skin(marked)[0]
-    cleaned, _ = without_markers(marked, outline)
+    outline = extract_marked_skin(marked)[0]
+    cleaned, _ = remove_markers(marked, outline)
     one = find_markers(outline, skin_of(cleaned)[0])
     back = motion.apply(np.array([site.position for site in moved_sites]))
     truth = np.array([site.position for site in sites])

@@ -22,8 +22,8 @@ from identification_cases import (
 )
 from scipy.interpolate import interp1d
 
-from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site
-from limbfit.anatomy.sites.sites import indenter_axis, project_to_skin
+from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
+from limbfit.anatomy.sites.sites import compute_indenter_axis, project_to_skin
 from limbfit.anatomy.surfaces.surfaces import save_anatomy
 from limbfit.fe import solve
 from limbfit.indentation import (
@@ -103,8 +103,8 @@ class Limb:
             anatomy = Stump().anatomy(TRUE_SPACING_MM)
             spot = Take(site).spot
             position, _ = project_to_skin(anatomy, Stump().at(spot.degrees, spot.height))
-            axis = indenter_axis(anatomy.skin, position, INDENTER.width_mm)
-            mesh, _ = mesh_site(anatomy, position, axis, TRUE_MESH, base_mesh(anatomy, TRUE_MESH))
+            axis = compute_indenter_axis(anatomy.skin, position, INDENTER.width_mm)
+            mesh, _ = mesh_site(anatomy, position, axis, TRUE_MESH, build_base_mesh(anatomy, TRUE_MESH))
             write_vtu(mesh, file)
             write_json(place, {"position": list(map(float, position)), "axis": list(map(float, axis))})
         known = json.loads(place.read_text())

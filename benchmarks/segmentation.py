@@ -26,10 +26,10 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 
 from limbfit.anatomy.grid import BONES, FAT, LabelMap
-from limbfit.anatomy.labels.quality import assess
+from limbfit.anatomy.labels.quality import assess_labels
 from limbfit.anatomy.segmentation.one_limb import check_one_limb
 from limbfit.anatomy.segmentation.segmentation import segment
-from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy, signed_distance
+from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy, compute_signed_distance
 from limbfit.phantom.geometry import Limb, gradient_of, make_limb
 from limbfit.phantom.mri import CONTRASTS, DETAIL_GRIDS, ScanGrid, image_of, make_grid
 from limbfit.phantom.surfaces import true_anatomy
@@ -82,7 +82,7 @@ def surface_errors(anatomy: Anatomy, limb: Limb) -> dict[str, dict[str, float]]:
         low = (anatomy.height(there) < -BELOW_CUT_MM) & (
             (there - true.cut_point) @ true.cut_normal < -BELOW_CUT_MM
         )
-        back = np.abs(signed_distance(found[name], there[low]))
+        back = np.abs(compute_signed_distance(found[name], there[low]))
         errors[name] = {
             "rms_mm": float(np.sqrt(np.mean(off**2))),
             "p95_mm": float(np.percentile(off, 95)),
@@ -119,7 +119,7 @@ def measure_cost(voxel_mm: float, contrast: str, seed: int) -> dict[str, Any]:
     note("segment")
     build_anatomy(labels)
     note("surfaces")
-    assess(labels)
+    assess_labels(labels)
     note("quality")
     row["wall_s"] = round(time.perf_counter() - begun, 1)
     return row

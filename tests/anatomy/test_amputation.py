@@ -7,7 +7,7 @@ import pytest
 from limbs import DIRECTIONS, leg_image
 
 from limbfit.anatomy.imaging import LabelMap
-from limbfit.anatomy.segmentation.amputation import amputate
+from limbfit.anatomy.segmentation.amputation import amputate_limb
 from limbfit.anatomy.surfaces.surfaces import build_anatomy, check_anatomy
 from limbfit.errors import LabelError
 
@@ -28,7 +28,7 @@ def plane(leg) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def stump(leg, plane) -> LabelMap:
-    return amputate(leg, *plane, PAD)
+    return amputate_limb(leg, *plane, PAD)
 
 
 def test_what_is_proximal_is_untouched(leg, plane, stump):
@@ -88,12 +88,12 @@ def test_the_stump_becomes_surfaces(plane, stump):
 def test_impossible_planes_are_refused(leg, plane, shift, factor, pad, expected):
     point, normal = plane
     with pytest.raises(LabelError, match=expected):
-        amputate(leg, point + shift * normal, factor * normal, pad)
+        amputate_limb(leg, point + shift * normal, factor * normal, pad)
 
 
 def test_a_plane_along_the_limb_is_refused(leg, plane):
     with pytest.raises(LabelError, match=r"does not cross the limb: its normal is 8[0-9] degrees"):
-        amputate(leg, plane[0], np.cross(plane[1], [0.3, 0.1, 0.5]), PAD)
+        amputate_limb(leg, plane[0], np.cross(plane[1], [0.3, 0.1, 0.5]), PAD)
 
 
 def test_a_plane_that_cuts_nothing_off_is_refused(stump):
@@ -101,7 +101,7 @@ def test_a_plane_that_cuts_nothing_off_is_refused(stump):
     low = stump.heights(*_below(stump)) < 0
     assert low.any()
     with pytest.raises(LabelError, match="cuts nothing off"):
-        amputate(stump, *_below(stump), 4.0)
+        amputate_limb(stump, *_below(stump), 4.0)
 
 
 def _below(stump) -> tuple[np.ndarray, np.ndarray]:

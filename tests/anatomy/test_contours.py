@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from limbs import DIRECTIONS, grid, leg_image
 
-from limbfit.anatomy.labels.contours import even_odd, outlines, rasterise, read_contours, write_contours
+from limbfit.anatomy.labels.contours import (
+    fill_even_odd,
+    find_outlines,
+    rasterise_polygons,
+    read_contours,
+    write_contours,
+)
 from limbfit.errors import LabelError
 
 SHAPE, SPACING = (12, 40, 44), [1.2, 1.3, 5.0]
@@ -18,14 +24,14 @@ def circle(radius: float, count: int = 200) -> np.ndarray:
 
 
 def test_area_of_a_circle_with_a_hole():
-    mask = even_odd([circle(15.0), circle(6.0)], 44, 40)
+    mask = fill_even_odd([circle(15.0), circle(6.0)], 44, 40)
     assert mask.sum() == pytest.approx(np.pi * (15.0**2 - 6.0**2), rel=0.01)
     assert not mask[19, 20]
 
 
 def test_a_polygon_beyond_the_image_is_cut_at_its_border():
     corners = np.array([[-50.0, -50.0], [500.0, -50.0], [500.0, 10.5], [-50.0, 10.5]])
-    mask = even_odd([corners], 44, 40)
+    mask = fill_even_odd([corners], 44, 40)
     assert mask[:11].all()
     assert not mask[11:].any()
 
@@ -34,7 +40,7 @@ def test_outlines_of_any_mask_give_it_back():
     random = np.random.default_rng(1)
     for density in (0.1, 0.5, 0.9):
         mask = random.random((40, 44)) < density
-        assert np.array_equal(even_odd(outlines(mask), 44, 40), mask)
+        assert np.array_equal(fill_even_odd(find_outlines(mask), 44, 40), mask)
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS.values(), ids=DIRECTIONS.keys())
@@ -65,7 +71,7 @@ def _on_slices(slices: list[float], direction: np.ndarray) -> tuple:
 def test_contours_of_another_image_are_refused(slices, expected):
     polygons, like = _on_slices(slices, DIRECTIONS["oblique"])
     with pytest.raises(LabelError, match=expected):
-        rasterise(polygons, like)
+        rasterise_polygons(polygons, like)
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,13 @@ import pytest
 from bodies import ellipsoid, limb
 
 from limbfit.anatomy.imaging import read_labels, write_labels
-from limbfit.anatomy.meshing.engines import VolumeTask, netgen
-from limbfit.anatomy.meshing.layers import LayerSpec, limb_fields, signed_distance
-from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_limb, mesh_site
-from limbfit.anatomy.meshing.regions import interfaces, region_level
-from limbfit.anatomy.segmentation.amputation import amputate
-from limbfit.anatomy.segmentation.voxels import voxelised
-from limbfit.anatomy.surfaces.mending import closed_anatomy
+from limbfit.anatomy.meshing.engines import VolumeTask, run_netgen
+from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, compute_signed_distance
+from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_limb, mesh_site
+from limbfit.anatomy.meshing.regions import build_region_level, find_interfaces
+from limbfit.anatomy.segmentation.amputation import amputate_limb
+from limbfit.anatomy.segmentation.voxels import voxelise_anatomy
+from limbfit.anatomy.surfaces.mending import build_closed_anatomy
 from limbfit.anatomy.surfaces.surfaces import (
     Anatomy,
     build_anatomy,
@@ -48,7 +48,7 @@ def with_regions(**places: tuple[list[float], list[float]]) -> Anatomy:
 @cache
 def limb_without() -> Anatomy:
     bare = limb()
-    return closed_anatomy(bare.skin, bare.bones, (bare.cut_point, bare.cut_normal))[0]
+    return build_closed_anatomy(bare.skin, bare.bones, (bare.cut_point, bare.cut_normal))[0]
 
 
 INSIDE = ([-14.0, 0.0, -40.0], [5.0, 9.0, 16.0])
@@ -61,18 +61,18 @@ def meshed() -> tuple:
 
 
 def corners_between(mesh: Mesh, layers: int = 1) -> np.ndarray:
-    return mesh.points[np.unique(interfaces(mesh, layers)[0][:, :3])]
+    return mesh.points[np.unique(find_interfaces(mesh, layers)[0][:, :3])]
 
 
 def test_the_mesh_conforms_to_a_region(meshed: tuple) -> None:
     anatomy, mesh, report = meshed
     assert mesh.region_names == ("skin", "scar", "muscle")
     assert len(boundary_faces(mesh)) < 4 * len(mesh.cells)  # raises where a face has three cells
-    off = np.abs(signed_distance(anatomy.regions["scar"], corners_between(mesh))[0])
+    off = np.abs(compute_signed_distance(anatomy.regions["scar"], corners_between(mesh))[0])
     assert np.percentile(off, 95) < 0.01
     assert off.max() < 0.3
     middles = mesh.points[mesh.corners].mean(axis=1)
-    depth = -signed_distance(anatomy.regions["scar"], middles)[0]
+    depth = -compute_signed_distance(anatomy.regions["scar"], middles)[0]
     scar = mesh.regions == 1
     assert depth[scar].min() > 0.0
     assert depth[~scar].max() < 0.0
@@ -101,14 +101,14 @@ def test_it_joins_bone_and_layer_at_right_angles() -> None:
 
 
 def test_a_gap_thinner_than_the_clearance_is_closed() -> None:
-    fields = limb_fields(
+    fields = build_limb_fields(
         with_regions(scar=([-23.5, 0.0, -40.0], [4.5, 9.0, 14.0])), (LayerSpec("skin", 3.0),), 1.5
     )
-    level = region_level(fields, 0)
+    level = build_region_level(fields, 0)
     towards = fields.frame.to_limb(at(-28.0, 0.0, -40.0)[None])  # in the gap, 0.6 mm wide
     surface = fields.regions["scar"]
     outside = towards + np.linspace(0.0, 0.6, 4)[:, None] * fields.depth(towards)[1]
-    between = outside[signed_distance(surface, outside)[0] > 0.0]
+    between = outside[compute_signed_distance(surface, outside)[0] > 0.0]
     assert len(between)
     assert (level(between)[0] < 0.0).all()
 
@@ -151,22 +151,22 @@ def test_regions_in_the_wrong_place_are_refused(centre: list, axes: list, words:
 def test_regions_that_cannot_be_meshed_are_refused() -> None:
     thin = with_regions(scar=([-14.0, 0.0, -40.0], [1.0, 9.0, 16.0]))
     with pytest.raises(SurfaceError, match=r"geometry.regions.scar: .* 2\.0 mm thick at most, too thin"):
-        base_mesh(thin, COARSE)
+        build_base_mesh(thin, COARSE)
     shallow = with_regions(scar=([-30.0, 0.0, -40.0], [2.0, 9.0, 16.0]))
     with pytest.raises(SurfaceError, match="scar: nothing of the region lies under the layers"):
-        base_mesh(shallow, replace(COARSE, layers=(LayerSpec("skin", 9.0),)))
+        build_base_mesh(shallow, replace(COARSE, layers=(LayerSpec("skin", 9.0),)))
 
 
 def test_netgen_knows_no_regions() -> None:
     none = np.zeros((0, 3), dtype=np.int64)
     task = VolumeTask(np.zeros((4, 3)), np.arange(4)[None], np.array([1]), none, none, np.ones(4), 1.0)
     with pytest.raises(MeshingError, match=r"not installed|knows no regions"):
-        netgen(task, 1.0)
+        run_netgen(task, 1.0)
 
 
 def test_a_label_becomes_a_region_and_no_bone(tmp_path) -> None:
     anatomy = with_regions(scar=INSIDE)
-    drawn = voxelised(anatomy)
+    drawn = voxelise_anatomy(anatomy)
     write_labels(tmp_path / "labels.seg.nrrd", drawn)
     labels = read_labels(tmp_path / "labels.seg.nrrd")
     assert set(labels.bone_names) == {"scar", "tibia"}  # of a label that the study does not name
@@ -176,7 +176,9 @@ def test_a_label_becomes_a_region_and_no_bone(tmp_path) -> None:
     check_anatomy(built)
     assert set(built.bones) == {"tibia"}
     assert built.regions["mark"].volume == pytest.approx(anatomy.regions["scar"].volume, rel=0.02)
-    assert np.abs(signed_distance(anatomy.regions["scar"], built.regions["mark"].points)[0]).max() < 1.0
+    assert (
+        np.abs(compute_signed_distance(anatomy.regions["scar"], built.regions["mark"].points)[0]).max() < 1.0
+    )
     save_anatomy(tmp_path, built)
     assert load_anatomy(tmp_path).regions["mark"].volume == pytest.approx(built.regions["mark"].volume)
     with pytest.raises(
@@ -187,6 +189,6 @@ def test_a_label_becomes_a_region_and_no_bone(tmp_path) -> None:
 
 def test_a_virtual_amputation_keeps_what_is_proximal_of_it() -> None:
     anatomy = with_regions(scar=([-14.0, 0.0, -30.0], [5.0, 9.0, 16.0]))
-    labels = amputate(voxelised(anatomy), at(0.0, 0.0, -30.0), [0.0, 0.0, 1.0], pad_mm=10.0)
+    labels = amputate_limb(voxelise_anatomy(anatomy), at(0.0, 0.0, -30.0), [0.0, 0.0, 1.0], pad_mm=10.0)
     built = build_anatomy(labels, 3.0, (anatomy.cut_point, anatomy.cut_normal))
     assert built.regions["scar"].volume == pytest.approx(anatomy.regions["scar"].volume / 2, rel=0.05)

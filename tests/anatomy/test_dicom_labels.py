@@ -10,7 +10,7 @@ from limbs import DIRECTIONS, volume, write_dicom
 from test_labels import labels_on
 
 from limbfit.anatomy.imaging import SOFT_TISSUE, LabelMap, read_labels
-from limbfit.anatomy.labels.contours import even_odd
+from limbfit.anatomy.labels.contours import fill_even_odd
 from limbfit.errors import LabelError
 
 RANDOM = np.random.default_rng(3)
@@ -84,7 +84,7 @@ def test_even_odd_leaves_holes_and_fills_islands_in_them():
     def square(low: float, high: float) -> np.ndarray:
         return np.array([[low, low], [high, low], [high, high], [low, high]])
 
-    filled = even_odd([square(0.5, 9.5), square(2.5, 7.5), square(3.5, 5.5)], 12, 11)
+    filled = fill_even_odd([square(0.5, 9.5), square(2.5, 7.5), square(3.5, 5.5)], 12, 11)
     j, i = np.mgrid[:11, :12]
 
     def inside(low: float, high: float) -> np.ndarray:
@@ -97,15 +97,15 @@ def test_even_odd_leaves_holes_and_fills_islands_in_them():
             *([2.5, 2.5], [2.5, 7.5], [7.5, 7.5], [7.5, 2.5], [2.5, 2.5]),
         ]
     )
-    assert np.array_equal(even_odd([keyhole], 12, 11), inside(0.5, 9.5) ^ inside(2.5, 7.5))
+    assert np.array_equal(fill_even_odd([keyhole], 12, 11), inside(0.5, 9.5) ^ inside(2.5, 7.5))
 
 
 def test_a_slanted_triangle_has_its_area():
     corners = np.array([[3.3, 1.2], [80.7, 20.1], [30.9, 90.4]])
     (a, b), (c, d) = corners[1] - corners[0], corners[2] - corners[0]
-    assert even_odd([corners], 100, 100).sum() == pytest.approx((a * d - b * c) / 2, rel=0.01)
-    assert np.array_equal(even_odd([corners[::-1]], 100, 100), even_odd([corners], 100, 100))
-    assert np.array_equal(even_odd([corners[:, ::-1]], 100, 100), even_odd([corners], 100, 100).T)
+    assert fill_even_odd([corners], 100, 100).sum() == pytest.approx((a * d - b * c) / 2, rel=0.01)
+    assert np.array_equal(fill_even_odd([corners[::-1]], 100, 100), fill_even_odd([corners], 100, 100))
+    assert np.array_equal(fill_even_odd([corners[:, ::-1]], 100, 100), fill_even_odd([corners], 100, 100).T)
 
 
 @pytest.mark.parametrize(

@@ -12,14 +12,19 @@ from bodies import limb
 from limbs import SHARED, rotation
 
 from limbfit.anatomy.meshing import meshing, untangling
-from limbfit.anatomy.meshing.background import volumes
+from limbfit.anatomy.meshing.background import compute_volumes
 from limbfit.anatomy.meshing.engines import VolumeMesh
-from limbfit.anatomy.meshing.layered import with_layers
+from limbfit.anatomy.meshing.layered import extrude_layers
 from limbfit.anatomy.meshing.layers import LimbFields
-from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site
-from limbfit.anatomy.meshing.smoothing import held
-from limbfit.anatomy.meshing.untangling import inverted, repaired, thinned, untangled
-from limbfit.anatomy.sites.sites import indenter_axis, project_to_skin
+from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
+from limbfit.anatomy.meshing.smoothing import find_constraints
+from limbfit.anatomy.meshing.untangling import (
+    find_inverted_cells,
+    repair_mesh,
+    thin_inverted_layers,
+    untangle_cells,
+)
+from limbfit.anatomy.sites.sites import compute_indenter_axis, project_to_skin
 from limbfit.errors import MeshingError
 from limbfit.mesh import check, quality
 
@@ -39,14 +44,14 @@ def anatomy():
 @pytest.fixture(scope="module")
 def site(anatomy):
     point, _ = project_to_skin(anatomy, anatomy.skin.triangles[900].mean(axis=0))
-    return point, indenter_axis(anatomy.skin, point, 20.0)
+    return point, compute_indenter_axis(anatomy.skin, point, 20.0)
 
 
 def spoiled(monkeypatch: pytest.MonkeyPatch, spoil) -> None:
     """Let something go wrong between the layers' extrusion and the repairs."""
 
     def layers(core: VolumeMesh, fields: LimbFields, regions: tuple[str, ...]):
-        mesh, stack = with_layers(core, fields, regions)
+        mesh, stack = extrude_layers(core, fields, regions)
         return spoil(mesh, stack), stack
 
     monkeypatch.setattr(meshing, "with_layers", layers)
@@ -87,11 +92,11 @@ def test_inverted_cells_are_mended_and_told(monkeypatch, anatomy, site, where):
         node = int(nodes.get(where, inner_node(mesh, stack)))
         places.append(mesh.points[node])
         worse = crossed(mesh, stack) if where == "columns" else through(mesh, node)
-        assert (volumes(worse.points, worse.cells) <= 0).any()
+        assert (compute_volumes(worse.points, worse.cells) <= 0).any()
         return worse
 
     spoiled(monkeypatch, spoil)
-    base = base_mesh(anatomy, COARSE)
+    base = build_base_mesh(anatomy, COARSE)
     mesh, report = mesh_site(anatomy, *site, COARSE, base)
     check(mesh)
     assert quality(mesh).inverted == 0
@@ -110,12 +115,12 @@ def test_thinner_layers_alone_make_crossed_columns_sound(monkeypatch, anatomy, s
         return mesh
 
     spoiled(monkeypatch, spoil)
-    base = base_mesh(anatomy, COARSE)
+    base = build_base_mesh(anatomy, COARSE)
     mesh_site(anatomy, *site, COARSE, base)
     worse, stack = made[0]
-    assert inverted(worse).any()
-    points = thinned(worse.points, worse, stack, *held(worse, base.fields, stack))
-    assert (volumes(points, worse.cells) > 0).all()
+    assert find_inverted_cells(worse).any()
+    points = thin_inverted_layers(worse.points, worse, stack, *find_constraints(worse, base.fields, stack))
+    assert (compute_volumes(points, worse.cells) > 0).all()
 
 
 def test_what_cannot_be_mended_is_refused_with_its_place(monkeypatch, anatomy, site):
@@ -139,8 +144,8 @@ def test_a_sound_mesh_is_left_alone(monkeypatch, anatomy, site):
     kept = []
 
     def watched(mesh, fields, stack):
-        after, repairs = repaired(mesh, fields, stack)
-        kept.append(np.array_equal(after.points, mesh.points) and not inverted(mesh).any())
+        after, repairs = repair_mesh(mesh, fields, stack)
+        kept.append(np.array_equal(after.points, mesh.points) and not find_inverted_cells(mesh).any())
         return after, repairs
 
     monkeypatch.setattr(meshing, "repaired", watched)
@@ -160,13 +165,13 @@ def test_a_tangled_star_is_untangled():
                 tets.append([6, *flip])
     tets = np.array(tets)
     middle = np.vstack([tips, [[0.0, 0.0, 0.0]]])
-    if (volumes(middle, tets) < 0).all():
+    if (compute_volumes(middle, tets) < 0).all():
         tets = tets[:, [0, 2, 1, 3]]
-    assert (volumes(middle, tets) > 0).all()
+    assert (compute_volumes(middle, tets) > 0).all()
     points = np.vstack([tips, [[1.1, 0.9, 0.2]]])
     movable = np.arange(7) == 6
-    found = untangled(points, tets, np.zeros((7, 3)), movable)
-    assert (volumes(found, tets) > 0).all()
+    found = untangle_cells(points, tets, np.zeros((7, 3)), movable)
+    assert (compute_volumes(found, tets) > 0).all()
     assert np.array_equal(found[:6], tips)
 
 
@@ -186,7 +191,7 @@ def test_a_node_that_the_mesher_left_on_the_skin_is_put_back():
     found = foreign_meshes.read_limb("limb-6", foreign_meshes.limb_files(SHARED)["limb-6"], 0.0, False)
     settings = foreign_meshes.default_settings()["own"]
     site = foreign_meshes.random_sites(found.anatomy, 10)[9]
-    row = foreign_meshes.site_row(found, base_mesh(found.anatomy, settings), settings, site)
+    row = foreign_meshes.site_row(found, build_base_mesh(found.anatomy, settings), settings, site)
     assert row["sound"], row["failure"]
 
 
@@ -200,5 +205,5 @@ def test_limbs_of_an_atlas_are_meshed_as_they_come(name):
     assert set(found.anatomy.bones) == {"tibia", "fibula", "femur", "patella"}
     settings = foreign_meshes.default_settings()["coarse"]
     sites = foreign_meshes.random_sites(found.anatomy, 1, 3)
-    row = foreign_meshes.site_row(found, base_mesh(found.anatomy, settings), settings, sites[0])
+    row = foreign_meshes.site_row(found, build_base_mesh(found.anatomy, settings), settings, sites[0])
     assert row["sound"], row["failure"]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from limbs import CALF, leg_image
 
-from limbfit.anatomy.imaging import LabelMap, Volume, check_image, cleaned, read_volume
+from limbfit.anatomy.imaging import LabelMap, Volume, check_image, clean_labels, read_volume
 from limbfit.anatomy.segmentation.one_limb import check_one_limb
 from limbfit.errors import ImageError, LabelError
 
@@ -22,7 +22,7 @@ def leg() -> tuple[Volume, LabelMap]:
 
 
 def test_a_whole_map_is_left_as_it_is(leg):
-    same, notes = cleaned(leg[1], PATH)
+    same, notes = clean_labels(leg[1], PATH)
     assert notes == []
     assert np.array_equal(same.array, leg[1].array)
 
@@ -34,7 +34,7 @@ def test_strays_and_holes_are_repaired_and_said(leg):
     array[5, 60, 3] = 2
     array[40:42, 40, 40] = 0
     array[40, 44:46, 30] = 3
-    back, notes = cleaned(labels.with_array(array), PATH)
+    back, notes = clean_labels(labels.with_array(array), PATH)
     assert np.array_equal(back.array, labels.array)
     assert notes == [
         "dropped 2 pieces (0.05 cm3) apart from the limb",
@@ -71,7 +71,7 @@ def spoil(labels: LabelMap, how: str) -> LabelMap:
 )
 def test_ambiguous_maps_are_refused(leg, how, expected):
     with pytest.raises(LabelError, match=expected) as caught:
-        cleaned(spoil(leg[1], how), PATH)
+        clean_labels(spoil(leg[1], how), PATH)
     assert str(PATH) in str(caught.value)
     assert caught.value.remedy
 

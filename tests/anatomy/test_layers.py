@@ -10,12 +10,12 @@ import pytest
 from test_meshing import COARSE, conforms, limb, site_of
 
 from limbfit.anatomy.grid import LabelMap
-from limbfit.anatomy.meshing.background import volumes
-from limbfit.anatomy.meshing.columns import columns, even_steps
+from limbfit.anatomy.meshing.background import compute_volumes
+from limbfit.anatomy.meshing.columns import build_columns, choose_even_steps
 from limbfit.anatomy.meshing.layers import LayerSpec
-from limbfit.anatomy.meshing.meshing import base_mesh, mesh_site
+from limbfit.anatomy.meshing.meshing import build_base_mesh, mesh_site
 from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy
-from limbfit.anatomy.surfaces.thickness import fat_depth, read_thickness, write_thickness
+from limbfit.anatomy.surfaces.thickness import measure_fat_depth, read_thickness, write_thickness
 from limbfit.errors import LabelError, SurfaceError
 from limbfit.mesh import Mesh
 
@@ -36,11 +36,11 @@ def test_columns_of_any_steps_fill_the_layers_and_conform() -> None:
     random = np.random.default_rng(0)
     steps = random.integers(1, 4, size=(2, len(points)))
     shuffled = random.permutation(faces)
-    stack = columns(np.arange(len(points)), steps, len(points))
+    stack = build_columns(np.arange(len(points)), steps, len(points))
     shares = np.tile([[0.0], [0.7], [1.0]], len(points))
     mesh_points = np.vstack([points, stack.placed(points, points + np.array([0, 0, 2.0]), shares)])
     tets, layer = stack.tets(shuffled)
-    size = volumes(mesh_points, tets)
+    size = compute_volumes(mesh_points, tets)
     assert size.min() > 0
     assert size[layer == 0].sum() == pytest.approx(25 * 1.4)
     assert size[layer == 1].sum() == pytest.approx(25 * 0.6)
@@ -51,8 +51,8 @@ def test_columns_of_any_steps_fill_the_layers_and_conform() -> None:
 def test_steps_follow_the_thickness_and_change_by_one_at_most() -> None:
     thickness = np.array([1.0, 1.0, 12.0, 12.0])
     edges = np.array([[0, 1], [1, 2], [2, 3]])
-    assert even_steps(thickness, np.full(4, 3.0), edges, 8).tolist() == [1, 1, 2, 3]
-    assert even_steps(thickness, np.full(4, 100.0), edges, 8).tolist() == [1, 1, 1, 1]
+    assert choose_even_steps(thickness, np.full(4, 3.0), edges, 8).tolist() == [1, 1, 2, 3]
+    assert choose_even_steps(thickness, np.full(4, 100.0), edges, 8).tolist() == [1, 1, 1, 1]
 
 
 @pytest.mark.parametrize("element", ["tet4", "tet10"])
@@ -76,8 +76,8 @@ def test_three_layers_are_as_thick_as_asked(element: str) -> None:
 def test_layers_are_thinned_over_bone_instead_of_trimming_it() -> None:
     anatomy = limb(bone_offset=19.0)
     thin = replace(COARSE, bone_policy="thin-skin")
-    base = base_mesh(anatomy, thin)
-    trimmed = base_mesh(anatomy, COARSE).trimmed["tibia"]
+    base = build_base_mesh(anatomy, thin)
+    trimmed = build_base_mesh(anatomy, COARSE).trimmed["tibia"]
     position, axis = site_of(anatomy, np.array([1.0, 0, 0]), -40.0)
     mesh, report = mesh_site(anatomy, position, axis, thin, base)
     conforms(mesh)
@@ -115,7 +115,7 @@ def fatty() -> tuple[LabelMap, Anatomy]:
 
 def test_fat_depth_is_that_of_its_inner_face(fatty: tuple) -> None:
     labels, anatomy = fatty
-    depth = fat_depth(labels, anatomy)
+    depth = measure_fat_depth(labels, anatomy)
     x, y, z = anatomy.skin.points.T
     side = (z > 50) & (z < 84)
     error = depth[side] - fat_thickness(np.arctan2(y, x)[side])
@@ -125,15 +125,15 @@ def test_fat_depth_is_that_of_its_inner_face(fatty: tuple) -> None:
 
 def test_a_map_makes_a_layer_of_that_thickness(fatty: tuple, tmp_path: Path) -> None:
     labels, anatomy = fatty
-    depth = fat_depth(labels, anatomy)
+    depth = measure_fat_depth(labels, anatomy)
     write_thickness(tmp_path / "map.vtp", anatomy.skin, depth)
     again = read_thickness(tmp_path / "map.vtp", anatomy.skin)
     np.testing.assert_allclose(again, depth, atol=1e-4)
     layers = (LayerSpec("skin", 1.5), LayerSpec("fat", None))
     settings = replace(COARSE, layers=layers)
     with pytest.raises(SurfaceError, match="fat_depth_mm is not given"):
-        base_mesh(anatomy, settings)
-    base = base_mesh(anatomy, settings, again)
+        build_base_mesh(anatomy, settings)
+    base = build_base_mesh(anatomy, settings, again)
     position, axis = np.array([40.0, 0.0, 60.0]), np.array([-1.0, 0.0, 0.0])
     mesh, report = mesh_site(anatomy, position, axis, settings, base)
     conforms(mesh)
@@ -149,13 +149,13 @@ def test_a_map_makes_a_layer_of_that_thickness(fatty: tuple, tmp_path: Path) -> 
 def test_a_map_needs_fat(fatty: tuple) -> None:
     labels, anatomy = fatty
     with pytest.raises(LabelError, match="no voxel is labelled 'fat'"):
-        fat_depth(replace(labels, names={1: "soft tissue", 2: "tibia"}), anatomy)
+        measure_fat_depth(replace(labels, names={1: "soft tissue", 2: "tibia"}), anatomy)
     with pytest.raises(LabelError, match="nothing but fat"):
-        fat_depth(labels.with_array(np.where(labels.array > 0, 2, 0)), anatomy)
+        measure_fat_depth(labels.with_array(np.where(labels.array > 0, 2, 0)), anatomy)
 
 
 def test_fat_is_at_least_as_thick_as_the_least() -> None:
     anatomy = limb()
     settings = replace(COARSE, layers=(LayerSpec("skin", 1.5), LayerSpec("fat", None, 2.0)))
-    fields = base_mesh(anatomy, settings, np.zeros(len(anatomy.skin.points))).fields
+    fields = build_base_mesh(anatomy, settings, np.zeros(len(anatomy.skin.points))).fields
     np.testing.assert_allclose(fields.depths[:, 0], [1.5, 3.5])

@@ -7,8 +7,8 @@ import pytest
 from bodies import limb
 from limbs import rotation
 
-from limbfit.anatomy.meshing.layers import LayerSpec, limb_fields, signed_distance
-from limbfit.anatomy.meshing.liner import under_liner
+from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, compute_signed_distance
+from limbfit.anatomy.meshing.liner import build_liner_surface
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.anatomy.surfaces.surfaces import Anatomy
 from limbfit.anatomy.surfaces.triangles import check_closed
@@ -30,21 +30,21 @@ def oblique() -> Anatomy:
 
 @pytest.fixture(scope="module")
 def lined(oblique: Anatomy) -> Anatomy:
-    return under_liner(oblique, THICKNESS)[0]
+    return build_liner_surface(oblique, THICKNESS)[0]
 
 
 def test_the_outer_face_is_a_thickness_outside_the_skin(oblique: Anatomy, lined: Anatomy) -> None:
     check_closed(lined.skin, "the liner")
     assert lined.skin.volume > oblique.skin.volume
     below = lined.skin.points[lined.height(lined.skin.points) < -5.0]
-    fields = limb_fields(oblique, (), 0.0)
-    away = signed_distance(fields.skin, fields.frame.to_limb(below))[0]
+    fields = build_limb_fields(oblique, (), 0.0)
+    away = compute_signed_distance(fields.skin, fields.frame.to_limb(below))[0]
     assert away == pytest.approx(THICKNESS, abs=0.02)
     assert lined.height(lined.skin.points).max() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_depth_of_fat_is_counted_from_the_outer_face(oblique: Anatomy) -> None:
-    lined, depth = under_liner(oblique, THICKNESS, np.full(len(oblique.skin.points), 4.0))
+    lined, depth = build_liner_surface(oblique, THICKNESS, np.full(len(oblique.skin.points), 4.0))
     assert depth == pytest.approx(np.full(len(lined.skin.points), 4.0 + THICKNESS))
 
 

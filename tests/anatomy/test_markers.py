@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from limbfit.anatomy.grid import LabelMap, Volume
-from limbfit.anatomy.segmentation.body import limb_mask, smoothed
-from limbfit.anatomy.sites.marked import marked_skin, outline_height, without_markers
-from limbfit.anatomy.sites.markers import Marker, bumps, find_markers, match_markers
-from limbfit.anatomy.sites.registration import limb_motion
+from limbfit.anatomy.segmentation.body import find_limb_mask, smooth_image
+from limbfit.anatomy.sites.marked import extract_marked_skin, outline_height, remove_markers
+from limbfit.anatomy.sites.markers import Marker, find_bumps, find_markers, match_markers
+from limbfit.anatomy.sites.registration import register_limb
 from limbfit.anatomy.surfaces.surfaces import extract_surface
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import ImageError, SiteError
@@ -22,7 +22,7 @@ SHIFT_MM, TURN_DEG = np.array([3.0, -2.5, 2.5]), 2.8
 
 
 def mask_of(volume: Volume) -> np.ndarray:
-    return limb_mask(volume, smoothed(volume))
+    return find_limb_mask(volume, smooth_image(volume))
 
 
 def skin_of(volume: Volume) -> Surface:
@@ -55,8 +55,8 @@ def check_found(found: tuple[Marker, ...], sites) -> None:
 def test_markers_of_a_second_image_of_a_moved_limb() -> None:
     """And they are misplaced by about the motion where it is not taken back."""
     limb, _, plain, marked = scans(1)
-    outline, skin = marked_skin(marked)[0], skin_of(plain)
-    motion = limb_motion(plain, marked, mask_of(plain))
+    outline, skin = extract_marked_skin(marked)[0], skin_of(plain)
+    motion = register_limb(plain, marked, mask_of(plain))
     check_found(
         find_markers(replace(outline, points=motion.apply(outline.points)), skin), true_sites(limb, 1)
     )
@@ -67,7 +67,7 @@ def test_markers_of_a_second_image_of_a_moved_limb() -> None:
 
 def test_motion_of_a_limb() -> None:
     limb, moved, plain, marked = scans(1)
-    motion = limb_motion(plain, marked, mask_of(plain))
+    motion = register_limb(plain, marked, mask_of(plain))
     before, after = (np.array([s.position for s in true_sites(place, 1)]) for place in (limb, moved))
     assert np.linalg.norm(motion.apply(after) - before, axis=1).max() < 0.15
     assert motion.turn_deg == pytest.approx(TURN_DEG, abs=0.2)
@@ -87,7 +87,7 @@ def test_motion_between_fine_images_is_as_exact() -> None:
         return Volume(total, np.full(3, 0.5), np.zeros(3), np.eye(3))
 
     shift = np.array([1.3, -0.8, 0.45])
-    motion = limb_motion(blobs(np.zeros(3)), blobs(shift), np.ones(k.shape, bool))
+    motion = register_limb(blobs(np.zeros(3)), blobs(shift), np.ones(k.shape, bool))
     assert np.abs(motion.apply(centres + shift) - centres).max() < 0.05
 
 
@@ -96,15 +96,15 @@ def test_another_limb_is_no_motion() -> None:
     _, _, plain, _ = scans(1)
     noise = np.random.default_rng(0).uniform(0, 1, plain.array.shape).astype(np.float32)
     with pytest.raises(ImageError, match="do not match"):
-        limb_motion(plain, plain.with_array(noise), mask_of(plain))
+        register_limb(plain, plain.with_array(noise), mask_of(plain))
 
 
 def test_markers_of_one_image_alone_are_found_and_taken_off() -> None:
     """The skin under them comes back within the thickness of a line, elsewhere it stays as it was."""
     _, moved, _, marked = scans(1)
     sites = true_sites(moved, 1)
-    outline = marked_skin(marked)[0]
-    cleaned, count = without_markers(marked, outline)
+    outline = extract_marked_skin(marked)[0]
+    cleaned, count = remove_markers(marked, outline)
     assert count == len(sites)
     skin = skin_of(cleaned)
     check_found(find_markers(outline, skin), sites)
@@ -118,9 +118,9 @@ def test_markers_of_one_image_alone_are_found_and_taken_off() -> None:
 @pytest.mark.slow
 def test_no_marker_where_there_is_none() -> None:
     _, _, plain, _ = scans(1)
-    outline = marked_skin(plain)[0]
-    assert bumps(outline, outline_height(outline)) == []
-    assert without_markers(plain, outline)[1] == 0
+    outline = extract_marked_skin(plain)[0]
+    assert find_bumps(outline, outline_height(outline)) == []
+    assert remove_markers(plain, outline)[1] == 0
     assert find_markers(outline, outline) == ()
 
 

@@ -10,9 +10,9 @@ import pytest
 from bodies import limb
 from limbs import rotation
 
-from limbfit.anatomy.surfaces.mending import closed_anatomy, flat_ends, mended, open_loops
+from limbfit.anatomy.surfaces.mending import build_closed_anatomy, find_flat_ends, open_loops, repair_surface
 from limbfit.anatomy.surfaces.surfaces import Surface, check_anatomy, check_closed
-from limbfit.anatomy.surfaces.triangles import compacted, from_pyvista
+from limbfit.anatomy.surfaces.triangles import from_pyvista, remove_unused_points
 from limbfit.errors import SurfaceError
 
 
@@ -22,7 +22,7 @@ def whole():
 
 
 def without(surface: Surface, faces: np.ndarray) -> Surface:
-    return compacted(replace(surface, faces=surface.faces[~faces]))
+    return remove_unused_points(replace(surface, faces=surface.faces[~faces]))
 
 
 def opened(surface: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
@@ -31,7 +31,7 @@ def opened(surface: Surface, point: np.ndarray, normal: np.ndarray) -> Surface:
 
 
 def test_a_closed_surface_is_left_alone(whole):
-    found = mended(whole.skin, "skin")
+    found = repair_surface(whole.skin, "skin")
     assert found.surface is whole.skin
     assert found.cap is None
     assert found.notes == ()
@@ -45,7 +45,7 @@ def turned(surface: Surface, which: slice) -> Surface:
 
 @pytest.mark.parametrize("which", [slice(0, None, 2), slice(1, None, 2), slice(0, 1), slice(0, 3000)])
 def test_turned_triangles_are_turned_back_and_counted(whole, which):
-    found = mended(turned(whole.skin, which), "skin")
+    found = repair_surface(turned(whole.skin, which), "skin")
     assert found.surface.volume == pytest.approx(whole.skin.volume, rel=1e-12)
     check_closed(found.surface)
     count = len(whole.skin.faces[which])
@@ -56,7 +56,7 @@ def test_turned_triangles_are_turned_back_and_counted(whole, which):
 
 def test_an_open_surface_with_turned_triangles_is_capped_as_one_without(whole):
     skin = opened(whole.skin, whole.cut_point - 3 * whole.cut_normal, whole.cut_normal)
-    plain, found = mended(skin, "skin"), mended(turned(skin, slice(0, None, 2)), "skin")
+    plain, found = repair_surface(skin, "skin"), repair_surface(turned(skin, slice(0, None, 2)), "skin")
     assert found.surface.volume == pytest.approx(plain.surface.volume, rel=1e-9)
     assert found.cap.normal == pytest.approx(plain.cap.normal, abs=1e-9)
 
@@ -64,11 +64,11 @@ def test_an_open_surface_with_turned_triangles_is_capped_as_one_without(whole):
 def test_a_surface_that_looks_inward_as_a_mirrored_one_does_is_refused(whole):
     for surface in (whole.skin.flipped, turned(whole.skin.flipped, slice(0, None, 5))):
         with pytest.raises(SurfaceError, match=r"inverted|oriented against each other"):
-            closed_anatomy(surface, whole.bones)
+            build_closed_anatomy(surface, whole.bones)
 
 
 def test_the_cut_of_a_closed_skin_is_the_flat_end_that_bones_reach_out_of(whole):
-    anatomy, notes = closed_anatomy(whole.skin, whole.bones)
+    anatomy, notes = build_closed_anatomy(whole.skin, whole.bones)
     assert anatomy.cut_normal == pytest.approx(whole.cut_normal, abs=1e-9)
     assert abs(whole.height(anatomy.cut_point)) < 1e-9
     assert len(notes) == 1
@@ -85,13 +85,13 @@ def segment_along_x(length: float) -> tuple[Surface, Surface]:
 
 def test_of_two_flat_ends_it_is_the_one_that_bones_reach_out_of():
     skin, bone = segment_along_x(80.0)
-    assert len(flat_ends(skin)) == 2
-    anatomy, notes = closed_anatomy(skin, {"tibia": bone})
+    assert len(find_flat_ends(skin)) == 2
+    anatomy, notes = build_closed_anatomy(skin, {"tibia": bone})
     assert anatomy.cut_normal == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
     assert anatomy.cut_point[0] == pytest.approx(300.0, abs=1e-6)
     assert sum("the proximal cut is its flat end" in note for note in notes) == 1
     with pytest.raises(SurfaceError, match="lies outside the skin"):  # through both: no guess is made
-        closed_anatomy(segment_along_x(60.0)[0], {"tibia": bone})
+        build_closed_anatomy(segment_along_x(60.0)[0], {"tibia": bone})
 
 
 def test_open_skin_and_bone_are_capped_and_cut_below_both(whole):
@@ -101,7 +101,7 @@ def test_open_skin_and_bone_are_capped_and_cut_below_both(whole):
     bone = opened(whole.bones["tibia"], whole.cut_point - 6 * whole.cut_normal, whole.cut_normal)
     with pytest.raises(SurfaceError, match="open"):
         check_closed(skin)
-    anatomy, notes = closed_anatomy(skin, {"tibia": bone})
+    anatomy, notes = build_closed_anatomy(skin, {"tibia": bone})
     check_anatomy(anatomy)
     assert [note.split(":")[0] for note in notes] == ["skin", "tibia"]
     assert all("open at one end" in note and "mm2" in note for note in notes)
@@ -118,7 +118,7 @@ def test_small_holes_are_filled_and_told_with_their_place(whole):
     here = np.argmin(np.abs(whole.height(middle) + 50.0))
     gone = np.zeros(len(middle), dtype=bool)
     gone[here] = gone[np.linalg.norm(middle - middle[here], axis=1).argsort()[1]] = True
-    found = mended(without(whole.skin, gone), "skin")
+    found = repair_surface(without(whole.skin, gone), "skin")
     check_closed(found.surface)
     assert found.cap is None
     assert len(found.notes) == 1
@@ -133,7 +133,7 @@ def test_two_open_ends_are_refused_with_their_places(whole):
     both = opened(both, whole.cut_point - 80 * whole.cut_normal, -whole.cut_normal)
     assert len(open_loops(both)) == 2
     with pytest.raises(SurfaceError, match=r"skin: 2 open ends .* at \(.*\) mm and \(.*\) mm; close all but"):
-        mended(both, "skin")
+        repair_surface(both, "skin")
 
 
 def test_loose_triangles_are_left_out(whole):
@@ -142,7 +142,7 @@ def test_loose_triangles_are_left_out(whole):
     littered = Surface(
         np.vstack([whole.skin.points, far]), np.vstack([whole.skin.faces, [[count, count + 1, count + 2]]])
     )
-    found = mended(littered, "skin")
+    found = repair_surface(littered, "skin")
     check_closed(found.surface)
     assert "1 loose pieces of 1 triangles left out" in found.notes[0]
 

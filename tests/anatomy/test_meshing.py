@@ -14,11 +14,11 @@ from bodies import limb
 from limbs import SHARED, rotation
 
 from limbfit.anatomy.meshing import engines
-from limbfit.anatomy.meshing.background import LAYER, banded, box_grid, cut, volumes
-from limbfit.anatomy.meshing.columns import columns
-from limbfit.anatomy.meshing.curving import with_diagonals
-from limbfit.anatomy.meshing.layers import LayerSpec, limb_fields, signed_distance
-from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site
+from limbfit.anatomy.meshing.background import LAYER, build_box_grid, compute_in_band, compute_volumes, cut
+from limbfit.anatomy.meshing.columns import build_columns
+from limbfit.anatomy.meshing.curving import curve_diagonals
+from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, compute_signed_distance
+from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
 from limbfit.anatomy.meshing.meshreport import mesh_warnings
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, read_surface
 from limbfit.errors import MeshingError, SurfaceError
@@ -100,7 +100,7 @@ def test_nodes_of_the_skin_stay_on_a_rough_one(oblique: Anatomy) -> None:
     mesh, report = mesh_site(rough, position, axis, settings)
     heads = mesh.points[np.unique(mesh.face_sets["skin"])]
     below = heads[(heads - rough.cut_point) @ rough.cut_normal < -10.0]
-    assert np.abs(signed_distance(rough.skin, below)[0]).max() < 1e-3
+    assert np.abs(compute_signed_distance(rough.skin, below)[0]).max() < 1e-3
     assert report.min_dihedral_deg > 6.0
 
 
@@ -118,18 +118,18 @@ def test_sets_lie_on_their_surfaces(meshed: tuple, oblique: Anatomy) -> None:
     )
     assert len(missing) == 0
     bone = mesh.points[mesh.node_sets["fixed_bone"]]
-    off_bone = np.abs(signed_distance(oblique.bones["tibia"], bone)[0])
+    off_bone = np.abs(compute_signed_distance(oblique.bones["tibia"], bone)[0])
     assert np.median(off_bone) < 0.02
     assert np.percentile(off_bone, 95) < 0.25
     assert off_bone.max() < 1.0
     faces = mesh.face_sets["skin"]
     below = oblique.height(mesh.points[np.unique(faces)]) < -4
-    off_skin = np.abs(signed_distance(oblique.skin, mesh.points[np.unique(faces)][below])[0])
+    off_skin = np.abs(compute_signed_distance(oblique.skin, mesh.points[np.unique(faces)][below])[0])
     assert np.percentile(off_skin, 95) < 0.02
     assert off_skin.max() < 0.3
     corners = mesh.points[faces[:, :3]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    outward = signed_distance(oblique.skin, corners.mean(axis=1))[1]
+    outward = compute_signed_distance(oblique.skin, corners.mean(axis=1))[1]
     assert (np.einsum("ij,ij->i", normals, outward) > 0).all()
 
 
@@ -143,7 +143,7 @@ def test_coarse_faces_lie_on_a_bone_in_the_mean(oblique: Anatomy) -> None:
     faces = faces[~np.isin(faces, mesh.node_sets["fixed_proximal"]).all(axis=1)]
     shares = np.array([[i / 8, j / 8] for i in range(9) for j in range(9 - i)])
     places = np.einsum("qk,fki->fqi", quadratic_simplex(shares)[0], mesh.points[faces]).reshape(-1, 3)
-    level, _ = signed_distance(oblique.bones["tibia"], places)
+    level, _ = compute_signed_distance(oblique.bones["tibia"], places)
     assert abs(level.mean()) < 0.08
     assert np.sqrt(np.mean(level**2)) < 0.32
     assert report.min_scaled_jacobian > 0.25
@@ -174,11 +174,11 @@ def test_curved_elements_follow_the_skin_better_than_straight_ones(meshed: tuple
 
 def test_shallow_bone_is_trimmed_and_reported() -> None:
     deep, shallow = limb(), limb(bone_offset=19.0)
-    assert base_mesh(deep, COARSE).trimmed["tibia"].volume_mm3 == 0.0
+    assert build_base_mesh(deep, COARSE).trimmed["tibia"].volume_mm3 == 0.0
     position, axis = site_of(shallow, np.array([1.0, 0, 0]), -40.0)
     mesh, report = mesh_site(shallow, position, axis, COARSE)
     trimmed = report.trimmed_bone["tibia"]
-    fields = limb_fields(shallow, COARSE.layers, COARSE.bone_clearance_mm)
+    fields = build_limb_fields(shallow, COARSE.layers, COARSE.bone_clearance_mm)
     nearest = fields.depth(fields.frame.to_limb(shallow.bones["tibia"].points))[0][
         fields_below(fields, shallow)
     ].min()
@@ -199,11 +199,11 @@ def test_cutting_a_grid_keeps_volume_and_signs() -> None:
         distance = np.linalg.norm(points, axis=1)
         return 8.0 - distance, -points / np.maximum(distance, 1e-12)[:, None]
 
-    grid = box_grid(np.full(3, -10.0), np.full(3, 10.0), 1.7)
+    grid = build_box_grid(np.full(3, -10.0), np.full(3, 10.0), 1.7)
     halves, positive = cut(grid, ball, LAYER)
-    size = volumes(halves.points, halves.tets)
+    size = compute_volumes(halves.points, halves.tets)
     assert size.min() > 0
-    assert size.sum() == pytest.approx(volumes(grid.points, grid.tets).sum(), rel=1e-12)
+    assert size.sum() == pytest.approx(compute_volumes(grid.points, grid.tets).sum(), rel=1e-12)
     assert size[positive].sum() == pytest.approx(4 / 3 * np.pi * 512, rel=0.02)
     on_level = (halves.mask & LAYER) > 0
     assert np.abs(ball(halves.points[on_level])[0]).max() < 0.02
@@ -217,7 +217,7 @@ def test_settled_cells_have_the_exact_sign_and_band() -> None:
         return 20.0 - np.linalg.norm(points, axis=1), points
 
     points = np.random.default_rng(0).uniform(-60, 60, size=(4000, 3))
-    exact, found = field(points)[0], banded(field, points, 5.0, 4.0)
+    exact, found = field(points)[0], compute_in_band(field, points, 5.0, 4.0)
     assert (np.sign(found) == np.sign(exact)).all()
     inside = np.abs(exact) <= 5.0
     np.testing.assert_array_equal(found[inside], exact[inside])
@@ -238,23 +238,23 @@ def test_a_mesher_that_crashes_is_an_error_not_a_crash() -> None:
 
 def test_nothing_under_the_layer_is_refused(oblique: Anatomy) -> None:
     with pytest.raises(MeshingError, match="no muscle is left"):
-        base_mesh(oblique, replace(COARSE, layers=(LayerSpec("skin", 60.0),)))
+        build_base_mesh(oblique, replace(COARSE, layers=(LayerSpec("skin", 60.0),)))
 
 
 def test_a_skin_that_does_not_reach_the_cut_is_refused(oblique: Anatomy) -> None:
     lifted = replace(oblique, cut_point=oblique.cut_point + 5 * oblique.cut_normal)
     with pytest.raises(SurfaceError, match=r"5\.0 mm below"):
-        base_mesh(lifted, COARSE)
+        build_base_mesh(lifted, COARSE)
 
 
 def test_diagonals_follow_the_curved_edges_above_and_below() -> None:
-    stack = columns(np.array([0, 1, 2]), np.ones((1, 3), int), 3)
+    stack = build_columns(np.array([0, 1, 2]), np.ones((1, 3), int), 3)
     points = np.array([[0.0, 0, 0], [6, 0, 0], [0, 6, 0], [0, 0, 1], [6, 0, 1], [0, 6, 1]])
     tets, _ = stack.tets(np.array([[0, 1, 2]]))
     mesh = to_tet10(Mesh(points, tets, "tet4", np.zeros(3, np.int64), ("skin",)))
     flat = np.isin(mesh.points[:, 2], [0.0, 1.0]) & (np.arange(len(mesh.points)) >= 6)
     target = mesh.points + np.where(flat, 2.0, 0.0)[:, None] * np.array([0, 0, 1.0])
-    found = with_diagonals(mesh, target, stack) - mesh.points
+    found = curve_diagonals(mesh, target, stack) - mesh.points
     upright = (mesh.points[:, 2] == 0.5) & np.isin(mesh.points[:, :2], points[:, :2]).all(axis=1)
     diagonal = (mesh.points[:, 2] == 0.5) & (mesh.points[:, :2] % 6 != 0).any(axis=1)
     assert diagonal.sum() == 3

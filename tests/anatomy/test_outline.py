@@ -12,11 +12,11 @@ from limbs import write_dicom
 from limbfit.anatomy.grid import BONES, FAT, Volume
 from limbfit.anatomy.imaging import read_volume
 from limbfit.anatomy.morphology import compute_depth
-from limbfit.anatomy.segmentation.body import limb_mask, smoothed
+from limbfit.anatomy.segmentation.body import find_limb_mask, smooth_image
 from limbfit.anatomy.segmentation.contrast import is_ct
-from limbfit.anatomy.segmentation.fat import bright_fat, subcutaneous
+from limbfit.anatomy.segmentation.fat import find_bright_fat, select_subcutaneous
 from limbfit.anatomy.segmentation.segmentation import segment
-from limbfit.anatomy.segmentation.supports import without_supports
+from limbfit.anatomy.segmentation.supports import remove_supports
 from limbfit.errors import ImageError
 from limbfit.phantom.geometry import SKIN_AND_FAT, Limb, make_limb
 from limbfit.phantom.mri import CONTRASTS, image_of, make_grid
@@ -78,7 +78,7 @@ def test_a_cushion_on_one_side_only(images, inside):
     image = on_a_table(images["UTE"], inside, 0.7, 20.0)
     array = image.array.copy()
     array[:, :, :38][~inside[:, :, :38]] = images["UTE"].array[:, :, :38][~inside[:, :, :38]]
-    half = limb_mask(image.with_array(array), smoothed(image.with_array(array)))
+    half = find_limb_mask(image.with_array(array), smooth_image(image.with_array(array)))
     assert dice(half, inside) > 0.985
 
 
@@ -86,8 +86,8 @@ def test_ghosts_of_the_limb_are_air(images, inside):
     """Copies along the phase direction at 6 % of the signal, as motion and flow make them."""
     image = images["UTE"]
     ghosts = 0.06 * (np.roll(image.array, 25, axis=1) + np.roll(image.array, -25, axis=1))
-    found = limb_mask(
-        image.with_array(image.array + ghosts), smoothed(image.with_array(image.array + ghosts))
+    found = find_limb_mask(
+        image.with_array(image.array + ghosts), smooth_image(image.with_array(image.array + ghosts))
     )
     assert dice(found, inside) > 0.985
     assert (found & ~inside).sum() < 0.01 * inside.sum()
@@ -103,14 +103,14 @@ def test_air_inside_belongs_to_the_limb(images, inside, points, limb):
     pockets |= np.hypot(local[..., 0] - 5.0, local[..., 1] - 40.0) < 3.0
     pockets &= limb.skin(points) < -8.0
     array[pockets] = 0.01
-    found = limb_mask(image.with_array(array), smoothed(image.with_array(array)))
+    found = find_limb_mask(image.with_array(array), smooth_image(image.with_array(array)))
     assert pockets.sum() > 300
     assert found[pockets].all()
     assert dice(found, inside) > 0.985
 
 
 def test_a_limb_without_supports_is_left_as_it_is(inside, images):
-    assert np.array_equal(without_supports(inside, images["UTE"]), inside)
+    assert np.array_equal(remove_supports(inside, images["UTE"]), inside)
 
 
 @pytest.mark.parametrize("contrast", CONTRASTS)
@@ -217,7 +217,9 @@ def test_a_septum_is_no_subcutaneous_fat_and_a_vessel_in_the_fat_is():
     levels[septum | deep] = 2.0
     levels[vessel] = 0.1
     bones, depth = np.zeros(shape, dtype=bool), compute_depth(limb, spacing)
-    fat = subcutaneous(bright_fat(levels, limb, bones, depth, spacing), limb, bones, depth, spacing)
+    fat = select_subcutaneous(
+        find_bright_fat(levels, limb, bones, depth, spacing), limb, bones, depth, spacing
+    )
     assert dice(fat, layer) > 0.95
     assert not fat[deep].any()
     assert not fat[septum & (radius < 18)].any()
@@ -232,6 +234,8 @@ def test_dark_fat_far_from_the_coil_is_fat():
     limb, layer = radius < 27, (radius < 27) & (radius > 22)
     levels = (np.where(layer, 2.0, 1.0) * limb * (1 - 0.6 * k / 79)).astype(np.float32)
     bones, depth = np.zeros(shape, dtype=bool), compute_depth(limb, spacing)
-    fat = subcutaneous(bright_fat(levels, limb, bones, depth, spacing), limb, bones, depth, spacing)
+    fat = select_subcutaneous(
+        find_bright_fat(levels, limb, bones, depth, spacing), limb, bones, depth, spacing
+    )
     for end in (slice(0, 10), slice(-10, None)):
         assert dice(fat[end], layer[end]) > 0.9

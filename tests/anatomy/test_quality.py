@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from limbs import DIRECTIONS, leg_image
 
-from limbfit.anatomy.labels.quality import LIMB, assess
+from limbfit.anatomy.labels.quality import LIMB, assess_labels
 from limbfit.report.drawing.sheet import draw_sheet
 
 SHAPE, SPACING = (62, 60, 60), [2.0, 2.0, 2.5]
@@ -21,7 +21,7 @@ def leg():
 
 
 def test_a_good_map_has_measures_and_no_suspects(leg):
-    quality = assess(leg[1])
+    quality = assess_labels(leg[1])
     assert quality.suspects == ()
     tibia = quality.labels["tibia"]
     assert tibia["volume_cm3"] == pytest.approx(np.pi * 1.3**2 * 12, rel=0.07)
@@ -61,7 +61,7 @@ def _bitten(array, labels, k):
 def test_one_bad_slice_is_named(leg, damage, label, words):
     labels, array = leg[1], leg[1].array.copy()
     damage(array, labels, 31)
-    found = [s for s in assess(labels.with_array(array)).suspects if s.label == label]
+    found = [s for s in assess_labels(labels.with_array(array)).suspects if s.label == label]
     assert [s.slice for s in found if words in s.what] == [31]
 
 
@@ -70,7 +70,7 @@ def test_pieces_and_holes_are_counted(leg):
     k, j, i = np.argwhere(labels.mask("tibia")).mean(axis=0).astype(int)
     array[k, j, i] = labels.soft_value
     array[30, 30, 30:32] = labels.value("tibia")
-    facts = assess(labels.with_array(array)).labels["tibia"]
+    facts = assess_labels(labels.with_array(array)).labels["tibia"]
     assert (facts["pieces"], facts["holes"]) == (2, 1)
     assert facts["holes_cm3"] == pytest.approx(0.01)
 
@@ -79,7 +79,7 @@ def test_slices_are_counted_along_the_limb_whatever_the_axis(leg):
     labels, array = leg[1], leg[1].array.copy()
     _emptied(array, labels, 31)
     turned = labels.with_array(array).turned([2, 0, 1])
-    quality = assess(turned)
+    quality = assess_labels(turned)
     assert quality.as_json()["axis"] == "i"
     assert [s.slice for s in quality.suspects if "missing" in s.what] == [31]
 
@@ -90,7 +90,7 @@ def test_the_picture_grows_by_the_slices_to_look_at(leg, tmp_path):
     _shifted(array, labels, 31)
     bad = labels.with_array(array)
     for name, drawn in (("good", labels), ("bad", bad)):
-        draw_sheet(tmp_path / f"{name}.png", image, drawn, assess(drawn))
+        draw_sheet(tmp_path / f"{name}.png", image, drawn, assess_labels(drawn))
     good, worse = (matplotlib.image.imread(tmp_path / f"{name}.png") for name in ("good", "bad"))
     assert good.shape[1] == worse.shape[1] == 1200
     assert worse.shape[0] > good.shape[0] + 200

@@ -15,13 +15,13 @@ from scipy.spatial import cKDTree
 
 from limbfit.anatomy.imaging import LabelMap, Volume, read_labels, read_volume, write_labels, write_volume
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_site
-from limbfit.anatomy.sites.sites import indenter_axis
+from limbfit.anatomy.sites.sites import compute_indenter_axis
 from limbfit.anatomy.surfaces.surfaces import (
     Anatomy,
     build_anatomy,
+    compute_signed_distance,
     load_anatomy,
     save_anatomy,
-    signed_distance,
 )
 from limbfit.mesh import write_vtu
 
@@ -132,14 +132,14 @@ def test_the_mesh_on_disk_lies_where_the_body_lies(tmp_path, body, reference):
     """Read by another program (VTK): nodes of the skin on the skin, none of them in a bone."""
     site = reference.skin.points[np.argmin(np.abs(reference.height(reference.skin.points) + 60))]
     settings = MeshSettings(element="tet4", edge_near_mm=8.0, edge_far_mm=20.0, flatness=1.6)
-    mesh, _ = mesh_site(reference, site, indenter_axis(reference.skin, site, 20.0), settings)
+    mesh, _ = mesh_site(reference, site, compute_indenter_axis(reference.skin, site, 20.0), settings)
     write_vtu(mesh, tmp_path / "mesh.vtu")
     seen = pv.read(tmp_path / "mesh.vtu")
     assert np.abs(seen.points - mesh.points).max() < TOLERANCE_MM
     outer = seen.points[np.unique(mesh.face_sets["skin"])]
-    assert np.abs(signed_distance(reference.skin, outer)).max() < 1.0
+    assert np.abs(compute_signed_distance(reference.skin, outer)).max() < 1.0
     for bone in reference.bones.values():
-        assert signed_distance(bone, seen.points).min() > -1.0
+        assert compute_signed_distance(bone, seen.points).min() > -1.0
 
 
 def _sorted_like(triangles: np.ndarray, others: np.ndarray) -> np.ndarray:

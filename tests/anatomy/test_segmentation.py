@@ -8,8 +8,8 @@ from limbs import CALF, DIRECTIONS, leg_image
 from scipy.ndimage import label
 
 from limbfit.anatomy.imaging import BONES, LabelMap, Volume, read_volume
-from limbfit.anatomy.segmentation.body import bias_field, limb_mask, smoothed
-from limbfit.anatomy.segmentation.bones import escape_level, find_bones, name_bones
+from limbfit.anatomy.segmentation.body import estimate_bias_field, find_limb_mask, smooth_image
+from limbfit.anatomy.segmentation.bones import compute_escape_level, find_bones, name_bones
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.errors import ImageError
 from limbfit.phantom.geometry import make_limb
@@ -92,15 +92,15 @@ def test_what_is_no_mri_of_a_limb_is_refused(array, expected):
 def test_outline_lies_at_half_the_signal_of_the_tissue_beside_it():
     """Bright fat at the skin does not push the outline outward: the volume is right to 0.5 %."""
     image, truth = leg_image(SPACING, SHAPE, DIRECTIONS["straight"], noise=0.01)
-    limb = limb_mask(image, smoothed(image))
+    limb = find_limb_mask(image, smooth_image(image))
     assert limb.sum() == pytest.approx(truth.limb.sum(), rel=0.005)
 
 
 def test_bias_field_is_the_coils():
     image, truth = leg_image(SPACING, SHAPE, DIRECTIONS["straight"], noise=0.01)
-    found = bias_field(image, truth.limb)[truth.limb]
+    found = estimate_bias_field(image, truth.limb)[truth.limb]
     before = image.array[truth.mask("soft tissue")]
-    after = before / bias_field(image, truth.limb)[truth.mask("soft tissue")]
+    after = before / estimate_bias_field(image, truth.limb)[truth.mask("soft tissue")]
     muscle = after < 1.5 * np.median(after)
     assert found.std() > 0.02
     assert after[muscle].std() / after[muscle].mean() < 0.8 * before[muscle].std() / before[muscle].mean()
@@ -122,7 +122,7 @@ def test_escape_level_is_its_definition():
     plane = random.integers(1, 9, size=(14, 12)).astype(np.float32)
     inside = np.zeros(plane.shape, bool)
     inside[2:-2, 2:-2] = True
-    fast = escape_level(plane[None], inside[None])[0]
+    fast = compute_escape_level(plane[None], inside[None])[0]
     assert np.array_equal(fast[inside], escape_by_definition(plane, inside)[inside])
 
 

@@ -9,7 +9,7 @@ import pytest
 import pyvista as pv
 from limbs import SHARED
 
-from limbfit.anatomy.sites.sites import indenter_axis, project_to_skin, square_edges
+from limbfit.anatomy.sites.sites import compute_indenter_axis, compute_square_edges, project_to_skin
 from limbfit.anatomy.surfaces.surfaces import Anatomy, read_surface
 from limbfit.anatomy.surfaces.triangles import from_pyvista
 from limbfit.errors import SiteError
@@ -39,7 +39,7 @@ def test_a_site_off_the_skin_is_refused_with_its_name(ball: Anatomy) -> None:
 
 def test_axis_of_a_ball_points_to_its_centre(ball: Anatomy) -> None:
     position = 50.0 * np.array([0.6, -0.64, 0.48])
-    axis = indenter_axis(ball.skin, position, 20.0)
+    axis = compute_indenter_axis(ball.skin, position, 20.0)
     assert np.linalg.norm(axis) == pytest.approx(1.0)
     np.testing.assert_allclose(axis, -position / 50.0, atol=0.01)
 
@@ -49,7 +49,7 @@ def test_axis_is_the_area_mean_over_a_ridge() -> None:
     rise = np.tan(np.radians([10.0, 40.0]))
     points = [(x, y, -abs(x) * rise[int(x > 0)]) for x in (-40.0, 0.0, 40.0) for y in (-40.0, 40.0)]
     roof = pv.PolyData(np.array(points), faces=[3, 0, 2, 1, 3, 1, 2, 3, 3, 2, 4, 3, 3, 3, 4, 5]).subdivide(1)
-    axis = indenter_axis(from_pyvista(roof), [0.0, 0.0, 0.0], 20.0, edge=[0, 1, 0])
+    axis = compute_indenter_axis(from_pyvista(roof), [0.0, 0.0, 0.0], 20.0, edge=[0, 1, 0])
     slope = np.degrees(np.arctan2(-axis[0], -axis[2]))
     # Under a tilted square each plane is cut off at the same distance across the axis.
     areas = 1 / np.cos(np.radians([10.0 + slope, 40.0 - slope]))
@@ -62,11 +62,11 @@ def test_axis_is_the_area_mean_over_a_ridge() -> None:
 
 def test_square_edges_are_an_orthonormal_frame_with_the_axis() -> None:
     for axis in (np.array([0.6, 0.0, 0.8]), np.array([0, 0, 1.0])):
-        frame = np.vstack([square_edges(axis), axis])
+        frame = np.vstack([compute_square_edges(axis), axis])
         np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(square_edges(np.array([0, 1.0, 0]))[0], [1.0, 0, 0])
+    np.testing.assert_allclose(compute_square_edges(np.array([0, 1.0, 0]))[0], [1.0, 0, 0])
     with pytest.raises(SiteError, match="parallel"):
-        square_edges(np.array([0, 0, 1.0]), [0, 0, 2.0])
+        compute_square_edges(np.array([0, 0, 1.0]), [0, 0, 2.0])
 
 
 @pytest.mark.skipif(not OPENLIMB.is_dir(), reason="the shared mean limb is not beside the repository")
@@ -76,5 +76,7 @@ def test_axes_of_the_mean_limb_agree_with_those_given() -> None:
     for site in sites.values():
         point, distance = project_to_skin(anatomy, site["position"])
         assert distance < 0.5
-        angle = np.degrees(np.arccos(indenter_axis(anatomy.skin, point, 20.0) @ np.array(site["axis"])))
+        angle = np.degrees(
+            np.arccos(compute_indenter_axis(anatomy.skin, point, 20.0) @ np.array(site["axis"]))
+        )
         assert angle < 1.0

@@ -12,7 +12,7 @@ import pyvista as pv
 from limbs import DIRECTIONS, Leg, grid, leg_image, rotation, write_dicom
 
 from limbfit.anatomy.imaging import LabelMap, read_volume
-from limbfit.anatomy.surfaces.extraction import fine_surface, untangled
+from limbfit.anatomy.surfaces.extraction import extract_fine_surface, untangle_surface
 from limbfit.anatomy.surfaces.surfaces import (
     Anatomy,
     Surface,
@@ -20,10 +20,10 @@ from limbfit.anatomy.surfaces.surfaces import (
     check_anatomy,
     check_closed,
     extract_surface,
+    find_self_intersections,
     load_anatomy,
     read_surface,
     save_anatomy,
-    self_intersections,
     write_surface,
 )
 from limbfit.errors import LabelError, SurfaceError
@@ -152,7 +152,7 @@ def test_self_intersections_agree_with_testing_every_pair(seed, large):
     """Also where a few faces are so large, as in a scan's cap, that they are looked for in pieces."""
     points = scatter_triangles(seed, large).reshape(-1, 3)
     surface = Surface(points, np.arange(60).reshape(-1, 3))
-    fast = {tuple(sorted(pair)) for pair in self_intersections(surface)}
+    fast = {tuple(sorted(pair)) for pair in find_self_intersections(surface)}
     slow = set()
     for i in range(20):
         for j in range(i + 1, 20):
@@ -197,7 +197,7 @@ def test_edges_have_the_length_that_was_asked_for():
 def test_smoothing_and_coarse_triangles_keep_the_volume(edge):
     labels, _ = sphere_labels(12.0, [1.5, 1.5, 1.5], seed=3)
     volume = labels.mask("tibia").sum() * labels.voxel_mm3
-    assert fine_surface(labels, "tibia", edge).volume == pytest.approx(volume, rel=1e-3)
+    assert extract_fine_surface(labels, "tibia", edge).volume == pytest.approx(volume, rel=1e-3)
     assert extract_surface(labels, "tibia", edge).volume == pytest.approx(volume, rel=1e-3)
 
 
@@ -207,9 +207,9 @@ def test_folded_triangles_are_untangled():
     first, second = points[0], points[np.argsort(np.linalg.norm(points - points[0], axis=1))[12]]
     points[0] = first + 1.3 * (second - first)  # beyond its neighbours: their triangles lie over others
     folded = Surface(points, surface.faces)
-    assert len(self_intersections(folded)) > 0
-    mended = untangled(folded)
-    assert len(self_intersections(mended)) == 0
+    assert len(find_self_intersections(folded)) > 0
+    mended = untangle_surface(folded)
+    assert len(find_self_intersections(mended)) == 0
     assert np.median(np.linalg.norm(mended.points - surface.points, axis=1)) == 0
     assert np.abs(np.linalg.norm(mended.points, axis=1) - 50).max() < 3
 

@@ -7,9 +7,9 @@ import pytest
 from bodies import limb, revolved
 
 from limbfit.anatomy.meshing import thinbones
-from limbfit.anatomy.meshing.background import volumes
-from limbfit.anatomy.meshing.layers import limb_fields
-from limbfit.anatomy.meshing.meshing import MeshSettings, base_mesh, mesh_site
+from limbfit.anatomy.meshing.background import compute_volumes
+from limbfit.anatomy.meshing.layers import build_limb_fields
+from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface
 
 RADIUS, AT = 4.0, np.array([-17.0, 0.0, 0.0])
@@ -31,14 +31,14 @@ def test_the_base_keeps_a_bone_half_as_thick_as_its_grid_is_wide(thin: Anatomy) 
     """The volume that it takes from the core is three quarters of its own; an even grid keeps a third."""
     assert COARSE.base_spacing_mm > 1.85 * RADIUS
     without = Anatomy(thin.skin, {"tibia": thin.bones["tibia"]}, thin.cut_point, thin.cut_normal)
-    core = [np.abs(volumes(base.grid.points, base.grid.tets)).sum()
-            for base in (base_mesh(without, COARSE), base_mesh(thin, COARSE))]  # fmt: skip
+    core = [np.abs(compute_volumes(base.grid.points, base.grid.tets)).sum()
+            for base in (build_base_mesh(without, COARSE), build_base_mesh(thin, COARSE))]  # fmt: skip
     own = np.pi * RADIUS**2 * 60.0
     assert 0.75 * own < core[0] - core[1] < 1.05 * own
 
 
 def test_only_thin_bone_is_found_thin(thin: Anatomy) -> None:
-    fields = limb_fields(thin, COARSE.layers, COARSE.bone_clearance_mm)
+    fields = build_limb_fields(thin, COARSE.layers, COARSE.bone_clearance_mm)
     places = fields.frame.to_patient(thinbones.thin_places(fields, COARSE.base_spacing_mm))
     assert len(places) > 50
     assert (places[:, 0] < thin.cut_point[0] - 8.0).all()  # none of the bone of 9 mm radius at x = 8 mm

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from limbfit.anatomy.sites.under import DEEPEST_MM, tissue_under
+from limbfit.anatomy.sites.under import DEEPEST_MM, measure_tissue_under
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface
 
 
@@ -25,17 +25,19 @@ def limb() -> Anatomy:
 
 
 def test_it_is_the_distance_along_the_axis(limb):
-    assert tissue_under(limb, (50, 0, 0), (-1, 0, 0), 1.0) == pytest.approx(15.0, abs=0.1)
+    assert measure_tissue_under(limb, (50, 0, 0), (-1, 0, 0), 1.0) == pytest.approx(15.0, abs=0.1)
 
 
 def test_the_thinnest_place_under_the_footprint_counts(limb):
     # Beside the bone's top the skin falls away slower than the bone: the middle is thinnest.
-    assert tissue_under(limb, (50, 0, 0), (-1, 0, 0), 20.0) == pytest.approx(15.0, abs=0.1)
+    assert measure_tissue_under(limb, (50, 0, 0), (-1, 0, 0), 20.0) == pytest.approx(15.0, abs=0.1)
     # 8 mm to the side the centre sees 16.9 mm, the edge of the footprint the bone's top.
     place = (np.sqrt(50**2 - 8**2), 8, 0)
-    assert tissue_under(limb, place, (-1, 0, 0), 20.0) < tissue_under(limb, place, (-1, 0, 0), 1.0)
+    assert measure_tissue_under(limb, place, (-1, 0, 0), 20.0) < measure_tissue_under(
+        limb, place, (-1, 0, 0), 1.0
+    )
 
 
 def test_without_bone_below_it_is_deep(limb):
-    assert tissue_under(limb, (0, 50, 0), (0, -1, 0), 20.0) == DEEPEST_MM
-    assert tissue_under(limb, (-50, 0, 0), (1, 0, 0), 20.0) == DEEPEST_MM
+    assert measure_tissue_under(limb, (0, 50, 0), (0, -1, 0), 20.0) == DEEPEST_MM
+    assert measure_tissue_under(limb, (-50, 0, 0), (1, 0, 0), 20.0) == DEEPEST_MM

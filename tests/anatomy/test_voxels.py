@@ -7,7 +7,7 @@ import pytest
 from bodies import limb
 from limbs import rotation
 
-from limbfit.anatomy.segmentation.voxels import amputated, voxelised
+from limbfit.anatomy.segmentation.voxels import amputate_anatomy, voxelise_anatomy
 from limbfit.anatomy.surfaces.surfaces import check_anatomy
 from limbfit.errors import LabelError
 
@@ -21,7 +21,7 @@ def whole():
 
 
 def test_voxels_keep_the_volumes(whole):
-    labels = voxelised(whole)
+    labels = voxelise_anatomy(whole)
     assert labels.bone_names == ("tibia",)
     assert labels.limb.sum() * labels.voxel_mm3 == pytest.approx(whole.skin.volume, rel=0.005)
     below = labels.index_to_point((np.array(np.nonzero(labels.limb))[::-1]).T)
@@ -32,7 +32,7 @@ def test_bones_end_at_the_plane_and_the_limb_within_the_pad(whole):
     tilt = whole.cut_normal + 0.1 * np.linalg.svd(whole.cut_normal[None])[2][1]
     normal = tilt / np.linalg.norm(tilt)
     point = whole.cut_point - 40.0 * whole.cut_normal
-    stump = amputated(whole, point, normal, PAD, EDGE)
+    stump = amputate_anatomy(whole, point, normal, PAD, EDGE)
     check_anatomy(stump)
     bone = (stump.bones["tibia"].points - point) @ normal
     skin = (stump.skin.points - point) @ normal
@@ -44,4 +44,4 @@ def test_bones_end_at_the_plane_and_the_limb_within_the_pad(whole):
 
 def test_a_plane_beyond_the_bones_is_refused(whole):
     with pytest.raises(LabelError, match="cuts nothing off"):
-        amputated(whole, whole.cut_point - 85.0 * whole.cut_normal, whole.cut_normal, PAD, EDGE)
+        amputate_anatomy(whole, whole.cut_point - 85.0 * whole.cut_normal, whole.cut_normal, PAD, EDGE)

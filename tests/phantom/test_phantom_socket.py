@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_phantom_folder import cubic_law
 
-from limbfit.anatomy.frame import limb_frame
+from limbfit.anatomy.frame import build_limb_frame
 from limbfit.anatomy.surfaces.surfaces import load_anatomy, write_surface
 from limbfit.phantom import make_limb, make_phantom
 from limbfit.phantom.socket import LINER_MM, make_socket
@@ -51,7 +51,7 @@ def check_socket(seed: int, file: Path | None = None) -> None:
     assert np.all(np.array(depths[3:]) < 0.5)  # relieved
     if file is not None:
         write_surface(file, socket.surface)
-        frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+        frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
         assert not read_socket(file, outer=liner, frame=frame, bones=anatomy.bones).notes
 
 

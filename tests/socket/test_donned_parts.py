@@ -15,7 +15,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "anatomy"))
 from bodies import limb
 
-from limbfit.anatomy.frame import limb_frame
+from limbfit.anatomy.frame import build_limb_frame
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.donning import Load, SocketFit, don, pack, socket_problem, unpack
@@ -33,7 +33,7 @@ TISSUES = {"skin": OgdenQLV(0.009, 6.0, 2.0, 0.5), "muscle": OgdenQLV(0.004, 4.0
 def donned(tmp_path_factory):
     """The arguments of a simulation with derivatives, its outcome, and what was kept of each part."""
     anatomy, folder = limb(), tmp_path_factory.mktemp("parts")
-    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     trim = Trim([(anatomy.cut_point - 26.0 * anatomy.cut_normal, anatomy.cut_normal)])
     socket = rectify_limb(
         anatomy.skin, frame, Recipe(trim=trim, reduction_percent=3.0, distal_clearance_mm=3.0)

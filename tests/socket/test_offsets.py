@@ -10,7 +10,7 @@ import trimesh
 from socket_limbs import CUT_NORMAL, round_limb
 from test_wall import thickness as measured_by_trimesh
 
-from limbfit.anatomy.frame import limb_frame
+from limbfit.anatomy.frame import build_limb_frame
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, Zone, rectify_limb
@@ -21,7 +21,7 @@ from limbfit.socket.trim import Trim
 from limbfit.socket.wall import build_wall, measure_thickness
 
 LIMB = round_limb()
-FRAME = limb_frame(LIMB.cut_point, LIMB.cut_normal)
+FRAME = build_limb_frame(LIMB.cut_point, LIMB.cut_normal)
 PLAIN = Recipe(
     Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)]), 0.0, flare_mm=0.0, distal="bearing", edge_mm=5.0
 )

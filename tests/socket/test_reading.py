@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, round_limb
 
-from limbfit.anatomy.frame import limb_frame
+from limbfit.anatomy.frame import build_limb_frame
 from limbfit.anatomy.surfaces.surfacefiles import write_surface
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
@@ -25,14 +25,16 @@ TRIM = Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)])
 
 def read(file: Path, unit: str = "mm", space: str | None = None) -> Socket:
     limb = round_limb()
-    frame = limb_frame(limb.cut_point, limb.cut_normal)
+    frame = build_limb_frame(limb.cut_point, limb.cut_normal)
     return read_socket(file, unit, space, outer=limb.skin, frame=frame, bones=limb.bones)  # type: ignore[arg-type]
 
 
 @cache
 def drawn() -> Socket:
     limb = round_limb()
-    return rectify_limb(limb.skin, limb_frame(limb.cut_point, limb.cut_normal), Recipe(TRIM, flare_mm=0.0))
+    return rectify_limb(
+        limb.skin, build_limb_frame(limb.cut_point, limb.cut_normal), Recipe(TRIM, flare_mm=0.0)
+    )
 
 
 def face() -> Surface:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, FILES, TOP, real_limb, revolved, round_limb
 
-from limbfit.anatomy.frame import Frame, limb_frame
-from limbfit.anatomy.surfaces.surfaces import Anatomy, signed_distance
-from limbfit.anatomy.surfaces.triangles import Surface, self_intersections
+from limbfit.anatomy.frame import Frame, build_limb_frame
+from limbfit.anatomy.surfaces.surfaces import Anatomy, compute_signed_distance
+from limbfit.anatomy.surfaces.triangles import Surface, find_self_intersections
 from limbfit.errors import SurfaceError
 from limbfit.socket import Area, Recipe, Socket, measure_circumference, rectify_limb
 from limbfit.socket.landmarks import find_knee_centre
@@ -21,7 +21,7 @@ PLAIN = Recipe(Trim([(np.array([0.0, 0.0, 115.0]), CUT_NORMAL)]), flare_mm=0.0, 
 
 
 def frame_of(anatomy: Anatomy) -> Frame:
-    return limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    return build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
 
 
 def made(recipe: Recipe = PLAIN, anatomy: Anatomy | None = None) -> Socket:
@@ -41,7 +41,7 @@ def check_face(socket: Socket, anatomy: Anatomy) -> None:
     """What holds of every socket: one brim, one side, no crossing, and clear where it is clear."""
     skin = anatomy.skin
     face, clear = socket.surface, Surface(socket.clear, socket.faces)
-    assert len(self_intersections(face)) == len(self_intersections(clear)) == 0
+    assert len(find_self_intersections(face)) == len(find_self_intersections(clear)) == 0
     assert socket.closed.volume > 0
     edges = np.sort(np.vstack([socket.faces[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
     alone, counts = np.unique(edges, axis=0, return_counts=True)
@@ -50,10 +50,10 @@ def check_face(socket: Socket, anatomy: Anatomy) -> None:
     # Clear of the limb: from points on the face, and from the limb's points.
     weights = np.array([[1, 0, 0], [0.5, 0.5, 0], [1 / 3, 1 / 3, 1 / 3], [0.2, 0.2, 0.6], [0.6, 0.2, 0.2]])
     on = np.einsum("wc,mcd->mwd", weights, clear.triangles).reshape(-1, 3)
-    assert signed_distance(skin, on).min() > 0.49
+    assert compute_signed_distance(skin, on).min() > 0.49
     apart = igl.point_mesh_squared_distance(skin.points, socket.clear, socket.faces)[0]
     assert np.sqrt(apart.min()) > 0.49
-    assert signed_distance(closed_above(clear, anatomy), skin.points).max() < 0.0
+    assert compute_signed_distance(closed_above(clear, anatomy), skin.points).max() < 0.0
 
 
 def closed_above(clear: Surface, anatomy: Anatomy) -> Surface:
@@ -173,7 +173,7 @@ def test_where_the_limb_lies_does_not_matter() -> None:
     shift = np.array([120.0, -340.0, 55.0])
     skin = Surface(limb.skin.points @ turn.T + shift, limb.skin.faces)
     recipe = replace(PLAIN, trim=Trim([(turn @ [0.0, 0.0, 115.0] + shift, turn @ CUT_NORMAL)]))
-    moved = rectify_limb(skin, limb_frame(turn @ limb.cut_point + shift, turn @ CUT_NORMAL), recipe)
+    moved = rectify_limb(skin, build_limb_frame(turn @ limb.cut_point + shift, turn @ CUT_NORMAL), recipe)
     assert moved.volume_mm3 == pytest.approx(made().volume_mm3, rel=1e-4)
     assert moved.closed.volume > 0
 
@@ -222,7 +222,7 @@ def test_a_folded_limb_is_refused() -> None:
     )
     folded = revolved(profile, 90)
     with pytest.raises(SurfaceError, match="folded by"):
-        rectify_limb(folded, limb_frame(np.array([0.0, 0.0, TOP]), CUT_NORMAL), PLAIN)
+        rectify_limb(folded, build_limb_frame(np.array([0.0, 0.0, TOP]), CUT_NORMAL), PLAIN)
 
 
 @pytest.mark.parametrize(

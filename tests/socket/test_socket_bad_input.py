@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.anatomy.frame import limb_frame
+from limbfit.anatomy.frame import build_limb_frame
 from limbfit.anatomy.surfaces.surfaces import write_surface
-from limbfit.anatomy.surfaces.triangles import Surface, compacted
+from limbfit.anatomy.surfaces.triangles import Surface, remove_unused_points
 from limbfit.socket import Recipe, rectify_limb
 from limbfit.socket.trim import Trim
 from small_limb import limb, revolved, small_limb
@@ -40,7 +40,7 @@ def with_file(folder: Path, text: str) -> Path:
 def drawn() -> Surface:
     anatomy = limb()
     trim = Trim([(anatomy.cut_point - [0.0, 0.0, 26.0], anatomy.cut_normal)])
-    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     return rectify_limb(anatomy.skin, frame, Recipe(trim, flare_mm=0.0, distal_clearance_mm=3.0)).surface
 
 
@@ -130,7 +130,7 @@ def test_a_load_that_a_frictionless_cylinder_cannot_carry_is_told_with_the_remed
     around = revolved(np.full(20, 29.0), np.linspace(200.0, 274.0, 20) - 300.0)
     side = np.abs(around.face_normals[:, 2]) < 0.5
     tube = Surface(around.points + anatomy.cut_point, around.faces[side])
-    write_surface(study / "socket.stl", compacted(tube).flipped)
+    write_surface(study / "socket.stl", remove_unused_points(tube).flipped)
     code, _, err = limbfit("socket", study)
     told = err.splitlines()[-1]
     assert code == 1, err

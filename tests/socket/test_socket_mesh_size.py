@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, round_limb
 
-from limbfit.anatomy.frame import limb_frame
+from limbfit.anatomy.frame import build_limb_frame
 from limbfit.pipeline.shared.socket_shape import mesh_edge_mm
 from limbfit.pipeline.verbs.check import check_study
 from limbfit.socket import Recipe, Socket, rectify_limb
@@ -21,7 +21,7 @@ from small_limb import small_limb
 def shank() -> Socket:
     limb = round_limb()
     recipe = Recipe(Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)]), 3.0, edge_mm=5.0)
-    return rectify_limb(limb.skin, limb_frame(limb.cut_point, limb.cut_normal), recipe)
+    return rectify_limb(limb.skin, build_limb_frame(limb.cut_point, limb.cut_normal), recipe)
 
 
 def of_size(socket: Socket, factor: float) -> Socket:

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from socket_limbs import CUT_NORMAL, FILES, real_limb, round_limb
 
-from limbfit.anatomy.frame import limb_frame
+from limbfit.anatomy.frame import build_limb_frame
 from limbfit.anatomy.surfaces.surfacefiles import write_surface
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
@@ -24,7 +24,7 @@ RECIPE = Recipe(Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)]))
 
 def drawn(recipe: Recipe = RECIPE) -> Socket:
     limb = round_limb()
-    return rectify_limb(limb.skin, limb_frame(limb.cut_point, limb.cut_normal), recipe)
+    return rectify_limb(limb.skin, build_limb_frame(limb.cut_point, limb.cut_normal), recipe)
 
 
 def read_back(body: Surface, folder: Path) -> trimesh.Trimesh:
@@ -105,5 +105,5 @@ def test_real_limbs(tmp_path: Path, name: str) -> None:
     knee = find_knee_centre(limb)
     assert knee is not None
     trim = Trim([(knee - 15.0 * limb.cut_normal, limb.cut_normal)])
-    socket = rectify_limb(limb.skin, limb_frame(limb.cut_point, limb.cut_normal), Recipe(trim))
+    socket = rectify_limb(limb.skin, build_limb_frame(limb.cut_point, limb.cut_normal), Recipe(trim))
     check_wall(socket, limb.cut_normal, tmp_path, 4.0)

@@ -36,13 +36,13 @@ class ProximalEnd:
         return view[::-1] if self.side < 0 else view
 
 
-def longest_axis(limb: Mask, grid: Grid) -> int:
+def find_longest_axis(limb: Mask, grid: Grid) -> int:
     """The grid axis (0, 1, 2 for i, j, k) along which a mask is longest."""
-    extents = [_extent(limb, axis) for axis in range(3)]
+    extents = [_find_extent(limb, axis) for axis in range(3)]
     return int(np.argmax([(b - a + 1) * grid.spacing[axis] for axis, (a, b) in enumerate(extents)]))
 
 
-def proximal_end(limb: Mask, grid: Grid, axis: int | None = None) -> ProximalEnd:
+def find_proximal_end(limb: Mask, grid: Grid, axis: int | None = None) -> ProximalEnd:
     """Where the limb was cut: at the border of the image that it reaches, else at its thicker end.
 
     The limb's axis is the grid axis along which it is longest, if it is not given. Of two ends at the
@@ -50,8 +50,8 @@ def proximal_end(limb: Mask, grid: Grid, axis: int | None = None) -> ProximalEnd
     """
     if not limb.any():
         raise LabelError("the label map is empty", remedy="give one with the limb labelled")
-    axis = longest_axis(limb, grid) if axis is None else axis
-    low, high = _extent(limb, axis)
+    axis = find_longest_axis(limb, grid) if axis is None else axis
+    low, high = _find_extent(limb, axis)
     ends = [ProximalEnd(axis, -1, low), ProximalEnd(axis, 1, high)]
     border = [end for end in ends if end.layer in (0, grid.size[axis] - 1)]
     if len(border) == 1:
@@ -59,15 +59,15 @@ def proximal_end(limb: Mask, grid: Grid, axis: int | None = None) -> ProximalEnd
     if len(border) == 2:
         return max(border, key=lambda end: end.direction(grid)[2])
     depth = min(3, high - low)
-    return max(ends, key=lambda end: int(layer(limb, axis, end.layer - depth * end.side).sum()))
+    return max(ends, key=lambda end: int(select_layer(limb, axis, end.layer - depth * end.side).sum()))
 
 
-def layer(mask: Mask, axis: int, index: int) -> Mask:
+def select_layer(mask: Mask, axis: int, index: int) -> Mask:
     """One layer of ``[k, j, i]`` across grid axis 0, 1, 2 (i, j, k)."""
     return np.take(mask, index, axis=2 - axis)
 
 
-def _extent(mask: Mask, axis: int) -> tuple[int, int]:
+def _find_extent(mask: Mask, axis: int) -> tuple[int, int]:
     others = tuple(n for n in range(3) if n != 2 - axis)
     filled = np.flatnonzero(mask.any(axis=others))
     return int(filled[0]), int(filled[-1])

@@ -25,7 +25,7 @@ class Frame:
         return points @ self.rotation + self.origin
 
 
-def limb_frame(cut_point: Array, cut_normal: Array) -> Frame:
+def build_limb_frame(cut_point: Array, cut_normal: Array) -> Frame:
     """The frame whose z axis is the proximal normal and whose origin is ``cut_point``."""
     z = np.asarray(cut_normal, dtype=float) / np.linalg.norm(cut_normal)
     helper = np.eye(3)[np.argmin(np.abs(z))]

@@ -186,7 +186,7 @@ class Volume(Grid):
 
     @classmethod
     def from_sitk(cls, image: sitk.Image) -> Volume:
-        return cls(sitk.GetArrayFromImage(image), *geometry_of(image))
+        return cls(sitk.GetArrayFromImage(image), *read_geometry(image))
 
     def with_array(self, array: ArrayLike) -> Volume:
         return replace(self, array=np.asarray(array))
@@ -213,7 +213,7 @@ class LabelMap(Grid):
     @classmethod
     def from_sitk(cls, image: sitk.Image, names: Mapping[int, str] | None = None) -> LabelMap:
         array = sitk.GetArrayFromImage(image)
-        return cls(array, *geometry_of(image), names=dict(names or DEFAULT_NAMES))
+        return cls(array, *read_geometry(image), names=dict(names or DEFAULT_NAMES))
 
     @property
     def limb(self) -> NDArray[np.bool_]:
@@ -285,7 +285,7 @@ def check_direction(direction: Array) -> None:
         )
 
 
-def geometry_of(image: sitk.Image) -> tuple[Array, Array, Array]:
+def read_geometry(image: sitk.Image) -> tuple[Array, Array, Array]:
     """Spacing, origin and direction of a three-dimensional SimpleITK image."""
     if image.GetDimension() != 3:
         raise ImageError(f"an image needs three dimensions, this one has {image.GetDimension()}")

@@ -18,16 +18,16 @@ from .images.dicom import Series, describe_series, list_series, read_series
 from .images.formats import format_of, read_image
 from .images.nifti import describe_forms
 from .labels.dicom_labels import find_dicom_labels, read_dicom_labels
-from .labels.labelcheck import cleaned
+from .labels.labelcheck import clean_labels
 from .labels.labelfiles import (
     is_seg_nrrd,
     read_label_image,
     read_seg_nrrd,
+    to_label_error,
     write_seg_nrrd,
     write_sidecar,
-    wrong_file,
 )
-from .labels.placement import on_grid_of
+from .labels.placement import place_on_grid
 
 __all__ = [
     "BONES",
@@ -37,7 +37,7 @@ __all__ = [
     "Series",
     "Volume",
     "check_image",
-    "cleaned",
+    "clean_labels",
     "describe_series",
     "list_series",
     "read_labels",
@@ -66,7 +66,7 @@ def read_volume(path: str | Path, series_uid: str | None = None) -> Volume:
     if path.is_dir():
         volume = read_series(path, series_uid)
     else:
-        volume = _as_volume(read_image(path), path)
+        volume = _to_volume(read_image(path), path)
         if format_of(path).name == "NIfTI":
             volume = replace(volume, notes=describe_forms(path, volume.affine))
     if not np.all(np.isfinite(volume.array)):
@@ -123,7 +123,7 @@ def read_labels(path: str | Path, like: Volume | None = None) -> LabelMap:
         labels = _read_label_file(path)
     if not labels.array.any():
         raise LabelError("the label map is empty", file=path, remedy="give one with the limb labelled")
-    return labels if like is None else on_grid_of(labels, like, path)
+    return labels if like is None else place_on_grid(labels, like, path)
 
 
 def write_labels(path: str | Path, labels: LabelMap) -> None:
@@ -142,10 +142,10 @@ def _read_label_file(path: Path) -> LabelMap:
         image = read_image(path)
         return read_label_image(path, image)
     except ImageError as error:
-        raise wrong_file(error, path) from None
+        raise to_label_error(error, path) from None
 
 
-def _as_volume(image: sitk.Image, path: Path) -> Volume:
+def _to_volume(image: sitk.Image, path: Path) -> Volume:
     if image.GetNumberOfComponentsPerPixel() != 1:
         raise ImageError("an image needs one grey value per voxel", file=path)
     try:

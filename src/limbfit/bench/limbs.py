@@ -9,10 +9,10 @@ import numpy as np
 
 from ..anatomy.grid import Grid
 from ..anatomy.imaging import read_volume
-from ..anatomy.segmentation.amputation import amputate
+from ..anatomy.segmentation.amputation import amputate_limb
 from ..anatomy.segmentation.segmentation import segment
 from ..anatomy.segmentation.voxels import label_map
-from ..anatomy.sites.sites import indenter_axis
+from ..anatomy.sites.sites import compute_indenter_axis
 from ..anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface
 from ..arrays import Array
 from ..errors import InputError
@@ -67,7 +67,7 @@ def openlimb_mean(folder: Path) -> Anatomy:
 
 def amputated_calf(folder: Path) -> Anatomy:
     """The calf MRI, segmented automatically and amputated as in the example."""
-    labels = amputate(segment(read_volume(folder)), *CALF_PLANE, pad_mm=CALF_PAD_MM)
+    labels = amputate_limb(segment(read_volume(folder)), *CALF_PLANE, pad_mm=CALF_PAD_MM)
     return _checked(build_anatomy(labels))
 
 
@@ -83,4 +83,4 @@ def random_sites(anatomy: Anatomy, count: int, seed: int = 0) -> list[tuple[Arra
     area = np.where(anatomy.height(corners).max(axis=1) < -BELOW_CUT_MM, area, 0.0)
     faces = random.choice(len(area), count, p=area / area.sum())
     points = np.einsum("ni,nij->nj", random.dirichlet(np.ones(3), count), corners[faces])
-    return [(point, indenter_axis(anatomy.skin, point, INDENTER_MM)) for point in points]
+    return [(point, compute_indenter_axis(anatomy.skin, point, INDENTER_MM)) for point in points]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..anatomy.meshing.engines import ENGINES
-from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
+from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
 from ..anatomy.surfaces.surfaces import Anatomy
 from ..errors import InputError, LimbfitError
 from .limbs import limbs, random_sites
@@ -63,7 +63,7 @@ def bench_meshing(
         tell(done * sites, len(makers) * sites, name)
         anatomy = make()
         start = cpu_seconds()
-        base = base_mesh(anatomy, settings)
+        base = build_base_mesh(anatomy, settings)
         seconds_base[name] = cpu_seconds() - start
         for i, (position, axis) in enumerate(random_sites(anatomy, sites)):
             try:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
+from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
 from ..anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ..errors import RunError
 from ..fe import StepControl, solve
@@ -135,7 +135,7 @@ class TrueForce:
 def _base(folder: Path, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
     """What all sites of a phantom share; a worker makes it once."""
     anatomy = load_anatomy(folder)
-    return anatomy, base_mesh(anatomy, settings)
+    return anatomy, build_base_mesh(anatomy, settings)
 
 
 def site_mesh(job: TruthMeshJob) -> Mesh:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..anatomy.frame import limb_frame
+from ..anatomy.frame import build_limb_frame
 from ..anatomy.surfaces.surfacefiles import write_surface
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
 from ..socket import Area, Recipe, Socket, read_socket, rectify_limb
@@ -59,7 +59,7 @@ def make_socket(anatomy: Anatomy, outer: Surface, kind: str = "transtibial") -> 
     known = find_directions(anatomy, "right")
     regions = build_default_regions(anatomy, known)
     areas = [Area(name, regions[name].position, radius, depth) for name, radius, depth in AREAS[kind]]
-    knee, frame = find_knee_centre(anatomy), limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    knee, frame = find_knee_centre(anatomy), build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     trim = _below_cut(anatomy) if knee is None else _around_tendon(anatomy, known, knee)
     return rectify_limb(outer, frame, Recipe(trim, REDUCTION_PERCENT, areas)), areas
 
@@ -87,7 +87,7 @@ def write_socket(folder: Path, limb: Limb, anatomy: Anatomy) -> dict[str, Any]:
     socket, areas = make_socket(anatomy, outer, limb.kind)
     (folder / FILE).parent.mkdir()
     write_surface(folder / FILE, socket.surface)
-    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     read_socket(folder / FILE, outer=outer, frame=frame, bones=anatomy.bones)
     return {
         "file": FILE.as_posix(),

@@ -10,7 +10,7 @@ import pyvista as pv
 from numpy.typing import NDArray
 
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
-from ..anatomy.surfaces.triangles import bodies, from_pyvista, half_edges
+from ..anatomy.surfaces.triangles import find_bodies, find_half_edges, from_pyvista
 from .fields import PROXIMAL_CUT_MM, skin_field
 from .geometry import TENDON, Limb
 
@@ -83,7 +83,7 @@ def contour(field: Field, box: Box) -> Surface:
     image = pv.ImageData(dimensions=size, spacing=[a[1] - a[0] for a in axes], origin=box.low)
     image.point_data["field"] = values.ravel()
     poly = image.contour([0.0], scalars="field", method="flying_edges", compute_normals=False).clean()
-    surface = bodies(from_pyvista(poly))[0]
+    surface = find_bodies(from_pyvista(poly))[0]
     surface = _capped(_on_surface(field, surface, box.high[2]), box.high[2])
     return surface if surface.volume > 0 else surface.flipped
 
@@ -103,7 +103,7 @@ def _on_surface(field: Field, surface: Surface, top: float) -> Surface:
 
 def _capped(surface: Surface, top: float) -> Surface:
     """Closed with a fan around the middle of its open rim, which lies in the plane z = ``top``."""
-    edges = half_edges(surface.faces)
+    edges = find_half_edges(surface.faces)
     n = len(surface.points)
     keys, back = edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0]
     rim = edges[~np.isin(keys, back)]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..anatomy.frame import Frame
-from ..anatomy.surfaces.surfaces import signed_distance
+from ..anatomy.surfaces.surfaces import compute_signed_distance
 from ..anatomy.surfaces.triangles import Surface
 from ..errors import SurfaceError
 from .shape import close_by_fans
@@ -48,6 +48,6 @@ def refuse_bones(
         below = local[local[:, 2] < lowest - INTO_BONE_MM]
         if not len(below):
             continue
-        out = float(signed_distance(closed, below).max()) - spare_mm
+        out = float(compute_signed_distance(closed, below).max()) - spare_mm
         if out > INTO_BONE_MM:
             raise SurfaceError(f"the socket cuts {out:.1f} mm into the bone {name}", remedy=remedy)

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from ..anatomy.frame import Frame
-from ..anatomy.surfaces.surfaces import signed_distance
-from ..anatomy.surfaces.triangles import Surface, half_edges
+from ..anatomy.surfaces.surfaces import compute_signed_distance
+from ..anatomy.surfaces.triangles import Surface, find_half_edges
 from ..arrays import Array
 from ..errors import SurfaceError
 from .rays import LimbProfile
@@ -51,17 +51,17 @@ def apply_clearance(points: Array, faces: Ints, limb: LimbProfile, outer: Surfac
 
 
 def _build_neighbours(faces: Ints, count: int) -> csr_array:
-    edges = half_edges(faces)
+    edges = find_half_edges(faces)
     both = np.vstack([edges, edges[:, ::-1]])
     return csr_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count))
 
 
 def _compute_moves(points: Array, faces: Ints, limb: Surface) -> Array:
     """(n,) by how much each point should move out so that all that is measured near it is clear, mm."""
-    need = np.maximum(AIM_MM - signed_distance(limb, points), 0.0)
+    need = np.maximum(AIM_MM - compute_signed_distance(limb, points), 0.0)
     for corners in ((0, 1), (1, 2), (2, 0), (0, 1, 2)):
         ends = faces[:, list(corners)]
-        short = np.maximum(AIM_MM - signed_distance(limb, points[ends].mean(axis=1)), 0.0)
+        short = np.maximum(AIM_MM - compute_signed_distance(limb, points[ends].mean(axis=1)), 0.0)
         for end in ends.T:
             np.maximum.at(need, end, short)
     squared, nearest, _ = igl.point_mesh_squared_distance(limb.points, points, faces)

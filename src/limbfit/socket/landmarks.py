@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..anatomy.frame import limb_frame
+from ..anatomy.frame import build_limb_frame
 from ..anatomy.surfaces.surfaces import Anatomy
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
@@ -97,7 +97,7 @@ def load_point(anatomy: Anatomy, brim: Array) -> Array:
     knee = find_knee_centre(anatomy)
     if knee is not None:
         return knee
-    frame, skin = limb_frame(anatomy.cut_point, anatomy.cut_normal), anatomy.skin
+    frame, skin = build_limb_frame(anatomy.cut_point, anatomy.cut_normal), anatomy.skin
     z = min(float(frame.to_limb(brim)[:, 2].mean()), -1.0)  # below the cut, which closes the skin
     local = Surface(frame.to_limb(skin.points), skin.faces)
     x, y, _ = measure_section(cut_section(local, (0.0, 0.0, z), (0.0, 0.0, 1.0)))

@@ -14,11 +14,11 @@ from ..anatomy.surfaces.mending import count_turned, open_loops, orient_faces
 from ..anatomy.surfaces.surfacefiles import read_surface
 from ..anatomy.surfaces.triangles import (
     Surface,
-    bodies,
     check_sides,
-    compacted,
-    half_edges,
-    self_intersections,
+    find_bodies,
+    find_half_edges,
+    find_self_intersections,
+    remove_unused_points,
 )
 from ..arrays import Array
 from ..errors import SurfaceError
@@ -94,7 +94,7 @@ def _read(surface: Surface, outer: Surface, frame: Frame, bones: Mapping[str, Su
         face = face.flipped
         brim = brim[::-1]
         notes.append("its triangles looked away from the tissue and were turned")
-    crossing = self_intersections(face)
+    crossing = find_self_intersections(face)
     if len(crossing):
         raise SurfaceError(
             f"the socket crosses itself ({len(crossing)} pairs of faces)",
@@ -123,7 +123,7 @@ def _check_size(surface: Surface, outer: Surface) -> None:
 
 
 def _keep_largest_piece(surface: Surface) -> tuple[Surface, list[str]]:
-    parts = bodies(surface)
+    parts = find_bodies(surface)
     loose = [part for part in parts[1:] if len(part.faces) < LOOSE_SHARE * len(surface.faces)]
     if len(parts) - len(loose) > 1:
         raise SurfaceError(
@@ -203,7 +203,7 @@ def _select_inner_face(wall: Surface, rays: Rays) -> tuple[Surface, float]:
             "the socket is closed: it has no opening for the limb", remedy="cut it open at the brim"
         )
     thick = float(np.median([met[1] - met[0] for met, s in zip(hits, seen) if s and len(met) > 1]))
-    inner = bodies(compacted(Surface(wall.points, wall.faces[seen])))[0]
+    inner = find_bodies(remove_unused_points(Surface(wall.points, wall.faces[seen])))[0]
     inner = _remove_ears(inner)
     if len(inner.faces) < 0.9 * seen.sum():
         raise SurfaceError(
@@ -217,9 +217,9 @@ def _remove_ears(surface: Surface) -> Surface:
     """Without faces that hang on by one edge or a corner, so that its edge is one clean line."""
     faces = surface.faces
     while True:
-        edges = np.sort(half_edges(faces), axis=1)
+        edges = np.sort(find_half_edges(faces), axis=1)
         _, inverse, counts = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
         alone = (counts[inverse.ravel()] == 1).reshape(3, -1).sum(axis=0)
         if not (alone >= 2).any():
-            return bodies(compacted(Surface(surface.points, faces)))[0]
+            return find_bodies(remove_unused_points(Surface(surface.points, faces)))[0]
         faces = faces[alone < 2]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..anatomy.frame import Frame
-from ..anatomy.surfaces.triangles import Surface, self_intersections
+from ..anatomy.surfaces.triangles import Surface, find_self_intersections
 from ..arrays import Array
 from ..errors import SurfaceError
 from .areas import Area, Zone
@@ -216,7 +216,7 @@ def _compute_flare(drawn: SocketSurface, normals: Array, radius: float) -> Array
 
 
 def _refuse_crossing(face: Surface, recipe: Recipe) -> None:
-    crossing = self_intersections(face)
+    crossing = find_self_intersections(face)
     if not len(crossing):
         return
     place = face.triangles[crossing[0, 0]].mean(axis=0)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..anatomy.surfaces.mending import open_loops
-from ..anatomy.surfaces.surfaces import signed_distance
+from ..anatomy.surfaces.surfaces import compute_signed_distance
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 
@@ -58,7 +58,7 @@ class Socket:
 
     def offset(self, limb: Surface) -> Array:
         """(n,) how deep each point lies inside a closed limb surface, mm; negative outside."""
-        return -signed_distance(limb, self.points)
+        return -compute_signed_distance(limb, self.points)
 
 
 def close_by_fans(surface: Surface) -> Surface:

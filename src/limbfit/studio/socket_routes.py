@@ -12,7 +12,7 @@ import numpy as np
 from fastapi import APIRouter, Response
 from pydantic import Field
 
-from ..anatomy.frame import limb_frame
+from ..anatomy.frame import build_limb_frame
 from ..errors import InputError, SurfaceError
 from ..mesh import read_vtu
 from ..pipeline.shared.artefacts import digest
@@ -182,7 +182,7 @@ def _handles(folder: StudyFolder, study: Study) -> list[list[float]]:
     anatomy, table = anatomy_of(folder, study), study.socket
     if anatomy is None or table.file is not None:
         return []
-    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     try:
         limb = _profile(folder, surfaces_mark(folder, study))
         if table.trimline and not table.trim_planes:
@@ -198,7 +198,7 @@ def _profile(folder: StudyFolder, mark: str) -> LimbProfile:
     anatomy = anatomy_of(folder, folder.load())
     if anatomy is None:
         raise InputError(NONE_YET)
-    return compute_profile(anatomy.skin, limb_frame(anatomy.cut_point, anatomy.cut_normal))
+    return compute_profile(anatomy.skin, build_limb_frame(anatomy.cut_point, anatomy.cut_normal))
 
 
 def face_block(folder: StudyFolder) -> bytes:
@@ -284,7 +284,7 @@ def post_trimline(folder: Folder, line: LineOfPage) -> dict[str, Any]:
     anatomy = anatomy_of(folder, study)
     if anatomy is None:
         raise InputError(NONE_YET)
-    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     with blaming(study, "socket.trimline"):
         limb = _profile(folder, surfaces_mark(folder, study))
         points = wrap_trimline(limb, frame, np.array(line.points))

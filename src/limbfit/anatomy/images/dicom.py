@@ -18,7 +18,7 @@ from ..bounds import check_voxels
 from ..grid import Volume
 from .dicom_headers import SliceHeader, read_headers
 from .dicom_pixels import read_pixels
-from .dicom_stack import same_plane_geometry, stacked
+from .dicom_stack import has_same_plane, stack_slices
 
 _PLAIN_WORDS = {"dcm", "dicom", "ima", "im", "img", "image", "i", "slice", "mr", "ct", "pt", "ser", "series"}
 _MAX_COUNT = 9999  # of files; a larger number may be that of a person
@@ -46,15 +46,15 @@ def list_series(folder: str | Path) -> list[Series]:
         try:
             headers = read_headers(path)
         except ImageError as error:
-            place = f"file {number} of {len(files)} by name{_shown_name(path.relative_to(folder))}"
+            place = f"file {number} of {len(files)} by name{_redact_name(path.relative_to(folder))}"
             raise ImageError(error.what, file=folder, place=place, remedy=error.remedy) from None
         for header in headers or ():
             groups[header.series_uid].append(header)
     series = [Series(uid, tuple(slices)) for uid, slices in sorted(groups.items())]
-    return [_joined(series)] if _is_one_stack(series) else series
+    return [_join_series(series)] if _is_one_stack(series) else series
 
 
-def _shown_name(path: Path) -> str:
+def _redact_name(path: Path) -> str:
     """The name of a file in brackets, if it holds only words of machines and counters."""
     words, numbers = re.findall(r"[^\W\d_]+", str(path)), re.findall(r"\d+", str(path))
     is_plain = all(word.lower() in _PLAIN_WORDS for word in words)
@@ -80,11 +80,11 @@ def describe_series(folder: str | Path) -> list[dict[str, Any]]:
         raise ImageError("no such folder", file=folder, remedy="give the folder that holds the DICOM files")
     found = list_series(folder)
     if not found:
-        raise _none(folder)
-    return [_facts(series) for series in found]
+        raise _build_none_error(folder)
+    return [_collect_facts(series) for series in found]
 
 
-def _facts(series: Series) -> dict[str, Any]:
+def _collect_facts(series: Series) -> dict[str, Any]:
     first = series.slices[0]
     facts: dict[str, Any] = {
         "uid": series.uid,
@@ -98,7 +98,7 @@ def _facts(series: Series) -> dict[str, Any]:
         "why_not": None,
     }
     try:
-        _, spacing, _ = stacked(series.slices)
+        _, spacing, _ = stack_slices(series.slices)
     except ImageError as error:
         return facts | {"whole": False, "why_not": str(error)}
     return facts | {"spacing_mm": [round(float(step), 6) for step in spacing]}
@@ -126,14 +126,14 @@ def read_series(folder: str | Path, series_uid: str | None = None) -> Volume:
 
 
 def _read_volume(series: Series) -> Volume:
-    slices, spacing, direction = stacked(series.slices)
+    slices, spacing, direction = stack_slices(series.slices)
     origin = slices[0].position
     assert origin is not None
     check_voxels((slices[0].columns, slices[0].rows, len(slices)), slices[0].path)
     return Volume(read_pixels(slices), spacing, origin, direction, slices[0].modality)
 
 
-def _none(folder: Path) -> ImageError:
+def _build_none_error(folder: Path) -> ImageError:
     return ImageError(
         "no DICOM images in this folder", file=folder, remedy="give the folder that holds the slices"
     )
@@ -141,7 +141,7 @@ def _none(folder: Path) -> ImageError:
 
 def _choose(folder: Path, found: list[Series], uid: str | None) -> Series:
     if not found:
-        raise _none(folder)
+        raise _build_none_error(folder)
     if uid is not None:
         chosen = [series for series in found if series.uid == uid]
         if chosen:
@@ -172,9 +172,9 @@ def _is_one_stack(series: list[Series]) -> bool:
     slices = [one.slices[0] for one in series]
     first = slices[0]
     return all(
-        other.series_number == first.series_number and same_plane_geometry(first, other) for other in slices
+        other.series_number == first.series_number and has_same_plane(first, other) for other in slices
     )
 
 
-def _joined(series: list[Series]) -> Series:
+def _join_series(series: list[Series]) -> Series:
     return Series(series[0].uid, tuple(one.slices[0] for one in series))

@@ -77,7 +77,7 @@ class SliceHeader:
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
+def silence_readers() -> Iterator[None]:
     """Silence pydicom and ITK, whose warnings quote values of tags and names of files."""
     log = logging.getLogger("pydicom")
     shown, disabled = sitk.ProcessObject.GetGlobalWarningDisplay(), log.disabled
@@ -102,15 +102,15 @@ def read_headers(path: Path) -> list[SliceHeader] | None:
     """
     damaged = ImageError("the DICOM file is cut short or damaged", remedy="export the series again")
     try:
-        with quiet():
+        with silence_readers():
             tags = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=list(_TAGS))
             if _is_segmentation(tags):
                 return []
             if "Rows" not in tags or "Columns" not in tags:
-                if _should_be_an_image(tags):
+                if _is_image_class(tags):
                     raise damaged
                 return []
-            return _frames(tags, path) if _is_enhanced(tags) else [_single(tags, path)]
+            return _read_frames(tags, path) if _is_enhanced(tags) else [_read_single(tags, path)]
     except InvalidDicomError:
         if _is_torn(path):
             raise damaged from None
@@ -128,7 +128,7 @@ def _is_torn(path: Path) -> bool:
     return is_zero or path.suffix.lower() in (".dcm", ".ima")
 
 
-def _should_be_an_image(tags: FileDataset) -> bool:
+def _is_image_class(tags: FileDataset) -> bool:
     """Whether a file without rows and columns is of a class that has them, or breaks off before its class."""
     kind = tags.file_meta.get("MediaStorageSOPClassUID") or tags.get("SOPClassUID")
     return kind is None or kind.name.endswith(_IMAGE_CLASS)
@@ -145,7 +145,7 @@ def _is_enhanced(tags: FileDataset) -> bool:
     return "PerFrameFunctionalGroupsSequence" in tags or (kind is not None and kind.name in _ENHANCED)
 
 
-def _single(tags: FileDataset, path: Path) -> SliceHeader:
+def _read_single(tags: FileDataset, path: Path) -> SliceHeader:
     if int(tags.get("NumberOfFrames", 1) or 1) > 1:
         raise ImageError(
             "multi-frame images without a place for each frame",
@@ -153,10 +153,10 @@ def _single(tags: FileDataset, path: Path) -> SliceHeader:
             remedy="export the original series, as enhanced MR or CT or as one file per slice",
         )
     return SliceHeader(
-        **_of_file(tags, path),
-        position=_numbers(tags.get("ImagePositionPatient"), 3),
-        orientation=_numbers(tags.get("ImageOrientationPatient"), 6),
-        pixel_spacing=_numbers(tags.get("PixelSpacing"), 2),
+        **_read_file_geometry(tags, path),
+        position=_to_numbers(tags.get("ImagePositionPatient"), 3),
+        orientation=_to_numbers(tags.get("ImageOrientationPatient"), 6),
+        pixel_spacing=_to_numbers(tags.get("PixelSpacing"), 2),
         stated_spacing=_number(tags.get("SpacingBetweenSlices")),
         thickness=_number(tags.get("SliceThickness")),
         rescale=_rescale(tags),
@@ -168,10 +168,10 @@ def _rescale(tags: Dataset) -> tuple[float, float]:
     return (1.0 if slope is None else slope, 0.0 if intercept is None else intercept)
 
 
-def _of_file(tags: FileDataset, path: Path) -> dict:
+def _read_file_geometry(tags: FileDataset, path: Path) -> dict:
     return {
         "path": path,
-        "series_uid": _plain_uid(str(tags.get("SeriesInstanceUID", ""))),
+        "series_uid": _redact_uid(str(tags.get("SeriesInstanceUID", ""))),
         "series_number": str(tags.get("SeriesNumber", "") or ""),
         "modality": str(tags.get("Modality", "")),
         "rows": int(tags.Rows),
@@ -182,13 +182,13 @@ def _of_file(tags: FileDataset, path: Path) -> dict:
     }
 
 
-def _plain_uid(uid: str) -> str:
+def _redact_uid(uid: str) -> str:
     """The UID as it will be shown; one that is not digits and dots (someone typed into it) as a digest."""
     is_uid = re.fullmatch(r"[0-9.]{0,64}", uid) is not None
     return uid if is_uid else "x" + hashlib.sha256(uid.encode()).hexdigest()[:12]
 
 
-def _frames(tags: FileDataset, path: Path) -> list[SliceHeader]:
+def _read_frames(tags: FileDataset, path: Path) -> list[SliceHeader]:
     """A slice for each frame of an enhanced file."""
     groups = tags.get("PerFrameFunctionalGroupsSequence") or []
     if not groups or len(groups) != int(tags.get("NumberOfFrames", 1) or 1):
@@ -198,20 +198,22 @@ def _frames(tags: FileDataset, path: Path) -> list[SliceHeader]:
             remedy="export the series again, or as one file per slice",
         )
     shared = (tags.get("SharedFunctionalGroupsSequence") or [Dataset()])[0]
-    file = _of_file(tags, path)
-    return [_frame(n, (group, shared), file) for n, group in enumerate(groups)]
+    file = _read_file_geometry(tags, path)
+    return [_read_frame(n, (group, shared), file) for n, group in enumerate(groups)]
 
 
-def _frame(number: int, groups: tuple[Dataset, Dataset], file: dict) -> SliceHeader:
-    measures = functional_group(groups, "PixelMeasuresSequence")
-    values = functional_group(groups, "PixelValueTransformationSequence")
+def _read_frame(number: int, groups: tuple[Dataset, Dataset], file: dict) -> SliceHeader:
+    measures = find_functional_group(groups, "PixelMeasuresSequence")
+    values = find_functional_group(groups, "PixelValueTransformationSequence")
     return SliceHeader(
         **file,
-        position=_numbers(functional_group(groups, "PlanePositionSequence").get("ImagePositionPatient"), 3),
-        orientation=_numbers(
-            functional_group(groups, "PlaneOrientationSequence").get("ImageOrientationPatient"), 6
+        position=_to_numbers(
+            find_functional_group(groups, "PlanePositionSequence").get("ImagePositionPatient"), 3
         ),
-        pixel_spacing=_numbers(measures.get("PixelSpacing"), 2),
+        orientation=_to_numbers(
+            find_functional_group(groups, "PlaneOrientationSequence").get("ImageOrientationPatient"), 6
+        ),
+        pixel_spacing=_to_numbers(measures.get("PixelSpacing"), 2),
         stated_spacing=_number(measures.get("SpacingBetweenSlices")),
         thickness=_number(measures.get("SliceThickness")),
         frame=number,
@@ -219,7 +221,7 @@ def _frame(number: int, groups: tuple[Dataset, Dataset], file: dict) -> SliceHea
     )
 
 
-def functional_group(groups: tuple[Dataset, Dataset], name: str) -> Dataset:
+def find_functional_group(groups: tuple[Dataset, Dataset], name: str) -> Dataset:
     """A functional group of a frame: its own, else the one shared by all frames, else an empty one."""
     for group in groups:
         items = group.get(name)
@@ -228,7 +230,7 @@ def functional_group(groups: tuple[Dataset, Dataset], name: str) -> Dataset:
     return Dataset()
 
 
-def _numbers(value: object, count: int) -> Array | None:
+def _to_numbers(value: object, count: int) -> Array | None:
     if value is None or not hasattr(value, "__len__") or len(value) != count:
         return None
     numbers = np.array([float(v) for v in value])  # type: ignore[attr-defined]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydicom.uid import UID
 
 from ...errors import ImageError
-from .dicom_headers import SliceHeader, quiet
+from .dicom_headers import SliceHeader, silence_readers
 
 
 def read_pixels(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
@@ -25,29 +25,29 @@ def read_pixels(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
     ImageError
         For pixels that are cut short, cannot be decoded or do not match the headers.
     """
-    with quiet():
+    with silence_readers():
         try:
-            array = _of_files(slices) if slices[0].frame is None else _of_frames(slices)
+            array = _read_files(slices) if slices[0].frame is None else _read_frames(slices)
         except ImageError:
             raise
         except Exception:  # its text may hold file names and tag values
-            raise _undecoded({one.syntax for one in slices}) from None
+            raise _build_decoding_error({one.syntax for one in slices}) from None
     if array.shape != (len(slices), slices[0].rows, slices[0].columns):
         raise ImageError("the pixels do not match the headers", remedy="export the series again")
     return array
 
 
-def _of_files(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
+def _read_files(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
     """GDCM applies each image's own slope and intercept."""
     reader = sitk.ImageSeriesReader()
     reader.SetFileNames([str(one.path) for one in slices])
     reader.SetOutputPixelType(sitk.sitkFloat32)
-    with muted():
+    with mute_libraries():
         return sitk.GetArrayFromImage(reader.Execute())
 
 
 @contextmanager
-def muted() -> Iterator[None]:
+def mute_libraries() -> Iterator[None]:
     """Keep the C libraries below ITK from writing to the terminal, which they do past every setting."""
     sys.stdout.flush()
     sys.stderr.flush()
@@ -64,7 +64,7 @@ def muted() -> Iterator[None]:
         os.close(nowhere)
 
 
-def _of_frames(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
+def _read_frames(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
     files = {one.path: pydicom.dcmread(one.path).pixel_array for one in slices}
     planes = []
     for one in slices:
@@ -75,7 +75,7 @@ def _of_frames(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
     return np.stack(planes)
 
 
-def _undecoded(syntaxes: set[str]) -> ImageError:
+def _build_decoding_error(syntaxes: set[str]) -> ImageError:
     """What is wrong with pixels that no decoder took."""
     names = sorted(UID(text).name for text in syntaxes if _is_compressed(UID(text)))
     if names:

@@ -16,7 +16,7 @@ _AXIS_TOLERANCE = 1e-4
 _FINEST_MM = 0.02
 
 
-def stacked(slices: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Array, Array]:
+def stack_slices(slices: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Array, Array]:
     """Slices in order along their normal, spacing (3,) mm and direction (3, 3) of their grid.
 
     Raises
@@ -27,12 +27,12 @@ def stacked(slices: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Array, Ar
     first = slices[0]
     _check_kind(slices)
     for other in slices:
-        if not same_plane_geometry(first, other):
+        if not has_same_plane(first, other):
             raise ImageError(
                 "slices of one series differ in orientation, size or pixel spacing",
                 remedy="leave out scout images, or choose another series",
             )
-    rows, columns = _axes(first)
+    rows, columns = _compute_axes(first)
     normal = np.cross(rows, columns)
     heights = np.array([one.position @ normal for one in slices])  # type: ignore[operator]
     ordered = [slices[n] for n in np.argsort(heights, kind="stable")]
@@ -45,7 +45,7 @@ def stacked(slices: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Array, Ar
     )
 
 
-def same_plane_geometry(a: SliceHeader, b: SliceHeader) -> bool:
+def has_same_plane(a: SliceHeader, b: SliceHeader) -> bool:
     return (
         (a.rows, a.columns, a.modality) == (b.rows, b.columns, b.modality)
         and _close(a.orientation, b.orientation)
@@ -63,7 +63,7 @@ def _check_kind(slices: Sequence[SliceHeader]) -> None:
     for one in slices:
         if one.modality not in _VOLUMES:
             raise ImageError(
-                f"images of modality {_safe(one.modality)} are not slices of a volume",
+                f"images of modality {_redact_modality(one.modality)} are not slices of a volume",
                 remedy="give an MR or CT series",
             )
         if one.position is None or one.orientation is None or one.pixel_spacing is None:
@@ -93,13 +93,13 @@ def _check_kind(slices: Sequence[SliceHeader]) -> None:
         )
 
 
-def _safe(modality: str) -> str:
+def _redact_modality(modality: str) -> str:
     """The modality for a message: a code of DICOM, never free text that someone typed into the tag."""
     is_code = 2 <= len(modality) <= 10 and modality.isascii() and modality.isupper() and modality.isalpha()
     return modality if is_code and len(modality) <= 3 else "unknown"
 
 
-def _axes(header: SliceHeader) -> tuple[Array, Array]:
+def _compute_axes(header: SliceHeader) -> tuple[Array, Array]:
     assert header.orientation is not None
     rows, columns = header.orientation[:3], header.orientation[3:]
     lengths = np.linalg.norm(rows), np.linalg.norm(columns)

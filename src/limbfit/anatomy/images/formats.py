@@ -14,7 +14,7 @@ import SimpleITK as sitk  # noqa: N813
 from ...errors import ImageError, InputError
 from ...extensions import Registry
 from ..bounds import check_voxels
-from .dicom_pixels import muted
+from .dicom_pixels import mute_libraries
 from .nifti import check_nifti
 
 Read = Callable[[Path], sitk.Image]
@@ -38,16 +38,16 @@ class ImageFormat:
     is_written: bool = False
 
 
-def _itk(path: Path, is_placed: Callable[[sitk.ImageFileReader], bool] = lambda _: True) -> sitk.Image:
+def _read_itk(path: Path, is_placed: Callable[[sitk.ImageFileReader], bool] = lambda _: True) -> sitk.Image:
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
     try:
-        with muted():
+        with mute_libraries():
             reader.ReadImageInformation()
             check_voxels(reader.GetSize(), path)
             image = reader.Execute()
     except RuntimeError as error:
-        raise _unreadable(path, str(error)) from None
+        raise _build_reading_error(path, str(error)) from None
     if not is_placed(reader):  # its place in the patient would be a guess
         raise ImageError(
             "the file does not say how it lies in the patient",
@@ -57,7 +57,7 @@ def _itk(path: Path, is_placed: Callable[[sitk.ImageFileReader], bool] = lambda 
     return image
 
 
-def _unreadable(path: Path, text: str) -> ImageError:
+def _build_reading_error(path: Path, text: str) -> ImageError:
     if "orthonormal" in text or "Bad direction" in text:
         return ImageError(
             "the image axes are not orthonormal",
@@ -67,9 +67,9 @@ def _unreadable(path: Path, text: str) -> ImageError:
     return ImageError("the image cannot be read", file=path, remedy="check that the file is whole")
 
 
-def _nifti(path: Path) -> sitk.Image:
+def _read_nifti(path: Path) -> sitk.Image:
     check_nifti(path)
-    return _itk(path, _has_form)
+    return _read_itk(path, _has_form)
 
 
 def _has_form(reader: sitk.ImageFileReader) -> bool:
@@ -77,14 +77,14 @@ def _has_form(reader: sitk.ImageFileReader) -> bool:
     return any(reader.GetMetaData(key).strip() not in ("", "0") for key in keys)
 
 
-def _nrrd(path: Path) -> sitk.Image:
-    return _itk(path, lambda reader: "NRRD_space" in reader.GetMetaDataKeys())
+def _read_nrrd(path: Path) -> sitk.Image:
+    return _read_itk(path, lambda reader: "NRRD_space" in reader.GetMetaDataKeys())
 
 
 _OWN = (
-    ImageFormat("NIfTI", (".nii", ".nii.gz"), _nifti, is_written=True),
-    ImageFormat("NRRD", (".nrrd", ".nhdr"), _nrrd, is_written=True),
-    ImageFormat("MetaImage", (".mha", ".mhd"), _itk, is_written=True),
+    ImageFormat("NIfTI", (".nii", ".nii.gz"), _read_nifti, is_written=True),
+    ImageFormat("NRRD", (".nrrd", ".nhdr"), _read_nrrd, is_written=True),
+    ImageFormat("MetaImage", (".mha", ".mhd"), _read_itk, is_written=True),
 )
 IMAGE_FORMATS = Registry("image format", {one.name: one for one in _OWN})
 

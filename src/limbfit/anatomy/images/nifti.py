@@ -37,8 +37,8 @@ def check_nifti(path: Path) -> None:
     try:
         with _open(path) as stream:
             header = stream.read(_HEADER)
-            length, bad = _voxels(stream, header)
-        whole = length >= _length(header)
+            length, bad = _count_bytes_and_nans(stream, header)
+        whole = length >= _compute_length(header)
     except (OSError, EOFError, zlib.error, struct.error, ValueError, OverflowError):
         whole, bad = False, 0
     if not whole:
@@ -54,7 +54,7 @@ def check_nifti(path: Path) -> None:
         )
 
 
-class _Forms(NamedTuple):
+class _HeaderForms(NamedTuple):
     """What a header says twice: affine matrices (4, 4) from indices to RAS mm, for an image of a size."""
 
     qform: Array
@@ -85,7 +85,7 @@ def describe_forms(path: Path, affine: Array) -> tuple[str, ...]:
     )
 
 
-def _read_forms(path: Path) -> _Forms | None:
+def _read_forms(path: Path) -> _HeaderForms | None:
     """The qform and the sform of a file; None where it does not state both."""
     with _open(path) as stream:
         header = stream.read(_HEADER)
@@ -111,14 +111,14 @@ def _read_forms(path: Path) -> _Forms | None:
     qform[:3, :3] = turn * pixdim[1:4] * [1.0, 1.0, -1.0 if pixdim[0] < 0.0 else 1.0]
     qform[:3, 3] = place[3:]
     scale = np.diag([*[_UNITS_MM.get(int(unit) & 7, 1.0)] * 3, 1.0])
-    return _Forms(scale @ qform, scale @ sform, dim[1:4])
+    return _HeaderForms(scale @ qform, scale @ sform, dim[1:4])
 
 
 def _open(path: Path) -> IO[bytes] | gzip.GzipFile:
     return gzip.open(path) if path.name.lower().endswith(".gz") else path.open("rb")
 
 
-def _voxels(stream: IO[bytes] | gzip.GzipFile, header: bytes) -> tuple[int, int]:
+def _count_bytes_and_nans(stream: IO[bytes] | gzip.GzipFile, header: bytes) -> tuple[int, int]:
     """Length of the file in bytes, and how many of its voxels are not numbers."""
     length, bad = len(header), 0
     kind = _FLOATS.get(struct.unpack(f"{_order(header)}h", header[70:72])[0])
@@ -136,7 +136,7 @@ def _order(header: bytes) -> str:
     return "<" if header[:4] == struct.pack("<i", _HEADER) else ">"
 
 
-def _length(header: bytes) -> float:
+def _compute_length(header: bytes) -> float:
     """Bytes that a NIfTI-1 file of this header holds (dim at 40, bitpix at 72, vox_offset at 108)."""
     order = _order(header)
     if struct.unpack(f"{order}i", header[:4])[0] != _HEADER:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ...arrays import Array
 from ...errors import LabelError
 from ..grid import SOFT_TISSUE, Grid, LabelMap, Volume
-from .naming import flatten, plain_name
+from .naming import flatten, normalise_name
 
 Mask = NDArray[np.bool_]
 
@@ -31,7 +31,7 @@ COLUMNS = ("label", "slice", "contour", "x_mm", "y_mm", "z_mm")
 _OFF_SLICE = 0.1  # slices: farther off, a contour was not drawn on this image
 
 
-def rasterise(polygons: Sequence[Array], like: Grid) -> Mask:
+def rasterise_polygons(polygons: Sequence[Array], like: Grid) -> Mask:
     """``[k, j, i]`` voxels whose centre lies inside, by even-odd; ``polygons`` (n, 3) each, LPS mm.
 
     Raises
@@ -61,11 +61,11 @@ def rasterise(polygons: Sequence[Array], like: Grid) -> Mask:
         )
     mask = np.zeros(like.array.shape, dtype=bool)
     for k, found in slices.items():
-        mask[k] = even_odd(found, like.size[0], like.size[1])
+        mask[k] = fill_even_odd(found, like.size[0], like.size[1])
     return mask
 
 
-def even_odd(polygons: Sequence[Array], columns: int, rows: int) -> Mask:
+def fill_even_odd(polygons: Sequence[Array], columns: int, rows: int) -> Mask:
     """(rows, columns) pixels whose centre (i, j) lies inside an odd number of polygons (n, 2).
 
     Each edge that passes a row's centre line toggles all pixels to its right; an edge takes its lower end and
@@ -83,7 +83,7 @@ def even_odd(polygons: Sequence[Array], columns: int, rows: int) -> Mask:
     return np.cumsum(toggles[:, :columns], axis=1) % 2 == 1
 
 
-def outlines(mask: Mask) -> list[Array]:
+def find_outlines(mask: Mask) -> list[Array]:
     """Closed polygons (n, 2) of a slice's mask ``[j, i]`` as (i, j), half-way between pixel centres."""
     if not mask.any():
         return []
@@ -104,7 +104,7 @@ def write_contours(path: str | Path, labels: LabelMap) -> None:
         rows.writerow(COLUMNS)
         for name, mask in masks.items():
             for k in np.flatnonzero(mask.any(axis=(1, 2))):
-                for n, line in enumerate(outlines(mask[k])):
+                for n, line in enumerate(find_outlines(mask[k])):
                     index = np.column_stack([line, np.full(len(line), k)])
                     points = labels.index_to_point(index)
                     rows.writerows([name, k, n, *(f"{x:.4f}" for x in point)] for point in points)
@@ -120,9 +120,9 @@ def read_contours(path: str | Path, like: Volume) -> LabelMap:
     """
     path = Path(path)
     found: dict[str, dict[tuple[int, int], list[list[float]]]] = defaultdict(lambda: defaultdict(list))
-    for line, row in _rows(path):
+    for line, row in _read_rows(path):
         try:
-            name, key = plain_name(row["label"]), (int(row["slice"]), int(row["contour"]))
+            name, key = normalise_name(row["label"]), (int(row["slice"]), int(row["contour"]))
             point = [float(row[axis]) for axis in COLUMNS[3:]]
         except (TypeError, ValueError):
             point = []
@@ -136,10 +136,10 @@ def read_contours(path: str | Path, like: Volume) -> LabelMap:
                 "a contour of fewer than 3 points", file=path, place=f"{name}, slice {short[0][0]}"
             )
     polygons = {name: [np.array(points) for points in contours.values()] for name, contours in found.items()}
-    return labels_of(polygons, like, path)
+    return build_labels(polygons, like, path)
 
 
-def labels_of(contours: Mapping[str, Sequence[Array]], like: Grid, path: Path) -> LabelMap:
+def build_labels(contours: Mapping[str, Sequence[Array]], like: Grid, path: Path) -> LabelMap:
     """Contours, LPS mm, of each structure as a label map on the grid of ``like``; ``path`` is for the error.
 
     Raises
@@ -150,7 +150,7 @@ def labels_of(contours: Mapping[str, Sequence[Array]], like: Grid, path: Path) -
     masks = []
     for name, polygons in contours.items():
         try:
-            masks.append(rasterise(polygons, like))
+            masks.append(rasterise_polygons(polygons, like))
         except LabelError as error:
             raise LabelError(error.what, file=path, place=name, remedy=error.remedy) from None
     try:
@@ -163,7 +163,7 @@ def labels_of(contours: Mapping[str, Sequence[Array]], like: Grid, path: Path) -
 _FORMAT = "give the columns " + ",".join(COLUMNS)
 
 
-def _rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
+def _read_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
     """Rows of the file with the number of their line."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:

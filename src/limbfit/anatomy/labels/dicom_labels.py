@@ -9,7 +9,7 @@ from pydicom.errors import InvalidDicomError
 
 from ...errors import LabelError
 from ..grid import LabelMap, Volume
-from ..images.dicom_headers import quiet
+from ..images.dicom_headers import silence_readers
 from .dicom_seg import SEGMENTATION, read_dicom_seg
 from .rtstruct import STRUCTURE_SET, read_rtstruct
 
@@ -23,7 +23,11 @@ def find_dicom_labels(path: Path) -> Path | None:
         For a folder without or with several of them, and for DICOM of another kind.
     """
     if path.is_dir():
-        found = [file for file in sorted(path.rglob("*")) if file.is_file() and _kind(file) is not None]
+        found = [
+            file
+            for file in sorted(path.rglob("*"))
+            if file.is_file() and _find_storage_class(file) is not None
+        ]
         if len(found) != 1:
             raise LabelError(
                 f"{len(found) or 'no'} DICOM segmentations or structure sets in this folder",
@@ -33,7 +37,7 @@ def find_dicom_labels(path: Path) -> Path | None:
         return found[0]
     if not path.is_file() or not _is_dicom(path):
         return None
-    if _kind(path) is None:
+    if _find_storage_class(path) is None:
         raise LabelError(
             "DICOM, but no segmentation and no structure set",
             file=path,
@@ -44,7 +48,7 @@ def find_dicom_labels(path: Path) -> Path | None:
 
 def read_dicom_labels(path: Path, like: Volume | None) -> LabelMap:
     """The label map of a file that :func:`find_dicom_labels` found."""
-    return read_rtstruct(path, like) if _kind(path) == STRUCTURE_SET else read_dicom_seg(path)
+    return read_rtstruct(path, like) if _find_storage_class(path) == STRUCTURE_SET else read_dicom_seg(path)
 
 
 def _is_dicom(path: Path) -> bool:
@@ -52,10 +56,10 @@ def _is_dicom(path: Path) -> bool:
         return stream.read(132)[128:] == b"DICM" or path.suffix.lower() == ".dcm"
 
 
-def _kind(path: Path) -> str | None:
+def _find_storage_class(path: Path) -> str | None:
     """The storage class, if it is one of a label map."""
     try:
-        with quiet():
+        with silence_readers():
             kind = str(pydicom.dcmread(path, specific_tags=["SOPClassUID"]).get("SOPClassUID", ""))
     except (InvalidDicomError, OSError):
         return None

@@ -17,8 +17,8 @@ from pydicom.dataset import Dataset, FileDataset
 from ...arrays import Array
 from ...errors import LabelError
 from ..grid import Grid, LabelMap
-from ..images.dicom_headers import functional_group, quiet
-from .naming import flatten, plain_name
+from ..images.dicom_headers import find_functional_group, silence_readers
+from .naming import flatten, normalise_name
 
 SEGMENTATION = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
 _ON_SLICE = 0.01  # of the slice spacing
@@ -26,7 +26,7 @@ _TILT_MM = 0.01
 
 
 @dataclass(frozen=True)
-class _Frames:
+class _SegmentFrames:
     """``pixels`` (n, rows, columns); ``segments`` (n,) their numbers, 0 where the pixels are numbers."""
 
     pixels: NDArray[np.uint16]
@@ -47,8 +47,8 @@ def read_dicom_seg(path: Path) -> LabelMap:
         For a fractional segmentation, frames without a place or out of a stack, or a damaged file.
     """
     try:
-        with quiet():
-            frames = _frames(pydicom.dcmread(path))
+        with silence_readers():
+            frames = _read_frames(pydicom.dcmread(path))
         grid, index = _stack(frames)
         masks = [_mask(frames, grid, index, number) for number in frames.names]
         array, names = flatten(masks, list(frames.names.values()))
@@ -61,42 +61,47 @@ def read_dicom_seg(path: Path) -> LabelMap:
     return LabelMap(array, grid.spacing, grid.origin, grid.direction, names)
 
 
-def _frames(data: FileDataset) -> _Frames:
+def _read_frames(data: FileDataset) -> _SegmentFrames:
     kind = str(data.get("SegmentationType", ""))
     if kind not in ("BINARY", "LABELMAP"):
         raise LabelError("a fractional segmentation", remedy="export a binary one")
     groups = [
         (group, data.SharedFunctionalGroupsSequence[0]) for group in data.PerFrameFunctionalGroupsSequence
     ]
-    axes = np.array([_orientation(group) for group in groups])
+    axes = np.array([_read_orientation(group) for group in groups])
     if np.abs(axes - axes[0]).max() > 1e-4:
         raise LabelError("frames of several orientations", remedy="export one for each orientation")
-    measures = functional_group(groups[0], "PixelMeasuresSequence")
+    measures = find_functional_group(groups[0], "PixelMeasuresSequence")
     stated = (measures.get("SpacingBetweenSlices"), measures.get("SliceThickness"))
-    return _Frames(
+    return _SegmentFrames(
         data.pixel_array.reshape(len(groups), data.Rows, data.Columns),
         np.array([_segment(group) if kind == "BINARY" else 0 for group in groups]),
         np.array([_position(group) for group in groups]),
         axes[0],
         np.array(measures.PixelSpacing, dtype=float),
         tuple(float(s) for s in stated if s),
-        {int(segment.SegmentNumber): plain_name(segment.SegmentLabel) for segment in data.SegmentSequence},
+        {
+            int(segment.SegmentNumber): normalise_name(segment.SegmentLabel)
+            for segment in data.SegmentSequence
+        },
     )
 
 
-def _orientation(groups: tuple[Dataset, Dataset]) -> list[float]:
-    return [float(x) for x in functional_group(groups, "PlaneOrientationSequence").ImageOrientationPatient]
+def _read_orientation(groups: tuple[Dataset, Dataset]) -> list[float]:
+    return [
+        float(x) for x in find_functional_group(groups, "PlaneOrientationSequence").ImageOrientationPatient
+    ]
 
 
 def _position(groups: tuple[Dataset, Dataset]) -> list[float]:
-    return [float(x) for x in functional_group(groups, "PlanePositionSequence").ImagePositionPatient]
+    return [float(x) for x in find_functional_group(groups, "PlanePositionSequence").ImagePositionPatient]
 
 
 def _segment(groups: tuple[Dataset, Dataset]) -> int:
-    return int(functional_group(groups, "SegmentIdentificationSequence").ReferencedSegmentNumber)
+    return int(find_functional_group(groups, "SegmentIdentificationSequence").ReferencedSegmentNumber)
 
 
-def _stack(frames: _Frames) -> tuple[Grid, NDArray[np.int64]]:
+def _stack(frames: _SegmentFrames) -> tuple[Grid, NDArray[np.int64]]:
     """The smallest grid that holds all frames, and the slice (n,) of each."""
     rows, columns = frames.orientation[:3], frames.orientation[3:]
     normal = np.cross(rows, columns)
@@ -127,7 +132,7 @@ def _slice_spacing(heights: Array, stated: tuple[float, ...]) -> float | None:
     return None
 
 
-def _mask(frames: _Frames, grid: Grid, index: NDArray[np.int64], number: int) -> NDArray[np.bool_]:
+def _mask(frames: _SegmentFrames, grid: Grid, index: NDArray[np.int64], number: int) -> NDArray[np.bool_]:
     mask = np.zeros(grid.array.shape, dtype=bool)
     for pixels, segment, k in zip(frames.pixels, frames.segments, index):
         if segment == 0:

@@ -19,7 +19,7 @@ _ISLAND = 0.2
 _MOSTLY_BONE = 0.8
 
 
-def cleaned(labels: LabelMap, path: Path) -> tuple[LabelMap, list[str]]:
+def clean_labels(labels: LabelMap, path: Path) -> tuple[LabelMap, list[str]]:
     """The map with one connected limb and each bone in one piece, and sentences on what was changed.
 
     Raises
@@ -29,9 +29,9 @@ def cleaned(labels: LabelMap, path: Path) -> tuple[LabelMap, list[str]]:
     """
     try:
         _check_names(labels)
-        labels, notes = _one_limb(labels)
+        labels, notes = _keep_one_limb(labels)
         for name in labels.bone_names:
-            labels, dropped = _one_piece(labels, name)
+            labels, dropped = _keep_one_piece(labels, name)
             notes += dropped
     except LabelError as error:
         raise LabelError(error.what, file=path, place=error.place, remedy=error.remedy) from None
@@ -53,8 +53,8 @@ def _check_names(labels: LabelMap) -> None:
         )
 
 
-def _one_limb(labels: LabelMap) -> tuple[LabelMap, list[str]]:
-    parts, sizes = _pieces(labels.limb)
+def _keep_one_limb(labels: LabelMap) -> tuple[LabelMap, list[str]]:
+    parts, sizes = _number_pieces(labels.limb)
     if len(sizes) > 1 and np.sort(sizes)[-2] > _ISLAND * sizes.max():
         raise LabelError(
             "two limbs, or a limb in two pieces, in one label map",
@@ -64,23 +64,25 @@ def _one_limb(labels: LabelMap) -> tuple[LabelMap, list[str]]:
     notes = []
     stray = labels.limb & ~largest
     if stray.any():
-        notes.append(f"dropped {_pieces_text(len(sizes) - 1, stray, labels)} apart from the limb")
+        notes.append(f"dropped {_describe_pieces(len(sizes) - 1, stray, labels)} apart from the limb")
     array = np.where(largest, labels.array, 0)
     holes = binary_fill_holes(largest) & ~largest
     if holes.any():
         array[holes] = labels.soft_value
-        notes.append(f"filled {_pieces_text(len(_pieces(holes)[1]), holes, labels, 'hole')} inside the limb")
+        notes.append(
+            f"filled {_describe_pieces(len(_number_pieces(holes)[1]), holes, labels, 'hole')} inside the limb"
+        )
     return labels.with_array(array), notes
 
 
-def _one_piece(labels: LabelMap, name: str) -> tuple[LabelMap, list[str]]:
+def _keep_one_piece(labels: LabelMap, name: str) -> tuple[LabelMap, list[str]]:
     mask = labels.mask(name)
     if mask.sum() > _MOSTLY_BONE * labels.limb.sum():
         raise LabelError(
             f"{name!r} takes up more than {_MOSTLY_BONE:.0%} of the limb",
             remedy="if it is the soft tissue, name it 'soft tissue'",
         )
-    parts, sizes = _pieces(mask)
+    parts, sizes = _number_pieces(mask)
     if len(sizes) < 2:
         return labels, []
     if np.sort(sizes)[-2] > _ISLAND * sizes.max():
@@ -90,16 +92,17 @@ def _one_piece(labels: LabelMap, name: str) -> tuple[LabelMap, list[str]]:
         )
     stray = mask & (parts != int(np.argmax(sizes)) + 1)
     array = np.where(stray, labels.soft_value, labels.array)
-    said = f"{_pieces_text(len(sizes) - 1, stray, labels)} of {name!r} apart from the bone became soft tissue"
+    pieces = _describe_pieces(len(sizes) - 1, stray, labels)
+    said = f"{pieces} of {name!r} apart from the bone became soft tissue"
     return labels.with_array(array), [said]
 
 
-def _pieces(mask: Mask) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+def _number_pieces(mask: Mask) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """The pieces that share faces, numbered from 1, and their sizes in voxels."""
     parts, _ = connected(mask)
     return parts, np.bincount(parts.ravel())[1:]
 
 
-def _pieces_text(count: int, mask: Mask, labels: LabelMap, noun: str = "piece") -> str:
+def _describe_pieces(count: int, mask: Mask, labels: LabelMap, noun: str = "piece") -> str:
     volume = float(mask.sum()) * labels.voxel_mm3 / 1000
     return f"{count} {noun}{'s' if count != 1 else ''} ({volume:.2g} cm3)"

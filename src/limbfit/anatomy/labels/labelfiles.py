@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ...errors import ImageError, LabelError
 from ..bounds import check_packed
 from ..grid import DEFAULT_NAMES, LabelMap
-from .naming import flatten, plain_name
+from .naming import flatten, normalise_name
 
 COLOURS: Mapping[str, tuple[float, float, float]] = {
     "soft tissue": (0.85, 0.55, 0.45),
@@ -59,8 +59,8 @@ def read_seg_nrrd(path: Path) -> LabelMap:
             "not a readable .seg.nrrd", file=path, remedy="save it again from 3D Slicer"
         ) from None
     layers = voxels if voxels.ndim == 4 else voxels[None]
-    spacing, origin, direction = _nrrd_geometry(header, path)
-    segments = _segments(header, layers, path)
+    spacing, origin, direction = _read_nrrd_geometry(header, path)
+    segments = _read_segments(header, layers, path)
     masks = [layers[layer] == value for _, layer, value in segments]
     try:
         flat, names = flatten(masks, [name for name, _, _ in segments])
@@ -101,36 +101,38 @@ def read_label_image(path: Path, image: sitk.Image) -> LabelMap:
     """Any scalar label image; names from ``<file>.json`` (``{"2": "tibia"}``) or the default ones."""
     if image.GetNumberOfComponentsPerPixel() != 1:
         raise LabelError("a label image has one value per voxel", file=path)
-    names = _sidecar_names(path)
+    names = _read_sidecar_names(path)
     try:
         return LabelMap.from_sitk(image, names)
     except LabelError as error:
         raise LabelError(error.what, file=path) from None
 
 
-def sidecar(path: Path) -> Path:
+def find_sidecar(path: Path) -> Path:
     """The JSON file that holds the names of a plain label image."""
     return path.with_name(path.name + ".json")
 
 
 def write_sidecar(path: Path, names: Mapping[int, str]) -> None:
     text = json.dumps({str(value): name for value, name in sorted(names.items())}, indent=2)
-    sidecar(path).write_text(text + "\n", encoding="utf-8")
+    find_sidecar(path).write_text(text + "\n", encoding="utf-8")
 
 
-def _sidecar_names(path: Path) -> dict[int, str]:
-    file = sidecar(path)
+def _read_sidecar_names(path: Path) -> dict[int, str]:
+    file = find_sidecar(path)
     if not file.is_file():
         return dict(DEFAULT_NAMES)
     try:
-        return {int(value): plain_name(name) for value, name in json.loads(file.read_text("utf-8")).items()}
+        return {
+            int(value): normalise_name(name) for value, name in json.loads(file.read_text("utf-8")).items()
+        }
     except (ValueError, AttributeError):
         raise LabelError(
             "the names of the labels cannot be read", file=file, remedy='write {"2": "tibia", ...}'
         ) from None
 
 
-def _nrrd_geometry(
+def _read_nrrd_geometry(
     header: Mapping[str, Any], path: Path
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     sign = _SPACES.get(str(header.get("space", "")).lower())
@@ -145,7 +147,7 @@ def _nrrd_geometry(
     return spacing, np.asarray(header["space origin"], dtype=float) * sign, steps / spacing
 
 
-def _segments(header: Mapping[str, Any], layers: NDArray[Any], path: Path) -> list[tuple[str, int, int]]:
+def _read_segments(header: Mapping[str, Any], layers: NDArray[Any], path: Path) -> list[tuple[str, int, int]]:
     """Name, layer and value of each segment of the header."""
     found = []
     for n in range(256):
@@ -156,10 +158,10 @@ def _segments(header: Mapping[str, Any], layers: NDArray[Any], path: Path) -> li
         value = int(header.get(f"Segment{n}_LabelValue", 1))
         if not 0 <= layer < len(layers):
             raise LabelError(f"segment {name!r} is in a layer that the file does not have", file=path)
-        found.append((plain_name(name), layer, value))
+        found.append((normalise_name(name), layer, value))
     return found
 
 
-def wrong_file(error: ImageError, path: Path) -> LabelError:
+def to_label_error(error: ImageError, path: Path) -> LabelError:
     """An image that cannot be read, said about a label map."""
     return LabelError(error.what, file=path, place=error.place, remedy=error.remedy)

@@ -14,7 +14,7 @@ from ..grid import DEFAULT_NAMES
 Mask = NDArray[np.bool_]
 
 
-def plain_name(name: str) -> str:
+def normalise_name(name: str) -> str:
     """Users of other programs write ``Soft Tissue`` or ``soft_tissue``; here it is lower case with spaces.
 
     Names become names of files, so whatever is not a letter, a digit or one of ``().+-`` becomes a space.

@@ -14,7 +14,7 @@ from ..grid import Grid, LabelMap, Volume
 _ON_GRID = 0.01  # voxels
 
 
-def on_grid_of(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
+def place_on_grid(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
     """A map of any extent, order and sense of axes on the whole grid of ``like``, voxel by voxel.
 
     Raises
@@ -24,14 +24,14 @@ def on_grid_of(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
     """
     if labels.same_grid(like):
         return labels
-    given, labels = labels, _cropped(labels.along(like.direction))
+    given, labels = labels, _crop_labels(labels.along(like.direction))
     offset = _offset(labels, like)
     if offset is None:
         raise LabelError(
             "the label map is on a different grid from the image",
             file=path,
-            remedy=f"image {_shape(like)}, labels {_shape(given)}: export it with the image as reference"
-            " geometry",
+            remedy=f"image {_format_shape(like)}, labels {_format_shape(given)}: "
+            "export it with the image as reference geometry",
         )
     last = offset + np.array(labels.size)
     if np.any(offset < 0) or np.any(last > np.array(like.size)):
@@ -45,7 +45,7 @@ def on_grid_of(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
     return LabelMap(full, like.spacing, like.origin, like.direction, labels.names)
 
 
-def _cropped(labels: LabelMap) -> LabelMap:
+def _crop_labels(labels: LabelMap) -> LabelMap:
     """Without the empty layers around what is labelled; a margin of zeros may lie outside the image."""
     if not labels.array.any():
         return labels
@@ -67,6 +67,6 @@ def _offset(labels: Grid, like: Grid) -> NDArray[np.int64] | None:
     return whole.astype(np.int64)
 
 
-def _shape(grid: Grid) -> str:
+def _format_shape(grid: Grid) -> str:
     size = " x ".join(str(n) for n in grid.size)
     return f"{size} voxels of {' x '.join(f'{s:.3g}' for s in grid.spacing)} mm"

@@ -11,7 +11,7 @@ from scipy.ndimage import binary_fill_holes
 from scipy.ndimage import label as connected
 
 from ...arrays import Array
-from ..ends import longest_axis
+from ..ends import find_longest_axis
 from ..grid import SOFT_TISSUE, LabelMap
 from ..morphology import find_box
 
@@ -25,7 +25,7 @@ _END_MM = 12.0  # a bone's end is round: its first and last slices may change qu
 
 
 @dataclass(frozen=True)
-class Suspect:
+class SliceWarning:
     """A slice (counted from 0 along ``axis``) in which a label looks wrong, and why."""
 
     label: str
@@ -39,7 +39,7 @@ class LabelQuality:
 
     axis: int
     labels: dict[str, dict[str, Any]]
-    suspects: tuple[Suspect, ...]
+    suspects: tuple[SliceWarning, ...]
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -49,23 +49,23 @@ class LabelQuality:
         }
 
 
-def assess(labels: LabelMap) -> LabelQuality:
+def assess_labels(labels: LabelMap) -> LabelQuality:
     """Measure every label and the limb as a whole, and name the slices that do not fit their neighbours."""
-    axis = longest_axis(labels.limb, labels)
+    axis = find_longest_axis(labels.limb, labels)
     order = [*(n for n in range(3) if n != axis), axis]
     turned = labels.turned(order)
     masks = {LIMB: turned.limb} | {
         name: turned.mask(name) for _, name in sorted(labels.names.items()) if turned.mask(name).any()
     }
-    suspects: list[Suspect] = []
+    suspects: list[SliceWarning] = []
     for name, mask in masks.items():
         if name != SOFT_TISSUE:
-            suspects += _odd_slices(name, mask, turned.spacing)
-    facts = {name: _facts(mask, turned) for name, mask in masks.items()}
+            suspects += _find_odd_slices(name, mask, turned.spacing)
+    facts = {name: _measure_label(mask, turned) for name, mask in masks.items()}
     return LabelQuality(axis, facts, tuple(sorted(suspects, key=lambda s: (s.slice, s.label))))
 
 
-def _facts(mask: Mask, labels: LabelMap) -> dict[str, Any]:
+def _measure_label(mask: Mask, labels: LabelMap) -> dict[str, Any]:
     """Volume, pieces that share faces, closed holes, and the slices from first to last."""
     box = find_box(mask)
     mask = mask[box]
@@ -84,26 +84,26 @@ def _facts(mask: Mask, labels: LabelMap) -> dict[str, Any]:
     }
 
 
-def _odd_slices(name: str, mask: Mask, spacing: Array) -> list[Suspect]:
+def _find_odd_slices(name: str, mask: Mask, spacing: Array) -> list[SliceWarning]:
     areas = mask.sum(axis=(1, 2)) * float(spacing[0] * spacing[1])
     filled = np.flatnonzero(areas)
     first, last = int(filled[0]), int(filled[-1])
-    empty = [Suspect(name, k, "missing between others") for k in range(first, last) if areas[k] == 0]
+    empty = [SliceWarning(name, k, "missing between others") for k in range(first, last) if areas[k] == 0]
     if empty or last - first < 6:
         return empty
-    area, centre = areas[first : last + 1], _centroids(mask[first : last + 1], spacing)
+    area, centre = areas[first : last + 1], _compute_centroids(mask[first : last + 1], spacing)
     reach = max(1, round(_END_MM / spacing[2]))
     low = reach if first > 0 else 1
     high = len(area) - (reach if last < len(areas) - 1 else 1)
     inner = np.zeros(len(area), dtype=bool)
     inner[low:high] = True
-    found = _outliers(name, area, centre, inner)
+    found = _find_outlying_slices(name, area, centre, inner)
     known = {s.slice + step for s in found for step in (-1, 0, 1)}
-    found += [jump for jump in _jumps(name, area, inner) if jump.slice not in known]
-    return [Suspect(s.label, s.slice + first, s.what) for s in found]
+    found += [jump for jump in _find_area_jumps(name, area, inner) if jump.slice not in known]
+    return [SliceWarning(s.label, s.slice + first, s.what) for s in found]
 
 
-def _centroids(mask: Mask, spacing: Array) -> Array:
+def _compute_centroids(mask: Mask, spacing: Array) -> Array:
     """Centroid (n, 2) of each slice, mm."""
     count = mask.sum(axis=(1, 2))
     j, i = np.arange(mask.shape[1]), np.arange(mask.shape[2])
@@ -112,24 +112,29 @@ def _centroids(mask: Mask, spacing: Array) -> Array:
     return np.column_stack([x, y])
 
 
-def _outliers(name: str, area: Array, centre: Array, inner: NDArray[np.bool_]) -> list[Suspect]:
+def _find_outlying_slices(
+    name: str, area: Array, centre: Array, inner: NDArray[np.bool_]
+) -> list[SliceWarning]:
     """Slices off the mean of the slice before and the slice after."""
     expected = (area[:-2] + area[2:]) / 2
     off = np.pad((area[1:-1] - expected) / expected, 1)
     aside = np.pad(np.linalg.norm(centre[1:-1] - (centre[:-2] + centre[2:]) / 2, axis=1), 1)
     found = []
-    for k in _peaks(np.abs(off), np.maximum(_AREA, _OUTLIER * _spread(off[inner])), inner):
-        found.append(Suspect(name, k, f"area {off[k]:+.0%} of what its neighbours have"))
-    for k in _peaks(aside, max(_CENTRE_MM, _OUTLIER * _spread(aside[inner])), inner):
-        found.append(Suspect(name, k, f"{aside[k]:.1f} mm beside its neighbours"))
+    for k in _find_peaks(np.abs(off), np.maximum(_AREA, _OUTLIER * _spread(off[inner])), inner):
+        found.append(SliceWarning(name, k, f"area {off[k]:+.0%} of what its neighbours have"))
+    for k in _find_peaks(aside, max(_CENTRE_MM, _OUTLIER * _spread(aside[inner])), inner):
+        found.append(SliceWarning(name, k, f"{aside[k]:.1f} mm beside its neighbours"))
     return found
 
 
-def _jumps(name: str, area: Array, inner: NDArray[np.bool_]) -> list[Suspect]:
+def _find_area_jumps(name: str, area: Array, inner: NDArray[np.bool_]) -> list[SliceWarning]:
     """Slices at which the area changes for good."""
     change = np.pad(np.diff(area) / np.maximum(area[1:], area[:-1]), (1, 0))
     limit = max(_JUMP, _OUTLIER * _spread(change[inner]))
-    return [Suspect(name, k, f"area jumps by {change[k]:+.0%}") for k in _peaks(np.abs(change), limit, inner)]
+    return [
+        SliceWarning(name, k, f"area jumps by {change[k]:+.0%}")
+        for k in _find_peaks(np.abs(change), limit, inner)
+    ]
 
 
 def _spread(values: Array) -> float:
@@ -137,7 +142,7 @@ def _spread(values: Array) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
 
 
-def _peaks(values: Array, limit: float, inner: NDArray[np.bool_]) -> list[int]:
+def _find_peaks(values: Array, limit: float, inner: NDArray[np.bool_]) -> list[int]:
     """Where values pass the limit and are the largest of their neighbours'."""
     padded = np.pad(values, 1)
     highest = (values >= padded[:-2]) & (values >= padded[2:])

@@ -11,9 +11,9 @@ from pydicom.dataset import FileDataset
 from ...arrays import Array
 from ...errors import LabelError
 from ..grid import LabelMap, Volume
-from ..images.dicom_headers import quiet
-from .contours import labels_of
-from .naming import plain_name
+from ..images.dicom_headers import silence_readers
+from .contours import build_labels
+from .naming import normalise_name
 
 STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
 
@@ -29,16 +29,16 @@ def read_rtstruct(path: Path, like: Volume | None) -> LabelMap:
     if like is None:
         raise LabelError("contours need the image on which they were drawn", file=path)
     try:
-        with quiet():
-            contours = _contours(pydicom.dcmread(path))
+        with silence_readers():
+            contours = _read_contours(pydicom.dcmread(path))
     except Exception:  # pydicom's texts quote values of tags
         raise LabelError("the structure set is damaged", file=path, remedy="export it again") from None
-    return labels_of(contours, like, path)
+    return build_labels(contours, like, path)
 
 
-def _contours(data: FileDataset) -> dict[str, list[Array]]:
+def _read_contours(data: FileDataset) -> dict[str, list[Array]]:
     """Closed contours, LPS mm, by the name of their structure; structures without any are left out."""
-    names = {int(roi.ROINumber): plain_name(roi.ROIName) for roi in data.StructureSetROISequence}
+    names = {int(roi.ROINumber): normalise_name(roi.ROIName) for roi in data.StructureSetROISequence}
     found: dict[str, list[Array]] = {}
     for item in data.ROIContourSequence:
         closed = [

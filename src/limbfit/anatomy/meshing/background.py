@@ -52,7 +52,7 @@ class TetGrid:
         return TetGrid(self.points[used], tets, self.mask[used], self.spacing, self.regions[keep])
 
 
-def box_grid(low: Array, high: Array, spacing: float) -> TetGrid:
+def build_box_grid(low: Array, high: Array, spacing: float) -> TetGrid:
     """Kuhn tetrahedra over a box whose top z is ``high[2]``, exactly; the box grows to whole cells."""
     counts = np.ceil((high - low) / spacing).astype(int) + 1
     axes = [low[0] + spacing * np.arange(counts[0]), low[1] + spacing * np.arange(counts[1])]
@@ -66,7 +66,7 @@ def box_grid(low: Array, high: Array, spacing: float) -> TetGrid:
     return TetGrid(points, tets, mask, spacing, np.zeros(len(tets), dtype=np.int64))
 
 
-def refined(grid: TetGrid, near: Callable[[Array], NDArray[np.bool_]], spacing: float) -> TetGrid:
+def refine_grid(grid: TetGrid, near: Callable[[Array], NDArray[np.bool_]], spacing: float) -> TetGrid:
     """The grid of a box halved, again and again, where ``near`` says so of its edges' middles.
 
     Halving the cubes' diagonals, their faces' and their edges in turn gives eight tetrahedra like the first
@@ -77,14 +77,14 @@ def refined(grid: TetGrid, near: Callable[[Array], NDArray[np.bool_]], spacing: 
         for length in edge * np.sqrt([3.0, 2.0, 1.0]):
             ends = np.sort(grid.tets[:, TET_EDGES].reshape(-1, 2), axis=1)
             a, b = np.moveaxis(grid.points[ends], 1, 0)
-            ends = _unique(ends[np.linalg.norm(b - a, axis=1) > 0.95 * length], len(grid.points))
+            ends = _select_unique_edges(ends[np.linalg.norm(b - a, axis=1) > 0.95 * length], len(grid.points))
             edges = ends[near(grid.points[ends].mean(axis=1))]
-            grid = _divided(grid, edges, np.full(len(edges), 0.5), 0)
+            grid = _divide_edges(grid, edges, np.full(len(edges), 0.5), 0)
         edge /= 2
     return grid
 
 
-def volumes(points: Array, tets: Ints) -> Array:
+def compute_volumes(points: Array, tets: Ints) -> Array:
     """Signed volumes (m,) of tetrahedra."""
     a, b, c, d = (points[tets[:, i]] for i in range(4))
     return np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6.0
@@ -100,37 +100,37 @@ def cut(
     grid : the grid.
     field : signed function of points (k, 3) that gives values (k,) and gradients (k, 3).
     bit : mask bit that the points on the level set receive.
-    slack : as for :func:`banded`.
+    slack : as for :func:`compute_in_band`.
     region : of the tetrahedra that are cut; others are divided where they share an edge. None: all.
 
     Returns
     -------
     The cut grid and, per tetrahedron that was to be cut, whether it lies where the field is positive.
     """
-    values = banded(field, grid.points, LONGEST_EDGE * grid.spacing, grid.spacing, slack)
+    values = compute_in_band(field, grid.points, LONGEST_EDGE * grid.spacing, grid.spacing, slack)
     wanted = grid.tets if region is None else grid.tets[grid.regions == region]
-    edges = _crossed_edges(wanted, values)
-    t = _roots(grid.points, edges, values, field)
-    grid, snapped = _snapped(grid, edges, t, bit)
+    edges = _find_crossed_edges(wanted, values)
+    t = _find_roots(grid.points, edges, values, field)
+    grid, snapped = _snap_vertices(grid, edges, t, bit)
     values = np.where(snapped, 0.0, values)
     crossed = ~snapped[edges].any(axis=1)
     edges, t = edges[crossed], t[crossed]
     on_level = np.isin(np.arange(len(values)), wanted) & (values == 0)
-    grid = _divided(replace(grid, mask=np.where(on_level, grid.mask | bit, grid.mask)), edges, t, bit)
+    grid = _divide_edges(replace(grid, mask=np.where(on_level, grid.mask | bit, grid.mask)), edges, t, bit)
     values = np.concatenate([values, np.zeros(len(edges))])
     return grid, values[grid.tets].sum(axis=1) > 0
 
 
-def _divided(grid: TetGrid, edges: Ints, t: Array, bit: int) -> TetGrid:
+def _divide_edges(grid: TetGrid, edges: Ints, t: Array, bit: int) -> TetGrid:
     """The grid with edges (k, 2), sorted, divided at ``t`` (k,); the fresh points receive a mask bit too."""
     a, b = edges.T
     fresh = grid.points[a] + t[:, None] * (grid.points[b] - grid.points[a])
-    tets, parent = _bisected(grid.tets, edges, len(grid.points))
+    tets, parent = _bisect_tetrahedra(grid.tets, edges, len(grid.points))
     mask = np.concatenate([grid.mask, (grid.mask[a] & grid.mask[b]) | bit])
     return TetGrid(np.vstack([grid.points, fresh]), tets, mask, grid.spacing, grid.regions[parent])
 
 
-def banded(field: Field, points: Array, band: float, spacing: float, slack: float = 0.0) -> Array:
+def compute_in_band(field: Field, points: Array, band: float, spacing: float, slack: float = 0.0) -> Array:
     """Values (n,) of a distance-like field: exact up to ``band``, elsewhere of the right sign and beyond it.
 
     A field that changes by at most ``slack`` more than 1 per mm cannot come back into the band within a cell
@@ -150,19 +150,19 @@ def banded(field: Field, points: Array, band: float, spacing: float, slack: floa
     return values
 
 
-def _crossed_edges(tets: Ints, values: Array) -> Ints:
+def _find_crossed_edges(tets: Ints, values: Array) -> Ints:
     """Unique edges (k, 2), smaller node first and sorted, whose ends differ strictly in sign."""
     ends = np.sort(tets[:, TET_EDGES].reshape(-1, 2), axis=1)
-    return _unique(ends[values[ends[:, 0]] * values[ends[:, 1]] < 0], len(values))
+    return _select_unique_edges(ends[values[ends[:, 0]] * values[ends[:, 1]] < 0], len(values))
 
 
-def _unique(edges: Ints, count: int) -> Ints:
+def _select_unique_edges(edges: Ints, count: int) -> Ints:
     """Each of some edges (k, 2) between ``count`` points once, sorted."""
     keys = np.unique(edges[:, 0] * count + edges[:, 1])
     return np.stack(np.divmod(keys, max(count, 1)), axis=1)
 
 
-def _roots(points: Array, edges: Ints, values: Array, field: Field) -> Array:
+def _find_roots(points: Array, edges: Ints, values: Array, field: Field) -> Array:
     """Where (k,) the field is zero on each edge, from 0 at its first node to 1; regula falsi (Illinois)."""
     a, b = points[edges[:, 0]], points[edges[:, 1]]
     low, high = np.zeros(len(edges)), np.ones(len(edges))
@@ -182,7 +182,7 @@ def _roots(points: Array, edges: Ints, values: Array, field: Field) -> Array:
     return low + (high - low) * f_low / (f_low - f_high)
 
 
-def _snapped(grid: TetGrid, edges: Ints, t: Array, bit: int) -> tuple[TetGrid, NDArray[np.bool_]]:
+def _snap_vertices(grid: TetGrid, edges: Ints, t: Array, bit: int) -> tuple[TetGrid, NDArray[np.bool_]]:
     """Move vertices that almost touch the level set onto it, along edges that keep them on their surfaces."""
     near, far = np.vstack([edges, edges[:, ::-1]]).T
     t = np.concatenate([t, 1.0 - t])
@@ -195,18 +195,18 @@ def _snapped(grid: TetGrid, edges: Ints, t: Array, bit: int) -> tuple[TetGrid, N
     )
     moved = np.zeros(len(grid.points), dtype=bool)
     moved[near[chosen]] = True
-    moved = _without_inversion(grid, target, moved)
+    moved = _select_sound_moves(grid, target, moved)
     return replace(grid, points=np.where(moved[:, None], target, grid.points)), moved
 
 
-def _without_inversion(grid: TetGrid, target: Array, moved: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _select_sound_moves(grid: TetGrid, target: Array, moved: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The moves that can be made together without flattening a tetrahedron."""
-    before = volumes(grid.points, grid.tets)
+    before = compute_volumes(grid.points, grid.tets)
     floor = np.minimum(SMALLEST_VOLUME * before.max(), 0.2 * before)
     moved = moved.copy()
     while moved.any():
         points = np.where(moved[:, None], target, grid.points)
-        bad = volumes(points, grid.tets) < floor
+        bad = compute_volumes(points, grid.tets) < floor
         undo = moved & np.isin(np.arange(len(moved)), grid.tets[bad])
         if not undo.any():
             break
@@ -214,7 +214,7 @@ def _without_inversion(grid: TetGrid, target: Array, moved: NDArray[np.bool_]) -
     return moved
 
 
-def _bisected(tets: Ints, edges: Ints, offset: int) -> tuple[Ints, Ints]:
+def _bisect_tetrahedra(tets: Ints, edges: Ints, offset: int) -> tuple[Ints, Ints]:
     """Bisect tetrahedra at their crossed ``edges``, the first in order first; edge i gets node offset + i.
 
     Also the number of the tetrahedron that each came from.
@@ -222,7 +222,7 @@ def _bisected(tets: Ints, edges: Ints, offset: int) -> tuple[Ints, Ints]:
     done, origin = [np.zeros((0, 4), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
     parent = np.arange(len(tets))
     while len(tets):
-        first = _first_crossed(tets, edges, offset)
+        first = _find_first_crossed(tets, edges, offset)
         whole = first == len(edges)
         done.append(tets[whole])
         origin.append(parent[whole])
@@ -233,7 +233,7 @@ def _bisected(tets: Ints, edges: Ints, offset: int) -> tuple[Ints, Ints]:
     return np.vstack(done), np.concatenate(origin)
 
 
-def _first_crossed(tets: Ints, edges: Ints, offset: int) -> Ints:
+def _find_first_crossed(tets: Ints, edges: Ints, offset: int) -> Ints:
     """Index (m,) of the first crossed edge of each tetrahedron; ``len(edges)`` where there is none."""
     if not len(edges):
         return np.zeros(len(tets), dtype=np.int64)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from ...arrays import Array
 from ...mesh import TET10_EDGES, Mesh
 from ...mesh.cells import quadratic_simplex
-from .curving import curved
-from .layered import bone_faces
+from .curving import curve_mesh
+from .layered import find_bone_faces
 from .layers import LimbFields
 
 Ints = NDArray[np.int64]
@@ -23,18 +23,18 @@ ROUNDS = 4
 SPLITS = 4  # of each edge of a face: so many squared places tell where it lies
 
 
-def balanced(mesh: Mesh, fields: LimbFields, straight: Array) -> Mesh:
+def balance_bone_faces(mesh: Mesh, fields: LimbFields, straight: Array) -> Mesh:
     """A tet10 mesh in the limb frame whose bone faces lie on the bone in the mean, as far as elements allow.
 
     No node comes nearer to the layers than bone may. ``straight`` (m,) is the least Jacobian of each
     straight-sided element, which keeps a share of it.
     """
-    faces = bone_faces(mesh)
+    faces = find_bone_faces(mesh)
     if not len(faces):
         return mesh
     nodes = np.unique(faces)
     in_plane = mesh.points[nodes, 2] == 0.0
-    shapes = _shapes()
+    shapes = _compute_shape_functions()
     for _ in range(ROUNDS):
         corners = mesh.points[faces[:, :3]]
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -50,11 +50,11 @@ def balanced(mesh: Mesh, fields: LimbFields, straight: Array) -> Mesh:
         moves = np.zeros_like(mesh.points)
         moves[nodes] = np.minimum(away[nodes] / total[nodes], room)[:, None] * slope
         moves[nodes[in_plane], 2] = 0.0
-        mesh = curved(mesh, mesh.points + _with_edges(mesh, moves, nodes), straight)
+        mesh = curve_mesh(mesh, mesh.points + _move_mid_nodes(mesh, moves, nodes), straight)
     return mesh
 
 
-def _with_edges(mesh: Mesh, moves: Array, stated: Ints) -> Array:
+def _move_mid_nodes(mesh: Mesh, moves: Array, stated: Ints) -> Array:
     """Moves (n, 3) in which mid-edge nodes other than those ``stated`` go with the ends of their edges."""
     found = moves.copy()
     middles, ends = mesh.cells[:, 4:].ravel(), mesh.cells[:, TET10_EDGES].reshape(-1, 2)
@@ -63,7 +63,7 @@ def _with_edges(mesh: Mesh, moves: Array, stated: Ints) -> Array:
     return found
 
 
-def _shapes() -> Array:
+def _compute_shape_functions() -> Array:
     """Shape functions (q, 6) of a quadratic triangle at the middles of equal parts of it."""
     i, j = (axis.ravel() for axis in np.meshgrid(range(SPLITS), range(SPLITS), indexing="ij"))
     whole = np.column_stack([i, j])

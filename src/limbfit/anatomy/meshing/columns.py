@@ -93,7 +93,7 @@ class Columns:
         return nodes, height
 
 
-def columns(base: Ints, steps: Ints, first: int) -> Columns:
+def build_columns(base: Ints, steps: Ints, first: int) -> Columns:
     """Columns of ``steps`` (layers, b) over sorted base nodes (b,); new nodes are numbered from ``first``."""
     count, layers = len(base), len(steps)
     owner, height = [np.arange(count)], [np.full(count, float(layers))]
@@ -109,7 +109,7 @@ def columns(base: Ints, steps: Ints, first: int) -> Columns:
     )
 
 
-def even_steps(thickness: Array, edge: Array, edges: Ints, most: int) -> Ints:
+def choose_even_steps(thickness: Array, edge: Array, edges: Ints, most: int) -> Ints:
     """Steps (b,) with which a layer (b,) mm thick has no elements much taller than their edges (b,) are long.
 
     Neighbours along ``edges`` (e, 2) differ by one at most.

@@ -18,7 +18,7 @@ SMALLEST_JACOBIAN = 0.3  # of the straight element's, at every node
 BISECTIONS = 5
 
 
-def curved(mesh: Mesh, target: Array, straight: Array) -> Mesh:
+def curve_mesh(mesh: Mesh, target: Array, straight: Array) -> Mesh:
     """A tet10 mesh with nodes moved to ``target`` (n, 3), less or not at all where elements would suffer.
 
     ``straight`` (m,) is the least Jacobian of each element with straight sides.
@@ -35,7 +35,7 @@ def curved(mesh: Mesh, target: Array, straight: Array) -> Mesh:
     raise AssertionError("each pass straightens more")
 
 
-def with_diagonals(mesh: Mesh, target: Array, stack: Columns) -> Array:
+def curve_diagonals(mesh: Mesh, target: Array, stack: Columns) -> Array:
     """Targets (n, 3) where edges within extruded layers follow the curved edges at their foot and head.
 
     An edge that stayed straight between two curved ones would fold thin elements.
@@ -58,11 +58,13 @@ def with_diagonals(mesh: Mesh, target: Array, stack: Columns) -> Array:
     share[new] = np.linalg.norm(mesh.points[new] - foot[stack.owner], axis=1) / length
     sides = column[ends]
     within = (sides >= 0).all(axis=1) & (sides[:, 0] != sides[:, 1]) & (ends >= stack.top[0]).any(axis=1)
-    keys = _keys(ends, corners)
+    keys = _number_edges(ends, corners)
     order = np.argsort(keys)
     moved = target - mesh.points
     feet, heads = (
-        moved[corners + order[np.searchsorted(keys, _keys(nodes[sides[within]], corners), sorter=order)]]
+        moved[
+            corners + order[np.searchsorted(keys, _number_edges(nodes[sides[within]], corners), sorter=order)]
+        ]
         for nodes in (stack.base, stack.top)
     )
     part = share[ends[within]].mean(axis=1)[:, None]
@@ -73,7 +75,7 @@ def with_diagonals(mesh: Mesh, target: Array, stack: Columns) -> Array:
     return target
 
 
-def _keys(ends: Ints, count: int) -> Ints:
+def _number_edges(ends: Ints, count: int) -> Ints:
     """One number (n,) for each edge (n, 2) between ``count`` nodes."""
     low, high = np.sort(ends, axis=1).T
     return np.asarray(low * count + high)

@@ -63,7 +63,7 @@ class VolumeMesh:
     triangle_refs: NDArray[np.int64]
 
 
-def mmg(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
+def run_mmg(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
     """Adapt with MMG (Dapogny, Dobrzynski, Frey 2014, J Comput Phys 262, 358-378).
 
     Raises
@@ -71,10 +71,10 @@ def mmg(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
     MesherError
         When MMG crashes, gives nothing or exceeds the time limit.
     """
-    return _in_worker(MMG_WORKER, "MMG", task, time_limit_s)
+    return _run_in_worker(MMG_WORKER, "MMG", task, time_limit_s)
 
 
-def netgen(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
+def run_netgen(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
     """Remesh the surface with MMG and fill it with Netgen (Schoeberl 1997, Comput Visual Sci 1, 41-52).
 
     Raises
@@ -90,10 +90,10 @@ def netgen(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
             "the mesher Netgen is not installed; install it with  pip install 'limbfit[netgen]'  "
             'or choose mesh.engine = "mmg"'
         )
-    return _in_worker(NETGEN_WORKER, "Netgen", task, time_limit_s)
+    return _run_in_worker(NETGEN_WORKER, "Netgen", task, time_limit_s)
 
 
-def _in_worker(worker: Path, name: str, task: VolumeTask, time_limit_s: float) -> VolumeMesh:
+def _run_in_worker(worker: Path, name: str, task: VolumeTask, time_limit_s: float) -> VolumeMesh:
     with tempfile.TemporaryDirectory(prefix="limbfit-mesh-") as folder:
         source, target = Path(folder, "task.npz"), Path(folder, "mesh.npz")
         np.savez(source, **{name: getattr(task, name) for name in task.__dataclass_fields__})
@@ -123,4 +123,4 @@ def run_worker(command: list[str], time_limit_s: float) -> None:
         )
 
 
-ENGINES: dict[str, Callable[[VolumeTask, float], VolumeMesh]] = {"mmg": mmg, "netgen": netgen}
+ENGINES: dict[str, Callable[[VolumeTask, float], VolumeMesh]] = {"mmg": run_mmg, "netgen": run_netgen}

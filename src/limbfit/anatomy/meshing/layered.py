@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from ...arrays import Array
 from ...mesh import Mesh, boundary_faces
 from .background import BONE, LAYER
-from .columns import Columns, columns, even_steps
+from .columns import Columns, build_columns, choose_even_steps
 from .engines import VolumeMesh
 from .layers import Level, LimbFields
-from .projection import projected
-from .regions import interfaces, mesh_numbers, region_level, same_faces
+from .projection import project_to_level
+from .regions import build_region_level, find_interfaces, find_same_faces, mesh_numbers
 
 Ints = NDArray[np.int64]
 
@@ -23,26 +23,26 @@ RIM_LAYERS = 3.0  # depth below the cut plane, in thicknesses, over which the ex
 MOST_STEPS = 8  # elements across one layer
 
 
-def core_mesh(points: Array, tets: Ints) -> Mesh:
+def build_core_mesh(points: Array, tets: Ints) -> Mesh:
     """The tetrahedra under the layers as a mesh that tells no regions."""
     return Mesh(points, tets, "tet4", np.zeros(len(tets), np.int64), ("core",))
 
 
-def with_layers(core: VolumeMesh, fields: LimbFields, regions: tuple[str, ...]) -> tuple[Mesh, Columns]:
+def extrude_layers(core: VolumeMesh, fields: LimbFields, regions: tuple[str, ...]) -> tuple[Mesh, Columns]:
     """The tet4 mesh of core and extruded layers with its sets, and the columns of the layers' nodes.
 
     ``regions`` names the layers, outermost first, the regions inside the core, and the core.
     """
     count = len(core.points)
-    faces = boundary_faces(core_mesh(core.points, core.tets))
-    interface = faces[same_faces(faces, core.triangles[core.triangle_refs == LAYER], count)]
+    faces = boundary_faces(build_core_mesh(core.points, core.tets))
+    interface = faces[find_same_faces(faces, core.triangles[core.triangle_refs == LAYER], count)]
     base = np.unique(interface)
     low = core.points[base]
     # Near the cut plane nodes go out sideways, or those below it could overtake those on it.
-    high = projected(fields.depth, low, np.minimum(-low[:, 2] / (RIM_LAYERS * fields.floor(low)), 1.0))
+    high = project_to_level(fields.depth, low, np.minimum(-low[:, 2] / (RIM_LAYERS * fields.floor(low)), 1.0))
     depths = fields.layer_depths(high)
-    across = _steps(np.searchsorted(base, interface), low, depths)
-    stack = columns(base, across, count)
+    across = _choose_steps(np.searchsorted(base, interface), low, depths)
+    stack = build_columns(base, across, count)
     shares = (depths[-1] - np.vstack([depths[::-1], np.zeros(len(base))])) / depths[-1]
     tets, layer = stack.tets(interface)
     innermost = len(fields.depths) - 1
@@ -54,10 +54,10 @@ def with_layers(core: VolumeMesh, fields: LimbFields, regions: tuple[str, ...]) 
         regions=np.concatenate([innermost - layer, numbers]),
         region_names=regions,
     )
-    return _with_sets(mesh, core, stack), stack
+    return _mark_sets(mesh, core, stack), stack
 
 
-def _steps(interface: Ints, low: Array, depths: Array) -> Ints:
+def _choose_steps(interface: Ints, low: Array, depths: Array) -> Ints:
     """Elements (layers, b) across each layer in each column, innermost layer first."""
     ends = np.sort(np.vstack([interface[:, [0, 1]], interface[:, [1, 2]], interface[:, [2, 0]]]), axis=1)
     edges = np.unique(ends, axis=0)
@@ -65,57 +65,57 @@ def _steps(interface: Ints, low: Array, depths: Array) -> Ints:
     degree = np.bincount(edges.ravel(), minlength=len(low))
     mean = np.bincount(edges.ravel(), np.repeat(length, 2), minlength=len(low)) / degree
     thickness = np.diff(np.vstack([np.zeros(len(low)), depths]), axis=0)[::-1]
-    return np.array([even_steps(part, mean, edges, MOST_STEPS) for part in thickness])
+    return np.array([choose_even_steps(part, mean, edges, MOST_STEPS) for part in thickness])
 
 
-def _with_sets(mesh: Mesh, core: VolumeMesh, stack: Columns) -> Mesh:
+def _mark_sets(mesh: Mesh, core: VolumeMesh, stack: Columns) -> Mesh:
     """Node and face sets by the surface that each boundary face lies on."""
     faces = boundary_faces(mesh)
     on_plane = (mesh.points[faces, 2] == 0.0).all(axis=1)
     outermost = (faces >= stack.top[0]) & (faces <= stack.top[-1])
     on_skin = outermost.all(axis=1) & ~on_plane
-    on_bone = same_faces(faces, core.triangles[core.triangle_refs == BONE], len(mesh.points)) & ~on_plane
+    on_bone = find_same_faces(faces, core.triangles[core.triangle_refs == BONE], len(mesh.points)) & ~on_plane
     sets = {"fixed_bone": on_bone, "fixed_proximal": on_plane}
     node_sets = {name: np.unique(faces[chosen]) for name, chosen in sets.items()}
     return replace(mesh, node_sets=node_sets, face_sets={"skin": faces[on_skin]})
 
 
-def curved_target(mesh: Mesh, fields: LimbFields) -> Array:
+def compute_curved_target(mesh: Mesh, fields: LimbFields) -> Array:
     """Where the mid-edge nodes of skin, layers' inner face, bone and regions would lie on smooth surfaces."""
     target = mesh.points.copy()
     free = np.where(mesh.points[:, 2] == 0.0, 0.0, 1.0)
     for nodes, level in _smooth_mid_nodes(mesh, fields):
-        target[nodes] = projected(level, target[nodes], free[nodes])
+        target[nodes] = project_to_level(level, target[nodes], free[nodes])
     return target
 
 
 def _smooth_mid_nodes(mesh: Mesh, fields: LimbFields) -> list[tuple[Ints, Callable[[Array], Level]]]:
     corners, layers = mesh.cells[:, :4].max() + 1, len(fields.depths)
     regions = [
-        (_mid_nodes(found, corners), region_level(fields, number))
-        for number, found in enumerate(interfaces(mesh, layers))
+        (_find_mid_nodes(found, corners), build_region_level(fields, number))
+        for number, found in enumerate(find_interfaces(mesh, layers))
     ]
     return [
         *regions,
-        (_mid_nodes(mesh.face_sets["skin"], corners), fields.depth),
-        (_mid_nodes(inner_faces(mesh, layers - 1), corners), fields.layer),
-        (_mid_nodes(bone_faces(mesh), corners), fields.void),
+        (_find_mid_nodes(mesh.face_sets["skin"], corners), fields.depth),
+        (_find_mid_nodes(find_inner_faces(mesh, layers - 1), corners), fields.layer),
+        (_find_mid_nodes(find_bone_faces(mesh), corners), fields.void),
     ]
 
 
-def _mid_nodes(faces: Ints, corners: int) -> Ints:
+def _find_mid_nodes(faces: Ints, corners: int) -> Ints:
     nodes = np.unique(faces)
     return nodes[nodes >= corners]
 
 
-def bone_faces(mesh: Mesh) -> Ints:
+def find_bone_faces(mesh: Mesh) -> Ints:
     """Outward faces on bone of a mesh in the limb frame."""
     faces = boundary_faces(mesh)
     on_plane = (mesh.points[faces[:, :3], 2] == 0.0).all(axis=1)
     return faces[~on_plane & np.isin(faces[:, :3], mesh.node_sets["fixed_bone"]).all(axis=1)]
 
 
-def inner_faces(mesh: Mesh, layer: int) -> Ints:
+def find_inner_faces(mesh: Mesh, layer: int) -> Ints:
     """Faces between a layer (counted from the skin) and what lies under it, outward from the latter."""
     under = mesh.regions > layer
     above = np.unique(mesh.corners[mesh.regions == layer])
@@ -123,5 +123,6 @@ def inner_faces(mesh: Mesh, layer: int) -> Ints:
     faces = boundary_faces(part)
     outer = boundary_faces(mesh)
     return faces[
-        np.isin(faces[:, :3], above).all(axis=1) & ~same_faces(faces[:, :3], outer[:, :3], len(mesh.points))
+        np.isin(faces[:, :3], above).all(axis=1)
+        & ~find_same_faces(faces[:, :3], outer[:, :3], len(mesh.points))
     ]

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from ...arrays import Array
 from ...errors import SurfaceError
-from ..frame import Frame, limb_frame
+from ..frame import Frame, build_limb_frame
 from ..surfaces.surfaces import Anatomy
-from ..surfaces.thickness import SLOPE, carried, sloped
+from ..surfaces.thickness import SLOPE, limit_slope, transfer_values
 from ..surfaces.triangles import Surface, from_pyvista
 
 Level = tuple[Array, Array]  # a signed function at points and its gradient there
@@ -69,7 +69,7 @@ class TrimmedBone:
 
 @dataclass(frozen=True)
 class LimbFields:
-    """Fields of a limb in its frame; build it with :func:`limb_fields`.
+    """Fields of a limb in its frame; build it with :func:`build_limb_fields`.
 
     ``skin``, ``bones`` and ``regions`` (bodies inside the core) are prolonged beyond the cut, in limb
     coordinates. ``depths`` (layers, n) are those of the layers' inner faces at the skin's n vertices,
@@ -95,14 +95,14 @@ class LimbFields:
 
     def depth(self, points: Array) -> Level:
         """Depth (n,) of points (n, 3) below the skin, positive inside, and its gradient (n, 3)."""
-        distance, slope = signed_distance(self.skin, points)
+        distance, slope = compute_signed_distance(self.skin, points)
         return -distance, -slope
 
     def layer_depths(self, points: Array) -> Array:
         """Depths (layers, n) of the layers' inner faces below the skin points nearest to points (n, 3)."""
         if self.uniform:
             return np.repeat(self.depths, len(points), axis=1)
-        return carried(self.skin, self.depths, points)
+        return transfer_values(self.skin, self.depths, points)
 
     def floor(self, points: Array) -> Array:
         """Depth (n,) of the innermost layer's inner face at points (n, 3)."""
@@ -132,8 +132,8 @@ class LimbFields:
         """Signed distance (n,) to the nearest bone as segmented, and its gradient."""
         value, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
         for bone in self.bones.values():
-            candidates = np.flatnonzero(box_distance(bone, points) < value)
-            distance, slope = signed_distance(bone, points[candidates])
+            candidates = np.flatnonzero(compute_box_distance(bone, points) < value)
+            distance, slope = compute_signed_distance(bone, points[candidates])
             nearer = distance < value[candidates]
             value[candidates[nearer]], gradient[candidates[nearer]] = distance[nearer], slope[nearer]
         return value, gradient
@@ -149,17 +149,17 @@ class LimbFields:
         if not len(shallow):
             return TrimmedBone(0.0, 0.0)
         # A bone's shallow part spans at most its own edge length beyond its shallow vertices.
-        pad = _longest_edge(bone)
+        pad = _measure_longest_edge(bone)
         low, high = shallow.min(axis=0) - pad, shallow.max(axis=0) + pad
         high[2] = min(high[2], 0.0)
         spacing = (np.prod(high - low) / TRIM_SAMPLES) ** (1 / 3)
-        samples = box_samples(low, high, spacing)
-        inside = signed_distance(bone, samples)[0] < 0
+        samples = sample_box(low, high, spacing)
+        inside = compute_signed_distance(bone, samples)[0] < 0
         cut = self.layer(samples[inside])[0] < self.bone_clearance_mm
         return TrimmedBone(float(cut.sum() * np.prod(high - low) / len(samples)), float(excess.max()))
 
 
-def limb_fields(
+def build_limb_fields(
     anatomy: Anatomy,
     layers: tuple[LayerSpec, ...],
     bone_clearance_mm: float,
@@ -182,7 +182,7 @@ def limb_fields(
     SurfaceError
         When the skin does not reach the cut plane, or the fat's depth is needed and not given.
     """
-    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     skin = Surface(frame.to_limb(anatomy.skin.points), anatomy.skin.faces)
     top = skin.points[:, 2].max()
     if top < -END_TOLERANCE_MM:
@@ -190,23 +190,23 @@ def limb_fields(
             f"the skin ends {-top:.1f} mm below the proximal cut plane",
             remedy="move the plane or check its normal",
         )
-    bones, regions = (_inner(bodies, frame) for bodies in (anatomy.bones, anatomy.regions))
-    long = prolonged(skin)
-    depths = _layer_depths(layers, skin, long, fat_depth_mm)
+    bones, regions = (_prolong_bodies(bodies, frame) for bodies in (anatomy.bones, anatomy.regions))
+    long = prolong_surface(skin)
+    depths = _compute_layer_depths(layers, skin, long, fat_depth_mm)
     fields = LimbFields(frame, long, bones, depths, bone_clearance_mm, regions=regions)
-    return _thinned(fields) if policy == "thin-skin" else fields
+    return _thin_layers(fields) if policy == "thin-skin" else fields
 
 
-def _inner(bodies: Mapping[str, Surface], frame: Frame) -> dict[str, Surface]:
+def _prolong_bodies(bodies: Mapping[str, Surface], frame: Frame) -> dict[str, Surface]:
     """Bodies inside the skin in the limb frame, those that end at the cut prolonged beyond it."""
     found = {name: Surface(frame.to_limb(body.points), body.faces) for name, body in bodies.items()}
     ends_at_cut = {
         name: -END_TOLERANCE_MM < body.points[:, 2].max() < SEAM_MM for name, body in found.items()
     }
-    return {name: prolonged(body) if ends_at_cut[name] else body for name, body in found.items()}
+    return {name: prolong_surface(body) if ends_at_cut[name] else body for name, body in found.items()}
 
 
-def _layer_depths(
+def _compute_layer_depths(
     layers: tuple[LayerSpec, ...], skin: Surface, long: Surface, fat_depth_mm: Array | None
 ) -> Array:
     """Depths (layers, n) of the layers' inner faces at the vertices of the prolonged skin, or (layers, 1)."""
@@ -215,7 +215,7 @@ def _layer_depths(
         if fat_depth_mm is None:
             raise SurfaceError("a layer follows the fat, but fat_depth_mm is not given")
         inside = np.minimum(long.points, [np.inf, np.inf, -SEAM_MM])
-        fat = carried(skin, fat_depth_mm[None], inside)[0]
+        fat = transfer_values(skin, fat_depth_mm[None], inside)[0]
     depth, depths = np.zeros_like(fat), []
     for layer in layers:
         if layer.thickness_mm is None:
@@ -226,13 +226,13 @@ def _layer_depths(
     return np.array(depths)
 
 
-def _thinned(fields: LimbFields) -> LimbFields:
+def _thin_layers(fields: LimbFields) -> LimbFields:
     """Layers thinned in proportion where bone comes nearer to the skin than they and the clearance do."""
     skin = fields.skin
     depths = np.repeat(fields.depths, len(skin.points), axis=1) if fields.uniform else fields.depths
     whole = depths[-1]
     room = np.maximum(fields._bone(skin.points)[0] - fields.bone_clearance_mm, THINNEST * whole)
-    left = np.minimum(whole, sloped(skin, np.minimum(whole, room), SLOPE))
+    left = np.minimum(whole, limit_slope(skin, np.minimum(whole, room), SLOPE))
     if (left == whole).all():
         return replace(fields, thinned=ThinnedSkin(0.0, float(whole.min())))
     below = skin.points[:, 2] <= 0.0
@@ -241,7 +241,7 @@ def _thinned(fields: LimbFields) -> LimbFields:
     return replace(fields, depths=depths * (left / whole), thinned=thinned)
 
 
-def signed_distance(surface: Surface, points: Array) -> Level:
+def compute_signed_distance(surface: Surface, points: Array) -> Level:
     """Signed distance (n,) of points (n, 3) to a closed outward surface, negative inside, and gradient."""
     distance, face, nearest = surface.search.signed(points)
     close = np.abs(distance) < NORMAL_WITHIN_MM
@@ -252,7 +252,7 @@ def signed_distance(surface: Surface, points: Array) -> Level:
     return distance, gradient
 
 
-def prolonged(surface: Surface) -> Surface:
+def prolong_surface(surface: Surface) -> Surface:
     """The surface below z = -SEAM_MM with its section there drawn out along z, far beyond the cut.
 
     Cutting below the plane makes it immaterial how exactly the surface's own cap lies on the plane and
@@ -265,19 +265,19 @@ def prolonged(surface: Surface) -> Surface:
     top = np.full(len(body.points), -1)
     top[moved] = len(body.points) + np.arange(len(moved))
     points = np.vstack([body.points, body.points[moved] + [0.0, 0.0, PROLONGATION_MM]])
-    a, b = _rim(body.faces[cap]).T
+    a, b = _find_rim(body.faces[cap]).T
     walls = np.vstack([np.stack([a, b, top[b]], axis=1), np.stack([a, top[b], top[a]], axis=1)])
     return Surface(points, np.vstack([body.faces[~cap], top[body.faces[cap]], walls]))
 
 
-def _rim(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+def _find_rim(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     """Directed edges (k, 2) of a patch of faces that no other face of the patch shares."""
     edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     _, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     return edges[counts[inverse.ravel()] == 1]
 
 
-def box_distance(surface: Surface, points: Array) -> Array:
+def compute_box_distance(surface: Surface, points: Array) -> Array:
     """Distance (n,) to the surface's bounding box, a lower bound of that to the surface; -inf inside."""
     low, high = surface.points.min(axis=0), surface.points.max(axis=0)
     outside = np.maximum(np.maximum(low - points, points - high), 0.0)
@@ -285,12 +285,12 @@ def box_distance(surface: Surface, points: Array) -> Array:
     return np.where(distance > 0, distance, -np.inf)
 
 
-def _longest_edge(surface: Surface) -> float:
+def _measure_longest_edge(surface: Surface) -> float:
     corners = surface.points[surface.faces]
     return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
 
 
-def box_samples(low: Array, high: Array, spacing: float) -> Array:
+def sample_box(low: Array, high: Array, spacing: float) -> Array:
     """Cell centres of a regular grid over a box."""
     counts = np.maximum(1, np.round((high - low) / spacing)).astype(int)
     axes = [lo + (np.arange(n) + 0.5) * (hi - lo) / n for lo, hi, n in zip(low, high, counts)]

@@ -27,27 +27,33 @@ from ...errors import MeshingError, ProblemError
 from ...mesh import Mesh, boundary_faces, check, node_jacobians, to_tet10
 from ..surfaces.surfaces import Anatomy
 from . import background
-from .background import BONE, LAYER, PLANE, REGION, TetGrid, volumes
-from .balancing import balanced
-from .curving import curved, with_diagonals
+from .background import BONE, LAYER, PLANE, REGION, TetGrid, compute_volumes
+from .balancing import balance_bone_faces
+from .curving import curve_diagonals, curve_mesh
 from .engines import ENGINES, MesherError, VolumeMesh, VolumeTask
-from .layered import core_mesh, curved_target, with_layers
-from .layers import BonePolicy, LayerSpec, LimbFields, TrimmedBone, limb_fields
-from .meshreport import GOOD_DIHEDRAL_DEG, MeshReport, enclosed_volume, mesh_report
-from .projection import guarded, projected
+from .layered import build_core_mesh, compute_curved_target, extrude_layers
+from .layers import BonePolicy, LayerSpec, LimbFields, TrimmedBone, build_limb_fields
+from .meshreport import GOOD_DIHEDRAL_DEG, MeshReport, compute_enclosed_volume, mesh_report
+from .projection import project_safely, project_to_level
 from .regions import (
+    build_region_level,
     check_regions,
+    compute_region_volumes,
     cut_at_regions,
-    interfaces,
+    find_interfaces,
+    measure_thickness,
     mesh_numbers,
-    refined_at_regions,
-    region_level,
-    region_volumes,
-    thickness,
+    refine_at_regions,
 )
-from .smoothing import polished
-from .thinbones import refined_at_bones
-from .untangling import inverted, narrowest, repaired, unrepaired, untangled
+from .smoothing import smooth_elements
+from .thinbones import refine_at_bones
+from .untangling import (
+    describe_narrowest_gap,
+    describe_unrepaired,
+    find_inverted_cells,
+    repair_mesh,
+    untangle_cells,
+)
 
 Ints = NDArray[np.int64]
 
@@ -112,7 +118,7 @@ class BaseMesh:
     regions_mm3: Mapping[str, float]
 
 
-def base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Array | None = None) -> BaseMesh:
+def build_base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Array | None = None) -> BaseMesh:
     """The part of meshing that does not depend on the site.
 
     Parameters
@@ -129,15 +135,15 @@ def base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Array | No
     MeshingError
         When nothing is left between layer, bones and cut.
     """
-    fields = limb_fields(
+    fields = build_limb_fields(
         anatomy, settings.layers, settings.bone_clearance_mm, settings.bone_policy, fat_depth_mm
     )
     spacing = settings.base_spacing_mm
     low = fields.skin.points.min(axis=0) - spacing
     high = fields.skin.points.max(axis=0) + spacing
     check_regions(fields, settings.edge_near_mm)
-    grid = background.box_grid(low, np.array([*high[:2], 0.0]), spacing)
-    grid = refined_at_bones(refined_at_regions(grid, fields), fields)
+    grid = background.build_box_grid(low, np.array([*high[:2], 0.0]), spacing)
+    grid = refine_at_bones(refine_at_regions(grid, fields), fields)
     for level, bit in ((fields.layer, LAYER), (fields.void, BONE)):
         grid, positive = background.cut(grid, level, bit, fields.floor_range_mm)
         grid = grid.kept(positive)
@@ -146,8 +152,8 @@ def base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Array | No
     grid = cut_at_regions(grid, fields)
     trimmed = fields.trimmed()
     limit = size_limit(fields, grid, settings)
-    enclosed = enclosed_volume(anatomy, fields, trimmed)
-    return BaseMesh(fields, grid, limit, trimmed, enclosed, region_volumes(fields))
+    enclosed = compute_enclosed_volume(anatomy, fields, trimmed)
+    return BaseMesh(fields, grid, limit, trimmed, enclosed, compute_region_volumes(fields))
 
 
 def mesh_site(
@@ -165,7 +171,7 @@ def mesh_site(
     position : the site (3,) on the skin, LPS mm.
     axis : unit vector (3,) into the limb.
     settings : edge lengths, layers, element.
-    base : of the same anatomy and settings, from :func:`base_mesh`; made here when not given.
+    base : of the same anatomy and settings, from :func:`build_base_mesh`; made here when not given.
 
     Returns
     -------
@@ -178,11 +184,11 @@ def mesh_site(
     MeshingError
         When the mesher fails, or its mesh has inverted elements that cannot be mended: where and why.
     """
-    base = base or base_mesh(anatomy, settings)
+    base = base or build_base_mesh(anatomy, settings)
     frame = base.fields.frame
     site, inward = frame.to_limb(np.asarray(position)), frame.rotation @ np.asarray(axis)
-    size = site_size(base.grid.points, base.size_limit, site, inward, settings)
-    return _meshed(base, size, settings, (site, NEAR_RADII * settings.near_radius_mm))
+    size = compute_site_size(base.grid.points, base.size_limit, site, inward, settings)
+    return _mesh_base(base, size, settings, (site, NEAR_RADII * settings.near_radius_mm))
 
 
 def mesh_limb(
@@ -192,33 +198,35 @@ def mesh_limb(
 
     Parameters
     ----------
-    anatomy, settings, fat_depth_mm : as for :func:`base_mesh`; edges are of ``edge_near_mm`` under the layers
-        and grow with the depth below them.
+    anatomy, settings, fat_depth_mm : as for :func:`build_base_mesh`; edges are of ``edge_near_mm`` under the
+        layers and grow with the depth below them.
     fine_to_mm : distance from the proximal cut up to which they are; nearer to it they grow.
     """
-    base = base_mesh(anatomy, settings, fat_depth_mm)
-    return _meshed(base, limb_size(base, fine_to_mm, settings), settings)
+    base = build_base_mesh(anatomy, settings, fat_depth_mm)
+    return _mesh_base(base, compute_limb_size(base, fine_to_mm, settings), settings)
 
 
-def _meshed(
+def _mesh_base(
     base: BaseMesh, size: Array, settings: MeshSettings, near: tuple[Array, float] | None = None
 ) -> tuple[Mesh, MeshReport]:
     """The mesh of a base in patient space, graded by the edge length (n,) at its grid's points; ``near``: as
     for `mesh_report`."""
     start = time.perf_counter()
     fields = base.fields
-    task = _task(base.grid, size, settings)
-    core = _snapped(_adapted(task, fields, settings), fields)
+    task = _build_task(base.grid, size, settings)
+    core = _snap_nodes(_adapt_core(task, fields, settings), fields)
     names = (*(layer.name for layer in settings.layers), *fields.regions, settings.core)
-    mesh, stack = with_layers(core, fields, names)
-    mesh = polished(mesh, fields, stack)
-    mesh, repairs = repaired(mesh, fields, stack)
-    if settings.element == "tet10" and not inverted(mesh).any():
+    mesh, stack = extrude_layers(core, fields, names)
+    mesh = smooth_elements(mesh, fields, stack)
+    mesh, repairs = repair_mesh(mesh, fields, stack)
+    if settings.element == "tet10" and not find_inverted_cells(mesh).any():
         mesh = to_tet10(mesh)
         if settings.curved:
             straight = node_jacobians(mesh).min(axis=1)
-            mesh = curved(mesh, with_diagonals(mesh, curved_target(mesh, fields), stack), straight)
-            mesh = balanced(mesh, fields, straight)
+            mesh = curve_mesh(
+                mesh, curve_diagonals(mesh, compute_curved_target(mesh, fields), stack), straight
+            )
+            mesh = balance_bone_faces(mesh, fields, straight)
     _check_usable(mesh, fields)
     seconds = time.perf_counter() - start
     report = mesh_report(
@@ -227,41 +235,43 @@ def _meshed(
     return mesh.with_points(fields.frame.to_patient(mesh.points)), replace(report, repairs=repairs)
 
 
-def _adapted(task: VolumeTask, fields: LimbFields, settings: MeshSettings) -> VolumeMesh:
+def _adapt_core(task: VolumeTask, fields: LimbFields, settings: MeshSettings) -> VolumeMesh:
     """The core, graded; a mesher that fails does so, as a rule, where its input is flattest."""
     try:
         return ENGINES[settings.engine](task, settings.time_limit_s)
     except MesherError as error:
-        where = narrowest(task.points, task.tets, fields)
+        where = describe_narrowest_gap(task.points, task.tets, fields)
         raise MeshingError(f"{error}; its input is flattest {where}") from None
 
 
 def _check_usable(mesh: Mesh, fields: LimbFields) -> None:
-    if inverted(mesh).any():
-        raise MeshingError(f"{unrepaired(mesh, fields)}; smooth the surface there, or choose smaller edges")
+    if find_inverted_cells(mesh).any():
+        raise MeshingError(
+            f"{describe_unrepaired(mesh, fields)}; smooth the surface there, or choose smaller edges"
+        )
     try:
         check(mesh)
     except ProblemError as error:
         raise MeshingError(f"the mesh cannot be used: {error.what}; choose other edges") from None
 
 
-def site_size(points: Array, limit: Array, site: Array, axis: Array, settings: MeshSettings) -> Array:
+def compute_site_size(points: Array, limit: Array, site: Array, axis: Array, settings: MeshSettings) -> Array:
     """Wanted edge length (n,) at points (n, 3), at most ``limit`` (n,); everything in the limb frame."""
     offset = points - site
     axial = offset @ axis
     lateral = np.linalg.norm(offset - axial[:, None] * axis, axis=1)
     distance = np.hypot(lateral, DEPTH_RATIO * axial)
-    return _graded(np.maximum(distance - settings.near_radius_mm, 0.0), limit, settings)
+    return _grade_size(np.maximum(distance - settings.near_radius_mm, 0.0), limit, settings)
 
 
-def limb_size(base: BaseMesh, fine_to_mm: float, settings: MeshSettings) -> Array:
+def compute_limb_size(base: BaseMesh, fine_to_mm: float, settings: MeshSettings) -> Array:
     """Wanted edge length (n,) at a whole limb's grid points: short under its layers, not near the cut."""
     points = base.grid.points
     beyond = np.maximum(points[:, 2] + fine_to_mm, 0.0) + np.maximum(base.fields.layer(points)[0], 0.0)
-    return _graded(beyond, base.size_limit, settings)
+    return _grade_size(beyond, base.size_limit, settings)
 
 
-def _graded(beyond: Array, limit: Array, settings: MeshSettings) -> Array:
+def _grade_size(beyond: Array, limit: Array, settings: MeshSettings) -> Array:
     """Edge length (n,) at distances (n,) beyond where it is shortest, at most ``limit`` (n,)."""
     size = np.minimum(settings.edge_near_mm + settings.growth * beyond, settings.edge_far_mm)
     return np.minimum(size, limit)
@@ -270,27 +280,31 @@ def _graded(beyond: Array, limit: Array, settings: MeshSettings) -> Array:
 def size_limit(fields: LimbFields, grid: TetGrid, settings: MeshSettings) -> Array:
     """Edge length (n,) at which layers, sheets of core over bone and regions keep their shape."""
     far, points, slack = settings.edge_far_mm, grid.points, fields.floor_range_mm
-    under_layers = np.maximum(background.banded(fields.layer, points, far, grid.spacing, slack), 0.0)
-    sheet = np.abs(background.banded(fields.void, points, far, grid.spacing, slack)) + under_layers
+    under_layers = np.maximum(background.compute_in_band(fields.layer, points, far, grid.spacing, slack), 0.0)
+    sheet = np.abs(background.compute_in_band(fields.void, points, far, grid.spacing, slack)) + under_layers
     smallest = min(settings.edge_near_mm, settings.bone_clearance_mm)
     over_bone = np.maximum(SHEET_RATIO * settings.flatness * sheet, smallest)
     depths = fields.layer_depths(points)
     thinnest = np.diff(depths, axis=0, prepend=0.0).min(axis=0)
     limit = np.minimum(LAYER_RATIO * settings.flatness * thinnest + under_layers, over_bone)
     for number in range(len(fields.regions)):
-        away = background.banded(region_level(fields, number), points, far, grid.spacing, slack)
-        edge = max(REGION_RATIO * thickness(fields, number), settings.edge_near_mm)
+        away = background.compute_in_band(
+            build_region_level(fields, number), points, far, grid.spacing, slack
+        )
+        edge = max(REGION_RATIO * measure_thickness(fields, number), settings.edge_near_mm)
         limit = np.minimum(limit, edge + np.maximum(away, 0.0))
     return limit
 
 
-def _task(grid: TetGrid, size: Array, settings: MeshSettings) -> VolumeTask:
-    triangles = boundary_faces(core_mesh(grid.points, grid.tets))
+def _build_task(grid: TetGrid, size: Array, settings: MeshSettings) -> VolumeTask:
+    triangles = boundary_faces(build_core_mesh(grid.points, grid.tets))
     common = np.bitwise_and.reduce(grid.mask[triangles], axis=1)
     surfaces = np.select([common & bit > 0 for bit in SURFACES], SURFACES, BONE)
     count = int(grid.regions.max())
     numbers = mesh_numbers(grid.regions, 0, count)
-    inner = interfaces(Mesh(grid.points, grid.tets, "tet4", numbers, tuple(map(str, range(count + 1)))), 0)
+    inner = find_interfaces(
+        Mesh(grid.points, grid.tets, "tet4", numbers, tuple(map(str, range(count + 1)))), 0
+    )
     refs = [np.full(len(faces), REGION << number) for number, faces in enumerate(inner)]
     return VolumeTask(
         grid.points,
@@ -303,27 +317,29 @@ def _task(grid: TetGrid, size: Array, settings: MeshSettings) -> VolumeTask:
     )
 
 
-def _snapped(core: VolumeMesh, fields: LimbFields) -> VolumeMesh:
+def _snap_nodes(core: VolumeMesh, fields: LimbFields) -> VolumeMesh:
     """Nodes of surfaces put on cut plane, regions, layer and bone as far as their elements allow."""
-    in_plane = _nodes_on(core, PLANE)
+    in_plane = _find_nodes_on(core, PLANE)
     target = core.points.copy()
     target[in_plane, 2] = 0.0
     free = np.where(in_plane, 0.0, 1.0)
-    regions = [(REGION << number, region_level(fields, number)) for number in range(len(fields.regions))]
+    regions = [
+        (REGION << number, build_region_level(fields, number)) for number in range(len(fields.regions))
+    ]
     for surface, level in (*regions, (BONE, fields.void), (LAYER, fields.layer)):
-        nodes = np.flatnonzero(_nodes_on(core, surface))
-        target[nodes] = projected(level, target[nodes], free[nodes])
-    points = guarded(core.points, target, core.tets, GOOD_DIHEDRAL_DEG)
+        nodes = np.flatnonzero(_find_nodes_on(core, surface))
+        target[nodes] = project_to_level(level, target[nodes], free[nodes])
+    points = project_safely(core.points, target, core.tets, GOOD_DIHEDRAL_DEG)
     points[in_plane, 2] = 0.0
-    return replace(core, points=_recovered(points, target, core, fields))
+    return replace(core, points=_recover_interface(points, target, core, fields))
 
 
-def _recovered(points: Array, target: Array, core: VolumeMesh, fields: LimbFields) -> Array:
+def _recover_interface(points: Array, target: Array, core: VolumeMesh, fields: LimbFields) -> Array:
     """Points (n, 3) with nodes that a mesher left far outside the layers' inner face put on it all the same.
 
     Bending its triangles over a ridge, MMG may put a node almost on the skin; inner nodes make room for it.
     """
-    layer = np.flatnonzero(_nodes_on(core, LAYER))
+    layer = np.flatnonzero(_find_nodes_on(core, LAYER))
     stray = layer[fields.layer(points[layer])[0] < -STRAY * fields.floor(points[layer])]
     if not len(stray):
         return points
@@ -331,11 +347,11 @@ def _recovered(points: Array, target: Array, core: VolumeMesh, fields: LimbField
     inner[core.triangles] = False
     moved = points.copy()
     moved[stray] = target[stray]
-    moved = untangled(moved, core.tets, np.zeros_like(moved), inner)
-    return moved if (volumes(moved, core.tets) > 0.0).all() else points
+    moved = untangle_cells(moved, core.tets, np.zeros_like(moved), inner)
+    return moved if (compute_volumes(moved, core.tets) > 0.0).all() else points
 
 
-def _nodes_on(core: VolumeMesh, surface: int) -> NDArray[np.bool_]:
+def _find_nodes_on(core: VolumeMesh, surface: int) -> NDArray[np.bool_]:
     chosen = np.zeros(len(core.points), dtype=bool)
     chosen[core.triangles[core.triangle_refs == surface]] = True
     return chosen

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from ...arrays import Array
 from ...mesh import Mesh, MeshQuality, dihedral_angles, quality
 from ..surfaces.surfaces import Anatomy, Surface
-from .layered import inner_faces
+from .layered import find_inner_faces
 from .layers import LimbFields, ThinnedSkin, TrimmedBone
-from .regions import interfaces, region_level
-from .thinbones import bone_warnings
+from .regions import build_region_level, find_interfaces
+from .thinbones import warn_of_lost_bone
 from .untangling import Repair
 
 Ints = NDArray[np.int64]
@@ -78,10 +78,13 @@ def mesh_report(
     found = quality(mesh)
     volume_error = found.volume_mm3 / enclosed_mm3 - 1.0
     layers = len(fields.depths)
-    faces = [_facets(mesh.face_sets["skin"]), *(_facets(inner_faces(mesh, i)) for i in range(layers))]
-    whole = _thickness(mesh, faces[-1], faces[0])
+    faces = [
+        _split_into_facets(mesh.face_sets["skin"]),
+        *(_split_into_facets(find_inner_faces(mesh, i)) for i in range(layers)),
+    ]
+    whole = _measure_thickness(mesh, faces[-1], faces[0])
     each = {
-        name: _summary(_thickness(mesh, faces[i + 1], faces[i]))
+        name: _summarise(_measure_thickness(mesh, faces[i + 1], faces[i]))
         for i, name in enumerate(mesh.region_names[:layers])
     }
     error = np.abs(fields.layer(mesh.points[faces[-1]].mean(axis=1))[0])
@@ -99,19 +102,21 @@ def mesh_report(
         layer_std_mm=float(whole.std()),
         layer_thickness_mm=each,
         interface_error_mm={"mean": float(error.mean()), "max": float(error.max())},
-        regions=_regions(mesh, fields, regions_mm3),
+        regions=_measure_regions(mesh, fields, regions_mm3),
         trimmed_bone=trimmed,
         thinned_skin=fields.thinned,
         seconds=seconds,
         engine=engine,
-        warnings=mesh_warnings(mesh, found, volume_error, near) + bone_warnings(mesh, fields, near),
+        warnings=mesh_warnings(mesh, found, volume_error, near) + warn_of_lost_bone(mesh, fields, near),
     )
 
 
-def _regions(mesh: Mesh, fields: LimbFields, regions_mm3: Mapping[str, float]) -> dict[str, dict[str, float]]:
+def _measure_regions(
+    mesh: Mesh, fields: LimbFields, regions_mm3: Mapping[str, float]
+) -> dict[str, dict[str, float]]:
     found = {}
-    for number, faces in enumerate(interfaces(mesh, len(fields.depths))):
-        error = np.abs(region_level(fields, number)(mesh.points[faces[:, :3]].mean(axis=1))[0])
+    for number, faces in enumerate(find_interfaces(mesh, len(fields.depths))):
+        error = np.abs(build_region_level(fields, number)(mesh.points[faces[:, :3]].mean(axis=1))[0])
         name = mesh.region_names[len(fields.depths) + number]
         found[name] = {
             "enclosed_mm3": regions_mm3[name],
@@ -142,43 +147,45 @@ def mesh_warnings(
     return tuple(warnings)
 
 
-def _thickness(mesh: Mesh, inner: Ints, outer: Ints) -> Array:
+def _measure_thickness(mesh: Mesh, inner: Ints, outer: Ints) -> Array:
     """Distance (n,) from the middles of inner facets to the surface of outer ones, mm."""
     squared = igl.point_mesh_squared_distance(mesh.points[inner].mean(axis=1), mesh.points, outer)[0]
     return np.asarray(np.sqrt(squared))
 
 
-def _summary(values: Array) -> dict[str, float]:
+def _summarise(values: Array) -> dict[str, float]:
     parts = {"mean": values.mean(), "std": values.std(), "min": values.min(), "max": values.max()}
     return {name: float(value) for name, value in parts.items()}
 
 
-def _facets(faces: Ints) -> Ints:
+def _split_into_facets(faces: Ints) -> Ints:
     """Flat triangles of 3-node faces (themselves) or 6-node faces (four each)."""
     if faces.shape[1] == 3:
         return faces
     return faces[:, [0, 3, 5, 3, 1, 4, 5, 4, 2, 3, 4, 5]].reshape(-1, 3)
 
 
-def enclosed_volume(anatomy: Anatomy, fields: LimbFields, trimmed: Mapping[str, TrimmedBone]) -> float:
+def compute_enclosed_volume(
+    anatomy: Anatomy, fields: LimbFields, trimmed: Mapping[str, TrimmedBone]
+) -> float:
     """Volume (mm3) below the cut that the skin encloses, less the bones as trimmed."""
     parts = [
         Surface(fields.frame.to_limb(part.points), part.faces)
         for part in (anatomy.skin, *anatomy.bones.values())
     ]
-    skin, *bones = [volume_below_cut(part) for part in parts]
+    skin, *bones = [compute_volume_below_cut(part) for part in parts]
     return skin - sum(bones) + sum(part.volume_mm3 for part in trimmed.values())
 
 
-def volume_below_cut(surface: Surface) -> float:
+def compute_volume_below_cut(surface: Surface) -> float:
     """Volume (mm3) of a closed surface below z = 0, by the divergence theorem with (0, 0, min(z, 0))."""
     corners = surface.points[surface.faces]
     normal_z = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] / 2.0
     low, middle, high = np.sort(corners[..., 2], axis=1).T
-    return float(normal_z @ _mean_negative_part(low, middle, high))
+    return float(normal_z @ _compute_mean_negative_part(low, middle, high))
 
 
-def _mean_negative_part(low: Array, middle: Array, high: Array) -> Array:
+def _compute_mean_negative_part(low: Array, middle: Array, high: Array) -> Array:
     """Mean of min(z, 0) over triangles whose corners have sorted heights low, middle, high."""
     with np.errstate(divide="ignore", invalid="ignore"):
         tip_below = low**3 / ((low - middle) * (low - high)) / 3.0

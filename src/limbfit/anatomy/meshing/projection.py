@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ...arrays import Array
 from ...mesh import dihedral_angles
-from .background import volumes
+from .background import compute_volumes
 
 Ints = NDArray[np.int64]
 Field = Callable[[Array], tuple[Array, Array]]
@@ -18,7 +18,7 @@ NEWTON_STEPS = 4
 BISECTIONS = 4
 
 
-def projected(field: Field, points: Array, z_freedom: Array) -> Array:
+def project_to_level(field: Field, points: Array, z_freedom: Array) -> Array:
     """Points (n, 3) moved to ``field = 0`` along its gradient with the z component weighted.
 
     ``z_freedom`` (n,) is 1 for free points and 0 for those that must keep their z (on the cut plane).
@@ -32,13 +32,13 @@ def projected(field: Field, points: Array, z_freedom: Array) -> Array:
     return points
 
 
-def guarded(points: Array, target: Array, tets: Ints, floor_deg: float) -> Array:
+def project_safely(points: Array, target: Array, tets: Ints, floor_deg: float) -> Array:
     """Points moved towards ``target`` as far as no dihedral angle falls below the floor or sinks under it."""
     share = np.ones(len(points))
     before = np.minimum(dihedral_angles(points, tets).min(axis=1), floor_deg)
     for attempt in range(BISECTIONS + 1):
         moved = points + share[:, None] * (target - points)
-        sound = volumes(moved, tets) > 0
+        sound = compute_volumes(moved, tets) > 0
         after = np.where(sound, dihedral_angles(moved, tets).min(axis=1), -1.0)
         bad = np.unique(tets[after < before - 1e-6])
         if not len(bad):

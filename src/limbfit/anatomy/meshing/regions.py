@@ -21,8 +21,8 @@ from ...arrays import Array
 from ...errors import SurfaceError
 from ...mesh import Mesh, boundary_faces
 from ..surfaces.triangles import Surface
-from .background import LONGEST_EDGE, REGION, Field, TetGrid, cut, refined
-from .layers import Level, LimbFields, box_distance, box_samples, signed_distance
+from .background import LONGEST_EDGE, REGION, Field, TetGrid, cut, refine_grid
+from .layers import Level, LimbFields, compute_box_distance, compute_signed_distance, sample_box
 
 Ints = NDArray[np.int64]
 
@@ -34,12 +34,12 @@ CELLS_ACROSS = 3.0  # of the grid over a region's thickness, before it is cut
 THINNEST_EDGES = 0.5  # of the edge near the site: a thinner region is refused
 
 
-def region_level(fields: LimbFields, number: int) -> Field:
+def build_region_level(fields: LimbFields, number: int) -> Field:
     """Signed function of points (n, 3) of the limb frame, negative in a region, and its gradient."""
     surface = list(fields.regions.values())[number]
 
     def level(points: Array) -> Level:
-        value = box_distance(surface, points)
+        value = compute_box_distance(surface, points)
         gradient = np.zeros((len(points), 3))
         near = np.flatnonzero(value < FAR_MM)
         if len(near):
@@ -47,23 +47,23 @@ def region_level(fields: LimbFields, number: int) -> Field:
         return value, gradient
 
     def _near(points: Array) -> Level:
-        distance, normal = _wall(fields, number, points)
+        distance, normal = _measure_to_wall(fields, number, points)
         push = np.maximum(fields.bone_clearance_mm - distance, 0.0)
-        value, slope = signed_distance(surface, points + push[:, None] * normal)
+        value, slope = compute_signed_distance(surface, points + push[:, None] * normal)
         across = np.einsum("ij,ij->i", slope, normal)
         return value, slope - np.where(push > 0.0, across, 0.0)[:, None] * normal
 
     return level
 
 
-def _wall(fields: LimbFields, number: int, points: Array) -> Level:
+def _measure_to_wall(fields: LimbFields, number: int, points: Array) -> Level:
     """Distance (n,) of points from the nearest wall of a region, and the unit direction away from it."""
     distance, normal = fields.layer(points)
     everywhere = np.arange(len(points))
     walls = [(everywhere, *fields.void(points))] if fields.bones else []
     for before, surface in enumerate(list(fields.regions.values())[:number]):
         close = everywhere[_is_near(surface, WALL_REACHES * fields.bone_clearance_mm, points)]
-        value, slope = region_level(fields, before)(points[close])
+        value, slope = build_region_level(fields, before)(points[close])
         steep = np.maximum(np.linalg.norm(slope, axis=1), GENTLEST)
         walls.append((close, value / steep, slope / steep[:, None]))
     for place, value, slope in walls:
@@ -72,13 +72,15 @@ def _wall(fields: LimbFields, number: int, points: Array) -> Level:
     return distance, normal
 
 
-def thickness(fields: LimbFields, number: int) -> float:
+def measure_thickness(fields: LimbFields, number: int) -> float:
     """Thickness (mm) of a region where it is thickest: twice the greatest depth in it, below the cut."""
     surface = list(fields.regions.values())[number]
-    return 2.0 * max(0.0, -float(signed_distance(surface, _samples(fields, number)[0])[0].min(initial=0.0)))
+    return 2.0 * max(
+        0.0, -float(compute_signed_distance(surface, _sample_region(fields, number)[0])[0].min(initial=0.0))
+    )
 
 
-def _samples(fields: LimbFields, number: int, pad_mm: float = 0.0) -> tuple[Array, float]:
+def _sample_region(fields: LimbFields, number: int, pad_mm: float = 0.0) -> tuple[Array, float]:
     """Points (n, 3) all over the box of a region below the cut, and the volume (mm3) that each stands for."""
     surface = list(fields.regions.values())[number]
     low, high = surface.points.min(axis=0) - pad_mm, surface.points.max(axis=0) + pad_mm
@@ -86,7 +88,7 @@ def _samples(fields: LimbFields, number: int, pad_mm: float = 0.0) -> tuple[Arra
     if high[2] <= low[2]:
         return np.zeros((0, 3)), 0.0
     whole = float(np.prod(high - low))
-    samples = box_samples(low, high, (whole / SAMPLES) ** (1 / 3))
+    samples = sample_box(low, high, (whole / SAMPLES) ** (1 / 3))
     return samples, whole / len(samples)
 
 
@@ -99,7 +101,7 @@ def check_regions(fields: LimbFields, edge_near_mm: float) -> None:
         For one that is thinner than half an edge near the site.
     """
     for number, name in enumerate(fields.regions):
-        thick = thickness(fields, number)
+        thick = measure_thickness(fields, number)
         if thick < THINNEST_EDGES * edge_near_mm:
             raise SurfaceError(
                 f"the region is {thick:.1f} mm thick at most, too thin for edges of {edge_near_mm:g} mm",
@@ -108,18 +110,18 @@ def check_regions(fields: LimbFields, edge_near_mm: float) -> None:
             )
 
 
-def refined_at_regions(grid: TetGrid, fields: LimbFields) -> TetGrid:
+def refine_at_regions(grid: TetGrid, fields: LimbFields) -> TetGrid:
     """A box's grid, fine enough about each region to be cut at its surface."""
     for number, surface in enumerate(fields.regions.values()):
-        spacing = thickness(fields, number) / CELLS_ACROSS
-        grid = refined(grid, partial(_is_near, surface, LONGEST_EDGE * spacing), spacing)
+        spacing = measure_thickness(fields, number) / CELLS_ACROSS
+        grid = refine_grid(grid, partial(_is_near, surface, LONGEST_EDGE * spacing), spacing)
     return grid
 
 
 def _is_near(surface: Surface, distance_mm: float, points: Array) -> NDArray[np.bool_]:
     """Which points (n,) lie inside a closed surface, or no farther outside than so."""
-    found = box_distance(surface, points) < distance_mm
-    found[found] = signed_distance(surface, points[found])[0] < distance_mm
+    found = compute_box_distance(surface, points) < distance_mm
+    found[found] = compute_signed_distance(surface, points[found])[0] < distance_mm
     return found
 
 
@@ -134,7 +136,7 @@ def cut_at_regions(grid: TetGrid, fields: LimbFields) -> TetGrid:
     # A level differs from the distance by as much as its points are pushed.
     slack = fields.floor_range_mm + 2.0 * fields.bone_clearance_mm
     for number, name in enumerate(fields.regions):
-        grid, outside = cut(grid, region_level(fields, number), REGION << number, slack, region=0)
+        grid, outside = cut(grid, build_region_level(fields, number), REGION << number, slack, region=0)
         inside = (grid.regions == 0) & ~outside
         if not inside.any():
             raise SurfaceError(
@@ -146,12 +148,12 @@ def cut_at_regions(grid: TetGrid, fields: LimbFields) -> TetGrid:
     return grid
 
 
-def region_volumes(fields: LimbFields) -> dict[str, float]:
+def compute_region_volumes(fields: LimbFields) -> dict[str, float]:
     """Volume (mm3) of each region under the layers, between the bones and the regions before it."""
     found = {}
     for number, name in enumerate(fields.regions):
-        samples, cell = _samples(fields, number, fields.bone_clearance_mm)
-        levels = [region_level(fields, before)(samples)[0] for before in range(number + 1)]
+        samples, cell = _sample_region(fields, number, fields.bone_clearance_mm)
+        levels = [build_region_level(fields, before)(samples)[0] for before in range(number + 1)]
         inside = (levels.pop() < 0.0) & (fields.layer(samples)[0] > 0.0) & (fields.void(samples)[0] > 0.0)
         for before in levels:
             inside &= before > 0.0
@@ -164,17 +166,17 @@ def mesh_numbers(regions: Ints, layers: int, count: int) -> Ints:
     return np.where(regions == 0, layers + count, layers + regions - 1)
 
 
-def interfaces(mesh: Mesh, layers: int) -> list[Ints]:
+def find_interfaces(mesh: Mesh, layers: int) -> list[Ints]:
     """Outward faces (k, 3 or 6) of each region after a mesh's layers to what comes after it, to the core."""
-    return [_interface(mesh, number) for number in range(layers, len(mesh.region_names) - 1)]
+    return [_find_interface(mesh, number) for number in range(layers, len(mesh.region_names) - 1)]
 
 
-def _interface(mesh: Mesh, number: int) -> Ints:
-    sides = [_faces_of(mesh, chosen) for chosen in (mesh.regions == number, mesh.regions > number)]
-    return sides[0][same_faces(sides[0][:, :3], sides[1][:, :3], len(mesh.points))]
+def _find_interface(mesh: Mesh, number: int) -> Ints:
+    sides = [_find_outward_faces(mesh, chosen) for chosen in (mesh.regions == number, mesh.regions > number)]
+    return sides[0][find_same_faces(sides[0][:, :3], sides[1][:, :3], len(mesh.points))]
 
 
-def _faces_of(mesh: Mesh, chosen: NDArray[np.bool_]) -> Ints:
+def _find_outward_faces(mesh: Mesh, chosen: NDArray[np.bool_]) -> Ints:
     """Outward faces of some cells together."""
     if not chosen.any():
         return np.zeros((0, mesh.kind.faces.shape[1]), dtype=np.int64)
@@ -182,7 +184,7 @@ def _faces_of(mesh: Mesh, chosen: NDArray[np.bool_]) -> Ints:
     return boundary_faces(part)
 
 
-def same_faces(faces: Ints, chosen: Ints, count: int) -> NDArray[np.bool_]:
+def find_same_faces(faces: Ints, chosen: Ints, count: int) -> NDArray[np.bool_]:
     """Which faces (m, 3) are among the chosen (k, 3), in any order of nodes; ``count`` nodes in all."""
     packed = [np.sort(part, axis=1) @ [count * count, count, 1] for part in (faces, chosen)]
     return np.isin(packed[0], packed[1])

@@ -13,8 +13,8 @@ from ..surfaces.triangles import Surface
 from .background import Field
 from .columns import Columns
 from .layers import LimbFields
-from .projection import guarded, projected
-from .regions import interfaces, region_level
+from .projection import project_safely, project_to_level
+from .regions import build_region_level, find_interfaces
 
 Ints = NDArray[np.int64]
 
@@ -30,7 +30,7 @@ PAIRS = np.triu_indices(4, 1)
 
 
 @dataclass(frozen=True)
-class Ways:
+class SmoothingMoves:
     """Where nodes may go: along a plane, freely, or in the layers along the skin at the depth that they have.
 
     A plane would lead a node of the layers far out of a bent or rough skin, from where no cell lets it back.
@@ -47,7 +47,9 @@ class Ways:
     skin: Surface
 
     @classmethod
-    def of(cls, points: Array, normals: Array, in_layers: NDArray[np.bool_], fields: LimbFields) -> Ways:
+    def of(
+        cls, points: Array, normals: Array, in_layers: NDArray[np.bool_], fields: LimbFields
+    ) -> SmoothingMoves:
         depth = np.full(len(points), np.nan)
         depth[in_layers] = np.sqrt(fields.skin.search.nearest(points[in_layers])[0])
         return cls(normals, depth, fields.skin)
@@ -63,36 +65,36 @@ class Ways:
         return np.asarray(nearest + share[:, None] * (places - nearest))
 
 
-def polished(mesh: Mesh, fields: LimbFields, stack: Columns) -> Mesh:
+def smooth_elements(mesh: Mesh, fields: LimbFields, stack: Columns) -> Mesh:
     """A tet4 mesh with its poor elements improved and its boundary nodes put back on the smooth surfaces.
 
     Inner nodes move freely, those of the layers along the skin, those on bone or cut along these, nodes on
     two of them not at all. Where the limb was cut off about the site, the boundary has no shape to keep.
     """
-    normals, movable = held(mesh, fields, stack)
-    ways = Ways.of(mesh.points, normals, _places(mesh, stack)[1], fields)
-    points = improved(mesh.points, mesh.cells, WORKED_BELOW_DEG, ways, movable)
+    normals, movable = find_constraints(mesh, fields, stack)
+    ways = SmoothingMoves.of(mesh.points, normals, _find_places(mesh, stack)[1], fields)
+    points = improve_angles(mesh.points, mesh.cells, WORKED_BELOW_DEG, ways, movable)
     return mesh.with_points(put_back(points, mesh, fields, stack))
 
 
 def put_back(points: Array, mesh: Mesh, fields: LimbFields, stack: Columns) -> Array:
     """Moved points (n, 3) of a mesh, those of surfaces put on them as far as cells allow."""
-    on_plane, in_layers, on_bone = _places(mesh, stack)
-    walls = _region_walls(mesh, fields)
+    on_plane, in_layers, on_bone = _find_places(mesh, stack)
+    walls = _find_region_walls(mesh, fields)
     target, free = points.copy(), np.where(on_plane, 0.0, 1.0)
     alone = _count(on_plane, in_layers, on_bone, *(chosen for chosen, _ in walls)) < 2
     own = [(np.flatnonzero(chosen & alone), level) for chosen, level in (*walls, (on_bone, fields.void))]
     for nodes, level in (*own, (stack.base, fields.layer), (stack.top, fields.depth)):
-        target[nodes] = projected(level, target[nodes], free[nodes])
-    return guarded(points, target, mesh.cells, GOOD_DEG)
+        target[nodes] = project_to_level(level, target[nodes], free[nodes])
+    return project_safely(points, target, mesh.cells, GOOD_DEG)
 
 
-def held(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Array, NDArray[np.bool_]]:
+def find_constraints(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Array, NDArray[np.bool_]]:
     """Unit normals (n, 3) of the surface that a node moves on, zero for inner ones; which may move (n,)."""
     points = mesh.points
-    on_plane, in_layers, on_bone = _places(mesh, stack)
+    on_plane, in_layers, on_bone = _find_places(mesh, stack)
     normals = np.where(on_plane[:, None], [0.0, 0.0, 1.0], np.zeros((len(points), 3)))
-    walls = _region_walls(mesh, fields)
+    walls = _find_region_walls(mesh, fields)
     for chosen, level in ((in_layers, fields.depth), (on_bone, fields.void), *walls):
         slope = level(points[chosen])[1]
         normals[chosen] = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
@@ -104,17 +106,17 @@ def _count(*places: NDArray[np.bool_]) -> Ints:
     return np.sum(places, axis=0)
 
 
-def _region_walls(mesh: Mesh, fields: LimbFields) -> list[tuple[NDArray[np.bool_], Field]]:
+def _find_region_walls(mesh: Mesh, fields: LimbFields) -> list[tuple[NDArray[np.bool_], Field]]:
     """Which nodes (n,) lie on the surface of each region inside the core, and its level."""
     found = []
-    for number, faces in enumerate(interfaces(mesh, len(fields.depths))):
+    for number, faces in enumerate(find_interfaces(mesh, len(fields.depths))):
         chosen = np.zeros(len(mesh.points), dtype=bool)
         chosen[faces] = True
-        found.append((chosen, region_level(fields, number)))
+        found.append((chosen, build_region_level(fields, number)))
     return found
 
 
-def _places(mesh: Mesh, stack: Columns) -> NDArray[np.bool_]:
+def _find_places(mesh: Mesh, stack: Columns) -> NDArray[np.bool_]:
     """Which nodes lie on the cut plane, in the layers, on bone (3, n)."""
     on_plane, in_layers, on_bone = np.zeros((3, len(mesh.points)), dtype=bool)
     on_plane[:] = mesh.points[:, 2] == 0.0
@@ -123,7 +125,9 @@ def _places(mesh: Mesh, stack: Columns) -> NDArray[np.bool_]:
     return np.stack([on_plane, in_layers, on_bone])
 
 
-def improved(points: Array, tets: Ints, goal_deg: float, ways: Ways, movable: NDArray[np.bool_]) -> Array:
+def improve_angles(
+    points: Array, tets: Ints, goal_deg: float, ways: SmoothingMoves, movable: NDArray[np.bool_]
+) -> Array:
     """Points (n, 3) with nodes of poor tetrahedra moved so that the smallest dihedral angle about each grows.
 
     Parameters
@@ -136,7 +140,7 @@ def improved(points: Array, tets: Ints, goal_deg: float, ways: Ways, movable: ND
     points = points.copy()
     order = np.argsort(tets, axis=None, kind="stable")
     starts = np.searchsorted(tets.ravel()[order], np.arange(len(points) + 1))
-    worst = worst_angles(points[tets[:, 0], None], points[tets[:, 1:]])[:, 0]
+    worst = compute_worst_angles(points[tets[:, 0], None], points[tets[:, 1:]])[:, 0]
     for _ in range(SWEEPS):
         before = points.copy()
         nodes = np.unique(tets[worst < goal_deg])
@@ -144,13 +148,13 @@ def improved(points: Array, tets: Ints, goal_deg: float, ways: Ways, movable: ND
             at = order[starts[node] : starts[node + 1]]
             star, corner = at // 4, at % 4
             opposite = np.take_along_axis(tets[star], OPPOSITE[corner], axis=1)
-            points[node], worst[star] = _best_place(points, opposite, node, ways)
+            points[node], worst[star] = _find_best_place(points, opposite, node, ways)
         if np.array_equal(before, points):
             break
     return points
 
 
-def _best_place(points: Array, opposite: Ints, node: int, ways: Ways) -> tuple[Array, Array]:
+def _find_best_place(points: Array, opposite: Ints, node: int, ways: SmoothingMoves) -> tuple[Array, Array]:
     """Where the smallest angle of the tetrahedra about a node is greatest, among a pattern of places.
 
     ``opposite`` (s, 3) are their other nodes.  Also the smallest angle (s,) of each with the node there.
@@ -159,12 +163,12 @@ def _best_place(points: Array, opposite: Ints, node: int, ways: Ways) -> tuple[A
     reach = np.linalg.norm(others - here, axis=2).min()
     moves = np.concatenate([step * reach * DIRECTIONS for step in STEPS])
     places = np.vstack([here, ways.places(node, here, moves)])
-    angles = worst_angles(places, others)
+    angles = compute_worst_angles(places, others)
     best = int(np.argmax(angles.min(axis=0)))
     return places[best], angles[:, best]
 
 
-def worst_angles(tips: Array, bases: Array) -> Array:
+def compute_worst_angles(tips: Array, bases: Array) -> Array:
     """Smallest dihedral angle (s, k) of tetrahedra between a tip and a base, degrees; -1 where inverted.
 
     Parameters

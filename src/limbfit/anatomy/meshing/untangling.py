@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from ...arrays import Array
 from ...mesh import Mesh, node_jacobians
 from ..frame import Frame
-from .background import volumes
+from .background import compute_volumes
 from .columns import Columns
-from .layers import LimbFields, signed_distance
-from .smoothing import DIRECTIONS, held, put_back
+from .layers import LimbFields, compute_signed_distance
+from .smoothing import DIRECTIONS, find_constraints, put_back
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -48,26 +48,29 @@ class Repair:
         )
 
 
-def repaired(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Mesh, tuple[Repair, ...]]:
+def repair_mesh(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Mesh, tuple[Repair, ...]]:
     """A tet4 mesh in the limb frame with its inverted cells mended as far as they can be, and the repairs."""
-    normals, movable = held(mesh, fields, stack)
+    normals, movable = find_constraints(mesh, fields, stack)
     on_plane = mesh.points[:, 2] == 0.0
     free = np.where(on_plane[:, None], [0.0, 0.0, 1.0], np.zeros((len(mesh.points), 3)))
     attempts: tuple[tuple[str, Callable[[Array], Array]], ...] = (
         (
             "nodes moved along their surfaces",
-            lambda p: put_back(untangled(p, mesh.cells, normals, movable), mesh, fields, stack),
+            lambda p: put_back(untangle_cells(p, mesh.cells, normals, movable), mesh, fields, stack),
         ),
-        ("layers thinned", lambda p: thinned(p, mesh, stack, normals, movable)),
-        ("nodes moved off their surfaces", lambda p: untangled(p, mesh.cells, free, movable | ~on_plane)),
+        ("layers thinned", lambda p: thin_inverted_layers(p, mesh, stack, normals, movable)),
+        (
+            "nodes moved off their surfaces",
+            lambda p: untangle_cells(p, mesh.cells, free, movable | ~on_plane),
+        ),
     )
     repairs = []
-    points, bad = mesh.points, inverted(mesh)
+    points, bad = mesh.points, find_inverted_cells(mesh)
     for what, attempt in attempts:
         if not bad.any():
             break
         tried = attempt(points)
-        left = volumes(tried, mesh.cells) <= 0.0
+        left = compute_volumes(tried, mesh.cells) <= 0.0
         if left.sum() < bad.sum():
             repairs.append(
                 _repair(what, points, tried, mesh.cells[bad], int(bad.sum() - left.sum()), fields.frame)
@@ -76,7 +79,7 @@ def repaired(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Mesh, tupl
     return mesh.with_points(points), tuple(repairs)
 
 
-def inverted(mesh: Mesh) -> Bools:
+def find_inverted_cells(mesh: Mesh) -> Bools:
     """Cells (m,) that have no positive Jacobian at one of their nodes."""
     return np.asarray(node_jacobians(mesh).min(axis=1) <= 0.0)
 
@@ -87,7 +90,7 @@ def _repair(what: str, before: Array, after: Array, cells: Ints, count: int, fra
     return Repair(count, what, (float(place[0]), float(place[1]), float(place[2])), moved)
 
 
-def untangled(points: Array, tets: Ints, normals: Array, movable: Bools) -> Array:
+def untangle_cells(points: Array, tets: Ints, normals: Array, movable: Bools) -> Array:
     """Points (n, 3) with nodes of inverted tetrahedra, and of nearly flat ones beside them, where the worst
     about each is best.
 
@@ -100,19 +103,19 @@ def untangled(points: Array, tets: Ints, normals: Array, movable: Bools) -> Arra
     before, points = points, points.copy()
     order = np.argsort(tets, axis=None, kind="stable")
     starts = np.searchsorted(tets.ravel()[order], np.arange(len(points) + 1))
-    about = tets[np.isin(tets, tets[volumes(points, tets) <= 0.0]).any(axis=1)]
+    about = tets[np.isin(tets, tets[compute_volumes(points, tets) <= 0.0]).any(axis=1)]
     for _ in range(SWEEPS):
-        poor = _roundness(points[about]) < SOUND
+        poor = _compute_roundness(points[about]) < SOUND
         if not poor.any():
             break
         nodes = np.unique(about[poor])
         for node in nodes[movable[nodes]]:
             star = tets[order[starts[node] : starts[node + 1]] // 4]
-            points[node] = _best_place(points, star, node, normals[node], before)
+            points[node] = _find_best_place(points, star, node, normals[node], before)
     return points
 
 
-def _best_place(points: Array, star: Ints, node: int, normal: Array, before: Array) -> Array:
+def _find_best_place(points: Array, star: Ints, node: int, normal: Array, before: Array) -> Array:
     """Where the worst of the cells about a node is best: here, among a pattern, or amidst its neighbours.
 
     No farther from where it was at first than its neighbours were: a node would run from hopeless cells.
@@ -126,24 +129,24 @@ def _best_place(points: Array, star: Ints, node: int, normal: Array, before: Arr
     places = here + moves - (moves @ normal)[:, None] * normal
     places = places[(np.linalg.norm(places - before[node], axis=1) <= FARTHEST * reach) | ~moves.any(axis=1)]
     trial = np.where(mine[None, :, :, None], places[:, None, None, :], corners[None])
-    worst = _roundness(trial.reshape(-1, 4, 3)).reshape(len(places), -1).min(axis=1)
+    worst = _compute_roundness(trial.reshape(-1, 4, 3)).reshape(len(places), -1).min(axis=1)
     return np.asarray(places[int(np.argmax(worst))])
 
 
-def _roundness(corners: Array) -> Array:
+def _compute_roundness(corners: Array) -> Array:
     """Signed volume (m,) of tetrahedra (m, 4, 3) over that of a regular one of the same mean edge."""
     flat = corners.reshape(-1, 3)
-    volume = volumes(flat, np.arange(len(flat)).reshape(-1, 4))
+    volume = compute_volumes(flat, np.arange(len(flat)).reshape(-1, 4))
     edges = corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]]
     return np.asarray(_REGULAR * volume / np.maximum((edges**2).sum(axis=2).mean(axis=1) ** 1.5, 1e-30))
 
 
-def thinned(points: Array, mesh: Mesh, stack: Columns, normals: Array, movable: Bools) -> Array:
+def thin_inverted_layers(points: Array, mesh: Mesh, stack: Columns, normals: Array, movable: Bools) -> Array:
     """Layers thinner from below where their cells are inverted: columns that cross do so at their feet."""
     points = points.copy()
     own = stack.top[0] + np.arange(len(stack.owner))
     for _ in range(2):
-        bad = volumes(points, mesh.cells) <= 0.0
+        bad = compute_volumes(points, mesh.cells) <= 0.0
         chosen = np.isin(stack.base, mesh.cells[bad]) | np.isin(stack.top, mesh.cells[bad])
         if not chosen.any():
             break
@@ -155,13 +158,13 @@ def thinned(points: Array, mesh: Mesh, stack: Columns, normals: Array, movable: 
         )
         inner = movable.copy()
         inner[feet] = False
-        points = untangled(points, mesh.cells, normals, inner)
+        points = untangle_cells(points, mesh.cells, normals, inner)
     return points
 
 
-def unrepaired(mesh: Mesh, fields: LimbFields) -> str:
+def describe_unrepaired(mesh: Mesh, fields: LimbFields) -> str:
     """Where the inverted cells of a mesh in the limb frame are (LPS mm), next to what, and why."""
-    bad = inverted(mesh)
+    bad = find_inverted_cells(mesh)
     number = int(mesh.regions[bad][0])
     region = mesh.region_names[number]
     why = (
@@ -173,10 +176,10 @@ def unrepaired(mesh: Mesh, fields: LimbFields) -> str:
     return f"{int(bad.sum())} of {len(mesh.cells)} cells are inverted, the first in {region} {where}: {why}"
 
 
-def narrowest(points: Array, tets: Ints, fields: LimbFields) -> str:
+def describe_narrowest_gap(points: Array, tets: Ints, fields: LimbFields) -> str:
     """Where the flattest of tetrahedra in the limb frame is (LPS mm), and next to what."""
     corners = points[tets]
-    return _place(corners[np.argmin(_roundness(corners))].mean(axis=0), fields)
+    return _place(corners[np.argmin(_compute_roundness(corners))].mean(axis=0), fields)
 
 
 def _place(point: Array, fields: LimbFields) -> str:
@@ -187,7 +190,7 @@ def _place(point: Array, fields: LimbFields) -> str:
         "the layers' inner face": abs(fields.layer(where)[0][0]),
         "the proximal cut": abs(point[2]),
     }
-    bones = {name: abs(signed_distance(bone, where)[0][0]) for name, bone in fields.bones.items()}
+    bones = {name: abs(compute_signed_distance(bone, where)[0][0]) for name, bone in fields.bones.items()}
     near |= {f"the bone {name}": distance for name, distance in bones.items()}
     surface = min(near, key=lambda name: near[name])
     place = ", ".join(f"{x:.1f}" for x in fields.frame.to_patient(point))

@@ -15,9 +15,9 @@ from scipy.ndimage import label as connected
 
 from ...arrays import Array
 from ...errors import LabelError
-from ..ends import proximal_end
+from ..ends import find_proximal_end
 from ..grid import LabelMap
-from ..surfaces.extraction import signed_distance_to
+from ..surfaces.extraction import compute_signed_distance_to
 
 _STEP_MM = 0.5  # of the cross-section
 _SMOOTH_MM = 1.0  # of its outline
@@ -26,7 +26,7 @@ _MOST_OBLIQUE_DEG = 60.0  # of the plane's normal to the limb
 _ROUNDING = 2.0  # the end is flat only further from the outline than this many pads
 
 
-def amputate(
+def amputate_limb(
     labels: LabelMap, plane_point: ArrayLike, plane_normal: ArrayLike, pad_mm: float = 15.0
 ) -> LabelMap:
     """The leg cut at a plane, with a rounded pad of soft tissue over the cut bones.
@@ -50,34 +50,34 @@ def amputate(
         For a plane that misses the limb, lies along it, points distally or cuts no bone off, or an image too
         short for the pad.
     """
-    point, normal = _unit_plane(plane_point, plane_normal)
+    point, normal = _normalise_plane(plane_point, plane_normal)
     if pad_mm <= 0:
         raise LabelError(f"the pad of soft tissue must be thicker than {pad_mm} mm")
     _check_direction(labels, normal)
-    labels = _divided(labels)
+    labels = _divide_slices(labels)
     height = labels.heights(point, normal)
-    section = _section(labels, point, normal)
+    section = _cut_section(labels, point, normal)
     _check_bones(labels, height)
     array = np.where(height >= 0, labels.array, 0).astype(np.uint8)
     near = np.nonzero((height < 0) & (height > -pad_mm))
     depth = section.depth_at(labels.index_to_point(np.column_stack(near[::-1])))
-    end = pad_mm * _quarter_ellipse(depth / min(section.largest_depth, _ROUNDING * pad_mm))
+    end = pad_mm * _evaluate_quarter_ellipse(depth / min(section.largest_depth, _ROUNDING * pad_mm))
     kept = -height[near] < end
     array[tuple(axis[kept] for axis in near)] = labels.soft_value
     _check(labels, array, section, height, pad_mm)
     return labels.with_array(array)
 
 
-def _divided(labels: LabelMap) -> LabelMap:
+def _divide_slices(labels: LabelMap) -> LabelMap:
     """Thick slices divided, the shape of each label interpolated (Raya and Udupa 1990)."""
     for axis in range(3):
         parts = int(np.ceil(labels.spacing[axis] / _THICKEST_MM))
         if parts > 1:
-            labels = _divided_along(labels, axis, parts)
+            labels = _divide_along(labels, axis, parts)
     return labels
 
 
-def _divided_along(labels: LabelMap, axis: int, parts: int) -> LabelMap:
+def _divide_along(labels: LabelMap, axis: int, parts: int) -> LabelMap:
     count = labels.size[axis]
     place = (np.arange(count * parts) + 0.5) / parts - 0.5
     spacing, start = labels.spacing.copy(), np.zeros(3)
@@ -88,7 +88,7 @@ def _divided_along(labels: LabelMap, axis: int, parts: int) -> LabelMap:
     order = sorted(present, key=lambda value: (value in bones, value))  # where they overlap bone stays whole
     masks = {0: labels.limb} | {value: labels.array == value for value in order}
     inside = {
-        value: _interpolated(signed_distance_to(mask, labels), place, 2 - axis) > 0
+        value: _interpolate_along(compute_signed_distance_to(mask, labels), place, 2 - axis) > 0
         for value, mask in masks.items()
     }
     array = np.where(inside.pop(0), labels.soft_value, 0).astype(np.uint8)
@@ -97,7 +97,7 @@ def _divided_along(labels: LabelMap, axis: int, parts: int) -> LabelMap:
     return replace(labels, array=array, spacing=spacing, origin=labels.index_to_point(start))
 
 
-def _interpolated(field: NDArray[np.float32], place: Array, axis: int) -> NDArray[np.float32]:
+def _interpolate_along(field: NDArray[np.float32], place: Array, axis: int) -> NDArray[np.float32]:
     """Linear interpolation along one array axis, constant beyond the ends."""
     last = field.shape[axis] - 1
     place = np.clip(place, 0, last)
@@ -107,7 +107,7 @@ def _interpolated(field: NDArray[np.float32], place: Array, axis: int) -> NDArra
     return below + part * (above - below)
 
 
-def _unit_plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
+def _normalise_plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
     vector = np.asarray(normal, dtype=float)
     length = float(np.linalg.norm(vector))
     if not length > 0:
@@ -117,7 +117,7 @@ def _unit_plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
 
 def _check_direction(labels: LabelMap, normal: Array) -> None:
     """Refuse a normal that points distally, or that is not along the limb at all."""
-    along = float(proximal_end(labels.limb, labels).direction(labels) @ normal)
+    along = float(find_proximal_end(labels.limb, labels).direction(labels) @ normal)
     angle = float(np.degrees(np.arccos(np.clip(along, -1, 1))))
     if angle > 180 - _MOST_OBLIQUE_DEG:
         raise LabelError(
@@ -143,7 +143,7 @@ def _check_bones(labels: LabelMap, height: Array) -> None:
         )
 
 
-def _quarter_ellipse(t: Array) -> Array:
+def _evaluate_quarter_ellipse(t: Array) -> Array:
     """0 at the outline (t = 0) with an upright tangent, 1 from t = 1 inward."""
     return np.sqrt(1 - (1 - np.clip(t, 0, 1)) ** 2)
 
@@ -167,7 +167,7 @@ class _Section:
         return map_coordinates(self.depth, place.T, order=1, mode="constant", cval=0.0)
 
 
-def _section(labels: LabelMap, point: Array, normal: Array) -> _Section:
+def _cut_section(labels: LabelMap, point: Array, normal: Array) -> _Section:
     """Where the plane cuts the limb; of several pieces the largest."""
     axes = np.linalg.svd(normal[None])[2][1:].T
     corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T * (np.array(labels.size) - 1)

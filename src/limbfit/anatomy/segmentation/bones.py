@@ -45,22 +45,22 @@ def find_bones(levels: Field, limb: Mask, spacing: Spacing, smallest_mm3: float)
     smallest_mm3 : bones smaller than this are left out.
     """
     deep = compute_depth(limb, spacing) > _SKIN_MM
-    marrow = deep & (levels > _BRIGHT) & (escape_level(levels, limb) < _ESCAPE)
-    parts = _parts(marrow, _SEED_PART * smallest_mm3 / float(np.prod(spacing)))
+    marrow = deep & (levels > _BRIGHT) & (compute_escape_level(levels, limb) < _ESCAPE)
+    parts = _number_cavities(marrow, _SEED_PART * smallest_mm3 / float(np.prod(spacing)))
     if parts.max() == 0:
         return []
     for value, place in enumerate(find_objects(parts), start=1):
         _follow(parts, value, place[0], levels, deep, spacing)
-    parts = _rejoined(parts)
+    parts = _join_cavities(parts)
     box = find_box(parts > 0, np.ceil(_CORTEX_MM / spacing[::-1]).astype(int) + 1)
     owned = np.zeros_like(parts)
-    owned[box] = _with_cortex(parts[box], levels[box], deep[box], spacing)
+    owned[box] = _add_cortex(parts[box], levels[box], deep[box], spacing)
     sizes = np.bincount(owned[box].ravel())[1:]
     large = 1 + np.flatnonzero(sizes * np.prod(spacing) >= max(smallest_mm3, 1))
     return [owned == value for value in sorted(large, key=lambda value: -sizes[value - 1])]
 
 
-def escape_level(levels: Field, limb: Mask) -> Field:
+def compute_escape_level(levels: Field, limb: Mask) -> Field:
     """Per slice, the largest level that some way from the voxel to the outside never falls below."""
     outside = np.float32(levels.max() + 1)
     found = np.empty_like(levels)
@@ -71,7 +71,7 @@ def escape_level(levels: Field, limb: Mask) -> Field:
     return found
 
 
-def _parts(marrow: Mask, smallest: float) -> NDArray[np.int32]:
+def _number_cavities(marrow: Mask, smallest: float) -> NDArray[np.int32]:
     """Connected cavities of at least ``smallest`` voxels, numbered from 1."""
     found, count = connected(marrow, np.ones((3, 3, 3)))
     sizes = np.bincount(found.ravel(), minlength=count + 1)
@@ -97,13 +97,13 @@ def _follow(
             k += step
             here = parts[k][box]
             free = deep[k][box] & ((here == 0) | (here == value))
-            found = _next_section(previous, levels[k][box], free, spacing)
+            found = _find_next_section(previous, levels[k][box], free, spacing)
             if found is None:
                 break
             here[found] = value
 
 
-def _next_section(previous: Mask, plane: Field, free: Mask, spacing: Spacing) -> Mask | None:
+def _find_next_section(previous: Mask, plane: Field, free: Mask, spacing: Spacing) -> Mask | None:
     """The marrow in the next slice, split from fat around it along the darkest line (watershed)."""
     inside = erode_mask(previous, _STEP_IN_MM, spacing) & free
     allowed = dilate_mask(previous, _STEP_OUT_MM, spacing) & free
@@ -120,7 +120,7 @@ def _next_section(previous: Mask, plane: Field, free: Mask, spacing: Spacing) ->
     return section if _GROWTH[0] <= ratio <= _GROWTH[1] else None
 
 
-def _rejoined(parts: NDArray[np.int32]) -> NDArray[np.int32]:
+def _join_cavities(parts: NDArray[np.int32]) -> NDArray[np.int32]:
     """Cavities that lie on each other in neighbouring slices are one: a leak in the ring parted them."""
     root = np.arange(parts.max() + 1)
     for low, high in pairwise(parts):
@@ -132,7 +132,7 @@ def _rejoined(parts: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.unique(root, return_inverse=True)[1].astype(np.int32)[parts]
 
 
-def _with_cortex(parts: NDArray[np.int32], levels: Field, deep: Mask, spacing: Spacing) -> NDArray[np.int32]:
+def _add_cortex(parts: NDArray[np.int32], levels: Field, deep: Mask, spacing: Spacing) -> NDArray[np.int32]:
     """Each cavity with the dark cortex around it, without the fascia and vessels that hang on."""
     marrow = parts > 0
     distance, nearest = distance_transform_edt(~marrow, sampling=spacing[::-1], return_indices=True)

@@ -38,7 +38,7 @@ def is_ct(volume: Volume, stated: Contrast = "auto") -> bool:
     if volume.modality in ("CT", "MR"):
         found, evidence = volume.modality == "CT", f"the DICOM modality {volume.modality} does"
     else:
-        found = _shows_air(volume, low) or (stated == "CT" and low < _LIGHTEST_HU)
+        found = _has_air_peak(volume, low) or (stated == "CT" and low < _LIGHTEST_HU)
         evidence = f"the grey values, {low:.0f} to {high:.0f}, do"
     if stated != "auto" and found != (stated == "CT"):
         raise ImageError(
@@ -53,7 +53,7 @@ def is_ct(volume: Volume, stated: Contrast = "auto") -> bool:
     return found
 
 
-def _shows_air(volume: Volume, low: float) -> bool:
+def _has_air_peak(volume: Volume, low: float) -> bool:
     """Whether the histogram has a peak at -1000, or at the end of a grey-value window.
 
     Resampling of MRI by B-splines overshoots to negative values too, but in few voxels, the fewer the lower.
@@ -64,6 +64,6 @@ def _shows_air(volume: Volume, low: float) -> bool:
     return air < _DENSEST_AIR_HU and count > _AIR_SHARE * volume.array.size
 
 
-def above_air(volume: Volume) -> Volume:
+def rescale_above_air(volume: Volume) -> Volume:
     """A CT image as an MRI-like one for the outline: air 0, soft tissue about 1000, bone no brighter."""
     return volume.with_array(np.clip(volume.array, AIR_HU, _TOP_HU) - AIR_HU)

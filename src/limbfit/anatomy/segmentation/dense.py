@@ -36,26 +36,26 @@ def find_dense_bones(hounsfield: Field, limb: Mask, spacing: Spacing, smallest_m
     half = (grey_dilation(compact, size=tuple(size)) + MUSCLE_HU) / 2
     dense = limb & (compact > _DENSE_HU)
     sharp = dense & (compact > half)
-    parts, _ = connected(sharp | (dense & _inner(sharp, dense, spacing)))
+    parts, _ = connected(sharp | (dense & _find_enclosed(sharp, dense, spacing)))
     voxel = float(np.prod(spacing))
     found = []
     for value, box in enumerate(find_objects(parts), start=1):
         if (parts[box] == value).sum() * voxel < 0.1 * smallest_mm3:
             continue
         bone = np.zeros(limb.shape, dtype=bool)
-        bone[box] = _filled(parts[box] == value, spacing)
+        bone[box] = _fill_bone(parts[box] == value, spacing)
         bone &= limb
         if bone.sum() * voxel >= smallest_mm3:
             found.append(bone)
     return sorted(found, key=lambda bone: -int(bone.sum()))
 
 
-def _inner(sharp: Mask, dense: Mask, spacing: Spacing) -> Mask:
+def _find_enclosed(sharp: Mask, dense: Mask, spacing: Spacing) -> Mask:
     """Dense voxels that sharp ones enclose: cancellous bone, which is below half of the cortex beside it."""
-    return _filled(sharp, spacing) & dense
+    return _fill_bone(sharp, spacing) & dense
 
 
-def _filled(part: Mask, spacing: Spacing) -> Mask:
+def _fill_bone(part: Mask, spacing: Spacing) -> Mask:
     """Closed over gaps of the cortex, filled slice by slice, without spikes."""
     padded = np.pad(part, ((0, 0), (1, 1), (1, 1)))  # a bone goes on beyond its ends, not beside them
     closed = fill_slices(close_mask(padded, _CLOSE_MM, spacing))

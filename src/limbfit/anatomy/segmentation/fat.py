@@ -32,17 +32,19 @@ _SAMPLE_MM = 2.5
 _NOISE_MM = 0.9
 
 
-def bright_fat(levels: Field, limb: Mask, bones: Mask, depth: Field, spacing: Spacing) -> Mask:
+def find_bright_fat(levels: Field, limb: Mask, bones: Mask, depth: Field, spacing: Spacing) -> Mask:
     """Voxels nearer to fat than to muscle in MRI, as bright as these are in their neighbourhood.
 
     ``levels`` are relative to muscle, ``depth`` is that below the skin (:func:`compute_depth`). What a coil
     sees less of is darker, fat and muscle alike, and N4 leaves some of that.
     """
     rind = limb & ~bones & (depth < _RIND_MM)
-    return np.asarray(limb & (_denoised(levels, limb, spacing) > _half_way(levels, rind, spacing)))
+    return np.asarray(
+        limb & (_average_in_limb(levels, limb, spacing) > _compute_half_way_level(levels, rind, spacing))
+    )
 
 
-def _denoised(levels: Field, limb: Mask, spacing: Spacing) -> Field:
+def _average_in_limb(levels: Field, limb: Mask, spacing: Spacing) -> Field:
     """The mean of the neighbourhood inside the limb."""
     sigma = _NOISE_MM / spacing[::-1]
     weight = gaussian_filter(limb.astype(np.float32), sigma, mode="nearest")
@@ -50,21 +52,21 @@ def _denoised(levels: Field, limb: Mask, spacing: Spacing) -> Field:
     return np.asarray(total / np.maximum(weight, 1e-3))
 
 
-def _half_way(levels: Field, rind: Mask, spacing: Spacing) -> Field:
+def _compute_half_way_level(levels: Field, rind: Mask, spacing: Spacing) -> Field:
     """Half-way between muscle and fat around each voxel."""
     every = np.maximum((_SAMPLE_MM / spacing[::-1]).astype(int), 1)
     thinned = tuple(slice(None, None, n) for n in every)
     values, inside = levels[thinned], rind[thinned]
     sampling = spacing[::-1] * every
     half = np.maximum(np.round(_NEAR_MM / sampling).astype(int), 1)
-    centres = [_centres(n, step) for n, step in zip(values.shape, _STEP_MM / sampling)]
+    centres = [_compute_centres(n, step) for n, step in zip(values.shape, _STEP_MM / sampling)]
     found = np.full([len(c) for c in centres], np.nan)
     for place in np.ndindex(*found.shape):
         middle = [int(c[n]) for c, n in zip(centres, place)]
         box = tuple(slice(max(m - h, 0), m + h + 1) for m, h in zip(middle, half))
         near = values[box][inside[box]]
         if len(near) >= _FEWEST:
-            found[place] = _between(near)
+            found[place] = _compute_isodata_level(near)
     if np.isfinite(found).any():
         nearest = distance_transform_edt(np.isnan(found), return_distances=False, return_indices=True)
         found = found[tuple(nearest)]
@@ -77,7 +79,7 @@ def _half_way(levels: Field, rind: Mask, spacing: Spacing) -> Field:
     return np.asarray(j @ np.tensordot(k, found.astype(np.float32), 1) @ i.T, dtype=np.float32)
 
 
-def _between(values: Field) -> float:
+def _compute_isodata_level(values: Field) -> float:
     """The level half-way between two kinds of tissue (isodata); not a number where there is one kind."""
     level = float(np.mean(np.percentile(values, (_LOW, _HIGH))))
     for _ in range(_ROUNDS):
@@ -89,7 +91,7 @@ def _between(values: Field) -> float:
     return level if high > _FAINTEST * low else np.nan
 
 
-def _centres(count: int, step: float) -> NDArray[np.float64]:
+def _compute_centres(count: int, step: float) -> NDArray[np.float64]:
     return np.linspace(0, count - 1, max(2, round(count / max(step, 1.0)) + 1))
 
 
@@ -102,13 +104,13 @@ def _interpolate_places(places: NDArray[np.float64], count: int) -> Field:
     return weights
 
 
-def subcutaneous(bright: Mask, limb: Mask, bones: Mask, depth: Field, spacing: Spacing) -> Mask:
+def select_subcutaneous(bright: Mask, limb: Mask, bones: Mask, depth: Field, spacing: Spacing) -> Mask:
     """The part of ``bright`` that belongs to the skin's layer, skin included; all masks ``[k, j, i]``.
 
     The image's ends (first and last k) do not count as skin.
     """
     outer = ~limb | (depth < SKIN_MM)
-    layer = _without_small_holes(bright | outer, spacing) & ~bones
+    layer = _fill_small_holes(bright | outer, spacing) & ~bones
     opened = open_mask(layer, SEPTUM_MM, spacing)
     joined = binary_propagation(outer & opened, mask=opened) | outer
     # What the layer parts from the inner limb belongs to it too.
@@ -117,7 +119,7 @@ def subcutaneous(bright: Mask, limb: Mask, bones: Mask, depth: Field, spacing: S
     return np.asarray(joined & limb & ~bones)
 
 
-def _without_small_holes(mask: Mask, spacing: Spacing) -> Mask:
+def _fill_small_holes(mask: Mask, spacing: Spacing) -> Mask:
     """Vessels and nerves in the fat filled, slice by slice."""
     in_slice = np.zeros((3, 3, 3), dtype=int)
     in_slice[1] = [[0, 1, 0], [1, 1, 1], [0, 1, 0]]

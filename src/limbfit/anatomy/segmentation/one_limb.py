@@ -29,9 +29,9 @@ def check_one_limb(volume: Volume) -> None:
     ImageError
         With the remedy: crop, or give labels.
     """
-    tissue, step = _tissue(volume)
+    tissue, step = _find_tissue(volume)
     for axis in range(3):
-        counts = np.array([_sections(plane, step) for plane in np.moveaxis(tissue, axis, 0)])
+        counts = np.array([_count_sections(plane, step) for plane in np.moveaxis(tissue, axis, 0)])
         if (counts > 0).sum() >= _FEWEST and (counts > 1).sum() > _SHARE * (counts > 0).sum():
             raise ImageError(
                 "two limbs in one image",
@@ -39,7 +39,7 @@ def check_one_limb(volume: Volume) -> None:
             )
 
 
-def _tissue(volume: Volume) -> tuple[Mask, float]:
+def _find_tissue(volume: Volume) -> tuple[Mask, float]:
     """What is brighter than air (Otsu) on coarse cubic voxels, closed over thin dark bone; their edge, mm."""
     step = max(_COARSE_MM, float(volume.spacing.max()))
     size = np.maximum(np.floor((np.array(volume.size) - 1) * volume.spacing / step).astype(int) + 1, 1)
@@ -60,7 +60,7 @@ def _tissue(volume: Volume) -> tuple[Mask, float]:
     return padded[2:-2, 2:-2, 2:-2] | tissue, step
 
 
-def _sections(plane: Mask, step: float) -> int:
+def _count_sections(plane: Mask, step: float) -> int:
     """How many large roundish sections a slice shows."""
     solid = binary_opening(np.pad(binary_fill_holes(plane), 1, mode="edge"), np.ones((3, 3)))
     parts, count = connected(solid)

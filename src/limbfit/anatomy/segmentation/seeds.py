@@ -10,14 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...errors import ImageError
 from ..grid import Grid
-from ..surfaces.extraction import signed_distance_to
+from ..surfaces.extraction import compute_signed_distance_to
 
 Mask = NDArray[np.bool_]
 
 _NEAR_MM = 3.0  # a seed this near to a bone is in it
 
 
-def seeded(bones: Sequence[Mask], seeds: Mapping[str, ArrayLike], grid: Grid) -> tuple[list[Mask], list[str]]:
+def grow_from_seeds(
+    bones: Sequence[Mask], seeds: Mapping[str, ArrayLike], grid: Grid
+) -> tuple[list[Mask], list[str]]:
     """One bone for each name: the pieces that hold its seeds; a piece with seeds of several names is divided.
 
     Parameters
@@ -35,19 +37,19 @@ def seeded(bones: Sequence[Mask], seeds: Mapping[str, ArrayLike], grid: Grid) ->
     holders: dict[int, dict[int, list[tuple[int, int, int]]]] = {}
     for n, name in enumerate(names):
         for point in np.asarray(seeds[name], dtype=float).reshape(-1, 3):
-            voxel, piece = _piece_of(point, bones, grid, name)
+            voxel, piece = _find_piece(point, bones, grid, name)
             holders.setdefault(piece, {}).setdefault(n, []).append(voxel)
     for piece, marked in holders.items():
         if len(marked) == 1:
             found[next(iter(marked))] |= bones[piece]
             continue
-        divided = _divided(bones[piece], marked, grid)
+        divided = _divide_piece(bones[piece], marked, grid)
         for n in marked:
             found[n] |= divided == n + 1
     return found, names
 
 
-def _piece_of(
+def _find_piece(
     point: NDArray[np.float64], bones: Sequence[Mask], grid: Grid, name: str
 ) -> tuple[tuple[int, int, int], int]:
     """The voxel ``(k, j, i)`` of the nearest bone, and which bone that is."""
@@ -74,9 +76,11 @@ def _piece_of(
     return best
 
 
-def _divided(bone: Mask, marked: Mapping[int, list[tuple[int, int, int]]], grid: Grid) -> NDArray[np.uint8]:
+def _divide_piece(
+    bone: Mask, marked: Mapping[int, list[tuple[int, int, int]]], grid: Grid
+) -> NDArray[np.uint8]:
     """One piece parted between names where it is thinnest (watershed of the depth); values are name + 1."""
-    depth = signed_distance_to(bone, grid)
+    depth = compute_signed_distance_to(bone, grid)
     markers = np.zeros(bone.shape, dtype=np.uint8)
     markers[~bone] = 255
     for n, voxels in marked.items():

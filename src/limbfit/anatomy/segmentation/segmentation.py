@@ -10,15 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_fill_holes
 
 from ...errors import ImageError
-from ..ends import ProximalEnd, proximal_end
+from ..ends import ProximalEnd, find_proximal_end
 from ..grid import BONES, DEFAULT_NAMES, FAT, LabelMap, Volume
 from ..morphology import Box, compute_depth, find_box, find_largest_piece
-from .body import bias_field, limb_axis, limb_mask, muscle_level, smoothed
+from .body import estimate_bias_field, estimate_muscle_level, find_limb_axis, find_limb_mask, smooth_image
 from .bones import find_bones, name_bones
-from .contrast import Contrast, above_air, is_ct
+from .contrast import Contrast, is_ct, rescale_above_air
 from .dense import find_dense_bones
-from .fat import FAT_HU, bright_fat, subcutaneous
-from .seeds import seeded
+from .fat import FAT_HU, find_bright_fat, select_subcutaneous
+from .seeds import grow_from_seeds
 
 Mask = NDArray[np.bool_]
 Field = NDArray[np.float32]
@@ -60,8 +60,8 @@ def segment(
         Where no limb or no bone is found, a seed lies in no bone, or the contrast is not the stated one.
     """
     ct = is_ct(volume, contrast)
-    visible = above_air(volume) if ct else volume
-    axis = limb_axis(visible)
+    visible = rescale_above_air(volume) if ct else volume
+    axis = find_limb_axis(visible)
     del visible
     order = [*(n for n in range(3) if n != axis), axis]
     found = _segment(volume.turned(order), ct, bias_correction, min_bone_volume_mm3, seeds)
@@ -86,26 +86,26 @@ class _Tissues:
         if self.ct:
             bright = (self.levels > FAT_HU[0]) & (self.levels < FAT_HU[1])
         else:
-            bright = bright_fat(self.levels, self.limb, bone, depth, spacing)
-        return subcutaneous(bright, self.limb, bone, depth, spacing)
+            bright = find_bright_fat(self.levels, self.limb, bone, depth, spacing)
+        return select_subcutaneous(bright, self.limb, bone, depth, spacing)
 
 
 def _segment(
     volume: Volume, ct: bool, bias_correction: bool, min_bone_volume_mm3: float, seeds: Seeds | None
 ) -> LabelMap:
     """The same for a volume whose slices lie across the limb."""
-    visible = above_air(volume) if ct else volume
-    smooth = smoothed(visible)
-    limb = limb_mask(visible, smooth)
+    visible = rescale_above_air(volume) if ct else volume
+    smooth = smooth_image(visible)
+    limb = find_limb_mask(visible, smooth)
     del visible
-    end, box = proximal_end(limb, volume, axis=2), find_box(limb, _MARGIN)
+    end, box = find_proximal_end(limb, volume, axis=2), find_box(limb, _MARGIN)
     smallest = _SEEDED_MM3 if seeds else min_bone_volume_mm3
     if ct:
-        found = _in_ct(smoothed(volume)[box], limb[box], end, volume.spacing, smallest)
+        found = _find_tissues_in_ct(smooth_image(volume)[box], limb[box], end, volume.spacing, smallest)
     else:
         if bias_correction:
-            smooth /= bias_field(volume, limb)
-        found = _in_mri(smooth[box], limb[box], end, volume.spacing, smallest)
+            smooth /= estimate_bias_field(volume, limb)
+        found = _find_tissues_in_mri(smooth[box], limb[box], end, volume.spacing, smallest)
     del smooth
     if not found.bones:
         raise ImageError(
@@ -114,19 +114,21 @@ def _segment(
         )
     bones = [_fill_piece(bone) for bone in found.bones]
     if seeds:
-        bones, names = seeded(bones, seeds, volume.cropped(box))
+        bones, names = grow_from_seeds(bones, seeds, volume.cropped(box))
     else:
         names = name_bones([end.along(bone) for bone in bones], volume.spacing)
-    return _labels(found.limb, found.fat(volume.spacing), bones, names, volume, box)
+    return _build_labels(found.limb, found.fat(volume.spacing), bones, names, volume, box)
 
 
-def _in_mri(smooth: Field, limb: Mask, end: ProximalEnd, spacing: Spacing, smallest_mm3: float) -> _Tissues:
-    levels = smooth / np.float32(muscle_level(smooth, limb))
+def _find_tissues_in_mri(
+    smooth: Field, limb: Mask, end: ProximalEnd, spacing: Spacing, smallest_mm3: float
+) -> _Tissues:
+    levels = smooth / np.float32(estimate_muscle_level(smooth, limb))
     found = find_bones(end.along(levels), end.along(limb), spacing, smallest_mm3)
     return _Tissues(limb, [end.along(bone) for bone in found], levels, ct=False)
 
 
-def _in_ct(
+def _find_tissues_in_ct(
     hounsfield: Field, limb: Mask, end: ProximalEnd, spacing: Spacing, smallest_mm3: float
 ) -> _Tissues:
     found = find_dense_bones(hounsfield, limb, spacing, smallest_mm3)
@@ -141,7 +143,9 @@ def _fill_piece(mask: Mask) -> Mask:
     return filled
 
 
-def _labels(limb: Mask, fat: Mask, bones: list[Mask], names: list[str], volume: Volume, box: Box) -> LabelMap:
+def _build_labels(
+    limb: Mask, fat: Mask, bones: list[Mask], names: list[str], volume: Volume, box: Box
+) -> LabelMap:
     array = limb.astype(np.uint8)
     known = dict(DEFAULT_NAMES)
     values = {name: value for value, name in known.items()}

@@ -14,7 +14,7 @@ from scipy.ndimage import label as connected
 from scipy.spatial import ConvexHull, QhullError
 
 from ..grid import Grid
-from ..labels.contours import even_odd
+from ..labels.contours import fill_even_odd
 
 Mask = NDArray[np.bool_]
 
@@ -25,23 +25,23 @@ _BITE_MM = 10.0  # how deep the strip under the limb may be
 _STEP_MM = 2.0
 
 
-def without_supports(mask: Mask, grid: Grid) -> Mask:
+def remove_supports(mask: Mask, grid: Grid) -> Mask:
     """The mask ``[k, j, i]`` (k along the limb) without slabs of up to 40 mm that stick out of the limb."""
     steps = np.maximum((_STEP_MM / grid.spacing[::-1]).astype(int), 1)
     coarse = mask[:: steps[0], :: steps[1], :: steps[2]]
     sampling = grid.spacing[::-1] * steps
-    body = _opened(coarse, sampling)
-    wings = _wings(coarse & ~body, body, sampling)
+    body = _open_limb(coarse, sampling)
+    wings = _find_wings(coarse & ~body, body, sampling)
     if not wings.any():
         return mask
-    strip = _hulls(wings) & (_depth(body, sampling) < _BITE_MM)
+    strip = _fill_hulls(wings) & (_compute_depth(body, sampling) < _BITE_MM)
     support = wings | strip
     for axis, step in enumerate(steps):
         support = np.repeat(support, step, axis=axis)
     return np.asarray(mask & ~support[: mask.shape[0], : mask.shape[1], : mask.shape[2]])
 
 
-def _opened(mask: Mask, sampling: NDArray[np.float64]) -> Mask:
+def _open_limb(mask: Mask, sampling: NDArray[np.float64]) -> Mask:
     """Opened by a large ball; beyond the image the limb goes on, beside it there is nothing."""
     reach = np.ceil(2 * BALL_MM / sampling).astype(int) + 1
     padded = np.pad(mask, [(reach[0], reach[0]), (0, 0), (0, 0)], mode="edge")
@@ -51,7 +51,7 @@ def _opened(mask: Mask, sampling: NDArray[np.float64]) -> Mask:
     return np.asarray(opened[tuple(slice(r, -r) for r in reach)]) & mask
 
 
-def _wings(residue: Mask, body: Mask, sampling: NDArray[np.float64]) -> Mask:
+def _find_wings(residue: Mask, body: Mask, sampling: NDArray[np.float64]) -> Mask:
     """Pieces of the residue that stick far out of the body along much of it."""
     away = distance_transform_edt(~body, sampling=sampling)
     length = np.ptp(np.flatnonzero(body.any(axis=(1, 2)))) + 1 if body.any() else 1
@@ -66,11 +66,11 @@ def _wings(residue: Mask, body: Mask, sampling: NDArray[np.float64]) -> Mask:
     return wings
 
 
-def _depth(body: Mask, sampling: NDArray[np.float64]) -> NDArray[np.float64]:
+def _compute_depth(body: Mask, sampling: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(distance_transform_edt(body, sampling=sampling))
 
 
-def _hulls(wings: Mask) -> Mask:
+def _fill_hulls(wings: Mask) -> Mask:
     """The convex hull of each slice."""
     found = wings.copy()
     for k, plane in enumerate(wings):
@@ -81,5 +81,5 @@ def _hulls(wings: Mask) -> Mask:
             corners = points[ConvexHull(points).vertices]
         except QhullError:  # all on one line
             continue
-        found[k] |= even_odd([corners], plane.shape[1], plane.shape[0])
+        found[k] |= fill_even_odd([corners], plane.shape[1], plane.shape[0])
     return found

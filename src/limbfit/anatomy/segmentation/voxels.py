@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkImagingStencil import vtkImageStencilToImage, vtkPolyDataToImageStencil
 
-from ..frame import limb_frame
+from ..frame import build_limb_frame
 from ..grid import SOFT_TISSUE, Grid, LabelMap
 from ..surfaces.surfaces import Anatomy, build_anatomy
 from ..surfaces.triangles import Surface
-from .amputation import amputate
+from .amputation import amputate_limb
 
 Mask = NDArray[np.bool_]
 
@@ -22,10 +22,10 @@ VOXEL_MM = 1.0  # as fine as an image of a limb; build_anatomy smooths its steps
 _MARGIN_MM = 4.0  # of empty voxels beside and below the limb
 
 
-def amputated(
+def amputate_anatomy(
     anatomy: Anatomy, plane_point: ArrayLike, plane_normal: ArrayLike, pad_mm: float, edge_mm: float
 ) -> Anatomy:
-    """An anatomy cut at a plane, with a rounded pad of soft tissue over the cut bones; see :func:`amputate`.
+    """An anatomy cut at a plane, with a pad over the cut bones; see :func:`amputate_limb`.
 
     Parameters
     ----------
@@ -39,16 +39,20 @@ def amputated(
     LabelError
         For a plane that misses the limb, lies along it, points distally or cuts no bone off.
     """
-    labels = amputate(voxelised(anatomy, pad_mm + _MARGIN_MM), plane_point, plane_normal, pad_mm=pad_mm)
+    labels = amputate_limb(
+        voxelise_anatomy(anatomy, pad_mm + _MARGIN_MM), plane_point, plane_normal, pad_mm=pad_mm
+    )
     return build_anatomy(labels, edge_mm, (anatomy.cut_point, anatomy.cut_normal))
 
 
-def voxelised(anatomy: Anatomy, distal_mm: float = _MARGIN_MM, spacing_mm: float = VOXEL_MM) -> LabelMap:
+def voxelise_anatomy(
+    anatomy: Anatomy, distal_mm: float = _MARGIN_MM, spacing_mm: float = VOXEL_MM
+) -> LabelMap:
     """The label map of an anatomy: cubic voxels in layers along the cut, the last just distal of it.
 
     ``distal_mm`` of empty voxels are left beyond the limb's end.
     """
-    frame = limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     points = frame.to_limb(anatomy.skin.points)
     low = points.min(axis=0) - [_MARGIN_MM, _MARGIN_MM, distal_mm]
     high = np.array([*(points.max(axis=0)[:2] + _MARGIN_MM), 0.0])
@@ -57,8 +61,8 @@ def voxelised(anatomy: Anatomy, distal_mm: float = _MARGIN_MM, spacing_mm: float
     empty = np.zeros(size[::-1], dtype=np.uint8)
     grid = Grid(empty, np.full(3, spacing_mm), frame.to_patient(corner), frame.rotation.T)
     inner = {**anatomy.regions, **anatomy.bones}  # bones last: they stay whole where the two overlap
-    masks = {name: filled(body, grid) for name, body in inner.items()}
-    labels = label_map(grid, filled(anatomy.skin, grid), masks)
+    masks = {name: fill_surface(body, grid) for name, body in inner.items()}
+    labels = label_map(grid, fill_surface(anatomy.skin, grid), masks)
     return replace(labels, regions={name: name for name in anatomy.regions})
 
 
@@ -71,14 +75,14 @@ def label_map(grid: Grid, limb: Mask, bones: Mapping[str, Mask]) -> LabelMap:
     return LabelMap(array, grid.spacing, grid.origin, grid.direction, names)
 
 
-def filled(surface: Surface, grid: Grid) -> Mask:
+def fill_surface(surface: Surface, grid: Grid) -> Mask:
     """``[k, j, i]``: which voxels' centres lie inside a closed surface."""
     index = Surface(grid.point_to_index(surface.points), surface.faces)
     stencil = vtkPolyDataToImageStencil()
     stencil.SetInputData(index.to_pyvista())
     stencil.SetOutputSpacing(1.0, 1.0, 1.0)
     stencil.SetOutputOrigin(0.0, 0.0, 0.0)
-    stencil.SetOutputWholeExtent(_extent(grid.size))
+    stencil.SetOutputWholeExtent(_find_extent(grid.size))
     image = vtkImageStencilToImage()
     image.SetInputConnection(stencil.GetOutputPort())
     image.SetInsideValue(1)
@@ -89,5 +93,5 @@ def filled(surface: Surface, grid: Grid) -> Mask:
     return values.reshape(grid.array.shape).astype(bool)
 
 
-def _extent(size: Sequence[int]) -> tuple[int, int, int, int, int, int]:
+def _find_extent(size: Sequence[int]) -> tuple[int, int, int, int, int, int]:
     return (0, size[0] - 1, 0, size[1] - 1, 0, size[2] - 1)

@@ -19,10 +19,10 @@ from ...arrays import Array
 from ...errors import ImageError
 from ..grid import Volume
 from ..morphology import dilate_mask, erode_mask, find_box
-from ..segmentation.body import limb_mask, smoothed
+from ..segmentation.body import find_limb_mask, smooth_image
 from ..segmentation.contrast import is_ct
-from ..surfaces.triangles import Surface, bodies, from_pyvista
-from .markers import Bump, bumps, cap_faces, near_cap
+from ..surfaces.triangles import Surface, find_bodies, from_pyvista
+from .markers import Bump, cap_faces, find_bumps, find_near_cap
 
 Mask = NDArray[np.bool_]
 Field = NDArray[np.float32]
@@ -37,7 +37,7 @@ _PATCH_MM = 14.0  # of skin around a foot that tells how the skin under it runs
 _ABOVE_MM = 15.0  # no marker is higher
 
 
-def marked_skin(volume: Volume) -> tuple[Surface, Mask]:
+def extract_marked_skin(volume: Volume) -> tuple[Surface, Mask]:
     """The skin of an image with the markers on it, LPS mm, and the limb's mask ``[k, j, i]``.
 
     Where the image ends, the skin is closed by a flat cap.
@@ -47,15 +47,15 @@ def marked_skin(volume: Volume) -> tuple[Surface, Mask]:
             "the image is CT; markers are found in MRI only",
             remedy="give the sites' positions (position in study.toml)",
         )
-    smooth = smoothed(volume)
-    limb = limb_mask(volume, smooth)
+    smooth = smooth_image(volume)
+    limb = find_limb_mask(volume, smooth)
     box = find_box(limb, 2 * np.ceil(_RIM_MM / volume.spacing[::-1]).astype(int) + 2)
-    contour = _contour(smooth[box], limb[box], volume.spacing)
+    contour = _extract_contour(smooth[box], limb[box], volume.spacing)
     skin = Surface(volume.cropped(box).index_to_point(contour.points), contour.faces)
     return (skin if skin.volume > 0 else skin.flipped), limb
 
 
-def _contour(smooth: Field, limb: Mask, spacing: Array) -> Surface:
+def _extract_contour(smooth: Field, limb: Mask, spacing: Array) -> Surface:
     """Where the signal falls to half of the tissue beside it, near to a limb's outline, in voxels."""
     core = erode_mask(limb, _RIM_MM, spacing)
     size = 2 * np.ceil(_RIM_MM / spacing[::-1]).astype(int) + 1
@@ -67,7 +67,7 @@ def _contour(smooth: Field, limb: Mask, spacing: Array) -> Surface:
     data = pv.ImageData(dimensions=padded.shape[::-1])
     data.point_data["level"] = padded.ravel()
     found = from_pyvista(data.contour([0.0], scalars="level", method="flying_edges", compute_normals=False))
-    return bodies(Surface(found.points - 1, found.faces))[0]
+    return find_bodies(Surface(found.points - 1, found.faces))[0]
 
 
 @dataclass(frozen=True)
@@ -81,18 +81,18 @@ class _Patch:
     def local(self, points: Array) -> tuple[Array, Array]:
         """Distance from the axis (n,) and height above the patch (n,) of points (n, 3), mm."""
         u, v, h = self.frame @ (points - self.origin).T
-        return np.hypot(u, v), h - _basis(u, v) @ self.coefficients
+        return np.hypot(u, v), h - _evaluate_basis(u, v) @ self.coefficients
 
 
-def without_markers(volume: Volume, skin: Surface) -> tuple[Volume, int]:
+def remove_markers(volume: Volume, skin: Surface) -> tuple[Volume, int]:
     """The image with the markers on its skin turned into air, and how many there were.
 
     Parameters
     ----------
     volume : an image with markers on.
-    skin : its outline (:func:`marked_skin`).
+    skin : its outline (:func:`extract_marked_skin`).
     """
-    found = bumps(skin, outline_height(skin))
+    found = find_bumps(skin, outline_height(skin))
     marked = np.zeros(len(skin.points), bool)
     for bump in found:
         marked[bump.feet] = True
@@ -100,7 +100,7 @@ def without_markers(volume: Volume, skin: Surface) -> tuple[Volume, int]:
     air = float(np.median(array[array < 0.2 * np.percentile(array, 99)]))
     normals = skin.vertex_normals
     for bump in found:
-        _clear(array, volume, *_patch_under(skin, normals, marked, bump), air)
+        _clear(array, volume, *_fit_patch_under_marker(skin, normals, marked, bump), air)
     return volume.with_array(array), len(found)
 
 
@@ -109,29 +109,29 @@ def outline_height(skin: Surface) -> Array:
     normals = skin.vertex_normals
     cells = np.floor(skin.points / _SPACING_MM).astype(np.int64)
     places = np.unique(cells, axis=0, return_index=True)[1]
-    cap = near_cap(skin, cap_faces(skin), skin.points)
+    cap = find_near_cap(skin, cap_faces(skin), skin.points)
     places = places[~cap[places]]
     points = skin.points[places]
     tree = cKDTree(points)
     around = tree.query(points, k=min(_NEIGHBOURS, len(points)))[1]
-    frames = _frames(normals[places][around].mean(axis=1))
+    frames = _build_frames(normals[places][around].mean(axis=1))
     offsets = np.einsum("nab,nkb->nka", frames, points[around] - points[:, None])
     facing = np.einsum("nkb,nb->nk", normals[places][around], frames[:, 2]) > 0.3
-    coefficients = _fitted(offsets, facing)
+    coefficients = _fit_patches(offsets, facing)
     nearest = tree.query(skin.points)[1]
     u, v, h = np.einsum("nab,nb->an", frames[nearest], skin.points - points[nearest])
-    height = h - (_basis(u, v) * coefficients[nearest]).sum(axis=1)
+    height = h - (_evaluate_basis(u, v) * coefficients[nearest]).sum(axis=1)
     height[cap] = 0.0
     return height
 
 
-def _basis(u: Array, v: Array) -> Array:
+def _evaluate_basis(u: Array, v: Array) -> Array:
     """Quadratic polynomials (..., 6) over a tangent plane, of the order of one 10 mm away."""
     u, v = u / 10, v / 10
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
 
-def _frames(normals: Array) -> Array:
+def _build_frames(normals: Array) -> Array:
     """Two tangents and the normal (n, 3, 3), rows, of normals (n, 3) of any length."""
     normal = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     other = np.eye(3)[np.abs(normal).argmin(axis=1)]
@@ -140,12 +140,12 @@ def _frames(normals: Array) -> Array:
     return np.stack([first, np.cross(normal, first), normal], axis=1)
 
 
-def _fitted(offsets: Array, usable: Mask) -> Array:
+def _fit_patches(offsets: Array, usable: Mask) -> Array:
     """Coefficients (n, 6) of patches over local points (n, k, 3), with Geman and McClure's weights.
 
     The width of the weights shrinks from round to round, so that no start has to be right.
     """
-    design = _basis(offsets[..., 0], offsets[..., 1])
+    design = _evaluate_basis(offsets[..., 0], offsets[..., 1])
     weight = usable.astype(float)
     coefficients = np.zeros((len(offsets), 6))
     for width in np.geomspace(8 * _REJECT_MM, _REJECT_MM, _ROUNDS):
@@ -158,16 +158,16 @@ def _fitted(offsets: Array, usable: Mask) -> Array:
     return coefficients
 
 
-def _patch_under(skin: Surface, normals: Array, marked: Mask, bump: Bump) -> tuple[_Patch, float]:
+def _fit_patch_under_marker(skin: Surface, normals: Array, marked: Mask, bump: Bump) -> tuple[_Patch, float]:
     """The skin under a marker, from the skin around its foot, and the radius of the foot, mm."""
     centre = skin.points[bump.feet].mean(axis=0)
     distance = np.linalg.norm(skin.points - centre, axis=1)
     foot = float(distance[bump.feet].max()) + _AROUND_MM
     near = (distance < foot + _PATCH_MM) & (distance > foot) & ~marked
-    (frame,) = _frames(normals[near].mean(axis=0)[None])
+    (frame,) = _build_frames(normals[near].mean(axis=0)[None])
     near &= normals @ frame[2] > 0.3
     offsets = (skin.points[near] - centre) @ frame.T
-    (coefficients,) = _fitted(offsets[None], np.ones((1, len(offsets)), bool))
+    (coefficients,) = _fit_patches(offsets[None], np.ones((1, len(offsets)), bool))
     return _Patch(centre, frame, coefficients), foot
 
 

@@ -17,8 +17,8 @@ from scipy.sparse.csgraph import connected_components
 
 from ...arrays import Array
 from ...errors import SiteError
-from ..surfaces.search import Search
-from ..surfaces.triangles import Surface, half_edges
+from ..surfaces.search import SurfaceSearch
+from ..surfaces.triangles import Surface, find_half_edges
 
 Indices = NDArray[np.int64]
 
@@ -74,16 +74,16 @@ def find_markers(
     base = _Skin(skin_without)
     height = base.height(skin_with.points)
     height[base.near_cap(skin_with.points)] = 0.0
-    areas = _vertex_areas(skin_with)
+    areas = _compute_vertex_areas(skin_with)
     found = []
-    for bump in bumps(skin_with, height, min_height_mm=min_height_mm, max_area_mm2=max_area_mm2):
+    for bump in find_bumps(skin_with, height, min_height_mm=min_height_mm, max_area_mm2=max_area_mm2):
         weights = areas[bump.upper] * height[bump.upper]
         position, direction = base.foot(skin_with.points[bump.upper], weights)
         found.append(Marker(position, bump.height, bump.area, direction))
     return tuple(sorted(found, key=lambda marker: -marker.height))
 
 
-def bumps(
+def find_bumps(
     surface: Surface,
     height: Array,
     *,
@@ -91,8 +91,8 @@ def bumps(
     max_area_mm2: float = MAX_AREA_MM2,
 ) -> list[Bump]:
     """What stands out high and small enough for a marker; ``height`` (n,) of each vertex, mm."""
-    labels = _clusters(height > min_height_mm / 2, surface.faces)
-    areas = _vertex_areas(surface)
+    labels = _number_clusters(height > min_height_mm / 2, surface.faces)
+    areas = _compute_vertex_areas(surface)
     found = []
     for label in range(labels.max(initial=-1) + 1):
         feet = np.flatnonzero(labels == label)
@@ -124,12 +124,14 @@ def match_markers(
     if not hints:
         return {}
     names = list(hints)
-    distance = _distances(markers, np.array([np.asarray(hints[name], float) for name in names]))
+    distance = _compute_distances(markers, np.array([np.asarray(hints[name], float) for name in names]))
     # A pair beyond reach costs more than any choice of pairs within it, so reach goes before nearness.
     cost = np.where(distance <= max_distance_mm, distance, 1e3 * (1 + max_distance_mm) * len(names))
     rows, columns = linear_sum_assignment(cost)
     pairs = {r: c for r, c in zip(rows, columns, strict=True) if distance[r, c] <= max_distance_mm}
-    faults = [check(names, pairs, distance, max_distance_mm) for check in (_missing, _doubled)]
+    faults = [
+        check(names, pairs, distance, max_distance_mm) for check in (_describe_missing, _describe_spare)
+    ]
     if any(faults):
         raise SiteError(
             "; ".join(filter(None, faults)),
@@ -139,14 +141,14 @@ def match_markers(
     return {names[r]: markers[c] for r, c in pairs.items()}
 
 
-def _distances(markers: Sequence[Marker], hints: Array) -> Array:
+def _compute_distances(markers: Sequence[Marker], hints: Array) -> Array:
     if not markers:
         return np.empty((len(hints), 0))
     positions = np.array([marker.position for marker in markers])
     return np.linalg.norm(hints[:, None] - positions, axis=-1)
 
 
-def _missing(names: list[str], pairs: Mapping[int, int], distance: Array, reach: float) -> str:
+def _describe_missing(names: list[str], pairs: Mapping[int, int], distance: Array, reach: float) -> str:
     """What to say of places without a marker; empty where there are none."""
     missing = [r for r in range(len(names)) if r not in pairs]
     told = [
@@ -156,7 +158,7 @@ def _missing(names: list[str], pairs: Mapping[int, int], distance: Array, reach:
     return f"no marker of its own within {reach:g} mm for {', '.join(told)}" if told else ""
 
 
-def _doubled(names: list[str], pairs: Mapping[int, int], distance: Array, reach: float) -> str:
+def _describe_spare(names: list[str], pairs: Mapping[int, int], distance: Array, reach: float) -> str:
     """What to say of places with a spare marker near them; empty where there are none."""
     spare = np.setdiff1d(np.arange(distance.shape[1]), list(pairs.values()))
     doubled = [names[r] for r in pairs if (distance[r, spare] <= reach).any()]
@@ -171,7 +173,7 @@ class _Skin:
         self.normals, self.areas = surface.face_normals, surface.face_areas
         self.centres = surface.triangles.mean(axis=1)
         self.cap = cap_faces(surface)
-        self.open = Search(surface.points, surface.faces[~self.cap])
+        self.open = SurfaceSearch(surface.points, surface.faces[~self.cap])
 
     def height(self, points: Array) -> Array:
         """Signed distance (n,), positive outside."""
@@ -179,7 +181,7 @@ class _Skin:
 
     def near_cap(self, points: Array) -> NDArray[np.bool_]:
         """Which points (n,) lie beyond the cap's plane or just under it."""
-        return near_cap(self.surface, self.cap, points)
+        return find_near_cap(self.surface, self.cap, points)
 
     def foot(self, points: Array, weights: Array) -> tuple[Array, Array]:
         """Where the weighted centroid of points (n, 3) stands on the skin, and the mean normal around it."""
@@ -209,7 +211,7 @@ def cap_faces(surface: Surface) -> NDArray[np.bool_]:
     return (normals @ normal > 0.98) & (np.abs(centres @ normal - level) < 1.0)
 
 
-def near_cap(surface: Surface, cap: NDArray[np.bool_], points: Array) -> NDArray[np.bool_]:
+def find_near_cap(surface: Surface, cap: NDArray[np.bool_], points: Array) -> NDArray[np.bool_]:
     """Which points (n,) lie beyond the plane of a surface's cap (faces of it) or just under it."""
     if not cap.any():
         return np.zeros(len(points), bool)
@@ -220,9 +222,9 @@ def near_cap(surface: Surface, cap: NDArray[np.bool_], points: Array) -> NDArray
     return points @ normal > level - CAP_MARGIN_MM
 
 
-def _clusters(raised: NDArray[np.bool_], faces: NDArray[np.int64]) -> NDArray[np.int64]:
+def _number_clusters(raised: NDArray[np.bool_], faces: NDArray[np.int64]) -> NDArray[np.int64]:
     """Cluster number (n,) of raised vertices that share edges; -1 elsewhere."""
-    edges = half_edges(faces)
+    edges = find_half_edges(faces)
     edges = edges[raised[edges].all(axis=1)]
     n = len(raised)
     graph = coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(n, n))
@@ -233,7 +235,7 @@ def _clusters(raised: NDArray[np.bool_], faces: NDArray[np.int64]) -> NDArray[np
     return labels
 
 
-def _vertex_areas(surface: Surface) -> Array:
+def _compute_vertex_areas(surface: Surface) -> Array:
     areas = np.zeros(len(surface.points))
     np.add.at(areas, surface.faces, surface.face_areas[:, None] / 3)
     return areas

@@ -35,7 +35,7 @@ def read_markups(path: str | Path) -> dict[str, Array]:
     path = Path(path)
     try:
         lists = json.loads(path.read_text(encoding="utf-8"))["markups"]
-        found = [pair for markup in lists for pair in _points(markup, path)]
+        found = [pair for markup in lists for pair in _read_points(markup, path)]
     except SiteError:
         raise
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -53,7 +53,7 @@ def read_markups(path: str | Path) -> dict[str, Array]:
     return dict(found)
 
 
-def _points(markup: dict[str, Any], path: Path) -> list[tuple[str, Array]]:
+def _read_points(markup: dict[str, Any], path: Path) -> list[tuple[str, Array]]:
     """Label and place of the placed points of one list; points that were only planned are left out."""
     sign = _SIGNS.get(str(markup.get("coordinateSystem")).upper())
     if sign is None:

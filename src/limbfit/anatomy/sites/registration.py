@@ -56,7 +56,7 @@ class LimbMotion:
         return float(np.linalg.norm(self.shift))
 
 
-def limb_motion(image: Volume, moved: Volume, limb: NDArray[np.bool_]) -> LimbMotion:
+def register_limb(image: Volume, moved: Volume, limb: NDArray[np.bool_]) -> LimbMotion:
     """The motion that lays the limb of ``moved`` onto that of ``image``.
 
     Parameters
@@ -72,19 +72,19 @@ def limb_motion(image: Volume, moved: Volume, limb: NDArray[np.bool_]) -> LimbMo
     """
     index = _sample(image, limb)
     points = image.index_to_point(index)
-    image, moved = _coarsen(image), _coarsen(moved)
+    image, moved = _coarsen_volume(image), _coarsen_volume(moved)
     centre = points.mean(axis=0)
     unknowns = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     for sigma in _LEVELS_MM:
-        wanted = _interpolator(image, sigma)(points)
-        value = _interpolator(moved, sigma)
+        wanted = _build_interpolator(image, sigma)(points)
+        value = _build_interpolator(moved, sigma)
         scale = _SOFT * float(np.median(wanted))
 
         def misfit(x: Array, wanted: Array = wanted, value: Callable[[Array], Array] = value) -> Array:
-            return (x[6] * value(_placed(points, centre, x)) - wanted) / scale  # noqa: B023 - used at once
+            return (x[6] * value(_move_points(points, centre, x)) - wanted) / scale  # noqa: B023 - used at once
 
         unknowns = least_squares(misfit, unknowns, loss="soft_l1", diff_step=0.02, xtol=1e-4, ftol=1e-6).x
-    correlation = float(np.corrcoef(wanted, value(_placed(points, centre, unknowns)))[0, 1])
+    correlation = float(np.corrcoef(wanted, value(_move_points(points, centre, unknowns)))[0, 1])
     if not correlation >= _SAME_LIMB:
         raise ImageError(
             f"the images with and without markers do not match (correlation {correlation:.2f})",
@@ -108,17 +108,17 @@ def _sample(image: Volume, limb: NDArray[np.bool_]) -> Array:
     return chosen + random.uniform(-0.5, 0.5, chosen.shape)
 
 
-def _coarsen(volume: Volume) -> Volume:
+def _coarsen_volume(volume: Volume) -> Volume:
     """The means of blocks of voxels that are not larger than 1 mm."""
     factors = np.maximum((_FINEST_MM / volume.spacing).astype(int), 1)
     return Volume.from_sitk(sitk.BinShrink(volume.to_sitk(), factors.tolist()))
 
 
-def _placed(points: Array, centre: Array, unknowns: Array) -> Array:
+def _move_points(points: Array, centre: Array, unknowns: Array) -> Array:
     return Rotation.from_rotvec(unknowns[:3] / _ARM_MM).apply(points - centre) + centre + unknowns[3:6]
 
 
-def _interpolator(volume: Volume, sigma_mm: float) -> Callable[[Array], Array]:
+def _build_interpolator(volume: Volume, sigma_mm: float) -> Callable[[Array], Array]:
     """The smoothed image as a function of points (n, 3); thinned to steps that still carry it."""
     smooth = gaussian_filter(volume.array, sigma_mm / volume.spacing[::-1])
     steps = np.maximum((sigma_mm / volume.spacing).astype(int), 1)

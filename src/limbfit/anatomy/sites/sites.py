@@ -40,7 +40,7 @@ def project_to_skin(anatomy: Anatomy, position: ArrayLike, name: str | None = No
     return np.asarray(nearest[0], dtype=float), distance
 
 
-def thinnest_tissue(anatomy: Anatomy, bone: str) -> tuple[float, Array]:
+def find_thinnest_tissue(anatomy: Anatomy, bone: str) -> tuple[float, Array]:
     """Least distance (mm) from a bone to the skin, and where it is on the bone (3,); the cut is no skin."""
     skin, points = anatomy.skin, anatomy.bones[bone].points
     open_faces = skin.faces[(np.abs(anatomy.height(skin.points)) > _ON_CUT_MM)[skin.faces].any(axis=1)]
@@ -50,7 +50,9 @@ def thinnest_tissue(anatomy: Anatomy, bone: str) -> tuple[float, Array]:
     return float(np.sqrt(squared[least])), inner[least]
 
 
-def indenter_axis(skin: Surface, position: ArrayLike, width: float, edge: ArrayLike | None = None) -> Array:
+def compute_indenter_axis(
+    skin: Surface, position: ArrayLike, width: float, edge: ArrayLike | None = None
+) -> Array:
     """The unit inward axis (3,): the area-weighted mean inward normal of the skin under a square footprint.
 
     Parameters
@@ -66,19 +68,19 @@ def indenter_axis(skin: Surface, position: ArrayLike, width: float, edge: ArrayL
         When no skin lies under the footprint.
     """
     centre = np.asarray(position, dtype=float)
-    points, normals = _samples(skin, centre, width)
+    points, normals = _sample_faces(skin, centre, width)
     face = skin.search.nearest(centre[None])[1]
-    axis = _unit(-_area_vectors(skin.points[skin.faces[face]])[0])
+    axis = _normalise(-_compute_area_vectors(skin.points[skin.faces[face]])[0])
     for _ in range(AXIS_STEPS):
-        across = square_edges(axis, edge) @ (points - centre).T
+        across = compute_square_edges(axis, edge) @ (points - centre).T
         under = (np.abs(across) <= width / 2).all(axis=0) & (normals @ axis < 0)
         if not under.any():
             raise SiteError("no skin lies under the indenter", remedy="check the site's position")
-        axis = _unit(-normals[under].sum(axis=0))
+        axis = _normalise(-normals[under].sum(axis=0))
     return axis
 
 
-def square_edges(axis: Array, edge: ArrayLike | None = None) -> Array:
+def compute_square_edges(axis: Array, edge: ArrayLike | None = None) -> Array:
     """The two unit edge directions (2, 3) of a square indenter, both normal to its axis.
 
     Without ``edge``, the first is the cross product of axis and z, or of axis and x where axis is z.
@@ -92,33 +94,33 @@ def square_edges(axis: Array, edge: ArrayLike | None = None) -> Array:
         raise SiteError(
             "edge is parallel to the axis", remedy="give a direction along one edge of the square"
         )
-    first = _unit(first)
+    first = _normalise(first)
     return np.array([first, np.cross(axis, first)])
 
 
-def _samples(skin: Surface, centre: Array, width: float) -> tuple[Array, Array]:
+def _sample_faces(skin: Surface, centre: Array, width: float) -> tuple[Array, Array]:
     """Centroids and area vectors of small pieces of the faces near a footprint."""
     corners, fine = skin.points[skin.faces], []
     while len(corners):
         edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
         close = np.linalg.norm(corners.mean(axis=1) - centre, axis=1) - edges < width
         fine.append(corners[close & (edges <= SAMPLE_EDGE_MM)])
-        corners = _quartered(corners[close & (edges > SAMPLE_EDGE_MM)])
+        corners = _split_in_four(corners[close & (edges > SAMPLE_EDGE_MM)])
     corners = np.concatenate(fine)
     near = np.linalg.norm(corners.mean(axis=1) - centre, axis=1) < width
-    return corners[near].mean(axis=1), _area_vectors(corners[near])
+    return corners[near].mean(axis=1), _compute_area_vectors(corners[near])
 
 
-def _quartered(corners: Array) -> Array:
+def _split_in_four(corners: Array) -> Array:
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
     return np.concatenate([np.stack(part, axis=1) for part in parts])
 
 
-def _area_vectors(corners: Array) -> Array:
+def _compute_area_vectors(corners: Array) -> Array:
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
 
 
-def _unit(vector: Array) -> Array:
+def _normalise(vector: Array) -> Array:
     return vector / np.linalg.norm(vector)

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..surfaces.surfaces import Anatomy
-from .sites import Array, square_edges
+from .sites import Array, compute_square_edges
 
 DEEPEST_MM = 40.0  # beyond it, bone no longer stiffens what is felt
 _TICKS = np.linspace(-0.5, 0.5, 5)
 
 
-def tissue_under(anatomy: Anatomy, position: ArrayLike, axis: ArrayLike, width: float) -> float:
+def measure_tissue_under(anatomy: Anatomy, position: ArrayLike, axis: ArrayLike, width: float) -> float:
     """Least distance (mm) along the axis from the skin to a bone under a square footprint, at most 40.
 
     Parameters
@@ -22,21 +22,21 @@ def tissue_under(anatomy: Anatomy, position: ArrayLike, axis: ArrayLike, width: 
     width : side of the square, mm.
     """
     centre, direction = np.asarray(position, dtype=float), np.asarray(axis, dtype=float)
-    along, across = square_edges(direction)
+    along, across = compute_square_edges(direction)
     u, v = np.meshgrid(width * _TICKS, width * _TICKS)
     # From outside: at its edges the footprint may lie off a curved skin.
     starts = centre + u.reshape(-1, 1) * along + v.reshape(-1, 1) * across - width * direction
-    skin = _first_hits(starts, direction, anatomy.skin.points[anatomy.skin.faces])
+    skin = _find_first_hits(starts, direction, anatomy.skin.points[anatomy.skin.faces])
     least = DEEPEST_MM
     for bone in anatomy.bones.values():
-        hits = _first_hits(starts, direction, bone.points[bone.faces])
+        hits = _find_first_hits(starts, direction, bone.points[bone.faces])
         through = np.isfinite(hits) & np.isfinite(skin) & (hits > skin)
         depth = hits[through] - skin[through]
         least = min(least, float(depth.min(initial=least)))
     return least
 
 
-def _first_hits(starts: Array, direction: Array, triangles: Array) -> Array:
+def _find_first_hits(starts: Array, direction: Array, triangles: Array) -> Array:
     """Distance (n,) along one direction from each start to the nearest triangle (m, 3, 3); inf for none.
 
     Möller and Trumbore 1997.

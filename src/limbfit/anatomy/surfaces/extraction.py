@@ -18,7 +18,7 @@ from scipy.ndimage import binary_fill_holes, gaussian_filter
 from ...errors import LabelError
 from ..grid import Grid, LabelMap, Volume
 from ..morphology import compute_distance, find_box, find_largest_piece
-from .triangles import Surface, bodies, from_pyvista, half_edges, self_intersections
+from .triangles import Surface, find_bodies, find_half_edges, find_self_intersections, from_pyvista
 
 Mask = NDArray[np.bool_]
 Field = NDArray[np.float32]
@@ -51,20 +51,20 @@ def extract_surface(labels: LabelMap, which: str | None, edge_mm: float = 3.0) -
     LabelError
         Where there is nothing to extract.
     """
-    fine = fine_surface(labels, which, edge_mm)
-    return untangled(keep_volume(untangled(remesh(fine, edge_mm)), fine.volume))
+    fine = extract_fine_surface(labels, which, edge_mm)
+    return untangle_surface(keep_volume(untangle_surface(remesh(fine, edge_mm)), fine.volume))
 
 
-def fine_surface(labels: LabelMap, which: str | None, edge_mm: float) -> Surface:
+def extract_fine_surface(labels: LabelMap, which: str | None, edge_mm: float) -> Surface:
     """The same surface with the many uneven triangles of marching cubes, for cutting and remeshing."""
     mask = labels.limb if which is None else labels.mask(which)
-    body, crop = _body(mask, labels, which or "limb")
+    body, crop = _select_body(mask, labels, which or "limb")
     field, level = smooth_field(body, crop, edge_mm)
-    fine = _smooth(_contour(field, level), *(_TAUBIN_SKIN if which is None else _TAUBIN_BONE))
+    fine = _smooth(_extract_isosurface(field, level), *(_TAUBIN_SKIN if which is None else _TAUBIN_BONE))
     return keep_volume(fine, float(body.sum()) * crop.voxel_mm3)
 
 
-def _body(mask: Mask, grid: Grid, name: str) -> tuple[Mask, Grid]:
+def _select_body(mask: Mask, grid: Grid, name: str) -> tuple[Mask, Grid]:
     """The largest connected body without inner holes, cropped with a margin of empty voxels."""
     if not mask.any():
         raise LabelError(f"no voxel is labelled {name!r}")
@@ -81,25 +81,25 @@ def _body(mask: Mask, grid: Grid, name: str) -> tuple[Mask, Grid]:
 
 def smooth_field(body: Mask, grid: Grid, edge_mm: float) -> tuple[Volume, float]:
     """Smoothed signed distance (mm, positive inside) on cubic voxels, and the level that keeps the volume."""
-    distance = signed_distance_to(body, grid)
+    distance = compute_signed_distance_to(body, grid)
     smooth = Volume(
         gaussian_filter(distance, _SIGMA_VOXELS, mode="nearest"), grid.spacing, grid.origin, grid.direction
     )
-    cubic = _cubic(smooth, edge_mm)
+    cubic = _resample_cubic(smooth, edge_mm)
     wanted = round(float(body.sum()) * grid.voxel_mm3 / cubic.voxel_mm3)
     values = cubic.array.ravel()
     place = len(values) - min(wanted, len(values) - 1)
     return cubic, float(np.partition(values, place)[place])
 
 
-def signed_distance_to(body: Mask, grid: Grid) -> Field:
+def compute_signed_distance_to(body: Mask, grid: Grid) -> Field:
     """Distance of each voxel to the nearest one on the other side, mm, positive inside, clamped."""
     reach = 3 * grid.spacing.max()
     inside, outside = (compute_distance(mask, grid.spacing) for mask in (~body, body))
     return np.minimum(inside, reach, out=inside) - np.minimum(outside, reach, out=outside)
 
 
-def _cubic(field: Volume, edge_mm: float) -> Volume:
+def _resample_cubic(field: Volume, edge_mm: float) -> Volume:
     """The field on cubic voxels fine enough for triangles of ``edge_mm``."""
     h = edge_mm / 2.5
     size = np.floor((np.array(field.size) - 1) * field.spacing / h).astype(int) + 1
@@ -117,14 +117,14 @@ def _cubic(field: Volume, edge_mm: float) -> Volume:
     return Volume.from_sitk(resampled)
 
 
-def _contour(field: Volume, level: float) -> Surface:
+def _extract_isosurface(field: Volume, level: float) -> Surface:
     """The isosurface in LPS mm, outward; its largest body."""
     image = pv.ImageData(dimensions=field.size)
     image.point_data["distance"] = field.array.ravel()
     found = from_pyvista(
         image.contour([level], scalars="distance", method="flying_edges", compute_normals=False)
     )
-    surface = bodies(Surface(field.index_to_point(found.points), found.faces))[0]
+    surface = find_bodies(Surface(field.index_to_point(found.points), found.faces))[0]
     return surface if surface.volume > 0 else surface.flipped
 
 
@@ -152,15 +152,15 @@ def remesh(
     return Surface(points, faces)
 
 
-def untangled(surface: Surface, share: float = 0.5) -> Surface:
+def untangle_surface(surface: Surface, share: float = 0.5) -> Surface:
     """Without faces that cross: their points go a share of the way to their neighbours' mean, until none do.
 
     Remeshing folds a few triangles where a bone is hardly thicker than they are long, as at a patella's rim.
     What still crosses after that is left to the check of the anatomy.
     """
-    edges = half_edges(surface.faces)
+    edges = find_half_edges(surface.faces)
     for _ in range(_MOST_RELAXED):
-        crossing = self_intersections(surface)
+        crossing = find_self_intersections(surface)
         if not len(crossing):
             break
         moved = np.unique(surface.faces[np.unique(crossing)])

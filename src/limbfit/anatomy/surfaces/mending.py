@@ -22,9 +22,9 @@ from scipy.sparse.csgraph import connected_components
 
 from ...arrays import Array
 from ...errors import SurfaceError
-from .extraction import untangled
+from .extraction import untangle_surface
 from .surfaces import Anatomy, check_anatomy
-from .triangles import Surface, bodies, from_pyvista, half_edges, self_intersections
+from .triangles import Surface, find_bodies, find_half_edges, find_self_intersections, from_pyvista
 
 Ints = NDArray[np.int64]
 
@@ -53,7 +53,7 @@ class Cap:
 
 
 @dataclass(frozen=True)
-class Mended:
+class RepairReport:
     """A surface after mending, the cap of its open end if it had one, and what was done, in words."""
 
     surface: Surface
@@ -61,7 +61,7 @@ class Mended:
     notes: tuple[str, ...]
 
 
-def mended(surface: Surface, name: str, file: Path | None = None) -> Mended:
+def repair_surface(surface: Surface, name: str, file: Path | None = None) -> RepairReport:
     """A surface whose faces look outward, without loose pieces and small holes, its one open end capped.
 
     Few crossing faces are smoothed.
@@ -73,7 +73,7 @@ def mended(surface: Surface, name: str, file: Path | None = None) -> Mended:
     SurfaceError
         For more than one open loop of notable size, or one whose outline crosses itself.
     """
-    surface, loose = _without_loose(surface, name)
+    surface, loose = _remove_loose_pieces(surface, name)
     surface, turned = orient_outward(surface, name)
     notes = loose + turned
     loops = open_loops(surface)
@@ -87,23 +87,23 @@ def mended(surface: Surface, name: str, file: Path | None = None) -> Mended:
             remedy="close all but the proximal end",
         )
     for loop in small:
-        surface, area = _filled(surface, loop)
+        surface, area = _fill_hole(surface, loop)
         where = _place(surface.points[loop].mean(axis=0))
         notes += (f"{name}: a hole of {len(loop)} edges at {where} filled, {area:.1f} mm2",)
-    surface, crossing = _uncrossed(surface, name)
+    surface, crossing = _smooth_crossings(surface, name)
     notes += crossing
     if not large:
-        return Mended(surface, None, notes)
+        return RepairReport(surface, None, notes)
     rim = surface.points[large[0]]
-    surface, cap, area = _capped(surface, rim, name, file)
+    surface, cap, area = _cap_open_end(surface, rim, name, file)
     note = (
         f"{name}: open at one end, cut flat {np.ptp(rim @ cap.normal) + INSIDE_MM:.1f} mm below its highest "
         f"edge and closed by a cap at {_place(cap.outline.mean(axis=0))}, {area:.0f} mm2"
     )
-    return Mended(surface, cap, (*notes, note))
+    return RepairReport(surface, cap, (*notes, note))
 
 
-def closed_anatomy(
+def build_closed_anatomy(
     skin: Surface,
     bones: Mapping[str, Surface],
     cut: tuple[ArrayLike, ArrayLike] | None = None,
@@ -124,31 +124,35 @@ def closed_anatomy(
         For a surface that cannot be mended, or an anatomy that :func:`check_anatomy` refuses.
     """
     files = files or {}
-    outer = mended(skin, "skin", files.get("skin"))
-    inner = {name: mended(bone, name, files.get(name)) for name, bone in bones.items()}
+    outer = repair_surface(skin, "skin", files.get("skin"))
+    inner = {name: repair_surface(bone, name, files.get(name)) for name, bone in bones.items()}
     found: tuple[str, ...] = ()
     if cut is None:
-        cut, found = _default_cut(outer, list(inner.values()))
+        cut, found = _choose_default_cut(outer, list(inner.values()))
     closed = {name: part.surface for name, part in inner.items()}
     anatomy = Anatomy(outer.surface, closed, np.asarray(cut[0]), np.asarray(cut[1]))
     check_anatomy(anatomy, files)
     return anatomy, (*(note for part in (outer, *inner.values()) for note in part.notes), *found)
 
 
-def _default_cut(skin: Mended, bones: Sequence[Mended]) -> tuple[tuple[Array, Array], tuple[str, ...]]:
+def _choose_default_cut(
+    skin: RepairReport, bones: Sequence[RepairReport]
+) -> tuple[tuple[Array, Array], tuple[str, ...]]:
     """Point and normal below all caps at the proximal end, so that bones stick out of it; notes on it."""
-    if skin.cap is None or _area(skin.cap.outline) < END_SHARE * skin.surface.area:
-        return _closed_cut(skin.surface, [bone.surface for bone in bones])
+    if skin.cap is None or _compute_area(skin.cap.outline) < END_SHARE * skin.surface.area:
+        return _choose_closed_cut(skin.surface, [bone.surface for bone in bones])
     normal, middle = skin.cap.normal, skin.cap.outline.mean(axis=0)
     caps = [bone.cap for bone in bones if bone.cap is not None and bone.cap.normal @ normal > 0]
     heights = [((cap.outline - middle) @ normal).min() for cap in (skin.cap, *caps)]
     return (middle + (min(h for h in heights if h > -PROXIMAL_MM) - BELOW_MM) * normal, normal), ()
 
 
-def _closed_cut(skin: Surface, bones: Sequence[Surface]) -> tuple[tuple[Array, Array], tuple[str, ...]]:
+def _choose_closed_cut(
+    skin: Surface, bones: Sequence[Surface]
+) -> tuple[tuple[Array, Array], tuple[str, ...]]:
     """The plane of a closed skin's one flat end (of several: of the one that bones reach out of), or its
     highest (z)."""
-    ends = flat_ends(skin)
+    ends = find_flat_ends(skin)
     beyond = [
         (point, normal)
         for point, normal in ends
@@ -165,10 +169,10 @@ def _closed_cut(skin: Surface, bones: Sequence[Surface]) -> tuple[tuple[Array, A
     return (point, normal), (note,)
 
 
-def flat_ends(surface: Surface) -> list[tuple[Array, Array]]:
+def find_flat_ends(surface: Surface) -> list[tuple[Array, Array]]:
     """Point and outward unit normal of planes that hold a notable part of a surface, the rest behind."""
     normals, areas, middles = surface.face_normals, surface.face_areas, surface.triangles.mean(axis=1)
-    edges = np.sort(half_edges(surface.faces), axis=1)
+    edges = np.sort(find_half_edges(surface.faces), axis=1)
     order = np.lexsort(edges.T)
     same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
     one, other = order[:-1][same] % len(areas), order[1:][same] % len(areas)
@@ -211,7 +215,7 @@ def count_turned(before: Surface, after: Surface) -> int:
 
 def _has_turned(faces: Ints) -> bool:
     """True where two faces run along an edge in the same direction."""
-    edges = half_edges(faces)
+    edges = find_half_edges(faces)
     return len(np.unique(edges, axis=0)) < len(edges)
 
 
@@ -219,9 +223,9 @@ def _place(point: Array) -> str:
     return "(" + ", ".join(f"{x:.1f}" for x in point) + ") mm"
 
 
-def _without_loose(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
+def _remove_loose_pieces(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
     """Without small open pieces beside the largest body; a small closed one may be meant and stays."""
-    main, *others = bodies(surface)
+    main, *others = find_bodies(surface)
     few = LOOSE_SHARE * len(surface.faces)
     loose = [part for part in others if len(part.faces) < few and len(open_edges(part))]
     if not loose:
@@ -236,7 +240,7 @@ def _without_loose(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...
 
 def open_edges(surface: Surface) -> Ints:
     """(k, 2) directed edges of the faces that no other face shares."""
-    edges = half_edges(surface.faces)
+    edges = find_half_edges(surface.faces)
     _, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     return edges[counts[inverse.ravel()] == 1]
 
@@ -267,21 +271,21 @@ def _is_small(surface: Surface, loop: Ints) -> bool:
     points = surface.points[loop]
     if np.linalg.norm(np.ptp(points, axis=0)) <= SMALL_MM:
         return True
-    return len(loop) <= FEW_EDGES and _area(points) < FEW_SHARE * surface.area
+    return len(loop) <= FEW_EDGES and _compute_area(points) < FEW_SHARE * surface.area
 
 
-def _area_vector(loop: Array) -> Array:
+def _compute_area_vector(loop: Array) -> Array:
     """Of what a loop (n, 3) spans, mm2, against the sense of its faces: it points out of the body."""
     spokes = loop - loop.mean(axis=0)
     return np.asarray(-0.5 * np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0))
 
 
-def _area(loop: Array) -> float:
+def _compute_area(loop: Array) -> float:
     """What a loop (n, 3) spans, mm2."""
-    return float(np.linalg.norm(_area_vector(loop)))
+    return float(np.linalg.norm(_compute_area_vector(loop)))
 
 
-def _filled(surface: Surface, loop: Ints) -> tuple[Surface, float]:
+def _fill_hole(surface: Surface, loop: Ints) -> tuple[Surface, float]:
     """A small hole closed, by one triangle or a fan about its middle; the area of the fan (mm2)."""
     points, back = surface.points, loop[::-1]
     if len(loop) == 3:
@@ -294,17 +298,19 @@ def _filled(surface: Surface, loop: Ints) -> tuple[Surface, float]:
     return Surface(points, np.vstack([surface.faces, fan])), area
 
 
-def _capped(surface: Surface, rim: Array, name: str, file: Path | None) -> tuple[Surface, Cap, float]:
+def _cap_open_end(surface: Surface, rim: Array, name: str, file: Path | None) -> tuple[Surface, Cap, float]:
     """Cut off just inside an open end with the points ``rim`` and closed there; the area of the cap (mm2)."""
-    vector = _area_vector(rim)
+    vector = _compute_area_vector(rim)
     normal = vector / np.linalg.norm(vector)
     point = rim.mean(axis=0)
     point = point + (((rim - point) @ normal).min() - INSIDE_MM) * normal
     cut = surface.to_pyvista().clip(normal=normal, origin=point).extract_surface(algorithm="dataset_surface")
-    body = bodies(from_pyvista(cut.triangulate().clean(tolerance=JOIN_MM, absolute=True).triangulate()))[0]
+    body = find_bodies(from_pyvista(cut.triangulate().clean(tolerance=JOIN_MM, absolute=True).triangulate()))[
+        0
+    ]
     loops = open_loops(body)
-    flat = _triangulated(body.points[loops[0]][::-1], normal) if len(loops) == 1 else None
-    if flat is None or Surface(body.points, loops[0][::-1][flat]).area > WIDENED * _area(rim):
+    flat = _triangulate_polygon(body.points[loops[0]][::-1], normal) if len(loops) == 1 else None
+    if flat is None or Surface(body.points, loops[0][::-1][flat]).area > WIDENED * _compute_area(rim):
         raise SurfaceError(
             f"{name}: its open end at {_place(rim.mean(axis=0))} cannot be closed by a plane",
             file=file,
@@ -316,26 +322,26 @@ def _capped(surface: Surface, rim: Array, name: str, file: Path | None) -> tuple
     return Surface(body.points, np.vstack([body.faces, faces])), cap, area
 
 
-def _triangulated(polygon: Array, normal: Array) -> Ints | None:
+def _triangulate_polygon(polygon: Array, normal: Array) -> Ints | None:
     """Triangles (n - 2, 3) that fill a flat polygon (n, 3), seen from ``normal``; None where none do."""
     along = np.linalg.svd(normal[None])[2][1]
     flat = polygon @ np.column_stack([along, np.cross(normal, along)])
     faces = manifold3d.triangulate([flat]).astype(np.int64)
     # Of a simple outline the triangles' areas add up to that of the outline.
-    if not np.isclose(Surface(polygon, faces).area, np.linalg.norm(_area_vector(polygon)), rtol=1e-6):
+    if not np.isclose(Surface(polygon, faces).area, np.linalg.norm(_compute_area_vector(polygon)), rtol=1e-6):
         return None
     return faces
 
 
-def _uncrossed(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
+def _smooth_crossings(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
     """A few crossing faces smoothed apart; a surface that crosses itself more is left as it is."""
-    crossing = self_intersections(surface)
+    crossing = find_self_intersections(surface)
     if not 0 < len(crossing) <= MOST_CROSSING:
         return surface, ()
     for share in (GENTLE, FIRM):
-        smooth = untangled(surface, share)
+        smooth = untangle_surface(surface, share)
         moved = np.linalg.norm(smooth.points - surface.points, axis=1).max()
-        if moved <= MOST_SMOOTHED_MM and not len(self_intersections(smooth)):
+        if moved <= MOST_SMOOTHED_MM and not len(find_self_intersections(smooth)):
             break
     else:
         return surface, ()

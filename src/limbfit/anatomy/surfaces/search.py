@@ -13,7 +13,7 @@ from ...arrays import Array
 Ints = NDArray[np.int64]
 
 
-class Search:
+class SurfaceSearch:
     """The trees of a surface: ``points`` (n, 3) mm and ``faces`` (m, 3), which must not change any more."""
 
     def __init__(self, points: Array, faces: Ints) -> None:
@@ -21,7 +21,7 @@ class Search:
 
     def nearest(self, points: ArrayLike) -> tuple[Array, Ints, Array]:
         """Squared distance (k,) of points (k, 3), mm^2, the nearest face (k,), and where on it (k, 3)."""
-        query = _query(points)
+        query = _to_query(points)
         if not len(query):
             return np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, 3))
         squared, face, foot = self._boxes.squared_distance(*self._surface, query)
@@ -36,7 +36,7 @@ class Search:
         squared, face, foot = self.nearest(points)
         if not len(face):
             return squared, face, foot
-        inside = self._windings.winding_number(_query(points)) > 0.5
+        inside = self._windings.winding_number(_to_query(points)) > 0.5
         return np.where(inside, -1.0, 1.0) * np.sqrt(squared), face, foot
 
     @cached_property
@@ -52,5 +52,5 @@ class Search:
         return tree
 
 
-def _query(points: ArrayLike) -> Array:
+def _to_query(points: ArrayLike) -> Array:
     return np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)

@@ -16,7 +16,7 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from ...errors import SurfaceError
 from ...mesh import silent_vtk
 from ..bounds import check_items
-from .triangles import Surface, compacted, from_pyvista
+from .triangles import Surface, from_pyvista, remove_unused_points
 
 SUFFIXES = (".stl", ".ply", ".vtp", ".obj")
 UNITS_MM: Mapping[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
@@ -53,7 +53,7 @@ def read_surface(
     surface = from_pyvista(poly.triangulate())
     if not np.all(np.isfinite(surface.points)):
         raise SurfaceError("points that are not numbers", file=path, remedy="export the surface again")
-    stated = _stated_space(path, poly)
+    stated = _read_stated_space(path, poly)
     if coordinates and stated and coordinates != stated:
         raise SurfaceError(
             f"the file says that it is in {stated}, the study says {coordinates}",
@@ -61,10 +61,10 @@ def read_surface(
             remedy=f"correct {key}, or export the surface again",
         )
     sign = np.array([-1.0, -1.0, 1.0]) if (coordinates or stated) == "RAS" else np.ones(3)
-    return _merged(Surface(surface.points * sign * UNITS_MM[unit], surface.faces))
+    return _merge_points(Surface(surface.points * sign * UNITS_MM[unit], surface.faces))
 
 
-def _stated_space(path: Path, poly: pv.PolyData) -> str | None:
+def _read_stated_space(path: Path, poly: pv.PolyData) -> str | None:
     """``LPS`` or ``RAS`` where the file says so as 3D Slicer does: SPACE in its header or field data."""
     if "SPACE" in poly.field_data:
         text = str(poly.field_data["SPACE"][0])
@@ -107,12 +107,12 @@ def _read_ply(path: Path) -> pv.PolyData:
     return pv.PolyData(found.points.astype(float), np.concatenate(faces))
 
 
-def _merged(surface: Surface) -> Surface:
+def _merge_points(surface: Surface) -> Surface:
     """One point where several coincide exactly (STL repeats them), without faces that collapse."""
     points, inverse = np.unique(surface.points, axis=0, return_inverse=True)
     faces = inverse.ravel()[surface.faces]
     a, b, c = faces.T
-    return compacted(Surface(points, faces[(a != b) & (b != c) & (c != a)]))
+    return remove_unused_points(Surface(points, faces[(a != b) & (b != c) & (c != a)]))
 
 
 def write_surface(path: str | Path, surface: Surface) -> None:

@@ -17,31 +17,31 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...arrays import Array
 from ...errors import LabelError, SurfaceError
-from ..ends import ProximalEnd, layer, proximal_end
+from ..ends import ProximalEnd, find_proximal_end, select_layer
 from ..grid import LabelMap
-from .extraction import extract_surface, fine_surface, remesh
+from .extraction import extract_fine_surface, extract_surface, remesh
 from .surfacefiles import read_surface, write_surface
 from .triangles import (
     Surface,
-    bodies,
     check_closed,
+    find_bodies,
+    find_half_edges,
+    find_self_intersections,
     from_pyvista,
-    half_edges,
-    self_intersections,
 )
 
 __all__ = [
     "Anatomy",
     "Surface",
-    "bodies",
     "build_anatomy",
     "check_anatomy",
     "check_closed",
     "extract_surface",
+    "find_bodies",
+    "find_self_intersections",
     "load_anatomy",
     "read_surface",
     "save_anatomy",
-    "self_intersections",
     "write_surface",
 ]
 
@@ -77,7 +77,7 @@ class Anatomy:
     regions: Mapping[str, Surface] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        point, normal = _plane(self.cut_point, self.cut_normal)
+        point, normal = _normalise_plane(self.cut_point, self.cut_normal)
         object.__setattr__(self, "cut_normal", normal)
         object.__setattr__(self, "cut_point", point)
 
@@ -109,20 +109,24 @@ def build_anatomy(
     """
     labels = labels.nearest_lps()
     if proximal_cut is None:
-        end = proximal_end(labels.limb, labels)
-        point, normal = _default_cut(labels, end)
+        end = find_proximal_end(labels.limb, labels)
+        point, normal = _choose_default_cut(labels, end)
     else:
-        point, normal = _plane(*proximal_cut)  # a short limb may be wider than long: the cut tells its axis
-        end = proximal_end(labels.limb, labels, int(np.abs(normal @ labels.direction).argmax()))
+        point, normal = _normalise_plane(
+            *proximal_cut
+        )  # a short limb may be wider than long: the cut tells its axis
+        end = find_proximal_end(labels.limb, labels, int(np.abs(normal @ labels.direction).argmax()))
     own_point = np.round(labels.direction.T @ (point - labels.origin), 4)
     own_normal = np.round(labels.direction.T @ normal, 6)
-    built = _built(labels.in_own_frame(), end, edge_mm, own_point, own_normal / np.linalg.norm(own_normal))
+    built = _build_anatomy(
+        labels.in_own_frame(), end, edge_mm, own_point, own_normal / np.linalg.norm(own_normal)
+    )
     bones, regions = (
-        {name: _placed(body, labels) for name, body in bodies.items()}
+        {name: _to_patient_space(body, labels) for name, body in bodies.items()}
         for bodies in (built.bones, built.regions)
     )
     return Anatomy(
-        _placed(built.skin, labels),
+        _to_patient_space(built.skin, labels),
         bones,
         labels.direction @ built.cut_point + labels.origin,
         labels.direction @ built.cut_normal,
@@ -130,17 +134,19 @@ def build_anatomy(
     )
 
 
-def _placed(surface: Surface, grid: LabelMap) -> Surface:
+def _to_patient_space(surface: Surface, grid: LabelMap) -> Surface:
     """A surface in the own frame of a right-handed grid, in patient space."""
     return Surface(surface.points @ grid.direction.T + grid.origin, surface.faces)
 
 
-def _built(labels: LabelMap, end: ProximalEnd, edge_mm: float, point: Array, normal: Array) -> Anatomy:
-    extended = _extended(labels, end, _STICK_OUT_MM + _CUT_INSIDE_MM + 2 * edge_mm)
+def _build_anatomy(
+    labels: LabelMap, end: ProximalEnd, edge_mm: float, point: Array, normal: Array
+) -> Anatomy:
+    extended = _extend_labels(labels, end, _STICK_OUT_MM + _CUT_INSIDE_MM + 2 * edge_mm)
     distal = labels.heights(point, normal) < 0
     _check_sides(labels.limb & distal, end)
-    skin = capped(fine_surface(extended, None, edge_mm), point, normal, edge_mm)
-    reach = _within(extended, point + _STICK_OUT_MM * normal, normal)
+    skin = cut_and_cap(extract_fine_surface(extended, None, edge_mm), point, normal, edge_mm)
+    reach = _select_distal(extended, point + _STICK_OUT_MM * normal, normal)
     bones = {}
     for name in labels.bone_names:
         if (labels.mask(name) & distal).sum() * labels.voxel_mm3 >= _STUMP_MM3:
@@ -157,14 +163,14 @@ def _built(labels: LabelMap, end: ProximalEnd, edge_mm: float, point: Array, nor
     return Anatomy(skin, bones, point, normal, regions)
 
 
-def _default_cut(labels: LabelMap, end: ProximalEnd) -> tuple[Array, Array]:
+def _choose_default_cut(labels: LabelMap, end: ProximalEnd) -> tuple[Array, Array]:
     """A little inside the outer face of the last layer."""
     index = (np.array(labels.size) - 1) / 2
     index[end.axis] = end.layer + end.side * (0.5 - _CUT_INSIDE_MM / labels.spacing[end.axis])
     return labels.index_to_point(index), end.direction(labels)
 
 
-def _extended(labels: LabelMap, end: ProximalEnd, length_mm: float) -> LabelMap:
+def _extend_labels(labels: LabelMap, end: ProximalEnd, length_mm: float) -> LabelMap:
     """The map with the layer at the end repeated outward, as if the limb went on."""
     count = int(np.ceil(length_mm / labels.spacing[end.axis]))
     keep = slice(end.layer, None) if end.side < 0 else slice(None, end.layer + 1)
@@ -176,7 +182,7 @@ def _extended(labels: LabelMap, end: ProximalEnd, length_mm: float) -> LabelMap:
     return replace(labels, array=np.pad(kept, pad, mode="edge"), origin=labels.index_to_point(start))
 
 
-def _plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
+def _normalise_plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
     vector = np.asarray(normal, dtype=float)
     length = float(np.linalg.norm(vector))
     if length == 0:
@@ -190,19 +196,19 @@ def _check_sides(limb: NDArray[np.bool_], end: ProximalEnd) -> None:
         if axis == end.axis:
             continue
         for index in (0, -1):
-            if layer(limb, axis, index).sum() > 20:
+            if select_layer(limb, axis, index).sum() > 20:
                 raise LabelError(
                     "the limb runs out of the side of the image",
                     remedy="take an image that holds the whole limb, or move the proximal cut",
                 )
 
 
-def _within(labels: LabelMap, point: Array, normal: Array) -> LabelMap:
+def _select_distal(labels: LabelMap, point: Array, normal: Array) -> LabelMap:
     """Only what lies distal of a plane."""
     return labels.with_array(np.where(labels.heights(point, normal) <= 0, labels.array, 0))
 
 
-def capped(surface: Surface, point: Array, normal: Array, edge_mm: float) -> Surface:
+def cut_and_cap(surface: Surface, point: Array, normal: Array, edge_mm: float) -> Surface:
     """The part distal of the plane, closed by a flat cap with a sharp rim, in even triangles."""
     heights = (surface.points - point) @ normal
     if heights.min() >= 0 or heights.max() <= 0:
@@ -210,15 +216,15 @@ def capped(surface: Surface, point: Array, normal: Array, edge_mm: float) -> Sur
     even = remesh(surface, edge_mm, passes=_PASSES_BEFORE)
     cut = even.to_pyvista().clip_closed_surface(normal=-normal, origin=point, tolerance=1e-6)
     joined = pv.PolyData(cut).triangulate().clean(tolerance=_JOIN_MM, absolute=True).triangulate()
-    whole = bodies(from_pyvista(joined))[0]
-    return remesh(whole, edge_mm, _rim(whole, point, normal), _PASSES_AFTER)
+    whole = find_bodies(from_pyvista(joined))[0]
+    return remesh(whole, edge_mm, _find_rim(whole, point, normal), _PASSES_AFTER)
 
 
-def _rim(surface: Surface, point: Array, normal: Array) -> NDArray[np.int64]:
+def _find_rim(surface: Surface, point: Array, normal: Array) -> NDArray[np.int64]:
     """(n, 2) edges between the flat cap and the rest."""
     on_plane = np.abs((surface.points - point) @ normal) < _JOIN_MM
     in_cap = np.tile(on_plane[surface.faces].all(axis=1), 3)
-    edges = np.sort(half_edges(surface.faces), axis=1)
+    edges = np.sort(find_half_edges(surface.faces), axis=1)
     both, counts = np.unique(
         np.concatenate([np.unique(edges[in_cap], axis=0), np.unique(edges[~in_cap], axis=0)]),
         axis=0,
@@ -257,7 +263,7 @@ def _check_region(anatomy: Anatomy, name: str, file: Path | None) -> None:
             place=place,
             remedy="leave it out or move the cut",
         )
-    outside = float(signed_distance(anatomy.skin, points).max())
+    outside = float(compute_signed_distance(anatomy.skin, points).max())
     if outside > _OVERLAP_MM:
         raise SurfaceError(
             f"the region lies outside the limb by up to {outside:.1f} mm",
@@ -266,7 +272,9 @@ def _check_region(anatomy: Anatomy, name: str, file: Path | None) -> None:
             remedy="check that it is in the same coordinates (LPS or RAS) and unit as the skin",
         )
     for bone, body in anatomy.bones.items():
-        deep = max(-signed_distance(body, points).min(), -signed_distance(region, body.points).min())
+        deep = max(
+            -compute_signed_distance(body, points).min(), -compute_signed_distance(region, body.points).min()
+        )
         if deep > _OVERLAP_MM:
             raise SurfaceError(
                 f"the region and the bone {bone} overlap by up to {deep:.1f} mm",
@@ -283,7 +291,7 @@ def _check_inside(anatomy: Anatomy, name: str, file: Path | None) -> None:
         raise SurfaceError(
             f"{name} lies wholly beyond the proximal cut", file=file, remedy="leave it out or move the cut"
         )
-    distance = signed_distance(anatomy.skin, inner)
+    distance = compute_signed_distance(anatomy.skin, inner)
     outside = distance > _SKIN_TOLERANCE_MM
     if outside.any():
         what = (
@@ -306,7 +314,7 @@ def _is_at_one_end(skin: Surface, points: Array) -> bool:
     return bool(here.min() > along.max() - margin or here.max() < along.min() + margin)
 
 
-def signed_distance(surface: Surface, points: ArrayLike) -> Array:
+def compute_signed_distance(surface: Surface, points: ArrayLike) -> Array:
     """(n,) distance of points to a closed surface, mm, negative inside."""
     return surface.search.signed(points)[0]
 
@@ -325,15 +333,15 @@ def save_anatomy(folder: str | Path, anatomy: Anatomy, notes: Sequence[str] = ()
         "unit": "mm",
         "cut_point": anatomy.cut_point.tolist(),
         "cut_normal": anatomy.cut_normal.tolist(),
-        "skin": _measures(anatomy.skin),
-        "bones": {name: _measures(bone) for name, bone in anatomy.bones.items()},
-        "regions": {name: _measures(region) for name, region in anatomy.regions.items()},
+        "skin": _measure_surface(anatomy.skin),
+        "bones": {name: _measure_surface(bone) for name, bone in anatomy.bones.items()},
+        "regions": {name: _measure_surface(region) for name, region in anatomy.regions.items()},
         "notes": list(notes),
     }
     (folder / "surfaces.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
 
 
-def _measures(surface: Surface) -> dict[str, float | int]:
+def _measure_surface(surface: Surface) -> dict[str, float | int]:
     return {
         "faces": len(surface.faces),
         "volume_mm3": round(surface.volume, 1),

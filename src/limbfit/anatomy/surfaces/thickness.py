@@ -15,8 +15,8 @@ from ...errors import LabelError, SurfaceError
 from ..grid import LabelMap
 from ..morphology import find_largest_piece, open_mask
 from .extraction import extract_surface
-from .surfaces import Anatomy, signed_distance
-from .triangles import Surface, half_edges
+from .surfaces import Anatomy, compute_signed_distance
+from .triangles import Surface, find_half_edges
 
 Ints = NDArray[np.int64]
 
@@ -39,7 +39,7 @@ def check_fat(labels: LabelMap) -> None:
         )
 
 
-def fat_depth(labels: LabelMap, anatomy: Anatomy, edge_mm: float = 3.0) -> Array:
+def measure_fat_depth(labels: LabelMap, anatomy: Anatomy, edge_mm: float = 3.0) -> Array:
     """Depth (n,) of the fat's inner face below the vertices of an anatomy's skin, mm.
 
     Measured along the skin's inward normal to the smooth surface of all that the fat encloses; islands of fat
@@ -58,20 +58,20 @@ def fat_depth(labels: LabelMap, anatomy: Anatomy, edge_mm: float = 3.0) -> Array
         When the map has no fat, or nothing but fat.
     """
     check_fat(labels)
-    core = _core(labels)
+    core = _build_core(labels)
     inner = extract_surface(core, None, edge_mm)
     skin = anatomy.skin
-    depth = _along_normals(skin, inner)
+    depth = _measure_along_normals(skin, inner)
     near_cut = anatomy.height(skin.points) > -CUT_MM
     if near_cut.all():
         raise SurfaceError(f"the limb is not {CUT_MM:g} mm long distal of the proximal cut")
     below = np.flatnonzero(~near_cut)
     lowered = skin.points[near_cut] - CUT_MM * anatomy.cut_normal
     depth[near_cut] = depth[below[KDTree(skin.points[below]).query(lowered)[1]]]
-    return sloped(skin, smoothed_along(skin, depth, SMOOTH_MM), SLOPE)
+    return limit_slope(skin, smooth_along_surface(skin, depth, SMOOTH_MM), SLOPE)
 
 
-def _core(labels: LabelMap) -> LabelMap:
+def _build_core(labels: LabelMap) -> LabelMap:
     """What the subcutaneous fat encloses, as a label map of one label."""
     inside = labels.limb & ~labels.mask(FAT)
     opened = open_mask(inside, SHELL_MM, labels.spacing)  # a thin shell of skin outside the fat goes
@@ -80,19 +80,19 @@ def _core(labels: LabelMap) -> LabelMap:
     return labels.with_array(find_largest_piece(opened).astype(np.uint8), {1: "core"})
 
 
-def _along_normals(skin: Surface, inner: Surface) -> Array:
+def _measure_along_normals(skin: Surface, inner: Surface) -> Array:
     """Distance (n,) from the skin's vertices along their inward normals to an inner surface, mm."""
     inward, origin = -skin.vertex_normals, skin.points
-    nearest = np.maximum(signed_distance(inner, origin), 0.0)
+    nearest = np.maximum(compute_signed_distance(inner, origin), 0.0)
     along = nearest.copy()
     for _ in range(MARCHES):  # steps that cannot cross the surface
-        along += signed_distance(inner, origin + along[:, None] * inward)
+        along += compute_signed_distance(inner, origin + along[:, None] * inward)
     return np.clip(along, 0.0, OBLIQUE * nearest)
 
 
-def smoothed_along(surface: Surface, values: Array, length_mm: float) -> Array:
+def smooth_along_surface(surface: Surface, values: Array, length_mm: float) -> Array:
     """Values (n,) at vertices averaged over their neighbours along the surface, about ``length_mm`` far."""
-    a, b = edges_of(surface).T
+    a, b = find_edges(surface).T
     count = len(surface.points)
     links = coo_array((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(count, count)).tocsr()
     mean = diags_array(1.0 / links.sum(axis=1)) @ links
@@ -102,9 +102,9 @@ def smoothed_along(surface: Surface, values: Array, length_mm: float) -> Array:
     return np.asarray(values)
 
 
-def sloped(surface: Surface, values: Array, slope: float) -> Array:
+def limit_slope(surface: Surface, values: Array, slope: float) -> Array:
     """Values (n,) at vertices lowered so that along no edge they change by more than ``slope`` per mm."""
-    a, b = edges_of(surface).T
+    a, b = find_edges(surface).T
     rise = slope * np.linalg.norm(surface.points[a] - surface.points[b], axis=1)
     values = values.copy()
     while True:
@@ -115,7 +115,7 @@ def sloped(surface: Surface, values: Array, slope: float) -> Array:
             return values
 
 
-def carried(surface: Surface, values: Array, points: Array) -> Array:
+def transfer_values(surface: Surface, values: Array, points: Array) -> Array:
     """Values (k, n) at a surface's vertices, interpolated at the surface points nearest to points (m, 3)."""
     _, face, nearest = surface.search.nearest(points)
     a, b, c = np.moveaxis(surface.triangles[face], 1, 0)
@@ -127,9 +127,9 @@ def carried(surface: Surface, values: Array, points: Array) -> Array:
     return np.asarray(np.einsum("kmi,mi->km", values[:, surface.faces[face]], share))
 
 
-def edges_of(surface: Surface) -> Ints:
+def find_edges(surface: Surface) -> Ints:
     """Edges (e, 2) of a closed surface, each once."""
-    edges = half_edges(surface.faces)
+    edges = find_half_edges(surface.faces)
     return edges[edges[:, 0] < edges[:, 1]]
 
 
@@ -150,4 +150,4 @@ def read_thickness(path: str | Path, skin: Surface) -> Array:
     poly = pv.read(path)
     faces = np.asarray(poly.faces).reshape(-1, 4)[:, 1:]
     stored = Surface(np.asarray(poly.points), faces)
-    return carried(stored, np.asarray(poly.point_data[FAT_DEPTH], dtype=float)[None], skin.points)[0]
+    return transfer_values(stored, np.asarray(poly.point_data[FAT_DEPTH], dtype=float)[None], skin.points)[0]

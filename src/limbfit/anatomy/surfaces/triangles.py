@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from ...arrays import Array
 from ...errors import SurfaceError
-from .search import Search
+from .search import SurfaceSearch
 
 Faces = NDArray[np.int64]
 
@@ -48,13 +48,13 @@ class Surface:
         return {"points": self.points, "faces": self.faces}
 
     @cached_property
-    def search(self) -> Search:
+    def search(self) -> SurfaceSearch:
         """Its trees for nearest points and signed distances."""
-        return Search(self.points, self.faces)
+        return SurfaceSearch(self.points, self.faces)
 
     @cached_property
     def crossings(self) -> NDArray[np.int64]:
-        """(p, 2) pairs of faces that cross; see :func:`self_intersections`."""
+        """(p, 2) pairs of faces that cross; see :func:`find_self_intersections`."""
         return _find_crossings(self)
 
     @property
@@ -111,31 +111,33 @@ class Surface:
 
 def from_pyvista(poly: pv.PolyData) -> Surface:
     """A surface from triangulated poly-data; points that no face uses are dropped."""
-    return compacted(Surface(np.asarray(poly.points), np.asarray(poly.regular_faces, dtype=np.int64)))
+    return remove_unused_points(
+        Surface(np.asarray(poly.points), np.asarray(poly.regular_faces, dtype=np.int64))
+    )
 
 
-def compacted(surface: Surface) -> Surface:
+def remove_unused_points(surface: Surface) -> Surface:
     """Without the points that no face uses."""
     used, inverse = np.unique(surface.faces, return_inverse=True)
     return Surface(surface.points[used], inverse.reshape(surface.faces.shape))
 
 
-def bodies(surface: Surface) -> list[Surface]:
+def find_bodies(surface: Surface) -> list[Surface]:
     """The connected bodies of a surface, the one with most faces first."""
-    labels = _body_of_point(surface)[surface.faces[:, 0]]
+    labels = _number_bodies(surface)[surface.faces[:, 0]]
     values, counts = np.unique(labels, return_counts=True)
     order = values[np.argsort(-counts)]
-    return [compacted(replace(surface, faces=surface.faces[labels == value])) for value in order]
+    return [remove_unused_points(replace(surface, faces=surface.faces[labels == value])) for value in order]
 
 
-def _body_of_point(surface: Surface) -> NDArray[np.int64]:
-    edges = half_edges(surface.faces)
+def _number_bodies(surface: Surface) -> NDArray[np.int64]:
+    edges = find_half_edges(surface.faces)
     n = len(surface.points)
     graph = coo_array((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(n, n))
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
-def half_edges(faces: Faces) -> Faces:
+def find_half_edges(faces: Faces) -> Faces:
     """(3 m, 2) directed edges of the faces."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
@@ -166,7 +168,7 @@ def check_closed(
         smallest_mm = _SMALLEST_MM.get(name, _SMALLEST_OTHER_MM) if file or name == "skin" else 0.0
     _check_size(surface, name, file, smallest_mm)
     _check_edges(surface, name, file)
-    parts = len(bodies(surface))
+    parts = len(find_bodies(surface))
     if parts > 1:
         raise SurfaceError(
             f"{name}: {parts} separate bodies in one surface",
@@ -179,7 +181,7 @@ def check_closed(
             file=file,
             remedy="flip the normals so that they point outward",
         )
-    crossing = self_intersections(surface)
+    crossing = find_self_intersections(surface)
     if len(crossing):
         place = ", ".join(f"{x:.1f}" for x in surface.triangles[crossing[0, 0]].mean(axis=0))
         raise SurfaceError(
@@ -203,7 +205,7 @@ def _check_size(surface: Surface, name: str, file: str | Path | None, smallest: 
 
 
 def _check_edges(surface: Surface, name: str, file: str | Path | None) -> None:
-    edges = half_edges(surface.faces)
+    edges = find_half_edges(surface.faces)
     counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1]
     open_edges = int((counts == 1).sum())
     if open_edges:
@@ -223,7 +225,7 @@ def check_sides(surface: Surface, name: str, file: str | Path | None = None) -> 
     SurfaceError
         For edges of more than two faces, and for neighbours that are oriented against each other.
     """
-    edges = half_edges(surface.faces)
+    edges = find_half_edges(surface.faces)
     counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1]
     if counts.max() > 2:
         raise SurfaceError(
@@ -239,30 +241,30 @@ def check_sides(surface: Surface, name: str, file: str | Path | None = None) -> 
         )
 
 
-def self_intersections(surface: Surface) -> NDArray[np.int64]:
+def find_self_intersections(surface: Surface) -> NDArray[np.int64]:
     """(p, 2) pairs of faces without a common point of which an edge of one pierces the other."""
     return surface.crossings
 
 
 def _find_crossings(surface: Surface) -> NDArray[np.int64]:
-    pairs = _near_pairs(surface)
+    pairs = _find_near_pairs(surface)
     triangles = surface.triangles
     crossing = np.zeros(len(pairs), dtype=bool)
     for first, second in ((0, 1), (1, 0)):
         a, b = triangles[pairs[:, first]], triangles[pairs[:, second]]
         for corner in range(3):
-            crossing |= _pierces(a[:, corner], a[:, (corner + 1) % 3], b)
+            crossing |= _find_piercing(a[:, corner], a[:, (corner + 1) % 3], b)
     return pairs[crossing]
 
 
-def _near_pairs(surface: Surface) -> NDArray[np.int64]:
+def _find_near_pairs(surface: Surface) -> NDArray[np.int64]:
     """Pairs (p, 2) of faces that share no point and may cross: bounding boxes of pieces of them overlap.
 
     Pieces whose spheres meet are looked up in trees, one for each octave of sizes, some pieces at a time.
     """
     owner, pieces = _split_large(surface.triangles)
     low, high, centre = pieces.min(axis=1), pieces.max(axis=1), pieces.mean(axis=1)
-    radius = _radii(pieces)
+    radius = _compute_radii(pieces)
     octave = np.floor(np.log2(np.maximum(radius, 1e-6 * radius.max()))).astype(int)
     groups = [np.flatnonzero(octave == n) for n in np.unique(octave)]
     trees = [cKDTree(centre[group]) for group in groups]
@@ -275,11 +277,11 @@ def _near_pairs(surface: Surface) -> NDArray[np.int64]:
                 near = tree.sparse_distance_matrix(larger, reach, output_type="ndarray")
                 i, j = part[near["i"]], other[near["j"]]
                 apart = np.any((low[i] > high[j]) | (low[j] > high[i]), axis=1)
-                found.append(_distinct(owner[i[~apart]], owner[j[~apart]], surface.faces))
+                found.append(_select_distinct_pairs(owner[i[~apart]], owner[j[~apart]], surface.faces))
     return np.unique(np.concatenate(found), axis=0)
 
 
-def _distinct(i: NDArray[np.int64], j: NDArray[np.int64], faces: Faces) -> NDArray[np.int64]:
+def _select_distinct_pairs(i: NDArray[np.int64], j: NDArray[np.int64], faces: Faces) -> NDArray[np.int64]:
     """Pairs (p, 2) of faces, the lower number first, each once, without those that share a point."""
     keys = np.unique(np.minimum(i, j) * len(faces) + np.maximum(i, j))
     pairs = np.column_stack(np.divmod(keys, len(faces)))
@@ -293,10 +295,10 @@ def _split_large(triangles: Array) -> tuple[NDArray[np.int64], Array]:
     The flat caps of scans consist of long slivers, to each of which thousands of small faces are near.
     """
     owner = np.arange(len(triangles))
-    usual = _LARGE * float(np.median(_radii(triangles)))
+    usual = _LARGE * float(np.median(_compute_radii(triangles)))
     owners, pieces = [], []
     while len(owner):
-        large = _radii(triangles) > usual
+        large = _compute_radii(triangles) > usual
         owners.append(owner[~large])
         pieces.append(triangles[~large])
         owner, triangles = np.repeat(owner[large], 2), _halve(triangles[large])
@@ -313,12 +315,12 @@ def _halve(triangles: Array) -> Array:
     return halves.reshape(-1, 3, 3)
 
 
-def _radii(triangles: Array) -> Array:
+def _compute_radii(triangles: Array) -> Array:
     """(m,) largest distance of a corner from the centroid."""
     return np.linalg.norm(triangles - triangles.mean(axis=1, keepdims=True), axis=2).max(axis=1)
 
 
-def _pierces(start: Array, end: Array, triangle: Array) -> NDArray[np.bool_]:
+def _find_piercing(start: Array, end: Array, triangle: Array) -> NDArray[np.bool_]:
     """Whether each segment passes through the inside of its triangle (signed volumes)."""
     a, b, c = np.moveaxis(triangle, 1, 0)
 

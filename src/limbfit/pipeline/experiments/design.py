@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.sites.under import tissue_under
+from ...anatomy.sites.under import measure_tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...arrays import Array
 from ...errors import InputError, RunError, StudyError
@@ -73,7 +73,7 @@ def wanted_sites(study: Study, sites: int) -> int:
 def _deepest_mm(study: Study, limb: LimbGeometry, site: Site) -> float:
     """How deep a candidate at a site may go."""
     width = study.indenter_of((study.records_at(site) or (site,))[0]).width_mm
-    return DEEPEST_SHARE * tissue_under(limb.anatomy, *limb.place(site), width)
+    return DEEPEST_SHARE * measure_tissue_under(limb.anatomy, *limb.place(site), width)
 
 
 def run_design(
@@ -120,7 +120,7 @@ def _candidate_models(context: Context, depths_mm: Sequence[float]) -> tuple[lis
         if anatomy is None:
             models.append(own)
             continue
-        thickness = tissue_under(anatomy, own.position, own.axis, own.indenter.width_mm)
+        thickness = measure_tissue_under(anatomy, own.position, own.axis, own.indenter.width_mm)
         for depth in depths_mm:
             if depth > DEEPEST_SHARE * thickness:
                 left_out.append(f"site {own.site} at {depth:g} mm: the tissue is {thickness:.1f} mm thick")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.sites.under import tissue_under
+from ...anatomy.sites.under import measure_tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...arrays import Array
 from ...errors import InputError, RunError
@@ -203,7 +203,7 @@ def _planned(
                 model = replace(model, skin_points=skin_beside(model))
             if noises.waves is not None:
                 model = replace(model, waves=waves_under(model, read_vtu(model.mesh)))
-            thickness = tissue_under(anatomy, model.position, model.axis, model.indenter.width_mm)
+            thickness = measure_tissue_under(anatomy, model.position, model.axis, model.indenter.width_mm)
             most = DEEPEST_SHARE * thickness
             if most < max(wanted):
                 half = f"half of the tissue's {thickness:.1f} mm"

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.frame import Frame, limb_frame
+from ...anatomy.frame import Frame, build_limb_frame
 from ...anatomy.surfaces.surfaces import Anatomy, write_surface
 from ...anatomy.surfaces.triangles import Surface
 from ...arrays import Array
@@ -77,7 +77,7 @@ def undeformed_socket(
         Where loads, regions or the target pressure are not those of this limb, or the wall cannot be made.
     """
     with blaming(study, PLACE):
-        recipe, frame = recipe_of(study, anatomy), limb_frame(anatomy.cut_point, anatomy.cut_normal)
+        recipe, frame = recipe_of(study, anatomy), build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
         plain = rectify_limb(outer, frame, replace(recipe, reduction_percent=0.0))
         for load in study.socket.loads:
             load_of(study, load, anatomy, plain)
@@ -185,7 +185,7 @@ class _Bench:
 
     @property
     def frame(self) -> Frame:
-        return limb_frame(self.limb.anatomy.cut_point, self.limb.anatomy.cut_normal)
+        return build_limb_frame(self.limb.anatomy.cut_point, self.limb.anatomy.cut_normal)
 
     def tell(self, share: float, words: str) -> None:
         self.context.tell(NAME, self.count + share, self.total, words)

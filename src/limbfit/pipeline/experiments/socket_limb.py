@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...anatomy.meshing.layers import LayerSpec
-from ...anatomy.meshing.liner import under_liner
+from ...anatomy.meshing.liner import build_liner_surface
 from ...anatomy.meshing.meshing import MeshSettings, mesh_limb
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...arrays import Array
@@ -82,7 +82,7 @@ class SocketLimb:
         outer, depth = anatomy, stored_depth(surfaces, anatomy, mesh_settings(study))
         if thickness:
             context.tell(name, 0, 0, f"a liner of {thickness:g} mm around the limb")
-            outer, depth = under_liner(anatomy, thickness, depth)
+            outer, depth = build_liner_surface(anatomy, thickness, depth)
         return cls(study, anatomy, outer, depth, regions_of(study, anatomy), fibres_of(context))
 
     def materials(self, parameters: Parameters) -> dict[str, Material]:

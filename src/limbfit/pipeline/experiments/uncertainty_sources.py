@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ...anatomy.meshing.meshing import MeshSettings
-from ...anatomy.sites.sites import indenter_axis, project_to_skin
+from ...anatomy.sites.sites import compute_indenter_axis, project_to_skin
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...arrays import Array
 from ...fe import ORDER_IN_TIME
@@ -150,7 +150,9 @@ def _moved(context: Context, model: SiteModel, number: int, distance_mm: float) 
     wanted = np.array(model.position) + distance_mm * _tangents(axis)[number]
     point, _ = project_to_skin(anatomy, wanted)
     width = context.study.width_at(context.study.site(model.site))
-    turned = indenter_axis(anatomy.skin, point, width) - indenter_axis(anatomy.skin, model.position, width)
+    turned = compute_indenter_axis(anatomy.skin, point, width) - compute_indenter_axis(
+        anatomy.skin, model.position, width
+    )
     axis = axis + turned
     axis /= np.linalg.norm(axis)
     return replace(model, position=_vector(point), axis=_vector(axis))

@@ -9,7 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from ...anatomy.labels.labelfiles import sidecar
+from ...anatomy.labels.labelfiles import find_sidecar
 from ...fe import StepControl
 from ...study import Study
 from .artefacts import digest, file_digest
@@ -64,7 +64,7 @@ def input_files(study: Study) -> dict[str, list[Path]]:
     files["segment"] += [path for path in (study.segmentation.contours, hand_labels(study)) if path]
     if study.segmentation.labels is not None:
         files["segment"].append(study.segmentation.labels)
-        names = sidecar(study.segmentation.labels)
+        names = find_sidecar(study.segmentation.labels)
         files["segment"] += [names] if study.path(names).is_file() else []
     if study.surfaces is not None:
         files["surfaces"] += [study.surfaces.skin, *study.surfaces.bones.values()]

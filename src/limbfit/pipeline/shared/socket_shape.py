@@ -10,7 +10,7 @@ import igl
 import numpy as np
 from numpy.typing import NDArray
 
-from ...anatomy.frame import limb_frame
+from ...anatomy.frame import build_limb_frame
 from ...anatomy.surfaces.surfaces import Anatomy
 from ...anatomy.surfaces.triangles import Surface
 from ...arrays import Array
@@ -47,7 +47,7 @@ def socket_of(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
     StudyError
         With the key and the remedy.
     """
-    table, frame = study.socket, limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    table, frame = study.socket, build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     with blaming(study):
         if table.file is not None:
             return read_socket(

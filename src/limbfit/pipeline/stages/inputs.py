@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...anatomy.imaging import LabelMap, Volume, check_image, cleaned, read_labels, read_volume
+from ...anatomy.imaging import LabelMap, Volume, check_image, clean_labels, read_labels, read_volume
 from ...anatomy.labels.contours import read_contours
-from ...anatomy.labels.placement import on_grid_of
+from ...anatomy.labels.placement import place_on_grid
 from ...anatomy.segmentation.one_limb import check_one_limb
 from ...anatomy.segmentation.segmentation import segment
 from ...study import Study
@@ -57,7 +57,7 @@ def study_labels(study: Study, volume: Volume) -> tuple[LabelMap, list[str]] | N
         return None
     path = study.path(given)
     read = read_contours if table.contours is not None else read_labels
-    return cleaned(read(path, volume), path)
+    return clean_labels(read(path, volume), path)
 
 
 def automatic_labels(study: Study, volume: Volume) -> LabelMap:
@@ -80,6 +80,6 @@ def automatic_labels(study: Study, volume: Volume) -> LabelMap:
                 for name, points in table.seeds.items()
             },
         )
-    return on_grid_of(
+    return place_on_grid(
         LabelMap(found.array, near.spacing, near.origin, near.direction, found.names), volume, path
     )

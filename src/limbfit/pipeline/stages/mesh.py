@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...anatomy.meshing.layers import LayerSpec
-from ...anatomy.meshing.meshing import BaseMesh, MeshSettings, base_mesh, mesh_site
+from ...anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
 from ...anatomy.meshing.meshreport import MeshReport
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...anatomy.surfaces.thickness import read_thickness
@@ -78,7 +78,7 @@ def keep_mesh(mesh: Mesh, report: MeshReport, settings: MeshSettings, file: Path
 def _base(surfaces: Path, key: str, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
     """What all sites of a study share, whatever their ``near_radius_mm``; a worker makes it once."""
     anatomy = load_anatomy(surfaces)
-    return anatomy, base_mesh(anatomy, settings, stored_depth(surfaces, anatomy, settings))
+    return anatomy, build_base_mesh(anatomy, settings, stored_depth(surfaces, anatomy, settings))
 
 
 def stored_depth(surfaces: Path, anatomy: Anatomy, settings: MeshSettings) -> Array | None:

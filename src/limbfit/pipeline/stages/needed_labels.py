@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ...anatomy.imaging import LabelMap
-from ...anatomy.labels.naming import plain_name
+from ...anatomy.labels.naming import normalise_name
 from ...anatomy.surfaces.thickness import check_fat
 from ...study import Study
 from .files import labelled_file, naming
@@ -24,7 +24,7 @@ def check_labels(study: Study, labels: LabelMap) -> None:
 
 def labelled_regions(study: Study) -> dict[str, str]:
     """The label of each region that has one, by the region's name."""
-    return {one.name: plain_name(one.label) for one in study.geometry.regions if one.label is not None}
+    return {one.name: normalise_name(one.label) for one in study.geometry.regions if one.label is not None}
 
 
 def maps_fat(study: Study) -> bool:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.sites.sites import indenter_axis
-from ...anatomy.sites.under import tissue_under
+from ...anatomy.sites.sites import compute_indenter_axis
+from ...anatomy.sites.under import measure_tissue_under
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...identify.checks.plausibility import RecordFacts, RecordWarning, check_plausibility
 from ...indentation import contact_radius
@@ -85,10 +85,10 @@ def _facts(
     if row is not None and anatomy is not None:
         width = radius * np.sqrt(np.pi)
         axis = np.array(row["axis"])
-        normal = indenter_axis(anatomy.skin, row["position_mm"], width)
+        normal = compute_indenter_axis(anatomy.skin, row["position_mm"], width)
         facts = {
             "position_mm": tuple(row["position_mm"]),
-            "thickness_mm": tissue_under(anatomy, row["position_mm"], normal, width),
+            "thickness_mm": measure_tissue_under(anatomy, row["position_mm"], normal, width),
             "axis_deg": float(np.degrees(np.arccos(np.clip(axis @ normal, -1, 1)))),
             "off_skin_mm": row["off_skin_mm"] if row["marker"] is None else None,
             "hint_mm": None if row["marker"] is None else row["marker"]["distance_to_hint_mm"],

@@ -10,9 +10,9 @@ import numpy as np
 
 from ...anatomy.imaging import LabelMap, Volume, write_labels
 from ...anatomy.labels.contours import write_contours
-from ...anatomy.labels.quality import assess
-from ...anatomy.sites.marked import marked_skin, without_markers
-from ...anatomy.sites.registration import limb_motion
+from ...anatomy.labels.quality import assess_labels
+from ...anatomy.sites.marked import extract_marked_skin, remove_markers
+from ...anatomy.sites.registration import register_limb
 from ...anatomy.surfaces.surfaces import write_surface
 from ...report.drawing.sheet import draw_sheet
 from ...study import Study
@@ -41,7 +41,7 @@ def run_segment(context: Context, folder: Path) -> dict[str, Any]:
         labels, notes, method = automatic_labels(study, volume), [], "automatic"
     write_labels(folder / LABELS, labels)
     write_contours(folder / "contours.csv", labels)
-    quality = assess(labels)
+    quality = assess_labels(labels)
     write_json(folder / "quality.json", quality.as_json())
     draw_sheet(folder / "quality.png", volume, labels, quality)
     context.tell("segment", 2, 3, "outlining the skin with markers")
@@ -70,8 +70,8 @@ def without_own_markers(study: Study, volume: Volume, folder: Path) -> tuple[Vol
     if study.image.markers != "same":
         return volume, {}
     with naming(study.path(study.image.path)):
-        skin, _ = marked_skin(volume)
-        plain, count = without_markers(volume, skin)
+        skin, _ = extract_marked_skin(volume)
+        plain, count = remove_markers(volume, skin)
     write_surface(folder / MARKED_SKIN, skin)
     return plain, {"markers_removed": count}
 
@@ -84,8 +84,8 @@ def second_skin(study: Study, volume: Volume, labels: LabelMap, folder: Path) ->
     assert study.image is not None
     assert study.image.marked is not None
     with naming(study.path(study.image.marked)):
-        skin, _ = marked_skin(marked)
-        motion = limb_motion(volume, marked, labels.limb)
+        skin, _ = extract_marked_skin(marked)
+        motion = register_limb(volume, marked, labels.limb)
     write_surface(folder / MARKED_SKIN, replace(skin, points=motion.apply(skin.points)))
     measures = {"shift_mm": motion.shift_mm, "turn_deg": motion.turn_deg, "correlation": motion.correlation}
     return {"motion": {name: round(value, 3) for name, value in measures.items()}}

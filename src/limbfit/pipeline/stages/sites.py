@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...anatomy.sites.markers import find_markers, match_markers
-from ...anatomy.sites.sites import indenter_axis, project_to_skin
+from ...anatomy.sites.sites import compute_indenter_axis, project_to_skin
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy, read_surface
 from ...errors import SiteError
 from ...study import Site, Study
@@ -49,7 +49,7 @@ def place_site(site: Site, study: Study, anatomy: Anatomy, marker: Any) -> dict[
     wanted = np.array(site.position) if marker is None else marker.position
     try:
         point, off = project_to_skin(anatomy, wanted)
-        axis = site.axis or indenter_axis(anatomy.skin, point, study.width_at(site))
+        axis = site.axis or compute_indenter_axis(anatomy.skin, point, study.width_at(site))
     except SiteError as error:
         raise SiteError(
             error.what, file=study.file, place=f"sites.{site.name}", remedy=error.remedy

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from ...anatomy.imaging import LabelMap, read_labels
-from ...anatomy.segmentation.amputation import amputate
-from ...anatomy.segmentation.voxels import amputated
-from ...anatomy.surfaces.mending import closed_anatomy, orient_outward
+from ...anatomy.segmentation.amputation import amputate_limb
+from ...anatomy.segmentation.voxels import amputate_anatomy
+from ...anatomy.surfaces.mending import build_closed_anatomy, orient_outward
 from ...anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface, save_anatomy
-from ...anatomy.surfaces.thickness import fat_depth, write_thickness
+from ...anatomy.surfaces.thickness import measure_fat_depth, write_thickness
 from ...study import Study
 from ..shared.context import Context
 from .files import THICKNESS, labelled_file, naming
@@ -30,7 +30,7 @@ def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
         labels = _limb_labels(context)
         anatomy, notes = _imaged_anatomy(study, labels)
         if maps_fat(study):
-            depth = fat_depth(labels, anatomy, study.geometry.surface_edge_mm)
+            depth = measure_fat_depth(labels, anatomy, study.geometry.surface_edge_mm)
             write_thickness(folder / THICKNESS, anatomy.skin, depth)
     for note in notes:
         context.tell("surfaces", 1, 2, note)
@@ -47,7 +47,7 @@ def _limb_labels(context: Context) -> LabelMap:
     if geometry.amputation is None:
         return labels
     plane = geometry.amputation
-    return amputate(labels, plane.point, plane.normal, pad_mm=geometry.amputation_pad_mm)
+    return amputate_limb(labels, plane.point, plane.normal, pad_mm=geometry.amputation_pad_mm)
 
 
 def _imaged_anatomy(study: Study, labels: LabelMap) -> tuple[Anatomy, tuple[str, ...]]:
@@ -93,7 +93,9 @@ def given_anatomy(study: Study) -> tuple[Anatomy, tuple[str, ...]]:
     files = {name: study.path(path) for name, path in {"skin": tables.skin, **tables.bones}.items()}
     surfaces = {name: read_surface(path, tables.coordinates, tables.unit) for name, path in files.items()}
     skin, cut = surfaces.pop("skin"), geometry.proximal_cut
-    anatomy, notes = closed_anatomy(skin, surfaces, None if cut is None else (cut.point, cut.normal), files)
+    anatomy, notes = build_closed_anatomy(
+        skin, surfaces, None if cut is None else (cut.point, cut.normal), files
+    )
     if geometry.regions:
         anatomy, region_files, told = _with_given_regions(study, anatomy)
         notes += told
@@ -102,6 +104,6 @@ def given_anatomy(study: Study) -> tuple[Anatomy, tuple[str, ...]]:
         return anatomy, notes
     plane, pad = geometry.amputation, geometry.amputation_pad_mm
     with naming(files["skin"]):
-        stump = amputated(anatomy, plane.point, plane.normal, pad, geometry.surface_edge_mm)
+        stump = amputate_anatomy(anatomy, plane.point, plane.normal, pad, geometry.surface_edge_mm)
         check_anatomy(stump)
     return stump, notes

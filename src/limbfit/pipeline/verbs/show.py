@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.sites.sites import thinnest_tissue
+from ...anatomy.sites.sites import find_thinnest_tissue
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...errors import InputError
 from ...report.drawing.stage_pictures import draw_stage
@@ -93,7 +93,7 @@ def _surface_facts(study: Study, store: Store) -> dict[str, Any]:
 
 def _thinnest(anatomy: Anatomy, name: str) -> dict[str, Any]:
     """Where a bone comes nearest to the skin: thickness of the tissue and the place on the bone."""
-    thickness, place = thinnest_tissue(anatomy, name)
+    thickness, place = find_thinnest_tissue(anatomy, name)
     return {"tissue_mm": round(thickness, 2), "at": np.round(place, 1).tolist()}
 
 

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from ...anatomy.grid import FAT, SOFT_TISSUE, LabelMap, Volume
-from ...anatomy.labels.contours import outlines
+from ...anatomy.labels.contours import find_outlines
 from ...anatomy.labels.quality import LIMB, LabelQuality
 
 Mask = NDArray[np.bool_]
@@ -121,7 +121,7 @@ def _draw(
         plane, cmap="gray", vmin=low, vmax=max(high, low + 1e-6), extent=(*extent, *heights), origin="upper"
     )
     for name, mask in masks.items():
-        for line in outlines(mask[k]):
+        for line in find_outlines(mask[k]):
             closed = np.vstack([line, line[:1]])
             axes.plot(closed[:, 0], closed[:, 1], color=colours[name], linewidth=0.8)
     axes.set_xlim(*extent)
