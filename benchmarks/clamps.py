@@ -22,8 +22,8 @@ from limbfit.fe import History, Indenter, Problem, StepControl, solve
 from limbfit.indentation import materials
 from limbfit.indentation.clamps import clamped
 from limbfit.mesh import Mesh
-from limbfit.phantom import TrueSite, make_limb, true_parameters, true_sites
-from limbfit.phantom.surfaces import true_anatomy
+from limbfit.phantom import TrueSite, build_true_sites, draw_true_parameters, make_limb
+from limbfit.phantom.surfaces import build_true_anatomy
 from limbfit.study import ClampsTable
 
 SEED, INDENTER_MM, EDGE_MM, KAPPA_RATIO = 0, 20.0, 2.0, 100.0
@@ -40,7 +40,7 @@ def site_problem(site: TrueSite, mesh: Mesh) -> Problem:
     ramp = site.depth / site.speed
     return Problem(
         mesh=mesh,
-        materials=materials(true_parameters(SEED), KAPPA_RATIO),
+        materials=materials(draw_true_parameters(SEED), KAPPA_RATIO),
         fixed=mesh.held,
         contact_faces=faces[near < 0.71 * INDENTER_MM + site.depth + 8.0],
         indenter=tool,
@@ -91,11 +91,11 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the rows here")
     options = parser.parse_args()
     limb = make_limb(SEED)
-    anatomy = true_anatomy(limb)
+    anatomy = build_true_anatomy(limb)
     settings = replace(MESH, layers=limb.layers)
     base = build_base_mesh(anatomy, settings)
     rows = []
-    for site in true_sites(limb, SEED):
+    for site in build_true_sites(limb, SEED):
         if site.name in options.sites:
             mesh, _ = mesh_site(anatomy, site.position, site.axis, settings, base)
             rows.append(compare(site, mesh, np.asarray(anatomy.cut_normal), options.force))

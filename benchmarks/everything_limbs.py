@@ -29,12 +29,12 @@ from limbfit.anatomy.sites.under import measure_tissue_under
 from limbfit.anatomy.surfaces.mending import build_closed_anatomy
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, write_surface
 from limbfit.bench.limbs import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, amputated_calf, random_sites
-from limbfit.phantom.build import true_parameters
+from limbfit.phantom.build import draw_true_parameters
 from limbfit.phantom.geometry import make_limb
-from limbfit.phantom.labels import true_labels
+from limbfit.phantom.labels import build_true_labels
 from limbfit.phantom.mri import make_grid
 from limbfit.phantom.record import Ramp, record
-from limbfit.phantom.surfaces import Box, contour
+from limbfit.phantom.surfaces import Box, extract_contour
 
 Array = NDArray[np.floating]
 
@@ -55,8 +55,8 @@ def thigh_bodies() -> dict[str, Surface]:
 
     cut, out = THIGH_MM, THIGH_MM + 6.0
     return {
-        "skin": contour(skin, Box((-85.0, -85.0, -10.0), (85.0, 85.0, cut), 3.0)),
-        "femur": contour(femur, Box((-30.0, -30.0, 20.0), (40.0, 30.0, out), 2.0)),
+        "skin": extract_contour(skin, Box((-85.0, -85.0, -10.0), (85.0, 85.0, cut), 3.0)),
+        "femur": extract_contour(femur, Box((-30.0, -30.0, 20.0), (40.0, 30.0, out), 2.0)),
     }
 
 
@@ -110,7 +110,7 @@ def write_study(folder: Path, name: str, head: str, sites: list[dict[str, Any]])
 def record_sites(folder: Path, name: str, head: str, sites: list[dict[str, Any]]) -> None:
     """Indent the planned sites by simulation, and make the robot's records of them the study's own."""
     write_study(folder, name, head, sites)
-    truth = true_parameters(SEED)
+    truth = draw_true_parameters(SEED)
     values = ",".join(f"{value:g}" for tissue in truth.values() for value in tissue.values())
     recorded = []
     for i, site in enumerate(sites):
@@ -139,7 +139,7 @@ def map_labels(folder: Path, phantom: Path) -> None:
     shutil.copytree(phantom / "mri", folder / "mri")
     shutil.copytree(phantom / "traces", folder / "traces")
     limb = make_limb(SEED)
-    own = true_labels(limb, make_grid(limb, "coarse", SEED))
+    own = build_true_labels(limb, make_grid(limb, "coarse", SEED))
     names = {FOREIGN_VALUE * value: name for value, name in own.names.items()}
     foreign = LabelMap(FOREIGN_VALUE * own.array, own.spacing, own.origin, own.direction, names)
     write_labels(folder / "labels.nii.gz", foreign)

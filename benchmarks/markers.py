@@ -29,9 +29,9 @@ from limbfit.anatomy.sites.markers import Marker, find_markers, match_markers
 from limbfit.anatomy.sites.registration import register_limb
 from limbfit.anatomy.surfaces.surfaces import Surface, build_anatomy
 from limbfit.errors import SiteError
-from limbfit.phantom.geometry import Limb, make_limb, rotation_about
-from limbfit.phantom.mri import ScanGrid, image_of, make_grid
-from limbfit.phantom.sites import TrueSite, markers_of, true_sites
+from limbfit.phantom.geometry import Limb, build_rotation, make_limb
+from limbfit.phantom.mri import ScanGrid, build_image, make_grid
+from limbfit.phantom.sites import TrueSite, build_markers, build_true_sites
 
 SHIFT_MM, TURN_DEG = 5.0, 3.0
 EDGE_MM = 3.0
@@ -42,7 +42,7 @@ def moved(limb: Limb, seed: int) -> Limb:
     random = np.random.default_rng([seed, 10])
     axis, way = random.normal(size=3), random.normal(size=3)
     turn, shift = np.cbrt(random.uniform(size=2)) * (np.deg2rad(TURN_DEG), SHIFT_MM)
-    return limb.moved(rotation_about(axis, turn), shift * way / np.linalg.norm(way))
+    return limb.moved(build_rotation(axis, turn), shift * way / np.linalg.norm(way))
 
 
 def coarser(grid: ScanGrid, factor: float) -> ScanGrid:
@@ -80,9 +80,9 @@ def measure(seed: int, coarseness: float) -> dict[str, Any]:
     limb = make_limb(seed)
     second = moved(limb, seed)
     grid = coarser(make_grid(limb, "paper", seed), coarseness)
-    sites, moved_sites = true_sites(limb, seed), true_sites(second, seed)
-    plain = image_of(limb, grid, seed=seed)
-    marked = image_of(second, grid, markers_of(moved_sites), seed=seed)
+    sites, moved_sites = build_true_sites(limb, seed), build_true_sites(second, seed)
+    plain = build_image(limb, grid, seed=seed)
+    marked = build_image(second, grid, build_markers(moved_sites), seed=seed)
     start = _seconds()
     skin, mask = skin_of(plain)
     outline = extract_marked_skin(marked)[0]

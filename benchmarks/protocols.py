@@ -39,7 +39,7 @@ from limbfit.identify.checks.protocol import (
 )
 from limbfit.identify.fit.objective import SiteResponse
 from limbfit.indentation import to_vector
-from limbfit.phantom.record import NOTHING, ULTRASOUND_NOISE_MM, WAVES_NOISE_M_S, Seen
+from limbfit.phantom.record import NOTHING, ULTRASOUND_NOISE_MM, WAVES_NOISE_M_S, SecondaryMeasurements
 from limbfit.pipeline.experiments.protocol import DETERMINED
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import SimulationCache, curve_job, site_model
@@ -53,7 +53,7 @@ REST_S, SETUP_S, MINUTES = 30.0, 60.0, 25.0
 EXPECTED_N, EXPECTED_CORRELATION, MISFITS = 0.015, 0.95, (0.02, 0.01, 0.005, 0.002)
 FITTED = tuple(spot.name for spot in SPOTS if spot.fitted)
 HELD_OUT = tuple(Take(spot.name) for spot in SPOTS if not spot.fitted)
-ULTRASOUND = Seen(ultrasound=True)
+ULTRASOUND = SecondaryMeasurements(ultrasound=True)
 RAMPS = tuple(Take(site) for site in FITTED)
 INGREDIENTS: dict[str, tuple[Take, ...]] = {
     "paper": RAMPS,
@@ -62,13 +62,13 @@ INGREDIENTS: dict[str, tuple[Take, ...]] = {
     "speed": (*RAMPS, *(replace(one, speed=FAST) for one in RAMPS)),
     "indenter": (*RAMPS, *(replace(one, ball=True) for one in RAMPS)),
     "ultrasound": tuple(replace(one, seen=ULTRASOUND) for one in RAMPS),
-    "surface": tuple(replace(one, seen=Seen(surface=True)) for one in RAMPS),
-    "shear waves": tuple(replace(one, seen=Seen(shear_waves=True)) for one in RAMPS),
+    "surface": tuple(replace(one, seen=SecondaryMeasurements(surface=True)) for one in RAMPS),
+    "shear waves": tuple(replace(one, seen=SecondaryMeasurements(shear_waves=True)) for one in RAMPS),
 }
 FITTED_ALONE = ("prior", "surface", "shear waves")  # linear theory is not asked of them
 DESIGNED = {
     "designed": ULTRASOUND,
-    "designed with shear waves": Seen(ultrasound=True, shear_waves=True),
+    "designed with shear waves": SecondaryMeasurements(ultrasound=True, shear_waves=True),
     "designed without ultrasound": NOTHING,
     "designed with prior": ULTRASOUND,
 }
@@ -95,7 +95,7 @@ def plan_study(folder: Path, limb: Limb, edge_mm: float | None) -> Study:
 
 
 def designed(
-    folder: Path, limb: Limb, edge_mm: float | None, seen: Seen, depths_mm: Sequence[float]
+    folder: Path, limb: Limb, edge_mm: float | None, seen: SecondaryMeasurements, depths_mm: Sequence[float]
 ) -> tuple[Take, ...]:
     """The protocol that limbfit designs before anybody is indented: at the start and two more tissues."""
     found = plan_protocol(
@@ -158,7 +158,12 @@ def wanted_of(folder: Path, limb: Limb, edge_mm: float | None) -> DesignTarget:
 
 
 def best_at_truth(
-    folder: Path, limb: Limb, edge_mm: float | None, minutes: float, misfit: float, seen: Seen
+    folder: Path,
+    limb: Limb,
+    edge_mm: float | None,
+    minutes: float,
+    misfit: float,
+    seen: SecondaryMeasurements,
 ) -> tuple[Take, ...]:
     """The protocol of so many minutes that linear theory prefers at the true tissue."""
     ways = product(FITTED, (SLOW, FAST), (0.0, HOLD_S), (False, True))

@@ -34,14 +34,14 @@ from limbfit.indentation import (
     read_indenter,
     waves_under,
 )
-from limbfit.mesh import Mesh, gauges_along, read_vtu, write_vtu
+from limbfit.mesh import Mesh, find_gauges_along, read_vtu, write_vtu
 from limbfit.phantom.record import (
     CLEARANCE_MM,
     DISPLACEMENT_NOISE_MM,
     NOTHING,
     RATE_HZ,
     RobotRecord,
-    Seen,
+    SecondaryMeasurements,
     write_surface,
     write_ultrasound,
     write_waves,
@@ -70,7 +70,7 @@ class Take:
     hold_s: float = 0.0
     ball: bool = False
     depth: float | None = None
-    seen: Seen = NOTHING
+    seen: SecondaryMeasurements = NOTHING
 
     @property
     def name(self) -> str:
@@ -124,7 +124,7 @@ class Limb:
         mesh, position, axis = self._mesh(take.site)
         indenter = BALL if take.ball else INDENTER
         model = SiteModel(take.name, Path(), "", position, axis, *take.knots, indenter=indenter)
-        gauges = gauges_along(mesh, np.array(position), np.array(axis))
+        gauges = find_gauges_along(mesh, np.array(position), np.array(axis))
         points, waves = np.zeros((0, 3)), ()
         if take.seen.surface or take.seen.shear_waves:
             points = points_around(mesh, read_indenter(indenter, position, axis, None))

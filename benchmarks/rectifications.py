@@ -33,7 +33,7 @@ from limbfit.errors import InputError, RunError
 from limbfit.execution import SerialExecutor
 from limbfit.mesh import Mesh
 from limbfit.phantom.geometry import make_limb
-from limbfit.phantom.surfaces import true_anatomy
+from limbfit.phantom.surfaces import build_true_anatomy
 from limbfit.pipeline.experiments.socket_limb import SocketLimb
 from limbfit.pipeline.shared.context import Context, quiet
 from limbfit.pipeline.shared.socket_shape import socket_of
@@ -84,7 +84,7 @@ def write_study(name: str, folder: Path, shared: Path) -> None:
     """The surfaces of a limb, and a study of them."""
     cut = ""
     if name == "phantom":
-        anatomy = true_anatomy(make_limb(0))
+        anatomy = build_true_anatomy(make_limb(0))
         skin, bones = anatomy.skin, dict(anatomy.bones)
         point, normal = anatomy.cut_point.tolist(), anatomy.cut_normal.tolist()
         cut = f"[geometry]\nproximal_cut = {{ point = {point}, normal = {normal} }}"

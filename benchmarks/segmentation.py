@@ -30,9 +30,9 @@ from limbfit.anatomy.labels.quality import assess_labels
 from limbfit.anatomy.segmentation.one_limb import check_one_limb
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy, compute_signed_distance
-from limbfit.phantom.geometry import Limb, gradient_of, make_limb
-from limbfit.phantom.mri import CONTRASTS, DETAIL_GRIDS, ScanGrid, image_of, make_grid
-from limbfit.phantom.surfaces import true_anatomy
+from limbfit.phantom.geometry import Limb, compute_gradient, make_limb
+from limbfit.phantom.mri import CONTRASTS, DETAIL_GRIDS, ScanGrid, build_image, make_grid
+from limbfit.phantom.surfaces import build_true_anatomy
 
 BELOW_CUT_MM = 3.0
 FIELD_MM = np.array([300.0, 256.0, 256.0])  # k, j, i
@@ -44,7 +44,7 @@ def dice(a: np.ndarray, b: np.ndarray) -> float:
 
 def distances(points: np.ndarray, field: Any) -> np.ndarray:
     """First-order distances (n,) of points to the zero surface of a field, mm."""
-    slopes = np.linalg.norm(gradient_of(field, points), axis=-1)
+    slopes = np.linalg.norm(compute_gradient(field, points), axis=-1)
     return np.abs(field(points)) / slopes
 
 
@@ -64,7 +64,7 @@ def truth_masks(limb: Limb, labels: LabelMap) -> dict[str, np.ndarray]:
 
 def surface_errors(anatomy: Anatomy, limb: Limb) -> dict[str, dict[str, float]]:
     """RMS and 95th percentile of the found surfaces' distance to the truth, and of the truth's to them."""
-    true = true_anatomy(limb, 3.0)
+    true = build_true_anatomy(limb, 3.0)
     fields = {"skin": limb.skin} | {
         name: lambda p, name=name: limb.bone(name, p)
         for name in BONES  # type: ignore[misc]
@@ -103,7 +103,7 @@ def cover_field(limb: Limb, voxel_mm: float, seed: int) -> ScanGrid:
 def measure_cost(voxel_mm: float, contrast: str, seed: int) -> dict[str, Any]:
     """CPU seconds of each step and the largest memory (GB) until its end."""
     limb = make_limb(seed)
-    image = image_of(limb, cover_field(limb, voxel_mm, seed), seed=seed, levels=CONTRASTS[contrast])
+    image = build_image(limb, cover_field(limb, voxel_mm, seed), seed=seed, levels=CONTRASTS[contrast])
     row: dict[str, Any] = {"voxel_mm": voxel_mm, "contrast": contrast, "seed": seed, "shape": image.size}
     start, begun = time.process_time(), time.perf_counter()
 
@@ -127,7 +127,7 @@ def measure_cost(voxel_mm: float, contrast: str, seed: int) -> dict[str, Any]:
 
 def one(detail: str, contrast: str, seed: int) -> dict[str, Any]:
     limb = make_limb(seed)
-    image = image_of(limb, make_grid(limb, detail, seed), seed=seed, levels=CONTRASTS[contrast])
+    image = build_image(limb, make_grid(limb, detail, seed), seed=seed, levels=CONTRASTS[contrast])
     start = time.process_time()
     labels = segment(image)
     labelled = time.process_time()

@@ -31,7 +31,7 @@ from limbfit.execution import SerialExecutor
 from limbfit.identify.uncertainty.uncertainty import NORMAL_95
 from limbfit.indentation import flat_names, to_parameters, to_vector
 from limbfit.mesh import Mesh
-from limbfit.phantom.build import true_parameters
+from limbfit.phantom.build import draw_true_parameters
 from limbfit.pipeline.experiments.socket_intervals import drawn, first_order
 from limbfit.pipeline.experiments.socket_limb import SocketLimb
 from limbfit.pipeline.shared.context import Context, quiet
@@ -158,7 +158,7 @@ def main() -> None:
             if name.isdigit():
                 rows[name] = bench.run(bench.centre * np.exp(drawn(bench.covariance, int(name), asked.seed)))
             elif name == "truth":
-                rows[name] = bench.run(to_vector(true_parameters(asked.truth), study.tissues))
+                rows[name] = bench.run(to_vector(draw_true_parameters(asked.truth), study.tissues))
             else:
                 rows[name] = bench.run(
                     bench.centre, known=name == "centre", friction=FRICTION if name == "friction" else 1.0

@@ -15,7 +15,7 @@ from limbfit.bench.blocks import block_site
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
-from limbfit.mesh.boxes import SIX_TETS, boxes, upright
+from limbfit.mesh.boxes import SIX_TETS, build_boxes, turn_upright
 from limbfit.phantom.record import Ramp, record
 from limbfit.pipeline.shared.artefacts import write_json
 from limbfit.pipeline.shared.context import Context
@@ -85,8 +85,8 @@ def layered_block(
     ends = -np.concatenate([[0.0], np.cumsum(thickness_mm)])
     lines = [np.linspace(a, b, max(round((a - b) / height_mm), 1), endpoint=False) for a, b in pairwise(ends)]
     z = np.concatenate([*lines, ends[-1:]])[::-1]
-    points, corners = boxes(side, side, z)
-    cells = upright(points, corners[:, SIX_TETS].reshape(-1, 4))
+    points, corners = build_boxes(side, side, z)
+    cells = turn_upright(points, corners[:, SIX_TETS].reshape(-1, 4))
     depth = -points[cells][:, :, 2].mean(axis=1)
     regions = np.searchsorted(np.cumsum(thickness_mm)[:-1], depth)
     mesh = Mesh(points, cells, "tet4", regions, tuple(tissues))

@@ -14,9 +14,9 @@ from limbfit.anatomy.sites.registration import register_limb
 from limbfit.anatomy.surfaces.surfaces import extract_surface
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import ImageError, SiteError
-from limbfit.phantom.geometry import make_limb, rotation_about
-from limbfit.phantom.mri import image_of, make_grid
-from limbfit.phantom.sites import markers_of, true_sites
+from limbfit.phantom.geometry import build_rotation, make_limb
+from limbfit.phantom.mri import build_image, make_grid
+from limbfit.phantom.sites import build_markers, build_true_sites
 
 SHIFT_MM, TURN_DEG = np.array([3.0, -2.5, 2.5]), 2.8
 
@@ -34,11 +34,11 @@ def skin_of(volume: Volume) -> Surface:
 def scans(seed: int):
     """The limb, the limb after a motion, and images of the first without and the second with markers."""
     limb = make_limb(seed)
-    turn = rotation_about(np.array([0.3, 0.2, 1.0]), np.deg2rad(TURN_DEG))
+    turn = build_rotation(np.array([0.3, 0.2, 1.0]), np.deg2rad(TURN_DEG))
     moved = limb.moved(turn, SHIFT_MM)
     grid = make_grid(limb, "coarse", seed)
-    marked = image_of(moved, grid, markers_of(true_sites(moved, seed)), seed=seed)
-    return limb, moved, image_of(limb, grid, seed=seed), marked
+    marked = build_image(moved, grid, build_markers(build_true_sites(moved, seed)), seed=seed)
+    return limb, moved, build_image(limb, grid, seed=seed), marked
 
 
 def check_found(found: tuple[Marker, ...], sites) -> None:
@@ -58,17 +58,17 @@ def test_markers_of_a_second_image_of_a_moved_limb() -> None:
     outline, skin = extract_marked_skin(marked)[0], skin_of(plain)
     motion = register_limb(plain, marked, mask_of(plain))
     check_found(
-        find_markers(replace(outline, points=motion.apply(outline.points)), skin), true_sites(limb, 1)
+        find_markers(replace(outline, points=motion.apply(outline.points)), skin), build_true_sites(limb, 1)
     )
     astray = [marker.position for marker in find_markers(outline, skin)]
-    errors = [np.linalg.norm(astray - s.position, axis=1).min() for s in true_sites(limb, 1) if astray]
+    errors = [np.linalg.norm(astray - s.position, axis=1).min() for s in build_true_sites(limb, 1) if astray]
     assert not errors or max(errors) > 2.0
 
 
 def test_motion_of_a_limb() -> None:
     limb, moved, plain, marked = scans(1)
     motion = register_limb(plain, marked, mask_of(plain))
-    before, after = (np.array([s.position for s in true_sites(place, 1)]) for place in (limb, moved))
+    before, after = (np.array([s.position for s in build_true_sites(place, 1)]) for place in (limb, moved))
     assert np.linalg.norm(motion.apply(after) - before, axis=1).max() < 0.15
     assert motion.turn_deg == pytest.approx(TURN_DEG, abs=0.2)
     assert motion.correlation > 0.95
@@ -102,7 +102,7 @@ def test_another_limb_is_no_motion() -> None:
 def test_markers_of_one_image_alone_are_found_and_taken_off() -> None:
     """The skin under them comes back within the thickness of a line, elsewhere it stays as it was."""
     _, moved, _, marked = scans(1)
-    sites = true_sites(moved, 1)
+    sites = build_true_sites(moved, 1)
     outline = extract_marked_skin(marked)[0]
     cleaned, count = remove_markers(marked, outline)
     assert count == len(sites)

@@ -19,7 +19,7 @@ from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.anatomy.segmentation.supports import remove_supports
 from limbfit.errors import ImageError
 from limbfit.phantom.geometry import SKIN_AND_FAT, Limb, make_limb
-from limbfit.phantom.mri import CONTRASTS, image_of, make_grid
+from limbfit.phantom.mri import CONTRASTS, build_image, make_grid
 
 SEED = 2
 
@@ -40,7 +40,7 @@ def grid(limb):
 
 @pytest.fixture(scope="module")
 def images(limb, grid) -> dict[str, Volume]:
-    return {name: image_of(limb, grid, seed=SEED, levels=levels) for name, levels in CONTRASTS.items()}
+    return {name: build_image(limb, grid, seed=SEED, levels=levels) for name, levels in CONTRASTS.items()}
 
 
 @pytest.fixture(scope="module")

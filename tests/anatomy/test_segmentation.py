@@ -13,7 +13,7 @@ from limbfit.anatomy.segmentation.bones import compute_escape_level, find_bones,
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.errors import ImageError
 from limbfit.phantom.geometry import make_limb
-from limbfit.phantom.mri import make_grid, slabs
+from limbfit.phantom.mri import generate_slabs, make_grid
 
 SHAPE, SPACING = (62, 60, 60), [2.0, 2.0, 2.5]
 
@@ -51,7 +51,7 @@ def test_phantom_with_all_four_bones():
     """The demo's image: limb above 0.98, every bone above 0.93 (Dice)."""
     limb = make_limb(1)
     where = make_grid(limb, "coarse", 1)
-    array = np.concatenate([slab for _, slab in slabs(limb, where, (), 1)])
+    array = np.concatenate([slab for _, slab in generate_slabs(limb, where, (), 1)])
     image = Volume(array, where.spacing, where.origin, where.direction)
     labels = segment(image)
     points = where.points(*(slice(0, n) for n in array.shape))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from limbfit.bench.blocks import HEX, SIX_TETS, boxes, upright
+from limbfit.bench.blocks import HEX, SIX_TETS, build_boxes, turn_upright
 from limbfit.fe import (
     ELEMENTS,
     History,
@@ -47,14 +47,14 @@ def block(
 
     Node sets ``bottom``; face set ``top``.  ``jitter`` moves inner nodes at random (fixed seed), mm.
     """
-    points, corners = boxes(*(np.asarray(lines, dtype=float) for lines in (x, y, z)))
+    points, corners = build_boxes(*(np.asarray(lines, dtype=float) for lines in (x, y, z)))
     low, high = points.min(axis=0), points.max(axis=0)
     inner = ((points > low) & (points < high)).all(axis=1)
     points[inner] += jitter * np.random.default_rng(1).uniform(-1, 1, (inner.sum(), 3))
     if cell_type == "hex8":
         cells = corners[:, HEX]
     else:
-        cells = upright(points, corners[:, SIX_TETS].reshape(-1, 4))
+        cells = turn_upright(points, corners[:, SIX_TETS].reshape(-1, 4))
     centres = points[cells].mean(axis=1)
     regions = (centres[:, 2] < high[2] - layer).astype(int)
     if cell_type == "tet10":

@@ -9,7 +9,7 @@ import pytest
 from blocks import boundary
 
 from limbfit import History, Indenter, OgdenQLV, Problem
-from limbfit.bench.blocks import SIX_TETS, boxes, upright
+from limbfit.bench.blocks import SIX_TETS, build_boxes, turn_upright
 from limbfit.errors import ProblemError
 from limbfit.fe import StepControl, System, solve
 from limbfit.indentation import clamped, clamping_pins
@@ -23,13 +23,13 @@ UP = np.array([0.0, 0.0, 1.0])
 def pipe(radial: int = 3, around: int = 28, up: int = 10) -> Mesh:
     """Tissue around a rigid bone along z."""
     lines = np.linspace(INNER, OUTER, radial + 1), np.linspace(0.0, 2.0 * np.pi, around + 1)
-    points, corners = boxes(*lines, np.linspace(0.0, LENGTH, up + 1))
+    points, corners = build_boxes(*lines, np.linspace(0.0, LENGTH, up + 1))
     r, angle, z = points.T
     points = np.column_stack([r * np.cos(angle), r * np.sin(angle), z])
     _, first, number = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
     cells = number.ravel()[corners[:, SIX_TETS].reshape(-1, 4)]
     points, r = points[first], r[first]
-    cells = upright(points, cells)
+    cells = turn_upright(points, cells)
     faces = boundary(cells, "tet4")
     skin = faces[(r[faces] > OUTER - 1e-6).all(axis=1)]
     sets = {"fixed_bone": np.flatnonzero(r < INNER + 1e-6)}

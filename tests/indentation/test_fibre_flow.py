@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limbfit.bench.blocks import HEX, SIX_TETS, boxes, upright
+from limbfit.bench.blocks import HEX, SIX_TETS, build_boxes, turn_upright
 from limbfit.errors import ProblemError
 from limbfit.indentation import fibre_field, neighbourhood
 from limbfit.indentation.fibres import flow_directions
@@ -18,14 +18,14 @@ def bar(bent: bool = False) -> Mesh:
     """Muscle of 12 x 6 x 60 mm under 3 mm of skin: from the cut at z = 60 to bone at z = 0; or bent into a
     quarter of a ring around the x axis."""
     x, y, z = np.linspace(0.0, 12.0, 4), np.linspace(0.0, 9.0, 7), np.linspace(0.0, 60.0, 13)
-    points, corners = boxes(x, y, z)
-    cells = upright(points, corners[:, SIX_TETS].reshape(-1, 4))
+    points, corners = build_boxes(x, y, z)
+    cells = turn_upright(points, corners[:, SIX_TETS].reshape(-1, 4))
     skin = points[cells][:, :, 1].mean(axis=1) > 6.0
     height = points[:, 2].copy()
     if bent:
         angle, radius = 0.5 * np.pi * height / 60.0, 30.0 + points[:, 1]
         points = np.column_stack([points[:, 0], radius * np.cos(angle), radius * np.sin(angle)])
-        cells = upright(points, cells)
+        cells = turn_upright(points, cells)
     cut, bone = np.flatnonzero(height > 59.9), np.flatnonzero(height < 0.1)
     sets = {"fixed_proximal": cut, "fixed_bone": bone}
     return Mesh(points, cells, "tet4", (~skin).astype(int), ("skin", "muscle"), sets, {"skin": cells[:0, :3]})
@@ -68,7 +68,7 @@ def test_a_flow_without_a_way_is_refused(name, what):
 
 
 def test_a_flow_needs_tetrahedra():
-    points, corners = boxes(*[np.linspace(0.0, 1.0, 2)] * 3)
+    points, corners = build_boxes(*[np.linspace(0.0, 1.0, 2)] * 3)
     mesh = Mesh(points, corners[:, HEX], "hex8", np.zeros(1, dtype=int), ("muscle",))
     with pytest.raises(ProblemError, match="tetrahedra"):
         flow_directions(mesh, "muscle")

@@ -8,12 +8,18 @@ import numpy as np
 import pytest
 
 from limbfit.anatomy.surfaces.surfaces import save_anatomy
-from limbfit.phantom.build import _ramp, _triple, true_parameters
-from limbfit.phantom.forces import DISCRETISATIONS, ForceJob, TruthMeshJob, site_force, site_mesh
+from limbfit.phantom.build import _build_ramp, _to_triple, draw_true_parameters
+from limbfit.phantom.forces import (
+    DISCRETISATIONS,
+    ForceJob,
+    TruthMeshJob,
+    mesh_true_site,
+    simulate_true_force,
+)
 from limbfit.phantom.geometry import make_limb
-from limbfit.phantom.record import Seen
-from limbfit.phantom.sites import true_sites
-from limbfit.phantom.surfaces import true_anatomy
+from limbfit.phantom.record import SecondaryMeasurements
+from limbfit.phantom.sites import build_true_sites
+from limbfit.phantom.surfaces import build_true_anatomy
 
 NAMES = [f"{number:02d}" for number in range(1, 19)]
 
@@ -22,8 +28,8 @@ NAMES = [f"{number:02d}" for number in range(1, 19)]
 def phantom(tmp_path_factory):
     limb = make_limb(0)
     folder = tmp_path_factory.mktemp("anatomy")
-    save_anatomy(folder, true_anatomy(limb))
-    return folder, {site.name: site for site in true_sites(limb, 0)}
+    save_anatomy(folder, build_true_anatomy(limb))
+    return folder, {site.name: site for site in build_true_sites(limb, 0)}
 
 
 @pytest.mark.slow
@@ -31,10 +37,12 @@ def phantom(tmp_path_factory):
 def test_site_is_simulated_to_its_end(phantom, name):
     folder, sites = phantom
     site = sites[name]
-    made, at, axis = DISCRETISATIONS["coarse"], _triple(site.position), _triple(site.axis)
-    mesh = site_mesh(TruthMeshJob(name, folder, at, axis, made.mesh, made.within_mm))
+    made, at, axis = DISCRETISATIONS["coarse"], _to_triple(site.position), _to_triple(site.axis)
+    mesh = mesh_true_site(TruthMeshJob(name, folder, at, axis, made.mesh, made.within_mm))
     steps = made.steps(site.thickness)
-    found = site_force(ForceJob(name, mesh, at, axis, _ramp(site), steps, true_parameters(0)))
+    found = simulate_true_force(
+        ForceJob(name, mesh, at, axis, _build_ramp(site), steps, draw_true_parameters(0))
+    )
     peak = int(np.argmax(found.force))
     assert 2.0 < found.force[peak] < 20.0
     assert found.times[peak] == pytest.approx(site.depth / site.speed, rel=0.02)
@@ -46,12 +54,15 @@ def test_a_site_shows_what_is_asked_for_and_no_more(phantom):
     """One of coarse tissue within 45 mm; the force is the same whatever is seen beside it."""
     folder, sites = phantom
     site, made = sites["05"], DISCRETISATIONS["coarse"]
-    at, axis = _triple(site.position), _triple(site.axis)
+    at, axis = _to_triple(site.position), _to_triple(site.axis)
     settings = replace(made.mesh, edge_near_mm=7.0)
-    mesh = site_mesh(TruthMeshJob("05", folder, at, axis, settings, 45.0))
+    mesh = mesh_true_site(TruthMeshJob("05", folder, at, axis, settings, 45.0))
     steps = replace(made.steps(site.thickness), load_steps=4, unload_steps=3)
-    job = ForceJob("05", mesh, at, axis, _ramp(site), steps, true_parameters(0))
-    plain, found = site_force(job), site_force(replace(job, seen=Seen(True, True, True)))
+    job = ForceJob("05", mesh, at, axis, _build_ramp(site), steps, draw_true_parameters(0))
+    plain, found = (
+        simulate_true_force(job),
+        simulate_true_force(replace(job, seen=SecondaryMeasurements(True, True, True))),
+    )
     assert found.force == pytest.approx(plain.force, abs=1e-6 * plain.force.max())
     assert (plain.layers, len(plain.skin_points)) == ({}, 0)
     assert set(found.layers) == set(found.speeds) == {"skin", "muscle"}

@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 
 from limbfit.anatomy.grid import BONES
 from limbfit.anatomy.surfaces.surfaces import check_closed
-from limbfit.phantom.geometry import Limb, make_limb, rotation_about
-from limbfit.phantom.sites import DETAIL_SITES, FITTED, SAFE_SHARE, true_sites
-from limbfit.phantom.surfaces import true_anatomy
+from limbfit.phantom.geometry import Limb, build_rotation, make_limb
+from limbfit.phantom.sites import DETAIL_SITES, FITTED, SAFE_SHARE, build_true_sites
+from limbfit.phantom.surfaces import build_true_anatomy
 
 SEEDS = (0, 1, 2, 3)
 
@@ -23,7 +23,7 @@ def grid_of(limb: Limb, spacing: float = 2.0) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return true_anatomy(make_limb(0))
+    return build_true_anatomy(make_limb(0))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -112,7 +112,7 @@ def test_the_femur_sticks_out_of_the_flat_cut_and_nothing_else_does(anatomy) -> 
 
 def test_a_moved_limb_is_the_same_limb_elsewhere() -> None:
     limb = make_limb(0)
-    turn, shift = rotation_about(np.array([1.0, 2.0, 3.0]), 0.05), np.array([1.0, -2.0, 0.5])
+    turn, shift = build_rotation(np.array([1.0, 2.0, 3.0]), 0.05), np.array([1.0, -2.0, 0.5])
     moved = limb.moved(turn, shift)
     middle = limb.to_patient(np.array([0.0, 0.0, 125.0]))
     point = limb.skin_point(1.0, 100.0)
@@ -124,7 +124,7 @@ def test_a_moved_limb_is_the_same_limb_elsewhere() -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_sites_lie_on_the_skin_in_four_regions_at_safe_depths(seed: int) -> None:
     limb = make_limb(seed)
-    sites = true_sites(limb, seed)
+    sites = build_true_sites(limb, seed)
     assert len(sites) == 18
     positions = np.array([site.position for site in sites])
     assert np.abs(limb.skin(positions)).max() < 1e-9

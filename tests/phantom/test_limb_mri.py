@@ -16,11 +16,11 @@ from limbfit.phantom.mri import (
     MARKER_HEIGHT_MM,
     NOISE,
     RESCALE_SLOPE,
+    generate_slabs,
     make_grid,
-    slabs,
     write_series,
 )
-from limbfit.phantom.sites import markers_of, true_sites
+from limbfit.phantom.sites import build_markers, build_true_sites
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def grid(limb):
 
 @pytest.fixture(scope="module")
 def markers(limb):
-    return markers_of(true_sites(limb, 0))
+    return build_markers(build_true_sites(limb, 0))
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def read(folder: Path) -> sitk.Image:
 
 
 def rendered(limb, grid, markers=(), seed=0, noise=NOISE) -> np.ndarray:
-    return np.concatenate([signal for _, signal in slabs(limb, grid, markers, seed, noise)])
+    return np.concatenate([signal for _, signal in generate_slabs(limb, grid, markers, seed, noise)])
 
 
 @pytest.fixture(scope="module")

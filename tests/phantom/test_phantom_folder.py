@@ -15,8 +15,8 @@ from limbfit.anatomy.imaging import read_labels
 from limbfit.anatomy.surfaces.surfaces import load_anatomy
 from limbfit.errors import InputError, SiteError
 from limbfit.laws import LAWS
-from limbfit.phantom import make_limb, make_phantom, true_parameters
-from limbfit.phantom.forces import TrueForce, site_force, site_mesh
+from limbfit.phantom import draw_true_parameters, make_limb, make_phantom
+from limbfit.phantom.forces import TrueForce, mesh_true_site, simulate_true_force
 from limbfit.phantom.sites import DETAIL_SITES, FITTED
 from limbfit.study import load_study
 from limbfit.traces import read_surface_motion
@@ -28,7 +28,7 @@ def cubic_law(function, jobs):
     Where cameras are wanted two points follow the indenter by a half and a tenth.
     """
     for job in jobs:
-        if function is site_mesh:
+        if function is mesh_true_site:
             yield None
             continue
         times = np.linspace(0, 2 * job.ramp.peak_s, 101)
@@ -96,10 +96,10 @@ def test_one_patient_two_series(made) -> None:
 
 
 def test_another_seed_is_another_patient() -> None:
-    assert true_parameters(1) == true_parameters(1)
-    assert true_parameters(1) != true_parameters(2)
+    assert draw_true_parameters(1) == draw_true_parameters(1)
+    assert draw_true_parameters(1) != draw_true_parameters(2)
     for seed in range(5):
-        parameters = true_parameters(seed)
+        parameters = draw_true_parameters(seed)
         assert 6.3 < parameters["skin"]["c_kPa"] < 8.7
         assert 3.8 < parameters["muscle"]["c_kPa"] < 5.2
 
@@ -119,8 +119,8 @@ def test_a_limb_with_fat_has_three_tissues_and_is_the_same_otherwise(tmp_path, m
     assert truth["limb"] == plain["limb"]
     assert truth["parameters"]["muscle"] == plain["parameters"]["muscle"]
     assert truth["parameters"]["fat"]["c_kPa"] < truth["parameters"]["muscle"]["c_kPa"]
-    assert jobs[site_force][0].parameters == truth["parameters"]
-    meshed = jobs[site_mesh][0].settings.layers
+    assert jobs[simulate_true_force][0].parameters == truth["parameters"]
+    meshed = jobs[mesh_true_site][0].settings.layers
     assert [layer.name for layer in meshed] == ["skin", "fat"]
     assert [layer.thickness_mm for layer in meshed] == [layer.thickness_mm for layer in study.geometry.layers]
 

@@ -12,7 +12,7 @@ from limbfit.anatomy.frame import build_limb_frame
 from limbfit.anatomy.surfaces.surfaces import load_anatomy, write_surface
 from limbfit.phantom import make_limb, make_phantom
 from limbfit.phantom.socket import LINER_MM, make_socket
-from limbfit.phantom.surfaces import outer_surface, true_anatomy
+from limbfit.phantom.surfaces import build_outer_surface, build_true_anatomy
 from limbfit.pipeline.shared.socket_shape import socket_of
 from limbfit.socket import read_socket
 from limbfit.study import load_study
@@ -28,7 +28,7 @@ def test_a_socket_beside_the_patient(tmp_path: Path) -> None:
     assert study.socket.file == Path(truth["file"])
     assert study.socket.liner.thickness_mm == truth["liner_mm"]
     anatomy = load_anatomy(tmp_path / "study" / "truth")
-    liner = outer_surface(make_limb(2), LINER_MM)
+    liner = build_outer_surface(make_limb(2), LINER_MM)
     socket = socket_of(study, anatomy, liner)
     assert socket.notes == ()
     assert socket.volume_mm3 == pytest.approx(truth["volume_mm3"], rel=1e-4)
@@ -42,7 +42,10 @@ def test_a_socket_beside_the_patient(tmp_path: Path) -> None:
 
 def check_socket(seed: int, file: Path | None = None) -> None:
     """The socket of a coarse limb, where it decides as on the fine one; read back from a file, if given."""
-    anatomy, liner = true_anatomy(make_limb(seed), 8.0), outer_surface(make_limb(seed), LINER_MM, 8.0)
+    anatomy, liner = (
+        build_true_anatomy(make_limb(seed), 8.0),
+        build_outer_surface(make_limb(seed), LINER_MM, 8.0),
+    )
     socket, areas = make_socket(anatomy, liner)
     assert anatomy.height(socket.points).max() < -20.0  # below the cut, with the brim's flare
     depth = socket.offset(liner)

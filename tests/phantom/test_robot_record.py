@@ -6,7 +6,7 @@ import pytest
 from limbfit.errors import SiteError
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.record import CLEARANCE_MM, FORCE_NOISE_N, Ramp, record
-from limbfit.phantom.sites import SPEED_MM_S, SPEED_SPREAD, true_sites
+from limbfit.phantom.sites import SPEED_MM_S, SPEED_SPREAD, build_true_sites
 
 RAMP = Ramp(depth=5.0, speed=0.96)
 
@@ -63,7 +63,7 @@ def test_the_csv_is_what_a_robot_writes(made, tmp_path) -> None:
 
 
 def test_speeds_vary_a_little_from_site_to_site() -> None:
-    speeds = np.array([site.speed for site in true_sites(make_limb(0), 0)])
+    speeds = np.array([site.speed for site in build_true_sites(make_limb(0), 0)])
     assert np.abs(speeds / SPEED_MM_S - 1).max() <= SPEED_SPREAD
     assert speeds.std() > 0.005
 

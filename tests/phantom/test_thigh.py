@@ -13,13 +13,13 @@ from test_phantom_folder import cubic_law
 from limbfit import run_study
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.errors import InputError, StudyError
-from limbfit.phantom import Limb, make_limb, make_phantom, true_sites
+from limbfit.phantom import Limb, build_true_sites, make_limb, make_phantom
 from limbfit.phantom.forces import choose_discretisation
 from limbfit.phantom.labels import FILE, write_true_labels
-from limbfit.phantom.mri import image_of, make_grid
+from limbfit.phantom.mri import build_image, make_grid
 from limbfit.phantom.sites import DETAIL_SITES, SAFE_SHARE
 from limbfit.phantom.socket import LINER_MM, make_socket
-from limbfit.phantom.surfaces import outer_surface, true_anatomy
+from limbfit.phantom.surfaces import build_outer_surface, build_true_anatomy
 from limbfit.pipeline.shared.socket_shape import load_of, regions_of
 from limbfit.pipeline.verbs.check import check_study
 from limbfit.study import load_study
@@ -34,14 +34,14 @@ def thigh(seed: int) -> Limb:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_its_sizes_are_those_of_a_thigh_and_its_sites_lie_deep_over_the_femur(seed: int) -> None:
     limb = thigh(seed)
-    anatomy = true_anatomy(limb, 6.0)
+    anatomy = build_true_anatomy(limb, 6.0)
     assert list(anatomy.bones) == ["femur"]
     assert 1.9 < anatomy.skin.volume / 1e6 < 3.5  # litres
     femur = anatomy.bones["femur"].points
     assert anatomy.height(femur).max() == pytest.approx(6.0, abs=1e-6)  # out of the cut
     assert 30.0 < limb.to_limb(femur)[:, 2].min() < 50.0  # padded by muscle
     assert limb.skin(femur[anatomy.height(femur) < 0.0]).max() < -25.0
-    sites = true_sites(limb, seed)
+    sites = build_true_sites(limb, seed)
     assert all(site.thickness > 20.0 and site.depth <= SAFE_SHARE * site.thickness for site in sites)
     positions = np.array([site.position for site in sites])
     apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
@@ -59,7 +59,7 @@ def regions(sites) -> set[str]:
 def test_the_default_segmentation_finds_its_femur_and_calls_it_no_tibia() -> None:
     limb = thigh(0)
     grid = make_grid(limb, "coarse", 0)
-    labels = segment(image_of(limb, grid, seed=0), bias_correction=False)
+    labels = segment(build_image(limb, grid, seed=0), bias_correction=False)
     assert labels.bone_names == ("bone-1",)
     points = grid.points(*(slice(0, size) for size in grid.shape))
     bone, whole = limb.bone("femur", points) < 0, limb.skin(points) < 0
@@ -68,7 +68,7 @@ def test_the_default_segmentation_finds_its_femur_and_calls_it_no_tibia() -> Non
 
 
 def test_its_socket_presses_in_where_it_says() -> None:
-    anatomy, liner = true_anatomy(thigh(0), 8.0), outer_surface(thigh(0), LINER_MM, 8.0)
+    anatomy, liner = build_true_anatomy(thigh(0), 8.0), build_outer_surface(thigh(0), LINER_MM, 8.0)
     socket, areas = make_socket(anatomy, liner, THIGH)
     assert -40.0 < anatomy.height(socket.points[socket.brim]).mean() < -25.0
     depth = socket.offset(liner)
@@ -97,11 +97,11 @@ def test_its_study_needs_no_tibia(tmp_path: Path) -> None:
     assert "transfemoral residuum" in (tmp_path / "study" / "study.toml").read_text()
     study = load_study(tmp_path / "study")
     assert study.socket.side == "right"
-    anatomy = true_anatomy(thigh(0), 8.0)
+    anatomy = build_true_anatomy(thigh(0), 8.0)
     names = set(regions_of(study, anatomy))
     assert {"anterior proximal", "medial distal", "lateral middle"} <= names
     assert not {name for name in names if "tibia" in name or "patella" in name}
-    socket, _ = make_socket(anatomy, outer_surface(thigh(0), LINER_MM, 8.0), THIGH)
+    socket, _ = make_socket(anatomy, build_outer_surface(thigh(0), LINER_MM, 8.0), THIGH)
     force, moment, point = load_of(study, study.socket.loads[0], anatomy, socket)
     assert force == pytest.approx(800.0 * anatomy.cut_normal)
     assert not moment.any()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from limbfit.anatomy.imaging import Volume, write_volume
 from limbfit.phantom.geometry import make_limb
-from limbfit.phantom.mri import image_of, make_grid
+from limbfit.phantom.mri import build_image, make_grid
 from limbfit.pipeline import run_study
 from limbfit.study import load_study
 
@@ -27,7 +27,7 @@ depth_mm = 5.0
 def make_segmented(folder: Path) -> Path:
     """The study's folder, stage ``segment`` done."""
     limb = make_limb(3)
-    fine = image_of(limb, make_grid(limb, "coarse", 3), seed=3)
+    fine = build_image(limb, make_grid(limb, "coarse", 3), seed=3)
     part = Volume(fine.array[30:100], fine.spacing, fine.index_to_point([0, 0, 30]), fine.direction)
     write_volume(folder / "image.nrrd", part)
     (folder / "study.toml").write_text(STUDY)

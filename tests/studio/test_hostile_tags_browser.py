@@ -12,7 +12,7 @@ from browsing import PATIENCE_MS, until
 from conftest import write_trace
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.mri import make_grid, write_series
-from limbfit.phantom.sites import true_sites
+from limbfit.phantom.sites import build_true_sites
 from limbfit.pipeline import study_status
 from limbfit.study import load_study
 
@@ -56,7 +56,7 @@ def limb(tmp_path_factory):
             for n, tag in enumerate(LONG_TAGS):
                 setattr(data, tag, ATTACKS[n % len(ATTACKS)].format(n))
             data.save_as(file)
-    site = true_sites(limb, 3)[0]
+    site = build_true_sites(limb, 3)[0]
     (folder / "study.toml").write_text(
         STUDY.format(name=NAME, place=[round(float(x), 2) for x in site.position])
     )

@@ -11,8 +11,8 @@ import pyvista as pv
 
 from limbfit.mesh import Mesh, boundary_faces, to_tet10
 from limbfit.web.arrays import pack, unpack
-from limbfit.web.assets import STATIC, inline_script
-from limbfit.web.shapes import cell_quality, interface, read_shell, volume_of
+from limbfit.web.assets import STATIC, build_inline_script
+from limbfit.web.shapes import compute_cell_quality, extract_interface, read_shell, to_volume_shape
 
 
 def _block(n: int = 3) -> Mesh:
@@ -58,12 +58,12 @@ def test_only_arrays_that_scripts_can_read_are_packed():
 
 
 def test_inlined_modules_are_one_classic_script(tmp_path, monkeypatch):
-    text = inline_script("colours.js", "overlay.js", "camera.js", "volume.js", "viewer.js", "chart.js")
+    text = build_inline_script("colours.js", "overlay.js", "camera.js", "volume.js", "viewer.js", "chart.js")
     assert not re.search(r"^\s*(import|export)\b", text, re.MULTILINE)
     (tmp_path / "bad.js").write_text('const end = "</SCRIPT>";')
     monkeypatch.setattr("limbfit.web.assets.STATIC", tmp_path)
     with pytest.raises(ValueError, match="ends a script"):
-        inline_script("bad.js")
+        build_inline_script("bad.js")
 
 
 def test_vendored_files_are_those_that_are_listed():
@@ -77,7 +77,7 @@ def test_vendored_files_are_those_that_are_listed():
 @pytest.mark.parametrize("quadratic", [False, True])
 def test_faces_of_a_volume_close_it(quadratic):
     mesh = _block()
-    volume = volume_of(to_tet10(mesh) if quadratic else mesh)
+    volume = to_volume_shape(to_tet10(mesh) if quadratic else mesh)
     outside = volume.neighbours < 0
     assert outside.sum() == len(boundary_faces(mesh)) == 6 * 9 * 2
     assert len(volume.cells) * 4 == outside.sum() + 2 * (~outside).sum()
@@ -88,7 +88,7 @@ def test_faces_of_a_volume_close_it(quadratic):
 
 
 def test_the_interface_lies_between_the_regions():
-    shell = interface(volume_of(_block()), 0)
+    shell = extract_interface(to_volume_shape(_block()), 0)
     np.testing.assert_allclose(shell.points[:, 2], 1 / 3, atol=1e-6)
     corners = shell.points[shell.faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -96,7 +96,7 @@ def test_the_interface_lies_between_the_regions():
 
 
 def test_quality_of_cells():
-    found = cell_quality(to_tet10(_block()))
+    found = compute_cell_quality(to_tet10(_block()))
     assert found["volume_mm3"].sum() == pytest.approx(1.0)
     np.testing.assert_allclose(found["scaled_jacobian"], 1.0, rtol=1e-5)
     np.testing.assert_allclose(found["min_dihedral_deg"], 45.0, rtol=1e-4)  # cubes cut along a diagonal

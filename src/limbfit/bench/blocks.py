@@ -10,7 +10,7 @@ from ..errors import ProblemError
 from ..fe import ELEMENTS, History, Indenter, OgdenQLV, Problem
 from ..indentation import SiteModel
 from ..mesh import Mesh, boundary_faces, to_tet10, write_vtu
-from ..mesh.boxes import HEX, SIX_TETS, boxes, upright
+from ..mesh.boxes import HEX, SIX_TETS, build_boxes, turn_upright
 from ..study import SolverTable
 
 SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, 3.0, 0.3)
@@ -64,8 +64,10 @@ def layered_block(cell_type: str, divisions: int) -> Mesh:
     side = np.linspace(-HALF, HALF, divisions + 1)
     n_below, n_above = _through(divisions)
     below, above = np.linspace(-DEPTH, -LAYER, n_below + 1), np.linspace(-LAYER, 0.0, n_above + 1)
-    points, corners = boxes(side, side, np.concatenate([below, above[1:]]))
-    cells = corners[:, HEX] if cell_type == "hex8" else upright(points, corners[:, SIX_TETS].reshape(-1, 4))
+    points, corners = build_boxes(side, side, np.concatenate([below, above[1:]]))
+    cells = (
+        corners[:, HEX] if cell_type == "hex8" else turn_upright(points, corners[:, SIX_TETS].reshape(-1, 4))
+    )
     skin = points[cells][:, :, 2].mean(axis=1) > -LAYER
     linear = "hex8" if cell_type == "hex8" else "tet4"
     mesh = Mesh(points, cells, linear, np.where(skin, 0, 1), ("skin", "muscle"))

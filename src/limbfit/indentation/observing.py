@@ -16,7 +16,7 @@ from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import Indenter, Result
 from ..fe.interpolation import interpolate
-from ..mesh import Gauge, Mesh, gauges_along, read_vtu
+from ..mesh import Gauge, Mesh, find_gauges_along, read_vtu
 from ..study import Vector
 from .sites import SiteModel, read_indenter
 from .skin_points import skin_points
@@ -43,7 +43,9 @@ def gauges_of(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
 def _of_layers(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
     if not model.layers:
         return ()
-    found = {one.region: one for one in gauges_along(mesh, np.array(model.position), np.array(model.axis))}
+    found = {
+        one.region: one for one in find_gauges_along(mesh, np.array(model.position), np.array(model.axis))
+    }
     for layer in model.layers:
         if layer not in found:
             known = ", ".join(found)
@@ -93,7 +95,7 @@ def is_under(indenter: Indenter, points: Array) -> NDArray[np.bool_]:
 
 def layers_under(model: SiteModel) -> tuple[str, ...]:
     """The tissues on the axis of a site's indenter, outermost first, as its stored mesh has them."""
-    found = gauges_along(read_vtu(model.mesh), np.array(model.position), np.array(model.axis))
+    found = find_gauges_along(read_vtu(model.mesh), np.array(model.position), np.array(model.axis))
     return tuple(one.region for one in found)
 
 

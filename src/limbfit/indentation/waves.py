@@ -29,7 +29,7 @@ from ..fe import Material, Result
 from ..fe.history import Memory
 from ..fe.kernel.laws import Laws
 from ..fe.kernel.places import Places, elastic_at
-from ..mesh import Mesh, gauges_along, locate
+from ..mesh import Mesh, find_gauges_along, locate
 from ..study import Vector
 
 DENSITY = 1000.0  # kg/m^3, as elastography takes it for all soft tissue
@@ -71,7 +71,7 @@ def wave_places(
         For a tissue that is not there, or not so deep.
     """
     found, top, spans = [], 0.0, {}
-    for gauge in gauges_along(mesh, position, axis):
+    for gauge in find_gauges_along(mesh, position, axis):
         spans[gauge.region] = (top, top + gauge.thickness_mm)
         top += gauge.thickness_mm
     for tissue, depth in [(name, None) for name in spans] if wanted is None else wanted:

@@ -1,7 +1,7 @@
 """Volume meshes: points, cells, named sets; their quality; VTU on disk."""
 
 from .cells import CELLS, TET10_EDGES, TET_FACES, TRI6_EDGES, CellType
-from .gauges import Gauge, LayerGauge, gauges_along
+from .gauges import Gauge, LayerGauge, find_gauges_along
 from .locating import locate
 from .measures import MeshQuality, dihedral_angles, quality
 from .volume import (
@@ -28,7 +28,7 @@ __all__ = [
     "cell_volumes",
     "check",
     "dihedral_angles",
-    "gauges_along",
+    "find_gauges_along",
     "locate",
     "node_jacobians",
     "quality",

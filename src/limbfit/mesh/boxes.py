@@ -12,7 +12,7 @@ SIX_TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0,
 HEX = np.array([0, 4, 6, 2, 1, 5, 7, 3])
 
 
-def boxes(x: Array, y: Array, z: Array) -> tuple[Array, NDArray[np.int64]]:
+def build_boxes(x: Array, y: Array, z: Array) -> tuple[Array, NDArray[np.int64]]:
     """Grid points (n, 3) and the corners (m, 8) of each box, numbered 4 i + 2 j + k."""
     grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
     index = np.arange(grid[..., 0].size).reshape(grid.shape[:3])
@@ -21,7 +21,7 @@ def boxes(x: Array, y: Array, z: Array) -> tuple[Array, NDArray[np.int64]]:
     return grid.reshape(-1, 3), np.stack(corners, axis=1)
 
 
-def upright(points: Array, tets: NDArray[np.int64]) -> NDArray[np.int64]:
+def turn_upright(points: Array, tets: NDArray[np.int64]) -> NDArray[np.int64]:
     """The tetrahedra (m, 4) with those turned over that are inside out."""
     edges = points[tets[:, 1:]] - points[tets[:, :1]]
     flip = np.linalg.det(edges) < 0.0

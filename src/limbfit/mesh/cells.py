@@ -55,23 +55,23 @@ class CellType:
         return self.corners == 4
 
 
-def _simplex_gradients(d: int) -> Array:
+def _compute_simplex_gradients(d: int) -> Array:
     return np.vstack([-np.ones(d), np.eye(d)])
 
 
-def _barycentric(x: Array) -> Array:
+def _to_barycentric(x: Array) -> Array:
     return np.column_stack([1.0 - x.sum(axis=1), x])
 
 
 def linear_simplex(x: Array) -> tuple[Array, Array]:
     """Linear triangle (d = 2) or tetrahedron (d = 3)."""
-    L = _barycentric(x)
-    return L, np.broadcast_to(_simplex_gradients(x.shape[1]), (*L.shape, x.shape[1])).copy()
+    L = _to_barycentric(x)
+    return L, np.broadcast_to(_compute_simplex_gradients(x.shape[1]), (*L.shape, x.shape[1])).copy()
 
 
 def quadratic_simplex(x: Array) -> tuple[Array, Array]:
     """Quadratic triangle (6 nodes) or tetrahedron (10 nodes)."""
-    L, dL = _barycentric(x), _simplex_gradients(x.shape[1])
+    L, dL = _to_barycentric(x), _compute_simplex_gradients(x.shape[1])
     edges = TRI6_EDGES if x.shape[1] == 2 else TET10_EDGES
     i, j = edges[:, 0], edges[:, 1]
     values = np.hstack([L * (2.0 * L - 1.0), 4.0 * L[:, i] * L[:, j]])
@@ -80,7 +80,7 @@ def quadratic_simplex(x: Array) -> tuple[Array, Array]:
     return values, np.concatenate([corner, middle], axis=1)
 
 
-def _tensor_linear(x: Array, corners: Array) -> tuple[Array, Array]:
+def _evaluate_tensor_linear(x: Array, corners: Array) -> tuple[Array, Array]:
     d = x.shape[1]
     factors = 0.5 * (1.0 + x[:, None, :] * corners[None])
     gradients = np.empty((len(x), len(corners), d))
@@ -96,12 +96,12 @@ HEX_CORNERS = np.vstack([np.column_stack([QUAD_CORNERS, np.full(4, z)]) for z in
 
 def linear_quadrilateral(x: Array) -> tuple[Array, Array]:
     """Bilinear quadrilateral, 4 nodes."""
-    return _tensor_linear(x, QUAD_CORNERS)
+    return _evaluate_tensor_linear(x, QUAD_CORNERS)
 
 
 def linear_hexahedron(x: Array) -> tuple[Array, Array]:
     """Trilinear hexahedron, 8 nodes."""
-    return _tensor_linear(x, HEX_CORNERS)
+    return _evaluate_tensor_linear(x, HEX_CORNERS)
 
 
 _TET_NODES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])

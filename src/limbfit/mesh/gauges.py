@@ -61,7 +61,7 @@ class _Crossing:
     weights: Array
 
 
-def gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[LayerGauge, ...]:
+def find_gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[LayerGauge, ...]:
     """A gauge of each region that a line meets, from where it enters the mesh nearest to ``origin``.
 
     It ends where the line first leaves the mesh: at bone, which is hollow, or at the other side. Of a region
@@ -78,7 +78,7 @@ def gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[LayerGauge, ..
         Where the line does not enter the mesh.
     """
     axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
-    crossings = _crossings(mesh, np.asarray(origin, dtype=float), axis)
+    crossings = _find_crossings(mesh, np.asarray(origin, dtype=float), axis)
     entries = [k for k, one in enumerate(crossings) if one.above < 0]
     if not entries:
         raise ProblemError("no tissue lies under the indenter's axis", remedy="check the site's position")
@@ -89,19 +89,19 @@ def gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[LayerGauge, ..
     spans: dict[int, tuple[_Crossing, _Crossing]] = {}
     for top, bottom in pairwise(crossings[first : end + 1]):
         spans.setdefault(top.below, (top, bottom))
-    return tuple(_gauge(mesh.region_names[region], axis, *span) for region, span in spans.items())
+    return tuple(_build_gauge(mesh.region_names[region], axis, *span) for region, span in spans.items())
 
 
-def _gauge(region: str, axis: Array, top: _Crossing, bottom: _Crossing) -> LayerGauge:
+def _build_gauge(region: str, axis: Array, top: _Crossing, bottom: _Crossing) -> LayerGauge:
     weights: Array = np.concatenate([top.weights, -bottom.weights])
     kept, place = np.unique(np.concatenate([top.nodes, bottom.nodes]), return_inverse=True)
     thickness = bottom.along_mm - top.along_mm
     return LayerGauge(kept, np.bincount(place, weights).astype(np.float64), axis, region, thickness)
 
 
-def _crossings(mesh: Mesh, origin: Array, axis: Array) -> list[_Crossing]:
+def _find_crossings(mesh: Mesh, origin: Array, axis: Array) -> list[_Crossing]:
     """Where the line goes from one region into another, in order, each place once."""
-    near = _cells_at(mesh, origin, axis)
+    near = _find_cells_at(mesh, origin, axis)
     faces = mesh.cells[near][:, mesh.kind.faces]
     owners = np.repeat(near, faces.shape[1])
     faces = faces.reshape(-1, faces.shape[2])
@@ -116,7 +116,7 @@ def _crossings(mesh: Mesh, origin: Array, axis: Array) -> list[_Crossing]:
         here, there = mesh.regions[owners[one]], mesh.regions[owners[other]]
         if count == 1 or here != there:
             outside = -1 if count == 1 else int(there)
-            found += _met(mesh, faces[one], origin, axis, int(here), outside)
+            found += _intersect_face(mesh, faces[one], origin, axis, int(here), outside)
     found.sort(key=lambda c: c.along_mm)
     kept: list[_Crossing] = []
     for one in found:
@@ -126,7 +126,7 @@ def _crossings(mesh: Mesh, origin: Array, axis: Array) -> list[_Crossing]:
     return kept
 
 
-def _cells_at(mesh: Mesh, origin: Array, axis: Array) -> Ints:
+def _find_cells_at(mesh: Mesh, origin: Array, axis: Array) -> Ints:
     """Cells (k,) whose corners lie around the line: in a ball about their middle that it meets."""
     corners = mesh.points[mesh.corners]
     middle = corners.mean(axis=1)
@@ -136,7 +136,9 @@ def _cells_at(mesh: Mesh, origin: Array, axis: Array) -> Ints:
     return np.flatnonzero(away <= radius + _SAME_MM)
 
 
-def _met(mesh: Mesh, face: Ints, origin: Array, axis: Array, inside: int, outside: int) -> list[_Crossing]:
+def _intersect_face(
+    mesh: Mesh, face: Ints, origin: Array, axis: Array, inside: int, outside: int
+) -> list[_Crossing]:
     """Where the line meets a face that is outward from region ``inside``: nowhere or once."""
     triangles = [[0, 1, 2]] if mesh.kind.face_corners == 3 else [[0, 1, 2], [0, 2, 3]]
     for triangle in triangles:

@@ -139,15 +139,15 @@ class Mesh:
 
 def node_jacobians(mesh: Mesh) -> NDArray[np.float64]:
     """Jacobian determinant (m, k) of each cell at its own nodes, for unit reference cells, in mm3."""
-    return _determinants(mesh, mesh.kind.nodes) * mesh.kind.side**3
+    return _compute_determinants(mesh, mesh.kind.nodes) * mesh.kind.side**3
 
 
 def cell_volumes(mesh: Mesh) -> NDArray[np.float64]:
     """Volumes (m,) of the cells, curved edges included, in mm3."""
-    return _determinants(mesh, mesh.kind.points) @ mesh.kind.weights
+    return _compute_determinants(mesh, mesh.kind.points) @ mesh.kind.weights
 
 
-def _determinants(mesh: Mesh, where: NDArray[np.float64]) -> NDArray[np.float64]:
+def _compute_determinants(mesh: Mesh, where: NDArray[np.float64]) -> NDArray[np.float64]:
     """det(dx/dxi) (m, q) at local coordinates (q, 3)."""
     _, gradients = mesh.kind.shape(where)
     return np.linalg.det(np.einsum("mki,qkj->mqij", mesh.points[mesh.cells], gradients))
@@ -214,12 +214,12 @@ def to_tet10(mesh: Mesh) -> Mesh:
         points=np.vstack([mesh.points, mesh.points[edges].mean(axis=1)]),
         cells=np.hstack([mesh.cells, count + inverse.reshape(-1, 6)]),
         cell_type="tet10",
-        node_sets={name: _promoted_set(nodes, boundary) for name, nodes in mesh.node_sets.items()},
+        node_sets={name: _promote_set(nodes, boundary) for name, nodes in mesh.node_sets.items()},
         face_sets={name: with_mid_nodes(faces) for name, faces in mesh.face_sets.items()},
     )
 
 
-def _promoted_set(nodes: NDArray[np.int64], boundary: NDArray[np.int64]) -> NDArray[np.int64]:
+def _promote_set(nodes: NDArray[np.int64], boundary: NDArray[np.int64]) -> NDArray[np.int64]:
     inside = np.isin(boundary[:, :3], nodes).all(axis=1)
     return np.union1d(nodes, boundary[inside, 3:].ravel()).astype(np.int64)
 

@@ -27,15 +27,22 @@ from scipy.interpolate import interp1d
 from ..anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from ..errors import InputError
 from ..indentation import Parameters
-from .forces import ForceJob, TrueForce, TruthMeshJob, choose_discretisation, site_force, site_mesh
+from .forces import (
+    ForceJob,
+    TrueForce,
+    TruthMeshJob,
+    choose_discretisation,
+    mesh_true_site,
+    simulate_true_force,
+)
 from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, make_limb
 from .labels import write_true_labels
 from .mri import DETAIL_GRIDS, make_grid, write_series
-from .record import Ramp, Seen, record, write_surface, write_ultrasound, write_waves
-from .sites import DETAIL_SITES, INDENTER_MM, TrueSite, chosen, markers_of, true_sites
+from .record import Ramp, SecondaryMeasurements, record, write_surface, write_ultrasound, write_waves
+from .sites import DETAIL_SITES, INDENTER_MM, TrueSite, build_markers, build_true_sites, select_sites
 from .socket import write_socket
-from .studyfile import study_text
-from .surfaces import true_anatomy
+from .studyfile import format_study
+from .surfaces import build_true_anatomy
 
 Mapping = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 Listener = Callable[[str, float, float], None]
@@ -50,23 +57,23 @@ PARAMETER_SPREAD = 0.15
 KAPPA_RATIO = 100.0
 
 
-def true_parameters(seed: int, fat: bool = False, tendon: bool = False) -> Parameters:
+def draw_true_parameters(seed: int, fat: bool = False, tendon: bool = False) -> Parameters:
     """The tissues of a seed, with or without fat and tendon: within 15 % of the base, three digits.
 
     The tendon is a stiffer muscle.
     """
     random = np.random.default_rng([seed, 7])
-    found = {tissue: _drawn(values, random) for tissue, values in PARAMETER_BASE.items()}
+    found = {tissue: _draw_values(values, random) for tissue, values in PARAMETER_BASE.items()}
     between: Parameters = {}
     if fat:
-        between["fat"] = _drawn(FAT_BASE, np.random.default_rng([seed, 9]))
+        between["fat"] = _draw_values(FAT_BASE, np.random.default_rng([seed, 9]))
     if tendon:
-        stiffness = _drawn({"c_kPa": TENDON_KPA}, np.random.default_rng([seed, 11]))
+        stiffness = _draw_values({"c_kPa": TENDON_KPA}, np.random.default_rng([seed, 11]))
         between[TENDON] = found["muscle"] | stiffness
     return {"skin": found["skin"], **between, "muscle": found["muscle"]}
 
 
-def _drawn(values: dict[str, float], random: np.random.Generator) -> dict[str, float]:
+def _draw_values(values: dict[str, float], random: np.random.Generator) -> dict[str, float]:
     return {
         name: float(f"{value * (1 + PARAMETER_SPREAD * random.uniform(-1, 1)):.3g}")
         for name, value in values.items()
@@ -122,27 +129,27 @@ def make_phantom(
     if detail not in DETAIL_GRIDS:
         raise InputError(f"unknown detail {detail!r}", remedy=f"use one of {', '.join(DETAIL_GRIDS)}")
     patient = make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER, tendon, limb)
-    seen = Seen(ultrasound, surface, shear_waves)
-    parameters = true_parameters(seed, fat, tendon)
-    everywhere = true_sites(patient, seed)
-    indented = chosen(everywhere, DETAIL_SITES[detail] if sites is None else sites)
-    with _appearing(folder) as work:
-        truth = _truth(patient, everywhere, detail, seed, parameters)
-        anatomy = true_anatomy(patient)
+    seen = SecondaryMeasurements(ultrasound, surface, shear_waves)
+    parameters = draw_true_parameters(seed, fat, tendon)
+    everywhere = build_true_sites(patient, seed)
+    indented = select_sites(everywhere, DETAIL_SITES[detail] if sites is None else sites)
+    with _open_hidden_folder(folder) as work:
+        truth = _truth_to_dict(patient, everywhere, detail, seed, parameters)
+        anatomy = build_true_anatomy(patient)
         if socket:
             truth["socket"] = write_socket(work, patient, anatomy)
         _write_images(work, patient, everywhere, detail, seed, tell)
         truth["sites"] = _write_traces(
             work, patient, anatomy, indented, detail, seed, parameters, mapping, tell, seen
         )
-        text = study_text(indented, detail, seed, patient, seen, socket)
+        text = format_study(indented, detail, seed, patient, seen, socket)
         (work / "study.toml").write_text(text, encoding="utf-8")
         (work / "truth.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
     return truth
 
 
 @contextmanager
-def _appearing(folder: Path) -> Iterator[Path]:
+def _open_hidden_folder(folder: Path) -> Iterator[Path]:
     """A hidden folder beside ``folder`` that takes its name when the block ends well."""
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
         raise InputError("there is something already", file=folder, remedy="give a new or an empty folder")
@@ -165,7 +172,7 @@ def _write_images(
     grid = make_grid(limb, detail, seed)
     if limb.has_tendon:
         write_true_labels(work, limb, grid)
-    series = (("plain", (), "UTE residuum"), ("markers", markers_of(everywhere), "UTE residuum, markers"))
+    series = (("plain", (), "UTE residuum"), ("markers", build_markers(everywhere), "UTE residuum, markers"))
     for number, (name, markers, description) in enumerate(series, start=1):
         write_series(
             work / "mri" / name,
@@ -189,7 +196,7 @@ def _write_traces(
     parameters: Parameters,
     mapping: Mapping,
     tell: Listener,
-    seen: Seen,
+    seen: SecondaryMeasurements,
 ) -> list[dict[str, Any]]:
     """Simulate and record every site; what is true of each, for ``truth.json``."""
     truth, traces = work / "truth", work / "traces"
@@ -198,17 +205,17 @@ def _write_traces(
     save_anatomy(truth, anatomy)
     made = choose_discretisation(detail, limb.kind)
     settings = replace(made.mesh, layers=limb.layers)
-    places = [(site.name, _triple(site.position), _triple(site.axis)) for site in indented]
+    places = [(site.name, _to_triple(site.position), _to_triple(site.axis)) for site in indented]
     wanted = [TruthMeshJob(name, truth, at, axis, settings, made.within_mm) for name, at, axis in places]
     jobs = []
     tell("meshes", 0, len(wanted))
-    for (name, at, axis), site, mesh in zip(places, indented, mapping(site_mesh, wanted), strict=True):
+    for (name, at, axis), site, mesh in zip(places, indented, mapping(mesh_true_site, wanted), strict=True):
         steps = made.steps(site.thickness)
-        jobs.append(ForceJob(name, mesh, at, axis, _ramp(site), steps, parameters, seen))
+        jobs.append(ForceJob(name, mesh, at, axis, _build_ramp(site), steps, parameters, seen))
         tell("meshes", len(jobs), len(wanted))
     tell("forces", 0, len(jobs))
     told = []
-    for i, (site, found) in enumerate(zip(indented, mapping(site_force, jobs), strict=True)):
+    for i, (site, found) in enumerate(zip(indented, mapping(simulate_true_force, jobs), strict=True)):
         told.append(_record_site(traces, site, found, seed))
         tell("forces", i + 1, len(jobs))
     return told
@@ -216,7 +223,7 @@ def _write_traces(
 
 def _record_site(traces: Path, site: TrueSite, found: TrueForce, seed: int) -> dict[str, Any]:
     random = np.random.default_rng([seed, 8, int(site.name)])
-    made = record(_ramp(site), lambda t: np.interp(t, found.times, found.force), random)
+    made = record(_build_ramp(site), lambda t: np.interp(t, found.times, found.force), random)
     made.write(traces / f"site-{site.name}.csv")
     if found.layers:
         write_ultrasound(
@@ -247,7 +254,7 @@ def _record_site(traces: Path, site: TrueSite, found: TrueForce, seed: int) -> d
             np.random.default_rng([seed, 13, int(site.name)]),
         )
     return {
-        **_site_facts(site),
+        **_site_to_dict(site),
         "depth_mm": site.depth,
         "speed_mm_s": site.speed,
         "fitted": site.fitted,
@@ -259,16 +266,16 @@ def _record_site(traces: Path, site: TrueSite, found: TrueForce, seed: int) -> d
     }
 
 
-def _ramp(site: TrueSite) -> Ramp:
+def _build_ramp(site: TrueSite) -> Ramp:
     return Ramp(site.depth, site.speed)
 
 
-def _triple(vector: Any) -> tuple[float, float, float]:
+def _to_triple(vector: Any) -> tuple[float, float, float]:
     x, y, z = (float(v) for v in vector)
     return x, y, z
 
 
-def _site_facts(site: TrueSite) -> dict[str, Any]:
+def _site_to_dict(site: TrueSite) -> dict[str, Any]:
     return {
         "name": site.name,
         "region": site.region,
@@ -278,7 +285,7 @@ def _site_facts(site: TrueSite) -> dict[str, Any]:
     }
 
 
-def _truth(
+def _truth_to_dict(
     limb: Limb, everywhere: Sequence[TrueSite], detail: str, seed: int, parameters: Parameters
 ) -> dict[str, Any]:
     made = choose_discretisation(detail, limb.kind)
@@ -294,7 +301,7 @@ def _truth(
             "rotation": limb.rotation.tolist(),
             "origin_mm": limb.origin.tolist(),
         },
-        "markers": [_site_facts(site) for site in everywhere],
+        "markers": [_site_to_dict(site) for site in everywhere],
         "mesh": {
             **asdict(made.mesh),
             "layers": [asdict(layer) for layer in limb.layers],

@@ -61,7 +61,7 @@ def vary(base: LimbShape, seed: int) -> LimbShape:
     return replace(base, **drawn)
 
 
-def smoothstep(t: Array) -> Array:
+def compute_smoothstep(t: Array) -> Array:
     """0 below 0, 1 above 1, with level ends."""
     t = np.clip(t, 0, 1)
     return t * t * (3 - 2 * t)
@@ -72,26 +72,26 @@ def bump(t: Array) -> Array:
     return np.exp(-0.5 * t * t)
 
 
-def _dome(shape: LimbShape, z: Array) -> Array:
+def _compute_dome(shape: LimbShape, z: Array) -> Array:
     return np.clip((shape.dome - z) / shape.dome, 0, None)
 
 
-def skin_field(shape: LimbShape, points: Array) -> Array:
+def compute_skin_field(shape: LimbShape, points: Array) -> Array:
     """Skin field at points (..., 3) of the limb frame: star-shaped sections on an ellipsoidal end."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     radius = shape.section_radius(np.arctan2(x, -y), z)
-    level = np.sqrt((x * x + y * y) / radius**2 + _dome(shape, z) ** 2)
+    level = np.sqrt((x * x + y * y) / radius**2 + _compute_dome(shape, z) ** 2)
     return (level - 1) * radius
 
 
-def surface_point(shape: LimbShape, angle: Array, z: Array, inset: Array | float = 0.0) -> Array:
+def compute_surface_point(shape: LimbShape, angle: Array, z: Array, inset: Array | float = 0.0) -> Array:
     """Point (..., 3) at an angle and height, ``inset`` millimetres radially under the skin."""
-    reach = np.sqrt(np.clip(1 - _dome(shape, z) ** 2, 0, None))
+    reach = np.sqrt(np.clip(1 - _compute_dome(shape, z) ** 2, 0, None))
     radius = shape.section_radius(angle, z) * reach - inset
     return np.stack([radius * np.sin(angle), -radius * np.cos(angle), z + 0 * radius], axis=-1)
 
 
-def between(section: Array, z: Array, low: float, high: float, rounding: float) -> Array:
+def extrude_section(section: Array, z: Array, low: float, high: float, rounding: float) -> Array:
     """A prism from ``low`` to ``high`` over a section's field, its edges rounded."""
     a = section + rounding
     b = np.maximum(z - high, low - z) + rounding
@@ -99,7 +99,7 @@ def between(section: Array, z: Array, low: float, high: float, rounding: float) 
     return np.minimum(np.maximum(a, b), 0) + outside - rounding
 
 
-def triangle(x: Array, y: Array, corners: tuple[Array, Array, Array]) -> Array:
+def compute_triangle_distance(x: Array, y: Array, corners: tuple[Array, Array, Array]) -> Array:
     """Exact signed distance to a triangle whose corners (..., 2) may vary from point to point."""
     squared, sides = [], []
     for start, end in zip(corners, (*corners[1:], corners[0]), strict=True):
@@ -113,7 +113,9 @@ def triangle(x: Array, y: Array, corners: tuple[Array, Array, Array]) -> Array:
     return np.where(inside, -distance, distance)
 
 
-def ellipsoid(points: Array, centre: tuple[float, float, float], axes: tuple[float, float, float]) -> Array:
+def compute_ellipsoid_distance(
+    points: Array, centre: tuple[float, float, float], axes: tuple[float, float, float]
+) -> Array:
     """First-order distance to an ellipsoid."""
     scaled = (points - np.array(centre, points.dtype)) / np.array(axes, points.dtype)
     k0 = np.linalg.norm(scaled, axis=-1)
@@ -121,7 +123,7 @@ def ellipsoid(points: Array, centre: tuple[float, float, float], axes: tuple[flo
     return k0 * (k0 - 1) / np.maximum(k1, 1e-6)
 
 
-def joined(a: Array, b: Array, blend: float) -> Array:
+def join_fields(a: Array, b: Array, blend: float) -> Array:
     """Smooth union of two fields."""
     h = np.clip(blend - np.abs(a - b), 0, None) / blend
     return np.minimum(a, b) - h * h * blend / 4

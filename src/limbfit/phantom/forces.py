@@ -29,9 +29,9 @@ from ..indentation import (
     read_indenter,
     waves_under,
 )
-from ..mesh import Mesh, gauges_along
+from ..mesh import Mesh, find_gauges_along
 from ..study import IndenterTable
-from .record import NOTHING, Ramp, Seen
+from .record import NOTHING, Ramp, SecondaryMeasurements
 from .sites import INDENTER_EDGE_MM, INDENTER_MM
 
 ELEMENT = "tet10g8p0"
@@ -109,7 +109,7 @@ class ForceJob:
     ramp: Ramp
     steps: StepControl
     parameters: Parameters
-    seen: Seen = NOTHING
+    seen: SecondaryMeasurements = NOTHING
 
 
 @dataclass(frozen=True)
@@ -132,21 +132,21 @@ class TrueForce:
 
 
 @lru_cache(maxsize=1)
-def _base(folder: Path, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
+def _build_base(folder: Path, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
     """What all sites of a phantom share; a worker makes it once."""
     anatomy = load_anatomy(folder)
     return anatomy, build_base_mesh(anatomy, settings)
 
 
-def site_mesh(job: TruthMeshJob) -> Mesh:
+def mesh_true_site(job: TruthMeshJob) -> Mesh:
     """Mesh one site, and keep the tissue that its force depends on."""
-    anatomy, base = _base(job.anatomy, job.settings)
+    anatomy, base = _build_base(job.anatomy, job.settings)
     position = np.array(job.position)
     mesh, _ = mesh_site(anatomy, position, np.array(job.axis), job.settings, base)
     return mesh if job.within_mm is None else neighbourhood(mesh, position, job.within_mm).mesh
 
 
-def site_force(job: ForceJob) -> TrueForce:
+def simulate_true_force(job: ForceJob) -> TrueForce:
     """Solve one site.
 
     Raises
@@ -180,7 +180,9 @@ def site_force(job: ForceJob) -> TrueForce:
     found = TrueForce(job.site, times, result.force_at(times), facts)
     if not any(job.seen):
         return found
-    gauges = gauges_along(job.mesh, np.array(job.position), np.array(job.axis)) if job.seen.ultrasound else ()
+    gauges = (
+        find_gauges_along(job.mesh, np.array(job.position), np.array(job.axis)) if job.seen.ultrasound else ()
+    )
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
     around = points_around(job.mesh, indenter) if job.seen.surface else np.zeros((0, 3))
     waves = waves_under(model, job.mesh) if job.seen.shear_waves else ()

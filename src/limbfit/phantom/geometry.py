@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..anatomy.meshing.layers import LayerSpec
 from ..errors import InputError
-from .fields import PROXIMAL_CUT_MM, Array, LimbShape, skin_field, surface_point, vary
-from .shank import Shank, tendon_field
+from .fields import PROXIMAL_CUT_MM, Array, LimbShape, compute_skin_field, compute_surface_point, vary
+from .shank import Shank, compute_tendon_field
 from .thigh import Thigh
 
 TENDON = "tendon"  # the region's name
@@ -21,7 +21,7 @@ SKIN_LAYER = (LayerSpec("skin", 3.0),)
 SKIN_AND_FAT = (LayerSpec("skin", 2.0), LayerSpec("fat", 4.0))
 
 
-def rotation_about(axis: Array, angle: float) -> NDArray[np.float64]:
+def build_rotation(axis: Array, angle: float) -> NDArray[np.float64]:
     """Rotation matrix (3, 3) about ``axis`` by ``angle`` radians (Rodrigues)."""
     x, y, z = np.asarray(axis, float) / np.linalg.norm(axis)
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -62,7 +62,7 @@ class Limb:
 
     def skin(self, points: Array) -> Array:
         """Skin field at LPS points (..., 3), unbounded proximally."""
-        return skin_field(self.shape, self.to_limb(points))
+        return compute_skin_field(self.shape, self.to_limb(points))
 
     def bone(self, name: str, points: Array) -> Array:
         """Field of one of its bones at LPS points (..., 3); the femur is unbounded proximally."""
@@ -76,15 +76,15 @@ class Limb:
     def tendon(self, points: Array) -> Array:
         """Field of the patellar tendon between the bones at LPS points (..., 3)."""
         assert isinstance(self.shape, Shank)
-        return np.maximum(tendon_field(self.shape, self.to_limb(points)), -self.bones(points))
+        return np.maximum(compute_tendon_field(self.shape, self.to_limb(points)), -self.bones(points))
 
     def skin_point(self, angle: float, height: float) -> NDArray[np.float64]:
         """The LPS point of the skin at an angle around the limb and a height above its tip."""
-        return self.to_patient(surface_point(self.shape, np.asarray(angle), np.asarray(height)))
+        return self.to_patient(compute_surface_point(self.shape, np.asarray(angle), np.asarray(height)))
 
     def inward(self, points: Array) -> NDArray[np.float64]:
         """Unit inward skin normals (n, 3) at LPS points (n, 3)."""
-        gradient = gradient_of(self.skin, points)
+        gradient = compute_gradient(self.skin, points)
         return -gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
 
     def tissue_thickness(self, point: Array, axis: Array, limit: float = 40.0) -> float:
@@ -126,12 +126,12 @@ def make_limb(
     lean = np.deg2rad(random.uniform(8, 14))
     towards = random.uniform(0, 2 * np.pi)
     lean_axis = np.array([np.cos(towards), np.sin(towards), 0.0])
-    turn = rotation_about(np.array([0.0, 0.0, 1.0]), np.deg2rad(random.uniform(-8, 8)))
+    turn = build_rotation(np.array([0.0, 0.0, 1.0]), np.deg2rad(random.uniform(-8, 8)))
     origin = np.array([-95.0, 15.0, -420.0]) + random.uniform(-15, 15, 3)
-    return Limb(vary(LIMBS[kind], seed), rotation_about(lean_axis, lean) @ turn, origin, layers, tendon)
+    return Limb(vary(LIMBS[kind], seed), build_rotation(lean_axis, lean) @ turn, origin, layers, tendon)
 
 
-def gradient_of(field, points: Array, step: float = 0.05) -> NDArray[np.float64]:  # type: ignore[no-untyped-def]
+def compute_gradient(field, points: Array, step: float = 0.05) -> NDArray[np.float64]:  # type: ignore[no-untyped-def]
     """Central differences (n, 3) of a field at points (n, 3)."""
     offsets = step * np.eye(3)
     return np.stack([(field(points + d) - field(points - d)) / (2 * step) for d in offsets], axis=-1)

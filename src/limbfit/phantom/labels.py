@@ -15,7 +15,7 @@ FILE = Path("labels") / "labels.seg.nrrd"
 TENDON_LABEL, TENDON_VALUE = "patellar tendon", 7
 
 
-def true_labels(limb: Limb, grid: ScanGrid) -> LabelMap:
+def build_true_labels(limb: Limb, grid: ScanGrid) -> LabelMap:
     """Soft tissue, bones and, where the limb has one, the patellar tendon, voxel by voxel."""
     values = {name: value for value, name in DEFAULT_NAMES.items()}
     array = np.zeros(grid.shape, dtype=np.uint8)
@@ -36,4 +36,4 @@ def true_labels(limb: Limb, grid: ScanGrid) -> LabelMap:
 def write_true_labels(folder: Path, limb: Limb, grid: ScanGrid) -> None:
     """Write the label map to ``FILE`` below a folder."""
     (folder / FILE.parent).mkdir()
-    write_labels(folder / FILE, true_labels(limb, grid))
+    write_labels(folder / FILE, build_true_labels(limb, grid))

@@ -23,7 +23,7 @@ from scipy.special import ndtr
 
 from ..anatomy.grid import Volume
 from .fields import PROXIMAL_CUT_MM
-from .geometry import Limb, rotation_about
+from .geometry import Limb, build_rotation
 
 FAT, MUSCLE, MARROW, CORTEX, TENDON, MARKER = 1.0, 0.5, 0.8, 0.12, 0.3, 1.15
 MARKER_DIAMETER_MM, MARKER_HEIGHT_MM = 9.0, 5.0
@@ -86,7 +86,7 @@ def make_grid(limb: Limb, detail: str, seed: int) -> ScanGrid:
     """The scanner's oblique box around a limb: a few degrees off the limb's own frame."""
     shape, spacing = DETAIL_GRIDS[detail]
     random = np.random.default_rng([seed, 3])
-    tilt = rotation_about(random.normal(size=3), np.deg2rad(random.uniform(2, 4)))
+    tilt = build_rotation(random.normal(size=3), np.deg2rad(random.uniform(2, 4)))
     direction = limb.rotation @ tilt
     middle = limb.to_patient(np.array([0.0, 3.0, PROXIMAL_CUT_MM / 2 - 1.0]))
     half = np.array([shape[2] - 1, shape[1] - 1, shape[0] - 1]) / 2 * np.array(spacing)
@@ -111,7 +111,7 @@ class SkinMarker:
         return np.minimum(np.maximum(a, b), 0) + np.hypot(np.maximum(a, 0), np.maximum(b, 0)) - rounding
 
 
-def _occupancy(
+def _compute_occupancy(
     field: NDArray[np.floating], spacing: tuple[float, float, float], offsets: Sequence[float]
 ) -> list[NDArray[np.floating]]:
     """Share of each voxel that lies deeper than ``offset`` inside, for each offset (mm)."""
@@ -123,17 +123,17 @@ def _occupancy(
     return [ndtr(-np.sqrt(12.0, dtype=field.dtype) * (distance + offset) / width) for offset in offsets]
 
 
-def _tissue(
+def _compute_tissue(
     limb: Limb, points: NDArray[np.floating], spacing: tuple[float, float, float], levels: Contrast
 ) -> tuple:
     """Noise-free signal of a block and the share of each voxel inside the skin."""
-    skin, inner = _occupancy(limb.skin(points), spacing, (0.0, limb.layers_mm))
+    skin, inner = _compute_occupancy(limb.skin(points), spacing, (0.0, limb.layers_mm))
     signal = levels.air + (levels.fat - levels.air) * skin + (levels.muscle - levels.fat) * inner
     if limb.has_tendon:
-        (band,) = _occupancy(limb.tendon(points), spacing, (0.0,))
+        (band,) = _compute_occupancy(limb.tendon(points), spacing, (0.0,))
         signal += (levels.tendon - signal) * band
     for name, cortex in limb.shape.cortex_mm.items():
-        bone, marrow = _occupancy(limb.bone(name, points), spacing, (0.0, cortex))
+        bone, marrow = _compute_occupancy(limb.bone(name, points), spacing, (0.0, cortex))
         signal = signal * (1 - bone) + levels.cortex * bone + (levels.marrow - levels.cortex) * marrow
     return signal, skin
 
@@ -153,11 +153,11 @@ def _add_marker(
     box = tuple(slice(max(ix.min() - 1, 0), ix.max() + 2) for ix in np.nonzero(near))
     if min(signal[box].shape) < 2:
         return
-    (share,) = _occupancy(marker.field(points[box]), spacing, (0.0,))
+    (share,) = _compute_occupancy(marker.field(points[box]), spacing, (0.0,))
     signal[box] += (levels.marker - levels.air) * share * (1 - skin[box])
 
 
-def _limb_window(grid: ScanGrid, limb: Limb, k: slice) -> tuple[slice, slice]:
+def _find_limb_window(grid: ScanGrid, limb: Limb, k: slice) -> tuple[slice, slice]:
     """Rows and columns of a slab that can hold tissue."""
     heights = np.array([-10.0, PROXIMAL_CUT_MM + 40.0])
     axis = limb.to_patient(np.stack([0 * heights, 0 * heights, heights], axis=-1))
@@ -172,7 +172,7 @@ def _limb_window(grid: ScanGrid, limb: Limb, k: slice) -> tuple[slice, slice]:
     return window[0], window[1]
 
 
-def _bias_field(seed: int, amplitude: float) -> Callable[[ScanGrid, slice], NDArray[np.float32]]:
+def _build_bias_field(seed: int, amplitude: float) -> Callable[[ScanGrid, slice], NDArray[np.float32]]:
     """A smooth receive profile within 1 +- ``amplitude`` over the whole image."""
     random = np.random.default_rng([seed, 4])
     linear, quadratic = random.uniform(-1, 1, 3), random.uniform(-1, 1, 3)
@@ -189,7 +189,7 @@ def _bias_field(seed: int, amplitude: float) -> Callable[[ScanGrid, slice], NDAr
     return profile
 
 
-def slabs(
+def generate_slabs(
     limb: Limb,
     grid: ScanGrid,
     markers: Sequence[SkinMarker],
@@ -199,14 +199,14 @@ def slabs(
 ) -> Iterator[tuple[slice, NDArray[np.float32]]]:
     """The image slab by slab: slices and signal (nk, nj, ni), with bias and noise (None: the contrast's)."""
     random = np.random.default_rng([seed, 5, len(markers)])
-    bias = _bias_field(seed, levels.bias)
+    bias = _build_bias_field(seed, levels.bias)
     deviation = levels.noise if noise is None else noise
     for start in range(0, grid.shape[0], SLAB):
         k = slice(start, min(start + SLAB, grid.shape[0]))
         padded = slice(k.start - 1, k.stop + 1)
-        rows, columns = _limb_window(grid, limb, padded)
+        rows, columns = _find_limb_window(grid, limb, padded)
         points = grid.points(padded, rows, columns)
-        tissue, skin = _tissue(limb, points, grid.spacing, levels)
+        tissue, skin = _compute_tissue(limb, points, grid.spacing, levels)
         for marker in markers:
             _add_marker(tissue, skin, points, grid.spacing, marker, levels)
         signal = np.full((k.stop - k.start, *grid.shape[1:]), levels.air, np.float32)
@@ -219,7 +219,7 @@ def slabs(
         yield k, signal
 
 
-def image_of(
+def build_image(
     limb: Limb,
     grid: ScanGrid,
     markers: Sequence[SkinMarker] = (),
@@ -229,7 +229,7 @@ def image_of(
     levels: Contrast = UTE,
 ) -> Volume:
     """The whole image in memory, without a detour by files; ``levels`` is one of ``CONTRASTS``."""
-    array = np.concatenate([signal for _, signal in slabs(limb, grid, markers, seed, noise, levels)])
+    array = np.concatenate([signal for _, signal in generate_slabs(limb, grid, markers, seed, noise, levels)])
     return Volume(array, np.array(grid.spacing), grid.origin, grid.direction)
 
 
@@ -246,8 +246,8 @@ def write_series(
 ) -> None:
     """Render a limb and write it as one DICOM file per slice (MR Image Storage) into ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
-    series = _uid(seed, "series", number)
-    for k, signal in slabs(limb, grid, markers, seed):
+    series = _build_uid(seed, "series", number)
+    for k, signal in generate_slabs(limb, grid, markers, seed):
         stored = np.clip(np.rint(signal * (FULL_SCALE / RESCALE_SLOPE)), 0, 65535).astype(np.uint16)
         for index, pixels in zip(range(k.start, k.stop), stored, strict=True):
             slice_ = _slice_dataset(grid, index, pixels, seed, number, series)
@@ -257,12 +257,12 @@ def write_series(
             progress(k.stop / grid.shape[0])
 
 
-def _uid(seed: int, *names: object) -> UID:
+def _build_uid(seed: int, *names: object) -> UID:
     """The same seed gives the same identifiers, so that a phantom is reproduced to the byte."""
     return generate_uid(entropy_srcs=["limbfit phantom", str(seed), *map(str, names)])
 
 
-def _decimals(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
+def _format_decimals(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
     return [format_number_as_ds(float(value)) for value in values]
 
 
@@ -271,7 +271,7 @@ def _slice_dataset(
 ) -> FileDataset:
     meta = FileMetaDataset()
     meta.MediaStorageSOPClassUID = MRImageStorage
-    meta.MediaStorageSOPInstanceUID = _uid(seed, "image", number, index)
+    meta.MediaStorageSOPInstanceUID = _build_uid(seed, "image", number, index)
     meta.TransferSyntaxUID = ExplicitVRLittleEndian
     data = FileDataset(None, {}, file_meta=meta, preamble=b"\0" * 128)  # type: ignore[arg-type]
     _identify(data, meta, seed, number, series)
@@ -288,8 +288,8 @@ def _slice_dataset(
 def _identify(data: FileDataset, meta: FileMetaDataset, seed: int, number: int, series: UID) -> None:
     """Tags of a made-up scan; nobody is behind them."""
     data.SOPClassUID, data.SOPInstanceUID = meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID
-    data.StudyInstanceUID, data.SeriesInstanceUID = _uid(seed, "study"), series
-    data.FrameOfReferenceUID, data.PositionReferenceIndicator = _uid(seed, "frame"), ""
+    data.StudyInstanceUID, data.SeriesInstanceUID = _build_uid(seed, "study"), series
+    data.FrameOfReferenceUID, data.PositionReferenceIndicator = _build_uid(seed, "frame"), ""
     data.PatientName, data.PatientID = "PHANTOM", f"PHANTOM-{seed}"
     data.PatientBirthDate, data.PatientSex = "", ""
     data.StudyID, data.SeriesNumber, data.AccessionNumber = "1", str(number), ""
@@ -306,8 +306,10 @@ def _identify(data: FileDataset, meta: FileMetaDataset, seed: int, number: int, 
 def _place(data: FileDataset, grid: ScanGrid, index: int) -> None:
     """Image plane tags: the row cosines point along i, the column cosines along j."""
     position = grid.origin + index * grid.spacing[2] * grid.direction[:, 2]
-    data.ImagePositionPatient = _decimals(position)
-    data.ImageOrientationPatient = _decimals(np.concatenate([grid.direction[:, 0], grid.direction[:, 1]]))
-    data.PixelSpacing = _decimals([grid.spacing[1], grid.spacing[0]])
-    data.SliceThickness = data.SpacingBetweenSlices = _decimals([grid.spacing[2]])[0]
-    data.SliceLocation = _decimals([float(position @ grid.direction[:, 2])])[0]
+    data.ImagePositionPatient = _format_decimals(position)
+    data.ImageOrientationPatient = _format_decimals(
+        np.concatenate([grid.direction[:, 0], grid.direction[:, 1]])
+    )
+    data.PixelSpacing = _format_decimals([grid.spacing[1], grid.spacing[0]])
+    data.SliceThickness = data.SpacingBetweenSlices = _format_decimals([grid.spacing[2]])[0]
+    data.SliceLocation = _format_decimals([float(position @ grid.direction[:, 2])])[0]

@@ -27,7 +27,7 @@ DISPLACEMENT_NOISE_MM = 0.005
 HEADER = "time_s,displacement_mm,force_N"
 
 
-class Seen(NamedTuple):
+class SecondaryMeasurements(NamedTuple):
     """What is seen of an indentation beside its force."""
 
     ultrasound: bool = False
@@ -35,7 +35,7 @@ class Seen(NamedTuple):
     shear_waves: bool = False
 
 
-NOTHING = Seen()
+NOTHING = SecondaryMeasurements()
 
 
 @dataclass(frozen=True)

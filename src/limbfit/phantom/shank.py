@@ -8,7 +8,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from .fields import Array, LimbShape, between, bump, ellipsoid, joined, smoothstep, surface_point, triangle
+from .fields import (
+    Array,
+    LimbShape,
+    bump,
+    compute_ellipsoid_distance,
+    compute_smoothstep,
+    compute_surface_point,
+    compute_triangle_distance,
+    extrude_section,
+    join_fields,
+)
 
 TENDON_MM = 24.0, 6.0  # width and thickness of the patellar tendon
 
@@ -58,11 +68,11 @@ class Shank(LimbShape):
         return self.joint
 
     def section_radius(self, angle: Array, z: Array) -> Array:
-        mean = self.radius_distal + (self.radius_proximal - self.radius_distal) * smoothstep(z / 185)
+        mean = self.radius_distal + (self.radius_proximal - self.radius_distal) * compute_smoothstep(z / 185)
         posterior = ((1 - np.cos(angle)) / 2) ** 2
         calf = self.calf * bump((z - self.joint + 60) / 42) * posterior
         anteromedial = ((1 + np.cos(angle - 0.45)) / 2) ** 3
-        flat = -self.flattening * smoothstep((self.joint - z + 10) / 50) * anteromedial
+        flat = -self.flattening * compute_smoothstep((self.joint - z + 10) / 50) * anteromedial
         knee = 2.5 * bump((z - self.joint - 30) / 22) * ((1 + np.cos(angle)) / 2) ** 4
         popliteal = -3.0 * bump((z - self.joint - 5) / 18) * posterior
         return mean + calf + flat + knee + popliteal
@@ -71,72 +81,79 @@ class Shank(LimbShape):
         return _BONE_FIELDS[name](self, points)
 
 
-def _tibia(shape: Shank, points: Array) -> Array:
+def _compute_tibia(shape: Shank, points: Array) -> Array:
     """A rounded triangle: crest under the skin, medial face along it, widening to the plateau."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
-    plateau = smoothstep((z - shape.joint + 48) / 38)
+    plateau = compute_smoothstep((z - shape.joint + 48) / 38)
     rounding = 3.5 + 9.5 * plateau
-    bevel = 9.0 * smoothstep((65 - z) / 45)
-    tuberosity = 3.0 * smoothstep((z - shape.joint + 65) / 30)
+    bevel = 9.0 * compute_smoothstep((65 - z) / 45)
+    tuberosity = 3.0 * compute_smoothstep((z - shape.joint + 65) / 30)
     section_z = np.minimum(z, shape.joint)
     depth = 3.5 + bevel + tuberosity
 
     def blended(shaft: Array, target: tuple[float, float]) -> Array:
         return shaft[..., :2] + plateau[..., None] * (np.array(target, shaft.dtype) - shaft[..., :2])
 
-    crest = surface_point(shape, np.full_like(z, shape.crest_angle), section_z, shape.crest_depth + depth)
-    medial = surface_point(shape, np.full_like(z, 0.92), section_z, shape.medial_depth + depth)
-    lateral = 0.38 * surface_point(shape, np.full_like(z, -0.25), np.maximum(section_z, shape.dome))
+    crest = compute_surface_point(
+        shape, np.full_like(z, shape.crest_angle), section_z, shape.crest_depth + depth
+    )
+    medial = compute_surface_point(shape, np.full_like(z, 0.92), section_z, shape.medial_depth + depth)
+    lateral = 0.38 * compute_surface_point(shape, np.full_like(z, -0.25), np.maximum(section_z, shape.dome))
     corners = (
         blended(crest, (0.0, -20.0)),
         blended(medial, (23.0, 4.0)),
         blended(lateral, (-21.0, 2.0)),
     )
-    section = triangle(x, y, corners) - rounding
-    return between(section, z, shape.pad, shape.joint - shape.joint_gap / 2, 4.0)
+    section = compute_triangle_distance(x, y, corners) - rounding
+    return extrude_section(section, z, shape.pad, shape.joint - shape.joint_gap / 2, 4.0)
 
 
-def _fibula(shape: Shank, points: Array) -> Array:
+def _compute_fibula(shape: Shank, points: Array) -> Array:
     """A thin rod on the lateral side, posterior of the tibia, with a head below the knee."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     top = shape.joint - 13
-    head = smoothstep((z - top + 32) / 24)
+    head = compute_smoothstep((z - top + 32) / 24)
     radius = shape.fibula_radius + 2.5 * head
     inset = radius + 12.0 - 5.5 * head
     section_z = np.clip(z, shape.dome, shape.joint)
-    centre = surface_point(shape, -1.85 - 0.2 * head, section_z, inset)
+    centre = compute_surface_point(shape, -1.85 - 0.2 * head, section_z, inset)
     section = np.hypot(x - centre[..., 0], y - centre[..., 1]) - radius
-    return between(section, z, shape.fibula_cut, top, 5.0)
+    return extrude_section(section, z, shape.fibula_cut, top, 5.0)
 
 
-def _femur(shape: Shank, points: Array) -> Array:
+def _compute_femur(shape: Shank, points: Array) -> Array:
     """Two condyles on a shaft that leaves the image."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     low = shape.joint + shape.joint_gap / 2
     axes = (19.0, 28.0, shape.condyle)
-    medial = ellipsoid(points, (21.0, 5.0, low + shape.condyle), axes)
-    lateral = ellipsoid(points, (-21.0, 5.0, low + shape.condyle), axes)
+    medial = compute_ellipsoid_distance(points, (21.0, 5.0, low + shape.condyle), axes)
+    lateral = compute_ellipsoid_distance(points, (-21.0, 5.0, low + shape.condyle), axes)
     flare = 15.0 + 10.0 * bump((z - low - 25) / 22)
-    shaft = between(np.hypot(x, y - 1.0) - flare, z, low + 9, 1e3, 8.0)
-    return joined(joined(medial, lateral, 8.0), shaft, 12.0)
+    shaft = extrude_section(np.hypot(x, y - 1.0) - flare, z, low + 9, 1e3, 8.0)
+    return join_fields(join_fields(medial, lateral, 8.0), shaft, 12.0)
 
 
-def _patella(shape: Shank, points: Array) -> Array:
+def _compute_patella(shape: Shank, points: Array) -> Array:
     height = shape.joint + 33
     anterior = float(shape.section_radius(np.asarray(0.0), np.asarray(height)))
     axes = (shape.patella, 9.5, shape.patella + 1)
-    return ellipsoid(points, (0.0, -(anterior - 7.0 - axes[1]), height), axes)
+    return compute_ellipsoid_distance(points, (0.0, -(anterior - 7.0 - axes[1]), height), axes)
 
 
-def tendon_field(shape: Shank, points: Array) -> Array:
+def compute_tendon_field(shape: Shank, points: Array) -> Array:
     """A flat band from within the patella's lower half to within the tibial tuberosity, under the skin."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     above = z - shape.joint
-    depth = 9.5 + 5.5 * smoothstep((above - 2) / 16) + 4.5 * smoothstep((-14 - above) / 24)
+    depth = 9.5 + 5.5 * compute_smoothstep((above - 2) / 16) + 4.5 * compute_smoothstep((-14 - above) / 24)
     across = y + shape.section_radius(0 * z, z) - depth
     a, b = np.abs(x) - TENDON_MM[0] / 2 + 2.5, np.abs(across) - TENDON_MM[1] / 2 + 2.5
     section = np.minimum(np.maximum(a, b), 0) + np.hypot(np.maximum(a, 0), np.maximum(b, 0)) - 2.5
-    return between(section, z, shape.joint - 40, shape.joint + 17, 2.0)
+    return extrude_section(section, z, shape.joint - 40, shape.joint + 17, 2.0)
 
 
-_BONE_FIELDS = {"tibia": _tibia, "fibula": _fibula, "patella": _patella, "femur": _femur}
+_BONE_FIELDS = {
+    "tibia": _compute_tibia,
+    "fibula": _compute_fibula,
+    "patella": _compute_patella,
+    "femur": _compute_femur,
+}

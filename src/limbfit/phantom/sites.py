@@ -37,22 +37,26 @@ class Place:
     depth: float
 
 
-def _places(region: str, depth: float, first: int, spots: Sequence[tuple[float, float]]) -> list[Place]:
+def _build_places(region: str, depth: float, first: int, spots: Sequence[tuple[float, float]]) -> list[Place]:
     return [Place(f"{first + i:02d}", region, angle, below, depth) for i, (angle, below) in enumerate(spots)]
 
 
 SHANK_PLACES = (
-    *_places(PATELLAR, 5.0, 1, [(0.0, 7.0), (-0.45, 16.0), (0.45, 16.0)]),
-    *_places(TIBIA, 3.5, 4, [(0.95, 46.0), (0.95, 72.0), (0.95, 98.0), (0.35, 42.0), (1.0, 124.0)]),
-    *_places(LATERAL, 5.0, 9, [(-0.8, 44.0), (-0.85, 72.0), (-0.85, 100.0), (-1.3, 58.0), (-1.3, 86.0)]),
-    *_places(POSTERIOR, 7.0, 14, [(3.14, 38.0), (2.75, 64.0), (-2.7, 64.0), (3.14, 92.0), (3.14, 120.0)]),
+    *_build_places(PATELLAR, 5.0, 1, [(0.0, 7.0), (-0.45, 16.0), (0.45, 16.0)]),
+    *_build_places(TIBIA, 3.5, 4, [(0.95, 46.0), (0.95, 72.0), (0.95, 98.0), (0.35, 42.0), (1.0, 124.0)]),
+    *_build_places(
+        LATERAL, 5.0, 9, [(-0.8, 44.0), (-0.85, 72.0), (-0.85, 100.0), (-1.3, 58.0), (-1.3, 86.0)]
+    ),
+    *_build_places(
+        POSTERIOR, 7.0, 14, [(3.14, 38.0), (2.75, 64.0), (-2.7, 64.0), (3.14, 92.0), (3.14, 120.0)]
+    ),
 )
 _COLUMN = ((0.0, 75.0), (0.3, 105.0), (-0.3, 105.0), (0.0, 130.0), (0.0, 160.0))
 THIGH_PLACES = (
-    *_places("anterior", 6.0, 1, [(0.0, 95.0), (-0.45, 125.0), (0.45, 125.0)]),
-    *_places("medial", 6.0, 4, [(0.5 * np.pi + aside, below) for aside, below in _COLUMN]),
-    *_places("lateral", 5.0, 9, [(-0.5 * np.pi + aside, below) for aside, below in _COLUMN]),
-    *_places("posterior", 7.0, 14, [(np.pi + aside, below) for aside, below in _COLUMN]),
+    *_build_places("anterior", 6.0, 1, [(0.0, 95.0), (-0.45, 125.0), (0.45, 125.0)]),
+    *_build_places("medial", 6.0, 4, [(0.5 * np.pi + aside, below) for aside, below in _COLUMN]),
+    *_build_places("lateral", 5.0, 9, [(-0.5 * np.pi + aside, below) for aside, below in _COLUMN]),
+    *_build_places("posterior", 7.0, 14, [(np.pi + aside, below) for aside, below in _COLUMN]),
 )
 FITTED = ("01", "05", "10", "15")
 DETAIL_SITES = {
@@ -79,15 +83,15 @@ class TrueSite:
     hint: NDArray[np.float64]
 
 
-def true_sites(limb: Limb, seed: int) -> tuple[TrueSite, ...]:
+def build_true_sites(limb: Limb, seed: int) -> tuple[TrueSite, ...]:
     """All 18 sites of a limb."""
     places = SHANK_PLACES if isinstance(limb.shape, Shank) else THIGH_PLACES
     return tuple(
-        _true_site(limb, place, np.random.default_rng([seed, 6, i])) for i, place in enumerate(places)
+        _build_true_site(limb, place, np.random.default_rng([seed, 6, i])) for i, place in enumerate(places)
     )
 
 
-def chosen(sites: Sequence[TrueSite], names: Sequence[str]) -> tuple[TrueSite, ...]:
+def select_sites(sites: Sequence[TrueSite], names: Sequence[str]) -> tuple[TrueSite, ...]:
     """The named sites, in the order of the limb's list.
 
     Raises
@@ -104,14 +108,14 @@ def chosen(sites: Sequence[TrueSite], names: Sequence[str]) -> tuple[TrueSite, .
     return tuple(site for site in sites if site.name in set(names))
 
 
-def markers_of(sites: Sequence[TrueSite]) -> tuple[SkinMarker, ...]:
+def build_markers(sites: Sequence[TrueSite]) -> tuple[SkinMarker, ...]:
     """A skin marker on every site."""
     return tuple(SkinMarker(site.position, -site.axis) for site in sites)
 
 
-def _true_site(limb: Limb, place: Place, random: np.random.Generator) -> TrueSite:
+def _build_true_site(limb: Limb, place: Place, random: np.random.Generator) -> TrueSite:
     position = limb.skin_point(place.angle, limb.shape.datum - place.below)
-    footprint = _footprint(limb, position)
+    footprint = _sample_footprint(limb, position)
     axis = limb.inward(footprint).mean(axis=0)
     axis /= np.linalg.norm(axis)
     thickness = min(limb.tissue_thickness(point, axis) for point in footprint)
@@ -130,7 +134,7 @@ def _true_site(limb: Limb, place: Place, random: np.random.Generator) -> TrueSit
     )
 
 
-def _footprint(limb: Limb, position: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sample_footprint(limb: Limb, position: NDArray[np.float64]) -> NDArray[np.float64]:
     """Skin points (25, 3) under a square indenter at a position, found along its normal."""
     normal = -limb.inward(position[None])[0]
     proximal = limb.proximal_normal - normal * (limb.proximal_normal @ normal)

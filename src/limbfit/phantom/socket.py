@@ -16,7 +16,7 @@ from ..socket.regions import build_default_regions
 from ..socket.trim import Trim
 from .fields import Array
 from .geometry import Limb
-from .surfaces import outer_surface
+from .surfaces import build_outer_surface
 
 FILE = Path("socket") / "socket.stl"
 LINER_MM = 6.0
@@ -60,15 +60,15 @@ def make_socket(anatomy: Anatomy, outer: Surface, kind: str = "transtibial") -> 
     regions = build_default_regions(anatomy, known)
     areas = [Area(name, regions[name].position, radius, depth) for name, radius, depth in AREAS[kind]]
     knee, frame = find_knee_centre(anatomy), build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
-    trim = _below_cut(anatomy) if knee is None else _around_tendon(anatomy, known, knee)
+    trim = _trim_below_cut(anatomy) if knee is None else _trim_around_tendon(anatomy, known, knee)
     return rectify_limb(outer, frame, Recipe(trim, REDUCTION_PERCENT, areas)), areas
 
 
-def _below_cut(anatomy: Anatomy) -> Trim:
+def _trim_below_cut(anatomy: Anatomy) -> Trim:
     return Trim([(anatomy.cut_point - BELOW_CUT_MM * anatomy.cut_normal, anatomy.cut_normal)])
 
 
-def _around_tendon(anatomy: Anatomy, known: Directions, knee: Array) -> Trim:
+def _trim_around_tendon(anatomy: Anatomy, known: Directions, knee: Array) -> Trim:
     """As of a patellar-tendon-bearing socket: from the patella's middle to below the knee at the back.
 
     A brim below the knee all around would cut through the bar on the tendon, half of which lies above it.
@@ -83,7 +83,7 @@ def _around_tendon(anatomy: Anatomy, known: Directions, knee: Array) -> Trim:
 
 def write_socket(folder: Path, limb: Limb, anatomy: Anatomy) -> dict[str, Any]:
     """Write the socket of a limb into a study's folder and read it back; returns what is true of it."""
-    outer = outer_surface(limb, LINER_MM)
+    outer = build_outer_surface(limb, LINER_MM)
     socket, areas = make_socket(anatomy, outer, limb.kind)
     (folder / FILE).parent.mkdir()
     write_surface(folder / FILE, socket.surface)

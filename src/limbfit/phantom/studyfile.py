@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from ..anatomy.meshing.layers import LayerSpec
 from .geometry import TENDON, Limb
 from .labels import FILE, TENDON_LABEL
-from .record import NOTHING, Seen
+from .record import NOTHING, SecondaryMeasurements
 from .shank import Shank
 from .sites import INDENTER_EDGE_MM, INDENTER_MM, TrueSite
 from .socket import FILE as SOCKET_FILE
@@ -94,12 +94,12 @@ surface = "traces/site-{name}-surface.csv"     # how the skin around the indente
 """
 
 
-def study_text(
+def format_study(
     sites: Sequence[TrueSite],
     detail: str,
     seed: int,
     limb: Limb,
-    seen: Seen = NOTHING,
+    seen: SecondaryMeasurements = NOTHING,
     socket: bool = False,
 ) -> str:
     """The content of ``study.toml`` for some sites of a limb."""
@@ -107,7 +107,7 @@ def study_text(
         seed=seed,
         detail=detail,
         kind=limb.kind,
-        layers=_layers(limb.layers),
+        layers=_format_layers(limb.layers),
         labels=_LABELS if limb.has_tendon else "",
         regions=_REGIONS if limb.has_tendon else "",
         tissues=_TISSUES if limb.has_tendon else "",
@@ -123,16 +123,16 @@ def study_text(
         parts.append(_SITE.format(name=site.name, region=site.region, fitted=fitted, x=x, y=y, z=z))
         for one, line in zip(seen, (_ULTRASOUND, _SURFACE, _WAVES), strict=True):
             parts += [line.format(name=site.name)] if one else []
-    return "".join([*parts, *_socket(limb, socket)])
+    return "".join([*parts, *_format_socket(limb, socket)])
 
 
-def _socket(limb: Limb, made: bool) -> list[str]:
+def _format_socket(limb: Limb, made: bool) -> list[str]:
     """The table of the socket, where it says anything."""
     lines = [_SIDE] * (not isinstance(limb.shape, Shank)) + [_FILE] * made
     return ["\n[socket]\n", *lines] if lines else []
 
 
-def _layers(layers: Sequence[LayerSpec]) -> str:
+def _format_layers(layers: Sequence[LayerSpec]) -> str:
     if len(layers) == 1:
         return f"skin_layer_mm = {layers[0].thickness_mm}       # skin and adipose tissue, uniform"
     tables = ", ".join(

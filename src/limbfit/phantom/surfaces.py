@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
 from ..anatomy.surfaces.triangles import find_bodies, find_half_edges, from_pyvista
-from .fields import PROXIMAL_CUT_MM, skin_field
+from .fields import PROXIMAL_CUT_MM, compute_skin_field
 from .geometry import TENDON, Limb
 
 Array = NDArray[np.floating]
@@ -30,7 +30,7 @@ class Box:
 STICK_OUT_MM = 6.0  # of the femur beyond the cut, so that the void it leaves is open there
 
 
-def true_anatomy(limb: Limb, spacing: float = 2.4) -> Anatomy:
+def build_true_anatomy(limb: Limb, spacing: float = 2.4) -> Anatomy:
     """Skin, bones and tendon of a limb (LPS mm); the skin is closed by the flat proximal cut.
 
     Parameters
@@ -40,41 +40,43 @@ def true_anatomy(limb: Limb, spacing: float = 2.4) -> Anatomy:
     """
     shape = limb.shape
     box = Box((-80.0, -85.0, -4.0), (80.0, 85.0, PROXIMAL_CUT_MM), spacing)
-    skin = contour(lambda p: skin_field(shape, p), box)
-    bones = {name: _bone(limb, name, spacing / 1.5) for name in limb.bone_names}
-    regions = {TENDON: _placed(limb, _tendon(limb, spacing / 2))} if limb.has_tendon else {}
+    skin = extract_contour(lambda p: compute_skin_field(shape, p), box)
+    bones = {name: _build_bone(limb, name, spacing / 1.5) for name in limb.bone_names}
+    regions = {TENDON: _to_patient_space(limb, _build_tendon(limb, spacing / 2))} if limb.has_tendon else {}
     return Anatomy(
-        skin=_placed(limb, skin),
-        bones={name: _placed(limb, bone) for name, bone in bones.items()},
+        skin=_to_patient_space(limb, skin),
+        bones={name: _to_patient_space(limb, bone) for name, bone in bones.items()},
         cut_point=limb.to_patient(np.array([0.0, 0.0, PROXIMAL_CUT_MM])),
         cut_normal=limb.proximal_normal,
         regions=regions,
     )
 
 
-def outer_surface(limb: Limb, thickness_mm: float, spacing: float = 2.4) -> Surface:
+def build_outer_surface(limb: Limb, thickness_mm: float, spacing: float = 2.4) -> Surface:
     """The closed surface (LPS mm) about ``thickness_mm`` outside the skin: that of a liner."""
     reach = thickness_mm + 4.0
     box = Box((-80.0 - reach, -85.0 - reach, -reach), (80.0 + reach, 85.0 + reach, PROXIMAL_CUT_MM), spacing)
-    return _placed(limb, contour(lambda p: skin_field(limb.shape, p) - thickness_mm, box))
+    return _to_patient_space(
+        limb, extract_contour(lambda p: compute_skin_field(limb.shape, p) - thickness_mm, box)
+    )
 
 
-def _bone(limb: Limb, name: str, spacing: float) -> Surface:
+def _build_bone(limb: Limb, name: str, spacing: float) -> Surface:
     box = Box((-62.0, -66.0, 10.0), (62.0, 62.0, PROXIMAL_CUT_MM + STICK_OUT_MM), spacing)
-    return contour(lambda p: limb.shape.bone_field(name, p), box)
+    return extract_contour(lambda p: limb.shape.bone_field(name, p), box)
 
 
-def _tendon(limb: Limb, spacing: float) -> Surface:
+def _build_tendon(limb: Limb, spacing: float) -> Surface:
     middle = limb.shape.datum - 12.0
     box = Box((-24.0, -66.0, middle - 36.0), (24.0, -22.0, middle + 36.0), spacing)
-    return contour(lambda p: limb.tendon(limb.to_patient(p)), box)
+    return extract_contour(lambda p: limb.tendon(limb.to_patient(p)), box)
 
 
-def _placed(limb: Limb, surface: Surface) -> Surface:
+def _to_patient_space(limb: Limb, surface: Surface) -> Surface:
     return Surface(limb.to_patient(surface.points), surface.faces)
 
 
-def contour(field: Field, box: Box) -> Surface:
+def extract_contour(field: Field, box: Box) -> Surface:
     """The closed zero surface of a field (limb frame), capped flat where it leaves the box at the top."""
     size = [round((h - l) / box.spacing) + 1 for l, h in zip(box.low, box.high, strict=True)]
     axes = [np.linspace(l, h, n) for l, h, n in zip(box.low, box.high, size, strict=True)]
@@ -84,11 +86,11 @@ def contour(field: Field, box: Box) -> Surface:
     image.point_data["field"] = values.ravel()
     poly = image.contour([0.0], scalars="field", method="flying_edges", compute_normals=False).clean()
     surface = find_bodies(from_pyvista(poly))[0]
-    surface = _capped(_on_surface(field, surface, box.high[2]), box.high[2])
+    surface = _cap_rim(_project_to_surface(field, surface, box.high[2]), box.high[2])
     return surface if surface.volume > 0 else surface.flipped
 
 
-def _on_surface(field: Field, surface: Surface, top: float) -> Surface:
+def _project_to_surface(field: Field, surface: Surface, top: float) -> Surface:
     """Points moved onto the zero of the field by Newton steps; those of the rim stay in the top plane."""
     points = surface.points.copy()
     rim = np.abs(points[:, 2] - top) < 1e-3
@@ -101,7 +103,7 @@ def _on_surface(field: Field, surface: Surface, top: float) -> Surface:
     return Surface(points, surface.faces)
 
 
-def _capped(surface: Surface, top: float) -> Surface:
+def _cap_rim(surface: Surface, top: float) -> Surface:
     """Closed with a fan around the middle of its open rim, which lies in the plane z = ``top``."""
     edges = find_half_edges(surface.faces)
     n = len(surface.points)

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from .fields import PROXIMAL_CUT_MM, Array, LimbShape, between, bump, smoothstep
+from .fields import PROXIMAL_CUT_MM, Array, LimbShape, bump, compute_smoothstep, extrude_section
 
 
 @dataclass(frozen=True)
@@ -48,16 +48,16 @@ class Thigh(LimbShape):
         return PROXIMAL_CUT_MM
 
     def section_radius(self, angle: Array, z: Array) -> Array:
-        mean = self.radius_distal + (self.radius_proximal - self.radius_distal) * smoothstep(z / 220)
+        mean = self.radius_distal + (self.radius_proximal - self.radius_distal) * compute_smoothstep(z / 220)
         front = self.quadriceps * bump((z - 150) / 60) * ((1 + np.cos(angle)) / 2) ** 2
-        inner = self.adductors * smoothstep((z - 100) / 130) * ((1 + np.sin(angle)) / 2) ** 2
-        outer = -self.flattening * smoothstep((z - 60) / 80) * ((1 - np.sin(angle)) / 2) ** 3
+        inner = self.adductors * compute_smoothstep((z - 100) / 130) * ((1 + np.sin(angle)) / 2) ** 2
+        outer = -self.flattening * compute_smoothstep((z - 60) / 80) * ((1 - np.sin(angle)) / 2) ** 3
         return mean + front + inner + outer
 
     def bone_field(self, name: str, points: Array) -> Array:
         """Field of the femur's bowed shaft at points (..., 3) of the limb frame, unbounded proximally."""
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
-        aside = self.lateral * smoothstep((z + 60) / 250)
+        aside = self.lateral * compute_smoothstep((z + 60) / 250)
         ahead = self.anterior + self.bow * bump((z - 130) / 70)
-        radius = self.femur_radius + 2.0 * smoothstep((z - 190) / 60)
-        return between(np.hypot(x + aside, y + ahead) - radius, z, self.femur_cut, 1e3, 4.0)
+        radius = self.femur_radius + 2.0 * compute_smoothstep((z - 190) / 60)
+        return extrude_section(np.hypot(x + aside, y + ahead) - radius, z, self.femur_cut, 1e3, 4.0)

@@ -11,7 +11,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from ..web.assets import asset, inline_script, integrity
+from ..web.assets import build_inline_script, compute_integrity, read_asset
 from .drawing.plots import make_standalone
 from .page import Cell, Figure, Page, Row, Table
 from .sections.contents import make_page
@@ -116,10 +116,13 @@ def _render(page: Page) -> str:
         return loader.get_source(environment, name)[0]
 
     moves = any(block.kind == "interactive" for section in page.sections for block in section.blocks)
-    script = f"(() => {{\n{inline_script(*SCRIPTS)}\n{source('report.js')}}})();" if moves else ""
-    style = "\n".join([source("report.css"), *(asset(name) for name in STYLES if moves)])
+    script = f"(() => {{\n{build_inline_script(*SCRIPTS)}\n{source('report.js')}}})();" if moves else ""
+    style = "\n".join([source("report.css"), *(read_asset(name) for name in STYLES if moves)])
     return environment.get_template("report.html.j2").render(
-        page=page, css=Markup(style), script=Markup(script), script_source=integrity(script) if moves else ""
+        page=page,
+        css=Markup(style),
+        script=Markup(script),
+        script_source=compute_integrity(script) if moves else "",
     )
 
 

@@ -16,7 +16,7 @@ from ..mesh import read_grid, read_vtu
 from ..phases import find_phases, loading_end
 from ..pipeline.shared.artefacts import read_curves
 from ..web.arrays import pack
-from ..web.shapes import volume_of
+from ..web.shapes import to_volume_shape
 from .folder import StudyFolder, fingerprint, stored
 
 _FRAME = re.compile(r'<DataSet timestep="([^"]+)" part="0" file="[^"/]+/(step-\d{4,}\.vtu)"/>')
@@ -133,7 +133,7 @@ def mesh_block(folder: StudyFolder, source: str, site: str) -> bytes:
         if field.array in arrays
     ]
     facts = {"regions": list(mesh.region_names), "fields": fields, "cells": len(mesh.cells)}
-    return pack(volume_of(mesh).arrays(), facts)
+    return pack(to_volume_shape(mesh).arrays(), facts)
 
 
 def moment_block(folder: StudyFolder, source: str, site: str, moment: int, name: str) -> bytes:

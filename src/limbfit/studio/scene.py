@@ -19,7 +19,7 @@ from ..pipeline.stages.sites import place_site
 from ..pipeline.stages.surfaces import given_anatomy
 from ..study import Site, Study
 from ..web.arrays import pack
-from ..web.shapes import Shell, cell_quality, interface, patient_frame, volume_of
+from ..web.shapes import Shell, build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape
 from .folder import StudyFolder, fingerprint, stored
 
 SKIN = "skin"
@@ -62,7 +62,7 @@ def scene_of(folder: StudyFolder) -> dict[str, Any]:
     meshes = stored(folder.results / "mesh" / "mesh.json")
     return {
         "surfaces": {} if anatomy is None else _surface_marks(folder, study, anatomy),
-        "frame": patient_frame(None if anatomy is None else anatomy.cut_normal).tolist(),
+        "frame": build_patient_frame(None if anatomy is None else anatomy.cut_normal).tolist(),
         "sites": [_site_row(site, study, anatomy, placed.get(site.name)) for site in study.sites],
         "meshes": {
             site.name: fingerprint([file])
@@ -156,14 +156,14 @@ def layer_block(folder: StudyFolder, site: str, layer: str) -> bytes:
     mesh = read_vtu(folder.artefact("mesh", f"{site}.vtu"))
     if layer not in mesh.region_names[:-1]:
         raise InputError("the mesh has no such layer", remedy="make the meshes again")
-    return _shell_block(interface(volume_of(mesh), mesh.region_names.index(layer)))
+    return _shell_block(extract_interface(to_volume_shape(mesh), mesh.region_names.index(layer)))
 
 
 def mesh_block(folder: StudyFolder, site: str) -> bytes:
     """The mesh of a site: the arrays of `Volume` and the quality of each cell; ``regions`` are its names."""
     mesh = read_vtu(folder.artefact("mesh", f"{site}.vtu"))
     facts = {"regions": list(mesh.region_names), "element": mesh.cell_type, "cells": len(mesh.cells)}
-    return pack({**volume_of(mesh).arrays(), **cell_quality(mesh)}, facts)
+    return pack({**to_volume_shape(mesh).arrays(), **compute_cell_quality(mesh)}, facts)
 
 
 def on_skin(folder: StudyFolder, position: Sequence[float]) -> list[float]:

@@ -22,7 +22,7 @@ from ..socket.rays import LimbProfile, compute_profile
 from ..socket.trim import Trim, find_brim, trim_limb, wrap_trimline
 from ..study import Study
 from ..web.arrays import pack
-from ..web.shapes import patient_frame, volume_of
+from ..web.shapes import build_patient_frame, to_volume_shape
 from .editing import remove_area, set_area, set_trimline
 from .folder import StudyFolder, fingerprint, stored
 from .identification_routes import last_run
@@ -92,7 +92,7 @@ def _file(folder: StudyFolder, run: str, step: int) -> Path:
 def get_runs(folder: Folder) -> dict[str, Any]:
     """Stored runs, the patient's sides, and the run that goes on or begins."""
     anatomy = anatomy_of(folder, folder.load())
-    frame = patient_frame(None if anatomy is None else anatomy.cut_normal)
+    frame = build_patient_frame(None if anatomy is None else anatomy.cut_normal)
     run = running(folder)
     more = {"run": run, "starting": starting(folder), "last": last_run(folder, run is not None)}
     return {"runs": runs_of(folder), "frame": frame.tolist()} | more
@@ -102,7 +102,7 @@ def get_runs(folder: Folder) -> dict[str, Any]:
 def get_mesh(folder: Folder, run: str) -> Response:
     """The limb of a run as arrays of `VolumeShape`; ``place`` (n,): number of each node in ``places``."""
     mesh = read_vtu(_file(folder, run, 0))
-    volume = volume_of(mesh)
+    volume = to_volume_shape(mesh)
     place, places = _places(folder, volume.points.astype(float))
     facts = {"regions": list(mesh.region_names), "places": places}
     return _block(volume.arrays() | {"place": place}, facts)

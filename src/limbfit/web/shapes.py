@@ -52,7 +52,7 @@ class VolumeShape:
         return {name: getattr(self, name) for name in names}
 
 
-def patient_frame(cut_normal: ArrayLike | None) -> NDArray[np.float64]:
+def build_patient_frame(cut_normal: ArrayLike | None) -> NDArray[np.float64]:
     """Rows: the patient's left, posterior and proximal direction, the last one along the limb (LPS)."""
     up = np.asarray((0.0, 0.0, 1.0) if cut_normal is None else cut_normal, dtype=float)
     up = up / np.linalg.norm(up)
@@ -76,16 +76,16 @@ def read_shell(file: Path, most_faces: int | None = None) -> Shell:
         raise ProblemError("holds no triangles", file=file, remedy="make the surfaces again")
     if most_faces is not None and surface.n_cells > most_faces:
         surface = surface.decimate(1.0 - most_faces / surface.n_cells)
-    return shell_of(surface)
+    return to_shell(surface)
 
 
-def shell_of(surface: Any) -> Shell:
+def to_shell(surface: Any) -> Shell:
     """The triangles of a pyvista surface that holds nothing else."""
     faces = np.asarray(surface.faces).reshape(-1, 4)[:, 1:]
     return Shell(np.asarray(surface.points, dtype=np.float32), faces.astype(np.uint32))
 
 
-def volume_of(mesh: Mesh) -> VolumeShape:
+def to_volume_shape(mesh: Mesh) -> VolumeShape:
     """A mesh of tetrahedra as arrays to draw.
 
     Raises
@@ -97,7 +97,7 @@ def volume_of(mesh: Mesh) -> VolumeShape:
         raise ProblemError("only meshes of tetrahedra are drawn, not of hexahedra")
     nodes, cells = np.unique(mesh.cells[:, :4], return_inverse=True)
     cells = cells.reshape(-1, 4)
-    faces, owners, neighbours = _face_table(cells, len(nodes))
+    faces, owners, neighbours = _build_face_table(cells, len(nodes))
     return VolumeShape(
         points=mesh.points[nodes].astype(np.float32),
         cells=cells.astype(np.uint32),
@@ -109,7 +109,7 @@ def volume_of(mesh: Mesh) -> VolumeShape:
     )
 
 
-def _face_table(cells: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], ...]:
+def _build_face_table(cells: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], ...]:
     faces = cells[:, TET_FACES].reshape(-1, 3)
     low, middle, high = np.sort(faces, axis=1).T
     keys = (low * count + middle) * count + high
@@ -123,7 +123,7 @@ def _face_table(cells: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64]
     return faces[order[starts]], owners, np.where(sizes == 2, second, _NO_CELL)
 
 
-def interface(volume: VolumeShape, region: int) -> Shell:
+def extract_interface(volume: VolumeShape, region: int) -> Shell:
     """The faces between the regions up to ``region`` (layers, outermost first) and those beyond."""
     inside = volume.neighbours != _NO_CELL
     ours = volume.regions[volume.owners] <= region
@@ -133,7 +133,7 @@ def interface(volume: VolumeShape, region: int) -> Shell:
     return Shell(volume.points[used], faces.reshape(-1, 3).astype(np.uint32))
 
 
-def cell_quality(mesh: Mesh) -> dict[str, Floats]:
+def compute_cell_quality(mesh: Mesh) -> dict[str, Floats]:
     """Of each cell: its smallest dihedral angle (degrees), scaled Jacobian (-) and volume (mm3)."""
     jacobians = node_jacobians(mesh)
     scaled = jacobians.min(axis=1) / np.abs(jacobians.mean(axis=1))

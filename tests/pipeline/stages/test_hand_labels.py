@@ -12,7 +12,7 @@ from limbfit.anatomy.grid import LabelMap, Volume
 from limbfit.anatomy.imaging import read_labels, write_labels, write_volume
 from limbfit.errors import StudyError
 from limbfit.phantom.geometry import make_limb
-from limbfit.phantom.mri import image_of, make_grid
+from limbfit.phantom.mri import build_image, make_grid
 from limbfit.pipeline import run_study
 from limbfit.pipeline.verbs.run import study_status
 from limbfit.study import Study, load_study
@@ -33,7 +33,7 @@ depth_mm = 5.0
 @pytest.fixture(scope="module")
 def image() -> Volume:
     limb = make_limb(3)
-    fine = image_of(limb, make_grid(limb, "coarse", 3), seed=3)
+    fine = build_image(limb, make_grid(limb, "coarse", 3), seed=3)
     return Volume(fine.array[30:100], fine.spacing, fine.index_to_point([0, 0, 30]), fine.direction)
 
 

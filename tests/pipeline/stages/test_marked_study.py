@@ -9,9 +9,9 @@ import pytest
 
 import limbfit
 from limbfit.errors import StudyError
-from limbfit.phantom.geometry import make_limb, rotation_about
+from limbfit.phantom.geometry import build_rotation, make_limb
 from limbfit.phantom.mri import make_grid, write_series
-from limbfit.phantom.sites import markers_of, true_sites
+from limbfit.phantom.sites import build_markers, build_true_sites
 
 SEED = 3
 TOLERANCE_MM = 1.5  # voxels of 2.4 mm
@@ -34,11 +34,11 @@ def scans(tmp_path_factory):
     """A folder with both series; the sites of the first, and of the second, moved one."""
     folder = tmp_path_factory.mktemp("marked")
     limb = make_limb(SEED)
-    moved = limb.moved(rotation_about(np.array([0.2, 0.4, 1.0]), np.deg2rad(2.5)), np.array([3.0, -2.0, 2.0]))
+    moved = limb.moved(build_rotation(np.array([0.2, 0.4, 1.0]), np.deg2rad(2.5)), np.array([3.0, -2.0, 2.0]))
     grid = make_grid(limb, "coarse", SEED)
-    plain, marked = true_sites(limb, SEED), true_sites(moved, SEED)
+    plain, marked = build_true_sites(limb, SEED), build_true_sites(moved, SEED)
     write_series(folder / "plain", limb, grid, seed=SEED, number=1)
-    write_series(folder / "marked", moved, grid, markers_of(marked), seed=SEED, number=2)
+    write_series(folder / "marked", moved, grid, build_markers(marked), seed=SEED, number=2)
     return folder, plain, marked
 
 
@@ -65,7 +65,9 @@ def test_sites_are_where_the_markers_were(scans, way: str) -> None:
 def test_a_series_of_no_second_image_is_refused(tmp_path) -> None:
     (tmp_path / "mri").mkdir()
     write_study(
-        tmp_path, 'path = "mri"\nmarkers = "same"\nmarkers_series = "1.2.3"', true_sites(make_limb(0), 0)[:1]
+        tmp_path,
+        'path = "mri"\nmarkers = "same"\nmarkers_series = "1.2.3"',
+        build_true_sites(make_limb(0), 0)[:1],
     )
     with pytest.raises(StudyError, match="markers_series belongs to a second image"):
         limbfit.load_study(tmp_path)

@@ -15,7 +15,7 @@ from limbfit.bench.blocks import block_site
 from limbfit.bench.blocks import layered_block as block_of
 from limbfit.errors import ProblemError, TraceError
 from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_vector
-from limbfit.mesh import gauges_along
+from limbfit.mesh import find_gauges_along
 from limbfit.phantom.record import write_ultrasound
 from limbfit.pipeline.shared.simulations import SimulationCache
 from limbfit.pipeline.stages.calibrate import run_calibrate
@@ -34,7 +34,7 @@ DOWN = np.array([0.0, 0.0, -1.0])
 def test_a_gauge_follows_the_interfaces(kind: str, place: tuple[float, float]) -> None:
     """Displacements that the elements represent exactly: what the layers lose is known."""
     mesh = block_of(kind, 6)
-    found = {one.region: one for one in gauges_along(mesh, np.array([*place, 0.0]), DOWN)}
+    found = {one.region: one for one in find_gauges_along(mesh, np.array([*place, 0.0]), DOWN)}
     assert {name: one.thickness_mm for name, one in found.items()} == pytest.approx(
         {"skin": 3.0, "muscle": 27.0}
     )
@@ -46,7 +46,7 @@ def test_a_gauge_follows_the_interfaces(kind: str, place: tuple[float, float]) -
 
 def test_quadratic_faces_are_followed_by_their_own_functions() -> None:
     mesh = block_of("tet10", 6)
-    skin, muscle = gauges_along(mesh, np.array([2.3, -4.1, 0.0]), DOWN)
+    skin, muscle = find_gauges_along(mesh, np.array([2.3, -4.1, 0.0]), DOWN)
     sunk = 0.02 * mesh.points[:, 0] ** 2 * (mesh.points[:, 2] > -1.0)  # of the top alone
     assert skin.weights @ sunk[skin.nodes] == pytest.approx(0.02 * 2.3**2, rel=1e-9)
     assert muscle.weights @ sunk[muscle.nodes] == pytest.approx(0.0, abs=1e-12)
@@ -56,13 +56,13 @@ def test_what_lies_on_the_other_side_is_not_counted() -> None:
     """Skin above and below muscle: ultrasound sees the near one."""
     mesh = layered_block((3.0, 9.0, 2.0), ("skin", "muscle", "far"), 12.0, 4, 3.0)
     mesh = replace(mesh, regions=np.where(mesh.regions == 2, 0, mesh.regions))
-    found = gauges_along(mesh, np.array([1.0, 2.0, 0.0]), DOWN)
+    found = find_gauges_along(mesh, np.array([1.0, 2.0, 0.0]), DOWN)
     assert {one.region: one.thickness_mm for one in found} == pytest.approx({"skin": 3.0, "muscle": 9.0})
 
 
 def test_no_tissue_under_the_axis_is_told() -> None:
     with pytest.raises(ProblemError, match="no tissue lies under the indenter's axis"):
-        gauges_along(block_of("hex8", 4), np.array([100.0, 0.0, 0.0]), DOWN)
+        find_gauges_along(block_of("hex8", 4), np.array([100.0, 0.0, 0.0]), DOWN)
 
 
 @pytest.mark.slow

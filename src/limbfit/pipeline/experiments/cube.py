@@ -23,7 +23,7 @@ from ...fe.observables import element_fields
 from ...indentation import materials
 from ...laws import KPA, LAWS, OGDEN
 from ...mesh import Mesh
-from ...mesh.boxes import HEX, boxes
+from ...mesh.boxes import HEX, build_boxes
 from ...study import Study
 from ..shared.artefacts import read_json, write_json
 from ..shared.context import Context
@@ -184,7 +184,7 @@ def _times() -> Array:
 def cube_mesh(cells: int = 1) -> Mesh:
     """The cube of ``cells`` hexahedra along a side, from the origin, mm."""
     lines = np.linspace(0.0, SIDE_MM, cells + 1)
-    points, corners = boxes(lines, lines, lines)
+    points, corners = build_boxes(lines, lines, lines)
     return Mesh(points, corners[:, HEX], "hex8", np.zeros(len(corners), dtype=int), ("cube",), {}, {})
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from ...errors import InputError
 from ...execution import make_executor
 from ...phantom.build import make_phantom
-from ...phantom.forces import site_force
+from ...phantom.forces import simulate_true_force
 from ...study import load_study
 from ..shared.artefacts import read_json
 from ..shared.context import Listener, Progress, quiet
@@ -36,7 +36,7 @@ def make_phantom_study(
     with kernels_compiling() as compiled, make_executor(workers) as executor:
 
         def mapping(function: Callable, jobs: Iterable) -> Iterable:
-            if function is site_force:
+            if function is simulate_true_force:
                 compiled()
             return executor.map(function, jobs)
 

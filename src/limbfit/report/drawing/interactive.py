@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ...arrays import Array
 from ...mesh import read_vtu
 from ...web.arrays import pack
-from ...web.shapes import interface, read_shell, shell_of, volume_of
+from ...web.shapes import extract_interface, read_shell, to_shell, to_volume_shape
 from ..formats import symbol, unit_of
 from ..page import Interactive
 from ..store import Curves, Json, Results
@@ -92,10 +92,10 @@ def _read_layers(store: Results) -> Iterable[tuple[str, Any]]:
     if file is None:
         return
     mesh = read_vtu(file)
-    volume = volume_of(mesh)
+    volume = to_volume_shape(mesh)
     inner = {file.removeprefix("region-") for file in store.surface_files if file.startswith("region-")}
     for index, name in enumerate(name for name in mesh.region_names[:-1] if name not in inner):
-        yield f"inner face of {name}", interface(volume, index)
+        yield f"inner face of {name}", extract_interface(volume, index)
 
 
 def _describe_site(store: Results, row: Json) -> Json:
@@ -138,7 +138,7 @@ def _cut_field(store: Results, row: Json, file: Path) -> dict[str, NDArray[Any]]
     if not near.any():
         return None
     part = surface.extract_cells(np.flatnonzero(near)).extract_surface(algorithm="dataset_surface")
-    shell = shell_of(part)
+    shell = to_shell(part)
     return {
         "points": shell.points,
         "faces": shell.faces,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vtkmodules.vtkCommonCore import vtkLogger
 
 from ...arrays import Array
-from ...web.shapes import patient_frame
+from ...web.shapes import build_patient_frame
 from ..page import Figure
 from ..store import Json, Results
 from .panels import FIELD_MAP, PAPER, Mark, Shot, View, embed_png, legend, make_colour_bar, picture_row
@@ -43,7 +43,7 @@ def unit(values: Iterable[float]) -> Array:
 
 def read_limb_frame(store: Results) -> Array:
     """Rows: patient's left, posterior and proximal direction, the last one along the limb."""
-    return patient_frame(store.surfaces.get("cut_normal"))
+    return build_patient_frame(store.surfaces.get("cut_normal"))
 
 
 @contextmanager
