@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from limbfit.errors import TraceError
-from limbfit.traces import Trace, check_trace, understand
+from limbfit.traces import Trace, check_trace, interpret_record
 
 Array = NDArray[np.float64]
 Random = np.random.Generator
@@ -406,7 +406,7 @@ def read(case: Case, wrong: str | None) -> Reading:
     """Read a record as limbfit does; ``wrong`` is the kind of remark that it deserves."""
     try:
         check_trace(case.trace)
-        found = understand(case.trace)
+        found = interpret_record(case.trace)
     except TraceError as error:
         return Reading((), error.what, told=True)
     kinds = tuple(sorted({remark.kind for remark in found.remarks}))

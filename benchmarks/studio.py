@@ -44,7 +44,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from browsing import WITH_WEBGL
 from limbfit.errors import RunError
 from limbfit.studio.folder import StudyFolder
-from limbfit.studio.processes import running, starting, stop_run
+from limbfit.studio.processes import find_running, find_starting, stop_run
 
 VIEWS = ("image", "model", "traces", "identification", "results")
 STAY_S = 60.0 / len(VIEWS)
@@ -243,7 +243,7 @@ def stop(folder: StudyFolder) -> None:
     """Interrupt the run that goes on, and wait for its end: its study is about to be removed."""
     with suppress(RunError):
         stop_run(folder)
-    while running(folder) is not None or starting(folder) is not None:
+    while find_running(folder) is not None or find_starting(folder) is not None:
         time.sleep(0.5)
 
 

@@ -6,7 +6,7 @@ import time
 
 import psutil
 
-from limbfit.studio.commands import find_command, interrupt, start_command
+from limbfit.studio.commands import find_command, interrupt_process, start_command
 
 
 def ended(process, within_s=60.0):
@@ -31,6 +31,6 @@ def test_a_command_is_found_and_interrupted(tmp_path):
     while find_command(words) is None:
         time.sleep(0.05)
     assert find_command(words) == (process, [*words, "more"])
-    interrupt(process)
+    interrupt_process(process)
     ended(process)
     assert find_command(words) is None

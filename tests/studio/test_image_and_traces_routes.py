@@ -19,7 +19,7 @@ from limbfit.pipeline.shared.store import lock
 from limbfit.studio.app import create_app
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import Door
-from limbfit.studio.processes import running, stop_run
+from limbfit.studio.processes import find_running, stop_run
 from limbfit.study import load_study
 
 HOST = "http://127.0.0.1:8124"
@@ -168,18 +168,18 @@ def test_times_off_the_record_leave_the_study_as_it_is(study):
 def test_who_runs_a_study_is_read_from_its_lock(study):
     """Whoever holds it, also without the studio; what is no limbfit command is not interrupted."""
     folder = StudyFolder(study / "study.toml")
-    assert running(folder) is None
+    assert find_running(folder) is None
     with lock(study / "results"):
-        assert running(folder)["process"] == os.getpid()
+        assert find_running(folder)["process"] == os.getpid()
         if "limbfit" not in " ".join(sys.argv[:2]):
             with pytest.raises(Exception, match="is no limbfit command; end it where it runs"):
                 stop_run(folder)
-    assert running(folder) is None
+    assert find_running(folder) is None
     (study / "results" / ".lock").touch()
     holder = study / "results" / ".holder"
     holder.write_text(f"process {os.getpid()} (since 2026-01-01 00:00 UTC)")
-    assert running(folder) is None  # it lives, and holds nothing
+    assert find_running(folder) is None  # it lives, and holds nothing
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     holder.write_text(f"process {ended.pid} (since 2026-01-01 00:00 UTC)")
-    assert running(folder) is None
+    assert find_running(folder) is None

@@ -15,7 +15,7 @@ from limbfit.mesh import Mesh, boundary_faces, quality, write_vtu
 from limbfit.studio.app import create_app
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import Door
-from limbfit.studio.scene import anatomy_of
+from limbfit.studio.scene import read_anatomy
 from limbfit.web.arrays import unpack
 
 ORIGIN = "http://127.0.0.1:8123"
@@ -60,18 +60,18 @@ def test_a_surface_is_sent_as_it_is(page, study):
 
 def test_surfaces_are_read_again_only_where_they_or_what_is_said_of_them_changed(study):
     folder = StudyFolder(study / "study.toml")
-    first = anatomy_of(folder, folder.load())
-    assert anatomy_of(folder, folder.load()) is first
+    first = read_anatomy(folder, folder.load())
+    assert read_anatomy(folder, folder.load()) is first
     text = folder.file.read_text()
     folder.file.write_text(text.replace('"tibia.stl" }', '"tibia.stl" }\nunit = "cm"'))
-    assert np.ptp(anatomy_of(folder, folder.load()).skin.points) == pytest.approx(
+    assert np.ptp(read_anatomy(folder, folder.load()).skin.points) == pytest.approx(
         10 * np.ptp(first.skin.points)
     )
     folder.file.write_text(text)
     skin = pv.read(study / "skin.stl")
     skin.points *= 1.1
     skin.save(study / "skin.stl")
-    assert np.ptp(anatomy_of(folder, folder.load()).skin.points) > 1.05 * np.ptp(first.skin.points)
+    assert np.ptp(read_anatomy(folder, folder.load()).skin.points) > 1.05 * np.ptp(first.skin.points)
 
 
 def test_a_click_becomes_a_site_of_the_study_within_a_millimetre(page, study):

@@ -13,7 +13,7 @@ from limbfit.studio.app import create_app
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import Door
 from limbfit.studio.playback import FIELDS
-from limbfit.studio.simulating import simulating
+from limbfit.studio.simulating import find_simulating
 from limbfit.web.arrays import unpack
 
 ORIGIN = "http://127.0.0.1:8123"
@@ -118,12 +118,12 @@ def test_a_simulation_is_found_by_its_command_and_stopped(page, study, monkeypat
     folder = StudyFolder(study / "study.toml")
     assert page.post("/api/results/simulate/9").status_code == 422
     started = page.post("/api/results/simulate/1").json()
-    assert simulating(folder) == started
+    assert find_simulating(folder) == started
     assert page.get("/api/results/site/2").json()["simulating"] == started  # whoever asks
     assert page.post("/api/results/simulate/2").status_code == 409
     assert page.post("/api/results/stop").json() == started
     deadline = time.monotonic() + 20
-    while simulating(folder) is not None and time.monotonic() < deadline:
+    while find_simulating(folder) is not None and time.monotonic() < deadline:
         time.sleep(0.1)
-    assert simulating(folder) is None
+    assert find_simulating(folder) is None
     assert page.post("/api/results/stop").status_code == 409

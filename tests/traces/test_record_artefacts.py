@@ -10,7 +10,7 @@ from made_records import path_record, record, relaxing
 from scipy.signal import lfilter
 
 from limbfit.errors import TraceError
-from limbfit.traces import Trace, check_trace, read_trace, understand
+from limbfit.traces import Trace, check_trace, interpret_record, read_trace
 
 SLACK_MM, SPEED, NOISE_N = 0.4, 0.96, 0.03
 TURN_S = 5.4 / SPEED
@@ -52,7 +52,7 @@ def test_a_force_at_the_end_of_its_range(sound, share, before_noise):
     trace, clean = sound
     limit = share * clean.max()
     force = noisy(np.minimum(clean, limit)) if before_noise else np.minimum(trace.force_N, limit)
-    found = understand(replace(trace, force_N=force))
+    found = interpret_record(replace(trace, force_N=force))
     remark = only(found, "saturation")
     assert remark.evidence["limit_N"] == pytest.approx(limit, rel=0.02)
     beyond = trace.time_s[clean > limit]
@@ -63,7 +63,7 @@ def test_a_force_at_the_end_of_its_range(sound, share, before_noise):
 
 @pytest.mark.parametrize(("start_s", "end_s"), [(2.0, 3.2), (5.1, 6.1), (7.0, 8.0)])
 def test_lost_samples(sound, start_s, end_s):
-    found = understand(without(sound[0], start_s, end_s))
+    found = interpret_record(without(sound[0], start_s, end_s))
     remark = only(found, "gap")
     assert remark.evidence["start_s"] == pytest.approx(start_s, abs=0.003)
     assert remark.evidence["end_s"] == pytest.approx(end_s, abs=0.003)
@@ -72,7 +72,7 @@ def test_lost_samples(sound, start_s, end_s):
 
 
 def test_samples_lost_where_the_skin_is_met(sound):
-    found = understand(without(sound[0], 0.2, 0.8))
+    found = interpret_record(without(sound[0], 0.2, 0.8))
     assert "gap" in [remark.kind for remark in found.remarks]
     assert_within(found)
 
@@ -83,7 +83,7 @@ def test_a_force_that_froze(sound, start_s):
     force = trace.force_N.copy()
     held = (trace.time_s >= start_s) & (trace.time_s < start_s + 0.8)
     force[held] = force[held][0]
-    found = understand(replace(trace, force_N=force))
+    found = interpret_record(replace(trace, force_N=force))
     remark = only(found, "frozen")
     assert remark.evidence["start_s"] == pytest.approx(start_s, abs=0.003)
     assert remark.evidence["end_s"] == pytest.approx(start_s + 0.8, abs=0.005)
@@ -94,7 +94,9 @@ def test_a_force_that_froze(sound, start_s):
 @pytest.mark.parametrize("lag_s", [0.06, 0.2])
 def test_a_force_that_comes_late(sound, lag_s):
     trace, clean = sound
-    found = understand(replace(trace, force_N=noisy(np.interp(trace.time_s - lag_s, trace.time_s, clean))))
+    found = interpret_record(
+        replace(trace, force_N=noisy(np.interp(trace.time_s - lag_s, trace.time_s, clean)))
+    )
     remark = only(found, "lag")
     assert remark.evidence["lag_s"] == pytest.approx(lag_s, abs=0.02)
     assert "no passive tissue" in remark.what
@@ -105,7 +107,7 @@ def test_a_force_that_is_filtered(sound):
     """A low-pass filter of 0.1 s moves straight parts by as much, and takes the edge off a kink."""
     trace, clean = sound
     decay = np.exp(-0.002 / 0.1)
-    found = understand(replace(trace, force_N=noisy(lfilter([1.0 - decay], [1.0, -decay], clean))))
+    found = interpret_record(replace(trace, force_N=noisy(lfilter([1.0 - decay], [1.0, -decay], clean))))
     assert 0.03 < only(found, "lag").evidence["lag_s"] < 0.12
     assert_within(found, most_sd_mm=0.15)
 
@@ -113,7 +115,7 @@ def test_a_force_that_is_filtered(sound):
 def test_a_person_who_breathes_in_the_force(sound):
     trace, clean = sound
     swing = 0.3 * np.sin(2 * np.pi * 0.25 * trace.time_s) * np.clip(clean / 0.3, 0.0, 1.0)
-    found = understand(replace(trace, force_N=noisy(clean + swing)))
+    found = interpret_record(replace(trace, force_N=noisy(clean + swing)))
     remark = only(found, "swing")
     assert remark.evidence["cycles_per_s"] == pytest.approx(0.25, abs=0.03)
     assert remark.evidence["swing_N"] == pytest.approx(0.3, rel=0.3)
@@ -125,7 +127,7 @@ def test_a_person_whose_limb_moves(sound):
     fine = np.arange(0.0, trace.time_s[-1] + 0.002, 0.001)
     path = np.minimum(SPEED * fine, 10.8 - SPEED * fine) - SLACK_MM
     force = relaxing(fine, path + 0.3 * np.sin(2 * np.pi * 0.25 * fine + 1.0), p=1.3)
-    found = understand(replace(trace, force_N=noisy(np.interp(trace.time_s, fine, force))))
+    found = interpret_record(replace(trace, force_N=noisy(np.interp(trace.time_s, fine, force))))
     assert only(found, "swing").evidence["cycles_per_s"] == pytest.approx(0.25, abs=0.04)
     assert_within(found, most_sd_mm=1.0)
 
@@ -136,7 +138,7 @@ def test_a_sensor_that_was_zeroed_in_contact(sound, to_the_end):
     start = int(np.argmax(trace.displacement_mm >= SLACK_MM + 0.15))
     end = None if to_the_end else int(np.flatnonzero(trace.displacement_mm > SLACK_MM + 0.15)[-1])
     rows = slice(start, end)
-    found = understand(
+    found = interpret_record(
         Trace(
             trace.time_s[rows] - trace.time_s[start],
             trace.displacement_mm[rows] - trace.displacement_mm[start],
@@ -152,7 +154,7 @@ def test_a_sensor_that_was_zeroed_in_contact(sound, to_the_end):
 @pytest.mark.parametrize("size", [0.5, -0.5, 0.2])
 def test_a_force_that_jumps_does_not_drift(sound, size):
     trace, _ = sound
-    found = understand(replace(trace, force_N=trace.force_N + size * (trace.time_s >= 3.0)))
+    found = interpret_record(replace(trace, force_N=trace.force_N + size * (trace.time_s >= 3.0)))
     remark = only(found, "step")
     assert remark.evidence["step_N"] == pytest.approx(size, abs=0.06)
     assert remark.evidence["time_s"] == pytest.approx(3.0, abs=0.005)
@@ -163,7 +165,7 @@ def test_a_force_that_jumps_does_not_drift(sound, size):
 def test_a_jump_off_the_skin_is_adhesion():
     trace, _ = path_record([0.0, 5.4, 10.8, 11.8], [0.0, 5.4, 0.0, 0.0])
     sticks = (trace.time_s > 10.2) & (trace.time_s < 10.45)  # from 0.2 mm below the skin
-    assert understand(replace(trace, force_N=trace.force_N - 0.4 * sticks)).remarks == ()
+    assert interpret_record(replace(trace, force_N=trace.force_N - 0.4 * sticks)).remarks == ()
 
 
 @pytest.mark.parametrize("share", [0.1, -0.1])
@@ -171,7 +173,7 @@ def test_a_sensor_that_warms_up(share):
     trace, clean_at = path_record([0.0, 6.0, 12.0, 12.4], [0.0, 5.8, 0.0, 0.0], slack=0.8)
     clean = clean_at(trace.time_s)
     drift = share * clean.max() * (1.0 - np.exp(-trace.time_s / 3.0))
-    found = understand(replace(trace, force_N=trace.force_N + drift))
+    found = interpret_record(replace(trace, force_N=trace.force_N + drift))
     remark = only(found, "drift")
     assert "not along a straight line" in remark.what
     assert remark.evidence["drift_start_N_per_s"] == pytest.approx(share * clean.max() / 3.0, rel=0.5)
@@ -182,7 +184,7 @@ def test_a_sensor_that_warms_up(share):
 
 def test_a_force_in_coarse_steps_is_read(sound):
     trace, _ = sound
-    found = understand(replace(trace, force_N=np.round(trace.force_N / 0.25) * 0.25))
+    found = interpret_record(replace(trace, force_N=np.round(trace.force_N / 0.25) * 0.25))
     remark = only(found, "resolution")
     assert remark.evidence["step_N"] == 0.25
     assert remark.what == "the force comes in steps of 0.25 N"
@@ -193,7 +195,7 @@ def test_a_force_in_coarse_steps_is_read(sound):
 @pytest.mark.parametrize("noise_mm", [0.0, 0.005])
 def test_a_displacement_in_coarse_steps_is_read(size, noise_mm):
     trace, _ = record(noise_mm=noise_mm)
-    found = understand(replace(trace, displacement_mm=np.round(trace.displacement_mm / size) * size))
+    found = interpret_record(replace(trace, displacement_mm=np.round(trace.displacement_mm / size) * size))
     remark = only(found, "resolution")
     assert remark.evidence["step_mm"] == pytest.approx(size)
     assert remark.what == f"the displacement comes in steps of {size:g} mm"
@@ -209,7 +211,7 @@ def test_rounded_times_are_spread(sound, tmp_path):
     table = np.stack([rounded.time_s, rounded.displacement_mm, rounded.force_N], axis=1)
     file = tmp_path / "a.csv"
     np.savetxt(file, table, delimiter=",", header="time_s,displacement_mm,force_N", comments="", fmt="%.17g")
-    found = understand(read_trace(file))
+    found = interpret_record(read_trace(file))
     remark = only(found, "times")
     assert remark.evidence["time_step_s"] == pytest.approx(0.01)
     assert remark.evidence["doubled_times"] == np.sum(np.diff(rounded.time_s) == 0.0)
@@ -219,7 +221,7 @@ def test_rounded_times_are_spread(sound, tmp_path):
 
 def test_rounded_times_with_a_gap_stay_where_they_are(sound):
     gapped = without(sound[0], 2.0, 3.0)
-    found = understand(replace(gapped, time_s=np.round(gapped.time_s, 2)))
+    found = interpret_record(replace(gapped, time_s=np.round(gapped.time_s, 2)))
     assert [remark.kind for remark in found.remarks] == ["times", "gap"]
     assert np.abs(found.trace.time_s - gapped.time_s).max() < 0.011
     assert (np.diff(found.trace.time_s) > 0.0).all()
@@ -230,7 +232,7 @@ def test_rows_that_are_there_twice_are_left_out(sound):
     rows = np.sort(np.r_[np.arange(len(trace.time_s)), [5, 400, 400, 2000]])
     doubled = Trace(trace.time_s[rows], trace.displacement_mm[rows], trace.force_N[rows])
     check_trace(doubled)
-    found = understand(doubled)
+    found = interpret_record(doubled)
     assert only(found, "rows").evidence["doubled_rows"] == 4
     assert np.array_equal(found.trace.time_s, trace.time_s)
     assert np.array_equal(found.trace.force_N, trace.force_N)
@@ -263,7 +265,7 @@ def test_a_record_of_few_different_times_is_refused(sound):
     ids=str,
 )
 def test_sound_records_have_no_remarks(changes):
-    assert understand(record(**changes)[0]).remarks == ()
+    assert interpret_record(record(**changes)[0]).remarks == ()
 
 
 MOVEMENTS = {
@@ -278,12 +280,13 @@ MOVEMENTS = {
 
 @pytest.mark.parametrize("movement", MOVEMENTS)
 def test_other_movements_have_no_remarks(movement):
-    assert understand(path_record(*MOVEMENTS[movement], rate=100.0)[0]).remarks == ()
+    assert interpret_record(path_record(*MOVEMENTS[movement], rate=100.0)[0]).remarks == ()
 
 
 def test_samples_that_are_missing_at_random_are_no_gap(sound):
     trace, _ = sound
     kept = np.random.default_rng(0).random(len(trace.time_s)) > 0.3
     assert (
-        understand(Trace(trace.time_s[kept], trace.displacement_mm[kept], trace.force_N[kept])).remarks == ()
+        interpret_record(Trace(trace.time_s[kept], trace.displacement_mm[kept], trace.force_N[kept])).remarks
+        == ()
     )

@@ -10,7 +10,7 @@ import pytest
 from made_records import OPENLIMB, needs_openlimb, record
 
 from limbfit.traces import Trace, find_touch_down, read_trace, regularise
-from limbfit.traces.regularise import _spline
+from limbfit.traces.regularise import _fit_spline
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -100,8 +100,8 @@ def test_smoothing_a_simulated_force_does_not_make_it_stiffer():
 def test_the_penalty_of_cross_validation_is_found_out():
     x = np.linspace(0, 3, 150)
     y, w = np.sin(2 * x) + 0.1 * np.random.default_rng(3).standard_normal(150), np.full(150, 4.0)
-    chosen, penalty = _spline(x, y, w, None, {0.0: np.array(0.0)})
-    given, _ = _spline(x, y, w, penalty, {0.0: np.array(0.0)})
+    chosen, penalty = _fit_spline(x, y, w, None, {0.0: np.array(0.0)})
+    given, _ = _fit_spline(x, y, w, penalty, {0.0: np.array(0.0)})
     assert penalty > 0
     assert given(x) == pytest.approx(chosen(x), abs=1e-7)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from limbfit.errors import TraceError
-from limbfit.traces import SurfaceMotion, in_contact, read_surface_motion
+from limbfit.traces import SurfaceMotion, read_surface_motion, select_frames_in_contact
 
 HEAD = "time_s,x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm"
 AT = ((10.0, 0.0, 0.0), (0.0, 12.0, 0.0))
@@ -92,14 +92,14 @@ def motion(times: np.ndarray, seed: int = 0, sd: float = 0.0) -> SurfaceMotion:
 
 def test_times_are_of_the_records_clock() -> None:
     seen = motion(np.arange(0.0, 10.0))
-    found = in_contact(seen, (0.0, 12.0), 2.0, 8.0)
+    found = select_frames_in_contact(seen, (0.0, 12.0), 2.0, 8.0)
     assert found.time_s.tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
     with pytest.raises(
         TraceError, match="times from 0 to 9 s, and the record goes from 0 to 8 s; give times"
     ):
-        in_contact(seen, (0.0, 8.0), 2.0, 7.0)
+        select_frames_in_contact(seen, (0.0, 8.0), 2.0, 7.0)
     with pytest.raises(TraceError, match=r"no displacement while the indenter presses \(9.20 to 11.00 s\)"):
-        in_contact(seen, (0.0, 12.0), 9.2, 11.0)
+        select_frames_in_contact(seen, (0.0, 12.0), 9.2, 11.0)
 
 
 def test_means_are_of_the_frames_that_show_a_point() -> None:

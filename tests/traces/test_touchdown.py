@@ -12,7 +12,7 @@ import pytest
 from scipy.signal import lfilter
 
 from limbfit.traces import Trace, find_touch_down
-from limbfit.traces.scatter import Scatter, scatter_of
+from limbfit.traces.scatter import Scatter, estimate_scatter
 
 NOISE_N, RATE_HZ = 0.05, 500.0
 
@@ -81,7 +81,7 @@ def test_the_noise_is_known_by_its_correlation(lag):
     """On a curve, whose own bends are no noise; the deviation of a long mean is what counts."""
     curve = 5 * np.linspace(0, 1, 4000) ** 2
     parts = [curve + NOISE_N * autoregressive(np.random.default_rng(k), 4000, lag) for k in range(8)]
-    found = [scatter_of(part) for part in parts]
+    found = [estimate_scatter(part) for part in parts]
     assert np.mean([one.lag for one in found]) == pytest.approx(lag, abs=0.02)
     long = np.mean([one.of_means(200) for one in found])
     assert long == pytest.approx(Scatter(NOISE_N, lag).of_means(200), rel=0.1)

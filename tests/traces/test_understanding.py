@@ -11,7 +11,7 @@ import pytest
 from conftest import write_trace
 from limbfit import check_study, load_study
 from limbfit.errors import InputError, StudyError, TraceError
-from limbfit.traces import Trace, find_touch_down, understand
+from limbfit.traces import Trace, find_touch_down, interpret_record
 
 NOISE_N = 0.03
 
@@ -35,7 +35,7 @@ def kinds(found):
 def test_a_sound_record_is_left_alone():
     for seed in range(5):
         trace, _ = record(seed)
-        found = understand(trace)
+        found = interpret_record(trace)
         assert found.trace is trace
         assert found.remarks == ()
         assert found.touch_down == find_touch_down(trace)
@@ -47,7 +47,7 @@ def test_a_sound_record_is_left_alone():
 @pytest.mark.parametrize("drift", [0.05, -0.05])
 def test_a_force_that_drifts_is_set_straight(drift):
     trace, clean = record()
-    found = understand(replace(trace, force_N=trace.force_N + drift * trace.time_s))
+    found = interpret_record(replace(trace, force_N=trace.force_N + drift * trace.time_s))
     assert kinds(found) == ["drift"]
     assert found.remarks[0].evidence["drift_N_per_s"] == pytest.approx(drift, rel=0.05)
     assert f"{drift:+.2g} N/s" in found.remarks[0].what
@@ -61,7 +61,7 @@ def test_a_sensor_that_drifts_away_is_refused():
     with pytest.raises(
         TraceError, match=r"force_N: the force drifts by \+0\.3 N/s.*; let the sensor warm up"
     ):
-        understand(replace(trace, force_N=trace.force_N + 0.3 * trace.time_s))
+        interpret_record(replace(trace, force_N=trace.force_N + 0.3 * trace.time_s))
 
 
 # --- spikes
@@ -79,7 +79,7 @@ def spiked(values, size, seed=3, per_mille=1.0):
 def test_spikes_are_taken_out_and_counted(size):
     trace, clean = record()
     force, places = spiked(trace.force_N, size)
-    found = understand(replace(trace, force_N=force))
+    found = interpret_record(replace(trace, force_N=force))
     assert kinds(found) == ["spikes"]
     assert found.remarks[0].evidence["spikes"] == len(places)
     assert f"{len(places)} of {len(force)} samples of the force" in found.remarks[0].what
@@ -91,7 +91,7 @@ def test_spikes_are_taken_out_and_counted(size):
 def test_spikes_of_the_displacement_are_taken_out():
     trace, _ = record()
     moved, _ = spiked(trace.displacement_mm, 2.0)
-    found = understand(replace(trace, displacement_mm=moved))
+    found = interpret_record(replace(trace, displacement_mm=moved))
     assert "displacement" in found.remarks[0].what
     assert np.abs(found.trace.displacement_mm - trace.displacement_mm).max() < 0.05
 
@@ -102,14 +102,14 @@ def test_a_broken_cable_is_refused():
     with pytest.raises(
         TraceError, match="samples stick out from their neighbours; check the sensor and its cable"
     ):
-        understand(replace(trace, force_N=force))
+        interpret_record(replace(trace, force_N=force))
 
 
 def test_a_corner_is_no_spike():
     """At 10 Hz a peak is three samples."""
     trace, clean = record()
     few = Trace(trace.time_s[::50], trace.displacement_mm[::50], clean[::50])
-    assert understand(few).trace is few
+    assert interpret_record(few).trace is few
 
 
 # --- in contact
@@ -128,7 +128,7 @@ def cut(trace, at_mm, zeroed=False):
 @pytest.mark.parametrize("at_mm", [2.5, 4.5])
 def test_a_record_that_begins_in_full_contact_is_refused(at_mm):
     with pytest.raises(TraceError, match=r"force_N: the record begins in contact: .*; zero the sensor clear"):
-        understand(cut(record()[0], at_mm))
+        interpret_record(cut(record()[0], at_mm))
 
 
 def test_a_sensor_that_was_zeroed_in_contact_is_refused():
@@ -138,18 +138,18 @@ def test_a_sensor_that_was_zeroed_in_contact_is_refused():
         trace.time_s[start:], trace.displacement_mm[start:], trace.force_N[start:] - trace.force_N[start]
     )
     with pytest.raises(TraceError, match=r"begins in contact: .* N when it is released"):
-        understand(pressed)
+        interpret_record(pressed)
 
 
 def test_a_record_that_starts_on_the_skin_is_taken_with_a_remark():
-    found = understand(record(clear=0.0)[0])
+    found = interpret_record(record(clear=0.0)[0])
     assert kinds(found) == ["start"]
     assert "no approach" in found.remarks[0].what
 
 
 def test_a_sensor_with_an_offset_is_no_contact():
     trace, _ = record()
-    found = understand(replace(trace, force_N=trace.force_N + 0.6))
+    found = interpret_record(replace(trace, force_N=trace.force_N + 0.6))
     assert found.remarks == ()
     assert found.touch_down.baseline_N == pytest.approx(0.6, abs=0.02)
 
@@ -164,13 +164,13 @@ def fast(seed, clear=0.4):
 @pytest.mark.parametrize("seed", [0, 8, 43, 51])
 def test_noise_is_no_contact(seed):
     """Three of these look like contact where the noise is not counted."""
-    assert kinds(understand(fast(seed))) in ([], ["start"])
+    assert kinds(interpret_record(fast(seed))) in ([], ["start"])
 
 
 def test_contact_is_seen_in_noise():
     for seed in range(5):
         with pytest.raises(TraceError, match="begins in contact"):
-            understand(cut(fast(seed), 1.9))
+            interpret_record(cut(fast(seed), 1.9))
 
 
 # --- what `limbfit check` says

@@ -34,11 +34,11 @@ def create_app(folder: StudyFolder, door: Door) -> FastAPI:
     for routes in ROUTES:
         app.include_router(routes.router)
     for kind, status in ((InputError, 422), (LimbfitError, 409), (FileNotFoundError, 404)):
-        app.add_exception_handler(kind, _told(status))
-    app.add_exception_handler(TooLargeError, _told(413))
-    app.add_exception_handler(HTTPException, _refused)
-    app.add_exception_handler(Exception, _internal)
-    app.add_exception_handler(RequestValidationError, _unusable)
+        app.add_exception_handler(kind, _to_json(status))
+    app.add_exception_handler(TooLargeError, _to_json(413))
+    app.add_exception_handler(HTTPException, _respond_refused)
+    app.add_exception_handler(Exception, _respond_internal)
+    app.add_exception_handler(RequestValidationError, _respond_unusable)
     app.add_api_route("/", _page, include_in_schema=False)
     app.mount("/static", StaticFiles(directory=STATIC))
     app.mount("/web", StaticFiles(directory=SHARED))
@@ -50,7 +50,7 @@ def _page() -> FileResponse:
     return FileResponse(STATIC / "index.html")
 
 
-def _told(status: int) -> Any:
+def _to_json(status: int) -> Any:
     def handler(request: Request, error: Exception) -> JSONResponse:
         text = str(error) or "the request is too large"
         if isinstance(error, FileNotFoundError):
@@ -60,18 +60,18 @@ def _told(status: int) -> Any:
     return handler
 
 
-def _refused(request: Request, error: Exception) -> JSONResponse:
+def _respond_refused(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     return JSONResponse({"error": error.detail}, error.status_code)
 
 
-def _internal(request: Request, error: Exception) -> JSONResponse:
+def _respond_internal(request: Request, error: Exception) -> JSONResponse:
     name = type(error).__name__
     text = f"internal error: {name}; set LIMBFIT_TRACEBACK=1 to see where, and please report it"
     return JSONResponse({"error": text}, 500)
 
 
-def _unusable(request: Request, error: Exception) -> JSONResponse:
+def _respond_unusable(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     first = error.errors()[0]
     place = ".".join(str(part) for part in first["loc"][1:])

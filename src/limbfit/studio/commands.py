@@ -58,7 +58,7 @@ def _is_known(process: int) -> bool:
         return True
 
 
-def interrupt(process: int) -> None:
+def interrupt_process(process: int) -> None:
     """What Ctrl-C in its terminal would do.
 
     A process that only starts is terminated too: Python may lose an interrupt then.

@@ -74,7 +74,7 @@ def set_site(file: Path, site: str, values: Mapping[str, Any]) -> Study:
 
     A new place removes ``near``, and the other way round: a site has one of them.
     """
-    return edit_study(file, lambda document: _assign(_table_of(document, site, file), values))
+    return edit_study(file, lambda document: _assign(_find_table(document, site, file), values))
 
 
 def set_record(file: Path, record: Record, values: Mapping[str, Any]) -> Study:
@@ -108,7 +108,7 @@ def remove_site(file: Path, name: str) -> Study:
     """Take a site out of the study; its record stays where it is."""
 
     def change(document: tomlkit.TOMLDocument) -> None:
-        _table_of(document, name, file)
+        _find_table(document, name, file)
         sites = document["sites"]
         del sites[[str(site.get("name")) for site in sites].index(name)]
 
@@ -130,7 +130,7 @@ def set_area(file: Path, name: str, values: Mapping[str, Any]) -> Study:
     """Change an area of ``[[socket.areas]]``, or add one of that name; None removes a key."""
 
     def change(document: tomlkit.TOMLDocument) -> None:
-        rows = _areas(document)
+        rows = _ensure_areas(document)
         known = next((row for row in rows if str(row.get("name")) == name), None)
         if known is None:
             known = tomlkit.table() if isinstance(rows, AoT) else tomlkit.inline_table()
@@ -152,7 +152,7 @@ def remove_area(file: Path, name: str) -> Study:
     """
 
     def change(document: tomlkit.TOMLDocument) -> None:
-        rows = _areas(document)
+        rows = _ensure_areas(document)
         names = [str(row.get("name")) for row in rows]
         if name not in names:
             raise StudyError(f"no area is named {name!r}", file=file, place="socket.areas")
@@ -165,7 +165,7 @@ def set_trimline(file: Path, points: Sequence[Sequence[float]] | None) -> Study:
     """State ``socket.trimline`` (LPS, mm) in the place of any other brim; None: there is the default one."""
 
     def change(document: tomlkit.TOMLDocument) -> None:
-        table = _socket(document)
+        table = _ensure_socket(document)
         for key in ("trim_mm", "trim_planes", "trimline"):
             table.pop(key, None)
         if points is not None:
@@ -176,22 +176,22 @@ def set_trimline(file: Path, points: Sequence[Sequence[float]] | None) -> Study:
     return edit_study(file, change)
 
 
-def _areas(document: tomlkit.TOMLDocument) -> Any:
+def _ensure_areas(document: tomlkit.TOMLDocument) -> Any:
     """The list of areas, made where there is none."""
-    table = _socket(document)
+    table = _ensure_socket(document)
     if "areas" not in table:
         table["areas"] = tomlkit.aot()
     return table["areas"]
 
 
-def _socket(document: tomlkit.TOMLDocument) -> Any:
+def _ensure_socket(document: tomlkit.TOMLDocument) -> Any:
     """The table ``[socket]``, made where there is none."""
     if "socket" not in document:
         document["socket"] = tomlkit.table()
     return document["socket"]
 
 
-def _table_of(document: tomlkit.TOMLDocument, name: str, file: Path) -> Any:
+def _find_table(document: tomlkit.TOMLDocument, name: str, file: Path) -> Any:
     sites = document.get("sites")
     for site in sites if isinstance(sites, list) else ():
         if str(site.get("name")) == name:
@@ -224,7 +224,7 @@ class Shown:
         return BESIDE if study.segmentation.is_given else f"results/segment/{LABELS}"
 
 
-def shown_labels(folder: StudyFolder) -> Shown | None:
+def find_shown_labels(folder: StudyFolder) -> Shown | None:
     """The corrected map beside the study where the study names it, else that of the stage ``segment``."""
     given = folder.load().segmentation.labels
     file = folder.results / "segment" / LABELS
@@ -234,7 +234,7 @@ def shown_labels(folder: StudyFolder) -> Shown | None:
 
 
 @lru_cache(maxsize=1)
-def labels_of(shown: Shown) -> LabelMap:
+def read_shown_labels(shown: Shown) -> LabelMap:
     """The label map on the page; the last one is kept: a page asks for its names, then for its voxels."""
     return read_labels(shown.file)
 

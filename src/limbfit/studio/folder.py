@@ -47,7 +47,7 @@ class StudyFolder:
         FileNotFoundError
             Where there is none.
         """
-        return inside(self.results, *parts)
+        return resolve_inside(self.results, *parts)
 
     def changes(self) -> dict[str, str]:
         """A fingerprint of each thing that a page may have to read again."""
@@ -55,15 +55,19 @@ class StudyFolder:
         logs = sorted((results / "log").glob("*.jsonl"))[-1:]
         work = results.glob(".work-calibrate-*/runs")
         return {
-            "study": fingerprint([self.file]),
-            "stages": fingerprint([*sorted(results.glob("*/stage.json")), *sorted(results.glob(".work-*"))]),
-            "labels": fingerprint(results / place / "labels.seg.nrrd" for place in ("segment", "by-hand")),
-            "log": fingerprint([*logs, *work]),
-            "acquired": fingerprint(sorted(self.folder.glob(f"{ACQUIRED}/*/*"))),
+            "study": compute_fingerprint([self.file]),
+            "stages": compute_fingerprint(
+                [*sorted(results.glob("*/stage.json")), *sorted(results.glob(".work-*"))]
+            ),
+            "labels": compute_fingerprint(
+                results / place / "labels.seg.nrrd" for place in ("segment", "by-hand")
+            ),
+            "log": compute_fingerprint([*logs, *work]),
+            "acquired": compute_fingerprint(sorted(self.folder.glob(f"{ACQUIRED}/*/*"))),
         }
 
 
-def inside(root: Path, *parts: str) -> Path:
+def resolve_inside(root: Path, *parts: str) -> Path:
     """A file below a folder by the parts of its path; see `StudyFolder.artefact` for the errors."""
     for part in parts:
         is_plain = bool(part) and part.isprintable() and not set(part) & set('/\\:*?"<>|')
@@ -77,12 +81,12 @@ def inside(root: Path, *parts: str) -> Path:
     return path
 
 
-def stored(file: Path) -> dict[str, Any]:
+def read_stored(file: Path) -> dict[str, Any]:
     """What a JSON artefact holds; empty where there is none."""
     return dict(read_json(file)) if file.is_file() else {}
 
 
-def fingerprint(files: Iterable[Path]) -> str:
+def compute_fingerprint(files: Iterable[Path]) -> str:
     """Changes when one of the files is written, appears or goes."""
     seen: list[Any] = []
     for file in files:

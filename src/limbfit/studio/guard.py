@@ -103,7 +103,7 @@ class GuardMiddleware:
         cookie = ""
         if is_entry and self.door.opens(given):
             cookie = f"{self.door.cookie}={self.door.token}; Path=/; HttpOnly; SameSite=Strict"
-        await self.app(scope, _bounded(receive), _dressed(send, cookie))
+        await self.app(scope, _limit_body(receive), _add_headers(send, cookie))
 
     def _refusal(self, scope: Scope, headers: Headers, given: str) -> tuple[int, str] | None:
         """Status and reason why a request is refused; None where it is not."""
@@ -138,7 +138,7 @@ class TooLargeError(Exception):
     """A body without a stated length went over the limit."""
 
 
-def _bounded(receive: Receive) -> Receive:
+def _limit_body(receive: Receive) -> Receive:
     seen = 0
 
     async def bounded() -> Message:
@@ -152,7 +152,7 @@ def _bounded(receive: Receive) -> Receive:
     return bounded
 
 
-def _dressed(send: Send, cookie: str) -> Send:
+def _add_headers(send: Send, cookie: str) -> Send:
     """Every answer with the headers that keep it where it belongs; an answer's own policy stays."""
 
     async def dressed(message: Message) -> None:
@@ -170,5 +170,5 @@ def _dressed(send: Send, cookie: str) -> Send:
 async def _answer(send: Send, status: int, reason: str) -> None:
     body = json.dumps({"error": reason}).encode()
     raw = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
-    await _dressed(send, "")({"type": "http.response.start", "status": status, "headers": raw})
+    await _add_headers(send, "")({"type": "http.response.start", "status": status, "headers": raw})
     await send({"type": "http.response.body", "body": body})

@@ -14,8 +14,8 @@ from ..pipeline.shared.artefacts import read_curves
 from ..pipeline.shared.simulations import newest_simulations
 from ..study import Record
 from .folder import StudyFolder
-from .processes import running, start_run, starting, stop_run
-from .study_routes import Folder, stages_of_folder
+from .processes import find_running, find_starting, start_run, stop_run
+from .study_routes import Folder, list_stages
 
 router = APIRouter(prefix="/api/identification")
 LAST_LINES = 40  # of the log
@@ -37,18 +37,18 @@ class RunRequest(BaseModel):
 def get_identification(folder: Folder) -> dict[str, Any]:
     """Stages, those of them that a run does, that run or the last one, iterates of the search, its answer."""
     study = folder.load()
-    stages = stages_of_folder(folder)
-    logs = _logs(folder)
+    stages = list_stages(folder)
+    logs = _list_logs(folder)
     done = _answer(folder)
-    run = running(folder)
+    run = find_running(folder)
     state = next(row for row in stages if row["stage"] == "calibrate")
     return {
         "stages": stages,
         "chain": [row["stage"] for row in stages if row["stage"] in STAGE_NAMES],
         "run": run,
-        "starting": starting(folder) if run is None else None,
-        "last": last_run(folder, run is not None),
-        "iterates": _iterates(folder, logs, state["state"], done),
+        "starting": find_starting(folder) if run is None else None,
+        "last": describe_last_run(folder, run is not None),
+        "iterates": _collect_iterates(folder, logs, state["state"], done),
         "parameters": list(study.law.keys),
         "tissues": list(study.tissues),
         "sites": [{"site": record.name, "fitted": record.fitted} for record in study.recorded],
@@ -64,8 +64,8 @@ def get_curves(folder: Folder, name: str) -> dict[str, Any]:
     that are measured and simulated. ``of`` is null where nothing is simulated yet.
     """
     site = folder.load().indentation(name)
-    states = {row["stage"]: row["state"] for row in stages_of_folder(folder)}
-    live = _newest(folder, site.name) if states["calibrate"] != "done" else None
+    states = {row["stage"]: row["state"] for row in list_stages(folder)}
+    live = _read_newest(folder, site.name) if states["calibrate"] != "done" else None
     stored = folder.results / "predict" / f"{site.name}.csv"
     measured = folder.results / "traces" / f"{site.name}.csv"
     if live is not None and measured.is_file():
@@ -115,30 +115,32 @@ def _answer(folder: StudyFolder) -> dict[str, Any] | None:
     }
 
 
-def _iterates(
+def _collect_iterates(
     folder: StudyFolder, logs: list[Path], state: str, done: dict[str, Any] | None
 ) -> dict[str, Any]:
     """Iterates of the search that goes on or was stopped; else of the stored answer."""
     if state != "done":
         finished = (folder.store.stamp("calibrate") or {}).get("finished", "")
         for log in reversed(logs[-LOGS_SEARCHED:]):
-            rows = [row for row in _events(log) if row["event"] == "fit" and row.get("stage") == "calibrate"]
+            rows = [
+                row for row in _read_events(log) if row["event"] == "fit" and row.get("stage") == "calibrate"
+            ]
             facts = [row["facts"] for row in rows if row.get("facts") and row["time"] > finished]
             if facts:
                 return {"of": "log", "rows": facts}
     return {"of": "answer" if done else "nothing", "rows": done.pop("iterates") if done else []}
 
 
-def _logs(folder: StudyFolder) -> list[Path]:
+def _list_logs(folder: StudyFolder) -> list[Path]:
     return sorted((folder.results / "log").glob("*.jsonl"))
 
 
-def last_run(folder: StudyFolder, is_running: bool) -> dict[str, Any] | None:
+def describe_last_run(folder: StudyFolder, is_running: bool) -> dict[str, Any] | None:
     """The newest log, if any: what it is of, how it ended, its newest progress and lines."""
-    logs = _logs(folder)
+    logs = _list_logs(folder)
     if not logs:
         return None
-    events = _events(logs[-1])
+    events = _read_events(logs[-1])
     progress = [row for row in events if row["event"] in ("progress", "fit")]
     end = _ENDS.get(events[-1]["event"]) if events else None
     if end is None:
@@ -156,7 +158,7 @@ def last_run(folder: StudyFolder, is_running: bool) -> dict[str, Any] | None:
     }
 
 
-def _events(log: Path) -> list[dict[str, Any]]:
+def _read_events(log: Path) -> list[dict[str, Any]]:
     """The events of a log; the last line may be half written."""
     events = []
     for line in log.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -169,7 +171,7 @@ def _events(log: Path) -> list[dict[str, Any]]:
     return events
 
 
-def _newest(folder: StudyFolder, site: str) -> list[float] | None:
+def _read_newest(folder: StudyFolder, site: str) -> list[float] | None:
     for runs in sorted(folder.results.glob(".work-calibrate-*/runs")):
         found = newest_simulations(runs, (site,)).get(site)
         if found is not None and found.completed:

@@ -17,8 +17,8 @@ from ..anatomy.surfaces.surfaces import read_surface
 from ..errors import InputError, RunError
 from ..pipeline.stages.inputs import plain_image
 from ..study import Study
-from .editing import LABELS, labels_of, save_labels, shown_labels
-from .processes import running
+from .editing import LABELS, find_shown_labels, read_shown_labels, save_labels
+from .processes import find_running
 from .study_routes import Folder
 
 router = APIRouter(prefix="/api/image")
@@ -45,14 +45,14 @@ def get_facts(folder: Folder) -> dict[str, Any]:
         return {"has_image": False}
     surfaces = sorted(file.name for file in (folder.results / "surfaces").glob("*.stl"))
     facts: dict[str, Any] = {"has_image": True, "surfaces": surfaces, "labels": None}
-    shown = shown_labels(folder)
+    shown = find_shown_labels(folder)
     if shown is not None:
-        labels = labels_of(shown)
+        labels = read_shown_labels(shown)
         facts["labels"] = {
             "base": shown.digest,
             "saved_to": shown.saved_to(study),
             "names": [
-                {"value": value, "name": name, "colour": _hex(colour_of(name, n))}
+                {"value": value, "name": name, "colour": _format_hex(colour_of(name, n))}
                 for n, (value, name) in enumerate(sorted(labels.names.items()))
             ],
         }
@@ -62,16 +62,16 @@ def get_facts(folder: Folder) -> dict[str, Any]:
 @router.get("/volume")
 def get_volume(folder: Folder) -> Response:
     """The image as NIfTI, its voxels in the page's order."""
-    return _nifti(_study_volume(folder.load()).along(PAGE_AXES))
+    return _respond_nifti(_read_study_volume(folder.load()).along(PAGE_AXES))
 
 
 @router.get("/labels")
 def get_labels(folder: Folder) -> Response:
     """The label map as NIfTI, voxels as in `get_volume`; the header ``X-Base`` names its content."""
-    shown = shown_labels(folder)
+    shown = find_shown_labels(folder)
     if shown is None:
         raise FileNotFoundError(LABELS)
-    answer = _nifti(labels_of(shown).along(PAGE_AXES))
+    answer = _respond_nifti(read_shown_labels(shown).along(PAGE_AXES))
     answer.headers["X-Base"] = shown.digest
     return answer
 
@@ -82,21 +82,21 @@ def post_labels(folder: Folder, painting: Painting) -> dict[str, Any]:
 
     It is refused where the labels are others than those that were painted on, and while a run goes on.
     """
-    study, shown = folder.load(), shown_labels(folder)
+    study, shown = folder.load(), find_shown_labels(folder)
     if shown is None:
         raise FileNotFoundError(LABELS)
-    if running(folder) is not None:
+    if find_running(folder) is not None:
         raise RunError("a run of this study is in progress; stop it or wait for it before labels are saved")
     if shown.digest != painting.base:
         raise RunError(
             "the labels have changed since they were opened here; open them again and repeat the changes"
         )
-    labels = labels_of(shown)
+    labels = read_shown_labels(shown)
     painted = paint(labels, painting.runs)
     changed = int((painted.array != labels.array).sum())
     if changed:
         save_labels(folder, study, shown, painted)
-    again = shown_labels(folder)
+    again = find_shown_labels(folder)
     assert again is not None
     return {"changed_voxels": changed, "base": again.digest, "saved_to": again.saved_to(folder.load())}
 
@@ -133,14 +133,14 @@ def paint(labels: LabelMap, runs: list[tuple[int, int, int]]) -> LabelMap:
     return turned.with_array(flat.reshape(turned.array.shape)).along(labels.direction)
 
 
-def _study_volume(study: Study) -> Volume:
+def _read_study_volume(study: Study) -> Volume:
     """The image as it is; what ``segment`` asks of it besides, one limb, is for that stage to say."""
     if study.image is None:
         raise InputError("the study has no image", file=study.file, place="image")
     return plain_image(study)
 
 
-def _nifti(grid: Volume | LabelMap) -> Response:
+def _respond_nifti(grid: Volume | LabelMap) -> Response:
     array = grid.array
     if array.dtype != np.uint8 and np.array_equal(array, np.round(array)) and np.abs(array).max() < 2**15:
         array = array.astype(np.int16)
@@ -154,5 +154,5 @@ def _nifti(grid: Volume | LabelMap) -> Response:
         return Response(file.read_bytes(), media_type="application/octet-stream")
 
 
-def _hex(colour: tuple[float, float, float]) -> str:
+def _format_hex(colour: tuple[float, float, float]) -> str:
     return "#" + "".join(f"{round(255 * part):02x}" for part in colour)

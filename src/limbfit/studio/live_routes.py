@@ -18,7 +18,7 @@ from ..acquire.phases import FINAL
 from ..errors import TraceError
 from ..pipeline.verbs.acquire import FOLDER as ACQUIRED
 from ..pipeline.verbs.acquire import RECORD, VERDICT
-from .folder import StudyFolder, inside
+from .folder import StudyFolder, resolve_inside
 from .study_routes import Folder
 
 router = APIRouter(prefix="/api/live")
@@ -50,7 +50,7 @@ class StoredVerdict(BaseModel):
 @router.get("")
 def get_session(folder: Folder) -> dict[str, Any]:
     """The newest session that is being recorded, else the newest that ended lately; null if none."""
-    found = [(age, file.parent) for age, file in _records(folder) if age < RECENT_S]
+    found = [(age, file.parent) for age, file in _list_records(folder) if age < RECENT_S]
     if not found:
         return {"session": None}
     _, newest = max(found, key=lambda one: (one[0] < SILENT_S, one[1].name))
@@ -66,8 +66,8 @@ def get_part(
     Times in s of limbfit's clock, positions in mm from the pin's home, forces in N, of the test pin.
     ``offset`` is where to go on, at once where ``more`` is true; ``age_s`` is how long ago the record grew.
     """
-    file = inside(folder.folder, ACQUIRED, site, stamp, RECORD)
-    age = _age(file)
+    file = resolve_inside(folder.folder, ACQUIRED, site, stamp, RECORD)
+    age = _compute_age(file)
     part, following = follow_recording(file, offset, every=EVERY)
     return {
         "site": site,
@@ -77,20 +77,20 @@ def get_part(
         "age_s": age,
         "silent": age > SILENT_S,
         **_read(part, file, first=offset == 0),
-        "verdict": _verdict(file.with_name(VERDICT)),
+        "verdict": _read_verdict(file.with_name(VERDICT)),
     }
 
 
-def _records(folder: StudyFolder) -> list[tuple[float, Path]]:
+def _list_records(folder: StudyFolder) -> list[tuple[float, Path]]:
     """Records that were begun, with their ages in s."""
     found = []
     for file in (folder.folder / ACQUIRED).glob(f"*/*/{RECORD}"):
         if _STAMP.fullmatch(file.parent.name) and file.is_file():
-            found.append((_age(file), file))
+            found.append((_compute_age(file), file))
     return found
 
 
-def _age(file: Path) -> float:
+def _compute_age(file: Path) -> float:
     return max(time.time() - file.stat().st_mtime, 0.0)
 
 
@@ -99,7 +99,7 @@ def _read(part: Recording, file: Path, first: bool) -> dict[str, Any]:
         settings = part.head["settings"]
         pin, limit_N = range(PINS)[int(settings["pin"]) - 1], float(settings["force_limit_N"])
         ramps = int(settings["precondition"]) + int(settings["repeats"])
-        phases = [_phase(event) for event in part.events if event["event"] == "phase"]
+        phases = [_describe_phase(event) for event in part.events if event["event"] == "phase"]
         if not math.isfinite(limit_N):
             raise ValueError
     except (KeyError, TypeError, ValueError, IndexError, OverflowError):
@@ -109,13 +109,13 @@ def _read(part: Recording, file: Path, first: bool) -> dict[str, Any]:
         "head": {"pin": pin + 1, "force_limit_N": limit_N, "ramps": ramps} if first else None,
         "phases": phases,
         "ended": ended[-1] if ended else None,
-        "time_s": _short(part.host_us / 1e6),
-        "position_mm": _short(part.position_um[:, pin] / 1e3),
-        "force_N": _short(part.force_mN[:, pin] / 1e3),
+        "time_s": _shorten(part.host_us / 1e6),
+        "position_mm": _shorten(part.position_um[:, pin] / 1e3),
+        "force_N": _shorten(part.force_mN[:, pin] / 1e3),
     }
 
 
-def _phase(event: dict[str, Any]) -> dict[str, Any]:
+def _describe_phase(event: dict[str, Any]) -> dict[str, Any]:
     touch = event.get("touch_um")
     return {
         "at_s": event["at_us"] / 1e6,
@@ -126,7 +126,7 @@ def _phase(event: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _verdict(file: Path) -> dict[str, Any] | None:
+def _read_verdict(file: Path) -> dict[str, Any] | None:
     if not file.is_file():
         return None
     try:
@@ -137,5 +137,5 @@ def _verdict(file: Path) -> dict[str, Any] | None:
         raise TraceError("not a verdict of limbfit acquire", file=file) from None
 
 
-def _short(values: np.ndarray) -> list[float]:
+def _shorten(values: np.ndarray) -> list[float]:
     return np.round(values, 4).tolist()

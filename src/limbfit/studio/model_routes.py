@@ -39,41 +39,41 @@ class SiteChange(StrictModel):
     position: Place | None = None
 
 
-def _block(content: bytes) -> Response:
+def _respond_block(content: bytes) -> Response:
     return Response(content, media_type="application/octet-stream")
 
 
 @router.get("/scene")
 def get_scene(folder: Folder) -> dict[str, Any]:
     """Surfaces, sites and meshes as they stand."""
-    return scene.scene_of(folder)
+    return scene.describe_scene(folder)
 
 
 @router.get("/surface/{name}")
 def get_surface(folder: Folder, name: str) -> Response:
     """A surface as a block of arrays (see limbfit/web/arrays.py)."""
-    return _block(scene.surface_block(folder, name))
+    return _respond_block(scene.build_surface_block(folder, name))
 
 
 @router.get("/layer/{site}/{layer}")
 def get_layer(folder: Folder, site: str, layer: str) -> Response:
     """The inner face of a layer, of a site's mesh."""
-    return _block(scene.layer_block(folder, site, layer))
+    return _respond_block(scene.build_layer_block(folder, site, layer))
 
 
 @router.get("/mesh/{site}")
 def get_mesh(folder: Folder, site: str) -> Response:
     """The mesh of a site with the quality of its cells."""
-    return _block(scene.mesh_block(folder, site))
+    return _respond_block(scene.mesh_block(folder, site))
 
 
 @router.post("/sites")
 def post_site(folder: Folder, site: NewSite) -> dict[str, Any]:
     """Add a site on the skin; the scene as it is afterwards."""
-    position = scene.on_skin(folder, site.position)
+    position = scene.project_to_skin_of_study(folder, site.position)
     more = {"region": site.region or None, "depth_mm": site.depth_mm}
     add_site(folder.file, site.name, position, {key: value for key, value in more.items() if value})
-    return scene.scene_of(folder)
+    return scene.describe_scene(folder)
 
 
 @router.post("/sites/{name}")
@@ -82,14 +82,14 @@ def post_change(folder: Folder, name: str, change: SiteChange) -> dict[str, Any]
     values: dict[str, Any] = change.model_dump(exclude_none=True)
     if change.position is not None:
         scene.check_movable(folder.load(), name)
-        values["position"] = scene.on_skin(folder, change.position)
+        values["position"] = scene.project_to_skin_of_study(folder, change.position)
     if values:
         set_site(folder.file, name, values)
-    return scene.scene_of(folder)
+    return scene.describe_scene(folder)
 
 
 @router.post("/sites/{name}/remove")
 def post_removal(folder: Folder, name: str) -> dict[str, Any]:
     """Take a site out of the study file; its record stays."""
     remove_site(folder.file, name)
-    return scene.scene_of(folder)
+    return scene.describe_scene(folder)

@@ -13,8 +13,8 @@ from ..errors import InputError, RunError
 from ..pipeline import export_study
 from ..pipeline.shared.artefacts import read_curves, write_json
 from ..study import Record
-from .folder import StudyFolder, stored
-from .study_routes import stages_of_folder
+from .folder import StudyFolder, read_stored
+from .study_routes import list_stages
 
 KEPT, ABOUT = "kept", "kept.json"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,39}")
@@ -29,15 +29,15 @@ _COLUMNS = (
 )
 
 
-def outcome_of(folder: StudyFolder, kept: str | None = None) -> dict[str, Any]:
+def collect_outcome(folder: StudyFolder, kept: str | None = None) -> dict[str, Any]:
     """Parameters with intervals and verdicts, errors by site and their means; empty where nothing is stored.
 
     Parameters
     ----------
     kept : name of a kept run; by default the study's own results.
     """
-    place = folder.results if kept is None else _kept(folder, kept)
-    calibration, predicted = (stored(place / name) for name in _FILES)
+    place = folder.results if kept is None else _find_kept_run(folder, kept)
+    calibration, predicted = (read_stored(place / name) for name in _FILES)
     uncertainty = calibration.get("uncertainty") or {}
     return {
         "stages": [
@@ -55,7 +55,7 @@ def outcome_of(folder: StudyFolder, kept: str | None = None) -> dict[str, Any]:
     }
 
 
-def curves_of(folder: StudyFolder, site: str, kept: str | None = None) -> dict[str, list[float]]:
+def read_site_curves(folder: StudyFolder, site: str, kept: str | None = None) -> dict[str, list[float]]:
     """Columns of the predicted forces of a site (s, mm, N).
 
     Raises
@@ -66,15 +66,15 @@ def curves_of(folder: StudyFolder, site: str, kept: str | None = None) -> dict[s
     if kept is None:
         file = folder.artefact("predict", f"{site}.csv")
     else:
-        _kept(folder, kept)
+        _find_kept_run(folder, kept)
         file = folder.artefact(KEPT, kept, f"{site}.csv")
     return {name: values.tolist() for name, values in read_curves(file).items()}
 
 
-def kept_runs(folder: StudyFolder) -> list[dict[str, Any]]:
+def list_kept_runs(folder: StudyFolder) -> list[dict[str, Any]]:
     """``name`` and ``since`` of the runs that were kept, newest first."""
     found = [
-        {"name": file.parent.name, "since": stored(file).get("since", "")}
+        {"name": file.parent.name, "since": read_stored(file).get("since", "")}
         for file in (folder.results / KEPT).glob(f"*/{ABOUT}")
     ]
     return sorted(found, key=lambda row: str(row["since"]), reverse=True)
@@ -115,10 +115,10 @@ def keep_run(folder: StudyFolder, name: str) -> dict[str, Any]:
 
 def drop_run(folder: StudyFolder, name: str) -> None:
     """Remove a kept run."""
-    shutil.rmtree(_kept(folder, name))
+    shutil.rmtree(_find_kept_run(folder, name))
 
 
-def _kept(folder: StudyFolder, name: str) -> Path:
+def _find_kept_run(folder: StudyFolder, name: str) -> Path:
     """The folder of a kept run.
 
     Raises
@@ -131,7 +131,7 @@ def _kept(folder: StudyFolder, name: str) -> Path:
     return folder.artefact(KEPT, name, ABOUT).parent
 
 
-def downloads_of(folder: StudyFolder) -> list[dict[str, str]]:
+def list_downloads(folder: StudyFolder) -> list[dict[str, str]]:
     """Files to keep: ``title`` and ``path`` below ``/api/files``."""
     wanted = [("report", "report.html", "report (HTML)"), ("report", "methods.md", "methods (Markdown)")]
     found = [
@@ -144,7 +144,7 @@ def downloads_of(folder: StudyFolder) -> list[dict[str, str]]:
     return found
 
 
-def site_downloads(folder: StudyFolder, site: str) -> list[dict[str, str]]:
+def list_site_downloads(folder: StudyFolder, site: str) -> list[dict[str, str]]:
     """The same for one site: curves, fields, the FEBio input where it was written."""
     study = folder.load()
     one = study.indentation(site)
@@ -175,7 +175,7 @@ def write_feb_of(folder: StudyFolder, site: str) -> dict[str, str]:
     """
     study = folder.load()
     name = study.indentation(site).name
-    states = {row["stage"]: row["state"] for row in stages_of_folder(folder)}
+    states = {row["stage"]: row["state"] for row in list_stages(folder)}
     if states.get("mesh") != "done":
         raise RunError("the meshes are not up to date; run the study until mesh first")
     export_study(study, "feb", site=name)

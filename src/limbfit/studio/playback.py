@@ -17,7 +17,7 @@ from ..phases import find_phases, loading_end
 from ..pipeline.shared.artefacts import read_curves
 from ..web.arrays import pack
 from ..web.shapes import to_volume_shape
-from .folder import StudyFolder, fingerprint, stored
+from .folder import StudyFolder, compute_fingerprint, read_stored
 
 _FRAME = re.compile(r'<DataSet timestep="([^"]+)" part="0" file="[^"/]+/(step-\d{4,}\.vtu)"/>')
 
@@ -49,25 +49,25 @@ FIELDS = {
 }
 
 
-def sources_of(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
+def list_sources(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
     """What can be shown of a site: every step of a simulation, or the deepest point of the prediction.
 
     Each has ``source``, ``title``, ``times_s``, ``deepest`` (which of them), ``parameters_from``, and
     ``mark``, which other fields change.
     """
     found = []
-    moments = _moments(folder, site)
+    moments = _list_moments(folder, site)
     if moments:
         times_s = [time for time, _ in moments]
-        origin = stored(folder.results / "simulate" / f"{site}.json").get("parameters_from")
+        origin = read_stored(folder.results / "simulate" / f"{site}.json").get("parameters_from")
         found.append(
             {
                 "source": "simulate",
                 "title": "every step, simulated",
                 "times_s": times_s,
-                "deepest": _deepest(folder, site, times_s),
+                "deepest": _find_deepest(folder, site, times_s),
                 "parameters_from": origin,
-                "mark": fingerprint(file for _, file in moments),
+                "mark": compute_fingerprint(file for _, file in moments),
             }
         )
     predicted = folder.results / "predict" / f"{site}.vtu"
@@ -76,16 +76,16 @@ def sources_of(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
             {
                 "source": "predict",
                 "title": "the deepest point, predicted",
-                "times_s": [_peak_time(folder.artefact("predict", f"{site}.csv"))],
+                "times_s": [_find_peak_time(folder.artefact("predict", f"{site}.csv"))],
                 "deepest": 0,
                 "parameters_from": "identified",
-                "mark": fingerprint([predicted]),
+                "mark": compute_fingerprint([predicted]),
             }
         )
     return found
 
 
-def _moments(folder: StudyFolder, site: str) -> list[tuple[float, Path]]:
+def _list_moments(folder: StudyFolder, site: str) -> list[tuple[float, Path]]:
     """Times and files of a stored animation that are there."""
     collection = folder.results / "simulate" / f"{site}.pvd"
     if not collection.is_file():
@@ -95,28 +95,28 @@ def _moments(folder: StudyFolder, site: str) -> list[tuple[float, Path]]:
     return [(time, file) for time, file in files if file.is_file()]
 
 
-def _deepest(folder: StudyFolder, site: str, times_s: list[float]) -> int:
+def _find_deepest(folder: StudyFolder, site: str, times_s: list[float]) -> int:
     """The moment nearest to the deepest point; the last one while the simulation goes on."""
     curve = folder.results / "simulate" / f"{site}.csv"
     if not curve.is_file():
         return len(times_s) - 1
-    return int(np.argmin(np.abs(np.array(times_s) - _peak_time(curve))))
+    return int(np.argmin(np.abs(np.array(times_s) - _find_peak_time(curve))))
 
 
-def _peak_time(curve: Path) -> float:
+def _find_peak_time(curve: Path) -> float:
     columns = read_curves(curve)
     stated = columns["displacement_mm"] if "displacement_mm" in columns else columns["force_N"]
     loading = loading_end(find_phases(columns["time_s"], stated))
     return 0.0 if loading is None else loading.end_s
 
 
-def _file(folder: StudyFolder, source: str, site: str, moment: int) -> Path:
+def _find_file(folder: StudyFolder, source: str, site: str, moment: int) -> Path:
     if source == "predict":
         return folder.artefact("predict", f"{site}.vtu")
     if source != "simulate":
         raise InputError("fields are those of simulate or predict")
     folder.artefact("simulate", f"{site}.pvd")  # a plain name, inside the study
-    moments = _moments(folder, site)
+    moments = _list_moments(folder, site)
     if not 0 <= moment < len(moments):
         raise FileNotFoundError(f"moment {moment} of site {site}")
     return folder.artefact("simulate", site, moments[moment][1].name)
@@ -124,9 +124,9 @@ def _file(folder: StudyFolder, source: str, site: str, moment: int) -> Path:
 
 def mesh_block(folder: StudyFolder, source: str, site: str) -> bytes:
     """The mesh that the fields of a site stand on: arrays of `Volume`; facts: names of regions, fields."""
-    file = _file(folder, source, site, 0)
+    file = _find_file(folder, source, site, 0)
     mesh = read_vtu(file)
-    arrays = arrays_of(file)
+    arrays = read_arrays(file)
     fields = [
         {"name": name, "title": field.title, "unit": field.unit}
         for name, field in FIELDS.items()
@@ -136,7 +136,7 @@ def mesh_block(folder: StudyFolder, source: str, site: str) -> bytes:
     return pack(to_volume_shape(mesh).arrays(), facts)
 
 
-def moment_block(folder: StudyFolder, source: str, site: str, moment: int, name: str) -> bytes:
+def build_moment_block(folder: StudyFolder, source: str, site: str, moment: int, name: str) -> bytes:
     """``moved`` (n, 3) of the drawn nodes in mm, and ``values`` of a field on cells or drawn nodes.
 
     Raises
@@ -147,8 +147,8 @@ def moment_block(folder: StudyFolder, source: str, site: str, moment: int, name:
         For a moment that is not there.
     """
     field = FIELDS.get(name)
-    file = _file(folder, source, site, moment)
-    arrays = arrays_of(file)
+    file = _find_file(folder, source, site, moment)
+    arrays = read_arrays(file)
     if field is None or field.array not in arrays:
         raise InputError("no such field is stored", remedy="fields are " + ", ".join(FIELDS))
     nodes = np.unique(arrays["cells"][:, :4])
@@ -164,7 +164,7 @@ def moment_block(folder: StudyFolder, source: str, site: str, moment: int, name:
     )
 
 
-def arrays_of(file: Path) -> dict[str, NDArray[Any]]:
+def read_arrays(file: Path) -> dict[str, NDArray[Any]]:
     """The point and cell arrays of a VTU file, and its ``cells`` (m, k)."""
     grid = read_grid(file)
     found = {}

@@ -17,14 +17,14 @@ from ..errors import InputError, RunError
 from ..pipeline import STAGE_NAMES
 from ..pipeline.shared.store import holder_of, is_held
 from ..study import load_study
-from .commands import PROGRAM, find_command, interrupt, start_command
+from .commands import PROGRAM, find_command, interrupt_process, start_command
 from .folder import StudyFolder
 
 VERBS = (("run",), ("socket", "fit"), ("socket", "design"))  # that are started here
 _HOLDER = re.compile(r"process (\d+) \(since ([^)]*)\)")
 
 
-def running(folder: StudyFolder) -> dict[str, Any] | None:
+def find_running(folder: StudyFolder) -> dict[str, Any] | None:
     """``process`` and ``since`` of the run that holds the study; None where none does."""
     found = _HOLDER.match(holder_of(folder.results))
     if found is None or not psutil.pid_exists(int(found[1])) or not is_held(folder.results):
@@ -32,13 +32,13 @@ def running(folder: StudyFolder) -> dict[str, Any] | None:
     return {"process": int(found[1]), "since": found[2]}
 
 
-def starting(folder: StudyFolder) -> int | None:
+def find_starting(folder: StudyFolder) -> int | None:
     """The process that was started here for a run and does not hold the study yet; None where none is."""
-    found = (find_command(_command(folder, *verb)) for verb in VERBS)
+    found = (find_command(_read_command(folder, *verb)) for verb in VERBS)
     return next((one[0] for one in found if one is not None), None)
 
 
-def _command(folder: StudyFolder, *verb: str) -> list[str]:
+def _read_command(folder: StudyFolder, *verb: str) -> list[str]:
     return [*PROGRAM, *verb, str(folder.file.resolve())]
 
 
@@ -60,21 +60,23 @@ def start_run(
             raise InputError(f"no stage is named {name!r}", remedy="stages are " + ", ".join(STAGE_NAMES))
     options = [*(["--until", until] if until else []), *(["--from", start] if start else [])]
     options += [word for name in force for word in ("--force", name)]
-    return {"process": start_command([*_command(folder, "run"), *options], folder.folder)}
+    return {"process": start_command([*_read_command(folder, "run"), *options], folder.folder)}
 
 
 def start_socket(folder: StudyFolder, *, design: bool) -> dict[str, Any]:
     """Start ``limbfit socket fit`` or ``limbfit socket design`` on the study; the errors of `start_run`."""
     _refuse_busy(folder)
     return {
-        "process": start_command(_command(folder, "socket", "design" if design else "fit"), folder.folder)
+        "process": start_command(
+            _read_command(folder, "socket", "design" if design else "fit"), folder.folder
+        )
     }
 
 
 def _refuse_busy(folder: StudyFolder) -> None:
     load_study(folder.file)
-    holder = running(folder)
-    busy = starting(folder) if holder is None else holder["process"]
+    holder = find_running(folder)
+    busy = find_starting(folder) if holder is None else holder["process"]
     if busy is not None:
         raise RunError(f"process {busy} is running this study; stop it first, or wait for it")
 
@@ -87,8 +89,8 @@ def stop_run(folder: StudyFolder) -> dict[str, Any]:
     RunError
         Where no run holds the study, or it is no ``limbfit`` command.
     """
-    holder = running(folder)
-    if holder is None and (early := starting(folder)) is not None:
+    holder = find_running(folder)
+    if holder is None and (early := find_starting(folder)) is not None:
         holder = {"process": early}
     if holder is None:
         raise RunError("no run holds this study: there is nothing to stop")
@@ -99,7 +101,7 @@ def stop_run(folder: StudyFolder) -> dict[str, Any]:
             raise RunError(
                 f"process {process.pid}, which holds this study, is no limbfit command; end it where it runs"
             )
-        interrupt(process.pid)
+        interrupt_process(process.pid)
     except psutil.Error:
         raise RunError(f"process {holder['process']} cannot be interrupted; end it where it runs") from None
     return holder

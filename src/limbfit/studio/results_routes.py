@@ -20,7 +20,7 @@ class Name(BaseModel):
     name: Annotated[str, Field(min_length=1, max_length=40)]
 
 
-def _block(content: bytes) -> Response:
+def _respond_block(content: bytes) -> Response:
     return Response(content, media_type="application/octet-stream")
 
 
@@ -28,9 +28,9 @@ def _block(content: bytes) -> Response:
 def get_outcome(folder: Folder, kept: str | None = None) -> dict[str, Any]:
     """Parameters and errors of this run or of a kept one; kept runs; files to keep."""
     return {
-        **outcome.outcome_of(folder, kept),
-        "kept": outcome.kept_runs(folder),
-        "downloads": outcome.downloads_of(folder),
+        **outcome.collect_outcome(folder, kept),
+        "kept": outcome.list_kept_runs(folder),
+        "downloads": outcome.list_downloads(folder),
     }
 
 
@@ -38,29 +38,29 @@ def get_outcome(folder: Folder, kept: str | None = None) -> dict[str, Any]:
 def get_site(folder: Folder, site: str) -> dict[str, Any]:
     """What can be shown of a site, its files, and how a simulation of it goes."""
     return {
-        "sources": playback.sources_of(folder, folder.load().indentation(site).name),
-        "downloads": outcome.site_downloads(folder, site),
-        "simulating": simulating.simulating(folder),
-        "failure": simulating.failure_of(folder, site),
+        "sources": playback.list_sources(folder, folder.load().indentation(site).name),
+        "downloads": outcome.list_site_downloads(folder, site),
+        "simulating": simulating.find_simulating(folder),
+        "failure": simulating.read_failure(folder, site),
     }
 
 
 @router.get("/curves/{site}")
 def get_curves(folder: Folder, site: str, kept: str | None = None) -> dict[str, list[float]]:
     """Predicted forces of a site, of this run or of a kept one."""
-    return outcome.curves_of(folder, site, kept)
+    return outcome.read_site_curves(folder, site, kept)
 
 
 @router.get("/mesh/{source}/{site}")
 def get_mesh(folder: Folder, source: str, site: str) -> Response:
     """The mesh that the fields of a site stand on, as a block of arrays."""
-    return _block(playback.mesh_block(folder, source, site))
+    return _respond_block(playback.mesh_block(folder, source, site))
 
 
 @router.get("/moment/{source}/{site}/{moment}/{field}")
 def get_moment(folder: Folder, source: str, site: str, moment: int, field: str) -> Response:
     """Displacements and a field at one moment, as a block of arrays."""
-    return _block(playback.moment_block(folder, source, site, moment, field))
+    return _respond_block(playback.build_moment_block(folder, source, site, moment, field))
 
 
 @router.post("/simulate/{site}")

@@ -20,28 +20,28 @@ from ..pipeline.stages.surfaces import given_anatomy
 from ..study import Site, Study
 from ..web.arrays import pack
 from ..web.shapes import Shell, build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape
-from .folder import StudyFolder, fingerprint, stored
+from .folder import StudyFolder, compute_fingerprint, read_stored
 
 SKIN = "skin"
 
 
-def anatomy_of(folder: StudyFolder, study: Study) -> Anatomy | None:
+def read_anatomy(folder: StudyFolder, study: Study) -> Anatomy | None:
     """The stored surfaces, else those that the study gives; None where the image is not segmented yet."""
-    return _anatomy(folder, surfaces_mark(folder, study))
+    return _read_marked_anatomy(folder, mark_surfaces(folder, study))
 
 
-def surfaces_mark(folder: StudyFolder, study: Study) -> str:
+def mark_surfaces(folder: StudyFolder, study: Study) -> str:
     """Changes with the files of the limb's surfaces and with what the study says of them."""
     given, geometry = study.surfaces, study.geometry
     files = [] if given is None else [given.skin, *given.bones.values()]
     files += [one.surface for one in geometry.regions if one.surface is not None]
     made = sorted((folder.results / "surfaces").glob("*"))
     stated = digest(*(one and one.model_dump(mode="json") for one in (given, geometry)))
-    return f"{fingerprint([*made, *map(study.path, files)])} {stated}"
+    return f"{compute_fingerprint([*made, *map(study.path, files)])} {stated}"
 
 
 @lru_cache(maxsize=1)
-def _anatomy(folder: StudyFolder, mark: str) -> Anatomy | None:
+def _read_marked_anatomy(folder: StudyFolder, mark: str) -> Anatomy | None:
     """The last one is kept, by its ``mark``: to mend and check given surfaces can take seconds."""
     study = folder.load()
     if _is_made(folder):
@@ -49,23 +49,23 @@ def _anatomy(folder: StudyFolder, mark: str) -> Anatomy | None:
     return None if study.surfaces is None else given_anatomy(study)[0]
 
 
-def scene_of(folder: StudyFolder) -> dict[str, Any]:
+def describe_scene(folder: StudyFolder) -> dict[str, Any]:
     """Surfaces by name, the patient's sides, every site as the study file has it now, and what is meshed.
 
     A site without a place (not matched to a marker yet, or off the skin) has ``problem`` in words. Surfaces
     and meshes come with fingerprints, so that the page reads again only what was made anew.
     """
     study = folder.load()
-    anatomy = anatomy_of(folder, study)
-    rows = stored(folder.results / "sites" / "sites.json").get("sites", [])
+    anatomy = read_anatomy(folder, study)
+    rows = read_stored(folder.results / "sites" / "sites.json").get("sites", [])
     placed = {row["site"]: row for row in rows}
-    meshes = stored(folder.results / "mesh" / "mesh.json")
+    meshes = read_stored(folder.results / "mesh" / "mesh.json")
     return {
-        "surfaces": {} if anatomy is None else _surface_marks(folder, study, anatomy),
+        "surfaces": {} if anatomy is None else _mark_each_surface(folder, study, anatomy),
         "frame": build_patient_frame(None if anatomy is None else anatomy.cut_normal).tolist(),
-        "sites": [_site_row(site, study, anatomy, placed.get(site.name)) for site in study.sites],
+        "sites": [_describe_site(site, study, anatomy, placed.get(site.name)) for site in study.sites],
         "meshes": {
-            site.name: fingerprint([file])
+            site.name: compute_fingerprint([file])
             for site in study.sites
             if (file := _mesh_file(folder, site.name)) is not None
         },
@@ -74,21 +74,21 @@ def scene_of(folder: StudyFolder) -> dict[str, Any]:
     }
 
 
-def _surface_marks(folder: StudyFolder, study: Study, anatomy: Anatomy) -> dict[str, str]:
+def _mark_each_surface(folder: StudyFolder, study: Study, anatomy: Anatomy) -> dict[str, str]:
     if _is_made(folder):
-        files = {name: _surface_file(folder, name) for name in (SKIN, *anatomy.bones)}
+        files = {name: _find_surface_file(folder, name) for name in (SKIN, *anatomy.bones)}
     else:
         assert study.surfaces is not None
         files = {SKIN: study.surfaces.skin, **study.surfaces.bones}
         files = {name: study.path(file) for name, file in files.items()}
-    return {name: fingerprint([file]) for name, file in files.items()}
+    return {name: compute_fingerprint([file]) for name, file in files.items()}
 
 
 def _is_made(folder: StudyFolder) -> bool:
     return (folder.results / "surfaces" / "surfaces.json").is_file()
 
 
-def _surface_file(folder: StudyFolder, name: str) -> Path:
+def _find_surface_file(folder: StudyFolder, name: str) -> Path:
     return folder.artefact("surfaces", f"{name}.stl" if name == SKIN else f"bone-{name}.stl")
 
 
@@ -97,7 +97,7 @@ def _mesh_file(folder: StudyFolder, site: str) -> Path | None:
     return file if file.is_file() else None
 
 
-def _site_row(
+def _describe_site(
     site: Site, study: Study, anatomy: Anatomy | None, placed: Mapping[str, Any] | None
 ) -> dict[str, Any]:
     row: dict[str, Any] = {
@@ -124,7 +124,7 @@ def _site_row(
     return row
 
 
-def surface_block(folder: StudyFolder, name: str) -> bytes:
+def build_surface_block(folder: StudyFolder, name: str) -> bytes:
     """One surface as a block of arrays: ``points``, ``faces``.
 
     Raises
@@ -132,31 +132,31 @@ def surface_block(folder: StudyFolder, name: str) -> bytes:
     InputError
         For a name that the model does not have.
     """
-    surface = _surface(folder, name)
+    surface = _read_one_surface(folder, name)
     if surface is None:
         raise InputError("the model has no such surface", remedy="run the stages until surfaces")
-    return _shell_block(Shell(surface.points.astype(np.float32), surface.faces.astype(np.uint32)))
+    return _build_shell_block(Shell(surface.points.astype(np.float32), surface.faces.astype(np.uint32)))
 
 
-def _surface(folder: StudyFolder, name: str) -> Surface | None:
+def _read_one_surface(folder: StudyFolder, name: str) -> Surface | None:
     """One surface; of stored ones only its file is read."""
     if _is_made(folder):
-        bones = stored(folder.results / "surfaces" / "surfaces.json").get("bones", ())
-        return read_surface(_surface_file(folder, name)) if name == SKIN or name in bones else None
-    anatomy = anatomy_of(folder, folder.load())
+        bones = read_stored(folder.results / "surfaces" / "surfaces.json").get("bones", ())
+        return read_surface(_find_surface_file(folder, name)) if name == SKIN or name in bones else None
+    anatomy = read_anatomy(folder, folder.load())
     return None if anatomy is None else {SKIN: anatomy.skin, **anatomy.bones}.get(name)
 
 
-def _shell_block(shell: Shell) -> bytes:
+def _build_shell_block(shell: Shell) -> bytes:
     return pack({"points": shell.points, "faces": shell.faces})
 
 
-def layer_block(folder: StudyFolder, site: str, layer: str) -> bytes:
+def build_layer_block(folder: StudyFolder, site: str, layer: str) -> bytes:
     """The inner face of a layer in the mesh of a site, as a block of arrays: ``points``, ``faces``."""
     mesh = read_vtu(folder.artefact("mesh", f"{site}.vtu"))
     if layer not in mesh.region_names[:-1]:
         raise InputError("the mesh has no such layer", remedy="make the meshes again")
-    return _shell_block(extract_interface(to_volume_shape(mesh), mesh.region_names.index(layer)))
+    return _build_shell_block(extract_interface(to_volume_shape(mesh), mesh.region_names.index(layer)))
 
 
 def mesh_block(folder: StudyFolder, site: str) -> bytes:
@@ -166,7 +166,7 @@ def mesh_block(folder: StudyFolder, site: str) -> bytes:
     return pack({**to_volume_shape(mesh).arrays(), **compute_cell_quality(mesh)}, facts)
 
 
-def on_skin(folder: StudyFolder, position: Sequence[float]) -> list[float]:
+def project_to_skin_of_study(folder: StudyFolder, position: Sequence[float]) -> list[float]:
     """The point of the skin nearest to a place (LPS, mm).
 
     Raises
@@ -175,7 +175,7 @@ def on_skin(folder: StudyFolder, position: Sequence[float]) -> list[float]:
         Where there is no skin, or the place is far off it.
     """
     study = folder.load()
-    anatomy = anatomy_of(folder, study)
+    anatomy = read_anatomy(folder, study)
     if anatomy is None:
         raise InputError("there is no skin yet to place a site on", remedy="run the stages until surfaces")
     point, _ = project_to_skin(anatomy, position)
@@ -194,7 +194,7 @@ def check_movable(study: Study, name: str) -> None:
     markups = study.markups
     if markups is None:
         return
-    if not _places_of_file(study.file).get(site.name, False):
+    if not _read_stated_places(study.file).get(site.name, False):
         raise InputError(
             f"site {name} has its place from the markups file {markups.file}",
             file=study.file,
@@ -203,7 +203,7 @@ def check_movable(study: Study, name: str) -> None:
         )
 
 
-def _places_of_file(file: Path) -> dict[str, bool]:
+def _read_stated_places(file: Path) -> dict[str, bool]:
     """Whether each site of a study file has a place of its own there."""
     sites = tomllib.loads(file.read_text(encoding="utf-8")).get("sites", [])
     return {str(site.get("name")): "position" in site or "near" in site for site in sites}

@@ -45,7 +45,7 @@ def serve(
     RunError
         Where the port is taken.
     """
-    folder = StudyFolder(_study_file(study))
+    folder = StudyFolder(_find_study_file(study))
     folder.load()
     if not is_loopback(host) and not expose:
         raise InputError(
@@ -54,7 +54,7 @@ def serve(
         )
     if host in ("0.0.0.0", "::", ""):
         raise InputError("name one address of this machine to listen on, not all of them", place="--host")
-    listener = _listen(host, port)
+    listener = _open_socket(host, port)
     door = Door(host, listener.getsockname()[1])
     tell(door.address)
     config = uvicorn.Config(
@@ -74,12 +74,12 @@ def serve(
         uvicorn.Server(config).run(sockets=[listener])
 
 
-def _study_file(study: str | Path) -> Path:
+def _find_study_file(study: str | Path) -> Path:
     path = Path(study).absolute()
     return path / "study.toml" if path.is_dir() else path
 
 
-def _listen(host: str, port: int) -> socket.socket:
+def _open_socket(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

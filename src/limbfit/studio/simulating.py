@@ -14,21 +14,21 @@ import psutil
 
 from ..errors import RunError
 from ..pipeline.verbs.journal import discreet
-from .commands import PROGRAM, find_command, interrupt, start_command
+from .commands import PROGRAM, find_command, interrupt_process, start_command
 from .folder import StudyFolder
-from .processes import running
+from .processes import find_running
 
 _SAID = 400  # characters of what a failed simulation said that are told
 
 
-def simulating(folder: StudyFolder) -> dict[str, Any] | None:
+def find_simulating(folder: StudyFolder) -> dict[str, Any] | None:
     """``process`` and ``site`` of the simulation that this study has running; None where it has none."""
-    begin = _words(folder)
+    begin = _read_words(folder)
     found = find_command(begin)
     return None if found is None else {"process": found[0], "site": found[1][len(begin)]}
 
 
-def _words(folder: StudyFolder) -> list[str]:
+def _read_words(folder: StudyFolder) -> list[str]:
     return [*PROGRAM, "simulate", str(folder.file.resolve()), "--animation", "--site"]
 
 
@@ -43,16 +43,16 @@ def start_simulation(folder: StudyFolder, site: str) -> dict[str, Any]:
         Where the study is being run or a simulation goes on.
     """
     name = folder.load().indentation(site).name
-    holder = running(folder) or simulating(folder)
+    holder = find_running(folder) or find_simulating(folder)
     if holder is not None:
         raise RunError(f"process {holder['process']} works on this study; stop it first, or wait for it")
-    _said_file(folder, name).parent.mkdir(parents=True, exist_ok=True)
-    with _said_file(folder, name).open("wb") as said:
-        process = start_command([*_words(folder), name], folder.folder, said)
+    _find_output_file(folder, name).parent.mkdir(parents=True, exist_ok=True)
+    with _find_output_file(folder, name).open("wb") as said:
+        process = start_command([*_read_words(folder), name], folder.folder, said)
     return {"process": process, "site": name}
 
 
-def _said_file(folder: StudyFolder, site: str) -> Path:
+def _find_output_file(folder: StudyFolder, site: str) -> Path:
     return folder.results / "simulate" / f".{site}.said"
 
 
@@ -64,17 +64,17 @@ def stop_simulation(folder: StudyFolder) -> dict[str, Any]:
     RunError
         Where none goes on.
     """
-    found = simulating(folder)
+    found = find_simulating(folder)
     if found is None:
         raise RunError("no simulation is running: there is nothing to stop")
     with suppress(psutil.NoSuchProcess):  # it has ended meanwhile
-        interrupt(found["process"])
+        interrupt_process(found["process"])
     return found
 
 
-def failure_of(folder: StudyFolder, site: str) -> str | None:
+def read_failure(folder: StudyFolder, site: str) -> str | None:
     """The error with which the last simulation of a site ended; None where it ended well or goes on."""
-    file = _said_file(folder, folder.load().indentation(site).name)
+    file = _find_output_file(folder, folder.load().indentation(site).name)
     if not file.is_file():
         return None
     lines = [line.strip() for line in file.read_text(encoding="utf-8", errors="replace").splitlines()]

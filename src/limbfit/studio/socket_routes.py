@@ -24,12 +24,12 @@ from ..study import Study
 from ..web.arrays import pack
 from ..web.shapes import build_patient_frame, to_volume_shape
 from .editing import remove_area, set_area, set_trimline
-from .folder import StudyFolder, fingerprint, stored
-from .identification_routes import last_run
+from .folder import StudyFolder, compute_fingerprint, read_stored
+from .identification_routes import describe_last_run
 from .model_routes import Place, StrictModel, Text
-from .playback import arrays_of
-from .processes import running, start_socket, starting
-from .scene import anatomy_of, on_skin, surfaces_mark
+from .playback import read_arrays
+from .processes import find_running, find_starting, start_socket
+from .scene import mark_surfaces, project_to_skin_of_study, read_anatomy
 from .study_routes import Folder
 
 router = APIRouter(prefix="/api/socket")
@@ -62,17 +62,17 @@ class WantedRun(StrictModel):
     design: bool = False
 
 
-def runs_of(folder: StudyFolder) -> list[dict[str, Any]]:
+def list_runs(folder: StudyFolder) -> list[dict[str, Any]]:
     """Stored runs: ``run``, ``steps`` (name, regions, settling_mm), ``mark``, which other fields change."""
-    single = stored(folder.results / "socket" / "socket.json")
+    single = read_stored(folder.results / "socket" / "socket.json")
     found = {SOCKET: single} if single else {}
-    designed = stored(folder.results / "socket_design" / "socket_design.json")
+    designed = read_stored(folder.results / "socket_design" / "socket_design.json")
     found |= {one["name"]: one["simulation"] for one in designed.get("designs", [])}
     rows = []
     for name, content in found.items():
         steps = [{"name": "donning"} | content["donning"], *content["loads"]]
-        files = [_file(folder, name, i) for i in range(len(steps))]
-        rows.append({"run": name, "steps": [_step(one) for one in steps], "mark": fingerprint(files)})
+        files = [_find_file(folder, name, i) for i in range(len(steps))]
+        rows.append({"run": name, "steps": [_step(one) for one in steps], "mark": compute_fingerprint(files)})
     return rows
 
 
@@ -82,7 +82,7 @@ def _step(held: dict[str, Any]) -> dict[str, Any]:
     return {"name": held["name"], "settling_mm": held.get("settling_mm"), "regions": regions}
 
 
-def _file(folder: StudyFolder, run: str, step: int) -> Path:
+def _find_file(folder: StudyFolder, run: str, step: int) -> Path:
     if run == SOCKET:
         return folder.artefact("socket", f"held-{step}.vtu")
     return folder.artefact("socket_design", f"{run}-{step}.vtu")
@@ -91,27 +91,27 @@ def _file(folder: StudyFolder, run: str, step: int) -> Path:
 @router.get("")
 def get_runs(folder: Folder) -> dict[str, Any]:
     """Stored runs, the patient's sides, and the run that goes on or begins."""
-    anatomy = anatomy_of(folder, folder.load())
+    anatomy = read_anatomy(folder, folder.load())
     frame = build_patient_frame(None if anatomy is None else anatomy.cut_normal)
-    run = running(folder)
-    more = {"run": run, "starting": starting(folder), "last": last_run(folder, run is not None)}
-    return {"runs": runs_of(folder), "frame": frame.tolist()} | more
+    run = find_running(folder)
+    more = {"run": run, "starting": find_starting(folder), "last": describe_last_run(folder, run is not None)}
+    return {"runs": list_runs(folder), "frame": frame.tolist()} | more
 
 
 @router.get("/mesh/{run}")
 def get_mesh(folder: Folder, run: str) -> Response:
     """The limb of a run as arrays of `VolumeShape`; ``place`` (n,): number of each node in ``places``."""
-    mesh = read_vtu(_file(folder, run, 0))
+    mesh = read_vtu(_find_file(folder, run, 0))
     volume = to_volume_shape(mesh)
-    place, places = _places(folder, volume.points.astype(float))
+    place, places = _name_places(folder, volume.points.astype(float))
     facts = {"regions": list(mesh.region_names), "places": places}
-    return _block(volume.arrays() | {"place": place}, facts)
+    return _respond_block(volume.arrays() | {"place": place}, facts)
 
 
-def _places(folder: StudyFolder, points: np.ndarray) -> tuple[np.ndarray, list[str]]:
+def _name_places(folder: StudyFolder, points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """The regions of the nearest skin, in words: a number of each point (n,), and the words."""
     study = folder.load()
-    anatomy = anatomy_of(folder, study)
+    anatomy = read_anatomy(folder, study)
     if anatomy is None:
         return np.zeros(len(points), np.uint16), [""]
     skin, regions = anatomy.skin, regions_of(study, anatomy)
@@ -127,16 +127,16 @@ def get_step(folder: Folder, run: str, step: int, field: str) -> Response:
     """``values`` (n,) of a field in kPa at the drawn nodes, when a step has been held."""
     if field not in _FIELDS:
         raise InputError("no such field is stored", remedy="fields are " + ", ".join(_FIELDS))
-    arrays = arrays_of(_file(folder, run, step))
+    arrays = read_arrays(_find_file(folder, run, step))
     nodes = np.unique(arrays["cells"][:, :4])
-    return _block({"values": arrays[_FIELDS[field]].reshape(-1)[nodes].astype(np.float32)}, {})
+    return _respond_block({"values": arrays[_FIELDS[field]].reshape(-1)[nodes].astype(np.float32)}, {})
 
 
-def _block(arrays: dict[str, Any], facts: dict[str, Any]) -> Response:
+def _respond_block(arrays: dict[str, Any], facts: dict[str, Any]) -> Response:
     return Response(pack(arrays, facts), media_type="application/octet-stream")
 
 
-def shape_of(folder: StudyFolder) -> dict[str, Any]:
+def describe_shape(folder: StudyFolder) -> dict[str, Any]:
     """What ``[socket]`` says of the shape, and whether such a face can be drawn around the bare skin.
 
     ``areas`` with their places, ``regions`` to choose from, ``file`` where the face is read from one;
@@ -144,15 +144,15 @@ def shape_of(folder: StudyFolder) -> dict[str, Any]:
     which another face changes, ``problem`` in words or None, ``has_limb``, ``volume_cm3``.
     """
     study = folder.load()
-    table, anatomy = study.socket, anatomy_of(folder, study)
+    table, anatomy = study.socket, read_anatomy(folder, study)
     regions = {} if anatomy is None else regions_of(study, anatomy)
     mark = _mark(folder, study)
-    found = _drawn(folder, mark)
+    found = _build_face(folder, mark)
     drawn = isinstance(found, Socket)
     return {
         "file": None if table.file is None else table.file.name,
         "reduction_percent": table.reduction_percent,
-        "trim": {"points": _handles(folder, study), "is_line": bool(table.trimline)},
+        "trim": {"points": _find_handles(folder, study), "is_line": bool(table.trimline)},
         "areas": [
             {
                 "name": area.name,
@@ -177,14 +177,14 @@ def _place(position: Any, region: str | None, regions: Mapping[str, Any]) -> lis
     return [float(x) for x in regions[region].position] if region and region in regions else None
 
 
-def _handles(folder: StudyFolder, study: Study) -> list[list[float]]:
+def _find_handles(folder: StudyFolder, study: Study) -> list[list[float]]:
     """Where the brim can be dragged: the points of the study's line alone, else some all around the brim."""
-    anatomy, table = anatomy_of(folder, study), study.socket
+    anatomy, table = read_anatomy(folder, study), study.socket
     if anatomy is None or table.file is not None:
         return []
     frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     try:
-        limb = _profile(folder, surfaces_mark(folder, study))
+        limb = _compute_profile(folder, mark_surfaces(folder, study))
         if table.trimline and not table.trim_planes:
             return [[*map(float, row)] for row in wrap_trimline(limb, frame, np.array(table.trimline))]
         return [[*map(float, row)] for row in find_brim(limb, frame, trim_of(study, anatomy), HANDLES)]
@@ -193,15 +193,15 @@ def _handles(folder: StudyFolder, study: Study) -> list[list[float]]:
 
 
 @lru_cache(maxsize=2)
-def _profile(folder: StudyFolder, mark: str) -> LimbProfile:
+def _compute_profile(folder: StudyFolder, mark: str) -> LimbProfile:
     """That of the bare skin; the last ones are kept, by the ``mark`` of the limb's surfaces."""
-    anatomy = anatomy_of(folder, folder.load())
+    anatomy = read_anatomy(folder, folder.load())
     if anatomy is None:
         raise InputError(NONE_YET)
     return compute_profile(anatomy.skin, build_limb_frame(anatomy.cut_point, anatomy.cut_normal))
 
 
-def face_block(folder: StudyFolder) -> bytes:
+def build_face_block(folder: StudyFolder) -> bytes:
     """The face as a block of arrays: ``points`` (n, 3), ``faces`` (m, 3), ``values`` (n,): offset, mm.
 
     Offsets are from the bare skin, negative where the face is pressed in.
@@ -212,7 +212,7 @@ def face_block(folder: StudyFolder) -> bytes:
         Where there is none.
     """
     study = folder.load()
-    found, anatomy = _drawn(folder, _mark(folder, study)), anatomy_of(folder, study)
+    found, anatomy = _build_face(folder, _mark(folder, study)), read_anatomy(folder, study)
     if not isinstance(found, Socket) or anatomy is None:
         raise InputError(found if isinstance(found, str) else NONE_YET)
     arrays = {
@@ -226,17 +226,17 @@ def face_block(folder: StudyFolder) -> bytes:
 def _mark(folder: StudyFolder, study: Study) -> str:
     """Changes with the limb's surfaces, the socket's file and what the table says of the shape."""
     table = study.socket
-    file = fingerprint([] if table.file is None else [study.path(table.file)])
+    file = compute_fingerprint([] if table.file is None else [study.path(table.file)])
     stated = digest(table.model_dump(mode="json", exclude={"design", "loads"}))
-    return f"{surfaces_mark(folder, study)} {file} {stated}"
+    return f"{mark_surfaces(folder, study)} {file} {stated}"
 
 
 @lru_cache(maxsize=2)
-def _drawn(folder: StudyFolder, mark: str) -> Socket | str:
+def _build_face(folder: StudyFolder, mark: str) -> Socket | str:
     """The face around the bare skin, or why there is none; the last ones are kept, by their ``mark``."""
     study = folder.load()
     try:
-        anatomy = anatomy_of(folder, study)
+        anatomy = read_anatomy(folder, study)
         return NONE_YET if anatomy is None else socket_of(study, anatomy, anatomy.skin)
     except InputError as error:
         return f"{error.what}; {error.remedy}" if error.remedy else error.what
@@ -244,14 +244,14 @@ def _drawn(folder: StudyFolder, mark: str) -> Socket | str:
 
 @router.get("/shape")
 def get_shape(folder: Folder) -> dict[str, Any]:
-    """What the study says of the shape, and whether it can be drawn; see `shape_of`."""
-    return shape_of(folder)
+    """What the study says of the shape, and whether it can be drawn; see `describe_shape`."""
+    return describe_shape(folder)
 
 
 @router.get("/face")
 def get_face(folder: Folder) -> Response:
-    """The face with its offset from the bare skin; see `face_block`."""
-    return Response(face_block(folder), media_type="application/octet-stream")
+    """The face with its offset from the bare skin; see `build_face_block`."""
+    return Response(build_face_block(folder), media_type="application/octet-stream")
 
 
 @router.post("/areas")
@@ -259,16 +259,16 @@ def post_area(folder: Folder, area: AreaOfPage) -> dict[str, Any]:
     """Add an area to the study file, or change the one of that name; the shape as it is afterwards."""
     values = area.model_dump(exclude={"name"})
     if area.position is not None:
-        values["position"] = on_skin(folder, area.position)
+        values["position"] = project_to_skin_of_study(folder, area.position)
     set_area(folder.file, area.name, values)
-    return shape_of(folder)
+    return describe_shape(folder)
 
 
 @router.post("/areas/{name}/remove")
 def post_removal(folder: Folder, name: str) -> dict[str, Any]:
     """Take an area out of the study file."""
     remove_area(folder.file, name)
-    return shape_of(folder)
+    return describe_shape(folder)
 
 
 @router.post("/trimline")
@@ -281,23 +281,23 @@ def post_trimline(folder: Folder, line: LineOfPage) -> dict[str, Any]:
         Where it does not go once around the limb, or leaves no socket; the file is left as it was.
     """
     study = folder.load()
-    anatomy = anatomy_of(folder, study)
+    anatomy = read_anatomy(folder, study)
     if anatomy is None:
         raise InputError(NONE_YET)
     frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     with blaming(study, "socket.trimline"):
-        limb = _profile(folder, surfaces_mark(folder, study))
+        limb = _compute_profile(folder, mark_surfaces(folder, study))
         points = wrap_trimline(limb, frame, np.array(line.points))
         trim_limb(limb, frame, Trim(line=points))
     set_trimline(folder.file, points.tolist())
-    return shape_of(folder)
+    return describe_shape(folder)
 
 
 @router.post("/trimline/remove")
 def post_default_brim(folder: Folder) -> dict[str, Any]:
     """Take the trimline out of the study file: the brim is the default one."""
     set_trimline(folder.file, None)
-    return shape_of(folder)
+    return describe_shape(folder)
 
 
 @router.post("/start")

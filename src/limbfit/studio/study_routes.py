@@ -11,8 +11,8 @@ from fastapi.responses import FileResponse
 from ..pipeline import study_status
 from ..pipeline.shared.provenance import input_files
 from ..study import Study
-from .folder import StudyFolder, fingerprint
-from .processes import running
+from .folder import StudyFolder, compute_fingerprint
+from .processes import find_running
 
 router = APIRouter(prefix="/api")
 # A report has scripts of its own: shown in a browser, it is kept apart from this page and its cookie.
@@ -22,12 +22,12 @@ REPORT_POLICY = (
 )
 
 
-def study_folder(request: Request) -> StudyFolder:
+def get_study_folder(request: Request) -> StudyFolder:
     """The folder that this server shows."""
     return request.app.state.folder
 
 
-Folder = Annotated[StudyFolder, Depends(study_folder)]
+Folder = Annotated[StudyFolder, Depends(get_study_folder)]
 
 
 @router.get("/study")
@@ -69,19 +69,19 @@ def get_study(folder: Folder) -> dict[str, Any]:
 @router.get("/stages")
 def get_stages(folder: Folder) -> dict[str, Any]:
     """State of every stage, as ``limbfit status`` tells it, and the run that goes on, if any."""
-    return {"stages": stages_of_folder(folder), "run": running(folder)}
+    return {"stages": list_stages(folder), "run": find_running(folder)}
 
 
 @router.get("/changes")
 def get_changes(folder: Folder) -> dict[str, Any]:
     """Fingerprints by topic; a page reads again what stands on a topic whose fingerprint changed."""
-    return {**folder.changes(), "run": running(folder)}
+    return {**folder.changes(), "run": find_running(folder)}
 
 
 @router.get("/files/{stage}/{name}")
 def get_file(folder: Folder, stage: str, name: str, download: bool = False) -> FileResponse:
     """A stored artefact ``results/<stage>/<name>``; with ``download`` as a file to keep."""
-    return _file(folder, (stage, name), download)
+    return _respond_file(folder, (stage, name), download)
 
 
 @router.get("/files/{stage}/{group}/{name}")
@@ -89,10 +89,10 @@ def get_file_of_group(
     folder: Folder, stage: str, group: str, name: str, download: bool = False
 ) -> FileResponse:
     """A stored artefact ``results/<stage>/<group>/<name>``, such as a table of the report."""
-    return _file(folder, (stage, group, name), download)
+    return _respond_file(folder, (stage, group, name), download)
 
 
-def _file(folder: StudyFolder, parts: tuple[str, ...], download: bool) -> FileResponse:
+def _respond_file(folder: StudyFolder, parts: tuple[str, ...], download: bool) -> FileResponse:
     path = folder.artefact(*parts)
     headers = {}
     if path.suffix.lower() in (".html", ".htm", ".svg", ".xml"):
@@ -111,7 +111,7 @@ class _Remembered:
 _remembered = _Remembered()
 
 
-def stages_of_folder(folder: StudyFolder) -> list[dict[str, Any]]:
+def list_stages(folder: StudyFolder) -> list[dict[str, Any]]:
     """`study_status`, which reads every input file: again only where one was written."""
     study = folder.load()
     mark = _mark(folder, study)
@@ -129,5 +129,5 @@ def _mark(folder: StudyFolder, study: Study) -> str:
     ]
     changes = folder.changes()
     return repr(
-        (str(folder.file), changes["study"], changes["stages"], changes["labels"], fingerprint(below))
+        (str(folder.file), changes["study"], changes["stages"], changes["labels"], compute_fingerprint(below))
     )

@@ -14,10 +14,10 @@ from ..errors import InputError
 from ..pipeline.stages.curves import read_record
 from ..pipeline.stages.plausible import record_flags
 from ..study import Record, Study
-from ..traces.numerics import bins
+from ..traces.numerics import average_in_bins
 from .editing import set_record
-from .folder import StudyFolder, fingerprint
-from .study_routes import Folder, stages_of_folder
+from .folder import StudyFolder, compute_fingerprint
+from .study_routes import Folder, list_stages
 
 router = APIRouter(prefix="/api/traces")
 MOST_POINTS, CURVE_POINTS = 2000, 400  # of a raw record and of a regularised one on the page
@@ -57,41 +57,41 @@ def get_records(folder: Folder) -> dict[str, Any]:
             "stated": found.get("stated"),
         }
         rows.append(row)
-    return {"sites": rows, "flags": _flags(folder, study, records)}
+    return {"sites": rows, "flags": _collect_flags(folder, study, records)}
 
 
 @router.get("/{name}")
 def get_record(folder: Folder, name: str) -> dict[str, Any]:
     """One record raw and regularised; times in s of the record, displacement in mm, force in N."""
     study = folder.load()
-    return _read(study, _recorded(study, name))
+    return _read(study, _find_record(study, name))
 
 
 @router.post("/{name}/preview")
 def preview_record(folder: Folder, name: str, times: Times) -> dict[str, Any]:
     """The record as it would be with other times; nothing is stored."""
     study = folder.load()
-    return _read(study, _with_times(_recorded(study, name), times))
+    return _read(study, _replace_times(_find_record(study, name), times))
 
 
 @router.post("/{name}")
 def post_times(folder: Folder, name: str, times: Times) -> dict[str, Any]:
     """Store the times in the study file, or remove them; the stage ``traces`` turns stale."""
     study = folder.load()
-    record = _with_times(_recorded(study, name), times)
+    record = _replace_times(_find_record(study, name), times)
     found = _read(study, record)
     set_record(folder.file, record, {"touch_down_s": record.touch_down_s, "peak_s": record.peak_s})
     return found
 
 
-def _recorded(study: Study, name: str) -> Record:
+def _find_record(study: Study, name: str) -> Record:
     one = study.indentation(name)
     if not isinstance(one, Record):
         raise InputError(f"site {name} has no record", file=study.file, place=f"sites.{name}")
     return one
 
 
-def _with_times(record: Record, times: Times) -> Record:
+def _replace_times(record: Record, times: Times) -> Record:
     rounded = {key: None if at is None else round(at, 4) for key, at in times.model_dump().items()}
     return replace(record, touch_down_s=rounded["touch_down_s"], peak_s=rounded["peak_s"])
 
@@ -99,7 +99,7 @@ def _with_times(record: Record, times: Times) -> Record:
 def _read(study: Study, record: Record) -> dict[str, Any]:
     """A record with its curves, for as long as neither its file nor what is stated of it changes."""
     file = study.path(record.trace)
-    key = repr((str(file), fingerprint([file]), study.traces, record.touch_down_s, record.peak_s))
+    key = repr((str(file), compute_fingerprint([file]), study.traces, record.touch_down_s, record.peak_s))
     if key not in _kept:
         if len(_kept) >= _MOST_KEPT:
             _kept.clear()
@@ -110,8 +110,8 @@ def _read(study: Study, record: Record) -> dict[str, Any]:
 def _record(study: Study, record: Record) -> dict[str, Any]:
     trace, smooth, facts = read_record(study, record)
     even = smooth.resample(CURVE_POINTS)
-    time, force, _ = bins(trace.time_s, trace.force_N, MOST_POINTS)
-    _, moved, _ = bins(trace.time_s, trace.displacement_mm, MOST_POINTS)
+    time, force, _ = average_in_bins(trace.time_s, trace.force_N, MOST_POINTS)
+    _, moved, _ = average_in_bins(trace.time_s, trace.displacement_mm, MOST_POINTS)
     start = facts["touch_down_s"]
     return {
         "facts": {key: value for key, value in facts.items() if not key.startswith("knots")},
@@ -119,23 +119,25 @@ def _record(study: Study, record: Record) -> dict[str, Any]:
         "samples": len(trace.time_s),
         "step_s": float(np.median(np.diff(trace.time_s))),
         "raw": {
-            "time_s": _short(time),
-            "displacement_mm": _short(moved),
-            "force_N": _short(force),
+            "time_s": _shorten(time),
+            "displacement_mm": _shorten(moved),
+            "force_N": _shorten(force),
         },
         "regularised": {
-            "time_s": _short(even.time_s + start),
-            "displacement_mm": _short(even.displacement_mm),
-            "force_N": _short(even.force_N),
+            "time_s": _shorten(even.time_s + start),
+            "displacement_mm": _shorten(even.displacement_mm),
+            "force_N": _shorten(even.force_N),
         },
     }
 
 
-def _short(values: np.ndarray) -> list[float]:
+def _shorten(values: np.ndarray) -> list[float]:
     return np.round(values, 5).tolist()
 
 
-def _flags(folder: StudyFolder, study: Study, records: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
+def _collect_flags(
+    folder: StudyFolder, study: Study, records: dict[str, dict[str, Any]]
+) -> list[dict[str, Any]]:
     """Flags on the records as they are now, and those of the last prediction against the model."""
     placed, anatomy = {}, None
     if (folder.results / "sites" / "sites.json").is_file():
@@ -146,7 +148,7 @@ def _flags(folder: StudyFolder, study: Study, records: dict[str, dict[str, Any]]
     steps = {name: one["step_s"] for name, one in records.items()}
     flags = [flag.to_dict() for flag in record_flags(study, facts, steps, placed, anatomy)]
     if (folder.results / "predict" / "predict.json").is_file():
-        states = {row["stage"]: row["state"] for row in stages_of_folder(folder)}
+        states = {row["stage"]: row["state"] for row in list_stages(folder)}
         old = "" if states.get("predict") == "done" else " (of the last prediction, which is stale)"
         for flag in folder.store.read("predict", "predict.json").get("flags", []):
             if flag["found"] == "against the model":

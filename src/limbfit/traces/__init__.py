@@ -13,18 +13,19 @@ Units: s, mm, N; force positive when pushing, displacement positive into the lim
 """
 
 from .creep import Creep, regularise_creep
-from .layers import Layers, Thinning, read_layers, thinnings
+from .layers import Layers, Thinning, compute_thinnings, read_layers
 from .reading import read_trace
 from .record import COLUMNS, Remark, Trace, check_trace
 from .regularise import Regularised, regularise
-from .surface import SurfaceMeans, SurfaceMotion, in_contact, read_surface_motion
+from .surface import SurfaceMeans, SurfaceMotion, read_surface_motion, select_frames_in_contact
 from .touchdown import TouchDown, find_touch_down, touch_down_at
-from .understanding import Understood, understand
+from .understanding import InterpretedRecord, interpret_record
 from .waves import WaveMeans, WaveSpeeds, read_wave_speeds
 
 __all__ = [
     "COLUMNS",
     "Creep",
+    "InterpretedRecord",
     "Layers",
     "Regularised",
     "Remark",
@@ -33,19 +34,18 @@ __all__ = [
     "Thinning",
     "TouchDown",
     "Trace",
-    "Understood",
     "WaveMeans",
     "WaveSpeeds",
     "check_trace",
+    "compute_thinnings",
     "find_touch_down",
-    "in_contact",
+    "interpret_record",
     "read_layers",
     "read_surface_motion",
     "read_trace",
     "read_wave_speeds",
     "regularise",
     "regularise_creep",
-    "thinnings",
+    "select_frames_in_contact",
     "touch_down_at",
-    "understand",
 ]

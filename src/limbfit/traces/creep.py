@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..phases import MotionPhase, boundaries, find_phases, spread
-from .displacement import broken_line
-from .numerics import Array, rms
+from .displacement import fit_broken_line
+from .numerics import Array, compute_rms
 from .record import Trace
-from .regularise import Regularised, SmoothCurve, held, with_samples
+from .regularise import Regularised, SmoothCurve, find_holds, select_sampled_corners
 from .touchdown import TouchDown
 
 END_SHARE = 0.05  # of the largest force: an indenter that hardly pushes may be anywhere
@@ -63,7 +63,7 @@ def regularise_creep(
     """
     since = trace.time_s - touch_down.time_s
     force = trace.force_N - touch_down.baseline_N
-    line = broken_line(trace.time_s, force, peak_s, quantity="force", unit="N")
+    line = fit_broken_line(trace.time_s, force, peak_s, quantity="force", unit="N")
     end = line.time_at(END_SHARE * float(line.values.max()), back=True) - touch_down.time_s
     corners = line.times - touch_down.time_s
     knots = np.r_[0.0, corners[(corners > 0.0) & (corners < end)], end]
@@ -71,10 +71,10 @@ def regularise_creep(
     knots_N[0] = 0.0
     of_force = find_phases(knots, knots_N)
     moved = trace.displacement_mm - touch_down.displacement_mm
-    parts = with_samples(boundaries(of_force), since)
-    curve = SmoothCurve(since, moved, parts, smoothing, held(parts, of_force))
+    parts = select_sampled_corners(boundaries(of_force), since)
+    curve = SmoothCurve(since, moved, parts, smoothing, find_holds(parts, of_force))
     inside = (since >= 0.0) & (since <= end)
-    phases = tuple(_as_moved(phase, curve) for phase in of_force)
+    phases = tuple(_with_displacements(phase, curve) for phase in of_force)
     time = spread(phases, 1000, knots)
     return Creep(
         time_s=time,
@@ -83,14 +83,14 @@ def regularise_creep(
         knots_s=knots,
         knots_mm=curve(knots),
         phases=phases,
-        noise_N=rms(force[inside] - np.interp(since[inside], knots, knots_N)),
-        noise_mm=rms(moved[inside] - curve(since[inside])),
+        noise_N=compute_rms(force[inside] - np.interp(since[inside], knots, knots_N)),
+        noise_mm=compute_rms(moved[inside] - curve(since[inside])),
         curve=curve,
         knots_N=knots_N,
     )
 
 
-def _as_moved(phase: MotionPhase, curve: SmoothCurve) -> MotionPhase:
+def _with_displacements(phase: MotionPhase, curve: SmoothCurve) -> MotionPhase:
     """A phase of the force with the displacements at its ends."""
     start, end = curve(np.array([phase.start_s, phase.end_s]))
     return replace(phase, start_mm=float(start), end_mm=float(end))

@@ -10,7 +10,13 @@ from scipy.optimize import least_squares
 
 from ..errors import TraceError
 from ..phases import MotionPhase, find_phases, tolerance_mm, way_in
-from .numerics import Array, bins, noise_level, resolution, straight
+from .numerics import (
+    Array,
+    average_in_bins,
+    build_linear_interpolation,
+    estimate_noise_level,
+    find_resolution,
+)
 
 _MAX_KNOTS = 41
 _STEPS = 0.7  # of a step in which the displacement comes: half of one is rounded, and corners are off too
@@ -60,7 +66,7 @@ class BrokenLine:
         return float(np.interp(displacement, np.maximum.accumulate(u[last:]), t[last:]))
 
 
-def broken_line(
+def fit_broken_line(
     time: Array,
     displacement: Array,
     peak_s: float | None = None,
@@ -80,11 +86,11 @@ def broken_line(
     TraceError
         Where forty pieces do not describe it, it never advances, or the way in cannot end at ``peak_s``.
     """
-    t, u, _ = bins(time, displacement, 5000)
-    at, coarse, n = bins(t, u, 300)
+    t, u, _ = average_in_bins(time, displacement, 5000)
+    at, coarse, n = average_in_bins(t, u, 300)
     travel = float(np.ptp(coarse))
-    noise = 4 * noise_level(u) / np.sqrt(float(n.mean()))
-    tolerance = max(0.003 * travel, noise, _STEPS * resolution(displacement))
+    noise = 4 * estimate_noise_level(u) / np.sqrt(float(n.mean()))
+    tolerance = max(0.003 * travel, noise, _STEPS * find_resolution(displacement))
     knots = np.array([time[0], time[-1]])
     while True:
         knots, values = _place_knots(t, u, knots)
@@ -106,10 +112,10 @@ def broken_line(
     line = BrokenLine(knots, values, tolerance)
     if way_in(line.phases) is None:
         raise TraceError(f"the {quantity} never advances", place=quantity, remedy="check the column")
-    return line if peak_s is None else _turning_at(peak_s, line, t, u)
+    return line if peak_s is None else _fit_line_turning_at(peak_s, line, t, u)
 
 
-def _turning_at(peak_s: float, line: BrokenLine, t: Array, u: Array) -> BrokenLine:
+def _fit_line_turning_at(peak_s: float, line: BrokenLine, t: Array, u: Array) -> BrokenLine:
     """The line whose way in ends at a stated time, its other corners where they were."""
     turn = int(np.flatnonzero(line.times == line.peak_s)[0])
     low = float(line.times[max(turn - 1, 0)])
@@ -117,7 +123,7 @@ def _turning_at(peak_s: float, line: BrokenLine, t: Array, u: Array) -> BrokenLi
     knots = line.times.copy()
     knots[turn] = peak_s
     if low < peak_s < high:
-        moved = BrokenLine(knots, _values(t, u, knots)[0], line.tolerance)
+        moved = BrokenLine(knots, _fit_values(t, u, knots)[0], line.tolerance)
         if moved.peak_s == peak_s:
             return moved
     raise TraceError(
@@ -127,13 +133,13 @@ def _turning_at(peak_s: float, line: BrokenLine, t: Array, u: Array) -> BrokenLi
     )
 
 
-def _values(t: Array, u: Array, knots: Array) -> tuple[Array, Array]:
+def _fit_values(t: Array, u: Array, knots: Array) -> tuple[Array, Array]:
     """Least-squares values of a continuous broken line with corners at ``knots``, and its hats."""
-    hats = straight(t, knots)
-    return _projected(hats, u), hats
+    hats = build_linear_interpolation(t, knots)
+    return _project_on_hats(hats, u), hats
 
 
-def _projected(hats: Array, u: Array) -> Array:
+def _project_on_hats(hats: Array, u: Array) -> Array:
     """Coefficients (k, ...) of hats (n, k) that come nearest to ``u`` (n, ...).
 
     Hats overlap with their neighbours only, so the normal equations are well conditioned; the little on their
@@ -151,18 +157,18 @@ def _place_knots(t: Array, u: Array, knots: Array) -> tuple[Array, Array]:
         return np.r_[knots[0], inner, knots[-1]]
 
     def misfit(inner: Array) -> Array:
-        values, hats = _values(t, u, whole(inner))
+        values, hats = _fit_values(t, u, whole(inner))
         return hats @ values - u
 
     def slopes(inner: Array) -> Array:
         """A corner that moves takes its hat along, at the speed on either side; the values follow (variable
         projection, Kaufman 1975)."""
         corners = whole(inner)
-        values, hats = _values(t, u, corners)
+        values, hats = _fit_values(t, u, corners)
         piece = np.clip(np.searchsorted(corners, t) - 1, 0, len(corners) - 2)
         speed = (np.diff(values) / np.diff(corners))[piece]
         moved = -speed[:, None] * hats[:, 1:-1]
-        return np.asarray(moved - hats @ _projected(hats, moved))
+        return np.asarray(moved - hats @ _project_on_hats(hats, moved))
 
     inner = knots[1:-1]
     if inner.size:
@@ -172,4 +178,4 @@ def _place_knots(t: Array, u: Array, knots: Array) -> tuple[Array, Array]:
         upper = np.r_[middle[1:-1] - margin[1:-1], knots[-1] - margin[-1]]
         found = least_squares(misfit, inner, jac=slopes, bounds=(lower, upper), x_scale=np.ptp(knots))
         inner = found.x
-    return whole(inner), _values(t, u, whole(inner))[0]
+    return whole(inner), _fit_values(t, u, whole(inner))[0]

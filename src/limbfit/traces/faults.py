@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from .displacement import BrokenLine
-from .numerics import Array, Bools, bins, noise_level, resolution, runs
+from .numerics import Array, Bools, average_in_bins, estimate_noise_level, find_resolution, find_runs
 from .record import Remark, Trace
-from .touchdown import TouchDown, depth_at
+from .touchdown import TouchDown, find_depth_at
 
 _FEW_DOUBLED = 0.2  # of the samples: more of them share a time because times are rounded
 _ROUNDED = 0.75  # of the resolution that an even clock may be off the times that are stated
@@ -84,19 +84,21 @@ def find_gaps(trace: Trace, line: BrokenLine) -> list[tuple[float, float]]:
     return [(a, b) for a, b in spans if np.ptp(line.path(np.array([a, b]))) > _MOVED * travel]
 
 
-def gap_remarks(gaps: list[tuple[float, float]], line: BrokenLine, met_s: float) -> list[Remark]:
+def find_gaps_without_force(gaps: list[tuple[float, float]], line: BrokenLine, met_s: float) -> list[Remark]:
     """One remark for each gap; where the skin is met in one, anywhere in it."""
     remarks = []
     for start, end in gaps:
         moved = float(np.ptp(line.path(np.array([start, end]))))
         what = f"no samples from {start:.2f} s to {end:.2f} s, while the indenter moves by {moved:.2g} mm"
-        numbers = {"start_s": start, "end_s": end, "moved_mm": moved} | _within(start, end, line, met_s)
+        numbers = {"start_s": start, "end_s": end, "moved_mm": moved} | _compute_added_deviation(
+            start, end, line, met_s
+        )
         cause = "samples that the logger lost"
         remarks.append(Remark("gap", what, cause, "record again: the force there is a guess", numbers))
     return remarks
 
 
-def _within(start: float, end: float, line: BrokenLine, met_s: float) -> dict[str, float]:
+def _compute_added_deviation(start: float, end: float, line: BrokenLine, met_s: float) -> dict[str, float]:
     """What a span without a force adds to the deviation of a touch-down in it or next to it."""
     if not start - (end - start) <= met_s <= end + (end - start):
         return {}
@@ -109,11 +111,11 @@ def find_frozen(trace: Trace, line: BrokenLine, rise_N: float) -> list[slice]:
     The force jumps at their end, or is at no level at which a force that scatters could stay.
     """
     force, path = trace.force_N, line.path(trace.time_s)
-    noise, size = noise_level(force), resolution(force)
+    noise, size = estimate_noise_level(force), find_resolution(force)
     jump = max(2.5 * size, _JUMP_NOISE * noise, _MOVED * rise_N)
     in_contact = force > np.percentile(force, 2) + _CONTACT * rise_N
     found = []
-    for start, end in runs(np.diff(force) == 0.0):
+    for start, end in find_runs(np.diff(force) == 0.0):
         last = end  # of the equal samples start..end
         if last - start + 1 < _FROZEN_SAMPLES or path[last] - path[start] < _MOVED * float(
             np.ptp(line.values)
@@ -126,7 +128,7 @@ def find_frozen(trace: Trace, line: BrokenLine, rise_N: float) -> list[slice]:
     return found
 
 
-def frozen_remarks(trace: Trace, frozen: list[slice], line: BrokenLine, met_s: float) -> list[Remark]:
+def find_frozen_force(trace: Trace, frozen: list[slice], line: BrokenLine, met_s: float) -> list[Remark]:
     remarks = []
     for run in frozen:
         start, end = float(trace.time_s[run.start]), float(trace.time_s[run.stop - 1])
@@ -136,19 +138,19 @@ def frozen_remarks(trace: Trace, frozen: list[slice], line: BrokenLine, met_s: f
             f"moves by {moved:.2g} mm"
         )
         numbers = {"start_s": start, "end_s": end, "force_N": force, "moved_mm": moved}
-        numbers |= _within(start, end, line, met_s)
+        numbers |= _compute_added_deviation(start, end, line, met_s)
         remarks.append(Remark("frozen", what, "a sensor that froze", "check it, and record again", numbers))
     return remarks
 
 
-def saturation_remarks(
+def find_saturation(
     trace: Trace, line: BrokenLine, rise_N: float, spans: list[tuple[float, float]]
 ) -> list[Remark]:
     """A force that stays at its top, while the indenter moves, for longer than noise at a turn explains; not
     where ``spans`` of time lack a force."""
     near = trace.time_s < 2 * line.peak_s - line.start_s  # a slow way out would have few bins for the turn
-    time, force, _ = bins(trace.time_s[near], trace.force_N[near], _BINS)
-    noise = max(noise_level(force), 1e-3 * rise_N, resolution(trace.force_N) / 4)
+    time, force, _ = average_in_bins(trace.time_s[near], trace.force_N[near], _BINS)
+    noise = max(estimate_noise_level(force), 1e-3 * rise_N, find_resolution(trace.force_N) / 4)
     top = float(np.median(force[force > force.max() - _TOP_NOISE * noise]))
     low = np.flatnonzero(force < top - _TOP_NOISE * noise)
     peak = int(np.argmax(force))
@@ -186,9 +188,9 @@ def find_steps(
     m = int(np.clip(round(_STEP_S * rate), *_STEP_SAMPLES))
     if len(force) < 4 * m:
         return []
-    whole, half = _jumps(force, m), _jumps(force, m // 2)
+    whole, half = _compute_jumps(force, m), _compute_jumps(force, m // 2)
     sd = 1.4826 * float(np.median(np.abs(whole)))
-    least = max(_STEP_SD * sd, _STEP_SHARE * rise_N, _STEP_STEPS * resolution(force))
+    least = max(_STEP_SD * sd, _STEP_SHARE * rise_N, _STEP_STEPS * find_resolution(force))
     sharp = np.abs(half - whole) < _SHARP * np.abs(whole) + sd
     steps = (np.abs(whole) > least) & sharp
     near = (m + 1) / rate
@@ -204,7 +206,7 @@ def find_steps(
     return sorted(found)
 
 
-def _jumps(force: Array, m: int) -> Array:
+def _compute_jumps(force: Array, m: int) -> Array:
     """How far the straight line through the ``m`` samples from each on starts above the end of that through
     the ``m`` before it, (n,) N; none at the ends."""
     x = np.arange(m) + 0.5
@@ -225,7 +227,7 @@ def step_remarks(steps: list[tuple[float, float]]) -> list[Remark]:
     return remarks
 
 
-def resolution_remarks(trace: Trace, line: BrokenLine, touch: TouchDown, rise_N: float) -> list[Remark]:
+def find_coarse_steps(trace: Trace, line: BrokenLine, touch: TouchDown, rise_N: float) -> list[Remark]:
     """Remarks on a force or a displacement whose steps are larger than what its neighbours scatter by.
 
     A touch-down is then known to where the force reaches the standard deviation of what is rounded.
@@ -235,7 +237,7 @@ def resolution_remarks(trace: Trace, line: BrokenLine, touch: TouchDown, rise_N:
         ("force", trace.force_N, "N", _COARSE_FORCE * rise_N),
         ("displacement", trace.displacement_mm, "mm", _COARSE_TRAVEL * float(np.ptp(line.values))),
     ):
-        size = resolution(values)
+        size = find_resolution(values)
         scatter = float(np.sqrt(np.mean(np.diff(values, 2) ** 2) / 6.0))
         if size < least or scatter > _DITHERED * size:
             continue
@@ -243,6 +245,6 @@ def resolution_remarks(trace: Trace, line: BrokenLine, touch: TouchDown, rise_N:
         cause = f"a sensor or an export that rounds the {kind}"
         numbers = {f"step_{unit}": size}
         if unit == "N":
-            numbers["adds_sd_mm"] = depth_at(trace, line, touch, size / float(np.sqrt(12.0)))
+            numbers["adds_sd_mm"] = find_depth_at(trace, line, touch, size / float(np.sqrt(12.0)))
         remarks.append(Remark("resolution", what, cause, "record with a finer range or more digits", numbers))
     return remarks

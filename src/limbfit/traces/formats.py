@@ -120,20 +120,20 @@ def _split(lines: Sequence[str], delimiter: str, start: int = 0) -> list[Row]:
     return [row for row in rows if any(row[1]) and not row[1][0].startswith("#")]
 
 
-def _delimiter(line: str) -> str:
+def _find_delimiter(line: str) -> str:
     return max("\t;,", key=line.count)
 
 
 def _read_text(text: str, file: Path, columns: Names) -> ColumnTable:
     lines = text.splitlines()
-    single = [_split([line], _delimiter(line), i) for i, line in enumerate(lines[:MAX_PREAMBLE])]
+    single = [_split([line], _find_delimiter(line), i) for i, line in enumerate(lines[:MAX_PREAMBLE])]
     header = _find_header([row for rows in single for row in rows], columns, file)
     number = header[0]
-    delimiter = _delimiter(lines[number - 1])
+    delimiter = _find_delimiter(lines[number - 1])
     rows = _split(lines[number:], delimiter, number)
     if delimiter != ",":
         rows = [(i, [cell.replace(",", ".") for cell in row]) for i, row in rows]
-    return _table(header, rows, columns, has_preamble=any(single[: number - 1]))
+    return _build_table(header, rows, columns, has_preamble=any(single[: number - 1]))
 
 
 def _find_header(rows: Sequence[Row], columns: Names, file: Path) -> Row:
@@ -155,7 +155,7 @@ def _find_header(rows: Sequence[Row], columns: Names, file: Path) -> Row:
     return likely
 
 
-def _table(header: Row, rows: Sequence[Row], columns: Names, has_preamble: bool) -> ColumnTable:
+def _build_table(header: Row, rows: Sequence[Row], columns: Names, has_preamble: bool) -> ColumnTable:
     """The table below a header; its first row may state units: words in each of the named columns."""
     number, names = header
     notes = (f"what stands before the header in line {number} is skipped",) if has_preamble else ()
@@ -199,13 +199,15 @@ def _read_lvm(text: str, file: Path, columns: Names) -> ColumnTable:
     if columns[TIME] not in names and "Time" in with_names[0][0].get("X_Dimension", ()):
         names = [columns[TIME] if name == _X else name for name in names]
         notes = (f"the times are LabVIEW's {_X}",)
-    rows = [row for tags, rows in with_names for row in _timed(rows[1:], tags, names, columns[TIME], file)]
+    rows = [
+        row for tags, rows in with_names for row in _add_times(rows[1:], tags, names, columns[TIME], file)
+    ]
     _find_header([(first[0], names)], columns, file)
     units = ["", *with_names[0][0].get("Y_Unit_Label", [])] + [""] * len(names)
     return ColumnTable(names, units[: len(names)], rows, notes=notes)
 
 
-def _timed(
+def _add_times(
     rows: Sequence[Row], tags: Mapping[str, list[str]], names: Sequence[str], time: str, file: Path
 ) -> list[Row]:
     """The rows of a segment, their times made of ``X0`` and ``Delta_X`` where the file leaves them out.
@@ -292,7 +294,7 @@ def _read_excel(file: Path, columns: Names) -> ColumnTable:
     openpyxl = _import("openpyxl", "openpyxl", "excel", file)
     try:
         book = openpyxl.load_workbook(file, read_only=True, data_only=True)
-        sheets = {sheet.title: _sheet_rows(sheet) for sheet in book.worksheets}
+        sheets = {sheet.title: _read_sheet_rows(sheet) for sheet in book.worksheets}
         book.close()
     except Exception as error:  # a broken file can fail anywhere in the parser
         raise TraceError(f"not a readable Excel file ({type(error).__name__})", file=file) from None
@@ -304,17 +306,18 @@ def _read_excel(file: Path, columns: Names) -> ColumnTable:
     rows = sheets[fitting[0]] if fitting else max(sheets.values(), key=len)
     header = _find_header(rows[:MAX_PREAMBLE], columns, file)
     below = [row for row in rows if row[0] > header[0]]
-    return _table(header, below, columns, has_preamble=rows[0] != header)
+    return _build_table(header, below, columns, has_preamble=rows[0] != header)
 
 
-def _sheet_rows(sheet: Any) -> list[Row]:
+def _read_sheet_rows(sheet: Any) -> list[Row]:
     rows = [
-        (i, [_cell(value) for value in row]) for i, row in enumerate(sheet.iter_rows(values_only=True), 1)
+        (i, [_format_cell(value) for value in row])
+        for i, row in enumerate(sheet.iter_rows(values_only=True), 1)
     ]
     return [row for row in rows if any(row[1])]
 
 
-def _cell(value: Any) -> str:
+def _format_cell(value: Any) -> str:
     """The text of a cell."""
     if hasattr(value, "isoformat"):
         return str(value.isoformat())

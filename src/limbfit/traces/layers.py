@@ -85,7 +85,9 @@ def read_layers(path: str | Path, time_name: str) -> Layers:
     return Layers(time, {name.removesuffix(SUFFIX): values for name, values in columns.items()})
 
 
-def thinnings(layers: Layers, touch_down_s: float, end_s: float, sd_mm: float) -> tuple[Thinning, ...]:
+def compute_thinnings(
+    layers: Layers, touch_down_s: float, end_s: float, sd_mm: float
+) -> tuple[Thinning, ...]:
     """How each tissue gives way between touch-down and ``end_s``, times of the record.
 
     The thickness at rest is the mean of all readings before touch-down.

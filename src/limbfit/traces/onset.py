@@ -75,12 +75,12 @@ def find_onset(
     if around is not None:
         reach = _AROUND * around.sd
         low, high = max(around.place_mm - reach, low), min(around.place_mm + reach, high)
-    return _weighed(part, whiten, np.linspace(low - before_mm, high, _PLACES), zeroed=before_mm == 0.0)
+    return _weigh_onsets(part, whiten, np.linspace(low - before_mm, high, _PLACES), zeroed=before_mm == 0.0)
 
 
-def _weighed(part: OnsetPart, whiten: Array, places: Array, zeroed: bool) -> Onset:
+def _weigh_onsets(part: OnsetPart, whiten: Array, places: Array, zeroed: bool) -> Onset:
     """Every onset that starts at one of the places (m,), weighed by its likelihood."""
-    shapes = _shapes(part, places) @ whiten.T
+    shapes = _build_shapes(part, places) @ whiten.T
     one, force = whiten.sum(axis=1), whiten @ part.force_N
     # Normal equations of baseline and stiffness, for all shapes (memories, m, forms) together.
     oo, oy, yy = one @ one, one @ force, force @ force
@@ -105,7 +105,7 @@ def _weighed(part: OnsetPart, whiten: Array, places: Array, zeroed: bool) -> Ons
     return Onset(mean, sd, exponent, float((share * baseline).sum()), least / free)
 
 
-def _shapes(part: OnsetPart, places: Array) -> Array:
+def _build_shapes(part: OnsetPart, places: Array) -> Array:
     """Onsets (memories, places, forms, n) for all memories and elastic forms, one at the part's end."""
     depth = np.maximum(part.travel_mm - places[:, None, None], 0.0)
     whole = np.maximum(depth[..., -1:], 1e-300)

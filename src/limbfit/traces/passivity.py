@@ -17,11 +17,11 @@ from scipy.optimize import nnls
 
 from ..phases import MotionPhase
 from .displacement import BrokenLine
-from .numerics import Array, bins, noise_level, resolution
+from .numerics import Array, average_in_bins, estimate_noise_level, find_resolution
 from .onset import compute_memory
 from .record import Remark, Trace
 from .scatter import Scatter
-from .touchdown import TouchDown, depth_at
+from .touchdown import TouchDown, find_depth_at
 
 _SHARPLY = 0.5  # of the largest speed: a corner at which the speed changes by more
 _WINDOW_S = 1.0  # on either side of a corner
@@ -45,7 +45,7 @@ _SWING_FREE = 0.1  # of a swing that passive forces must leave
 _SWING_RISE = 0.015  # of the rise: less does no harm
 
 
-def lag_remarks(
+def find_lag(
     trace: Trace, line: BrokenLine, touch: TouchDown, scatter: Scatter, spans: list[tuple[float, float]]
 ) -> list[Remark]:
     """A force that turns later than the displacement, told from its kinks where that turns or stops; corners
@@ -65,7 +65,7 @@ def lag_remarks(
             continue
         if np.median(force[np.abs(time) <= np.sort(np.abs(time))[4]]) < base + 0.2 * (top - base):
             continue
-        found.append(_delay(time, force, scatter))
+        found.append(_estimate_delay(time, force, scatter))
     if not found:
         return []
     # At none of them may it be late, and at some memory hides a delay.
@@ -73,7 +73,7 @@ def lag_remarks(
     met = float(np.interp(touch.time_s, (line.times[1:] + line.times[:-1]) / 2, speed))
     late_mm = delay * abs(met)
     step = float(np.median(np.diff(trace.time_s)))
-    unseen = resolution(trace.displacement_mm) / float(np.abs(speed).max())  # of when a corner was
+    unseen = find_resolution(trace.displacement_mm) / float(np.abs(speed).max())  # of when a corner was
     if delay < max(_LAG_SD * sd, _LAG_STEPS * step, unseen) or late_mm < _LAG_HARM * touch.uncertainty_mm:
         return []
     what = (
@@ -87,15 +87,15 @@ def lag_remarks(
     ]
 
 
-def _delay(time: Array, force: Array, scatter: Scatter) -> tuple[float, float]:
+def _estimate_delay(time: Array, force: Array, scatter: Scatter) -> tuple[float, float]:
     """By how much the kink of a force is late, s, and its standard deviation: parabolas that meet there."""
-    x, y, n = bins(time, force, _BINS)
+    x, y, n = average_in_bins(time, force, _BINS)
     alike = (1.0 + scatter.lag) / (1.0 - scatter.lag)
     noise = scatter.sd_N**2 * min(alike, float(n.mean())) + 1e-18
     widest = _LATEST * min(-time[0], time[-1])
     delays = np.linspace(-widest, widest, _DELAYS)
     for _ in range(2):
-        left = np.array([_kinked(x, y, n, delay) for delay in delays])
+        left = np.array([_compute_kink_misfit(x, y, n, delay) for delay in delays])
         variance = max(left.min() / max(len(x) - 6, 1), noise)
         weights = np.exp(-0.5 * (left - left.min()) / variance)
         weights /= weights.sum()
@@ -105,14 +105,14 @@ def _delay(time: Array, force: Array, scatter: Scatter) -> tuple[float, float]:
     return mean, sd
 
 
-def _kinked(x: Array, y: Array, n: Array, delay: float) -> float:
+def _compute_kink_misfit(x: Array, y: Array, n: Array, delay: float) -> float:
     """What two parabolas that meet at ``delay`` leave of means ``y`` (k,) of ``n`` samples each."""
     beyond = np.maximum(x - delay, 0.0)
     basis = np.stack([np.ones_like(x), x, x**2, beyond, beyond**2], axis=1)
-    return _misfit(basis * np.sqrt(n)[:, None], np.sqrt(n) * y)
+    return _compute_misfit(basis * np.sqrt(n)[:, None], np.sqrt(n) * y)
 
 
-def _misfit(basis: Array, y: Array) -> float:
+def _compute_misfit(basis: Array, y: Array) -> float:
     q, _ = np.linalg.qr(basis)
     return max(float(y @ y - np.sum((q.T @ y) ** 2)), 0.0)
 
@@ -126,7 +126,7 @@ class _Part:
     used: Array
 
 
-def swing_remarks(
+def find_swings(
     trace: Trace,
     line: BrokenLine,
     touch: TouchDown,
@@ -136,14 +136,14 @@ def swing_remarks(
 ) -> list[Remark]:
     """A force that swings as a person breathes, beyond all that passive tissue can do, and beyond its
     ``steps_s``."""
-    parts = _passive_parts(trace, line, touch, rise_N, steps_s)
+    parts = _remove_passive_forces(trace, line, touch, rise_N, steps_s)
     if not parts:
         return []
     time = np.concatenate([part.time_s for part in parts])
     left = np.concatenate([part.residual_N for part in parts])
     per_bin = len(trace.time_s) / _SWING_BINS if len(trace.time_s) > _SWING_BINS else 1.0
     noise = scatter.of_means(max(int(per_bin), 1))
-    noise = max(noise, noise_level(left), 2e-4 * rise_N)
+    noise = max(noise, estimate_noise_level(left), 2e-4 * rise_N)
     misfit = float(left @ left) / noise**2
     if misfit < len(left) + _SWING_F:
         return []
@@ -166,7 +166,7 @@ def swing_remarks(
     share = gain / max(misfit - free_values, 1e-12)
     if gain < _SWING_F * remaining or share < _SWING_SHARE or size < _SWING_RISE * rise_N:
         return []
-    moved = depth_at(trace, line, touch, size)
+    moved = find_depth_at(trace, line, touch, size)
     what = f"the force in contact swings by {size:.2g} N, {60 * cycles:.0f} times a minute"
     numbers = {"swing_N": size, "cycles_per_s": cycles, "explained": share, "adds_sd_mm": moved}
     cause = "a limb that moves as the person breathes"
@@ -174,18 +174,18 @@ def swing_remarks(
     return [Remark("swing", what, cause, remedy, numbers)]
 
 
-def _passive_parts(
+def _remove_passive_forces(
     trace: Trace, line: BrokenLine, touch: TouchDown, rise_N: float, steps_s: Sequence[float]
 ) -> list[_Part]:
     """What passive forces leave of each phase in contact."""
-    time, force, _ = bins(trace.time_s, trace.force_N - touch.baseline_N, _SWING_BINS)
+    time, force, _ = average_in_bins(trace.time_s, trace.force_N - touch.baseline_N, _SWING_BINS)
     contact = (force > _IN_CONTACT * rise_N) & (time > touch.time_s)
     found = []
     for phase in line.phases:
         inside = contact & (time > phase.start_s) & (time < phase.end_s)
         if inside.sum() < _LEAST_BINS:
             continue
-        basis = _passive(phase, time[inside], line, touch)
+        basis = _build_passive_forces(phase, time[inside], line, touch)
         basis /= np.linalg.norm(basis, axis=0)
         within = [at for at in steps_s if time[inside][0] < at < time[inside][-1]]
         free = np.stack([np.ones(len(basis)), *(1.0 * (time[inside] > at) for at in within)], axis=1)
@@ -196,7 +196,7 @@ def _passive_parts(
     return found
 
 
-def _passive(phase: MotionPhase, time: Array, line: BrokenLine, touch: TouchDown) -> Array:
+def _build_passive_forces(phase: MotionPhase, time: Array, line: BrokenLine, touch: TouchDown) -> Array:
     """Forces (n, k) that a passive tissue may have in a phase, but for a constant."""
     since = time - phase.start_s
     fading = np.stack([np.exp(-since / tau) for tau in _TAUS_S], axis=1)

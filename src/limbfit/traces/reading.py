@@ -188,12 +188,14 @@ def _read_clock(table: ColumnTable, name: str, file: Path, notes: list[str]) -> 
     if not table.rows or not _CLOCK.fullmatch(_get(table.rows[0], place, file, name)):
         return None
     notes.append(f"the times of day in column {name!r} are counted from the first")
-    times = np.array([_seconds(_get(row, place, file, name), row[0], name, file) for row in table.rows])
+    times = np.array(
+        [_parse_time_of_day(_get(row, place, file, name), row[0], name, file) for row in table.rows]
+    )
     midnights = np.cumsum(np.diff(times, prepend=times[0]) < -_DAY_S / 2)
     return np.asarray(times - times[0] + _DAY_S * midnights)
 
 
-def _seconds(cell: str, line: int, name: str, file: Path) -> float:
+def _parse_time_of_day(cell: str, line: int, name: str, file: Path) -> float:
     """Of a time of day since midnight."""
     clock = _CLOCK.fullmatch(cell)
     if clock is None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import TraceError
-from .numerics import Array, bins, noise_level
+from .numerics import Array, average_in_bins, estimate_noise_level
 
 COLUMNS = ("time_s", "displacement_mm", "force_N")
 MIN_SAMPLES = 20
@@ -79,8 +79,8 @@ def check_trace(
 
 
 def _check_contact(trace: Trace, columns: tuple[str, str, str], file: str | Path | None) -> None:
-    noise = noise_level(trace.force_N)
-    _, force, _ = bins(trace.time_s, trace.force_N, _RUNS)
+    noise = estimate_noise_level(trace.force_N)
+    _, force, _ = average_in_bins(trace.time_s, trace.force_N, _RUNS)
     travel = np.abs(trace.displacement_mm - np.median(trace.displacement_mm[:_FIRST]))
     moving = np.flatnonzero(travel > _STILL * travel.max())  # before a fast ramp there are few samples
     start = float(np.median(trace.force_N[: max(int(moving[0]) if moving.size else 0, _FIRST)]))
@@ -102,7 +102,7 @@ def _check_units(trace: Trace, columns: tuple[str, str, str], file: str | Path |
         remedy = "displacement into the limb must be positive: change the sign"
         raise TraceError("the displacement falls", file=file, place=columns[1], remedy=remedy)
     _check_range(inward, TRAVEL_MM, "travel", "mm", {1e3: "metres", 1e-3: "micrometres"}, columns[1], file)
-    speed = _typical_speed(trace)
+    speed = _compute_typical_speed(trace)
     guesses = {1e3: "milliseconds", 1e6: "microseconds", 1 / 60: "minutes"}
     _check_range(speed, SPEED_MM_S, "speed", "mm/s", guesses, columns[0], file)
     peak = float(trace.force_N.max())
@@ -110,7 +110,7 @@ def _check_units(trace: Trace, columns: tuple[str, str, str], file: str | Path |
     _check_range(peak, PEAK_N, "peak force", "N", guesses, columns[2], file)
 
 
-def _typical_speed(trace: Trace) -> float:
+def _compute_typical_speed(trace: Trace) -> float:
     """Speed on the way in between 20 and 80 % of the travel, mm/s."""
     u = trace.displacement_mm
     low, high = np.median(u[:5]), u.max()

@@ -11,8 +11,8 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 
 from ..errors import TraceError
 from ..phases import DENSER, MotionPhase, boundaries, find_phases, spread, way_in
-from .displacement import broken_line
-from .numerics import Array, bins, curved, rms
+from .displacement import fit_broken_line
+from .numerics import Array, average_in_bins, build_cubic_interpolation, compute_rms
 from .record import Trace
 from .touchdown import TouchDown
 
@@ -104,7 +104,7 @@ def regularise(
         Where fewer than 8 samples lie between touch-down and the peak, or no smoothing can be chosen, or
         the way in cannot end where it is stated to.
     """
-    line = broken_line(trace.time_s, trace.displacement_mm, peak_s)
+    line = fit_broken_line(trace.time_s, trace.displacement_mm, peak_s)
     start, end = touch_down.time_s, line.time_at(touch_down.displacement_mm, back=True)
     knots = np.r_[start, line.times[(line.times > start) & (line.times < end)], end]
     knots_mm = line(knots) - touch_down.displacement_mm
@@ -112,8 +112,8 @@ def regularise(
     force = trace.force_N - touch_down.baseline_N
     if ((trace.time_s >= start) & (trace.time_s <= line.peak_s)).sum() < 8:
         raise TraceError("fewer than 8 samples between touch-down and peak", remedy="check the record")
-    corners = with_samples(boundaries(phases), trace.time_s - start)
-    curve = SmoothCurve(trace.time_s - start, force, corners, smoothing, held(corners, phases))
+    corners = select_sampled_corners(boundaries(phases), trace.time_s - start)
+    curve = SmoothCurve(trace.time_s - start, force, corners, smoothing, find_holds(corners, phases))
     inside = (trace.time_s >= start) & (trace.time_s <= end)
     time = spread(phases, 1000, knots - start)
     return Regularised(
@@ -123,13 +123,13 @@ def regularise(
         knots_s=knots - start,
         knots_mm=knots_mm,
         phases=phases,
-        noise_N=rms(force[inside] - curve(trace.time_s[inside] - start)),
-        noise_mm=rms(trace.displacement_mm[inside] - line(trace.time_s[inside])),
+        noise_N=compute_rms(force[inside] - curve(trace.time_s[inside] - start)),
+        noise_mm=compute_rms(trace.displacement_mm[inside] - line(trace.time_s[inside])),
         curve=curve,
     )
 
 
-def with_samples(corners: Array, time: Array) -> Array:
+def select_sampled_corners(corners: Array, time: Array) -> Array:
     """The corners between which there are samples enough for a spline: a shorter part belongs to its
     neighbour."""
     kept = list(corners)
@@ -143,7 +143,7 @@ def with_samples(corners: Array, time: Array) -> Array:
     return np.array(kept)
 
 
-def held(corners: Array, phases: Sequence[MotionPhase]) -> tuple[bool, ...]:
+def find_holds(corners: Array, phases: Sequence[MotionPhase]) -> tuple[bool, ...]:
     """Whether each part between the corners is a hold."""
     middles = (corners[1:] + corners[:-1]) / 2
     return tuple(any(p.kind == "hold" and p.start_s < middle < p.end_s for p in phases) for middle in middles)
@@ -179,7 +179,7 @@ class SmoothCurve:
         self._clocks = [_Clock(a, b, p) for (a, b), p in zip(pairwise(corners), powers, strict=True)]
         parts = [(time >= clock.start_s) & (time <= clock.end_s) for clock in self._clocks]
         self._bins = [
-            bins(clock(time[part]), force[part], _BINS, clock.power)
+            average_in_bins(clock(time[part]), force[part], _BINS, clock.power)
             for clock, part in zip(self._clocks, parts)
         ]
         self._corners = corners
@@ -199,7 +199,7 @@ class SmoothCurve:
         for (x, _, _), clock in zip(self._bins, self._clocks):
             near = np.flatnonzero((at >= clock.start_s - _SAME_S) & (at <= clock.end_s + _SAME_S))
             matrix = np.zeros((len(x), len(at)))
-            matrix[:, near] = curved(x, clock(at[near]))
+            matrix[:, near] = build_cubic_interpolation(x, clock(at[near]))
             given.append(matrix)
         splines, _ = self._fitted(given, self._penalties)
         return self._joined(splines, at)
@@ -215,7 +215,7 @@ class SmoothCurve:
     ) -> tuple[list[BSpline], list[tuple[float, float]]]:
         """Splines of averages (bins of a part, ...) per part; their penalties, free and with ends given."""
         data = [(x, y, w) for (x, _, w), y in zip(self._bins, values)]
-        free = [_spline(*d, penalty, {}) for d, (penalty, _) in zip(data, penalties)]
+        free = [_fit_spline(*d, penalty, {}) for d, (penalty, _) in zip(data, penalties)]
         # The way up to a corner is smooth; the way from it starts with the fastest relaxation, which a spline
         # blunts.
         ends = [np.zeros(values[0].shape[1:])]
@@ -223,11 +223,11 @@ class SmoothCurve:
         pinned = []
         for k, (d, clock, (_, penalty)) in enumerate(zip(data, self._clocks, penalties)):
             own = {0.0: ends[k], clock.end_s - clock.start_s: ends[k + 1]}
-            pinned.append(_spline(*d, penalty, own))
+            pinned.append(_fit_spline(*d, penalty, own))
         return [spline for spline, _ in pinned], [(f, p) for (_, f), (_, p) in zip(free, pinned)]
 
 
-def _spline(
+def _fit_spline(
     time: Array, values: Array, weight: Array, penalty: float | None, pinned: dict[float, Array]
 ) -> tuple[BSpline, float]:
     """A smoothing spline of values (n, ...) and its penalty; cross-validation chooses it where it is None."""
@@ -242,10 +242,10 @@ def _spline(
     except ValueError:
         what = "cross-validation finds no smoothing for so short or so rough a record"
         raise TraceError(what, remedy="give traces.smoothing in the study") from None
-    return spline, _penalty(spline, x, y, w) if penalty is None else penalty
+    return spline, _compute_penalty(spline, x, y, w) if penalty is None else penalty
 
 
-def _penalty(spline: BSpline, x: Array, y: Array, w: Array) -> float:
+def _compute_penalty(spline: BSpline, x: Array, y: Array, w: Array) -> float:
     """The penalty of a smoothing spline: what makes its misfit and its roughness stationary along itself."""
     bend = spline.derivative(2)(x)
     rough = float(np.sum(np.diff(x) * (bend[1:] ** 2 + bend[1:] * bend[:-1] + bend[:-1] ** 2))) / 3.0

@@ -29,13 +29,13 @@ class Scatter:
         return self.sd_N * float(np.sqrt(longer)) / samples
 
 
-def scatter_of(*parts: Array) -> Scatter:
+def estimate_scatter(*parts: Array) -> Scatter:
     """The noise of forces on a smooth curve, in parts (n,) that are smooth each, evenly sampled.
 
     A curve takes some of the noise with it, the slow part above all: as many degrees of freedom as it has
     are given back, for the correlation as well (Bartlett's bias of an estimated autocorrelation).
     """
-    residuals = [_residual(part) for part in parts if len(part) > 2 * _LEAST_PER_PIECE]
+    residuals = [_compute_residual(part) for part in parts if len(part) > 2 * _LEAST_PER_PIECE]
     if not residuals:
         residuals = [(np.diff(np.concatenate(parts), 2) / np.sqrt(6.0), 0)]
     left, taken = np.concatenate([r for r, _ in residuals]), sum(k for _, k in residuals)
@@ -47,7 +47,7 @@ def scatter_of(*parts: Array) -> Scatter:
     return Scatter(float(np.sqrt(innovation / (1.0 - lag**2))), lag)
 
 
-def _residual(force: Array) -> tuple[Array, int]:
+def _compute_residual(force: Array) -> tuple[Array, int]:
     """What a cubic spline leaves of a force (n,), and how many coefficients it has."""
     n = len(force)
     pieces = int(np.clip(n // _LEAST_PER_PIECE, 1, _PIECES))

@@ -35,7 +35,7 @@ class SurfaceMotion:
     def of_rows(cls, time_s: Array, place_mm: Array, moved_mm: Array) -> SurfaceMotion:
         """From rows (r, ...), one for each point at each time; rows of one place are of one point."""
         frames, frame = np.unique(time_s, return_inverse=True)
-        points, point = _points_of(place_mm)
+        points, point = _find_points(place_mm)
         whole = np.full((len(frames), len(points), 3), np.nan)
         whole[frame, point] = moved_mm
         return cls(points, frames, whole)
@@ -146,7 +146,7 @@ def _check_sizes(file: Path, place: Array, moved: Array, given: str) -> None:
         )
 
 
-def _points_of(place: Array) -> tuple[Array, NDArray[np.int64]]:
+def _find_points(place: Array) -> tuple[Array, NDArray[np.int64]]:
     """The places (k, 3) of rows (r, 3), each once, and which (r,) each row has."""
     whole = np.round(place / _SAME_MM).astype(np.int64)
     _, first, point = np.unique(whole, axis=0, return_index=True, return_inverse=True)
@@ -155,7 +155,7 @@ def _points_of(place: Array) -> tuple[Array, NDArray[np.int64]]:
 
 def _check_once(file: Path, time_name: str, time: Array, place: Array) -> None:
     """Whether no point has two rows at one time."""
-    rows = np.column_stack([time, _points_of(place)[1]])
+    rows = np.column_stack([time, _find_points(place)[1]])
     _, once = np.unique(rows, axis=0, return_index=True)
     if len(once) < len(rows):
         again = int(np.setdiff1d(np.arange(len(rows)), once)[0])
@@ -168,7 +168,7 @@ def _check_once(file: Path, time_name: str, time: Array, place: Array) -> None:
         )
 
 
-def in_contact(
+def select_frames_in_contact(
     motion: SurfaceMotion, record_s: tuple[float, float], touch_down_s: float, end_s: float
 ) -> SurfaceMotion:
     """The frames between touch-down and ``end_s``, counted from touch-down.

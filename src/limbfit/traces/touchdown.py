@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import TraceError
-from .displacement import BrokenLine, broken_line
-from .numerics import Array, bins, split_at_gaps
+from .displacement import BrokenLine, fit_broken_line
+from .numerics import Array, average_in_bins, split_at_gaps
 from .onset import OnsetPart, find_onset
 from .record import MIN_SAMPLES, Trace
-from .scatter import Scatter, scatter_of
+from .scatter import Scatter, estimate_scatter
 
 
 @dataclass(frozen=True)
@@ -55,16 +55,16 @@ def find_touch_down(trace: Trace, line: BrokenLine | None = None) -> TouchDown:
     TraceError
         Where the force does not rise on the way in.
     """
-    return _from_onset(trace, line or broken_line(trace.time_s, trace.displacement_mm))
+    return _from_onset(trace, line or fit_broken_line(trace.time_s, trace.displacement_mm))
 
 
 def _from_onset(trace: Trace, line: BrokenLine) -> TouchDown:
-    time, travel, force = _way_in(trace, line)
+    time, travel, force = _select_way_in(trace, line)
     moving = int(np.searchsorted(time, line.start_s))
-    scatter = scatter_of(*split_at_gaps(time, force))
-    part = _part(time, travel, force, moving, scatter)
+    scatter = estimate_scatter(*split_at_gaps(time, force))
+    part = _select_low_force_part(time, travel, force, moving, scatter)
     rough = find_onset(part, scatter)
-    scatter, part = _near(rough.place_mm, time, travel, force, moving)
+    scatter, part = _estimate_near(rough.place_mm, time, travel, force, moving)
     onset = find_onset(part, scatter, rough)
     return TouchDown(
         time_s=float(np.interp(onset.place_mm, np.maximum.accumulate(travel), time)),
@@ -78,28 +78,28 @@ def _from_onset(trace: Trace, line: BrokenLine) -> TouchDown:
     )
 
 
-def deviation_before(trace: Trace, line: BrokenLine, touch: TouchDown) -> float:
+def compute_deviation_before(trace: Trace, line: BrokenLine, touch: TouchDown) -> float:
     """How far off (mm, root mean square) a touch-down is that may lie before the start of the record, with a
     sensor that was zeroed in contact."""
-    time, travel, force = _way_in(trace, line)
+    time, travel, force = _select_way_in(trace, line)
     moving = int(np.searchsorted(time, line.start_s))
-    scatter, part = _near(touch.displacement_mm, time, travel, force, moving)
+    scatter, part = _estimate_near(touch.displacement_mm, time, travel, force, moving)
     before = min(_BEFORE_SHARE * float(travel[-1] - travel[0]), _BEFORE_MM)
     onset = find_onset(part, scatter, before_mm=before)
     return float(np.hypot(onset.sd, onset.place_mm - touch.displacement_mm))
 
 
-def _near(
+def _estimate_near(
     place_mm: float, time: Array, travel: Array, force: Array, moving: int
 ) -> tuple[Scatter, OnsetPart]:
     """The noise on either side of a touch-down, as the kink in between is none, and the part to look at."""
     met = int(np.searchsorted(travel, place_mm))
     parts = (split_at_gaps(time[side], force[side]) for side in (slice(met), slice(met, None)))
-    scatter = scatter_of(*(part for side in parts for part in side))
-    return scatter, _part(time, travel, force, moving, scatter)
+    scatter = estimate_scatter(*(part for side in parts for part in side))
+    return scatter, _select_low_force_part(time, travel, force, moving, scatter)
 
 
-def _way_in(trace: Trace, line: BrokenLine) -> tuple[Array, Array, Array]:
+def _select_way_in(trace: Trace, line: BrokenLine) -> tuple[Array, Array, Array]:
     """Time, travel and force of the first way in.
 
     Counting travel along the fitted line keeps the noise of the displacement sensor out of the abscissa.
@@ -108,9 +108,11 @@ def _way_in(trace: Trace, line: BrokenLine) -> tuple[Array, Array, Array]:
     return trace.time_s[load], line(trace.time_s[load]), trace.force_N[load]
 
 
-def _part(time: Array, travel: Array, force: Array, moving: int, scatter: Scatter) -> OnsetPart:
+def _select_low_force_part(
+    time: Array, travel: Array, force: Array, moving: int, scatter: Scatter
+) -> OnsetPart:
     """The low-force part of a way in, as means."""
-    at, smooth, _ = bins(np.arange(len(force), dtype=float), force, _BINS)
+    at, smooth, _ = average_in_bins(np.arange(len(force), dtype=float), force, _BINS)
     base = float(np.median(force[: max(moving, len(force) // 50, 1)]))
     rise = float(smooth.max()) - base
     if rise <= 0.1 * float(np.ptp(smooth)):
@@ -134,7 +136,7 @@ def touch_down_at(trace: Trace, time_s: float) -> TouchDown:
     TraceError
         Where the time does not lie on the way in, or the force does not rise on it.
     """
-    line = broken_line(trace.time_s, trace.displacement_mm)
+    line = fit_broken_line(trace.time_s, trace.displacement_mm)
     first, last = float(trace.time_s[0]), line.peak_s
     if not first <= time_s < last:
         raise TraceError(
@@ -145,9 +147,9 @@ def touch_down_at(trace: Trace, time_s: float) -> TouchDown:
     return replace(_from_onset(trace, line), time_s=time_s, displacement_mm=float(line(np.array(time_s))))
 
 
-def depth_at(trace: Trace, line: BrokenLine, touch: TouchDown, force_N: float) -> float:
+def find_depth_at(trace: Trace, line: BrokenLine, touch: TouchDown, force_N: float) -> float:
     """How deep the indenter is when the force first reaches so much, mm."""
     way = (trace.time_s >= touch.time_s) & (trace.time_s <= line.peak_s)
-    time, force, _ = bins(trace.time_s[way], trace.force_N[way] - touch.baseline_N, _BINS)
+    time, force, _ = average_in_bins(trace.time_s[way], trace.force_N[way] - touch.baseline_N, _BINS)
     first = int(np.argmax(force >= min(force_N, float(force.max()))))
     return max(float(line(time[first])) - touch.displacement_mm, touch.uncertainty_mm)

@@ -15,23 +15,23 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from ..errors import TraceError
-from .displacement import BrokenLine, broken_line
+from .displacement import BrokenLine, fit_broken_line
 from .faults import (
+    find_coarse_steps,
     find_frozen,
+    find_frozen_force,
     find_gaps,
+    find_gaps_without_force,
+    find_saturation,
     find_steps,
-    frozen_remarks,
-    gap_remarks,
     mend_times,
-    resolution_remarks,
-    saturation_remarks,
     step_remarks,
 )
-from .numerics import Array, Bools, bins, noise_level, resolution, runs
-from .passivity import lag_remarks, swing_remarks
+from .numerics import Array, Bools, average_in_bins, estimate_noise_level, find_resolution, find_runs
+from .passivity import find_lag, find_swings
 from .record import Remark, Trace
-from .scatter import scatter_of
-from .touchdown import TouchDown, depth_at, deviation_before, find_touch_down, touch_down_at
+from .scatter import estimate_scatter
+from .touchdown import TouchDown, compute_deviation_before, find_depth_at, find_touch_down, touch_down_at
 
 _SPIKE_WIDTH = 2  # samples; what lasts longer may have happened
 _SPIKE_NOISE = 8.0  # standard deviations
@@ -61,7 +61,7 @@ _BINS = 200
 
 
 @dataclass(frozen=True)
-class Understood:
+class InterpretedRecord:
     """A record as it is used, where its skin is met, and what to know about it."""
 
     trace: Trace
@@ -69,7 +69,9 @@ class Understood:
     remarks: tuple[Remark, ...]
 
 
-def understand(trace: Trace, touch_down_s: float | None = None, *, forced: bool = False) -> Understood:
+def interpret_record(
+    trace: Trace, touch_down_s: float | None = None, *, forced: bool = False
+) -> InterpretedRecord:
     """Mend a record and find its touch-down, unless ``touch_down_s`` states it.
 
     Parameters
@@ -83,35 +85,35 @@ def understand(trace: Trace, touch_down_s: float | None = None, *, forced: bool 
         more than 30 % of the peak, or as `find_touch_down` and `touch_down_at` do.
     """
     trace, doubled = mend_times(trace)
-    trace, spikes = _without_spikes(trace)
-    line = broken_line(trace.time_s, trace.displacement_mm)
+    trace, spikes = _remove_spikes(trace)
+    line = fit_broken_line(trace.time_s, trace.displacement_mm)
     _check_start(trace, line)
-    rise, gaps = _rise(trace), find_gaps(trace, line)
+    rise, gaps = _compute_rise(trace), find_gaps(trace, line)
     frozen = [] if forced else find_frozen(trace, line, rise)
     lost = gaps + [(float(trace.time_s[run.start]), float(trace.time_s[run.stop - 1])) for run in frozen]
     steps = [] if forced else find_steps(trace, line, rise, lost)
-    level = _without_steps(trace, steps) if steps else _level_ends(trace, line)
+    level = _remove_steps(trace, steps) if steps else _level_ends(trace, line)
     touch = _touch_down(level, line, touch_down_s, forced)
-    straight, drift = (trace, []) if steps else _without_drift(trace, level, line, touch)
+    straight, drift = (trace, []) if steps else _remove_drift(trace, level, line, touch)
     if straight is not level and not steps:
         touch = _touch_down(straight, line, touch_down_s, forced)
     remarks = [
         *doubled,
         *spikes,
-        *resolution_remarks(trace, line, touch, rise),
-        *gap_remarks(gaps, line, touch.time_s),
-        *frozen_remarks(trace, frozen, line, touch.time_s),
+        *find_coarse_steps(trace, line, touch, rise),
+        *find_gaps_without_force(gaps, line, touch.time_s),
+        *find_frozen_force(trace, frozen, line, touch.time_s),
         *step_remarks(steps),
         *drift,
-        *([] if forced else _against_passive(straight, line, touch, rise, lost, steps)),
+        *([] if forced else _find_impassive_force(straight, line, touch, rise, lost, steps)),
         *([] if touch_down_s is not None else _start_remark(straight, line, touch, forced)),
     ]
     added = [remark.evidence.get("adds_sd_mm", 0.0) for remark in remarks]
     wide = float(np.linalg.norm([touch.uncertainty_mm, *added]))
-    return Understood(straight, replace(touch, uncertainty_mm=wide), tuple(remarks))
+    return InterpretedRecord(straight, replace(touch, uncertainty_mm=wide), tuple(remarks))
 
 
-def _against_passive(
+def _find_impassive_force(
     trace: Trace,
     line: BrokenLine,
     touch: TouchDown,
@@ -120,14 +122,14 @@ def _against_passive(
     steps: list[tuple[float, float]],
 ) -> list[Remark]:
     """Remarks on a force that no passive tissue gives, each looked for where no other explains it."""
-    at_top = saturation_remarks(trace, line, rise_N, lost)
+    at_top = find_saturation(trace, line, rise_N, lost)
     if at_top:
         return at_top
     way_in = (trace.time_s <= line.peak_s) & (trace.time_s >= touch.time_s)
-    scatter = scatter_of(trace.force_N[trace.time_s < touch.time_s], trace.force_N[way_in])
-    swing = [] if lost else swing_remarks(trace, line, touch, scatter, rise_N, [at for at, _ in steps])
+    scatter = estimate_scatter(trace.force_N[trace.time_s < touch.time_s], trace.force_N[way_in])
+    swing = [] if lost else find_swings(trace, line, touch, scatter, rise_N, [at for at, _ in steps])
     odd = [*lost, *((at, at) for at, _ in steps)]
-    return [*swing, *lag_remarks(trace, line, touch, scatter, odd)]
+    return [*swing, *find_lag(trace, line, touch, scatter, odd)]
 
 
 def _touch_down(trace: Trace, line: BrokenLine, stated_s: float | None, forced: bool) -> TouchDown:
@@ -140,11 +142,11 @@ def _touch_down(trace: Trace, line: BrokenLine, stated_s: float | None, forced: 
     return find_touch_down(Trace(trace.time_s[:most], trace.displacement_mm[:most], trace.force_N[:most]))
 
 
-def _without_spikes(trace: Trace) -> tuple[Trace, list[Remark]]:
+def _remove_spikes(trace: Trace) -> tuple[Trace, list[Remark]]:
     remarks = []
     for column, quantity, unit in (("force_N", "force", "N"), ("displacement_mm", "displacement", "mm")):
         values: Array = getattr(trace, column)
-        spikes = _spikes(values)
+        spikes = _find_spikes(values)
         count = int(spikes.sum())
         if not count:
             continue
@@ -168,23 +170,23 @@ def _without_spikes(trace: Trace) -> tuple[Trace, list[Remark]]:
     return trace, remarks
 
 
-def _spikes(values: Array) -> Bools:
+def _find_spikes(values: Array) -> Bools:
     """Which samples (n,) stick out from the median of their neighbours, one or two in a row."""
     off = values - median_filter(values, 2 * _SPIKE_WIDTH + 1, mode="nearest")
-    noise = max(1.4826 * float(np.median(np.abs(off))), noise_level(values))
+    noise = max(1.4826 * float(np.median(np.abs(off))), estimate_noise_level(values))
     share = _SPIKE_SHARE * float(np.ptp(np.percentile(values, [1, 99])))
-    out = np.abs(off) > max(_SPIKE_NOISE * noise, share, _SPIKE_RESOLUTION * resolution(values))
+    out = np.abs(off) > max(_SPIKE_NOISE * noise, share, _SPIKE_RESOLUTION * find_resolution(values))
     steps = np.abs(np.diff(values))
     for i in np.flatnonzero(out):
         before, after = steps[max(i - 1 - _AROUND, 0) : max(i - 1, 0)], steps[i + 2 : i + 2 + _AROUND]
         out[i] = abs(off[i]) > _SPIKE_STEPS * np.median(np.r_[before, after])
-    for start, end in runs(out):
+    for start, end in find_runs(out):
         if end - start > _SPIKE_WIDTH:
             out[start:end] = False
     return np.asarray(out, dtype=bool)
 
 
-def _without_steps(trace: Trace, steps: list[tuple[float, float]]) -> Trace:
+def _remove_steps(trace: Trace, steps: list[tuple[float, float]]) -> Trace:
     """The record without the jumps of its force: the onset is seen in it, whichever side of one is right."""
     force = trace.force_N.copy()
     for at, size in steps:
@@ -194,7 +196,7 @@ def _without_steps(trace: Trace, steps: list[tuple[float, float]]) -> Trace:
     return replace(trace, force_N=force)
 
 
-def _ends(trace: Trace, line: BrokenLine) -> tuple[Bools, Bools]:
+def _find_ends(trace: Trace, line: BrokenLine) -> tuple[Bools, Bools]:
     """Samples (n,) before the way in and after the last way out, with the indenter where it began."""
     back = line(trace.time_s) < line.values[0] + _CLEAR_MM
     return back & (trace.time_s < line.peak_s), back & (trace.time_s > _release_s(line))
@@ -205,11 +207,11 @@ def _level_ends(trace: Trace, line: BrokenLine) -> Trace:
 
     Only there a drift shows before the touch-down is known: near the skin it looks like an onset.
     """
-    before, after = _ends(trace, line)
+    before, after = _find_ends(trace, line)
     if min(before.sum(), after.sum()) < _LEAST_CLEAR:
         return trace
     change = float(np.median(trace.force_N[after]) - np.median(trace.force_N[before]))
-    if abs(change) < _DRIFT_SHARE * _rise(trace):
+    if abs(change) < _DRIFT_SHARE * _compute_rise(trace):
         return trace
     slope = change / float(trace.time_s[after].mean() - trace.time_s[before].mean())
     return replace(trace, force_N=trace.force_N - slope * (trace.time_s - trace.time_s[0]))
@@ -226,7 +228,7 @@ def _clear(trace: Trace, line: BrokenLine, touch: TouchDown) -> Bools:
     return np.asarray(line(trace.time_s) < touch.displacement_mm - margin)
 
 
-def _without_drift(
+def _remove_drift(
     trace: Trace, level: Trace, line: BrokenLine, touch: TouchDown
 ) -> tuple[Trace, list[Remark]]:
     """The record without its drift: a straight line, or what warms up where a straight one is not it."""
@@ -235,16 +237,16 @@ def _without_drift(
     if level is not trace and not (
         touch.in_contact_at_start and fallen
     ):  # that shows what it was zeroed under
-        clear |= np.logical_or(*_ends(trace, line))
+        clear |= np.logical_or(*_find_ends(trace, line))
     if clear.sum() < _LEAST_CLEAR:
         return trace, []
     time, force = trace.time_s[clear], trace.force_N[clear]
-    slope, residual = _straight(time, force)
-    scatter = scatter_of(*np.split(residual, np.flatnonzero(np.diff(np.flatnonzero(clear)) > 1) + 1))
+    slope, residual = _fit_line(time, force)
+    scatter = estimate_scatter(*np.split(residual, np.flatnonzero(np.diff(np.flatnonzero(clear)) > 1) + 1))
     spread = float(np.sqrt(np.sum((time - time.mean()) ** 2)))
     noise = scatter.sd_N * float(np.sqrt((1 + scatter.lag) / (1 - scatter.lag)))
     sd = noise / spread
-    peak = _rise(trace)
+    peak = _compute_rise(trace)
     total = slope * float(np.ptp(trace.time_s))
     if abs(slope) < _DRIFT_SD * sd or abs(total) < _DRIFT_SHARE * peak:
         return trace, []
@@ -256,7 +258,7 @@ def _without_drift(
             remedy="let the sensor warm up, zero it, and record again",
         )
     numbers = {"drift_N_per_s": slope, "drift_sd_N_per_s": sd, "drift_N": total}
-    shapes, misfits = _drifts(time, force, trace.time_s)
+    shapes, misfits = _fit_drifts(time, force, trace.time_s)
     excess = (misfits - misfits.min()) / noise**2
     weights = np.exp(-0.5 * excess) / np.exp(-0.5 * excess).sum()
     drift = shapes[0]
@@ -265,13 +267,13 @@ def _without_drift(
         first, last = np.diff(drift)[[0, -1]] / np.diff(trace.time_s)[[0, -1]]
         what += f", and not along a straight line ({first:+.2g} N/s at its start, {last:+.2g} at its end)"
         numbers |= {"drift_start_N_per_s": float(first), "drift_end_N_per_s": float(last)}
-    numbers["adds_sd_mm"] = _drift_sd(trace, line, touch, shapes - drift, weights)
+    numbers["adds_sd_mm"] = _compute_drift_sd(trace, line, touch, shapes - drift, weights)
     straight = replace(trace, force_N=trace.force_N - (drift - drift[0]))
     remedy = "let the sensor warm up before recording"
     return straight, [Remark("drift", what + "; taken off", "a sensor that warms up", remedy, numbers)]
 
 
-def _drifts(time: Array, force: Array, at: Array) -> tuple[Array, Array]:
+def _fit_drifts(time: Array, force: Array, at: Array) -> tuple[Array, Array]:
     """A straight drift and those that fade with `_WARMING` of the record, at times (n,) s: forces (k, n) that
     fit what is clear of the skin, and their squared misfits (k,)."""
     shapes, misfits = [], []
@@ -288,7 +290,9 @@ def _drifts(time: Array, force: Array, at: Array) -> tuple[Array, Array]:
     return np.array(shapes), np.array(misfits)
 
 
-def _drift_sd(trace: Trace, line: BrokenLine, touch: TouchDown, others: Array, weights: Array) -> float:
+def _compute_drift_sd(
+    trace: Trace, line: BrokenLine, touch: TouchDown, others: Array, weights: Array
+) -> float:
     """What drifts of other shapes (k, n), as likely as their weights (k,), make of the touch-down, mm.
 
     By the force that they leave at the onset from its level before: where that is reached.
@@ -297,30 +301,30 @@ def _drift_sd(trace: Trace, line: BrokenLine, touch: TouchDown, others: Array, w
     deep = min(int(np.searchsorted(trace.time_s, touch.time_s + _ONSET_S)), len(trace.time_s) - 1)
     change = others[:, deep] - others[:, : met + 1].mean(axis=1)
     rms = float(np.sqrt(weights @ change**2))
-    return max(depth_at(trace, line, touch, rms) - touch.uncertainty_mm, 0.0)
+    return max(find_depth_at(trace, line, touch, rms) - touch.uncertainty_mm, 0.0)
 
 
-def _straight(time: Array, force: Array) -> tuple[float, Array]:
+def _fit_line(time: Array, force: Array) -> tuple[float, Array]:
     """Slope of the straight line through (time, force), and what it leaves."""
     level, slope = np.polynomial.polynomial.polyfit(time - time[0], force, 1)
     return float(slope), force - level - slope * (time - time[0])
 
 
-def _rise(trace: Trace) -> float:
-    _, force, _ = bins(trace.time_s, trace.force_N, _BINS)
+def _compute_rise(trace: Trace) -> float:
+    _, force, _ = average_in_bins(trace.time_s, trace.force_N, _BINS)
     return float(np.ptp(force))
 
 
 def _check_start(trace: Trace, line: BrokenLine) -> None:
     """Refuse a record whose force is there from the first sample on, and rises at once."""
-    _, force, count = bins(trace.time_s, trace.force_N, _BINS)
+    _, force, count = average_in_bins(trace.time_s, trace.force_N, _BINS)
     peak, first, least = float(force.max()), float(force[0]), float(force.min())
     # Once released, the sensor says what its zero is; else it is taken to be zeroed.
     released = np.isfinite(_release_s(line))
-    noise = noise_level(trace.force_N)
+    noise = estimate_noise_level(trace.force_N)
     by_chance = _BY_CHANCE * noise / float(np.sqrt(count.min()))
     preload = max(first, first - least if released else 0.0) - by_chance
-    if preload < _PRELOAD_SHARE * peak or not _rises_at_once(trace, line, noise):
+    if preload < _PRELOAD_SHARE * peak or not _is_rising_at_once(trace, line, noise):
         return
     zeroed = f", and {least:.3g} N when it is released" if released else ""
     raise TraceError(
@@ -330,7 +334,7 @@ def _check_start(trace: Trace, line: BrokenLine) -> None:
     )
 
 
-def _rises_at_once(trace: Trace, line: BrokenLine, noise: float) -> bool:
+def _is_rising_at_once(trace: Trace, line: BrokenLine, noise: float) -> bool:
     """Whether the force rises over the first bit of travel about as it does on the whole way in.
 
     The bit is longer where ``noise`` (N, of a sample) would hide that.
@@ -359,14 +363,14 @@ def _start_remark(trace: Trace, line: BrokenLine, touch: TouchDown, forced: bool
         f"{touch.uncertainty_mm:.2f} mm: the touch-down rests on a sensor that was zero at the start"
     )
     numbers = {"touch_down_mm": touch.displacement_mm, "touch_down_sd_mm": touch.uncertainty_mm}
-    _, force, count = bins(trace.time_s, trace.force_N, _BINS)
+    _, force, count = average_in_bins(trace.time_s, trace.force_N, _BINS)
     preload = touch.baseline_N - float(force.min())
-    by_chance = _BY_CHANCE * noise_level(trace.force_N) / float(np.sqrt(count.min()))
-    pressed = preload > max(by_chance, _DRIFT_SHARE * _rise(trace))
+    by_chance = _BY_CHANCE * estimate_noise_level(trace.force_N) / float(np.sqrt(count.min()))
+    pressed = preload > max(by_chance, _DRIFT_SHARE * _compute_rise(trace))
     if pressed:
         what += f"; drawn back it shows {preload:.2g} N less, as if it had been zeroed in contact"
         numbers["preload_N"] = preload
     if not forced and (pressed or line.values[-1] > line.values[0] - _CLEAR_MM):
-        numbers["adds_sd_mm"] = deviation_before(trace, line, touch)
+        numbers["adds_sd_mm"] = compute_deviation_before(trace, line, touch)
     cause = "a record that starts on the skin"
     return [Remark("start", what, cause, "start some tenths of a millimetre clear of it", numbers)]

@@ -24,7 +24,7 @@ from limbfit.pipeline.stages.predict import run_predict
 from limbfit.report.drawing.figures import draw_layer_figure
 from limbfit.report.store import load_store
 from limbfit.study import SolverTable, Study
-from limbfit.traces import Layers, read_layers, thinnings
+from limbfit.traces import Layers, compute_thinnings, read_layers
 
 DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -100,7 +100,7 @@ def test_readings_become_compressions_with_their_noise(tmp_path: Path) -> None:
     true = np.interp(time, [1.0, 5.0, 9.0], [0.0, 2.0, 0.0])
     rows = np.column_stack([time, 20.0 - true + rng.normal(0.0, 0.1, time.size), 2.0 + 0.0 * time])
     layers = read_layers(table(tmp_path, "time_s,muscle_mm,skin_mm", rows), "time_s")
-    muscle, skin = thinnings(layers, 1.0, 9.0, 0.1)
+    muscle, skin = compute_thinnings(layers, 1.0, 9.0, 0.1)
     assert (muscle.tissue, skin.tissue) == ("muscle", "skin")
     assert muscle.is_seen
     assert not skin.is_seen
@@ -129,9 +129,9 @@ def test_what_is_wrong_with_a_file_is_told(tmp_path: Path, head: str, rows: list
 def test_readings_must_begin_before_and_last_into_contact() -> None:
     layers = Layers(np.linspace(2.0, 3.0, 20), {"fat": np.full(20, 5.0)})
     with pytest.raises(TraceError, match="no reading before touch-down"):
-        thinnings(layers, 1.0, 9.0, 0.1)
+        compute_thinnings(layers, 1.0, 9.0, 0.1)
     with pytest.raises(TraceError, match="only 1 readings in contact"):
-        thinnings(layers, 2.98, 9.0, 0.1)
+        compute_thinnings(layers, 2.98, 9.0, 0.1)
 
 
 def write_seen(study: Study, model: SiteModel, found: Simulation, made: Made) -> None:

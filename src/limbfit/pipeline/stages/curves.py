@@ -22,15 +22,15 @@ from ...traces import (
     Trace,
     WaveMeans,
     WaveSpeeds,
-    in_contact,
+    compute_thinnings,
+    interpret_record,
     read_layers,
     read_surface_motion,
     read_trace,
     read_wave_speeds,
     regularise,
     regularise_creep,
-    thinnings,
-    understand,
+    select_frames_in_contact,
 )
 from ..shared.artefacts import write_curves, write_json
 from ..shared.context import Context
@@ -56,7 +56,7 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, dict[
     file = study.path(record.trace)
     trace = read_trace(file, (table.time_s, table.displacement_mm, table.force_N))
     try:
-        known = understand(trace, record.touch_down_s, forced=record.forced)
+        known = interpret_record(trace, record.touch_down_s, forced=record.forced)
         trace, touch = known.trace, known.touch_down
         made = regularise_creep if record.forced else regularise
         smooth = made(trace, touch, table.smoothing, record.peak_s)
@@ -155,7 +155,7 @@ def read_observed(
         whole = read_surface_motion(file, study.traces.time_s)
         times = float(trace.time_s[0]), float(trace.time_s[-1])
         try:
-            found = found._replace(motion=in_contact(whole, times, touch_down_s, end_s))
+            found = found._replace(motion=select_frames_in_contact(whole, times, touch_down_s, end_s))
         except TraceError as error:
             raise TraceError(error.what, file=file, place=study.traces.time_s, remedy=error.remedy) from None
     return found
@@ -192,7 +192,7 @@ def _read_thinnings(study: Study, record: Record, touch_down_s: float, end_s: fl
     file = study.path(record.ultrasound)
     try:
         layers = read_layers(file, study.traces.time_s)
-        found = thinnings(layers, touch_down_s, end_s, record.ultrasound_sd_mm)
+        found = compute_thinnings(layers, touch_down_s, end_s, record.ultrasound_sd_mm)
     except TraceError as error:
         raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
     _check_tissues(study, file, "mm", [one.tissue for one in found])
