@@ -54,8 +54,8 @@ def spoiled(monkeypatch: pytest.MonkeyPatch, spoil) -> None:
         mesh, stack = extrude_layers(core, fields, regions)
         return spoil(mesh, stack), stack
 
-    monkeypatch.setattr(meshing, "with_layers", layers)
-    monkeypatch.setattr(meshing, "polished", lambda mesh, fields, stack: mesh)
+    monkeypatch.setattr(meshing, "extrude_layers", layers)
+    monkeypatch.setattr(meshing, "smooth_elements", lambda mesh, fields, stack: mesh)
 
 
 def through(mesh, node: int):
@@ -148,7 +148,7 @@ def test_a_sound_mesh_is_left_alone(monkeypatch, anatomy, site):
         kept.append(np.array_equal(after.points, mesh.points) and not find_inverted_cells(mesh).any())
         return after, repairs
 
-    monkeypatch.setattr(meshing, "repaired", watched)
+    monkeypatch.setattr(meshing, "repair_mesh", watched)
     _, report = mesh_site(anatomy, *site, COARSE)
     assert kept == [True]
     assert report.repairs == ()
