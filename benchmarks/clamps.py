@@ -19,8 +19,8 @@ import numpy as np
 
 from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
 from limbfit.fe import History, Indenter, Problem, StepControl, solve
-from limbfit.indentation import materials
-from limbfit.indentation.clamps import clamped
+from limbfit.indentation import build_materials
+from limbfit.indentation.clamps import clamp_problem
 from limbfit.mesh import Mesh
 from limbfit.phantom import TrueSite, build_true_sites, draw_true_parameters, make_limb
 from limbfit.phantom.surfaces import build_true_anatomy
@@ -40,7 +40,7 @@ def site_problem(site: TrueSite, mesh: Mesh) -> Problem:
     ramp = site.depth / site.speed
     return Problem(
         mesh=mesh,
-        materials=materials(draw_true_parameters(SEED), KAPPA_RATIO),
+        materials=build_materials(draw_true_parameters(SEED), KAPPA_RATIO),
         fixed=mesh.held,
         contact_faces=faces[near < 0.71 * INDENTER_MM + site.depth + 8.0],
         indenter=tool,
@@ -57,7 +57,7 @@ def compare(site: TrueSite, mesh: Mesh, along: Any, force: float) -> dict[str, A
     table = ClampsTable(force_N=force)
     begun = table.begun_s
     later = replace(problem, history=problem.history.later(begun), touch_down_s=begun)
-    found = solve(clamped(later, along, table), control)
+    found = solve(clamp_problem(later, along, table), control)
     for result in (bare, found):
         if not result.completed:
             raise SystemExit(f"site {site.name}: {result.reason}")

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_site
 from limbfit.anatomy.surfaces.surfaces import Anatomy, read_surface
-from limbfit.bench.measuring import max_rss_MB, warm_up
+from limbfit.bench.measuring import measure_max_rss_MB, warm_up
 from limbfit.bench.reference import find_reference
 from limbfit.fe import ELEMENTS, Problem, StepControl, solve
 from limbfit.indentation import SiteModel, build_problem
@@ -193,7 +193,7 @@ def simulate(run: Run, study: Path, file: Path) -> dict[str, Any]:
         "penetration_mm": float(result.penetration.max()),
         "cpu_seconds": seconds,
         "seconds": clock,
-        "max_rss_MB": max_rss_MB(),
+        "max_rss_MB": measure_max_rss_MB(),
         "completed": result.completed,
     }
 

@@ -34,7 +34,7 @@ from limbfit.fe import (
     Step,
     StepControl,
     System,
-    tractions,
+    compute_tractions,
 )
 from limbfit.fe import solve as simulate
 from limbfit.fe.kernel.laws import Laws
@@ -211,7 +211,7 @@ def pressures(problem: Problem, last: Step) -> dict[str, dict[str, float]]:
     the `AREAS`, by where it is at rest."""
     system = System(problem)
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    found = tractions(system, laws, last.state, 0)
+    found = compute_tractions(system, laws, last.state, 0)
     surface = system.bodies.all[0].surface
     rest, pressure, areas = (
         surface.points_at_rest.reshape(-1, 3),

@@ -28,7 +28,7 @@ from limbfit.anatomy.imaging import LabelMap, write_labels
 from limbfit.anatomy.sites.under import measure_tissue_under
 from limbfit.anatomy.surfaces.mending import build_closed_anatomy
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, write_surface
-from limbfit.bench.limbs import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, amputated_calf, random_sites
+from limbfit.bench.limbs import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, draw_random_sites, make_amputated_calf
 from limbfit.phantom.build import draw_true_parameters
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.labels import build_true_labels
@@ -82,7 +82,7 @@ def write_calf(folder: Path, source: Path) -> tuple[str, Anatomy]:
     shutil.copytree(source, folder / "mri")
     point, normal = (list(part) for part in CALF_PLANE)
     head = f'[image]\npath = "mri"\n\n[geometry]\namputation = {{ point = {point}, normal = {normal} }}\n'
-    return f"{head}amputation_pad_mm = {CALF_PAD_MM}\n", amputated_calf(source)
+    return f"{head}amputation_pad_mm = {CALF_PAD_MM}\n", make_amputated_calf(source)
 
 
 def plan_sites(anatomy: Anatomy) -> list[dict[str, Any]]:
@@ -96,7 +96,7 @@ def plan_sites(anatomy: Anatomy) -> list[dict[str, Any]]:
                 min(DEEPEST_MM, SHARE * measure_tissue_under(anatomy, position, axis, INDENTER_MM)), 2
             ),
         }
-        for i, (position, axis) in enumerate(random_sites(anatomy, SITES, SEED))
+        for i, (position, axis) in enumerate(draw_random_sites(anatomy, SITES, SEED))
     ]
 
 

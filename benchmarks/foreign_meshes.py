@@ -44,11 +44,11 @@ from limbfit.anatomy.surfaces.mending import build_closed_anatomy, open_loops
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, build_anatomy, find_bodies, read_surface
 from limbfit.anatomy.surfaces.thickness import measure_fat_depth
 from limbfit.anatomy.surfaces.triangles import from_pyvista
-from limbfit.bench.limbs import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, random_sites
-from limbfit.bench.meshing import cpu_seconds
+from limbfit.bench.limbs import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, draw_random_sites
+from limbfit.bench.meshing import measure_cpu_seconds
 from limbfit.errors import LimbfitError
 from limbfit.fe import solve
-from limbfit.indentation import SiteModel, build_problem, steps_of
+from limbfit.indentation import SiteModel, build_problem, build_steps
 from limbfit.mesh import Mesh, boundary_faces, quality
 from limbfit.pipeline.stages.mesh import coarse_settings, mesh_settings
 from limbfit.study import Study
@@ -154,7 +154,7 @@ def faults(mesh: Mesh, report: Any) -> list[str]:
 
 def site_row(limb: Limb, base: BaseMesh, settings: MeshSettings, site: tuple[Array, Array]) -> dict[str, Any]:
     """What became of one mesh; a failure says why."""
-    start = cpu_seconds()
+    start = measure_cpu_seconds()
     try:
         mesh, report = mesh_site(limb.anatomy, *site, settings, base)
     except LimbfitError as error:
@@ -169,7 +169,7 @@ def site_row(limb: Limb, base: BaseMesh, settings: MeshSettings, site: tuple[Arr
         "volume_error": report.volume_error,
         "layer_mm": report.layer_mean_mm,
         "repairs": [repair.text for repair in report.repairs],
-        "seconds": cpu_seconds() - start,
+        "seconds": measure_cpu_seconds() - start,
         "mesh": mesh,
     }
 
@@ -178,7 +178,7 @@ def simulated(
     mesh: Mesh, site: tuple[Array, Array], depth_mm: float, within_mm: float | None
 ) -> dict[str, Any]:
     """The indentation of a site by the default indenter and tissue, in and out."""
-    start, ramp = cpu_seconds(), depth_mm / SPEED_MM_S
+    start, ramp = measure_cpu_seconds(), depth_mm / SPEED_MM_S
     position, axis = (tuple(float(x) for x in part) for part in site)
     with tempfile.TemporaryDirectory() as folder:
         knots = (0.0, ramp, 2 * ramp), (0.0, depth_mm, 0.0)
@@ -194,20 +194,20 @@ def simulated(
         )
         tissue = {"c_kPa": 4.7, "m": 3.0, "gamma": 1.2, "tau_s": 2.0}
         problem = build_problem(model, mesh, dict.fromkeys(mesh.region_names, tissue))
-        result = solve(problem, steps_of(model), store="none")
+        result = solve(problem, build_steps(model), store="none")
     return {
         "completed": result.completed,
         "reason": result.reason,
         "peak_N": result.peak_force,
         "simulated_nodes": len(problem.mesh.points),
-        "solving_s": cpu_seconds() - start,
+        "solving_s": measure_cpu_seconds() - start,
         "doubts": [doubt.text for doubt in result.doubts],
     }
 
 
 def rows(limb: Limb, asked: argparse.Namespace, wanted: set[str]) -> Iterator[tuple[str, dict[str, Any]]]:
     """The wanted meshes of a limb, one after the other, by name."""
-    sites = random_sites(limb.anatomy, asked.sites, asked.seed)
+    sites = draw_random_sites(limb.anatomy, asked.sites, asked.seed)
     share = np.random.default_rng([asked.seed, 1]).uniform(0.1, 0.5, asked.sites)
     for kind, settings in settings_of(limb).items():
         names = [f"{limb.name}/{i}/{kind}" for i in range(asked.sites)]

@@ -17,7 +17,7 @@ from limbfit import load_study, run_study
 from limbfit.errors import LimbfitError
 from limbfit.execution import SerialExecutor, share_executor
 from limbfit.fe import solve
-from limbfit.indentation import Simulation, SimulationJob, build_problem, steps_of, to_parameters
+from limbfit.indentation import Simulation, SimulationJob, build_problem, build_steps, to_parameters
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.shared.artefacts import digest, read_curves
 from limbfit.pipeline.shared.simulations import job_digest
@@ -55,7 +55,7 @@ class Failing(SerialExecutor):
         parameters = to_parameters(np.array(job.parameters), job.tissues)
         problem = build_problem(model, read_vtu(model.mesh), parameters)
         for most in LIMITS:
-            steps = replace(steps_of(model), max_iterations=most, max_cuts=0)
+            steps = replace(build_steps(model), max_iterations=most, max_cuts=0)
             result = solve(problem, steps=steps, store="peak")
             if not result.completed:
                 break

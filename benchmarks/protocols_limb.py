@@ -29,10 +29,10 @@ from limbfit.fe import solve
 from limbfit.indentation import (
     SiteModel,
     build_problem,
-    observed,
-    points_around,
+    choose_points_around,
+    observe_result,
+    place_waves_under,
     read_indenter,
-    waves_under,
 )
 from limbfit.mesh import Mesh, find_gauges_along, read_vtu, write_vtu
 from limbfit.phantom.record import (
@@ -127,8 +127,8 @@ class Limb:
         gauges = find_gauges_along(mesh, np.array(position), np.array(axis))
         points, waves = np.zeros((0, 3)), ()
         if take.seen.surface or take.seen.shear_waves:
-            points = points_around(mesh, read_indenter(indenter, position, axis, None))
-            waves = waves_under(model, mesh)
+            points = choose_points_around(mesh, read_indenter(indenter, position, axis, None))
+            waves = place_waves_under(model, mesh)
         model = replace(model, layers=tuple(one.region for one in gauges), waves=waves)
         model = replace(model, skin_points=tuple(map(tuple, points)))
         steps = replace(TRUE_STEPS, load_steps=12, unload_steps=20)  # holds take those of unloading
@@ -137,7 +137,7 @@ class Limb:
         if not result.completed:
             raise SystemExit(f"the truth of {take.name} could not be simulated: {result.reason}")
         times = model.curve_times(2001)
-        values, _ = observed(result, model, times)
+        values, _ = observe_result(result, model, times)
         lost, moves, speeds = np.split(values, [len(gauges), len(values) - len(waves)])
         told = {f"compression_{one.region}": row for one, row in zip(gauges, lost)}
         told |= {f"thickness_{one.region}": np.array(one.thickness_mm) for one in gauges}

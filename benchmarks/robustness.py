@@ -33,7 +33,7 @@ from mapped_bodies import Array, Indices, slab
 from robustness_cases import ELEMENT, USUAL, Asked, draw, problem_of
 
 from limbfit.fe import History, Indenter, OgdenQLV, Problem, Result, solve
-from limbfit.fe.doubts import slipped
+from limbfit.fe.doubts import find_slip
 from limbfit.mesh import node_jacobians
 
 
@@ -64,7 +64,7 @@ def broken_laws(result: Result) -> list[str]:
         broken.append("force not finite")
     if force.min() < -1e-9 * max(force.max(), 1e-12):
         broken.append("negative force")
-    if not result.problem.history.forced and slipped(result.displacement, force):
+    if not result.problem.history.forced and find_slip(result.displacement, force):
         broken.append("force falls in loading")
     if force[-1] > 0.01 * force.max():
         broken.append("force after unloading")

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from runs_jobs import TISSUES, answer, bind, measured, nothing, stored_fields
 
-from limbfit.bench.blocks import DEPTH, INDENTATION, block_site, layered_block
+from limbfit.bench.blocks import DEPTH, INDENTATION, build_block_site, build_layered_block
 from limbfit.execution import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
 from limbfit.indentation import SimulationJob, SiteModel, simulate
 from limbfit.pipeline.shared.simulations import CURVE_POINTS, SimulationCache
@@ -38,10 +38,10 @@ SOFT, STIFF = (6.0, 5.0, 1.5, 0.6, 4.0, 4.0, 1.5, 0.6), (9.0, 6.0, 2.0, 0.5, 4.0
 
 def site(folder: Path, name: str, divisions: int) -> SiteModel:
     """A block as the mesh of a site; its lower face is fixed. In and out as the robot of the study does."""
-    block = layered_block("tet10", divisions)
+    block = build_layered_block("tet10", divisions)
     low = np.flatnonzero(block.points[:, 2] <= -DEPTH)
     mesh = replace(block, node_sets={"fixed_bottom": low})
-    return block_site(name, folder / f"{name}.vtu", mesh, INDENTATION, element=MeshTable().element)
+    return build_block_site(name, folder / f"{name}.vtu", mesh, INDENTATION, element=MeshTable().element)
 
 
 def job_of(model: SiteModel, parameters: tuple[float, ...], sensitivities: bool = True) -> SimulationJob:

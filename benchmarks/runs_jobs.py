@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from limbfit.bench.measuring import max_rss_MB
+from limbfit.bench.measuring import measure_max_rss_MB
 from limbfit.indentation import (
     Simulation,
     SimulationJob,
@@ -51,4 +51,4 @@ def measured(job: SimulationJob) -> tuple[Simulation, dict[str, float]]:
     made = simulate(job)
     after = resource.getrusage(resource.RUSAGE_SELF)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return made, {"cpu_s": cpu, "largest_memory_MB": max_rss_MB() * 1.048576}
+    return made, {"cpu_s": cpu, "largest_memory_MB": measure_max_rss_MB() * 1.048576}

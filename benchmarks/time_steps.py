@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from limbfit.bench.layer import curve_error, reference_layer, solve_layer
+from limbfit.bench.layer import compute_curve_error, solve_layer, solve_reference_layer
 from limbfit.fe import History, StepControl, solve
 from limbfit.indentation import SiteModel, build_problem
 from limbfit.mesh import read_vtu
@@ -45,10 +45,10 @@ def layer_rows() -> None:
     """The layer: elastic force with the square of the depth, relaxing by three times that, one Prony term."""
     print("| history | steps | number | " + " | ".join(f"tau {tau:g} s" for tau in TAUS) + " |")
     for name, history in HISTORIES.items():
-        exact = {tau: reference_layer(history, prony=((3.0, tau),)) for tau in TAUS}
+        exact = {tau: solve_reference_layer(history, prony=((3.0, tau),)) for tau in TAUS}
         for label, control in CONTROLS.items():
             found = {tau: solve_layer(history, control, ((3.0, tau),)) for tau in TAUS}
-            errors = ["{:.2f} / {:.2f}".format(*curve_error(found[tau], exact[tau])) for tau in TAUS]
+            errors = ["{:.2f} / {:.2f}".format(*compute_curve_error(found[tau], exact[tau])) for tau in TAUS]
             most = max(len(one.times) - 1 for one in found.values())
             print(f"| {name} | {label} | {most} | " + " | ".join(errors) + " |", flush=True)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from limbfit.anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from limbfit.anatomy.surfaces.triangles import Surface
-from limbfit.bench.blocks import block_site
+from limbfit.bench.blocks import build_block_site
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
@@ -132,7 +132,7 @@ def store_blocks(
     for i, (name, (thickness, depth, fitted)) in enumerate(blocks.items()):
         mesh = layered_block(thickness, tissues, divisions=divisions)
         file, element = store["mesh"] / f"{name}.vtu", study.mesh.element
-        model = block_site(name, file, mesh, depth, study.solver, element=element)
+        model = build_block_site(name, file, mesh, depth, study.solver, element=element)
         if coarse is not None:
             (store["mesh"] / COARSE).mkdir(exist_ok=True)
             write_vtu(

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import limbfit
-from limbfit.cli.reference import command_page
+from limbfit.cli.reference import build_command_page
 from limbfit.study import Study
 
 ROOT = Path(__file__).parents[1]
@@ -99,7 +99,7 @@ def test_python_of_the_pages_runs(page: str, tmp_path: Path, monkeypatch: pytest
 
 def test_the_page_of_commands_is_what_they_say() -> None:
     """Made anew by  python -m limbfit.cli.reference > docs/commands.md"""
-    assert (ROOT / "docs" / "commands.md").read_text(encoding="utf-8") == command_page()
+    assert (ROOT / "docs" / "commands.md").read_text(encoding="utf-8") == build_command_page()
 
 
 def test_every_page_is_in_the_site() -> None:

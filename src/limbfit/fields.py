@@ -14,7 +14,12 @@ from .arrays import Array
 from .fe import Problem, State, Step, System
 from .fe.history import Memory
 from .fe.kernel.laws import Laws
-from .fe.observables import contact_pressure, element_fields, nodal_average, von_mises
+from .fe.observables import (
+    average_at_nodes,
+    compute_contact_pressure,
+    compute_element_fields,
+    compute_von_mises,
+)
 from .mesh import write_pvd, write_vtu
 
 KPA = 1e-3  # MPa
@@ -33,16 +38,16 @@ def state_fields(system: System, problem: Problem, state: State) -> tuple[dict[s
     the one kept with ``store="peak"``.
     """
     laws = _laws(problem)
-    fields = element_fields(system, laws, state)
+    fields = compute_element_fields(system, laws, state)
     cauchy = fields.cauchy / KPA
     point_data = {
         "displacement_mm": state.u,
-        "contact_pressure_kPa": contact_pressure(system, laws, state) / KPA,
-        "cauchy_nodal_kPa": nodal_average(system, cauchy),
+        "contact_pressure_kPa": compute_contact_pressure(system, laws, state) / KPA,
+        "cauchy_nodal_kPa": average_at_nodes(system, cauchy),
     }
     cell_data = {
         "cauchy_kPa": cauchy,
-        "von_mises_kPa": von_mises(cauchy),
+        "von_mises_kPa": compute_von_mises(cauchy),
         "largest_stretch": fields.stretches[:, 0],
         "middle_stretch": fields.stretches[:, 1],
         "smallest_stretch": fields.stretches[:, 2],

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from limbfit.bench import bench_forward, bench_scaling
-from limbfit.bench.blocks import divisions_for, layered_block, punched_block
-from limbfit.bench.measuring import in_fresh_process, max_rss_MB, timed_solve
+from limbfit.bench.blocks import build_layered_block, build_punched_block, choose_divisions
+from limbfit.bench.measuring import measure_max_rss_MB, run_in_fresh_process, solve_timed
 from limbfit.bench.parity import ALL_CASES, bench_febio_parity
 from limbfit.bench.reference import CUBES, find_reference, load_case
-from limbfit.bench.scaling import exponent
+from limbfit.bench.scaling import fit_exponent
 from limbfit.bench.socket import SOCKET
 from limbfit.cli import main
 from limbfit.errors import InputError
@@ -38,7 +38,7 @@ def silent(done: int, total: int, text: str) -> None:
 
 @pytest.mark.parametrize("cell_type", ["tet4", "tet10", "hex8"])
 def test_block_fills_its_box(cell_type):
-    mesh = layered_block(cell_type, 8)
+    mesh = build_layered_block(cell_type, 8)
     check(mesh)
     found = quality(mesh)
     assert found.region_volumes_mm3["skin"] == pytest.approx(60 * 60 * 3)
@@ -55,37 +55,37 @@ def test_block_fills_its_box(cell_type):
 @pytest.mark.slow
 @pytest.mark.parametrize("element", list(ELEMENTS))
 def test_a_block_of_as_many_unknowns_as_wanted(element):
-    divisions = divisions_for(element, 3000)
-    assert System(punched_block(element, divisions)).unknowns >= 3000
-    assert System(punched_block(element, divisions - 1)).unknowns < 3000
+    divisions = choose_divisions(element, 3000)
+    assert System(build_punched_block(element, divisions)).unknowns >= 3000
+    assert System(build_punched_block(element, divisions - 1)).unknowns < 3000
 
 
 def test_exponent_of_a_power_law():
     rows = [{"unknowns": n, "seconds": 3e-7 * n**1.37} for n in (1000, 5000, 80_000)]
-    assert exponent(rows, "seconds") == pytest.approx(1.37)
+    assert fit_exponent(rows, "seconds") == pytest.approx(1.37)
 
 
 def rss_after(megabytes: int) -> float:
     held = np.ones(megabytes * 131072)
-    return max_rss_MB() + 0.0 * held[0]
+    return measure_max_rss_MB() + 0.0 * held[0]
 
 
 @pytest.mark.slow
 def test_memory_is_that_of_the_process_alone():
     mine = np.ones(400 * 131072)
-    small, large = (in_fresh_process(rss_after, size, 1) for size in (1, 200))
-    assert small < 400 < max_rss_MB()
+    small, large = (run_in_fresh_process(rss_after, size, 1) for size in (1, 200))
+    assert small < 400 < measure_max_rss_MB()
     assert large - small == pytest.approx(199, abs=15)
     assert mine.all()
 
 
 @pytest.mark.slow
 def test_facts_of_a_timed_simulation():
-    facts = timed_solve(punched_block("tet4", 6), StepControl(load_steps=3, unload_steps=2), True)
+    facts = solve_timed(build_punched_block("tet4", 6), StepControl(load_steps=3, unload_steps=2), True)
     assert facts["completed"]
     assert facts["steps"] == 5
     assert facts["element"] == "tet4"
-    assert facts["unknowns"] == System(punched_block("tet4", 6)).unknowns
+    assert facts["unknowns"] == System(build_punched_block("tet4", 6)).unknowns
     assert 0 < sum(facts["seconds_by_part"].values()) <= 1.01 * facts["seconds"]
     assert facts["factorisations"] >= 1
 

@@ -9,7 +9,7 @@ from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings
 from limbfit.anatomy.surfaces.surfaces import Anatomy
 from limbfit.bench import bench_meshing
-from limbfit.bench.limbs import phantom_limb, random_sites
+from limbfit.bench.limbs import draw_random_sites, make_phantom_limb
 from limbfit.errors import InputError
 
 COARSE = MeshSettings(edge_near_mm=6.0, edge_far_mm=24.0, near_radius_mm=8.0, growth=0.9, flatness=1.6)
@@ -21,11 +21,11 @@ def silent(done: int, total: int, text: str) -> None:
 
 @pytest.fixture(scope="module")
 def anatomy() -> Anatomy:
-    return phantom_limb(0, "coarse")
+    return make_phantom_limb(0, "coarse")
 
 
 def test_sites_lie_on_the_skin_and_look_in(anatomy: Anatomy) -> None:
-    for position, axis in random_sites(anatomy, 5):
+    for position, axis in draw_random_sites(anatomy, 5):
         assert anatomy.height(position) < -20
         assert np.linalg.norm(axis) == pytest.approx(1.0)
         nearest = np.linalg.norm(anatomy.skin.points - position, axis=1).argmin()

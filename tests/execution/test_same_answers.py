@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from layered import layered_block
-from limbfit.bench.blocks import block_site
+from limbfit.bench.blocks import build_block_site
 from limbfit.execution import ProcessExecutor, SerialExecutor
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.study import SolverTable
@@ -27,7 +27,8 @@ def jobs(tmp_path_factory):
     steps = SolverTable(load_steps=5, unload_steps=3)
     mesh = layered_block((3.0, 12.0), TISSUES)
     models = [
-        block_site(name, folder / f"{name}.vtu", mesh, depth, steps) for name, depth in (("a", 4), ("b", 5))
+        build_block_site(name, folder / f"{name}.vtu", mesh, depth, steps)
+        for name, depth in (("a", 4), ("b", 5))
     ]
     times = tuple(np.linspace(0.0, models[0].knots_s[-1], 21))
     return [SimulationJob(model, TISSUES, p, times) for p in PARAMETERS for model in models]

@@ -28,7 +28,7 @@ from limbfit.fe.contact.friction import Coulomb
 from limbfit.fe.contact.pose import Pose
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.motion import Drives
-from limbfit.fe.solution.products import symmetric_product
+from limbfit.fe.solution.products import multiply_symmetric
 from limbfit.fe.system import Increment
 
 TOOL = Indenter("square", 20.0, 3.0, centre=(0.3, -0.4, 2.0), axis=(0.1, 0.05, -1.0))
@@ -87,7 +87,7 @@ def test_forces_and_stiffness_of_a_free_body_are_derivatives_of_its_energy(mu, t
     assert here.contact_area > 10.0
     assert (ahead.energy - back.energy) / (2 * h) == pytest.approx((here.residual * d).sum(), rel=1e-5)
     assert (ahead.force - back.force) / (2 * h) == pytest.approx(-(here.advance * d).sum(), rel=1e-4)
-    K_d = symmetric_product(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
+    K_d = multiply_symmetric(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
     change = ((ahead.residual - back.residual) / (2 * h)).reshape(-1, 1)[system.free]
     np.testing.assert_allclose(K_d, change, atol=1e-4 * np.abs(change).max())
     border = np.abs(change[-6:]).max()

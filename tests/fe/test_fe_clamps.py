@@ -12,7 +12,7 @@ from limbfit import History, Indenter, OgdenQLV, Problem
 from limbfit.bench.blocks import SIX_TETS, build_boxes, turn_upright
 from limbfit.errors import ProblemError
 from limbfit.fe import StepControl, System, solve
-from limbfit.indentation import clamped, clamping_pins
+from limbfit.indentation import build_clamping_pins, clamp_problem
 from limbfit.mesh import Mesh
 from limbfit.study import ClampsTable
 
@@ -50,7 +50,7 @@ def pins_of(problem: Problem) -> dict[str, Indenter]:
     """The usual ones."""
     assert problem.indenter is not None
     skin = problem.mesh.face_sets["skin"]
-    return clamping_pins(problem.mesh.points, skin, problem.indenter, UP, ClampsTable())
+    return build_clamping_pins(problem.mesh.points, skin, problem.indenter, UP, ClampsTable())
 
 
 def test_eleven_of_fourteen_pins_clamp_all_around_but_beside_the_test_pin():
@@ -68,7 +68,7 @@ def test_eleven_of_fourteen_pins_clamp_all_around_but_beside_the_test_pin():
 def test_stated_pins_are_where_they_are_stated():
     problem = site(pipe())
     table = ClampsTable(angles_degrees=(90.0, -90.0), levels_mm=(20.0, -10.0))
-    bodies = clamped(problem, UP, table).bodies
+    bodies = clamp_problem(problem, UP, table).bodies
     centres = np.array([body.shape.centre for body in bodies])
     apart = centres - [0.0, 0.0, 0.5 * LENGTH]
     np.testing.assert_allclose(apart[:, 2], [20.0, -10.0], atol=1e-9)
@@ -87,7 +87,7 @@ def test_stated_pins_are_where_they_are_stated():
 )
 def test_a_pin_that_cannot_be_placed_is_refused(stated, match):
     with pytest.raises(ProblemError, match=f"clamps: .*{match}.*; give clamps.angles_degrees"):
-        clamped(site(pipe()), UP, ClampsTable(**stated))
+        clamp_problem(site(pipe()), UP, ClampsTable(**stated))
 
 
 def test_a_test_pin_along_the_limb_has_no_ring():
@@ -101,7 +101,7 @@ def clamped_pipe() -> Problem:
     table = ClampsTable(force_N=8.0)
     problem = site(pipe())
     later = replace(problem, history=problem.history.later(table.begun_s), touch_down_s=table.begun_s)
-    return clamped(later, UP, table)
+    return clamp_problem(later, UP, table)
 
 
 def test_a_direction_is_taken_as_far_as_its_contact_is_foreseen():
@@ -139,7 +139,7 @@ def test_a_clamped_limb_bulges_between_the_pins_and_is_indented_from_there():
     table = ClampsTable(force_N=8.0, settling_s=2.0)
     begun = table.begun_s
     later = replace(problem, history=problem.history.later(begun), touch_down_s=begun)
-    found = solve(clamped(later, UP, table), control)
+    found = solve(clamp_problem(later, UP, table), control)
     assert found.completed, found.reason
     after = found.times > begun * (1 + 1e-9)
     assert not found.force[~after].any()

@@ -11,7 +11,7 @@ from blocks import MUSCLE, SKIN, block, drive, punch
 from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, OgdenQLV, Problem, StepControl, System, solve
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.solution.products import symmetric_product
+from limbfit.fe.solution.products import multiply_symmetric
 from limbfit.fe.system import Increment
 from limbfit.mesh import Mesh
 
@@ -40,7 +40,7 @@ def test_contact_force_and_stiffness_are_derivatives_of_its_energy(cell_type, ru
     assert (ahead.force - back.force) / (2 * h) == pytest.approx(-(here.advance * d).sum(), rel=1e-4)
     deeper, shallower = at(u, 2.6 + h), at(u, 2.6 - h)
     assert (deeper.energy - shallower.energy) / (2 * h) == pytest.approx(here.force, rel=1e-5)
-    K_d = symmetric_product(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
+    K_d = multiply_symmetric(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
     change = ((ahead.residual - back.residual) / (2 * h)).reshape(-1, 1)[system.free]
     np.testing.assert_allclose(K_d, change, atol=1e-4 * np.abs(change).max())
 

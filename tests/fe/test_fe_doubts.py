@@ -9,9 +9,9 @@ import pytest
 from blocks import punch
 
 from limbfit.fe import Problem, Result, StepControl, solve
-from limbfit.fe.doubts import folded
+from limbfit.fe.doubts import find_inverted_elements
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.observables import contact_pressure
+from limbfit.fe.observables import compute_contact_pressure
 from limbfit.fe.system import Increment
 from limbfit.mesh import node_jacobians
 
@@ -50,7 +50,7 @@ def test_a_state_s_penalty_is_the_one_that_holds_it(problem):
     deepest = max(result.states, key=lambda state: state.displacement)
     usual = solve(problem, StepControl(load_steps=1))
     pressures = [
-        contact_pressure(r.system, laws, s) for r, s in ((result, deepest), (usual, usual.states[0]))
+        compute_contact_pressure(r.system, laws, s) for r, s in ((result, deepest), (usual, usual.states[0]))
     ]
     assert pressures[0].max() == pytest.approx(pressures[1].max(), rel=0.1)
 
@@ -113,5 +113,5 @@ def test_folded_elements_are_told_where_they_matter(problem, share, told):
     u[mesh.corners[0][0], 2] = -40.0
     inverted = (node_jacobians(mesh.with_points(mesh.points + u)) <= 0.0).any(axis=1)
     energy = np.where(inverted, share / inverted.sum(), (1.0 - share) / (~inverted).sum())
-    doubts = folded(mesh, u, lambda: energy, 3.0, np.array([0.0, 3.0]))
+    doubts = find_inverted_elements(mesh, u, lambda: energy, 3.0, np.array([0.0, 3.0]))
     assert ["2 % of the strain energy" in doubt.text for doubt in doubts] == [True] * told

@@ -12,9 +12,9 @@ from scipy.optimize import fsolve
 from limbfit import History, OgdenQLV, Problem
 from limbfit.errors import ProblemError
 from limbfit.fe import Fibred, StepControl, Support, System, solve
-from limbfit.fe.history import elastic_stresses
+from limbfit.fe.history import compute_elastic_stresses
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.observables import element_fields
+from limbfit.fe.observables import compute_element_fields
 from limbfit.fe.system import Increment
 
 GROUND = OgdenQLV(0.005, 4.0, 0.8, 0.4)
@@ -68,7 +68,7 @@ def test_a_turned_body_has_turned_forces():
     assert there.energy == pytest.approx(here.energy, rel=1e-12)
     np.testing.assert_allclose(there.residual, here.residual @ Q.T, atol=1e-12 * np.abs(here.residual).max())
     np.testing.assert_allclose(
-        elastic_stresses(system, laws, turned), elastic_stresses(system, laws, u), atol=1e-14
+        compute_elastic_stresses(system, laws, turned), compute_elastic_stresses(system, laws, u), atol=1e-14
     )
 
 
@@ -115,7 +115,7 @@ def test_a_bar_along_and_across_its_fibres(along, stretch):
     )  # fmt: skip
     result = solve(problem, StepControl(load_steps=5, tolerance=1e-9), store="all")
     assert result.completed, result.reason
-    fields = element_fields(result.system, Laws.build([tissue, tissue]), result.states[-1])
+    fields = compute_element_fields(result.system, Laws.build([tissue, tissue]), result.states[-1])
     area = fields.J / stretch  # of the section, over that at rest
     np.testing.assert_allclose(fields.cauchy[:, 0] * area, pull(tissue, stretch, along), rtol=1e-6)
     bare = replace(tissue, k1=0.0)

@@ -23,7 +23,7 @@ from limbfit.fe import (
 from limbfit.fe.contact.friction import Coulomb
 from limbfit.fe.contact.tool import Tool
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.solution.products import symmetric_product
+from limbfit.fe.solution.products import multiply_symmetric
 from limbfit.fe.solution.simulation import SteppedRun
 from limbfit.fe.system import Increment
 
@@ -72,7 +72,7 @@ def test_forces_and_stiffness_of_friction_are_derivatives_of_its_energy(rule, sh
     assert (ahead.force - back.force) / (2 * h) == pytest.approx(-(here.advance * d).sum(), rel=1e-4)
     rise = (one.at(u, 3.3 + h).energy - one.at(u, 3.3 - h).energy) / (2 * h)
     assert rise == pytest.approx(here.force, rel=1e-5)
-    K_d = symmetric_product(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
+    K_d = multiply_symmetric(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
     change = ((ahead.residual - back.residual) / (2 * h)).reshape(-1, 1)[system.free]
     np.testing.assert_allclose(K_d, change, atol=1e-4 * np.abs(change).max())
 

@@ -9,7 +9,7 @@ from numba import njit
 from samples import SAMPLES, energy, kirchhoff, point, quotients, slopes
 
 from limbfit.fe import ELEMENTS, History, Problem, System
-from limbfit.fe.history import elastic_stresses
+from limbfit.fe.history import compute_elastic_stresses
 from limbfit.fe.kernel.assembly import assemble
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.lanes import LANES, block_places, exponential, logarithm
@@ -137,8 +137,8 @@ def test_elastic_stress_is_that_of_each_point(name):
     system, laws, _, _, u = deformed(name)
     tissues = list(system.problem.materials.values())
     size = max(np.abs(tissue.table().terms[:, 0]).max() for tissue in tissues)
-    assert np.abs(elastic_stresses(system, laws, np.zeros_like(u))).max() <= 2e-16 * size
-    stress = elastic_stresses(system, laws, u)
+    assert np.abs(compute_elastic_stresses(system, laws, np.zeros_like(u))).max() <= 2e-16 * size
+    stress = compute_elastic_stresses(system, laws, u)
     for el, q in np.ndindex(stress.shape[:2]):
         F = np.eye(3) + u[system.cells[el]].T @ system.gradients[el, q].T
         c2, N = np.linalg.eigh(F.T @ F)

@@ -9,7 +9,7 @@ import pytest
 import scipy.sparse as sp
 from blocks import drive, punch
 
-from limbfit.bench.blocks import punched_block
+from limbfit.bench.blocks import build_punched_block
 from limbfit.fe import StepControl, Support, System, solve
 from limbfit.fe.history import Memory
 from limbfit.fe.kernel.laws import Laws
@@ -18,12 +18,12 @@ from limbfit.fe.solution.linear import (
     SOLVERS,
     WITHOUT_PARDISO,
     NotPositiveDefiniteError,
-    linear_solver,
+    build_linear_solver,
 )
 from limbfit.fe.solution.multigrid import Multigrid
-from limbfit.fe.solution.products import symmetric_product
+from limbfit.fe.solution.products import multiply_symmetric
 from limbfit.fe.solution.simulation import SteppedRun
-from limbfit.fe.solution.springs import touched
+from limbfit.fe.solution.springs import find_touched_unknowns
 
 
 def system(n: int = 200) -> tuple[sp.csr_matrix, np.ndarray]:
@@ -44,7 +44,7 @@ def test_peers_solve_alike(name):
     A, b = system()
     U = upper(A)
     try:
-        solver = linear_solver(U.indptr, U.indices, name)
+        solver = build_linear_solver(U.indptr, U.indices, name)
     except (ImportError, OSError):
         pytest.skip(f"{name} is not installed")
     for scale in (1.0, 3.0):
@@ -60,7 +60,7 @@ def test_halves_of_solutions_make_the_whole_and_those_among_the_last_unknowns_ar
     U = upper(A)
     wanted = np.array([3, 50, 51, 120, 198, 199], dtype=np.int32)
     try:
-        solver = linear_solver(U.indptr, U.indices, name, threads, last=wanted)
+        solver = build_linear_solver(U.indptr, U.indices, name, threads, last=wanted)
     except (ImportError, OSError):
         pytest.skip(f"{name} is not installed")
     solver.factorise(U.data)
@@ -79,7 +79,7 @@ def test_halves_of_solutions_make_the_whole_and_those_among_the_last_unknowns_ar
 
 
 def test_springs_under_the_indenter_and_beside_it_are_taken_in_exactly():
-    problem = punched_block("tet10", 6)
+    problem = build_punched_block("tet10", 6)
     system = System(problem)
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
     increment = Memory.rest(system, laws).increment(
@@ -87,7 +87,7 @@ def test_springs_under_the_indenter_and_beside_it_are_taken_in_exactly():
     )
     data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
     bodies, stiff = system.bodies, 50.0 * laws.modulus
-    last = touched(system, problem)
+    last = find_touched_unknowns(system, problem)
     factor = Factor(system, laws.moduli, last=last)
     if not factor.transposed:
         pytest.skip("the factor of this machine knows no halves")
@@ -125,7 +125,7 @@ def test_cholesky_notices_an_indefinite_matrix(name):
     A, _ = system()
     U = upper((A - 5.0 * sp.identity(A.shape[0])).tocsr())
     try:
-        solver = linear_solver(U.indptr, U.indices, name)
+        solver = build_linear_solver(U.indptr, U.indices, name)
     except (ImportError, OSError):
         pytest.skip(f"{name} is not installed")
     with pytest.raises(NotPositiveDefiniteError):
@@ -137,7 +137,7 @@ def test_symmetric_product(columns):
     A, _ = system()
     U, x = upper(A), np.random.default_rng(columns).normal(size=(A.shape[0], columns))
     for threads in (1, 2):
-        found = symmetric_product(U.indptr, U.indices, U.data, x, threads)
+        found = multiply_symmetric(U.indptr, U.indices, U.data, x, threads)
         np.testing.assert_allclose(found, A @ x, rtol=1e-12, atol=1e-12 * np.abs(A @ x).max())
         assert found.flags.c_contiguous
 
@@ -164,14 +164,14 @@ def test_a_tangent_with_negative_eigenvalues_is_solved_all_the_same():
 
 def test_a_deep_first_step_does_not_cost_the_single_precision():
     """Stiff contact deep inside makes the first tangent indefinite, which says nothing of the digits."""
-    run = SteppedRun(punched_block("tet10", 6), StepControl(), False, None)
+    run = SteppedRun(build_punched_block("tet10", 6), StepControl(), False, None)
     next(run.run())
     assert run.factor.counts["double_precision"] == 0
 
 
 def iterations(divisions: int) -> int:
     """Of conjugate gradients with multigrid, to a thousandth, on a block at rest."""
-    problem = punched_block("tet10", divisions)
+    problem = build_punched_block("tet10", divisions)
     system = System(problem)
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
     increment = Memory.rest(system, laws).increment(
@@ -195,7 +195,7 @@ def test_iterations_with_multigrid_do_not_grow_with_the_mesh():
 
 def test_multigrid_is_symmetric_and_positive():
     """Or conjugate gradients would not do; also with single components held."""
-    problem = punched_block("tet10", 5)
+    problem = build_punched_block("tet10", 5)
     n = len(problem.mesh.points)
     sides = np.flatnonzero(problem.mesh.points[:, 0] <= -30.0)
     system = System(replace(problem, supports=(Support(sides, 0),)))
@@ -212,7 +212,7 @@ def test_multigrid_is_symmetric_and_positive():
 
 def test_where_multigrid_does_not_converge_a_factor_takes_over():
     """As with a bulk modulus a million times the shear modulus."""
-    problem = punched_block("tet10", 4)
+    problem = build_punched_block("tet10", 4)
     stiff = {name: replace(m, kappa_ratio=1e6) for name, m in problem.materials.items()}
     system, laws = System(problem), Laws.build([stiff[name] for name in problem.mesh.region_names])
     increment = Memory.rest(system, laws).increment(

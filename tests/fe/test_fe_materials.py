@@ -25,7 +25,7 @@ from limbfit.fe import (
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.materials import prony_factors
 from limbfit.fe.materials.volumetric import volumetric
-from limbfit.fe.observables import element_fields
+from limbfit.fe.observables import compute_element_fields
 from limbfit.fe.system import Increment
 
 every_law = pytest.mark.parametrize("law", SAMPLES.values(), ids=SAMPLES)
@@ -165,7 +165,7 @@ def affine(law, direction, times, history) -> list[np.ndarray]:
     problem = Problem(mesh, {"skin": law, "muscle": law}, none, faces, None, history, supports=supports)
     system, laws = System(problem), Laws.build([law, law])
     steps = iterate(problem, StepControl(times=tuple(times), tolerance=1e-11))
-    return [element_fields(system, laws, s.state).cauchy[0] for s in steps]
+    return [compute_element_fields(system, laws, s.state).cauchy[0] for s in steps]
 
 
 @every_law

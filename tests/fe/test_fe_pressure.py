@@ -26,7 +26,7 @@ from limbfit.fe import (
 )
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.pressure import Pressed
-from limbfit.fe.solution.products import symmetric_product
+from limbfit.fe.solution.products import multiply_symmetric
 from limbfit.fe.system import Increment
 from limbfit.mesh import Mesh
 
@@ -68,7 +68,7 @@ def test_forces_and_tangent_of_a_pressed_block_are_derivatives_of_its_energy():
 
     here, ahead, back = at(u), at(u + h * d), at(u - h * d)
     assert (ahead.energy - back.energy) / (2 * h) == pytest.approx((here.residual * d).sum(), rel=1e-5)
-    K_d = symmetric_product(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
+    K_d = multiply_symmetric(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
     change = ((ahead.residual - back.residual) / (2 * h)).reshape(-1, 1)[system.free]
     np.testing.assert_allclose(K_d, change, atol=1e-6 * np.abs(change).max())
     pressed = system.pressures.all[0].volume(system.points + u)[2]

@@ -15,8 +15,8 @@ from blocks import SKIN, block, punch
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, OgdenQLV, Problem, Result, StepControl, Support, solve
-from limbfit.fe.doubts import slipped
-from limbfit.fe.solution.pace import Pace
+from limbfit.fe.doubts import find_slip
+from limbfit.fe.solution.pace import StepController
 from limbfit.study import MaterialTable
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
@@ -123,7 +123,7 @@ def paced(hard: Callable[[float, float], int]) -> list[tuple[float, int, str]]:
 
     ``hard``: how many iterations a step from one time to another takes.
     """
-    pace, now, tried = Pace(60), 0.0, []
+    pace, now, tried = StepController(60), 0.0, []
     while now < 1.0 and pace.cuts <= 5:
         t = pace.next_time(now, 0.5 if now < 0.5 else 1.0)
         needed, patience = hard(now, t), pace.patience
@@ -166,12 +166,12 @@ def test_a_force_that_falls_while_the_indenter_advances_is_told():
     """A fifth of it lost between two steps of loading; less than a tenth, and what relaxes, are none."""
     displacement = np.array([1.0, 2.0, 3.0, 3.0, 2.0])
     force = np.array([2.0, 5.0, 4.0, 2.0, 0.5])
-    (doubt,) = slipped(displacement, force)
+    (doubt,) = find_slip(displacement, force)
     assert doubt.text.startswith("the force falls from 5 N to 4 N while the indenter advances from 2 to 3 mm")
     assert (doubt.kind, doubt.count, doubt.depth_mm) == ("slipped", 1, 2.0)
     assert doubt.share == pytest.approx(2 / 3)
-    assert not slipped(displacement, np.where(force == 4.0, 4.8, force))
-    assert not slipped(np.zeros(1), np.zeros(1))
+    assert not find_slip(displacement, np.where(force == 4.0, 4.8, force))
+    assert not find_slip(np.zeros(1), np.zeros(1))
 
 
 def test_what_is_not_reached_is_said(robustness):

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, StepControl, iterate, solve
-from limbfit.fe.solution.control import schedule
+from limbfit.fe.solution.control import schedule_steps
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def result(problem):
 
 def test_schedule_hits_knots_and_peak():
     history = History(np.array([0.0, 3.0, 4.0, 9.0]), np.array([0.0, 2.0, 5.0, 0.0]))
-    times = schedule(history, StepControl())
+    times = schedule_steps(history, StepControl())
     assert {3.0, 4.0, 9.0} <= set(times)
     assert (np.diff(times) > 0).all()
     assert times[0] > 0

@@ -12,7 +12,7 @@ from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, NeoHookean, Problem, StepControl, System, iterate, solve
 from limbfit.fe.contact.sticky import Anchors
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.solution.products import symmetric_product
+from limbfit.fe.solution.products import multiply_symmetric
 from limbfit.fe.system import Increment
 
 
@@ -38,7 +38,7 @@ def test_forces_and_stiffness_of_anchors_are_derivatives_of_their_energy(rule):
     assert (ahead.force - back.force) / (2 * h) == pytest.approx(-(here.advance * d).sum(), rel=1e-4)
     rise = (at(u, 1.7 + h).energy - at(u, 1.7 - h).energy) / (2 * h)
     assert rise == pytest.approx(here.force, rel=1e-5)
-    K_d = symmetric_product(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
+    K_d = multiply_symmetric(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
     change = ((ahead.residual - back.residual) / (2 * h)).reshape(-1, 1)[system.free]
     np.testing.assert_allclose(K_d, change, atol=1e-4 * np.abs(change).max())
 

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from limbfit.fe import ELEMENTS, History, Indenter, NeoHookean, Problem, StepControl, Support, System, iterate
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.observables import element_fields
+from limbfit.fe.observables import compute_element_fields
 from limbfit.fe.system import Increment
 
 NONE = np.zeros(0, dtype=int)
@@ -51,7 +51,7 @@ def uniaxial(law, history: History, times: np.ndarray) -> np.ndarray:
     )
     system, laws = System(problem), Laws.build([law, law])
     steps = iterate(problem, StepControl(times=tuple(times), tolerance=1e-8))
-    found = {step.time: element_fields(system, laws, step.state).cauchy[0, 2] for step in steps}
+    found = {step.time: compute_element_fields(system, laws, step.state).cauchy[0, 2] for step in steps}
     return np.array([found[t] for t in times])  # a step may have been cut
 
 

@@ -10,8 +10,8 @@ from blocks import MUSCLE, SKIN, punch
 
 from limbfit.fe import History, Indenter, Motion, RigidBody, StepControl, solve
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.observables import contact_pressure, nodal_forces
-from limbfit.fe.tractions import tractions
+from limbfit.fe.observables import compute_contact_pressure, compute_nodal_forces
+from limbfit.fe.tractions import compute_tractions
 
 
 @pytest.mark.parametrize("friction", [0.3, "sticky"])
@@ -30,7 +30,7 @@ def test_tractions_balance_the_forces_and_moments_that_are_stated(friction):
     assert found.imbalance.shape == (6, 1)
     assert (found.imbalance[1:] < 1e-3).all()
     state, laws = found.states[-1], Laws.build([SKIN, MUSCLE])
-    on = tractions(found.system, laws, state)
+    on = compute_tractions(found.system, laws, state)
     frame = ball.frame
     np.testing.assert_allclose(frame @ on.force, found.reactions[-1, 0, :3], atol=1e-6)
     np.testing.assert_allclose(frame @ on.force, [0.4, found.reactions[-1, 0, 1], 3.0], atol=3e-3)
@@ -43,10 +43,10 @@ def test_tractions_balance_the_forces_and_moments_that_are_stated(friction):
     if friction == 0.3:
         assert (slides <= 0.3 * 1.001 * on.pressure_kPa + 1e-6).all()
     assert slides.max() > 0.1 * on.pressure_kPa.max()
-    held = nodal_forces(found.system, laws, state)[problem.fixed].sum(axis=0)
+    held = compute_nodal_forces(found.system, laws, state)[problem.fixed].sum(axis=0)
     np.testing.assert_allclose(held, -on.force, atol=3e-3)
     pressure, shear = on.at_nodes(len(problem.mesh.points))
     assert shear.shape == (len(pressure), 3)
-    old = 1e3 * contact_pressure(found.system, laws, state)
+    old = 1e3 * compute_contact_pressure(found.system, laws, state)
     assert pressure.max() == pytest.approx(old.max(), rel=0.25)
     assert 0.0 < on.contact_area < 450.0

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from blocks import punch
 
-from limbfit.bench.layer import curve_error, reference_layer, solve_layer
+from limbfit.bench.layer import compute_curve_error, solve_layer, solve_reference_layer
 from limbfit.fe import History, StepControl, solve
 from limbfit.fe.materials import prony_factors
-from limbfit.fe.solution.schedule import foresee, graded
+from limbfit.fe.solution.schedule import grade_steps, predict_remaining_times
 from limbfit.phantom.forces import DISCRETISATIONS
 from limbfit.study import SolverTable
 
@@ -30,9 +30,9 @@ FEWER = StepControl(load_steps=6, unload_steps=8)
 def test_the_curve_is_within_its_goal(name, tau):
     """0.3 % rms and 1 % at worst of the peak, read between the steps too."""
     layer = {"prony": ((3.0, tau),)}
-    exact = reference_layer(HISTORIES[name], **layer)
+    exact = solve_reference_layer(HISTORIES[name], **layer)
     for control in (USUAL, FEWER):
-        rms, worst = curve_error(solve_layer(HISTORIES[name], control, **layer), exact)
+        rms, worst = compute_curve_error(solve_layer(HISTORIES[name], control, **layer), exact)
         assert rms < 0.3
         assert worst < 1.0
 
@@ -41,8 +41,8 @@ def test_the_curve_is_within_its_goal(name, tau):
 @pytest.mark.parametrize("name", ["cycles", "two rates"])
 def test_cycles_and_rates_are_within_the_goal(name, tau):
     layer = {"prony": ((3.0, tau),)}
-    rms, worst = curve_error(
-        solve_layer(HISTORIES[name], USUAL, **layer), reference_layer(HISTORIES[name], **layer)
+    rms, worst = compute_curve_error(
+        solve_layer(HISTORIES[name], USUAL, **layer), solve_reference_layer(HISTORIES[name], **layer)
     )
     assert rms < 0.3
     assert worst < 1.0
@@ -52,8 +52,8 @@ def test_cycles_and_rates_are_within_the_goal(name, tau):
 def test_slow_tissue_that_has_not_come_back_is_met_on_the_way(tau):
     """At a time that no step foresees: the curve goes to zero there, not at the step before it."""
     layer = {"prony": ((3.0, tau),)}
-    exact = reference_layer(HISTORIES["cycles"], **layer)
-    rms, worst = curve_error(solve_layer(HISTORIES["cycles"], USUAL, **layer), exact)
+    exact = solve_reference_layer(HISTORIES["cycles"], **layer)
+    rms, worst = compute_curve_error(solve_layer(HISTORIES["cycles"], USUAL, **layer), exact)
     assert rms < 0.3
     assert worst < 1.8
 
@@ -69,8 +69,8 @@ def test_a_ramp_takes_no_more_steps_than_stated(control, most, tau):
 @pytest.mark.parametrize("detail", DISCRETISATIONS)
 def test_the_phantoms_truth_has_a_tenth_of_the_goals_error(detail, tau):
     layer = {"prony": ((3.0, tau),)}
-    exact = reference_layer(HISTORIES["ramp"], parts=1500, **layer)
-    rms, worst = curve_error(
+    exact = solve_reference_layer(HISTORIES["ramp"], parts=1500, **layer)
+    rms, worst = compute_curve_error(
         solve_layer(HISTORIES["ramp"], DISCRETISATIONS[detail].steps(20.0), **layer), exact
     )
     assert rms < 0.03
@@ -113,15 +113,15 @@ def test_a_step_before_the_end_of_contact_does_not_move_with_the_parameters():
     places = set()
     for g in np.linspace(2.9, 3.1, 9):
         places |= set(solve_layer(HISTORIES["ramp"], USUAL, ((g, 1.0),)).times.round(9))
-    planned = set(graded(HISTORIES["ramp"], USUAL.load_steps, USUAL.unload_steps).round(9))
+    planned = set(grade_steps(HISTORIES["ramp"], USUAL.load_steps, USUAL.unload_steps).round(9))
     assert 1 <= len(places - planned - {0.0}) <= 2
 
 
 def test_only_what_unloads_foresees_the_end_of_contact():
     history = HISTORIES["hold"]
-    planned = graded(history, 4, 4)
+    planned = grade_steps(history, 4, 4)
     left = [t for t in planned if t > 12.0]
-    assert foresee(history, planned, left, [0.0, T, 11.0, 12.0], [0.0, 5.0, 2.0, 1.0]) == left
+    assert predict_remaining_times(history, planned, left, [0.0, T, 11.0, 12.0], [0.0, 5.0, 2.0, 1.0]) == left
 
 
 def test_a_block_is_within_the_goal_with_fewer_steps():

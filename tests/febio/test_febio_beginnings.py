@@ -10,7 +10,7 @@ import pytest
 from febfiles import written
 
 from limbfit import OgdenQLV
-from limbfit.bench.blocks import punched_block
+from limbfit.bench.blocks import build_punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import (
     Activation,
@@ -22,7 +22,7 @@ from limbfit.fe import (
     OpenSurface,
     RigidBody,
     StepControl,
-    isochoric_stretch,
+    build_isochoric_stretch,
     solve,
 )
 from limbfit.febio import (
@@ -47,7 +47,7 @@ EXACT = StepControl(
     times=TIMES, stress="linear", penalty=20.0, penetration=1.0, hold_penalty=True, tolerance=1e-10
 )
 UP = np.array([0.0, 0.0, 1.0])
-TAUT = isochoric_stretch(UP, 0.9)[0]
+TAUT = build_isochoric_stretch(UP, 0.9)[0]
 STILL = Contractile(Fibred(OgdenQLV(0.004, 4.0, 0.0, 1.0), 0.0, 1.0), 0.01)
 
 
@@ -57,11 +57,11 @@ def sheet(motion, x, axis=(0.0, 0.0, 1.0), name="sheet"):
     faces = np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
     shape = OpenSurface(points, faces).placed(np.zeros(3), np.array(axis), np.array([0.0, 1.0, 0.0]))
     shape = replace(shape, points=points @ shape.frame.T)
-    return RigidBody(shape, punched_block("hex8", 6).mesh.face_sets["skin"], motion, name=name)
+    return RigidBody(shape, build_punched_block("hex8", 6).mesh.face_sets["skin"], motion, name=name)
 
 
 def block(**changes):
-    problem = punched_block("hex8", 6)
+    problem = build_punched_block("hex8", 6)
     end = History(np.array([0.0, TIMES[-1]]), np.zeros(2))
     given = {"indenter": None, "history": end, "materials": {"skin": SKIN, "muscle": MUSCLE}} | changes
     return replace(problem, **given)
@@ -71,7 +71,7 @@ def ball(axis=(0.0, 0.0, -1.0), x=0.0, motion=None, name="ball"):
     """A ball that is pressed in, whose facets are all that differs when it is read back."""
     shape = Indenter("sphere", 16.0, centre=(x, 4.0, 0.3), axis=axis, edge=(1.0, 0.0, 0.0))
     down = Motion.of([0.0, 1.0, 2.0, 3.0], z=[0.0, 0.0, 2.0, 1.5]) if motion is None else motion
-    return RigidBody(shape, punched_block("hex8", 6).mesh.face_sets["skin"], down, name=name)
+    return RigidBody(shape, build_punched_block("hex8", 6).mesh.face_sets["skin"], down, name=name)
 
 
 def back(problem, folder, control=EXACT):
@@ -95,7 +95,7 @@ def field(problem):
     """A pre-stretch of its own in every cell of the skin, none elsewhere."""
     mesh = problem.mesh
     stretch = np.where(mesh.regions == 0, np.random.default_rng(3).uniform(0.8, 0.95, len(mesh.cells)), 1.0)
-    return isochoric_stretch(np.tile(UP + 0.1 * ASKEW, (len(mesh.cells), 1)), stretch)
+    return build_isochoric_stretch(np.tile(UP + 0.1 * ASKEW, (len(mesh.cells), 1)), stretch)
 
 
 TENSES = {"materials": {"skin": SKIN, "muscle": TENSED}, "fibres": ASKEW,
@@ -306,7 +306,7 @@ def test_what_febio_cannot_express_is_refused(tmp_path):
         write_feb(
             block(bodies=(ball((0.2, 0.0, -1.0), motion=dragged),)), tmp_path / "model.feb", FebSettings()
         )
-    late = replace(punched_block("tet4", 4), history=COURSE, touch_down_s=HELD_S)
+    late = replace(build_punched_block("tet4", 4), history=COURSE, touch_down_s=HELD_S)
     for held in (late, block(prestretch=TAUT), block(bodies=(ball(),))):
         with pytest.raises(ProblemError, match="cannot follow where a clamped, tensed or pre-strained limb"):
             check_optimisable(held)

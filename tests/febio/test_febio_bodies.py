@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from febfiles import written
 
-from limbfit.bench.blocks import punched_block
+from limbfit.bench.blocks import build_punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import (
     History,
@@ -43,13 +43,13 @@ SHEET = OpenSurface(SIDE, np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
 
 
 def block(**changes):
-    problem = punched_block("hex8", 6)
+    problem = build_punched_block("hex8", 6)
     soft = {name: NeoHookean(0.006, kappa_ratio=100.0) for name in ("skin", "muscle")}
     return replace(problem.with_materials(soft), indenter=None, history=END, **changes)
 
 
 def sheet(motion, **changes):
-    faces = punched_block("hex8", 6).mesh.face_sets["skin"]
+    faces = build_punched_block("hex8", 6).mesh.face_sets["skin"]
     return RigidBody(SHEET, faces, motion, 0.3, pivot=(1.0, 2.0, 4.0), name="sheet", **changes)
 
 
@@ -175,7 +175,7 @@ def test_a_pressure_alone_is_read_back(tmp_path):
 
 
 def test_a_force_between_the_axes_beside_a_move_is_refused_and_can_be_turned(tmp_path):
-    problem = punched_block("tet4", 4)
+    problem = build_punched_block("tet4", 4)
     oblique = replace(problem.indenter, axis=(0.1, 0.0, -1.0))
     across = np.array([[0.0, 0.0], [0.5, 0.0]])
     history = History(np.array([0.0, 2.0]), force=np.array([0.0, 1.0]), across=across)

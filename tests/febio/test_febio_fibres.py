@@ -9,7 +9,7 @@ import pytest
 from febfiles import FEB, written
 
 from limbfit import OgdenQLV
-from limbfit.bench.blocks import punched_block
+from limbfit.bench.blocks import build_punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import Fibred, StepControl, solve
 from limbfit.febio import FebSettings, read_feb, to_problem, write_feb, write_inp
@@ -26,7 +26,7 @@ MIXED = (
 @pytest.mark.parametrize("ground", [GROUND, OgdenQLV(0.004, 5.0, 0.0, 1.0)], ids=["relaxing", "elastic"])
 @pytest.mark.parametrize("field", [False, True], ids=["one direction", "a field"])
 def test_fibres_are_read_back(tmp_path, ground, field):
-    problem = punched_block("tet4", 4)
+    problem = build_punched_block("tet4", 4)
     count = len(problem.mesh.cells)
     fibres = np.random.default_rng(0).normal(size=(count, 3)) if field else np.array([0.3, -1.0, 0.2])
     tissues = {"skin": OgdenQLV(0.009, 4.0, 1.0, 0.5), "muscle": Fibred(ground, 0.012, 2.5)}
@@ -78,7 +78,7 @@ def test_what_limbfit_has_not_is_refused_with_its_line(tmp_path, old, new, what)
 
 
 def test_abaqus_is_not_given_fibres(tmp_path):
-    problem = punched_block("tet4", 4)
+    problem = build_punched_block("tet4", 4)
     tissues = {name: Fibred(GROUND, 0.01, 3.0) for name in problem.mesh.region_names}
     with pytest.raises(ProblemError, match="has fibres, which are written for FEBio only"):
         write_inp(

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.bench.blocks import punched_block
+from limbfit.bench.blocks import build_punched_block
 from limbfit.fe import State, Step, StepControl, System, solve
-from limbfit.fe.kernel.elements import face_quadrature
+from limbfit.fe.kernel.elements import build_face_quadrature
 from limbfit.febio import (
     FacePenalties,
     FebSettings,
@@ -37,7 +37,7 @@ SITES = ("01", "05", "10", "13", "15", "17")
 
 def turned(element, axis, divisions=2):
     """The block with its surface normal along ``axis``."""
-    problem = punched_block(element, divisions)
+    problem = build_punched_block(element, divisions)
     z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     x = np.cross(z, [0.3, 0.9, -0.2])
     x /= np.linalg.norm(x)
@@ -73,7 +73,7 @@ def test_the_automatic_penalty_depends_on_the_normal(element, axis):
 
 def test_the_mean_is_over_what_the_indenter_covers():
     """Faces beyond it, of other normals or sizes, say nothing of how far it sinks in."""
-    problem = punched_block("hex8", 12)
+    problem = build_punched_block("hex8", 12)
     contact = Contact("sliding-elastic", ("", ""), 3.0, True, False, 0)
     mean = compute_mean_penalty(contact, problem, 0.1)
     points = problem.mesh.points.copy()
@@ -86,7 +86,7 @@ def test_the_mean_is_over_what_the_indenter_covers():
 @pytest.mark.parametrize(("rule", "grown"), [("sliding-elastic", 1.21), ("sliding-facet-on-facet", 1.0)])
 def test_every_face_has_its_own_penalty_over_its_own_area(rule, grown):
     """Skin that stretches by a tenth both ways: the area of a step ahead is foreseen from the last two."""
-    problem = punched_block("hex8", 4)
+    problem = build_punched_block("hex8", 4)
     points = problem.mesh.points.copy()
     points[:, 0] += np.where(points[:, 0] > 0.0, 0.2 * points[:, 0], 0.0)  # two sizes of faces
     problem = replace(problem, mesh=problem.mesh.with_points(points), start="as-given")
@@ -96,7 +96,7 @@ def test_every_face_has_its_own_penalty_over_its_own_area(rule, grown):
     weights = FacePenalties(system, (contact,), times)
     own = compute_automatic_penalties(problem, problem.contact_faces, 1.0) * 3.0
     modulus = np.mean([m.instantaneous_modulus for m in problem.materials.values()])
-    rest = face_quadrature(problem.formulation, points, problem.contact_faces, "gauss")[1]
+    rest = build_face_quadrature(problem.formulation, points, problem.contact_faces, "gauss")[1]
     uniform = compute_mean_penalty(contact, problem, 1.0) * modulus
     np.testing.assert_allclose(uniform * system.surface.areas, own[:, None] * rest, rtol=1e-12)
     for t, stretch in ((1.0, 1.0), (2.0, np.sqrt(1.105))):  # 1.21 is as far from 1.105 as that from 1
@@ -109,7 +109,7 @@ def test_every_face_has_its_own_penalty_over_its_own_area(rule, grown):
 
 def test_an_explicit_penalty_goes_out_and_comes_back(tmp_path):
     """It is as stiff as limbfit's: what is read has the stiffness that limbfit has."""
-    problem = punched_block("tet4", 4)
+    problem = build_punched_block("tet4", 4)
     steps = StepControl(penalty=300.0)
     write_feb(problem, tmp_path / "model.feb", FebSettings(steps=steps))
     text = (tmp_path / "model.feb").read_text()
@@ -126,7 +126,7 @@ def test_an_explicit_penalty_goes_out_and_comes_back(tmp_path):
 
 
 def test_what_differs_is_said_in_the_file(tmp_path):
-    problem = punched_block("tet4", 4)
+    problem = build_punched_block("tet4", 4)
     for settings, words in ((FebSettings(), "as stiff as limbfit's; FEBio's"), (FebSettings(3.0), "smaller")):
         write_feb(problem, tmp_path / "model.feb", settings)
         text = (tmp_path / "model.feb").read_text()
@@ -140,7 +140,7 @@ def test_what_differs_is_said_in_the_file(tmp_path):
 
 def test_a_written_model_is_as_stiff_as_its_own(tmp_path):
     """Read back and solved as FEBio would, with its steps and its penalty: within 1.5 % of the peak."""
-    problem = punched_block("tet4", 8)
+    problem = build_punched_block("tet4", 8)
     own = solve(problem, store="none")
     assert own.completed
     write_feb(problem, tmp_path / "model.feb", FebSettings())

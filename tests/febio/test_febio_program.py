@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.bench.blocks import punched_block
+from limbfit.bench.blocks import build_punched_block
 from limbfit.errors import InputError, ProblemError, RunError
 from limbfit.fe import History
 from limbfit.febio import RunVerdict, build_result, find_febio, judge_run, read_log, run_febio
@@ -95,7 +95,7 @@ def test_six_digits_of_the_end_are_the_end(tmp_path, end):
     assert judge_run(WELL.replace("time : 2", f"time : {0.9999 * end:.6g}"), 0, end).kind == "partial"
     (tmp_path / "forces.txt").write_text(f"*Step  = 1\n*Time  = {end:.6g}\n*Data  = Fz\n3,-1.5\n")
     history = History(np.array([0.0, end / 2, end]), np.array([0.0, 6.1, 0.0]))
-    problem = replace(punched_block("hex8", 2), history=history)
+    problem = replace(build_punched_block("hex8", 2), history=history)
     log = read_log(tmp_path / "forces.txt")
     assert build_result(problem, log, judge_run(said, 0, end)).completed
 
@@ -123,7 +123,7 @@ def replay(folder: Path, name: str) -> Path:
 def test_a_failed_run_is_a_result_with_its_reason(tmp_path, name):
     run = run_febio(replay(tmp_path, name), tmp_path, END, "forces.txt")
     assert run.verdict.kind == VERDICTS[name][0]
-    problem = punched_block("hex8", 2)
+    problem = build_punched_block("hex8", 2)
     history = History(np.array([0.0, END / 2, END]), np.array([0.0, 6.1, 0.0]))
     problem = replace(problem, history=history)
     found = build_result(problem, run.log, run.verdict, run.seconds)
@@ -145,7 +145,7 @@ def test_a_good_run(tmp_path):
         tmp_path, 2.0, "forces.txt",
     )  # fmt: skip
     assert run.verdict == RunVerdict("normal", "", 2.0, "4.11.0")
-    found = build_result(punched_block("hex8", 2), run.log, run.verdict)
+    found = build_result(build_punched_block("hex8", 2), run.log, run.verdict)
     assert found.completed
     assert found.force.tolist() == [0.0, 1.5]  # along the axis, which is -z; rest is put before it
 
@@ -225,7 +225,7 @@ def test_a_table_of_something_else(tmp_path):
     good = RunVerdict("normal", "", 2.0, "")
     file.write_text("*Step  = 1\n*Time  = 2\n*Data  = Fx;Fy\n3,0,0\n")
     with pytest.raises(ProblemError, match="has no Fz"):
-        build_result(punched_block("hex8", 2), read_log(file), good)
+        build_result(build_punched_block("hex8", 2), read_log(file), good)
     file.write_text("*Step  = 1\n*Time  = 200\n*Data  = Fz\n3,0\n")
     with pytest.raises(ProblemError, match="goes on to 200 s"):
-        build_result(punched_block("hex8", 2), read_log(file), good)
+        build_result(build_punched_block("hex8", 2), read_log(file), good)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from febfiles import FEB, written
 
-from limbfit.bench.blocks import punched_block
+from limbfit.bench.blocks import build_punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import Indenter, RigidSurface
 from limbfit.febio import FebSettings, build_step_control, read_feb, read_log, to_problem, write_feb
@@ -196,7 +196,7 @@ def test_a_motion_backwards_pushes_the_other_way(tmp_path):
 def test_edges_are_no_rounder_than_the_tissue_is_thick(tmp_path, thin):
     """A plate of 150 mm over a bar: 1 % of its width would be an edge of 1.5 mm."""
     plate = RigidSurface(np.array([75.0, 75.0, 5.0]) * BOX, BOX_FACES)
-    problem = punched_block("hex8", 2)
+    problem = build_punched_block("hex8", 2)
     points = problem.mesh.points * [1.0, 1.0, thin]
     tool = Indenter("stl", centre=(0.0, 0.0, 1.0), axis=(0.0, 0.0, -1.0), surface=plate)
     problem = replace(problem, mesh=problem.mesh.with_points(points), indenter=tool)

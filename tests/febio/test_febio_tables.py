@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from febfiles import FEB, written
 
-from limbfit.bench.blocks import punched_block
+from limbfit.bench.blocks import build_punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import History
 from limbfit.febio import FebSettings, read_feb, run_feb, write_feb
@@ -42,7 +42,7 @@ def last_step(file):
 def ran(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tables")
     ramp = History(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
-    problem = replace(punched_block("hex8", 4), history=ramp)
+    problem = replace(build_punched_block("hex8", 4), history=ramp)
     tool = write_feb(problem, folder / "model.feb", FebSettings())
     text = (folder / "model.feb").read_text()
     text = re.sub("<Output>.*</Output>", TABLES, text, flags=re.DOTALL)
@@ -120,7 +120,9 @@ def test_masses_add_up():
 
 
 def test_a_rigid_body_without_a_centre_reports_where_its_mass_is(tmp_path):
-    problem = replace(punched_block("hex8", 2), history=History(np.array([0.0, 1.0]), np.array([0.0, 1.0])))
+    problem = replace(
+        build_punched_block("hex8", 2), history=History(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    )
     tool = write_feb(problem, tmp_path / "model.feb", FebSettings())
     text = re.sub("<center_of_mass>.*</center_of_mass>", "", (tmp_path / "model.feb").read_text())
     model = read_feb(written(tmp_path, text))

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limbfit.bench.blocks import punched_block
+from limbfit.bench.blocks import build_punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, Ogden, OgdenQLV, RigidSurface, StepControl, System, solve
-from limbfit.fe.solution.control import schedule
+from limbfit.fe.solution.control import schedule_steps
 from limbfit.febio import (
     FebSettings,
     ParameterRange,
@@ -60,7 +60,7 @@ INDENTERS = {
 
 
 def block(element="tet10", shape="square", divisions=4):
-    return replace(punched_block(element, divisions), indenter=INDENTERS[shape])
+    return replace(build_punched_block(element, divisions), indenter=INDENTERS[shape])
 
 
 def exported(problem, folder, **settings):
@@ -92,7 +92,7 @@ def test_it_is_read_back_as_it_was(tmp_path, element):
         np.testing.assert_array_equal(back.prony, mine.prony)
         assert back.kappa == pytest.approx(mine.kappa, rel=1e-14)
     times = build_step_control(model, found).times
-    assert set(np.round(schedule(problem.history, StepControl()), 9)) <= set(np.round(times, 9))
+    assert set(np.round(schedule_steps(problem.history, StepControl()), 9)) <= set(np.round(times, 9))
 
 
 @pytest.mark.parametrize("terms", [1, 2, 6])

@@ -10,7 +10,7 @@ import pytest
 import pyvista as pv
 from scipy.interpolate import make_interp_spline
 
-from limbfit.bench.blocks import punched_block
+from limbfit.bench.blocks import build_punched_block
 from limbfit.fe import ELEMENTS, Indenter, OgdenQLV, StepControl, solve
 from limbfit.fields import Animation, write_fields
 from limbfit.mesh import cell_volumes, read_vtu
@@ -32,7 +32,7 @@ def played(problem, folder, **control):
 def elastic(request, tmp_path_factory):
     """A long-term elastic block under a flat round punch that covers several faces."""
     problem = replace(
-        punched_block(request.param, 12),
+        build_punched_block(request.param, 12),
         materials=ELASTIC,
         indenter=Indenter("cylinder", 30.0, 6.0, (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
     )
@@ -64,7 +64,7 @@ def test_pressure_integrates_to_the_force(elastic):
 @pytest.mark.parametrize("rule", ["nodes", "gauss"])
 def test_pressure_under_a_platen_is_the_force_exactly(element, rule, tmp_path):
     platen = Indenter("square", 90.0, 2.0, (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
-    problem = replace(punched_block(element, 4), indenter=platen, contact_rule=rule)
+    problem = replace(build_punched_block(element, 4), indenter=platen, contact_rule=rule)
     history = replace(problem.history, displacement=np.array([0.0, 2.0, 0.0]))
     rows = []
     result = solve(
@@ -139,7 +139,7 @@ def test_peak_file_and_animation_frame_are_the_same(elastic, tmp_path):
 
 
 def test_collection_plays_all_steps(tmp_path):
-    problem = replace(punched_block("tet4", 4), contact_rule="nodes")
+    problem = replace(build_punched_block("tet4", 4), contact_rule="nodes")
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "step-0099.vtu").write_text("left by a run with more steps")
     result, _ = played(problem, tmp_path)
@@ -160,7 +160,7 @@ def test_elements_share_one_set_of_fields(tmp_path):
     """Files of every element hold the same arrays, so that a ParaView state serves all."""
     names = set()
     for element in ELEMENTS:
-        problem = punched_block(element, 4)
+        problem = build_punched_block(element, 4)
         animation = Animation(problem, tmp_path / f"{element}.pvd")
         names.add(tuple(sorted(pv.read(animation.frames[0][1]).array_names)))
     assert len(names) == 1

@@ -11,7 +11,7 @@ import pytest
 from layered import block_context, block_study
 from limbfit.errors import InputError, StudyError
 from limbfit.fe import Contractile, OgdenQLV
-from limbfit.indentation import SimulationJob, build_problem, materials, simulate
+from limbfit.indentation import SimulationJob, build_materials, build_problem, simulate
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.experiments.socket import check_socket
 from limbfit.pipeline.shared.context import Context
@@ -37,7 +37,7 @@ def context(tmp_path_factory) -> Context:
 def test_the_core_contracts_and_no_other_tissue(tmp_path):
     study = study_of(tmp_path)
     assert study.fixed == ("skin.k1_kPa", "skin.k2", "skin.active_kPa")
-    made = materials(TRUTH, 100.0, study.law.name, study.fibres)
+    made = build_materials(TRUTH, 100.0, study.law.name, study.fibres)
     assert isinstance(made["skin"], OgdenQLV)
     assert isinstance(made["muscle"], Contractile)
     assert made["muscle"].active == pytest.approx(0.006)

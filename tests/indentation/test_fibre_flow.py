@@ -9,8 +9,8 @@ import pytest
 
 from limbfit.bench.blocks import HEX, SIX_TETS, build_boxes, turn_upright
 from limbfit.errors import ProblemError
-from limbfit.indentation import fibre_field, neighbourhood
-from limbfit.indentation.fibres import flow_directions
+from limbfit.indentation import build_fibre_field, cut_neighbourhood
+from limbfit.indentation.fibres import compute_flow_directions
 from limbfit.mesh import Mesh
 
 
@@ -33,7 +33,7 @@ def bar(bent: bool = False) -> Mesh:
 
 def test_a_straight_bar_has_straight_fibres_in_its_muscle_only():
     mesh = bar()
-    found = fibre_field([("muscle", "flow")], mesh)
+    found = build_fibre_field([("muscle", "flow")], mesh)
     inside = mesh.regions == 1
     np.testing.assert_allclose(found[inside], np.tile([0.0, 0.0, -1.0], (inside.sum(), 1)), atol=1e-6)
     np.testing.assert_array_equal(found[~inside], np.tile([1.0, 0.0, 0.0], ((~inside).sum(), 1)))
@@ -42,7 +42,7 @@ def test_a_straight_bar_has_straight_fibres_in_its_muscle_only():
 def test_a_bent_one_has_fibres_that_go_around():
     """The potential falls with the angle, so fibres are circles: within 4 degrees in linear tetrahedra."""
     mesh = bar(bent=True)
-    found = flow_directions(mesh, "muscle")
+    found = compute_flow_directions(mesh, "muscle")
     middle = mesh.points[mesh.cells[mesh.regions == 1]].mean(axis=1)
     around = np.column_stack([np.zeros(len(middle)), middle[:, 2], -middle[:, 1]])
     around /= np.linalg.norm(around, axis=1, keepdims=True)
@@ -51,8 +51,8 @@ def test_a_bent_one_has_fibres_that_go_around():
 
 def test_a_part_of_the_mesh_keeps_the_fibres_of_the_whole():
     mesh = bar(bent=True)
-    whole = fibre_field([("muscle", "flow")], mesh)
-    part = neighbourhood(mesh, np.array([6.0, 30.0, 20.0]), 20.0)
+    whole = build_fibre_field([("muscle", "flow")], mesh)
+    part = cut_neighbourhood(mesh, np.array([6.0, 30.0, 20.0]), 20.0)
     assert 0 < part.cells.sum() < len(mesh.cells)
     np.testing.assert_array_equal(part.mesh.points[part.mesh.cells], mesh.points[mesh.cells[part.cells]])
     assert len(whole[part.cells]) == len(part.mesh.cells)
@@ -64,11 +64,13 @@ def test_a_part_of_the_mesh_keeps_the_fibres_of_the_whole():
 def test_a_flow_without_a_way_is_refused(name, what):
     mesh = bar()
     with pytest.raises(ProblemError, match=what):
-        flow_directions(replace(mesh, node_sets={**mesh.node_sets, name: np.zeros(0, dtype=int)}), "muscle")
+        compute_flow_directions(
+            replace(mesh, node_sets={**mesh.node_sets, name: np.zeros(0, dtype=int)}), "muscle"
+        )
 
 
 def test_a_flow_needs_tetrahedra():
     points, corners = build_boxes(*[np.linspace(0.0, 1.0, 2)] * 3)
     mesh = Mesh(points, corners[:, HEX], "hex8", np.zeros(1, dtype=int), ("muscle",))
     with pytest.raises(ProblemError, match="tetrahedra"):
-        flow_directions(mesh, "muscle")
+        compute_flow_directions(mesh, "muscle")

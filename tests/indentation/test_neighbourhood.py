@@ -9,14 +9,14 @@ import pytest
 from scipy.sparse import csr_array, triu
 
 from layered import layered_block
-from limbfit.bench.blocks import block_site
+from limbfit.bench.blocks import build_block_site
 from limbfit.errors import ProblemError
-from limbfit.fe import System, tangent_at_rest
+from limbfit.fe import System, compute_tangent_at_rest
 from limbfit.indentation import (
     Extension,
     SimulationJob,
     build_problem,
-    neighbourhood,
+    cut_neighbourhood,
     simulate,
     simulating,
     to_vector,
@@ -42,7 +42,7 @@ def wide() -> Mesh:
 @pytest.fixture(scope="module")
 def site(wide, tmp_path_factory):
     steps = SolverTable(load_steps=4, unload_steps=4, penalty_per_mm=100.0)
-    return block_site("wide", tmp_path_factory.mktemp("wide") / "wide.vtu", wide, 4.0, steps, "tet10p0")
+    return build_block_site("wide", tmp_path_factory.mktemp("wide") / "wide.vtu", wide, 4.0, steps, "tet10p0")
 
 
 def job(model, **how) -> SimulationJob:
@@ -51,7 +51,7 @@ def job(model, **how) -> SimulationJob:
 
 
 def test_a_part_keeps_its_geometry_tissues_and_sets(wide):
-    part = neighbourhood(wide, CENTRE, RADIUS_MM)
+    part = cut_neighbourhood(wide, CENTRE, RADIUS_MM)
     mesh = part.mesh
     check(mesh)
     assert mesh.points == pytest.approx(wide.points[part.nodes])
@@ -76,18 +76,18 @@ def test_only_what_hangs_together_with_the_site_is_kept(wide):
         np.vstack([wide.points, other.points]), np.vstack([wide.cells, other.cells + len(wide.points)]),
         wide.cell_type, np.tile(wide.regions, 2), wide.region_names,
     )  # fmt: skip
-    assert neighbourhood(both, CENTRE, RADIUS_MM).nodes.max() < len(wide.points)
+    assert cut_neighbourhood(both, CENTRE, RADIUS_MM).nodes.max() < len(wide.points)
 
 
 def test_a_site_beside_its_mesh_is_told(wide):
     with pytest.raises(ProblemError, match="no cell of the mesh is within 42 mm"):
-        neighbourhood(wide, CENTRE - 500.0 * AXIS, RADIUS_MM)
+        cut_neighbourhood(wide, CENTRE - 500.0 * AXIS, RADIUS_MM)
 
 
 def test_a_part_that_nothing_else_carries_is_held_at_its_cut(wide, site):
     """Thin tissue far from bone: no cut below the indenter, no bone in reach."""
     far = replace(wide, node_sets={"fixed_side": wide.nodes_where(lambda p: p[:, 0] < -59.9)})
-    part = neighbourhood(far, CENTRE, RADIUS_MM)
+    part = cut_neighbourhood(far, CENTRE, RADIUS_MM)
     problem = build_problem(replace(site, within_mm=RADIUS_MM), far, TRUTH)
     assert len(part.cut) > 0
     assert set(problem.fixed) == set(part.cut)
@@ -128,7 +128,7 @@ def test_first_guesses_do_not_depend_on_what_was_simulated_before(site):
 
 def test_the_extension_is_in_equilibrium_where_nothing_is_given(site, wide):
     problem = build_problem(site, wide, TRUTH)
-    system, part = System(problem), neighbourhood(wide, CENTRE, RADIUS_MM)
+    system, part = System(problem), cut_neighbourhood(wide, CENTRE, RADIUS_MM)
     extended = Extension(system, part, CENTRE, RADIUS_MM)
     moved = np.random.default_rng(0).normal(size=(len(part.nodes), 3))
     u = extended(moved)
@@ -145,19 +145,21 @@ def test_the_extension_is_in_equilibrium_where_nothing_is_given(site, wide):
 
 def _product(system: System, u: np.ndarray) -> np.ndarray:
     """The tangent at rest times a displacement, at the unknowns."""
-    upper = csr_array((tangent_at_rest(system), system.indices, system.indptr), shape=(system.unknowns,) * 2)
+    upper = csr_array(
+        (compute_tangent_at_rest(system), system.indices, system.indptr), shape=(system.unknowns,) * 2
+    )
     return (upper + triu(upper, 1).T) @ u.ravel()[system.free]
 
 
 def test_workers_on_all_cores_keep_at_most_half_of_the_memory():
-    assert simulating.kept_nodes(64e9, 2) == 200_000
-    assert simulating.kept_nodes(8e9, 4) * 4 * 25_000 == pytest.approx(4e9)
+    assert simulating.count_stored_nodes(64e9, 2) == 200_000
+    assert simulating.count_stored_nodes(8e9, 4) * 4 * 25_000 == pytest.approx(4e9)
 
 
 def test_a_process_with_little_memory_forgets_the_site_that_was_not_used_for_longest(site, monkeypatch):
     other = replace(site, name="other")
     simulating._prepared.clear()
-    monkeypatch.setattr(simulating, "kept_nodes", lambda memory, cores: 1)
+    monkeypatch.setattr(simulating, "count_stored_nodes", lambda memory, cores: 1)
     for model in (site, other):
         assert simulate(job(model, sensitivities=False)).completed
     assert [model.name for model, _ in simulating._prepared] == ["other"]

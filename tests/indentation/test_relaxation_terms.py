@@ -9,7 +9,7 @@ import pytest
 from guide import identified
 from limbfit.errors import StudyError
 from limbfit.fe import OgdenQLV
-from limbfit.indentation import materials
+from limbfit.indentation import build_materials
 from limbfit.laws import LAWS, MOST_RELAXATIONS, TissueLaw, is_ogden
 from limbfit.report.formats import symbol, unit_of
 from limbfit.study import load_study
@@ -60,7 +60,7 @@ def test_a_study_with_two_terms_has_their_parameters_and_materials(tmp_path):
     assert [name for tissue, name in study.parameters if tissue == "skin"] == list(TRUTH)
     assert study.material.of("skin", "start")["tau2_s"] == 3.0
     assert {"skin.c_kPa", "muscle.m"} <= study.priors.keys()  # what is known of people holds for all of them
-    made = materials({"skin": TRUTH}, 80.0, study.law.name)["skin"]
+    made = build_materials({"skin": TRUTH}, 80.0, study.law.name)["skin"]
     assert made == OgdenQLV(0.006, 5.0, (1.6, 0.9), (0.12, 2.2), 80.0)
     assert made.parameter_names == tuple(p.name for p in study.law.parameters)
 

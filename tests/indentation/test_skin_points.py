@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.bench.blocks import block_site, layered_block
+from limbfit.bench.blocks import build_block_site, build_layered_block
 from limbfit.errors import ProblemError
 from limbfit.fe import Indenter
 from limbfit.indentation import (
     SimulationJob,
     SiteModel,
+    choose_points_around,
+    find_skin_points,
     is_under,
-    points_around,
     simulate,
-    skin_points,
     to_vector,
 )
 from limbfit.study import IndenterTable, SolverTable
@@ -32,9 +32,9 @@ TRUTH = {
 @pytest.mark.parametrize("kind", ["hex8", "tet10"])
 def test_a_point_follows_the_skin(kind: str) -> None:
     """Displacements that the elements represent exactly, on edges, inside faces and off the skin."""
-    mesh = layered_block(kind, 6)
+    mesh = build_layered_block(kind, 6)
     asked = np.array([[0.0, 0.0, 0.0], [12.3, -4.1, 1.5], [-7.7, 9.4, -0.5], [35.0, 1.0, 0.0]])
-    found = skin_points(mesh, asked)
+    found = find_skin_points(mesh, asked)
     feet = np.array([[0.0, 0.0, 0.0], [12.3, -4.1, 0.0], [-7.7, 9.4, 0.0], [30.0, 1.0, 0.0]])
     assert found.points == pytest.approx(feet, abs=1e-9)
     assert found.off_mm == pytest.approx([0.0, 1.5, 0.5, 5.0])
@@ -43,22 +43,22 @@ def test_a_point_follows_the_skin(kind: str) -> None:
     told = np.array([gauge.read(field) for gauge in found.gauges(np.eye(3))]).reshape(-1, 3)
     x, y, _ = feet.T
     assert told == pytest.approx(np.column_stack([0.1 * x - 0.02 * y, 0.05 * y, 0.2 * x - 1.0]), abs=1e-9)
-    (along,) = skin_points(mesh, asked[1:2]).gauges(np.array([[0.6, 0.0, 0.8]]))
+    (along,) = find_skin_points(mesh, asked[1:2]).gauges(np.array([[0.6, 0.0, 0.8]]))
     assert along.read(field) == pytest.approx(told[1] @ [0.6, 0.0, 0.8])
 
 
 def test_quadratic_faces_interpolate_quadratic_moves() -> None:
-    mesh = layered_block("tet10", 6)
-    (gauge,) = skin_points(mesh, np.array([[2.3, -4.1, 0.0]])).gauges(np.array([[0.0, 0.0, 1.0]]))
+    mesh = build_layered_block("tet10", 6)
+    (gauge,) = find_skin_points(mesh, np.array([[2.3, -4.1, 0.0]])).gauges(np.array([[0.0, 0.0, 1.0]]))
     sunk = np.zeros((len(mesh.points), 3))
     sunk[:, 2] = 0.02 * mesh.points[:, 0] ** 2
     assert gauge.read(sunk) == pytest.approx(0.02 * 2.3**2, rel=1e-9)
 
 
 def test_a_mesh_without_skin_is_refused() -> None:
-    mesh = replace(layered_block("hex8", 4), face_sets={})
+    mesh = replace(build_layered_block("hex8", 4), face_sets={})
     with pytest.raises(ProblemError, match="no face set 'skin'; mesh the site anew"):
-        skin_points(mesh, np.zeros((1, 3)))
+        find_skin_points(mesh, np.zeros((1, 3)))
 
 
 @pytest.mark.parametrize(("shape", "inside"), [("square", (9.5, 9.5)), ("sphere", (6.9, 6.9))])
@@ -70,13 +70,13 @@ def test_what_the_indenter_hides(shape: str, inside: tuple[float, float]) -> Non
 
 
 def test_rings_are_on_the_skin_and_beside_the_indenter() -> None:
-    mesh = layered_block("tet10", 6)
+    mesh = build_layered_block("tet10", 6)
     indenter = Indenter("square", 20.0, 2.0)
-    around = points_around(mesh, indenter)
+    around = choose_points_around(mesh, indenter)
     assert len(around) == 24
     assert np.abs(around[:, 2]).max() < 1e-9
     assert not is_under(indenter, around).any()
-    at_the_end = points_around(mesh, replace(indenter, centre=(25.0, 0.0, 0.0)))
+    at_the_end = choose_points_around(mesh, replace(indenter, centre=(25.0, 0.0, 0.0)))
     assert 8 <= len(at_the_end) < 24
     assert at_the_end[:, 0].max() <= 30.0 + 1e-9
 
@@ -84,9 +84,9 @@ def test_rings_are_on_the_skin_and_beside_the_indenter() -> None:
 def site(folder: Path) -> SiteModel:
     """A block of 60 mm under a ball, 3 mm deep."""
     steps = SolverTable(load_steps=3, unload_steps=2, penalty_per_mm=400.0)
-    mesh = layered_block("tet10", 6)
+    mesh = build_layered_block("tet10", 6)
     mesh = replace(mesh, node_sets={"fixed_bottom": mesh.node_sets["bottom"]})
-    model = block_site("a", folder / "a.vtu", mesh, 3.0, steps)
+    model = build_block_site("a", folder / "a.vtu", mesh, 3.0, steps)
     return replace(model, indenter=IndenterTable(shape="sphere", width_mm=16.0))
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.bench.blocks import block_site, layered_block
+from limbfit.bench.blocks import build_block_site, build_layered_block
 from limbfit.errors import ProblemError
 from limbfit.fe import History, OgdenQLV, Problem, Result, StepControl, Support, solve
-from limbfit.indentation import SimulationJob, SiteModel, WavePlace, simulate, to_vector, waves_under
-from limbfit.indentation.waves import DISC_HALF_MM, DISC_RADIUS_MM, disc_points, wave_speeds
+from limbfit.indentation import SimulationJob, SiteModel, WavePlace, place_waves_under, simulate, to_vector
+from limbfit.indentation.waves import DISC_HALF_MM, DISC_RADIUS_MM, compute_wave_speeds, sample_disc
 from limbfit.mesh import locate
 from limbfit.study import IndenterTable, SolverTable
 
@@ -28,7 +28,7 @@ MIDDLE = (0.0, 0.0, -16.0)
 
 def compressed(element: str, hold_s: float) -> Result:
     """A nearly incompressible cube that is shortened along z at once, free to widen, and held."""
-    mesh = layered_block(element, 2)
+    mesh = build_layered_block(element, 2)
     low, points = mesh.points.min(axis=0), mesh.points
     supports = [Support(np.flatnonzero(np.abs(points[:, i] - low[i]) < 1e-9), i) for i in range(3)]
     top = np.flatnonzero(np.abs(points[:, 2]) < 1e-9)
@@ -60,7 +60,7 @@ def test_speeds_in_a_compressed_cube(element: str) -> None:
     x, z = (1.0 - SHORTER) ** -0.5, 1.0 - SHORTER
     ways = {"z": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), "x": ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))}
     places = [WavePlace("muscle", MIDDLE, motion, way) for motion, way in ways.values()]
-    speeds, slopes = wave_speeds(result, places)
+    speeds, slopes = compute_wave_speeds(result, places)
     assert slopes is None
     assert speeds[:, 0] == pytest.approx(np.sqrt(1e6 * C * (1.0 + GAMMA) / 1e3), rel=1e-9)
     mean = (2.0 * pull(x) + pull(z)) / 3.0
@@ -76,10 +76,10 @@ def test_speeds_in_a_compressed_cube(element: str) -> None:
 
 def site(folder: Path) -> SiteModel:
     steps = SolverTable(load_steps=4, unload_steps=3, penalty_per_mm=400.0)
-    mesh = layered_block("tet10", 6)
+    mesh = build_layered_block("tet10", 6)
     mesh = replace(mesh, node_sets={"fixed_bottom": mesh.node_sets["bottom"]})
-    model = block_site("a", folder / "a.vtu", mesh, 4.0, steps)
-    return replace(model, waves=waves_under(model, mesh, [("skin", None), ("muscle", 20.0)]))
+    model = build_block_site("a", folder / "a.vtu", mesh, 4.0, steps)
+    return replace(model, waves=place_waves_under(model, mesh, [("skin", None), ("muscle", 20.0)]))
 
 
 def test_places_under_the_indenter(tmp_path: Path) -> None:
@@ -88,15 +88,15 @@ def test_places_under_the_indenter(tmp_path: Path) -> None:
     assert (muscle.tissue, muscle.point) == ("muscle", pytest.approx((0.0, 0.0, -20.0)))
     assert skin.motion == pytest.approx((0.0, 0.0, -1.0))
     assert np.dot(skin.way, skin.motion) == pytest.approx(0.0)
-    mesh = layered_block("tet10", 6)
-    found = waves_under(site(tmp_path), mesh)
+    mesh = build_layered_block("tet10", 6)
+    found = place_waves_under(site(tmp_path), mesh)
     assert [place.tissue for place in found] == ["skin", "muscle"]
     for wanted, told in (
         (("fat", None), "no fat lies under the indenter's axis, only skin, muscle"),
         (("skin", 12.0), "skin lies 0.0 to 3.0 mm deep, and not at 12 mm"),
     ):
         with pytest.raises(ProblemError, match=told):
-            waves_under(site(tmp_path), mesh, [wanted])
+            place_waves_under(site(tmp_path), mesh, [wanted])
 
 
 def test_speeds_and_their_slopes_beside_the_force(tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ def test_speeds_and_their_slopes_beside_the_force(tmp_path: Path) -> None:
 
 
 def test_means_over_a_disc_of_equal_weights() -> None:
-    points = disc_points()
+    points = sample_disc()
     assert points[0] == pytest.approx([0.0, 0.0, 0.0])
     assert np.hypot(points[:, 0], points[:, 1]).max() < DISC_RADIUS_MM
     mean, moments = points[1:].mean(axis=0), points[1:].T @ points[1:] / len(points[1:])
@@ -135,12 +135,12 @@ def test_speeds_under_a_ball_are_the_same_on_any_fine_mesh(tmp_path: Path) -> No
     """Where the middle is a node, and where it is amid a face: points alone differ by 2.7 %."""
     found = []
     for divisions in (15, 16):
-        mesh = layered_block("tet10", divisions)
+        mesh = build_layered_block("tet10", divisions)
         mesh = replace(mesh, node_sets={"fixed_bottom": mesh.node_sets["bottom"]})
         steps = SolverTable(load_steps=5, unload_steps=3, penalty_per_mm=150.0)
-        model = block_site("a", tmp_path / f"{divisions}.vtu", mesh, 4.0, steps)
+        model = build_block_site("a", tmp_path / f"{divisions}.vtu", mesh, 4.0, steps)
         ball = IndenterTable(shape="sphere", width_mm=24.0)
-        model = replace(model, indenter=ball, waves=waves_under(model, mesh))
+        model = replace(model, indenter=ball, waves=place_waves_under(model, mesh))
         vector = tuple(to_vector(TRUTH, TISSUES))
         found.append(simulate(SimulationJob(model, TISSUES, vector, (2.0, 4.0), False)).observed)
     assert found[0] == pytest.approx(found[1], rel=0.02)
@@ -157,7 +157,7 @@ def test_a_place_that_the_mesh_does_not_have_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["hex8", "tet10"])
 def test_points_are_located_in_cells(kind: str) -> None:
-    mesh = layered_block(kind, 6)
+    mesh = build_layered_block(kind, 6)
     points = np.array([[3.3, -7.1, -12.4], [-29.9, 14.0, -3.2], [0.0, 0.0, -1.0]])
     cells, local, off = locate(mesh, points, mesh.region_names.index("muscle"))
     assert off == pytest.approx([0.0, 0.0, 2.0], abs=1e-9)

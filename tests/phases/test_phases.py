@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from limbfit.fe import History
-from limbfit.fe.solution.control import StepControl, schedule
+from limbfit.fe.solution.control import StepControl, schedule_steps
 from limbfit.phases import boundaries, find_phases, in_words, loading_end
 
 
@@ -124,5 +124,5 @@ def test_a_history_without_loading_has_its_peak_at_rest():
 def test_a_hold_takes_no_steps_from_the_loading(end_mm):
     """A creeping hold put the peak at its end: loading got two steps of ten."""
     history = History(np.array([0.0, 1.0, 31.0, 32.0]), np.array([0.0, 3.0, end_mm, 0.0]))
-    times = schedule(history, StepControl(load_steps=10, unload_steps=8))
+    times = schedule_steps(history, StepControl(load_steps=10, unload_steps=8))
     assert (times <= 1.0).sum() == 10

@@ -12,7 +12,7 @@ import pytest
 
 from guide import from_the_guide, identified
 from limbfit import Indenter, Measure, load_study, register_shape
-from limbfit.bench.blocks import punched_block
+from limbfit.bench.blocks import build_punched_block
 from limbfit.errors import InputError, ProblemError, StudyError
 from limbfit.extensions import load_extensions
 from limbfit.fe import StepControl, solve
@@ -77,7 +77,7 @@ def test_its_wall_leans_by_its_taper(shape):
 def test_it_pushes_harder_than_a_cylinder_of_the_same_end_and_comes_back(shape):
     """Its wall widens: tissue is pushed aside by more."""
     control = StepControl(load_steps=5, unload_steps=4)
-    problem = punched_block("tet10", 6)
+    problem = build_punched_block("tet10", 6)
     start = {"width": 12.0, "edge_radius": 1.5, "centre": (0.0, 0.0, 1.0)}
     results = [
         solve(replace(problem, indenter=tool), control)
@@ -90,7 +90,7 @@ def test_it_pushes_harder_than_a_cylinder_of_the_same_end_and_comes_back(shape):
 
 def test_febio_is_given_its_front(tmp_path, shape):
     """Every point of the faceted body lies on it, and ahead of it both have the same distance."""
-    problem = replace(punched_block("tet4", 4), indenter=tapered(**FRAME))
+    problem = replace(build_punched_block("tet4", 4), indenter=tapered(**FRAME))
     tool = write_feb(problem, tmp_path / "model.feb", FebSettings())
     front = tool.points[np.unique(tool.front)]
     found = to_problem(read_feb(tmp_path / "model.feb")).indenter

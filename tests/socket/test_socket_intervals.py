@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from limbfit.fe import Doubt
+from limbfit.fe import SimulationWarning
 from limbfit.identify.uncertainty.uncertainty import NORMAL_95
 from limbfit.pipeline.experiments.socket_intervals import Spread, drawn, spread_facts, widen
 from limbfit.pipeline.experiments.socket_limb import warning
@@ -74,8 +74,10 @@ def test_what_derivatives_miss_of_simulated_draws_widens_the_intervals():
 
 
 def test_folded_elements_are_told_with_a_remedy_that_a_socket_has():
-    found = warning(Doubt("folded", "27 elements are inside out: a rounded indenter", 27, 0.0, 0.0))
+    found = warning(
+        SimulationWarning("folded", "27 elements are inside out: a rounded indenter", 27, 0.0, 0.0)
+    )
     assert found.startswith("27 elements of the limb")
     assert "socket.edge_mm" in found
     assert "indenter" not in found
-    assert warning(Doubt("unsettled", "use more steps", 1, 0.0, 0.0)) == "use more steps"
+    assert warning(SimulationWarning("unsettled", "use more steps", 1, 0.0, 0.0)) == "use more steps"

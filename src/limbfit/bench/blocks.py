@@ -18,9 +18,9 @@ HALF, DEPTH, LAYER = 30.0, 30.0, 3.0  # mm
 INDENTATION, SPEED = 6.0, 0.96  # mm, mm/s
 
 
-def punched_block(element: str, divisions: int) -> Problem:
+def build_punched_block(element: str, divisions: int) -> Problem:
     """The square punch on a block of 60 x 60 x 30 mm with a 3 mm layer; ``divisions`` cells along 60 mm."""
-    mesh = layered_block(ELEMENTS[element].cell_type, divisions)
+    mesh = build_layered_block(ELEMENTS[element].cell_type, divisions)
     ramp = INDENTATION / SPEED
     return Problem(
         mesh=mesh,
@@ -33,15 +33,15 @@ def punched_block(element: str, divisions: int) -> Problem:
     )
 
 
-def block_site(
+def build_block_site(
     name: str, file: Path, mesh: Mesh, depth_mm: float, steps: SolverTable | None = None, element: str = ""
 ) -> SiteModel:
     """A site in the middle of a block's top, its mesh stored in ``file``; in and out at the usual speed."""
     write_vtu(mesh, file)
-    return block_model(name, file, steps or SolverTable(), element, depth_mm)
+    return build_block_model(name, file, steps or SolverTable(), element, depth_mm)
 
 
-def block_model(
+def build_block_model(
     name: str, file: Path, steps: SolverTable, element: str, depth_mm: float = INDENTATION
 ) -> SiteModel:
     """The same, of a mesh that ``file`` holds."""
@@ -59,10 +59,10 @@ def block_model(
     )
 
 
-def layered_block(cell_type: str, divisions: int) -> Mesh:
+def build_layered_block(cell_type: str, divisions: int) -> Mesh:
     """Boxes of equal size below a layer; node set ``bottom``, face set ``skin`` (the whole top)."""
     side = np.linspace(-HALF, HALF, divisions + 1)
-    n_below, n_above = _through(divisions)
+    n_below, n_above = _divide_depth(divisions)
     below, above = np.linspace(-DEPTH, -LAYER, n_below + 1), np.linspace(-LAYER, 0.0, n_above + 1)
     points, corners = build_boxes(side, side, np.concatenate([below, above[1:]]))
     cells = (
@@ -80,13 +80,13 @@ def layered_block(cell_type: str, divisions: int) -> Mesh:
     return to_tet10(mesh) if cell_type == "tet10" else mesh
 
 
-def _through(divisions: int) -> tuple[int, int]:
+def _divide_depth(divisions: int) -> tuple[int, int]:
     """Cells through the depth, below the layer and in it, of about the same size as along the side."""
     size = 2 * HALF / divisions
     return max(round((DEPTH - LAYER) / size), 1), max(round(LAYER / size), 1)
 
 
-def divisions_for(element: str, unknowns: int) -> int:
+def choose_divisions(element: str, unknowns: int) -> int:
     """Fewest cells along the side that give a block that many unknowns.
 
     Raises
@@ -98,6 +98,6 @@ def divisions_for(element: str, unknowns: int) -> int:
         raise ProblemError(f"no element {element!r}", remedy=f"use one of {', '.join(ELEMENTS)}")
     order = 2 if ELEMENTS[element].cell_type == "tet10" else 1
     divisions = 2
-    while 3 * (order * divisions + 1) ** 2 * order * sum(_through(divisions)) < unknowns:
+    while 3 * (order * divisions + 1) ** 2 * order * sum(_divide_depth(divisions)) < unknowns:
         divisions += 1
     return divisions

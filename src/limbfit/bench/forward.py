@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from .measuring import in_fresh_process, timed_solve
+from .measuring import run_in_fresh_process, solve_timed
 from .reference import PUNCHED, ReferenceCase, Tell, find_reference, load_case
 
 # FEBio 4.11 with PARDISO, alone on 2 cores (Intel Xeon, 2.5 GHz), 2 threads.
@@ -56,9 +56,9 @@ def bench_forward(
     control = {**named.control, "threads": threads}
     job = ForwardJob(replace(named, problem=problem, control=control), folder, False)
     tell(0, 2, f"{case}, plain")
-    plain = in_fresh_process(run_forward, job, threads)
+    plain = run_in_fresh_process(run_forward, job, threads)
     tell(1, 2, f"{plain['seconds']:.1f} s plain; with sensitivities")
-    full = in_fresh_process(run_forward, replace(job, sensitivities=True), threads)
+    full = run_in_fresh_process(run_forward, replace(job, sensitivities=True), threads)
     tell(2, 2, f"{full['seconds']:.1f} s with sensitivities")
     febio = FEBIO_SECONDS.get(case)
     return {
@@ -77,4 +77,4 @@ def bench_forward(
 
 def run_forward(job: ForwardJob) -> dict[str, Any]:
     problem, control, _ = load_case(job.case, job.folder)
-    return timed_solve(problem, control, job.sensitivities)
+    return solve_timed(problem, control, job.sensitivities)

@@ -18,8 +18,8 @@ from ..fe import History, StepControl
 from ..fe.history import Memory
 from ..fe.interpolation import interpolate
 from ..fe.motion import Drives
-from ..fe.solution.control import schedule
-from ..fe.solution.schedule import foresee
+from ..fe.solution.control import schedule_steps
+from ..fe.solution.schedule import predict_remaining_times
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def solve_layer(
     laws: Any = SimpleNamespace(prony=np.array([prony]))
     point: Any = SimpleNamespace(regions=np.zeros(1, dtype=int), weights=np.ones((1, 1)))
     memory = Memory.rest(point, laws)
-    planned = schedule(history, control)
+    planned = schedule_steps(history, control)
     targets, times, forces = list(planned), [0.0], [0.0]
     while targets:
         t = targets.pop(0)
@@ -64,18 +64,18 @@ def solve_layer(
         times.append(t)
         forces.append(force)
         if control.times is None:
-            targets = foresee(history, planned, targets, times, forces)
+            targets = predict_remaining_times(history, planned, targets, times, forces)
     return LayerResult(history, np.array(times), np.array(forces))
 
 
-def reference_layer(history: History, parts: int = 600, **layer: Any) -> LayerResult:
+def solve_reference_layer(history: History, parts: int = 600, **layer: Any) -> LayerResult:
     """The same with so many steps in each phase that their error is nothing (some 1e-5 of the peak)."""
     part = (np.arange(1, parts + 1) / parts) ** 2.0
     times = np.concatenate([p.start_s + p.duration_s * part for p in history.phases])
     return solve_layer(history, StepControl(times=tuple(times)), **layer)
 
 
-def curve_error(found: LayerResult, exact: LayerResult, count: int = 2001) -> tuple[float, float]:
+def compute_curve_error(found: LayerResult, exact: LayerResult, count: int = 2001) -> tuple[float, float]:
     """Root mean square and largest error of the whole curve over the largest force, percent."""
     t = np.linspace(0.0, float(exact.times[-1]), count)
     force = np.interp(t, exact.times, exact.force)

@@ -28,7 +28,7 @@ CALF_PAD_MM = 15.0
 OPENLIMB_CUT = (0.0, 0.0, 5.0), (0.0, 0.0, 1.0)
 
 
-def limbs(shared: Path) -> dict[str, Callable[[], Anatomy]]:
+def list_limbs(shared: Path) -> dict[str, Callable[[], Anatomy]]:
     """Name and maker of five limbs; ``shared`` is the folder with ``data`` and ``reference``.
 
     Raises
@@ -40,11 +40,15 @@ def limbs(shared: Path) -> dict[str, Callable[[], Anatomy]]:
     for folder in (openlimb, calf):
         if not folder.is_dir():
             raise InputError("the real limbs are not there", file=folder, remedy="give --shared")
-    phantoms = {f"phantom {seed}": lambda seed=seed: phantom_limb(seed) for seed in SEEDS}
-    return {**phantoms, "openlimb": lambda: openlimb_mean(openlimb), "calf": lambda: amputated_calf(calf)}
+    phantoms = {f"phantom {seed}": lambda seed=seed: make_phantom_limb(seed) for seed in SEEDS}
+    return {
+        **phantoms,
+        "openlimb": lambda: make_openlimb_mean(openlimb),
+        "calf": lambda: make_amputated_calf(calf),
+    }
 
 
-def phantom_limb(seed: int, detail: str = "paper") -> Anatomy:
+def make_phantom_limb(seed: int, detail: str = "paper") -> Anatomy:
     """The surfaces of a phantom as a label map on its scanner's grid shows them."""
     limb, grid = make_limb(seed), make_grid(make_limb(seed), detail, seed)
     skin, *bones = np.zeros((1 + len(limb.bone_names), *grid.shape), dtype=bool)
@@ -55,28 +59,28 @@ def phantom_limb(seed: int, detail: str = "paper") -> Anatomy:
         for bone, name in zip(bones, limb.bone_names):
             bone[slab] = limb.bone(name, points) < 0
     voxels = Grid(skin, np.array(grid.spacing), grid.origin, grid.direction)
-    return _checked(build_anatomy(label_map(voxels, skin, dict(zip(limb.bone_names, bones)))))
+    return _check_limb(build_anatomy(label_map(voxels, skin, dict(zip(limb.bone_names, bones)))))
 
 
-def openlimb_mean(folder: Path) -> Anatomy:
+def make_openlimb_mean(folder: Path) -> Anatomy:
     """The mean residuum of 33 limbs (OpenLimb), as the example uses it."""
     bones = {name: read_surface(folder / f"{name}.stl") for name in ("tibia", "fibula")}
     point, normal = (np.array(part) for part in OPENLIMB_CUT)
-    return _checked(Anatomy(read_surface(folder / "skin.stl"), bones, point, normal))
+    return _check_limb(Anatomy(read_surface(folder / "skin.stl"), bones, point, normal))
 
 
-def amputated_calf(folder: Path) -> Anatomy:
+def make_amputated_calf(folder: Path) -> Anatomy:
     """The calf MRI, segmented automatically and amputated as in the example."""
     labels = amputate_limb(segment(read_volume(folder)), *CALF_PLANE, pad_mm=CALF_PAD_MM)
-    return _checked(build_anatomy(labels))
+    return _check_limb(build_anatomy(labels))
 
 
-def _checked(anatomy: Anatomy) -> Anatomy:
+def _check_limb(anatomy: Anatomy) -> Anatomy:
     check_anatomy(anatomy)
     return anatomy
 
 
-def random_sites(anatomy: Anatomy, count: int, seed: int = 0) -> list[tuple[Array, Array]]:
+def draw_random_sites(anatomy: Anatomy, count: int, seed: int = 0) -> list[tuple[Array, Array]]:
     """Positions (3,) spread evenly over the skin below the cut, and the indenter's axis (3,) at each."""
     random = np.random.default_rng(seed)
     corners, area = anatomy.skin.triangles, anatomy.skin.face_areas

@@ -12,20 +12,20 @@ import numpy as np
 
 from ..execution import ProcessExecutor
 from ..fe import Problem, Result, StepControl, solve
-from .blocks import punched_block
+from .blocks import build_punched_block
 
 Job = TypeVar("Job")
 Answer = TypeVar("Answer")
 MIB = 1024.0
 
 
-def in_fresh_process(function: Callable[[Job], Answer], job: Job, threads: int) -> Answer:
+def run_in_fresh_process(function: Callable[[Job], Answer], job: Job, threads: int) -> Answer:
     """``function(job)`` in a new process with that many threads: its largest memory is its own."""
     with ProcessExecutor(1, threads) as executor:
         return next(executor.map(function, [job]))
 
 
-def max_rss_MB() -> float:
+def measure_max_rss_MB() -> float:
     """Largest resident memory of this process so far, MiB."""
     status = Path("/proc/self/status")
     if status.is_file():  # the resource usage of a young process includes what its parent held
@@ -37,16 +37,16 @@ def max_rss_MB() -> float:
 
 def warm_up(element: str, sensitivities: bool) -> None:
     """Compile, or load from the cache, all kernels of an element with a problem of a few cells."""
-    solve(punched_block(element, 4), StepControl(load_steps=2, unload_steps=2), sensitivities)
+    solve(build_punched_block(element, 4), StepControl(load_steps=2, unload_steps=2), sensitivities)
 
 
-def timed_solve(problem: Problem, control: StepControl, sensitivities: bool) -> dict[str, Any]:
+def solve_timed(problem: Problem, control: StepControl, sensitivities: bool) -> dict[str, Any]:
     """Solve and say what it took; kernels are warmed up before the clock starts."""
     warm_up(problem.formulation.name, sensitivities)
-    return facts_of(solve(problem, control, sensitivities, store="none"))
+    return collect_facts(solve(problem, control, sensitivities, store="none"))
 
 
-def facts_of(result: Result) -> dict[str, Any]:
+def collect_facts(result: Result) -> dict[str, Any]:
     """Sizes, seconds by part, largest memory of this process, and how far it came."""
     statistics = dict(result.statistics)
     seconds = dict(statistics.pop("seconds"))
@@ -55,7 +55,7 @@ def facts_of(result: Result) -> dict[str, Any]:
         **{key: statistics[key] for key in ("factorisations", "linear_solver")},
         "seconds": seconds.pop("total"),
         "peak_force_N": float(np.max(result.force)),
-        "max_rss_MB": max_rss_MB(),
+        "max_rss_MB": measure_max_rss_MB(),
         "seconds_by_part": seconds,
         "completed": result.completed,
         "reason": result.reason,

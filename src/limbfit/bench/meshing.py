@@ -14,7 +14,7 @@ from ..anatomy.meshing.engines import ENGINES
 from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
 from ..anatomy.surfaces.surfaces import Anatomy
 from ..errors import InputError, LimbfitError
-from .limbs import limbs, random_sites
+from .limbs import draw_random_sites, list_limbs
 from .reference import Tell, find_reference
 
 SITES = 20
@@ -55,29 +55,29 @@ def bench_meshing(
         raise InputError(f"no mesher is named {engine!r}", remedy=f"use one of {', '.join(ENGINES)}")
     settings = replace(settings or MeshSettings(), engine=engine)
     if makers is None:
-        makers = limbs(shared or find_reference(Path.cwd()).parent)
+        makers = list_limbs(shared or find_reference(Path.cwd()).parent)
     rows: list[Row] = []
     failed: list[str] = []
     seconds_base = {}
     for done, (name, make) in enumerate(makers.items()):
         tell(done * sites, len(makers) * sites, name)
         anatomy = make()
-        start = cpu_seconds()
+        start = measure_cpu_seconds()
         base = build_base_mesh(anatomy, settings)
-        seconds_base[name] = cpu_seconds() - start
-        for i, (position, axis) in enumerate(random_sites(anatomy, sites)):
+        seconds_base[name] = measure_cpu_seconds() - start
+        for i, (position, axis) in enumerate(draw_random_sites(anatomy, sites)):
             try:
-                rows.append({"limb": name, **_measured(anatomy, position, axis, settings, base)})
+                rows.append({"limb": name, **_measure_mesh(anatomy, position, axis, settings, base)})
             except LimbfitError as error:
                 failed.append(f"{name}, site {i}: {error}")
             tell(done * sites + i + 1, len(makers) * sites, name)
     return {
         "engine": settings.engine,
-        **_summary(rows, failed),
+        **_summarise(rows, failed),
         "base_seconds_median": float(np.median(list(seconds_base.values()))),
         "failed": failed,
         "limbs": {
-            name: _summary(
+            name: _summarise(
                 [row for row in rows if row["limb"] == name],
                 [text for text in failed if text.startswith(f"{name},")],
             )
@@ -86,11 +86,11 @@ def bench_meshing(
     }
 
 
-def _measured(anatomy: Anatomy, position: Any, axis: Any, settings: MeshSettings, base: BaseMesh) -> Row:
-    start = cpu_seconds()
+def _measure_mesh(anatomy: Anatomy, position: Any, axis: Any, settings: MeshSettings, base: BaseMesh) -> Row:
+    start = measure_cpu_seconds()
     _, report = mesh_site(anatomy, position, axis, settings, base)
     return {
-        "seconds": cpu_seconds() - start,
+        "seconds": measure_cpu_seconds() - start,
         "nodes": report.nodes,
         "cells": report.cells,
         "dihedral": report.min_dihedral_deg,
@@ -102,7 +102,7 @@ def _measured(anatomy: Anatomy, position: Any, axis: Any, settings: MeshSettings
     }
 
 
-def _summary(rows: list[Row], failed: list[str]) -> dict[str, Any]:
+def _summarise(rows: list[Row], failed: list[str]) -> dict[str, Any]:
     summary: dict[str, Any] = {"sites": len(rows) + len(failed), "failures": len(failed)}
     if not rows:
         return summary
@@ -123,7 +123,7 @@ def _summary(rows: list[Row], failed: list[str]) -> dict[str, Any]:
     }
 
 
-def cpu_seconds() -> float:
+def measure_cpu_seconds() -> float:
     """CPU seconds of this process and of the mesher's processes that ended."""
     usage = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(part.ru_utime + part.ru_stime for part in usage)

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..fe import System, iterate, solve
 from ..fe.kernel.laws import Laws
-from ..fe.observables import element_fields
-from .reference import CUBES, PUNCHED, ReferenceCase, Tell, find_reference, load_case, pushing_force
+from ..fe.observables import compute_element_fields
+from .reference import CUBES, PUNCHED, ReferenceCase, Tell, find_reference, load_case, read_pushing_force
 from .socket import SOCKET, SocketCase, compare_socket
 
 KPA = 1e-3  # MPa
@@ -61,10 +61,10 @@ def compare_stress(case: ReferenceCase, folder: Path) -> Row:
     problem, control, log = load_case(case, folder)
     system = System(problem)
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    found = [element_fields(system, laws, step.state) for step in iterate(problem, control)]
+    found = [compute_element_fields(system, laws, step.state) for step in iterate(problem, control)]
     stress, J = np.array([f.cauchy[0, 2] for f in found]), np.array([f.J[0] for f in found])
     if len(found) < len(control.times or ()):
-        return _unfinished(f"stopped after {len(found)} steps")
+        return _build_unfinished_row(f"stopped after {len(found)} steps")
     peak = np.abs(log.column("sz")).max()
     return {
         "max_difference_percent": float(100.0 * np.abs(stress - log.column("sz")[1:]).max() / peak),
@@ -79,10 +79,10 @@ def compare_stress(case: ReferenceCase, folder: Path) -> Row:
 def compare_force(case: ReferenceCase, folder: Path) -> Row:
     """Force of the indenter over the whole curve."""
     problem, control, log = load_case(case, folder)
-    force = pushing_force(problem, log)
+    force = read_pushing_force(problem, log)
     result = solve(problem, control, store="none")
     if not result.completed:
-        return _unfinished(result.reason)
+        return _build_unfinished_row(result.reason)
     difference = np.interp(log.times, result.times, result.force) - force
     return {
         "max_difference_percent": float(100.0 * np.abs(difference).max() / force.max()),
@@ -99,5 +99,5 @@ def compare_force(case: ReferenceCase, folder: Path) -> Row:
     }
 
 
-def _unfinished(reason: str) -> Row:
+def _build_unfinished_row(reason: str) -> Row:
     return {"max_difference_percent": None, "note": f"not solved to the end: {reason}"}

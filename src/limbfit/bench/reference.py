@@ -57,18 +57,18 @@ CUBES = tuple(
 _NOTE = "penalty per element and over the current area in FEBio, uniform over the reference area here"
 
 
-def _punched(name: str, element: str, penalty: float, symmetry: int) -> ReferenceCase:
+def _build_punched_case(name: str, element: str, penalty: float, symmetry: int) -> ReferenceCase:
     problem = {"contact_rule": "gauss", "element": "tet10g8" if element == "tet10" else element}
     control = {"penalty": penalty, "penetration": 1.0}
     return ReferenceCase(name, element, problem, control, symmetry, _NOTE)
 
 
 PUNCHED = (
-    _punched("block/block_hex8", "hex8", 8.7, 4),
-    _punched("block/block_tet4", "tet4", 26.0, 4),
-    _punched("block/block_tet10", "tet10", 26.0, 4),
-    _punched("residuum/posterior_tet4", "tet4", 12.5, 1),
-    _punched("residuum/posterior_tet10", "tet10", 12.5, 1),
+    _build_punched_case("block/block_hex8", "hex8", 8.7, 4),
+    _build_punched_case("block/block_tet4", "tet4", 26.0, 4),
+    _build_punched_case("block/block_tet10", "tet10", 26.0, 4),
+    _build_punched_case("residuum/posterior_tet4", "tet4", 12.5, 1),
+    _build_punched_case("residuum/posterior_tet10", "tet10", 12.5, 1),
 )
 
 
@@ -105,7 +105,7 @@ def load_case(case: ReferenceCase, folder: Path) -> tuple[Problem, StepControl, 
     return problem, StepControl(times=tuple(log.times[1:]), stress="linear", **case.control), log
 
 
-def pushing_force(problem: Problem, log: FebioLog) -> Array:
+def read_pushing_force(problem: Problem, log: FebioLog) -> Array:
     """Force (n,) of the model on the tissue along the indenter's axis, N, from FEBio's reactions."""
     assert problem.indenter is not None
     axis = problem.indenter.frame[2]

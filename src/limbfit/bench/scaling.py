@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..fe import StepControl
-from .blocks import divisions_for, punched_block
-from .measuring import in_fresh_process, timed_solve
+from .blocks import build_punched_block, choose_divisions
+from .measuring import run_in_fresh_process, solve_timed
 from .reference import Tell
 
 UNKNOWNS = (20_000, 45_000, 80_000)
@@ -51,30 +51,30 @@ def bench_scaling(
         For an element that is not in the table.
     """
     control = replace(control, threads=threads)
-    jobs = [BlockJob(element, divisions_for(element, size), control) for size in unknowns]
+    jobs = [BlockJob(element, choose_divisions(element, size), control) for size in unknowns]
     jobs.append(BlockJob(PAPER_ELEMENT, paper_divisions, control))
     rows = []
     for i, job in enumerate(jobs):
         tell(i, len(jobs), f"{job.element}, {job.divisions} cells along 60 mm")
-        rows.append(in_fresh_process(run_block, job, threads))
+        rows.append(run_in_fresh_process(run_block, job, threads))
     tell(len(jobs), len(jobs), "done")
     *curve, paper = rows
     return {
         "element": element,
         "threads": threads,
         "sizes": curve,
-        "seconds_exponent": exponent(curve, "seconds"),
-        "memory_exponent": exponent(curve, "max_rss_MB"),
+        "seconds_exponent": fit_exponent(curve, "seconds"),
+        "memory_exponent": fit_exponent(curve, "max_rss_MB"),
         "paper_sized": paper,
     }
 
 
 def run_block(job: BlockJob) -> dict[str, Any]:
-    problem = punched_block(job.element, job.divisions)
-    return {"cells": len(problem.mesh.cells), **timed_solve(problem, job.control, sensitivities=False)}
+    problem = build_punched_block(job.element, job.divisions)
+    return {"cells": len(problem.mesh.cells), **solve_timed(problem, job.control, sensitivities=False)}
 
 
-def exponent(rows: list[dict[str, Any]], key: str) -> float:
+def fit_exponent(rows: list[dict[str, Any]], key: str) -> float:
     """Slope of the least-squares line of log ``key`` over log unknowns."""
     x = np.log([row["unknowns"] for row in rows])
     slope, _ = np.polyfit(x, np.log([row[key] for row in rows]), 1)

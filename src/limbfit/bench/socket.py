@@ -98,10 +98,12 @@ def compare_socket(case: SocketCase, folder: Path) -> Iterator[dict[str, Any]]:
             name = f"{part.table or case.name}.txt"
             found, febio = read_log(Path(out) / name), read_log(file.with_name(name))
             row = {"case": f"{case.name}: {part.name}", "element": case.element, "goal_percent": part.goal}
-            yield row | _compared(part, found, febio, "" if run.result.completed else run.result.reason)
+            yield row | _build_comparison_row(
+                part, found, febio, "" if run.result.completed else run.result.reason
+            )
 
 
-def _compared(part: CasePart, found: FebioLog, febio: FebioLog, reason: str) -> dict[str, Any]:
+def _build_comparison_row(part: CasePart, found: FebioLog, febio: FebioLog, reason: str) -> dict[str, Any]:
     forces = part.columns[0] in FORCES
     columns, whole = (
         [febio.names.index(name) for name in names if name in febio.names]

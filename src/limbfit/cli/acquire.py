@@ -21,7 +21,7 @@ from ..acquire.virtual import Serving, read_faults
 from ..errors import InputError
 from .commands import StudyPath
 from .console import STDERR, STDOUT, AsJson, print_json
-from .live import Live, PlainLines, keys
+from .live import Live, PlainLines, read_keys
 
 MOST_SPEED = 1000  # of an accelerated clock
 
@@ -69,7 +69,7 @@ def acquire(
         tool = given.indentation(name).indenter
         if tool is not None:
             STDERR.print(f"{name} is made with the indenter {tool!r}", soft_wrap=True)
-        rows.append(_one(given, name, device, depth, unattended, again))
+        rows.append(_acquire_one(given, name, device, depth, unattended, again))
         if not as_json:
             _show(rows[-1])
         if not rows[-1]["completed"]:
@@ -80,14 +80,14 @@ def acquire(
         raise typer.Exit(1)
 
 
-def _one(
+def _acquire_one(
     study: limbfit.Study, name: str, device: str, depth: float | None, unattended: bool, again: bool
 ) -> dict[str, Any]:
     events: SimpleQueue[Event] = SimpleQueue()
     prioritise()  # before the threads of the display and the keys start
     shown = Live(name, study.acquire) if STDERR.is_terminal else PlainLines(name)
-    operated = nullcontext() if unattended else keys(events, study.acquire.key_gap_ms / 1000)
-    with _signals(events), operated, shown:
+    operated = nullcontext() if unattended else read_keys(events, study.acquire.key_gap_ms / 1000)
+    with _stop_on_signals(events), operated, shown:
         return limbfit.acquire_site(
             study,
             name,
@@ -101,7 +101,7 @@ def _one(
 
 
 @contextmanager
-def _signals(events: SimpleQueue[Event]) -> Iterator[None]:
+def _stop_on_signals(events: SimpleQueue[Event]) -> Iterator[None]:
     """Interrupt, hang-up and termination stop the session, which then retracts; none of them kills it."""
 
     def stop(number: int, frame: Any) -> None:

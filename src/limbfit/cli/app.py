@@ -43,7 +43,7 @@ _VERBS: tuple[Callable[..., None], ...] = (
     *studio.VERBS,
 )
 for verb in _VERBS:
-    app.command()(runs.where(verb) if verb in _PLACED else verb)
+    app.command()(runs.add_execution_options(verb) if verb in _PLACED else verb)
 app.add_typer(socket.app, name="socket")
 app.add_typer(bench.app, name="bench")
 

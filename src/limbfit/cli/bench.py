@@ -12,7 +12,7 @@ from rich.table import Table
 import limbfit
 
 from ..execution import count_usable_cores
-from .console import STDOUT, AsJson, listening, print_json
+from .console import STDOUT, AsJson, listen_on_console, print_json
 
 app = typer.Typer(
     help="Benchmarks of solver, meshes and identification.", no_args_is_help=True, rich_markup_mode=None
@@ -30,8 +30,8 @@ UNKNOWNS, LARGE = (20_000, 45_000, 80_000), (125_000, 200_000, 300_000)
 @app.command()
 def febio_parity(reference: Reference = None, as_json: AsJson = False) -> None:
     """Compare forces and stresses with FEBio 4.11 on the same mesh, with the same element and steps."""
-    with listening() as listener:
-        rows = limbfit.bench_febio_parity(reference, tell=teller(listener, "febio-parity"))
+    with listen_on_console() as listener:
+        rows = limbfit.bench_febio_parity(reference, tell=build_listener(listener, "febio-parity"))
     if as_json:
         print_json(rows)
         return
@@ -59,9 +59,9 @@ def forward(
     as_json: AsJson = False,
 ) -> None:
     """Time one simulation, plain and with sensitivities, beside FEBio's time for it."""
-    with listening() as listener:
+    with listen_on_console() as listener:
         found = limbfit.bench_forward(
-            reference, case, element, threads, as_febio, tell=teller(listener, "forward")
+            reference, case, element, threads, as_febio, tell=build_listener(listener, "forward")
         )
     if as_json:
         print_json(found)
@@ -77,9 +77,9 @@ def scaling(
     as_json: AsJson = False,
 ) -> None:
     """Time and memory over the number of unknowns, and of a model of the paper's size."""
-    with listening() as listener:
+    with listen_on_console() as listener:
         found = limbfit.bench_scaling(
-            element, UNKNOWNS + (LARGE if large else ()), threads, tell=teller(listener, "scaling")
+            element, UNKNOWNS + (LARGE if large else ()), threads, tell=build_listener(listener, "scaling")
         )
     if as_json:
         print_json(found)
@@ -104,8 +104,8 @@ def meshing(
     as_json: AsJson = False,
 ) -> None:
     """Mesh random sites of five limbs: failures, angles, thickness, volume, time."""
-    with listening() as listener:
-        found = limbfit.bench_meshing(shared, sites, engine, tell=teller(listener, "meshing"))
+    with listen_on_console() as listener:
+        found = limbfit.bench_meshing(shared, sites, engine, tell=build_listener(listener, "meshing"))
     if as_json:
         print_json(found)
         return
@@ -124,7 +124,7 @@ def calibrate(
     as_json: AsJson = False,
 ) -> None:
     """Identify a copy of a study from scratch, and time it beside FEBio's loop of finite differences."""
-    with listening() as listener:
+    with listen_on_console() as listener:
         found = limbfit.bench_calibrate(study, listener=listener)
     if as_json:
         print_json(found)
@@ -132,7 +132,9 @@ def calibrate(
         show_facts(found)
 
 
-def teller(listener: Callable[[limbfit.Progress], None], stage: str) -> Callable[[int, int, str], None]:
+def build_listener(
+    listener: Callable[[limbfit.Progress], None], stage: str
+) -> Callable[[int, int, str], None]:
     return lambda done, total, text: listener(limbfit.Progress(stage, done, total, text))
 
 

@@ -15,7 +15,7 @@ import limbfit
 
 from ..errors import InputError
 from ..study import Study
-from .console import STDERR, STDOUT, AsJson, listening, parameter_heads, print_json
+from .console import STDERR, STDOUT, AsJson, format_parameter_heads, listen_on_console, print_json
 
 StudyPath = Annotated[
     Path, typer.Argument(help="study.toml, or the folder that holds it", show_default=False)
@@ -37,7 +37,7 @@ class SolverName(StrEnum):
     febio = "febio"
 
 
-def stage_names() -> list[str]:
+def list_stage_names() -> list[str]:
     return list(limbfit.STAGE_NAMES)
 
 
@@ -48,7 +48,7 @@ def demo(
 ) -> None:
     """Make a coarse synthetic patient and identify it: the whole path, from DICOM to report."""
     start = perf_counter()
-    with listening() as listener:
+    with listen_on_console() as listener:
         summary = limbfit.run_demo(folder, seed=seed, listener=listener)
     summary["seconds"] = round(perf_counter() - start, 1)
     show_summary(summary, as_json)
@@ -84,7 +84,7 @@ def phantom(
     as_json: AsJson = False,
 ) -> None:
     """Make a synthetic patient with known truth: MRI as DICOM, traces, study.toml, truth.json."""
-    with listening() as listener:
+    with listen_on_console() as listener:
         truth = limbfit.make_phantom_study(
             folder,
             detail=detail.value,
@@ -123,7 +123,7 @@ def series(
 
 def check(study: StudyPath, as_json: AsJson = False) -> None:
     """Read every input of a study and report what is wrong, before anything runs."""
-    with listening() as listener:
+    with listen_on_console() as listener:
         findings = limbfit.check_study(limbfit.load_study(study), listener=listener)
     if as_json:
         print_json(findings)
@@ -137,23 +137,24 @@ def check(study: StudyPath, as_json: AsJson = False) -> None:
 def run(
     study: StudyPath,
     until: Annotated[
-        str | None, typer.Option(help="stop after this stage of limbfit status", autocompletion=stage_names)
+        str | None,
+        typer.Option(help="stop after this stage of limbfit status", autocompletion=list_stage_names),
     ] = None,
     start: Annotated[
         str | None,
-        typer.Option("--from", help="redo this stage and all after it", autocompletion=stage_names),
+        typer.Option("--from", help="redo this stage and all after it", autocompletion=list_stage_names),
     ] = None,
     force: Annotated[
         list[str] | None,
         typer.Option(
-            help="redo this stage, repeatable; kept simulations are used", autocompletion=stage_names
+            help="redo this stage, repeatable; kept simulations are used", autocompletion=list_stage_names
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Run every stage that is missing or stale; a stopped run continues where it stopped."""
     began = perf_counter()
-    with listening() as listener:
+    with listen_on_console() as listener:
         summary = limbfit.run_study(
             limbfit.load_study(study),
             until=until,
@@ -202,7 +203,7 @@ def simulate(
 ) -> None:
     """Simulate one indentation; curve and fields go to results/simulate."""
     checked = limbfit.load_study(study)
-    with listening() as listener:
+    with listen_on_console() as listener:
         found = limbfit.simulate_site(
             checked,
             site,
@@ -230,7 +231,7 @@ def simulate(
 
 def report(study: StudyPath, as_json: AsJson = False) -> None:
     """Make the report again from stored results; nothing is solved."""
-    with listening() as listener:
+    with listen_on_console() as listener:
         summary = limbfit.report_study(limbfit.load_study(study), listener=listener)
     show_summary(summary, as_json)
 
@@ -285,7 +286,7 @@ def show_flags(flags: Sequence[Mapping[str, Any]]) -> None:
 
 def show_parameters(summary: dict[str, Any]) -> None:
     names = list(next(iter(summary["parameters"].values())))
-    table = Table("tissue", *parameter_heads(names), box=None)
+    table = Table("tissue", *format_parameter_heads(names), box=None)
     rows = [("identified", summary["parameters"])]
     if "truth" in summary:
         rows.append(("truth", summary["truth"]))

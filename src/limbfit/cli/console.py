@@ -52,20 +52,20 @@ def tell_stored(found: dict[str, Any], show: Callable[[dict[str, Any]], None], a
 
 
 @contextmanager
-def listening() -> Iterator[Callable[[limbfit.Progress], None]]:
+def listen_on_console() -> Iterator[Callable[[limbfit.Progress], None]]:
     """A listener that draws bars on a terminal and prints plain lines elsewhere, on standard error.
 
     An interrupt ends here: typer would turn it into an exit without a word.
     """
     try:
-        with bars() if STDERR.is_terminal else nullcontext(plain_listener()) as listener:
+        with draw_bars() if STDERR.is_terminal else nullcontext(build_plain_listener()) as listener:
             yield listener
     except KeyboardInterrupt:
         fail(INTERRUPTED, 130)
 
 
 @contextmanager
-def bars() -> Iterator[Callable[[limbfit.Progress], None]]:
+def draw_bars() -> Iterator[Callable[[limbfit.Progress], None]]:
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description:<10}"),
@@ -91,7 +91,7 @@ def bars() -> Iterator[Callable[[limbfit.Progress], None]]:
         yield listen
 
 
-def plain_listener() -> Callable[[limbfit.Progress], None]:
+def build_plain_listener() -> Callable[[limbfit.Progress], None]:
     start = perf_counter()
 
     def listen(event: limbfit.Progress) -> None:
@@ -137,7 +137,7 @@ def prompt_interrupt() -> Iterator[None]:
         far.close()  # which ends the watch
 
 
-def parameter_heads(keys: Iterable[str]) -> list[str]:
+def format_parameter_heads(keys: Iterable[str]) -> list[str]:
     """Parameters as heads of columns: ``tau_s`` is ``tau (s)``."""
     split = [split_key(key) for key in keys]
     return [f"{name} ({unit})" if unit else name for name, unit in split]

@@ -15,14 +15,22 @@ import limbfit
 
 from ..errors import InputError
 from .commands import StudyPath
-from .console import STDERR, STDOUT, AsJson, listening, parameter_heads, print_json, tell_stored
+from .console import (
+    STDERR,
+    STDOUT,
+    AsJson,
+    format_parameter_heads,
+    listen_on_console,
+    print_json,
+    tell_stored,
+)
 
 
 def run_verb(
     study: Path, name: str, tell: Callable[[dict[str, Any]], None], *, as_json: bool, **options: Any
 ) -> None:
     """Do the experiment ``name`` with ``options``, tell of it, and say where it is stored."""
-    with listening() as listener:
+    with listen_on_console() as listener:
         found = limbfit.run_experiment(limbfit.load_study(study), name, listener=listener, **options)
     tell_stored(found, tell, as_json)
 
@@ -78,7 +86,7 @@ def regions(
 
 
 def show_regions(found: dict[str, Any]) -> None:
-    names = parameter_heads(next(iter(found["whole"]["parameters"].values())))
+    names = format_parameter_heads(next(iter(found["whole"]["parameters"].values())))
     table = Table("region", "sites", "tissue", *names, "error (%)", "whole (%)", box=None)
     rows = [("whole limb", found["whole"]["fitted_sites"], found["whole"]["parameters"], None, None)]
     errors = ("own_error_percent", "whole_error_percent")
@@ -137,7 +145,7 @@ def sensitivity(
 ) -> None:
     """Simulate again with another c, bulk modulus, friction, indenter or mesh."""
     checked, found = limbfit.load_study(study), {}
-    with listening() as listener:
+    with listen_on_console() as listener:
         for name in parse_sensitivities(only):
             found[name] = limbfit.run_experiment(
                 checked, f"sensitivity-{name}", listener=listener, sites=site or []

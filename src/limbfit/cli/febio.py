@@ -11,7 +11,7 @@ import typer
 import limbfit
 
 from .commands import StudyPath, parse_parameters
-from .console import STDERR, STDOUT, AsJson, listening, print_json
+from .console import STDERR, STDOUT, AsJson, listen_on_console, print_json
 
 Parameters = Annotated[
     str | None,
@@ -35,7 +35,7 @@ def febio(
     as_json: AsJson = False,
 ) -> None:
     """Solve a FEBio input with limbfit's solver, and write the log-file tables that it asks for."""
-    with listening() as listener:
+    with listen_on_console() as listener:
         found = limbfit.simulate_feb(file, output, threads=threads, listener=listener)
     if as_json:
         print_json(found)
@@ -73,7 +73,7 @@ def export(
 ) -> None:
     """Write indentations as inputs of FEBio, Abaqus or CalculiX, with the numbers of limbfit simulate."""
     checked = limbfit.load_study(study)
-    with listening() as listener:
+    with listen_on_console() as listener:
         found = limbfit.export_study(
             checked,
             to.value,
@@ -106,7 +106,7 @@ def compare(
 ) -> None:
     """Solve a site by limbfit and by FEBio; curves and difference go to results/compare."""
     checked = limbfit.load_study(study)
-    with listening() as listener:
+    with listen_on_console() as listener:
         found = limbfit.compare_site(
             checked,
             site,

@@ -10,7 +10,7 @@ from rich.table import Table
 import limbfit
 
 from .commands import StudyPath
-from .console import STDOUT, AsJson, listening, print_json
+from .console import STDOUT, AsJson, listen_on_console, print_json
 
 
 def segment(study: StudyPath, as_json: AsJson = False) -> None:
@@ -35,54 +35,58 @@ def mesh(study: StudyPath, as_json: AsJson = False) -> None:
 
 def show(study: StudyPath, stage: str, tell: Callable[[dict[str, Any]], None], as_json: bool) -> None:
     """Do a stage, tell of it, and say where its picture is."""
-    with listening() as listener:
+    with listen_on_console() as listener:
         found = limbfit.show_stage(limbfit.load_study(study), stage, listener=listener)
     if as_json:
         print_json(found)
         return
     tell(found)
     if found["picture"]:
-        line(f"picture: {found['picture']}")
+        print_line(f"picture: {found['picture']}")
 
 
-def line(text: str) -> None:
+def print_line(text: str) -> None:
     STDOUT.print(text, soft_wrap=True)
 
 
 def show_labels(found: dict[str, Any]) -> None:
     volumes = ", ".join(f"{name} {value:.1f}" for name, value in found["volumes_cm3"].items())
-    line(f"{found['method']}; volumes in cm3: {volumes}")
+    print_line(f"{found['method']}; volumes in cm3: {volumes}")
     for repair in found.get("repairs", ()):
-        line(f"repaired: {repair}")
+        print_line(f"repaired: {repair}")
     for warning in found.get("warnings", ()):
-        line(f"warning: {warning}")
+        print_line(f"warning: {warning}")
     if "markers_removed" in found:
-        line(f"markers taken off the skin: {found['markers_removed']}")
+        print_line(f"markers taken off the skin: {found['markers_removed']}")
     if "motion" in found:
         motion = found["motion"]
-        line(
+        print_line(
             f"between the images the limb moved by {motion['shift_mm']:.1f} mm and {motion['turn_deg']:.1f} "
             f"degrees (correlation {motion['correlation']:.2f})"
         )
-    line(f"labels: {found['labels']}")
+    print_line(f"labels: {found['labels']}")
 
 
 def show_surfaces(found: dict[str, Any]) -> None:
-    table = table_of("body", "volume (cm3)", "triangles", "thinnest tissue (mm)", "at (LPS mm)")
+    table = build_table("body", "volume (cm3)", "triangles", "thinnest tissue (mm)", "at (LPS mm)")
     for name, volume in found["volumes_cm3"].items():
         thinnest = found["thinnest_mm"].get(name)
-        where = (f"{thinnest['tissue_mm']:.1f}", point(thinnest["at"])) if thinnest else ("", "")
+        where = (f"{thinnest['tissue_mm']:.1f}", format_point(thinnest["at"])) if thinnest else ("", "")
         table.add_row(name, f"{volume:.1f}", str(found["triangles"][name]), *where)
     STDOUT.print(table)
-    line(f"{found['closed_bodies']} closed bodies; proximal cut through {point(found['cut_point'])}")
+    print_line(
+        f"{found['closed_bodies']} closed bodies; proximal cut through {format_point(found['cut_point'])}"
+    )
     if found["amputation"]:
         ends = found["amputation"]["beyond_plane_mm"].items()
-        line("amputated; ends beyond the plane (mm): " + ", ".join(f"{name} {end:.1f}" for name, end in ends))
+        print_line(
+            "amputated; ends beyond the plane (mm): " + ", ".join(f"{name} {end:.1f}" for name, end in ends)
+        )
 
 
 def show_sites(found: dict[str, Any]) -> None:
     head = ("site", "region", "used", "at (LPS mm)", "off skin", "marker", "from 'near'")
-    table = table_of(*head)
+    table = build_table(*head)
     for site in found["sites"]:
         marker = site["marker"]
         evidence = ("", "")
@@ -90,13 +94,13 @@ def show_sites(found: dict[str, Any]) -> None:
             evidence = (f"{marker['height_mm']:.1f} mm", f"{marker['distance_to_hint_mm']:.1f} mm")
         used = "fitted" if site["fitted"] else "held out"
         off = f"{site['off_skin_mm']:.2f} mm"
-        table.add_row(site["site"], site["region"], used, point(site["position_mm"]), off, *evidence)
+        table.add_row(site["site"], site["region"], used, format_point(site["position_mm"]), off, *evidence)
     STDOUT.print(table)
 
 
 def show_meshes(found: dict[str, Any]) -> None:
     head = ("site", "nodes", "elements", "least angle", "layers (mm)", "trimmed bone (cm3)")
-    table = table_of(*head)
+    table = build_table(*head)
     for name, row in found["sites"].items():
         trimmed = ", ".join(
             f"{bone} {cut['volume_mm3'] / 1000:.2f}" for bone, cut in row["trimmed_bone"].items()
@@ -107,10 +111,10 @@ def show_meshes(found: dict[str, Any]) -> None:
     STDOUT.print(table)
     for name, row in found["sites"].items():
         for warning in row["warnings"]:
-            line(f"warning: site {name}: {warning}")
+            print_line(f"warning: site {name}: {warning}")
 
 
-def table_of(*head: str) -> Table:
+def build_table(*head: str) -> Table:
     """A table whose cells do not wrap but for regions and lists of bones, which may be long."""
     table = Table(box=None)
     for name in head:
@@ -118,7 +122,7 @@ def table_of(*head: str) -> Table:
     return table
 
 
-def point(position: Sequence[float]) -> str:
+def format_point(position: Sequence[float]) -> str:
     return ", ".join(f"{value:.1f}" for value in position)
 
 

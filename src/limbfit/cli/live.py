@@ -118,7 +118,7 @@ def plot(x: list[float], y: list[float], width: int = WIDTH, height: int = HEIGH
 
 
 @contextmanager
-def keys(events: SimpleQueue[Event], gap_s: float) -> Iterator[None]:
+def read_keys(events: SimpleQueue[Event], gap_s: float) -> Iterator[None]:
     """Read the terminal's keys, unbuffered and unechoed, in a thread; it is as before afterwards."""
     import termios
     import tty

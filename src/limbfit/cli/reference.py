@@ -20,60 +20,62 @@ done, 1 when something failed, 2 for bad usage or bad input, 130 when interrupte
 _MANY = 5  # commands that share an option or argument: it is explained once
 
 
-def command_page() -> str:
+def build_command_page() -> str:
     """All commands with their arguments and options, as Markdown."""
     known: Any = typer.main.get_command(app)
-    counted = Counter(_item(one) for _, command in _verbs("", known) for one in _parameters(command))
+    counted = Counter(
+        _format_item(one) for _, command in _list_verbs("", known) for one in _list_parameters(command)
+    )
     shared = {item for item, count in counted.items() if count >= _MANY}
     parts = [HEAD, *(item for item in counted if item in shared)]
     for title, names in GROUPS.items():
         parts.append(f"\n## {title}\n")
         for name in names:
-            parts += _section(f"limbfit {name}", known.commands[name], shared)
+            parts += _format_section(f"limbfit {name}", known.commands[name], shared)
     return "\n".join(parts)
 
 
-def _verbs(name: str, command: Any) -> Iterator[tuple[str, Any]]:
+def _list_verbs(name: str, command: Any) -> Iterator[tuple[str, Any]]:
     """The command, or those inside it."""
     inside = getattr(command, "commands", None)
     if inside is None:
         yield name, command
     else:
         for verb, one in inside.items():
-            yield from _verbs(f"{name} {verb}", one)
+            yield from _list_verbs(f"{name} {verb}", one)
 
 
-def _section(name: str, command: Any, shared: set[str]) -> list[str]:
-    lines = [f"### {name}\n", _text(command.help)] if hasattr(command, "commands") else []
-    for verb, one in _verbs(name, command):
-        parameters = _parameters(one)
+def _format_section(name: str, command: Any, shared: set[str]) -> list[str]:
+    lines = [f"### {name}\n", _format_text(command.help)] if hasattr(command, "commands") else []
+    for verb, one in _list_verbs(name, command):
+        parameters = _list_parameters(one)
         arguments = [p for p in parameters if p.param_type_name == "argument"]
         words = (p.name.upper() if p.required else f"[{p.name.upper()}]" for p in arguments)
-        own = [item for item in map(_item, parameters) if item not in shared]
-        also = [p for p in parameters if _item(p) in shared and p not in arguments]
-        lines += [f"### {' '.join([verb, *words])}\n", _text(one.help), *own, *([""] if own else [])]
-        lines += [f"Also {', '.join(map(_names, also))}.\n"] if also else []
+        own = [item for item in map(_format_item, parameters) if item not in shared]
+        also = [p for p in parameters if _format_item(p) in shared and p not in arguments]
+        lines += [f"### {' '.join([verb, *words])}\n", _format_text(one.help), *own, *([""] if own else [])]
+        lines += [f"Also {', '.join(map(_format_names, also))}.\n"] if also else []
     return lines
 
 
-def _parameters(command: Any) -> list[Any]:
+def _list_parameters(command: Any) -> list[Any]:
     return [one for one in command.params if one.name != "help"]
 
 
-def _names(parameter: Any) -> str:
+def _format_names(parameter: Any) -> str:
     if parameter.param_type_name == "argument":
         return f"`{parameter.name.upper()}`"
     return ", ".join(f"`{one}`" for one in (*parameter.opts, *parameter.secondary_opts))
 
 
-def _item(parameter: Any) -> str:
-    return f"* {_names(parameter)}: {_text(getattr(parameter, 'help', '')).strip()}"
+def _format_item(parameter: Any) -> str:
+    return f"* {_format_names(parameter)}: {_format_text(getattr(parameter, 'help', '')).strip()}"
 
 
-def _text(help_text: str | None) -> str:
+def _format_text(help_text: str | None) -> str:
     paragraphs = (help_text or "").replace("\b", "").split("\n\n")
     return "\n\n".join(" ".join(one.split()) for one in paragraphs) + "\n"
 
 
 if __name__ == "__main__":
-    print(command_page(), end="")
+    print(build_command_page(), end="")

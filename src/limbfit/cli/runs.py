@@ -14,8 +14,8 @@ from rich.table import Table
 import limbfit
 
 from ..execution import QUEUES, Placement, place_jobs
-from .commands import stage_names
-from .console import STDERR, STDOUT, AsJson, listening, print_json
+from .commands import list_stage_names
+from .console import STDERR, STDOUT, AsJson, listen_on_console, print_json
 
 _OPTIONS = {
     "workers": Annotated[
@@ -31,7 +31,7 @@ _OPTIONS = {
 }
 
 
-def where(verb: Callable[..., None]) -> Callable[..., None]:
+def add_execution_options(verb: Callable[..., None]) -> Callable[..., None]:
     """The verb with ``--workers``, ``--scheduler`` and ``--dask``, which say where its jobs run."""
 
     @wraps(verb)
@@ -53,13 +53,13 @@ def where(verb: Callable[..., None]) -> Callable[..., None]:
 def batch(
     studies: Annotated[list[Path], typer.Argument(help="study files or their folders", show_default=False)],
     until: Annotated[
-        str | None, typer.Option(help="stop each study after this stage", autocompletion=stage_names)
+        str | None, typer.Option(help="stop each study after this stage", autocompletion=list_stage_names)
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Run many studies on the same workers; one that fails does not stop the others."""
     rows = []
-    with listening() as listener:
+    with listen_on_console() as listener:
         for row in limbfit.run_batch(studies, until=until, listener=listener):
             rows.append(row)
             if row["error"] and not as_json:
@@ -91,7 +91,7 @@ def reproduce(
     as_json: AsJson = False,
 ) -> None:
     """Run a study again from its record in a new folder, and compare parameters and forces."""
-    with listening() as listener:
+    with listen_on_console() as listener:
         found = limbfit.reproduce_study(record, folder, tolerance=tolerance, listener=listener)
     if as_json:
         print_json(found)
@@ -124,4 +124,4 @@ def doctor(
         raise typer.Exit(1)
 
 
-VERBS = (where(batch), reproduce, doctor)
+VERBS = (add_execution_options(batch), reproduce, doctor)

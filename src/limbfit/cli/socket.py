@@ -13,9 +13,9 @@ import limbfit
 from ..errors import InputError
 from ..laws import split_key
 from .commands import StudyPath, parse_parameters
-from .console import STDOUT, AsJson, listening, tell_stored
+from .console import STDOUT, AsJson, listen_on_console, tell_stored
 from .groups import WithDefault
-from .runs import where
+from .runs import add_execution_options
 
 app = typer.Typer(
     help="Put a socket on the limb and load it (fit, the default), or design one.",
@@ -46,7 +46,7 @@ def fit(
     """Put a socket on the limb and load it: pressure and shear by region, settling, the report."""
     _check(parameters, literature)
     checked = limbfit.load_study(study)
-    with listening() as listener:
+    with listen_on_console() as listener:
         found = limbfit.fit_socket(
             checked,
             parameters=parse_parameters(parameters, checked),
@@ -63,7 +63,11 @@ def show_socket(found: dict[str, Any]) -> None:
     for note in found["socket"]["notes"]:
         STDOUT.print(f"socket: {note}", soft_wrap=True)
     for name, held in (("donning", found["donning"]), *((one["name"], one) for one in found["loads"])):
-        settled = f", settled by {held['settling_mm']:.1f} mm{_known(held)}" if "settling_mm" in held else ""
+        settled = (
+            f", settled by {held['settling_mm']:.1f} mm{_format_interval(held)}"
+            if "settling_mm" in held
+            else ""
+        )
         STDOUT.print(
             f"{name}: {held['peak_kPa']:.0f} kPa at most, in touch over "
             f"{held['contact_area_mm2'] / 100:.0f} cm2{settled}",
@@ -75,7 +79,9 @@ def show_socket(found: dict[str, Any]) -> None:
             known = row["interval_kPa"]
             interval = "" if known is None else f"{known[0]:.1f} to {known[1]:.1f}"
             numbers = [f"{row[key]:.1f}" for key in ("mean_kPa", "peak_kPa", "shear_kPa")]
-            table.add_row(row["region"], numbers[0], interval, _mostly(row["interval_from"]), *numbers[1:])
+            table.add_row(
+                row["region"], numbers[0], interval, _format_main_cause(row["interval_from"]), *numbers[1:]
+            )
         STDOUT.print(table)
     if found["samples"]:
         drawn, failed = found["samples"]["simulated"], found["samples"]["failed"]
@@ -88,7 +94,7 @@ def show_socket(found: dict[str, Any]) -> None:
     )
 
 
-def _mostly(shares: Mapping[str, float] | None) -> str:
+def _format_main_cause(shares: Mapping[str, float] | None) -> str:
     """The parameter that most of an interval comes from: ``muscle c 84 %``."""
     if not shares:
         return ""
@@ -97,11 +103,12 @@ def _mostly(shares: Mapping[str, float] | None) -> str:
     return f"{tissue} {split_key(key)[0]} {percent:.0f} %"
 
 
-def _known(load: Mapping[str, Any]) -> str:
+def _format_interval(load: Mapping[str, Any]) -> str:
     known = load["settling_interval_mm"]
     if known is None:
         return ""
-    return f" (95 %: {known[0]:.1f} to {known[1]:.1f}, mostly from {_mostly(load['settling_interval_from'])})"
+    cause = _format_main_cause(load["settling_interval_from"])
+    return f" (95 %: {known[0]:.1f} to {known[1]:.1f}, mostly from {cause})"
 
 
 def design(
@@ -120,7 +127,7 @@ def design(
     """Design a socket from a target pressure, for printing; load it beside a uniformly reduced one."""
     _check(parameters, literature)
     checked = limbfit.load_study(study)
-    with listening() as listener:
+    with listen_on_console() as listener:
         found = limbfit.design_socket(
             checked,
             optimise=[name.strip() for name in optimise.split(",") if name.strip()],
@@ -174,4 +181,4 @@ def _check(parameters: str | None, literature: bool) -> None:
 
 
 for verb in (fit, design):
-    app.command()(where(verb))
+    app.command()(add_execution_options(verb))

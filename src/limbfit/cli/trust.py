@@ -11,7 +11,7 @@ import limbfit
 
 from ..errors import InputError
 from .commands import StudyPath, parse_parameters
-from .console import STDOUT, AsJson, listening, tell_stored
+from .console import STDOUT, AsJson, listen_on_console, tell_stored
 from .experiments import run_verb
 
 
@@ -107,7 +107,7 @@ def design(
     checked = limbfit.load_study(study)
     used = parse_parameters(parameters, checked)
     chosen = parse_list(depths, "--depths", "give millimetres, such as 3,5,7")
-    with listening() as listener:
+    with listen_on_console() as listener:
         if protocol:
             found = limbfit.plan_protocol(
                 checked,

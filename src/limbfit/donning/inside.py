@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..fe import State, System
 from ..fe.kernel.laws import Laws
-from ..fe.observables import element_fields
+from ..fe.observables import compute_element_fields
 
 Mask = NDArray[np.bool_]
 
@@ -40,7 +40,7 @@ class Strains:
     @classmethod
     def of(cls, system: System, laws: Laws, state: State) -> Self:
         """Of a state that kept its memory."""
-        fields = element_fields(system, laws, state)
+        fields = compute_element_fields(system, laws, state)
         most, least = fields.stretches[:, 0] ** 2, fields.stretches[:, 2] ** 2
         volume = system.weights.sum(axis=1)
         return cls((most - least) / 4.0, (1.0 - least) / 2.0, 1e3 * fields.energy, volume)

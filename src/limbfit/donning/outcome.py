@@ -19,8 +19,8 @@ from ..fe import (
     StepControl,
     System,
     Tractions,
+    compute_tractions,
     solve,
-    tractions,
 )
 from ..fe.kernel.laws import Laws
 from .inside import Strains
@@ -150,7 +150,7 @@ def don(
     held = {} if begin is None else dict(begin.held)
 
     def note(step: Step) -> None:
-        found = tractions(system, laws, step.state)
+        found = compute_tractions(system, laws, step.state)
         rows.append(_row(step, found, patches))
         for name, _, off in fit.ends:
             if np.isclose(step.time, off):
@@ -207,7 +207,7 @@ def _slopes(
                 coordinates=state.coordinates + step * state.bodies[..., i],
                 penalty=state.penalty * (1.0 + step * laws.modulus_gradient[i] / laws.modulus),
             )
-            at = tractions(system, laws, there)
+            at = compute_tractions(system, laws, there)
             areas = at.areas.sum(axis=1)
             ways.append({name: _mean(at, areas, mask) for name, mask in patches.items()})
         for name in patches:

@@ -27,7 +27,7 @@ from .activation import Activation
 from .contact.indenter import Indenter
 from .contact.open_surface import OpenSurface
 from .contact.smooth_surface import SmoothSurface
-from .doubts import Doubt, texts_of
+from .doubts import SimulationWarning, list_texts
 from .kernel.elements import ELEMENTS
 from .materials import (
     ORDER_IN_TIME,
@@ -42,17 +42,17 @@ from .materials import (
 )
 from .motion import Motion, RigidBody
 from .pressure import Pressure
-from .prestretch import isochoric_stretch
+from .prestretch import build_isochoric_stretch
 from .problem import History, Problem, Support
 from .result import Result, State, Step
 from .snapshot import Checkpoints, Snapshot
 from .solution.compiling import are_compiled, compile_kernels
 from .solution.control import StepControl
-from .solution.guesses import tangent_at_rest
-from .solution.linear import linear_solver
+from .solution.guesses import compute_tangent_at_rest
+from .solution.linear import build_linear_solver
 from .solution.stepping import iterate, solve
 from .system import System
-from .tractions import Tractions, tractions
+from .tractions import Tractions, compute_tractions
 
 __all__ = [
     "ELEMENTS",
@@ -61,7 +61,6 @@ __all__ = [
     "Activation",
     "Checkpoints",
     "Contractile",
-    "Doubt",
     "Fibred",
     "History",
     "Indenter",
@@ -77,6 +76,7 @@ __all__ = [
     "Result",
     "RigidBody",
     "RigidSurface",
+    "SimulationWarning",
     "SmoothSurface",
     "Snapshot",
     "State",
@@ -86,12 +86,12 @@ __all__ = [
     "System",
     "Tractions",
     "are_compiled",
+    "build_isochoric_stretch",
+    "build_linear_solver",
     "compile_kernels",
-    "isochoric_stretch",
+    "compute_tangent_at_rest",
+    "compute_tractions",
     "iterate",
-    "linear_solver",
+    "list_texts",
     "solve",
-    "tangent_at_rest",
-    "texts_of",
-    "tractions",
 ]

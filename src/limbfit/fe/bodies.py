@@ -13,8 +13,8 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from .contact.contact import ContactSurface, Touch, add_springs, check_clear, contact, touching_offset
-from .contact.grip import Grip
+from .contact.contact import ContactSurface, Touch, add_springs, check_clear, contact, find_touching_offset
+from .contact.grip import StickyContact
 from .contact.pose import Pose
 from .contact.rigid import RigidShape
 from .contact.tool import Distances, Tool
@@ -103,7 +103,7 @@ class _Body:
         return Tool(self.surface, pose, u, self.free, self.row, self.unit)
 
 
-def extra_rows(bodies: Sequence[RigidBody]) -> int:
+def count_body_rows(bodies: Sequence[RigidBody]) -> int:
     """Rows of ``u`` beyond those of the nodes: two for each body that something is free to move."""
     return 2 * sum(bool(body.motion.free.any()) for body in bodies)
 
@@ -127,7 +127,7 @@ class Bodies:
             row += 2 if len(body.free) else 0
             self.all.append(body)
             drive, forced, growth = stated.motion.at(0.0)
-            start = impose_on(body, np.zeros((row, 3)), drive, forced)
+            start = impose_coordinates(body, np.zeros((row, 3)), drive, forced)
             check_clear(surface, body.tool(start, drive, growth).body, stated.name)
         self.rows, self.count, self.free = row, first, column
         self.levers = np.zeros((first, 3, column))
@@ -174,7 +174,7 @@ class Bodies:
         """``u`` with the free coordinates that displacements drive now at their values."""
         for body, value, forced in zip(self.all, drives.values, drives.forced):
             if len(body.free):
-                u = impose_on(body, u, value, forced)
+                u = impose_coordinates(body, u, value, forced)
         return u
 
     def trusted_share(self, direction: Array) -> float:
@@ -186,9 +186,14 @@ class Bodies:
         return 1.0 / max(1.0, float(np.abs(direction).max()) / (TRUSTED * min(widths)))
 
     def evaluate(
-        self, u: Array, drives: Drives, penalty: float, flat_from: float, grips: Sequence[Grip | None],
+        self,
+        u: Array,
+        drives: Drives,
+        penalty: float,
+        flat_from: float,
+        grips: Sequence[StickyContact | None],
         tangent: bool,
-    ) -> Contacts:  # fmt: skip
+    ) -> Contacts:
         """Energy and forces of all contact at ``u (r, 3)``; what a tangent needs where it is wanted."""
         gaps, weights, size = np.full(self.count, np.inf), np.zeros(self.count), (self.count, 3)
         forces, normals = np.zeros(size), np.zeros(size)
@@ -218,7 +223,7 @@ class Bodies:
                 self.levers[at, :, columns] = tool.levers
                 turning[at, :, columns] = tool.pose.turning(forces[at], body.free) * units
                 bent = tool.pose.bending(places, forces[at][pushed], body.free)
-                bending[columns, columns] = bent * units * units[:, None] + _mixed(
+                bending[columns, columns] = bent * units * units[:, None] + _couple_moves_and_turns(
                     np.einsum("cij,cik->jk", self.levers[at, :, columns], turning[at, :, columns]), body.free
                 )
         touch = Touch(gaps, normals, weights, blocks, stick, forces)
@@ -363,7 +368,7 @@ class Bodies:
         return out
 
 
-def impose_on(body: _Body, u: Array, value: Array, forced: NDArray[np.bool_]) -> Array:
+def impose_coordinates(body: _Body, u: Array, value: Array, forced: NDArray[np.bool_]) -> Array:
     """``u (r, 3)`` with the coordinates of a body at ``value (6,)`` that are free and not ``forced`` now."""
     held = np.zeros(6, dtype=bool)
     held[body.free] = ~forced[body.free]
@@ -375,7 +380,7 @@ def impose_on(body: _Body, u: Array, value: Array, forced: NDArray[np.bool_]) ->
     return u
 
 
-def _mixed(moved: Array, free: NDArray[np.intp]) -> Array:
+def _couple_moves_and_turns(moved: Array, free: NDArray[np.intp]) -> Array:
     """The part (k, k) between moves and turns, for ``moved``: lever of row times turning of column."""
     cross = np.where((free[:, None] < 3) & (free > 2), moved, 0.0)
     return cross + cross.T
@@ -385,7 +390,7 @@ def _start(problem: Problem, stated: RigidBody, surface: ContactSurface) -> Rigi
     """Where a body starts: the indenter just in touch, if the problem says so."""
     if stated.shape is not problem.indenter or problem.start != "touching":
         return stated.shape
-    offset = touching_offset(surface, stated.shape)
+    offset = find_touching_offset(surface, stated.shape)
     start = stated.shape.moved(offset)
     if abs(surface.gaps_at_rest(start).min()) > 1e-6:
         raise ProblemError(

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..errors import ProblemError
 from .contact.friction import LAWS_OF_STICKING
-from .kernel.elements import ELEMENTS, reference_gradients
+from .kernel.elements import ELEMENTS, compute_reference_gradients
 from .problem import Problem
 
 
@@ -78,7 +78,7 @@ def _check_cells(problem: Problem) -> None:
     unique = np.unique(np.sort(mesh.cells, axis=1), axis=0)
     if len(unique) != len(mesh.cells):
         raise ProblemError(f"the mesh has {len(mesh.cells) - len(unique)} duplicate cells")
-    _, weights = reference_gradients(problem.formulation, mesh.points, mesh.cells)
+    _, weights = compute_reference_gradients(problem.formulation, mesh.points, mesh.cells)
     upright = (weights > 0).all(axis=1)
     # A quadratic map may be upright at its points and its corners not.
     if mesh.kind.is_tetrahedron and len(mesh.kind.nodes) > mesh.kind.corners:

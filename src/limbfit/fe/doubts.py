@@ -24,7 +24,7 @@ FOLDED_ENERGY = 0.01
 
 
 @dataclass(frozen=True)
-class Doubt:
+class SimulationWarning:
     """One doubt about a simulation.
 
     Parameters
@@ -46,20 +46,22 @@ class Doubt:
     share: float
 
 
-def texts_of(doubts: Sequence[Doubt], *kinds: Kind) -> tuple[str, ...]:
+def list_texts(doubts: Sequence[SimulationWarning], *kinds: Kind) -> tuple[str, ...]:
     """What is said of each kind; empty where it is not doubted."""
     said = {doubt.kind: doubt.text for doubt in doubts}
     return tuple(said.get(kind, "") for kind in kinds)
 
 
-def _doubt(kind: Kind, text: str, count: int, depth_mm: float, displacement: Array) -> tuple[Doubt]:
+def _build_warning(
+    kind: Kind, text: str, count: int, depth_mm: float, displacement: Array
+) -> tuple[SimulationWarning]:
     most = float(np.abs(displacement).max(initial=0.0))
-    return (Doubt(kind, text, count, float(depth_mm), float(depth_mm) / most if most else 0.0),)
+    return (SimulationWarning(kind, text, count, float(depth_mm), float(depth_mm) / most if most else 0.0),)
 
 
-def folded(
+def find_inverted_elements(
     mesh: Mesh, u: Array, energy: Callable[[], Array], depth_mm: float, displacement: Array
-) -> tuple[Doubt, ...]:
+) -> tuple[SimulationWarning, ...]:
     """Elements that are inside out at a node of theirs at the displacements ``u (n, 3)`` of a depth.
 
     The quadrature of ``tet10`` lies inside and does not see it; the element has lost part of its stiffness.
@@ -79,10 +81,10 @@ def folded(
         "the strain energy, and the force may be too small by about as much: use element tet10v, a rounded "
         "edge of the indenter or a finer mesh at its edge"
     )
-    return _doubt("folded", text, count, depth_mm, displacement)
+    return _build_warning("folded", text, count, depth_mm, displacement)
 
 
-def slipped(displacement: Array, force: Array) -> tuple[Doubt, ...]:
+def find_slip(displacement: Array, force: Array) -> tuple[SimulationWarning, ...]:
     """Whether the force (n,), N, falls while the indenter advances (n,), mm.
 
     The tissue has lost its equilibrium.
@@ -97,10 +99,12 @@ def slipped(displacement: Array, force: Array) -> tuple[Doubt, ...]:
         f"to {end:.3g} mm: tissue folds, or slips past the indenter between contact points; "
         "use a finer mesh there"
     )
-    return _doubt("slipped", text, len(falls), start, displacement)
+    return _build_warning("slipped", text, len(falls), start, displacement)
 
 
-def sunk(displacement: Array, penetration: Array, allowed_mm: float, penalty: float) -> tuple[Doubt, ...]:
+def find_penetration(
+    displacement: Array, penetration: Array, allowed_mm: float, penalty: float
+) -> tuple[SimulationWarning, ...]:
     """Steps whose penetration (n,), mm, is more than is allowed, with contact of ``penalty`` (1/mm)."""
     deep = np.flatnonzero(penetration > allowed_mm)
     if not len(deep):
@@ -112,12 +116,12 @@ def sunk(displacement: Array, penetration: Array, allowed_mm: float, penalty: fl
         f"{allowed_mm:.3g} mm, and the force is a little too small: state a stiffer contact than "
         f"{penalty:.4g} per mm (solver.penalty_per_mm), such as {stiffer:g}"
     )
-    return _doubt("sunk", text, len(deep), displacement[deep[0]], displacement)
+    return _build_warning("sunk", text, len(deep), displacement[deep[0]], displacement)
 
 
-def unbalanced(
+def find_unbalanced_steps(
     displacement: Array, found: Sequence[tuple[float, float]], tolerance: float
-) -> tuple[Doubt, ...]:
+) -> tuple[SimulationWarning, ...]:
     """Steps, as (mm, residual over reactions), that were accepted at more than the tolerance."""
     if not found:
         return ()
@@ -126,10 +130,12 @@ def unbalanced(
         f"{len(found)} steps are in equilibrium to {worst:.2g} of the reactions only, not to "
         f"{tolerance:.2g}, first at {found[0][0]:.3g} mm: the force may be off by as much"
     )
-    return _doubt("unbalanced", text, len(found), found[0][0], displacement)
+    return _build_warning("unbalanced", text, len(found), found[0][0], displacement)
 
 
-def unsettled(displacement: Array, found: Sequence[tuple[float, float]]) -> tuple[Doubt, ...]:
+def find_unconverged_friction(
+    displacement: Array, found: Sequence[tuple[float, float]]
+) -> tuple[SimulationWarning, ...]:
     """Steps, as (mm, residual over reactions), whose friction did not settle with the normal force."""
     if not found:
         return ()
@@ -138,12 +144,12 @@ def unsettled(displacement: Array, found: Sequence[tuple[float, float]]) -> tupl
         f"the friction of {len(found)} steps belongs to a normal force that is off by up to {worst:.2g} of "
         f"the reactions, first at {found[0][0]:.3g} mm: use more steps"
     )
-    return _doubt("unsettled", text, len(found), found[0][0], displacement)
+    return _build_warning("unsettled", text, len(found), found[0][0], displacement)
 
 
-def inexact(displacement: Array, count: int) -> tuple[Doubt, ...]:
+def find_inexact_sensitivities(displacement: Array, count: int) -> tuple[SimulationWarning, ...]:
     """Sensitivities of unstable equilibria that could not be solved for."""
     if not count:
         return ()
     text = f"{count} sensitivities at unstable equilibria are inexact"
-    return _doubt("inexact", text, count, 0.0, displacement)
+    return _build_warning("inexact", text, count, 0.0, displacement)

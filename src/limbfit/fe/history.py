@@ -74,7 +74,7 @@ class Memory:
         return Memory(elastic, prony, self.elastic, dt)
 
 
-def elastic_stresses(system: System, laws: Laws, u: Array) -> Array:
+def compute_elastic_stresses(system: System, laws: Laws, u: Array) -> Array:
     """Deviatoric second Piola-Kirchhoff stress ``Se (m, q, 6)`` of the elastic law at ``u (n, 3)``, MPa."""
     stress = np.empty((*system.weights.shape, 6))
 
@@ -89,7 +89,7 @@ def elastic_stresses(system: System, laws: Laws, u: Array) -> Array:
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _elastic_stresses(elements, tables, u, records, out):  # type: ignore[no-untyped-def]
-    """The kernel of `elastic_stresses`, `LANES` elements side by side."""
+    """The kernel of `compute_elastic_stresses`, `LANES` elements side by side."""
     points, law, numbers = records
     m, q = elements[2].shape
     for start in range(0, m, LANES):

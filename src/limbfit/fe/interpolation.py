@@ -23,29 +23,31 @@ def interpolate(times: Array, force: Array, kinks: Array, values: Array, at: Arr
     ``kinks``: times where phases begin or end, s.
     """
     out = np.zeros((len(at), *values.shape[1:]))
-    for first, last in _stretches(times, force, kinks):
+    for first, last in _find_stretches(times, force, kinks):
         x, pushes = times[first : last + 1], force[first : last + 1]
         inside = np.flatnonzero((at >= x[0]) & (at <= x[-1]))
         if not len(inside):
             continue
         start = float(kinks[kinks <= x[0] + 1e-9 * times[-1]].max(initial=times[0]))
-        power = _power(times[times > start + 1e-9 * times[-1]] - start)
+        power = _choose_power(times[times > start + 1e-9 * times[-1]] - start)
         x, t = ((np.maximum(s - start, 0.0)) ** (1.0 / power) for s in (x, at[inside]))
         nodes = len(x)
         if nodes > 2 and pushes[-1] <= 0.0:
-            ends = [_spline(x[-1 - n : -1], pushes[-1 - n : -1])(x[-1]) for n in (3, nodes - 1) if n < nodes]
+            ends = [
+                _build_spline(x[-1 - n : -1], pushes[-1 - n : -1])(x[-1]) for n in (3, nodes - 1) if n < nodes
+            ]
             nodes -= int(max(ends) <= 0.0)  # contact ended on the way
         skip = 0
         if nodes > 2 and pushes[0] <= 0.0 and np.any(force[:first] > 0.0):
-            starts = [_spline(x[1 : n + 1], pushes[1 : n + 1])(x[0]) for n in (2, 3) if n < nodes]
+            starts = [_build_spline(x[1 : n + 1], pushes[1 : n + 1])(x[0]) for n in (2, 3) if n < nodes]
             skip = int(max(starts) <= 0.0)  # tissue that had not come back yet was met on the way
         kept = slice(skip, nodes)
-        inside = inside[(pushing := _spline(x[kept], pushes[kept])(t) > 0.0)]
-        out[inside] = _spline(x[kept], values[first : last + 1][kept])(t[pushing])
+        inside = inside[(pushing := _build_spline(x[kept], pushes[kept])(t) > 0.0)]
+        out[inside] = _build_spline(x[kept], values[first : last + 1][kept])(t[pushing])
     return out
 
 
-def _stretches(times: Array, force: Array, kinks: Array) -> list[tuple[int, int]]:
+def _find_stretches(times: Array, force: Array, kinks: Array) -> list[tuple[int, int]]:
     """First and last step of each stretch of a phase in which the indenter pushes."""
     corners = np.searchsorted(times, kinks - 1e-9 * times[-1]).clip(0, len(times) - 1)
     found = []
@@ -61,7 +63,7 @@ def _stretches(times: Array, force: Array, kinks: Array) -> list[tuple[int, int]
     return found
 
 
-def _power(since: Array) -> int:
+def _choose_power(since: Array) -> int:
     """The power of the spline's variable that the time since a kink is: 2 where steps grow fast after it.
 
     A whole number: the force is smooth in time, and so remains smooth in the variable.
@@ -69,5 +71,5 @@ def _power(since: Array) -> int:
     return 2 if len(since) > 1 and since[1] > 3.0 * since[0] else 1
 
 
-def _spline(x: Array, y: Array) -> BSpline:
+def _build_spline(x: Array, y: Array) -> BSpline:
     return make_interp_spline(x, y, k=min(3, len(x) - 1))

@@ -34,9 +34,9 @@ class ElementFields:
     energy: Array
 
 
-def element_fields(system: System, laws: Laws, state: State) -> ElementFields:
+def compute_element_fields(system: System, laws: Laws, state: State) -> ElementFields:
     """Fields of a state that kept its memory (``store="peak"``, or a step of `iterate`)."""
-    history = _relaxing(system, laws, state)
+    history = _compute_relaxing_stress(system, laws, state)
     out = np.zeros((len(system.cells), 11))
     points, law, numbers, _, _, element, *_ = workspace(0, system.weights.shape[1], laws.numbers.shape[1])
     records = points, law, numbers, element
@@ -46,21 +46,22 @@ def element_fields(system: System, laws: Laws, state: State) -> ElementFields:
     return ElementFields(out[:, :6], out[:, 6:9], out[:, 9], out[:, 10])
 
 
-def nodal_forces(system: System, laws: Laws, state: State) -> Array:
+def compute_nodal_forces(system: System, laws: Laws, state: State) -> Array:
     """Force (n, 3) from outside that every node of a state needs to stay where it is, N, but for contact.
 
     At supports their reactions; at free nodes what Newton's iteration left.  The state must have kept its
-    memory, as for `element_fields`.
+    memory, as for `compute_element_fields`.
     """
     increment = Increment(
-        state.time, state.displacement, np.ones(len(laws.prony)), _relaxing(system, laws, state),
+        state.time, state.displacement, np.ones(len(laws.prony)),
+        _compute_relaxing_stress(system, laws, state),
         state.penalty * laws.modulus, state.drives, state.grips, activation=state.activation,
     )  # fmt: skip
     found = system.evaluate(state.rows, laws, increment, tangent=False)
     return found.residual[: system.nodes]
 
 
-def _relaxing(system: System, laws: Laws, state: State) -> Array:
+def _compute_relaxing_stress(system: System, laws: Laws, state: State) -> Array:
     """Deviatoric second Piola-Kirchhoff stress (m, q, 6) of the Prony terms, MPa."""
     if state.memory is None:
         raise ValueError("the state was stored without its stresses")
@@ -71,7 +72,7 @@ def _relaxing(system: System, laws: Laws, state: State) -> Array:
     return stress
 
 
-def contact_pressure(system: System, laws: Laws, state: State) -> Array:
+def compute_contact_pressure(system: System, laws: Laws, state: State) -> Array:
     """Contact pressure (n,) at the nodes, MPa over the deformed area; 0 where nothing is in touch.
 
     The part of a node's contact force along the deformed skin's normal, over the node's share of the area.
@@ -81,9 +82,9 @@ def contact_pressure(system: System, laws: Laws, state: State) -> Array:
     pressure = np.zeros(len(system.points))
     if system.bodies is None:
         return pressure
-    force, faces = _contact_forces(system, laws, state), _touched(system)
-    share = _nodal_areas(system.element, system.points + state.u, faces)
-    to_middles = _corner_mean(len(pressure), faces) if faces.shape[1] == 6 else None
+    force, faces = _compute_contact_forces(system, laws, state), _find_touched_faces(system)
+    share = _compute_nodal_areas(system.element, system.points + state.u, faces)
+    to_middles = _build_corner_mean(len(pressure), faces) if faces.shape[1] == 6 else None
     if to_middles is not None:
         force, share = (values + to_middles.T @ values for values in (force, share))
     size = np.linalg.norm(share, axis=1)
@@ -95,7 +96,7 @@ def contact_pressure(system: System, laws: Laws, state: State) -> Array:
     return pressure
 
 
-def _contact_forces(system: System, laws: Laws, state: State) -> Array:
+def _compute_contact_forces(system: System, laws: Laws, state: State) -> Array:
     """Nodal forces (n, 3) of all contact, N."""
     nothing, penalty = np.zeros(0), state.penalty * laws.modulus
     increment = Increment(
@@ -104,20 +105,20 @@ def _contact_forces(system: System, laws: Laws, state: State) -> Array:
     return system.contact_force(state.rows, increment)[: system.nodes]
 
 
-def _touched(system: System) -> NDArray[np.int64]:
+def _find_touched_faces(system: System) -> NDArray[np.int64]:
     """The faces that bodies may touch, each once."""
     faces = np.concatenate([np.asarray(body.faces) for body in system.problem.rigid_bodies])
     return faces[np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])]
 
 
-def _corner_mean(n: int, faces: NDArray[np.int64]) -> sp.csr_matrix:
+def _build_corner_mean(n: int, faces: NDArray[np.int64]) -> sp.csr_matrix:
     """Matrix (n, n): at the corners of quadratic faces (f, 6) the mean over the mid-edge nodes beside."""
     corners, beside = faces[:, [0, 0, 1, 1, 2, 2]].ravel(), faces[:, [3, 5, 3, 4, 4, 5]].ravel()
     count = np.bincount(corners, minlength=n)
     return sp.csr_matrix((1.0 / count[corners], (corners, beside)), shape=(n, n))
 
 
-def _nodal_areas(element: Element, points: Array, faces: NDArray[np.int64]) -> Array:
+def _compute_nodal_areas(element: Element, points: Array, faces: NDArray[np.int64]) -> Array:
     """Each node's share (n, 3) of the area of the faces (f, k), outward, mm^2."""
     at, weights = element.face_rules["gauss"]
     N, dN = element.face_shape(at)
@@ -127,7 +128,7 @@ def _nodal_areas(element: Element, points: Array, faces: NDArray[np.int64]) -> A
     return np.stack([np.bincount(faces.ravel(), part, len(points)) for part in shares.T], axis=1)
 
 
-def nodal_average(system: System, values: Array) -> Array:
+def average_at_nodes(system: System, values: Array) -> Array:
     """Element values (m, c) at the nodes (n, c): the mean over the elements around, by their volume.
 
     Where two tissues meet it is a mean over both.
@@ -138,7 +139,7 @@ def nodal_average(system: System, values: Array) -> Array:
     return np.asarray((around @ values) / (around @ np.ones((m, 1))))
 
 
-def von_mises(cauchy: Array) -> Array:
+def compute_von_mises(cauchy: Array) -> Array:
     """Equivalent stress (m,) of stresses (m, 6) in the order xx, yy, zz, xy, yz, zx."""
     xx, yy, zz, xy, yz, zx = cauchy.T
     normal = (xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2
@@ -147,7 +148,7 @@ def von_mises(cauchy: Array) -> Array:
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _fields(elements, mean, tables, history, u, records, out):  # type: ignore[no-untyped-def]
-    """The kernel of `element_fields`, `LANES` elements side by side; adds to ``out (m, 11)``."""
+    """The kernel of `compute_element_fields`, `LANES` elements side by side; adds to ``out (m, 11)``."""
     points, law, numbers, element = records
     weights, regions = elements[2], elements[3]
     m, q = weights.shape

@@ -20,7 +20,7 @@ class Pattern:
     numbers: NDArray[np.int32]
 
 
-def node_graph(cells: NDArray[np.int32], nodes: int) -> sp.csr_matrix:
+def build_node_graph(cells: NDArray[np.int32], nodes: int) -> sp.csr_matrix:
     """Which nodes share a cell, themselves included; rows sorted."""
     m, k = cells.shape
     incidence = sp.csr_matrix(
@@ -31,7 +31,7 @@ def node_graph(cells: NDArray[np.int32], nodes: int) -> sp.csr_matrix:
     return graph
 
 
-def bordered(graph: sp.csr_matrix, borders: Sequence[NDArray[np.int64]]) -> sp.csr_matrix:
+def append_rows(graph: sp.csr_matrix, borders: Sequence[NDArray[np.int64]]) -> sp.csr_matrix:
     """A graph with two further rows for each of the ``borders``: they meet its nodes and each other."""
     n = graph.shape[0]
     size = n + 2 * len(borders)

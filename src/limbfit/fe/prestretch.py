@@ -16,7 +16,7 @@ from ..errors import ProblemError
 Array = NDArray[np.float64]
 
 
-def isochoric_stretch(directions: ArrayLike, stretches: ArrayLike) -> Array:
+def build_isochoric_stretch(directions: ArrayLike, stretches: ArrayLike) -> Array:
     """Pre-stretches (m, 3, 3) along ``directions`` at constant volume.
 
     ``directions (m, 3)``, or one (3,), of any length; ``stretches``, one or (m,), along them: what is across
@@ -39,7 +39,7 @@ def isochoric_stretch(directions: ArrayLike, stretches: ArrayLike) -> Array:
     return np.asarray(across * np.eye(3) + (along - across) * n[:, :, None] * n[:, None, :])
 
 
-def prestretched(given: ArrayLike, gradients: Array, weights: Array) -> tuple[Array, Array, Array]:
+def apply_prestretch(given: ArrayLike, gradients: Array, weights: Array) -> tuple[Array, Array, Array]:
     """Pre-stretches (m, 3, 3), and gradients (m, q, 3, k) 1/mm and weights (m, q) mm^3 of the tissue on its
     own."""
     G = np.ascontiguousarray(np.broadcast_to(np.asarray(given, dtype=float), (len(weights), 3, 3)))

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .contact.grip import Grip
-from .doubts import Doubt
+from .contact.grip import StickyContact
+from .doubts import SimulationWarning
 from .history import Memory
 from .interpolation import interpolate
 from .motion import Drives
@@ -38,7 +38,7 @@ class State:
     coordinates: Array = field(default_factory=lambda: np.zeros((0, 3)))
     bodies: Array | None = None
     drives: Drives = field(default_factory=Drives.none)
-    grips: tuple[Grip | None, ...] = ()
+    grips: tuple[StickyContact | None, ...] = ()
     activation: float = 0.0
 
     @property
@@ -114,7 +114,7 @@ class Result:
     completed: bool
     reason: str
     statistics: Mapping[str, Any]
-    doubts: tuple[Doubt, ...] = ()
+    doubts: tuple[SimulationWarning, ...] = ()
     system: Any = field(default=None, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -14,21 +14,21 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .bodies import Bodies, Contacts, extra_rows
+from .bodies import Bodies, Contacts, count_body_rows
 from .checking import check
 from .contact.contact import ContactSurface, Touch
-from .contact.grip import Grip
+from .contact.grip import StickyContact
 from .contact.indenter import Indenter
 from .contact.tool import Tool
 from .kernel.assembly import Elements, assemble
-from .kernel.elements import Element, reference_gradients
+from .kernel.elements import Element, compute_reference_gradients
 from .kernel.laws import Laws
 from .motion import Drives
-from .pattern import Pattern, bordered, node_graph, positions, upper_pattern
+from .pattern import Pattern, append_rows, build_node_graph, positions, upper_pattern
 from .pressure import Pressures
-from .prestretch import prestretched
+from .prestretch import apply_prestretch
 from .problem import Problem, ProblemError
-from .threads import thread_pool
+from .threads import get_thread_pool
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -51,7 +51,7 @@ class Increment:
     history: Array
     penalty: float
     drives: Drives = field(default_factory=Drives.none)
-    grips: tuple[Grip | None, ...] = ()
+    grips: tuple[StickyContact | None, ...] = ()
     flat_from: float = np.inf
     pressures: tuple[float, ...] = ()
     rims: Array | float = 0.0
@@ -123,7 +123,7 @@ class System:
         self.problem = problem
         self.element: Element = problem.formulation
         self.nodes = len(mesh.points)
-        self.rows = self.nodes + extra_rows(problem.rigid_bodies)
+        self.rows = self.nodes + count_body_rows(problem.rigid_bodies)
         self.points = np.ascontiguousarray(mesh.points, dtype=float)
         self.cells = np.ascontiguousarray(mesh.cells, dtype=np.int32)
         self.regions = np.ascontiguousarray(mesh.regions, dtype=np.int32)
@@ -131,10 +131,10 @@ class System:
         if problem.fibres is not None:
             given = np.broadcast_to(np.asarray(problem.fibres, dtype=float), (len(self.cells), 3))
             self.fibres = np.ascontiguousarray(given / np.linalg.norm(given, axis=1, keepdims=True))
-        self.gradients, self.weights = reference_gradients(self.element, self.points, mesh.cells)
+        self.gradients, self.weights = compute_reference_gradients(self.element, self.points, mesh.cells)
         self.prestretch = np.zeros((0, 3, 3))
         if problem.prestretch is not None:
-            found = prestretched(problem.prestretch, self.gradients, self.weights)
+            found = apply_prestretch(problem.prestretch, self.gradients, self.weights)
             self.prestretch, self.gradients, self.weights = found
         self._number_unknowns(problem)
         self._build_pattern(problem)
@@ -176,7 +176,7 @@ class System:
 
     def _build_pattern(self, problem: Problem) -> None:
         moved = [np.unique(body.faces) for body in problem.rigid_bodies if body.motion.free.any()]
-        graph, numbers = bordered(node_graph(self.cells, self.nodes), moved), self.numbers
+        graph, numbers = append_rows(build_node_graph(self.cells, self.nodes), moved), self.numbers
         self.indptr, self.indices = upper_pattern(numbers, graph.indptr, graph.indices, len(self.free))
         self.cell_positions = positions(self.cells, numbers, self.indptr, self.indices)
 
@@ -216,7 +216,7 @@ class System:
         """``work`` done on as many parts of the cells as there are threads, side by side."""
         ends = np.linspace(0, len(self.cells), self.threads + 1).astype(int)
         parts = [slice(a, b) for a, b in pairwise(ends)]
-        return [work(parts[0])] if len(parts) == 1 else list(thread_pool(self.threads).map(work, parts))
+        return [work(parts[0])] if len(parts) == 1 else list(get_thread_pool(self.threads).map(work, parts))
 
     def evaluate(self, u: Array, laws: Laws, increment: Increment, tangent: bool = True) -> Evaluation:
         """Energy, residual (r, 3) and, if wanted, tangent entries at ``u (r, 3)``."""

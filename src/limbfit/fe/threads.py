@@ -11,26 +11,26 @@ from threadpoolctl import ThreadpoolController, threadpool_info
 
 
 @functools.cache
-def thread_pool(threads: int) -> ThreadPoolExecutor:
+def get_thread_pool(threads: int) -> ThreadPoolExecutor:
     """Workers for compiled kernels that let go of the interpreter; kept for the life of the process."""
     return ThreadPoolExecutor(threads)
 
 
-def single_threaded_numpy() -> AbstractContextManager[object]:
+def limit_numpy_threads() -> AbstractContextManager[object]:
     """While this lasts, NumPy's own linear algebra runs on one thread.
 
     Its arrays are small here, and its idle threads would spin on the cores that the solver works on.
     """
-    return _openblas().limit(limits=1)
+    return _find_openblas().limit(limits=1)
 
 
 @functools.cache
-def _openblas() -> ThreadpoolController:
+def _find_openblas() -> ThreadpoolController:
     """OpenBLAS alone: a limit on all libraries, once lifted, would leave MKL with one thread."""
     return ThreadpoolController().select(internal_api="openblas")
 
 
-def quiet_openmp() -> None:
+def silence_openmp() -> None:
     """Let Intel's OpenMP threads sleep at once between factorisations instead of spinning for 0.2 s."""
     for library in threadpool_info():
         if library["prefix"] == "libiomp":

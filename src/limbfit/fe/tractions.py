@@ -89,7 +89,7 @@ class Tractions:
         return np.asarray(np.einsum("fq,fqi->fi", self.areas, values) / self.areas.sum(axis=1)[:, None])
 
 
-def tractions(system: System, laws: Laws, state: State, body: int = 0) -> Tractions:
+def compute_tractions(system: System, laws: Laws, state: State, body: int = 0) -> Tractions:
     """Those of the ``body``-th of a problem's rigid bodies in a state."""
     assert system.bodies is not None
     one, penalty = system.bodies.all[body], state.penalty * laws.modulus

@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import Array, Indices
 from ..errors import ProblemError
 from ..fe import ELEMENTS, Indenter, Motion, OpenSurface, RigidBody, RigidSurface, SmoothSurface
-from ..fe.kernel.elements import reference_gradients
+from ..fe.kernel.elements import compute_reference_gradients
 from ..mesh import Mesh
 from ..shapes import SHARP_EDGE
 from .penalty import find_smallest_depth
@@ -207,7 +207,7 @@ def build_tissue(model: FebModel) -> TissueMesh:
     mesh = Mesh(
         points, number[cells], first.cell_type, regions, tuple(parts), _select_node_sets(model, number)
     )
-    _, weights = reference_gradients(ELEMENTS[first.element], points, mesh.cells)
+    _, weights = compute_reference_gradients(ELEMENTS[first.element], points, mesh.cells)
     bad = np.flatnonzero((weights <= 0.0).any(axis=1))
     if len(bad):
         part_name = mesh.region_names[regions[bad[0]]]

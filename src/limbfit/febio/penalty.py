@@ -18,8 +18,8 @@ import numpy as np
 from ..arrays import Array, Indices
 from ..errors import ProblemError
 from ..fe import ELEMENTS, Material, Problem, Step, StepControl, System
-from ..fe.contact.contact import ContactSurface, touching_offset
-from ..fe.kernel.elements import face_quadrature, reference_gradients
+from ..fe.contact.contact import ContactSurface, find_touching_offset
+from ..fe.kernel.elements import build_face_quadrature, compute_reference_gradients
 from ..fe.materials import prony_factors
 from ..mesh import Mesh
 from .reading.model import Contact
@@ -126,7 +126,7 @@ class _BodyFaces:
 
     def _compute_areas_at(self, points: Array) -> Array:
         problem = self.problem
-        return face_quadrature(problem.formulation, points, self.all, problem.contact_rule)[1]
+        return build_face_quadrature(problem.formulation, points, self.all, problem.contact_rule)[1]
 
     def _weigh(self, areas: Array) -> None:
         self.body.surface = replace(self.body.surface, areas=self.share * areas)
@@ -148,7 +148,7 @@ def compute_automatic_penalties(problem: Problem, faces: Indices, dt: float) -> 
     squared = _compute_normals(mesh.points, faces) ** 2
     between = 0.5 * (1.0 - (squared**2).sum(axis=1))  # n1^2 n2^2 + .., as the squares add up to one
     compliance = (3.0 * kappa + mu) / (9.0 * kappa * mu) + 3.0 * between / mu
-    _, weights = reference_gradients(problem.formulation, mesh.points, mesh.cells[behind])
+    _, weights = compute_reference_gradients(problem.formulation, mesh.points, mesh.cells[behind])
     return np.asarray(_compute_areas(problem, faces).sum(axis=1) / weights.sum(axis=1) / compliance)
 
 
@@ -156,8 +156,8 @@ def find_smallest_depth(mesh: Mesh, faces: Indices) -> float:
     """Return the smallest depth of the elements behind contact faces: volume over area of the face, mm."""
     cells = _find_cells_behind(mesh, faces)
     element = ELEMENTS[mesh.cell_type]
-    _, areas = face_quadrature(element, mesh.points, faces, "gauss")
-    _, volumes = reference_gradients(element, mesh.points, mesh.cells[cells])
+    _, areas = build_face_quadrature(element, mesh.points, faces, "gauss")
+    _, volumes = compute_reference_gradients(element, mesh.points, mesh.cells[cells])
     return float((volumes.sum(axis=1) / areas.sum(axis=1)).min())
 
 
@@ -168,7 +168,7 @@ def _compute_mean_modulus(problem: Problem) -> float:
 
 
 def _compute_areas(problem: Problem, faces: Indices) -> Array:
-    return face_quadrature(problem.formulation, problem.mesh.points, faces, problem.contact_rule)[1]
+    return build_face_quadrature(problem.formulation, problem.mesh.points, faces, problem.contact_rule)[1]
 
 
 def _compute_normals(points: Array, faces: Indices) -> Array:
@@ -185,7 +185,7 @@ def _find_covered_faces(problem: Problem) -> Indices:
         return faces
     if problem.start == "touching":
         surface = ContactSurface.build(problem.formulation, problem.mesh.points, faces, problem.contact_rule)
-        indenter = indenter.moved(touching_offset(surface, indenter))
+        indenter = indenter.moved(find_touching_offset(surface, indenter))
     deepest = indenter.moved(float(problem.history.driver.max()))
     middle = problem.mesh.points[faces[:, : 4 if faces.shape[1] == 4 else 3]].mean(axis=1)
     inside = deepest.signed_distance(middle) < 0.0

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..fe import History, Motion, Problem, StepControl, System
-from ..fe.solution.stepping import FirstStep, onset
+from ..fe.solution.stepping import FirstStep, solve_until_onset
 from ..fe.solution.touchdown import CLEAR, IndenterStart
 
 PRESTRAIN_S = 1.0  # in which the pre-strain grows
@@ -73,7 +73,7 @@ def prepare_problem(problem: Problem, steps: StepControl) -> tuple[Problem, tupl
     motions = [body.motion for body in problem.rigid_bodies]
     if not (waits or any(np.asarray(motion.forced)[0].any() for motion in motions)):
         return problem.later(preparation.settling_s), tuple(m.later(preparation.settling_s) for m in motions)
-    begun = onset(problem, steps)
+    begun = solve_until_onset(problem, steps)
     moved = [_replace_first_force(motion, begun, i) for i, motion in enumerate(motions)]
     moved = [motion.later(preparation.approach_s) for motion in moved]
     if waits:

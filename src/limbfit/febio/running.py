@@ -15,7 +15,7 @@ from ..arrays import Array, Indices
 from ..errors import InputError, ProblemError, RunError
 from ..fe import Result, Step, System, solve
 from ..fe.kernel.laws import Laws
-from ..fe.observables import ElementFields, element_fields, nodal_forces
+from ..fe.observables import ElementFields, compute_element_fields, compute_nodal_forces
 from .drive import find_drive, group_contacts
 from .parts import build_tissue
 from .penalty import FacePenalties
@@ -133,7 +133,11 @@ class LogTables:
 
     def _write(self, time: float, step: Step | None) -> None:
         needed = any(request.kind == "element_data" for request in self.model.requests)
-        fields = element_fields(self.system, self.laws, step.state) if step is not None and needed else None
+        fields = (
+            compute_element_fields(self.system, self.laws, step.state)
+            if step is not None and needed
+            else None
+        )
         u = self._compute_displacement(step)
         for request, path in zip(self.model.requests, self.paths):
             stream = self.streams[path]
@@ -233,7 +237,7 @@ class LogTables:
             total += [*force, *(moment + np.cross(pivot - pivot_point, force))]
         if name in self.model.carried_nodes:
             nodes = self.tissue.node_index[self.model.carried_nodes[name]]
-            forces = nodal_forces(self.system, self.laws, step.state)[nodes]
+            forces = compute_nodal_forces(self.system, self.laws, step.state)[nodes]
             arms = self.tissue.mesh.points[nodes] + step.state.u[nodes] - pivot_point
             total += [*forces.sum(axis=0), *np.cross(arms, forces).sum(axis=0)]
         return total

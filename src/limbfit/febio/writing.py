@@ -16,7 +16,7 @@ import numpy as np
 from ..arrays import Array
 from ..errors import ProblemError, RunError
 from ..fe import Indenter, Motion, Problem, StepControl
-from ..fe.solution.control import schedule
+from ..fe.solution.control import schedule_steps
 from .conditions import (
     FIXED_SET,
     FRAME_BODY,
@@ -283,7 +283,7 @@ def _format_file(
 def _find_must_points(problem: Problem, settings: FebSettings) -> Array:
     """Return the times (k,) that FEBio must meet and the largest step up to each, s."""
     preparation = Preparation.from_problem(problem)
-    own = preparation.seconds + schedule(problem.history, settings.steps, problem.turns)
+    own = preparation.seconds + schedule_steps(problem.history, settings.steps, problem.turns)
     times, largest = np.append(0.0, own), np.full(len(own) + 1, compute_largest_step(problem))
     if preparation.settling_s:
         rest = preparation.settling_s - PRESTRAIN_S

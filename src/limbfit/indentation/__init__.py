@@ -1,30 +1,37 @@
 """A study's site as a mechanical problem, and what is observed in it."""
 
 from ..laws import Parameters, flat_names, to_parameters, to_vector
-from .clamps import clamped, clamping_pins
-from .fibres import Direction, fibre_field
-from .neighbourhood import Extension, neighbourhood
+from .clamps import build_clamping_pins, clamp_problem
+from .fibres import Direction, build_fibre_field
+from .neighbourhood import Extension, cut_neighbourhood
 from .observing import (
     OFF_SKIN_MM,
+    choose_points_around,
+    find_layers_under,
+    find_nearby_skin_points,
     is_under,
-    layers_under,
-    observed,
-    points_around,
-    skin_beside,
-    waves_under,
+    observe_result,
+    place_waves_under,
 )
-from .simulating import Simulation, SimulationJob, first_steps, job_fields, simulate, simulate_fields
+from .simulating import (
+    Simulation,
+    SimulationJob,
+    build_first_steps,
+    simulate,
+    simulate_fields,
+    store_job_fields,
+)
 from .sites import (
     Array,
     SiteModel,
+    build_materials,
     build_problem,
-    contact_radius,
-    materials,
+    build_steps,
+    compute_contact_radius,
     read_indenter,
-    steps_of,
 )
-from .skin_points import nearest_points, skin_points
-from .waves import WavePlace, as_vector
+from .skin_points import find_nearest_points, find_skin_points
+from .waves import WavePlace, to_vector3
 
 __all__ = [
     "OFF_SKIN_MM",
@@ -36,29 +43,29 @@ __all__ = [
     "SimulationJob",
     "SiteModel",
     "WavePlace",
-    "as_vector",
+    "build_clamping_pins",
+    "build_fibre_field",
+    "build_first_steps",
+    "build_materials",
     "build_problem",
-    "clamped",
-    "clamping_pins",
-    "contact_radius",
-    "fibre_field",
-    "first_steps",
+    "build_steps",
+    "choose_points_around",
+    "clamp_problem",
+    "compute_contact_radius",
+    "cut_neighbourhood",
+    "find_layers_under",
+    "find_nearby_skin_points",
+    "find_nearest_points",
+    "find_skin_points",
     "flat_names",
     "is_under",
-    "job_fields",
-    "layers_under",
-    "materials",
-    "nearest_points",
-    "neighbourhood",
-    "observed",
-    "points_around",
+    "observe_result",
+    "place_waves_under",
     "read_indenter",
     "simulate",
     "simulate_fields",
-    "skin_beside",
-    "skin_points",
-    "steps_of",
+    "store_job_fields",
     "to_parameters",
     "to_vector",
-    "waves_under",
+    "to_vector3",
 ]

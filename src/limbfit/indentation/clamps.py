@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import Indenter, Motion, Problem, RigidBody
-from ..fe.contact.contact import ContactSurface, touching_offset
+from ..fe.contact.contact import ContactSurface, find_touching_offset
 from ..study import ClampsTable
 
 
-def clamping_pins(
+def build_clamping_pins(
     points: Array, faces: NDArray[np.int64], indenter: Indenter, along: Array, clamps: ClampsTable
 ) -> dict[str, Indenter]:
     """The clamping pins by name, each off the skin at its angle; of the usual ones those that meet it.
@@ -39,7 +39,7 @@ def clamping_pins(
     inwards = indenter.frame[2]
     normal = np.asarray(along, dtype=float) - (along @ inwards) * inwards
     if np.linalg.norm(normal) < 0.3 * np.linalg.norm(along):
-        raise _refused("the indenter points along the limb, where no ring of pins holds it")
+        raise _build_refusal("the indenter points along the limb, where no ring of pins holds it")
     normal /= np.linalg.norm(normal)
     middles = points[faces[:, :3]].mean(axis=1) - np.asarray(indenter.centre)
     found: dict[str, Indenter] = {}
@@ -54,19 +54,19 @@ def clamping_pins(
         ahead = ahead[(np.abs(across) < clamps.width_mm / 2.0) & (ahead < 0.0)]
         if not len(ahead):
             if clamps.angles_degrees:
-                raise _refused(f"the {name}, {level:g} mm along the limb, misses the skin")
+                raise _build_refusal(f"the {name}, {level:g} mm along the limb, misses the skin")
             continue
         apart = float(np.linalg.norm(centre + ahead.min() * axis))
         if apart < 0.5 * (clamps.width_mm + indenter.width):
-            raise _refused(f"the {name} would lie on the test pin, {apart:.3g} mm off it")
+            raise _build_refusal(f"the {name} would lie on the test pin, {apart:.3g} mm off it")
         at = indenter.centre + centre - 3.0 * radius * axis
         found[name] = Indenter("square", clamps.width_mm, centre=at, axis=axis, edge=normal)
     if not found:
-        raise _refused("no clamping pin meets the skin")
+        raise _build_refusal("no clamping pin meets the skin")
     return found
 
 
-def clamped(problem: Problem, along: Array, clamps: ClampsTable) -> Problem:
+def clamp_problem(problem: Problem, along: Array, clamps: ClampsTable) -> Problem:
     """A site's problem with the clamping pins as further bodies, which press from its beginning to its end.
 
     Parameters
@@ -77,16 +77,16 @@ def clamped(problem: Problem, along: Array, clamps: ClampsTable) -> Problem:
     Raises
     ------
     ProblemError
-        As `clamping_pins`.
+        As `build_clamping_pins`.
     """
     mesh, indenter = problem.mesh, problem.indenter
     assert indenter is not None
-    pins = clamping_pins(mesh.points, mesh.face_sets["skin"], indenter, along, clamps)
-    bodies = tuple(_body(problem, pin, clamps, name) for name, pin in pins.items())
+    pins = build_clamping_pins(mesh.points, mesh.face_sets["skin"], indenter, along, clamps)
+    bodies = tuple(_build_pin_body(problem, pin, clamps, name) for name, pin in pins.items())
     return replace(problem, bodies=(*problem.bodies, *bodies))
 
 
-def _body(problem: Problem, pin: Indenter, clamps: ClampsTable, name: str) -> RigidBody:
+def _build_pin_body(problem: Problem, pin: Indenter, clamps: ClampsTable, name: str) -> RigidBody:
     """A pin that just touches the skin, pressed by its force until the end."""
     mesh, skin = problem.mesh, problem.mesh.face_sets["skin"]
     local = (mesh.points[skin[:, :3]].mean(axis=1) - pin.centre) @ pin.frame.T
@@ -96,9 +96,9 @@ def _body(problem: Problem, pin: Indenter, clamps: ClampsTable, name: str) -> Ri
     surface = ContactSurface.build(problem.formulation, mesh.points, skin[near], problem.contact_rule)
     times = [0.0, clamps.clamping_s, float(problem.history.times[-1])]
     motion = Motion.of(times, force={"z": [0.0, clamps.force_N, clamps.force_N]})
-    return RigidBody(pin.moved(touching_offset(surface, pin)), skin[near], motion, name=name)
+    return RigidBody(pin.moved(find_touching_offset(surface, pin)), skin[near], motion, name=name)
 
 
-def _refused(what: str) -> ProblemError:
+def _build_refusal(what: str) -> ProblemError:
     remedy = "give clamps.angles_degrees or clamps.levels_mm, or leave [clamps] out"
     return ProblemError(what, place="clamps", remedy=remedy)

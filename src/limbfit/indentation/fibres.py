@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import ELEMENTS
-from ..fe.kernel.elements import reference_gradients
+from ..fe.kernel.elements import compute_reference_gradients
 from ..mesh import Mesh
 from ..study import Vector
 
@@ -28,24 +28,24 @@ DISTAL_MM = 10.0  # of the bone's far end, along the limb, that fibres run to
 _SOLVED = 1e-8  # residual of the potential
 
 
-def fibre_field(fibres: Iterable[tuple[str, Direction]], mesh: Mesh) -> Array | None:
+def build_fibre_field(fibres: Iterable[tuple[str, Direction]], mesh: Mesh) -> Array | None:
     """The fibres' direction in each cell (m, 3); any where a tissue has none, None where all have none.
 
     Raises
     ------
     ProblemError
-        Where a flow has no way: see `flow_directions`.
+        Where a flow has no way: see `compute_flow_directions`.
     """
     found = None
     for tissue, direction in fibres:
         if tissue in mesh.region_names:
             found = np.tile([1.0, 0.0, 0.0], (len(mesh.cells), 1)) if found is None else found
             own = mesh.regions == mesh.region_names.index(tissue)
-            found[own] = flow_directions(mesh, tissue) if direction == "flow" else direction
+            found[own] = compute_flow_directions(mesh, tissue) if direction == "flow" else direction
     return found
 
 
-def flow_directions(mesh: Mesh, tissue: str) -> Array:
+def compute_flow_directions(mesh: Mesh, tissue: str) -> Array:
     """Unit directions (k, 3) in the cells of a tissue, in their order, towards the far end of the bone.
 
     The potential is 0 on the proximal cut and 1 on the bone within `DISTAL_MM` of its far end.
@@ -60,7 +60,7 @@ def flow_directions(mesh: Mesh, tissue: str) -> Array:
     corners = mesh.corners[mesh.regions == mesh.region_names.index(tissue)]
     nodes, cells = np.unique(corners, return_inverse=True)
     cells = cells.reshape(corners.shape)
-    start, end = _ends(mesh, nodes)
+    start, end = _find_ends(mesh, nodes)
     for met, what in ((start, "the proximal cut"), (end, "the far end of the bone")):
         if not met.any():
             raise ProblemError(
@@ -68,8 +68,8 @@ def flow_directions(mesh: Mesh, tissue: str) -> Array:
                 remedy='state a direction, or "axis", in material.fibres',
             )
     points = mesh.points[nodes]
-    gradients, weights = reference_gradients(ELEMENTS["tet4"], points, cells)
-    potential = _potential(len(nodes), cells, gradients[:, 0], weights[:, 0], start, end)
+    gradients, weights = compute_reference_gradients(ELEMENTS["tet4"], points, cells)
+    potential = _solve_potential(len(nodes), cells, gradients[:, 0], weights[:, 0], start, end)
     flow = np.einsum("mik,mk->mi", gradients[:, 0], potential[cells])
     size = np.linalg.norm(flow, axis=1, keepdims=True)
     if not (size > 0.0).all():
@@ -77,7 +77,7 @@ def flow_directions(mesh: Mesh, tissue: str) -> Array:
     return np.asarray(flow / size)
 
 
-def _ends(mesh: Mesh, nodes: NDArray[np.int64]) -> tuple[Bools, Bools]:
+def _find_ends(mesh: Mesh, nodes: NDArray[np.int64]) -> tuple[Bools, Bools]:
     """Which of the ``nodes`` are on the proximal cut, and which at the far end of the bone."""
     none = np.zeros(0, dtype=np.int64)
     cut, bone = (mesh.node_sets.get(name, none) for name in ("fixed_proximal", "fixed_bone"))
@@ -90,7 +90,7 @@ def _ends(mesh: Mesh, nodes: NDArray[np.int64]) -> tuple[Bools, Bools]:
     return np.isin(nodes, cut), np.isin(nodes, end) & ~np.isin(nodes, cut)
 
 
-def _potential(
+def _solve_potential(
     count: int, cells: NDArray[np.int64], gradients: Array, weights: Array, start: Bools, end: Bools
 ) -> Array:
     """The solution (n,) of Laplace's equation by linear tetrahedra: 0 at ``start``, 1 at ``end``."""

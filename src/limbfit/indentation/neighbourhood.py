@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..arrays import Array
 from ..errors import ProblemError
-from ..fe import Result, System, linear_solver, tangent_at_rest
+from ..fe import Result, System, build_linear_solver, compute_tangent_at_rest
 from ..mesh import Mesh
 
 Ints = NDArray[np.int64]
@@ -38,7 +38,7 @@ class Neighbourhood:
     cells: NDArray[np.bool_]
 
 
-def neighbourhood(mesh: Mesh, centre: Array, radius_mm: float) -> Neighbourhood:
+def cut_neighbourhood(mesh: Mesh, centre: Array, radius_mm: float) -> Neighbourhood:
     """The cells within a distance of a point that hang together with the one nearest to it.
 
     Node and face sets keep what is left of them.
@@ -76,7 +76,7 @@ def neighbourhood(mesh: Mesh, centre: Array, radius_mm: float) -> Neighbourhood:
     return Neighbourhood(part, np.flatnonzero(inside), number[inside & outside], kept)
 
 
-def held_cut(part: Neighbourhood, centre: Array, axis: Array) -> Ints:
+def find_fixed_cut_nodes(part: Neighbourhood, centre: Array, axis: Array) -> Ints:
     """Nodes of the cut to be held: those below the indenter, which advances along ``axis``."""
     offset = part.mesh.points[part.cut] - centre
     return part.cut[offset @ axis > _BELOW * np.linalg.norm(offset, axis=1)]
@@ -94,13 +94,13 @@ class Extension:
         self._solver = None
         if len(self._rest):
             upper = sp.csr_array(
-                (tangent_at_rest(system), system.indices, system.indptr), shape=(system.unknowns,) * 2
+                (compute_tangent_at_rest(system), system.indices, system.indptr), shape=(system.unknowns,) * 2
             )
             own = sp.csr_array(upper[self._rest][:, self._rest])
             own.sort_indices()
             full = sp.csr_array(upper + sp.triu(upper, 1).T)
             self._links = full[self._rest][:, self._given]
-            self._solver = linear_solver(own.indptr, own.indices, threads=system.threads)
+            self._solver = build_linear_solver(own.indptr, own.indices, threads=system.threads)
             self._solver.factorise(own.data)
 
     def __call__(self, u: Array) -> Array:

@@ -1,7 +1,7 @@
 """What is seen of a limb beside the force: layers that become thinner, skin that moves, waves.
 
 Ultrasound through the indenter sees the interfaces between tissues on its axis, cameras see the skin around
-it. Both are followed as material points (`mesh.gauges`, `skin_points`). Their displacement is that of
+it. Both are followed as material points (`mesh.gauges`, `find_skin_points`). Their displacement is that of
 the steps, and so are its derivatives, exact as those of the force are. Speeds follow from both (`waves`).
 """
 
@@ -19,15 +19,15 @@ from ..fe.interpolation import interpolate
 from ..mesh import Gauge, Mesh, find_gauges_along, read_vtu
 from ..study import Vector
 from .sites import SiteModel, read_indenter
-from .skin_points import skin_points
-from .waves import WavePlace, as_vector, wave_places, wave_speeds
+from .skin_points import find_skin_points
+from .waves import WavePlace, compute_wave_speeds, place_waves, to_vector3
 
 OFF_SKIN_MM = 5.0  # farther from the skin than that is no point of it
 RINGS_MM, DIRECTIONS = (3.0, 8.0, 15.0), 8
 MOST_ASIDE = 0.25  # of a ring's radius: where the skin ends its nearest point is elsewhere
 
 
-def gauges_of(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
+def build_gauges(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
     """The gauges of the model's ``layers``, in their order, then those of its ``skin_points``.
 
     A point has one along each of the ``skin_axes``.
@@ -37,10 +37,10 @@ def gauges_of(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
     ProblemError
         For a layer that is not there, and a point that is not on the skin.
     """
-    return (*_of_layers(model, mesh), *_of_skin(model, mesh))
+    return (*_build_layer_gauges(model, mesh), *_build_skin_gauges(model, mesh))
 
 
-def _of_layers(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
+def _build_layer_gauges(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
     if not model.layers:
         return ()
     found = {
@@ -56,10 +56,10 @@ def _of_layers(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
     return tuple(found[layer] for layer in model.layers)
 
 
-def _of_skin(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
+def _build_skin_gauges(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
     if not model.skin_points:
         return ()
-    found = skin_points(mesh, np.array(model.skin_points))
+    found = find_skin_points(mesh, np.array(model.skin_points))
     worst = int(np.argmax(found.off_mm))
     if found.off_mm[worst] > OFF_SKIN_MM:
         place = ", ".join(f"{value:.1f}" for value in model.skin_points[worst])
@@ -71,7 +71,7 @@ def _of_skin(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
     return found.gauges(np.array(model.skin_axes))
 
 
-def points_around(mesh: Mesh, indenter: Indenter) -> Array:
+def choose_points_around(mesh: Mesh, indenter: Indenter) -> Array:
     """Points (k, 3) of the skin in rings around an indenter, as cameras beside it would follow them.
 
     `RINGS_MM` beyond its edge in `DIRECTIONS` directions, as far as there is skin.
@@ -80,7 +80,7 @@ def points_around(mesh: Mesh, indenter: Indenter) -> Array:
     edge = indenter.width / 2.0 * (1.0 if indenter.body.is_round else np.sqrt(2.0))
     radii = edge + np.array(RINGS_MM)
     flat = np.stack([np.outer(radii, np.cos(turns)), np.outer(radii, np.sin(turns))], axis=-1).reshape(-1, 2)
-    found = skin_points(mesh, np.asarray(indenter.centre) + flat @ indenter.frame[:2])
+    found = find_skin_points(mesh, np.asarray(indenter.centre) + flat @ indenter.frame[:2])
     local = (found.points - indenter.centre) @ indenter.frame.T
     there = np.linalg.norm(local[:, :2] - flat, axis=1) < MOST_ASIDE * np.linalg.norm(flat, axis=1)
     return found.points[there]
@@ -93,39 +93,39 @@ def is_under(indenter: Indenter, points: Array) -> NDArray[np.bool_]:
     return np.asarray(indenter.local_distance(local)[0] <= 0.0)
 
 
-def layers_under(model: SiteModel) -> tuple[str, ...]:
+def find_layers_under(model: SiteModel) -> tuple[str, ...]:
     """The tissues on the axis of a site's indenter, outermost first, as its stored mesh has them."""
     found = find_gauges_along(read_vtu(model.mesh), np.array(model.position), np.array(model.axis))
     return tuple(one.region for one in found)
 
 
-def waves_under(
+def place_waves_under(
     model: SiteModel, mesh: Mesh, wanted: Sequence[tuple[str, float | None]] | None = None
 ) -> tuple[WavePlace, ...]:
-    """Places of shear waves under a site's indenter, which run along its edge; see `wave_places`."""
+    """Places of shear waves under a site's indenter, which run along its edge; see `place_waves`."""
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
     edge, _, axis = indenter.frame
-    return wave_places(mesh, np.array(model.position), axis, edge, wanted)
+    return place_waves(mesh, np.array(model.position), axis, edge, wanted)
 
 
-def skin_beside(model: SiteModel) -> tuple[Vector, ...]:
-    """`points_around` a site's indenter on its stored mesh."""
+def find_nearby_skin_points(model: SiteModel) -> tuple[Vector, ...]:
+    """`choose_points_around` a site's indenter on its stored mesh."""
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
-    return tuple(map(as_vector, points_around(read_vtu(model.mesh), indenter)))
+    return tuple(map(to_vector3, choose_points_around(read_vtu(model.mesh), indenter)))
 
 
-def observed(result: Result, model: SiteModel, times_s: Array) -> tuple[Array, Array | None]:
-    """What is seen at times (n,) s from touch-down, in the order of `Simulation.observed`: (g, n).
+def observe_result(result: Result, model: SiteModel, times_s: Array) -> tuple[Array, Array | None]:
+    """What is seen at times (n,) s from touch-down, in the order of `Simulation.observe_result`: (g, n).
 
     Lengths, mm, count from touch-down. And derivatives (g, n, p) with respect to the solver's parameters,
     where the states have some. The result must hold all of its states (``store="all"``). Tissue that the
     indenter has left comes back by and by, so readings go on where the force has ended.
     """
     states = result.states
-    gauges = gauges_of(model, result.problem.mesh)
+    gauges = build_gauges(model, result.problem.mesh)
     if not states:
         return np.zeros((model.gauges, len(times_s))), None
-    values, slopes = _at_states(result, model.waves, [gauge.read for gauge in gauges])
+    values, slopes = _read_at_states(result, model.waves, [gauge.read for gauge in gauges])
     since_touch = np.arange(len(values)) < len(gauges)
     at = np.clip(np.append(model.waits_s, times_s), result.times[0], result.times[-1])
 
@@ -140,24 +140,24 @@ def observed(result: Result, model: SiteModel, times_s: Array) -> tuple[Array, A
     return between(values), None if slopes is None else between(slopes)
 
 
-def _at_states(
+def _read_at_states(
     result: Result, waves: Sequence[WavePlace], reads: Sequence[Callable[[Array], Array]]
 ) -> tuple[Array, Array | None]:
     """What gauges ``read`` and how fast waves are, at rest and in every state, and derivatives."""
     states, values, slopes = result.states, [], []
     if reads:
-        values.append(_since_rest([[read(state.u) for state in states] for read in reads]))
+        values.append(_prepend_rest([[read(state.u) for state in states] for read in reads]))
         if states[0].sensitivity is not None:
             fields = [np.asarray(state.sensitivity) for state in states]
-            slopes.append(_since_rest([[read(field) for field in fields] for read in reads]))
+            slopes.append(_prepend_rest([[read(field) for field in fields] for read in reads]))
     if waves:
-        speeds, of_speeds = wave_speeds(result, waves)
+        speeds, of_speeds = compute_wave_speeds(result, waves)
         values.append(speeds)
         slopes += [] if of_speeds is None else [of_speeds]
     return np.concatenate(values), np.concatenate(slopes) if slopes else None
 
 
-def _since_rest(rows: Sequence[Sequence[Array]]) -> Array:
+def _prepend_rest(rows: Sequence[Sequence[Array]]) -> Array:
     """What is (g, s, ...) in the states, with nothing at rest before: (g, s + 1, ...)."""
     found = np.array(rows)
     return np.concatenate([np.zeros_like(found[:, :1]), found], axis=1)

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..arrays import Array
-from ..fe import isochoric_stretch
+from ..fe import build_isochoric_stretch
 from ..mesh import Mesh
 
 
-def prestretch_field(
+def build_prestretch_field(
     stretches: Iterable[tuple[str, float]], mesh: Mesh, fibres: Array | None, fibred: Container[str]
 ) -> Array | None:
     """The pre-stretch of each cell (m, 3, 3) at constant volume; None where no tissue has one.
@@ -31,13 +31,13 @@ def prestretch_field(
         found = np.tile(np.eye(3), (len(mesh.cells), 1, 1)) if found is None else found
         own = np.flatnonzero(mesh.regions == mesh.region_names.index(tissue))
         if fibres is not None and tissue in fibred:
-            found[own] = isochoric_stretch(fibres[own], stretch)
+            found[own] = build_isochoric_stretch(fibres[own], stretch)
         else:
-            found[own] = isochoric_stretch(_normals(mesh, own), stretch**-2.0)
+            found[own] = build_isochoric_stretch(_find_normals(mesh, own), stretch**-2.0)
     return found
 
 
-def _normals(mesh: Mesh, cells: NDArray[np.intp]) -> Array:
+def _find_normals(mesh: Mesh, cells: NDArray[np.intp]) -> Array:
     """Normals (k, 3) of the skin where it is nearest to the middle of the cells."""
     corners = mesh.points[mesh.face_sets["skin"][:, :3]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

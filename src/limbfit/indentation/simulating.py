@@ -17,18 +17,18 @@ import psutil
 
 from ..arrays import Array
 from ..execution import count_usable_cores
-from ..fe import Doubt, Problem, Result, State, StepControl, System, solve
+from ..fe import Problem, Result, SimulationWarning, State, StepControl, System, solve
 from ..fields import Animation, write_fields
 from ..laws import LAWS, OGDEN, to_parameters
 from ..mesh import read_vtu
-from .neighbourhood import Extension, neighbourhood
-from .observing import observed
+from .neighbourhood import Extension, cut_neighbourhood
+from .observing import observe_result
 from .sites import (
     Parameters,
     SiteModel,
     build_problem,
-    materials_of,
-    steps_of,
+    build_site_materials,
+    build_steps,
 )
 
 
@@ -83,7 +83,7 @@ class Simulation:
     reason: str
     penetration_mm: float
     facts: dict[str, Any]
-    doubts: tuple[Doubt, ...] = ()
+    doubts: tuple[SimulationWarning, ...] = ()
     observed: Array = field(default_factory=lambda: np.zeros((0, 0)))
     observed_jacobian: Array | None = None
 
@@ -135,7 +135,7 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
         problem = build_problem(
             replace(model, law=OGDEN), read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE)
         )
-        control = steps_of(model)
+        control = build_steps(model)
         penalty, system = control.penalty, System(problem, control.threads)
         if penalty is None:
             within = _REFERENCE_MM + model.indenter.width_mm / 2.0
@@ -144,22 +144,22 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
             # Under a stated force too it is driven by its displacement; nothing else moves the limb.
             near = replace(model.bare, knots_N=(), within_mm=within)
             allowed = _MARGIN * control.penetration
-            penalty = max(_yielding(near, tissues) / allowed, 2000.0 / model.indenter.width_mm)
+            penalty = max(_estimate_yielding(near, tissues) / allowed, 2000.0 / model.indenter.width_mm)
         known = _prepared[model, tissues] = Prepared(problem, system, penalty)
     _prepared.move_to_end((model, tissues))
-    most = kept_nodes(psutil.virtual_memory().total, count_usable_cores())
+    most = count_stored_nodes(psutil.virtual_memory().total, count_usable_cores())
     while len(_prepared) > 1 and sum(len(one.problem.mesh.points) for one in _prepared.values()) > most:
         _prepared.popitem(last=False)
     return known
 
 
-def kept_nodes(memory: float, cores: int) -> int:
+def count_stored_nodes(memory: float, cores: int) -> int:
     """Nodes of the sites that a process keeps on a machine with so many bytes and cores."""
     return min(_KEPT_NODES, int(_SHARE * memory / (cores * _BYTES)))
 
 
 @lru_cache(maxsize=64)
-def _yielding(model: SiteModel, tissues: tuple[str, ...]) -> float:
+def _estimate_yielding(model: SiteModel, tissues: tuple[str, ...]) -> float:
     """How far reference tissue lets the indenter sink in, over the way, times the contact penalty (1/mm).
 
     Over the penetration that is allowed it is the penalty, which all simulations of a site hold.  One that
@@ -171,7 +171,7 @@ def _yielding(model: SiteModel, tissues: tuple[str, ...]) -> float:
     problem = build_problem(replace(model, law=OGDEN), mesh, dict.fromkeys(tissues, _REFERENCE))
     deepest = problem.history.peak or float(problem.history.times[-1])
     times = tuple(deepest * np.arange(1, _REFERENCE_STEPS + 1) / _REFERENCE_STEPS)
-    found = solve(problem, steps=replace(steps_of(model), times=times), store="peak")
+    found = solve(problem, steps=replace(build_steps(model), times=times), store="peak")
     if not found.states:
         return 0.0
     return float(found.penetration[-1] / found.displacement[-1]) * found.states[-1].penalty
@@ -181,8 +181,8 @@ def _solve(model: SiteModel, parameters: Parameters, **how: Any) -> Result:
     """Simulate a site with what is prepared for it: the same answer, whatever was simulated before."""
     known = _prepare(model, tuple(parameters))
     return solve(
-        known.problem.with_materials(materials_of(model, parameters)),
-        steps=first_steps(model, tuple(parameters)),
+        known.problem.with_materials(build_site_materials(model, parameters)),
+        steps=build_first_steps(model, tuple(parameters)),
         system=known.system,
         **how,
     )
@@ -196,24 +196,26 @@ def _solve_from_rest(
     kept = known.rested.get(sensitivities)
     if kept is None or kept[0] != parameters:
         values = to_parameters(np.array(parameters), tissues, model.law)
-        found = _solve(model, values, sensitivities=sensitivities, store=_kept_of(model, sensitivities))
-        kept = parameters, replace(found, states=tuple(map(_lightened, found.states)))
+        found = _solve(
+            model, values, sensitivities=sensitivities, store=_choose_stored_states(model, sensitivities)
+        )
+        kept = parameters, replace(found, states=tuple(map(_reduce_precision, found.states)))
         known.rested[sensitivities] = kept
     return kept[1]
 
 
-def _kept_of(model: SiteModel, sensitivities: bool) -> str:
+def _choose_stored_states(model: SiteModel, sensitivities: bool) -> str:
     """Which states are kept: all, where they give first guesses or more than the force is read from them."""
     return "all" if sensitivities or model.gauges else "peak"
 
 
-def _lightened(state: State) -> State:
+def _reduce_precision(state: State) -> State:
     """Sensitivities are most of a state's memory; a first guess needs few digits of them."""
     single = None if state.sensitivity is None else state.sensitivity.astype(np.float32)
     return replace(state, sensitivity=single)  # type: ignore[arg-type]
 
 
-def _result(job: SimulationJob) -> Result:
+def _solve_job(job: SimulationJob) -> Result:
     """A job's simulation, from the first guesses that it states; not done again if it was the newest one."""
     model, tissues = job.model, job.tissues
     if not job.starts and job.nested_mm is None:
@@ -223,31 +225,31 @@ def _result(job: SimulationJob) -> Result:
         return known.link[1]
     if known.latest is None or known.latest[0] != wanted:
         values, with_slopes = to_parameters(np.array(job.parameters), tissues, model.law), job.sensitivities
-        store, warm = _kept_of(model, with_slopes), _guesses(job, known)
+        store, warm = _choose_stored_states(model, with_slopes), _prepare_guesses(job, known)
         found = _solve(model, values, sensitivities=with_slopes, warm_start=warm, store=store)
-        known.latest = wanted, replace(found, states=tuple(map(_lightened, found.states)))
+        known.latest = wanted, replace(found, states=tuple(map(_reduce_precision, found.states)))
     return known.latest[1]
 
 
-def _guesses(job: SimulationJob, known: Prepared) -> Result:
+def _prepare_guesses(job: SimulationJob, known: Prepared) -> Result:
     """The simulation that gives a job's first guesses, on its own mesh or carried on into it."""
     if job.nested is None:
-        found = _result(job.before)
+        found = _solve_job(job.before)
         if job.before.starts:
             known.link = replace(job.before, times_s=()), found
         return found
-    near = _result(job.nested)
+    near = _solve_job(job.nested)
     radius, centre = job.nested_mm, np.array(job.model.position)
     if known.extension is None or known.extension[0] != radius:
         assert radius is not None
-        part = neighbourhood(known.problem.mesh, centre, radius)
+        part = cut_neighbourhood(known.problem.mesh, centre, radius)
         known.extension = radius, Extension(known.system, part, centre, radius)
     return known.extension[1].guesses(near)
 
 
-def first_steps(model: SiteModel, tissues: Sequence[str]) -> StepControl:
-    """`steps_of`, with the contact penalty that every simulation of the site holds."""
-    return replace(steps_of(model), penalty=_prepare(model, tuple(tissues)).penalty, hold_penalty=True)
+def build_first_steps(model: SiteModel, tissues: Sequence[str]) -> StepControl:
+    """`build_steps`, with the contact penalty that every simulation of the site holds."""
+    return replace(build_steps(model), penalty=_prepare(model, tuple(tissues)).penalty, hold_penalty=True)
 
 
 def simulate(job: SimulationJob) -> Simulation:
@@ -256,13 +258,13 @@ def simulate(job: SimulationJob) -> Simulation:
     The answer depends on the job alone: not on the process, nor on what it simulated before. The simulation
     that a job starts from is done again where this process has not kept it.
     """
-    model, result = job.model, _result(job)
+    model, result = job.model, _solve_job(job)
     times = np.array(job.times_s) + model.waits_s
-    seen, slopes = observed(result, model, times) if model.gauges else (np.zeros((0, 0)), None)
+    seen, slopes = observe_result(result, model, times) if model.gauges else (np.zeros((0, 0)), None)
     return Simulation(
         site=model.name,
         force_N=result.response_at(times),
-        jacobian=_in_user_units(result, job, result.response_sensitivity_at(times))
+        jacobian=_to_user_units(result, job, result.response_sensitivity_at(times))
         if job.sensitivities
         else None,
         completed=result.completed,
@@ -271,7 +273,7 @@ def simulate(job: SimulationJob) -> Simulation:
         facts=dict(result.statistics),
         doubts=result.doubts,
         observed=seen,
-        observed_jacobian=None if slopes is None else _in_user_units(result, job, slopes),
+        observed_jacobian=None if slopes is None else _to_user_units(result, job, slopes),
     )
 
 
@@ -286,16 +288,16 @@ def simulate_fields(
     frames = None
     if animation is not None:
         prepared = _prepare(model, tuple(parameters)).problem
-        frames = Animation(prepared.with_materials(materials_of(model, parameters)), animation)
+        frames = Animation(prepared.with_materials(build_site_materials(model, parameters)), animation)
     result = _solve(model, parameters, on_step=None if frames is None else frames.add, store="peak")
     _write_deepest(result, file)
     return result
 
 
-def job_fields(job: SimulationJob, file: Path) -> None:
+def store_job_fields(job: SimulationJob, file: Path) -> None:
     """Fields of a job's simulation as `simulate_fields` stores them; it is done where this process has not
     just done it."""
-    _write_deepest(_result(job), file)
+    _write_deepest(_solve_job(job), file)
 
 
 def _write_deepest(result: Result, file: Path) -> None:
@@ -303,7 +305,7 @@ def _write_deepest(result: Result, file: Path) -> None:
         write_fields(result.system, result.problem, result.deepest, file)
 
 
-def _in_user_units(result: Result, job: SimulationJob, slopes: Array) -> Array:
+def _to_user_units(result: Result, job: SimulationJob, slopes: Array) -> Array:
     """Derivatives (..., p) of the solver in flat order, per kPa where the parameter is a modulus.
 
     A tissue that does not reach the site is no region of its mesh: nothing depends on it.

@@ -34,10 +34,10 @@ from ..laws import LAWS, OGDEN, Parameters
 from ..mesh import Mesh
 from ..phases import spread
 from ..study import ClampsTable, IndenterTable, SolverTable, Vector
-from .clamps import clamped
-from .fibres import Direction, fibre_field
-from .neighbourhood import held_cut, neighbourhood
-from .prestretch import prestretch_field
+from .clamps import clamp_problem
+from .fibres import Direction, build_fibre_field
+from .neighbourhood import cut_neighbourhood, find_fixed_cut_nodes
+from .prestretch import build_prestretch_field
 from .waves import WavePlace
 
 RISE_S, REST_S = 2.0, 5.0  # muscle tenses, and rests tensed, before the indenter touches
@@ -140,7 +140,7 @@ class SiteModel:
         return spread(self.history.phases, points, self.history.times)
 
 
-def materials(
+def build_materials(
     parameters: Parameters, kappa_ratio: float, law: str = OGDEN, fibred: Container[str] = ()
 ) -> dict[str, Material]:
     """The tissues for the solver, in MPa; those in ``fibred`` have fibres, where their law knows some."""
@@ -162,10 +162,10 @@ def materials(
     return found
 
 
-def materials_of(model: SiteModel, parameters: Parameters) -> dict[str, Material]:
+def build_site_materials(model: SiteModel, parameters: Parameters) -> dict[str, Material]:
     """The tissues of a site for the solver, whose law may be the study's own."""
     load_extensions(model.extensions)
-    return materials(parameters, model.kappa_ratio, model.law, dict(model.fibres))
+    return build_materials(parameters, model.kappa_ratio, model.law, dict(model.fibres))
 
 
 def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Problem:
@@ -176,12 +176,12 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
     comes first, for `SiteModel.waits_s`.
     """
     load_extensions(model.extensions)
-    cut, fibres = np.empty(0, dtype=np.int64), fibre_field(model.fibres, mesh)
-    strained = prestretch_field(model.prestretch, mesh, fibres, dict(model.fibres))
+    cut, fibres = np.empty(0, dtype=np.int64), build_fibre_field(model.fibres, mesh)
+    strained = build_prestretch_field(model.prestretch, mesh, fibres, dict(model.fibres))
     if model.within_mm is not None:
         centre, axis = np.array(model.position), np.array(model.axis)
-        part = neighbourhood(mesh, centre, model.within_mm)
-        mesh, cut = part.mesh, held_cut(part, centre, axis)
+        part = cut_neighbourhood(mesh, centre, model.within_mm)
+        mesh, cut = part.mesh, find_fixed_cut_nodes(part, centre, axis)
         fibres = None if fibres is None else fibres[part.cells]
         strained = None if strained is None else strained[part.cells]
         if not len(cut) and not len(mesh.held):  # nothing else carries it
@@ -192,7 +192,7 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
     near = np.linalg.norm(mesh.points[faces[:, :3]].mean(axis=1) - model.position, axis=1) < reach
     problem = Problem(
         mesh=mesh,
-        materials=materials_of(model, parameters),
+        materials=build_site_materials(model, parameters),
         fixed=np.union1d(mesh.held, cut),
         contact_faces=faces[near],
         indenter=indenter,
@@ -204,7 +204,7 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
         prestretch=strained,
         touch_down_s=model.waits_s,
     )
-    return problem if model.clamps is None else clamped(problem, np.array(model.along), model.clamps)
+    return problem if model.clamps is None else clamp_problem(problem, np.array(model.along), model.clamps)
 
 
 def read_indenter(table: IndenterTable, position: Vector, axis: Vector, edge: Vector | None) -> Indenter:
@@ -234,7 +234,7 @@ def read_indenter(table: IndenterTable, position: Vector, axis: Vector, edge: Ve
     )
 
 
-def contact_radius(indenter: IndenterTable) -> float:
+def compute_contact_radius(indenter: IndenterTable) -> float:
     """Of a circle with the indenter's section, mm; a sphere touches with less."""
     tool = read_indenter(indenter, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None)
     return float(np.sqrt(tool.body.section / np.pi))
@@ -257,7 +257,7 @@ def _read_stl(file: Path) -> tuple[Array, NDArray[np.int64]]:
     return vtk_to_numpy(found.GetPoints().GetData()), faces[(a != b) & (b != c) & (c != a)]
 
 
-def steps_of(model: SiteModel) -> StepControl:
+def build_steps(model: SiteModel) -> StepControl:
     """How the solver steps through a site's history, before it adapts.
 
     On a part of its mesh the indenter may sink in `ROUGHLY` times as far: its forces are corrected by those

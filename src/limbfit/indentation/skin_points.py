@@ -35,8 +35,8 @@ class SkinPoints:
         return tuple(Gauge(nodes, weights, axis) for nodes, weights in rows for axis in axes)
 
 
-def skin_points(mesh: Mesh, points: Array) -> SkinPoints:
-    """The points of a mesh's face set ``skin`` nearest to ``points`` (k, 3), mm; see `nearest_points`.
+def find_skin_points(mesh: Mesh, points: Array) -> SkinPoints:
+    """The points of a mesh's face set ``skin`` nearest to ``points`` (k, 3), mm; see `find_nearest_points`.
 
     Raises
     ------
@@ -46,10 +46,10 @@ def skin_points(mesh: Mesh, points: Array) -> SkinPoints:
     faces = mesh.face_sets.get("skin", np.empty((0, 3), dtype=np.int64))
     if not len(faces):
         raise ProblemError("the mesh has no face set 'skin'", remedy="mesh the site anew")
-    return nearest_points(mesh.points, faces, points)
+    return find_nearest_points(mesh.points, faces, points)
 
 
-def nearest_points(nodes: Array, faces: Ints, points: Array) -> SkinPoints:
+def find_nearest_points(nodes: Array, faces: Ints, points: Array) -> SkinPoints:
     """The points of a skin with ``nodes`` (n, 3) mm and ``faces`` (f, j) nearest to ``points`` (k, 3), mm.
 
     Faces count as the flat triangles of their corners, quadrilaterals as two; nodal values are interpolated

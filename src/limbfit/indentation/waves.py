@@ -28,7 +28,7 @@ from ..errors import ProblemError
 from ..fe import Material, Result
 from ..fe.history import Memory
 from ..fe.kernel.laws import Laws
-from ..fe.kernel.places import Places, elastic_at
+from ..fe.kernel.places import Places, evaluate_elastic_at
 from ..mesh import Mesh, find_gauges_along, locate
 from ..study import Vector
 
@@ -57,7 +57,7 @@ class WavePlace:
     way: Vector
 
 
-def wave_places(
+def place_waves(
     mesh: Mesh, position: Array, axis: Array, way: Array, wanted: Sequence[tuple[str, float | None]] | None
 ) -> tuple[WavePlace, ...]:
     """Places under the middle of an indenter: of each tissue so deep below the skin, mm, or its own middle.
@@ -87,11 +87,11 @@ def wave_places(
                 remedy="name the column after the tissue that is there, or leave the depth out",
             )
         point = position + (0.5 * (first + last) if depth is None else depth) * axis
-        found.append(WavePlace(tissue, as_vector(point), as_vector(axis), as_vector(way)))
+        found.append(WavePlace(tissue, to_vector3(point), to_vector3(axis), to_vector3(way)))
     return tuple(found)
 
 
-def as_vector(values: Array) -> Vector:
+def to_vector3(values: Array) -> Vector:
     """Three numbers as a model or a study holds them."""
     x, y, z = (float(value) for value in values)
     return x, y, z
@@ -110,7 +110,7 @@ class _Regions:
     @classmethod
     def of(cls, result: Result, places: Sequence[WavePlace]) -> _Regions:
         mesh, system = result.problem.mesh, result.system
-        cells, local = zip(*(_located(mesh, place) for place in places), strict=True)
+        cells, local = zip(*(_locate_points(mesh, place) for place in places), strict=True)
         number = np.repeat(np.arange(len(places)), [len(own) for own in cells])
         points = Places.at(
             mesh,
@@ -137,28 +137,28 @@ class _Regions:
         memory, gamma = Memory.rest(self.points, laws), laws.prony[..., 0]
         of, found = self.points.regions, []
         for u, dt, turn in zip(steps, seconds, turned, strict=True):
-            stress, moduli, F = elastic_at(self.points, laws, u)
+            stress, moduli, F = evaluate_elastic_at(self.points, laws, u)
             if dt > 0.0:
                 memory = memory.advanced(self.points, laws, stress[:, None], dt)
                 memory = memory.turned() if turn else memory
             for l, prony in enumerate(memory.prony):
                 stress = stress + gamma[of, l, None] * prony[:, 0]
             A, N = (np.einsum("mij,mi->mj", F, along) for along in (self.motion, self.way))
-            g = _contracting(A, N)
+            g = _build_contraction(A, N)
             stiffness = (1.0 + gamma.sum(axis=1))[of] * np.einsum("mr,mrs,ms->m", g, moduli, g)
-            tension = np.einsum("mr,mr->m", _contracting(N, N), stress)
+            tension = np.einsum("mr,mr->m", _build_contraction(N, N), stress)
             found.append(self.mean((stiffness + tension) / np.linalg.det(F)))
         return 1e3 * np.sqrt(np.maximum(np.array(found).T, _LEAST) / DENSITY)
 
 
-def _contracting(a: Array, b: Array) -> Array:
+def _build_contraction(a: Array, b: Array) -> Array:
     """Six numbers (m, 6) whose product with those of a symmetric tensor T is ``a . T b``."""
     off = [a[:, i] * b[:, j] + a[:, j] * b[:, i] for i, j in ((0, 1), (1, 2), (2, 0))]
     return np.column_stack([a * b, *off])
 
 
 @cache
-def disc_points() -> Array:
+def sample_disc() -> Array:
     """Points (m, 3) of the disc, mm, along two ways across and its axis: the middle, then equal volumes."""
     rings, angles = [np.zeros(1)], [np.zeros(1)]
     most = 3 * _RINGS * (_RINGS + 1) + 1
@@ -177,11 +177,11 @@ def disc_points() -> Array:
     return np.concatenate([np.zeros((1, 3)), *found])
 
 
-def _located(mesh: Mesh, place: WavePlace) -> tuple[NDArray[np.int64], Array]:
+def _locate_points(mesh: Mesh, place: WavePlace) -> tuple[NDArray[np.int64], Array]:
     """Cells and local coordinates of the points of a place's region that are in its tissue."""
     region = mesh.region_names.index(place.tissue)
     motion, way = np.array(place.motion), np.array(place.way)
-    points = np.array(place.point) + disc_points() @ np.stack([way, np.cross(motion, way), motion])
+    points = np.array(place.point) + sample_disc() @ np.stack([way, np.cross(motion, way), motion])
     cells, local, off = locate(mesh, points, region)
     if off[0] > OFF_TISSUE_MM:
         where = ", ".join(f"{value:.1f}" for value in place.point)
@@ -194,7 +194,7 @@ def _located(mesh: Mesh, place: WavePlace) -> tuple[NDArray[np.int64], Array]:
     return cells[kept], local[kept]
 
 
-def wave_speeds(result: Result, places: Sequence[WavePlace]) -> tuple[Array, Array | None]:
+def compute_wave_speeds(result: Result, places: Sequence[WavePlace]) -> tuple[Array, Array | None]:
     """Speeds of shear waves at places (k,) at rest and in every state of a simulation, m/s: (k, s + 1).
 
     And their derivatives (k, s + 1, p) with respect to the solver's parameters, where the states have some.
@@ -203,7 +203,7 @@ def wave_speeds(result: Result, places: Sequence[WavePlace]) -> tuple[Array, Arr
     problem, states = result.problem, result.states
     regions = _Regions.of(result, places)
     times = np.array([0.0, *(state.time for state in states)])
-    seconds, turned = np.diff(times, prepend=0.0), _turned(result, times)
+    seconds, turned = np.diff(times, prepend=0.0), _find_turns(result, times)
 
     def after(materials: Mapping[str, Material], by: int = 0, step: float = 0.0) -> Array:
         """The speeds where parameter number ``by`` is larger by ``step``."""
@@ -234,7 +234,7 @@ def wave_speeds(result: Result, places: Sequence[WavePlace]) -> tuple[Array, Arr
     return speeds, np.stack(slopes, axis=-1)
 
 
-def _turned(result: Result, times: Array) -> NDArray[np.bool_]:
+def _find_turns(result: Result, times: Array) -> NDArray[np.bool_]:
     """At which times (s,) of its states the solver let the stress go on otherwise than before (`Memory`)."""
     kinks = np.concatenate([result.problem.history.kinks, result.problem.turns])
     at_kinks = np.isclose(times[:, None], kinks, rtol=1e-9, atol=0.0).any(axis=1)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Array
 from ..errors import ProblemError
-from ..fe import Problem, StepControl, System, texts_of
+from ..fe import Problem, StepControl, System, list_texts
 from ..fe import solve as simulate
 from ..fe.checking import check
 from ..identify.fit.calibration import calibrate as search
@@ -191,7 +191,7 @@ class _Model:
         absent = np.zeros(len(times))
         columns = [full[:, known.index(name)] if name in known else absent for name in self.names]
         answer = found.response_at(times), np.stack(columns, axis=1), found.completed, found.reason
-        kinds = texts_of(found.doubts, "slipped", "folded")
+        kinds = list_texts(found.doubts, "slipped", "folded")
         return SiteResponse(*answer, f"curve {number + 1}", found.warnings, *kinds)
 
 

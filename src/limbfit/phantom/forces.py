@@ -23,11 +23,11 @@ from ..indentation import (
     Parameters,
     SiteModel,
     build_problem,
-    neighbourhood,
-    observed,
-    points_around,
+    choose_points_around,
+    cut_neighbourhood,
+    observe_result,
+    place_waves_under,
     read_indenter,
-    waves_under,
 )
 from ..mesh import Mesh, find_gauges_along
 from ..study import IndenterTable
@@ -143,7 +143,7 @@ def mesh_true_site(job: TruthMeshJob) -> Mesh:
     anatomy, base = _build_base(job.anatomy, job.settings)
     position = np.array(job.position)
     mesh, _ = mesh_site(anatomy, position, np.array(job.axis), job.settings, base)
-    return mesh if job.within_mm is None else neighbourhood(mesh, position, job.within_mm).mesh
+    return mesh if job.within_mm is None else cut_neighbourhood(mesh, position, job.within_mm).mesh
 
 
 def simulate_true_force(job: ForceJob) -> TrueForce:
@@ -184,11 +184,11 @@ def simulate_true_force(job: ForceJob) -> TrueForce:
         find_gauges_along(job.mesh, np.array(job.position), np.array(job.axis)) if job.seen.ultrasound else ()
     )
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
-    around = points_around(job.mesh, indenter) if job.seen.surface else np.zeros((0, 3))
-    waves = waves_under(model, job.mesh) if job.seen.shear_waves else ()
+    around = choose_points_around(job.mesh, indenter) if job.seen.surface else np.zeros((0, 3))
+    waves = place_waves_under(model, job.mesh) if job.seen.shear_waves else ()
     layers = tuple(gauge.region for gauge in gauges)
     model = replace(model, layers=layers, skin_points=tuple(map(tuple, around)), waves=waves)
-    values, _ = observed(result, model, times)
+    values, _ = observe_result(result, model, times)
     of_layers, of_skin, of_waves = np.split(values, [len(layers), len(values) - len(waves)])
     return replace(
         found,

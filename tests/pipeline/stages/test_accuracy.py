@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from layered import layered_block
-from limbfit.bench.blocks import SPEED, block_site
+from limbfit.bench.blocks import SPEED, build_block_site
 from limbfit.errors import StudyError
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.indentation.sites import ROUGHLY
@@ -148,7 +148,7 @@ def test_contact_is_as_stiff_as_the_site_needs(tmp_path: Path) -> None:
     """Reference tissue takes half of the allowed penetration; on a part of the mesh more."""
     tissues, depth = ("skin", "muscle"), 5.0
     mesh = layered_block((3.0, 12.0), tissues)
-    whole = block_site("a", tmp_path / "a.vtu", mesh, depth, SolverTable(load_steps=4, unload_steps=2))
+    whole = build_block_site("a", tmp_path / "a.vtu", mesh, depth, SolverTable(load_steps=4, unload_steps=2))
     found = {}
     for name, model in (("whole", whole), ("part", replace(whole, within_mm=60.0))):
         job = SimulationJob(model, tissues, (5.0, 5.0, 1.0, 1.0) * 2, (depth / SPEED,), sensitivities=False)

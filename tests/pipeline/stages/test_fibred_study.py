@@ -11,7 +11,7 @@ from guide import identified
 from layered import block_context, block_study
 from limbfit.errors import InputError, StudyError
 from limbfit.fe import Fibred, OgdenQLV
-from limbfit.indentation import SimulationJob, build_problem, materials, simulate
+from limbfit.indentation import SimulationJob, build_materials, build_problem, simulate
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.experiments.cube import check_cube
 from limbfit.pipeline.shared.context import Context
@@ -38,7 +38,7 @@ def test_the_core_has_fibres_along_the_limb_and_no_other_tissue(tmp_path):
     study = study_of(tmp_path)
     assert study.fibres == {"muscle": "axis"}
     assert study.fixed == ("skin.k1_kPa", "skin.k2")
-    made = materials(TRUTH, 100.0, study.law.name, study.fibres)
+    made = build_materials(TRUTH, 100.0, study.law.name, study.fibres)
     assert isinstance(made["skin"], OgdenQLV)
     assert isinstance(made["muscle"], Fibred)
     assert made["muscle"].parameters == pytest.approx((0.006, 5.0, 1.2, 0.5, 0.03, 3.0))

@@ -175,14 +175,14 @@ def test_a_coarse_simulation_that_the_solver_gives_up_takes_the_interval_with_it
     blocks, whole, tmp_path, monkeypatch
 ):
     """Its scale came from the force up to where it ended, held from there on."""
-    steps_of, chosen = indentation.steps_of, of("aside", coarse=True)
+    steps_of, chosen = indentation.build_steps, of("aside", coarse=True)
 
     def few_iterations(model: SiteModel):
         control = steps_of(model)
         coarse = model.name == "aside" and model.mesh.parent.name == COARSE
         return replace(control, most_iterations=8) if coarse else control
 
-    monkeypatch.setattr(indentation, "steps_of", few_iterations)
+    monkeypatch.setattr(indentation, "build_steps", few_iterations)
     indentation._prepared.clear()
     rows = blocks.predicted(tmp_path / "p", anew=chosen)
     indentation._prepared.clear()

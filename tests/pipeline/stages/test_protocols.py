@@ -10,7 +10,7 @@ import pytest
 
 from layered import layered_block
 from limbfit import check_study, load_study
-from limbfit.bench.blocks import block_site
+from limbfit.bench.blocks import build_block_site
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import SimulationJob, simulate, to_vector
 from limbfit.pipeline.shared.artefacts import write_json
@@ -92,7 +92,7 @@ def test_a_protocol_goes_from_its_record_to_residuals_and_report(tmp_path, name)
     for stage in ("sites", "traces", "mesh"):
         store[stage].mkdir(parents=True)
     mesh = layered_block((3.0, 11.0), TISSUES, divisions=4)
-    model = block_site(name, store["mesh"] / f"{name}.vtu", mesh, 3.0, study.solver)
+    model = build_block_site(name, store["mesh"] / f"{name}.vtu", mesh, 3.0, study.solver)
     own = {"indenter": study.indenter, "element": study.mesh.element}
     model = replace(model, knots_s=knots_s, knots_mm=knots_mm, **own)
     truth = tuple(to_vector(TRUTH, TISSUES))

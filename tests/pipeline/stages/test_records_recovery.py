@@ -11,7 +11,7 @@ import pytest
 
 import layered
 from layered import layered_block, store_blocks
-from limbfit.bench.blocks import block_site
+from limbfit.bench.blocks import build_block_site
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import SimulationJob, SiteModel, simulate
 from limbfit.mesh import write_vtu
@@ -110,7 +110,7 @@ def stored(folder: Path, text: str) -> Context:
     (folder / "study.toml").write_text(text)
     study = load_study(folder)
     truth = layered_block(LAYERS, study.tissues, 12.0, 6, 3.0)
-    base = block_site("a", folder / "truth.vtu", truth, 3.0, study.solver)
+    base = build_block_site("a", folder / "truth.vtu", truth, 3.0, study.solver)
     base = replace(base, element=study.mesh.element)
     for i, record in enumerate(study.recorded):
         write_record(study, record, base, np.random.default_rng(i))

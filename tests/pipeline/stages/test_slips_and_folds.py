@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from layered import layered_block
-from limbfit.bench.blocks import block_site
+from limbfit.bench.blocks import build_block_site
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve
 from limbfit.identify.fit.parameters import FIXED, Unknowns
@@ -26,7 +26,7 @@ class Block:
     def __init__(self, folder):
         steps = SolverTable(load_steps=4, unload_steps=2)
         mesh = layered_block((3.0, 12.0), TISSUES)
-        self.model = block_site("a", folder / "a.vtu", mesh, 5.0, steps, element="tet10")
+        self.model = build_block_site("a", folder / "a.vtu", mesh, 5.0, steps, element="tet10")
         self.times = tuple(np.linspace(0.0, self.model.knots_s[-1], 13))
         self.doubts: dict[tuple[float, ...], set[str]] = {}
 

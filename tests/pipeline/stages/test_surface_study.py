@@ -14,7 +14,7 @@ from limbfit.errors import TraceError
 from limbfit.indentation import (
     Simulation,
     SiteModel,
-    points_around,
+    choose_points_around,
     read_indenter,
 )
 from limbfit.mesh import Mesh
@@ -45,7 +45,7 @@ FRAME = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # edge, 
 
 
 def with_points(model: SiteModel, mesh: Mesh) -> SiteModel:
-    points = points_around(mesh, read_indenter(model.indenter, model.position, model.axis, None))
+    points = choose_points_around(mesh, read_indenter(model.indenter, model.position, model.axis, None))
     return replace(model, skin_points=tuple(map(tuple, points)))
 
 

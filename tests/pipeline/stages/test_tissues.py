@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from layered import TISSUES, TRUTH, layered_block, store_blocks
-from limbfit.bench.blocks import block_site
+from limbfit.bench.blocks import build_block_site
 from limbfit.cli.commands import parse_parameters
 from limbfit.errors import InputError, StudyError
 from limbfit.execution import SerialExecutor
@@ -79,7 +79,7 @@ def test_stages_share_by_parameter_and_a_single_tissue_has_one():
 
 def test_forces_and_sensitivities_of_three_tissues_equal_central_differences(tmp_path):
     mesh = layered_block((1.5, 6.0, 16.0), divisions=2)
-    model = block_site("1", tmp_path / "1.vtu", mesh, 4.0, STEPS)
+    model = build_block_site("1", tmp_path / "1.vtu", mesh, 4.0, STEPS)
     times = tuple(np.linspace(0.0, model.knots_s[-1], 15))
     truth = to_vector(TRUTH, TISSUES)
 
@@ -100,7 +100,7 @@ def test_forces_and_sensitivities_of_three_tissues_equal_central_differences(tmp
 
 def test_a_tissue_that_does_not_reach_the_site_has_no_influence(tmp_path):
     mesh = layered_block((1.5, 22.0), tissues=("skin", "muscle"), divisions=2)
-    model = block_site("thin", tmp_path / "thin.vtu", mesh, 3.0, STEPS)
+    model = build_block_site("thin", tmp_path / "thin.vtu", mesh, 3.0, STEPS)
     times = tuple(np.linspace(0.0, model.knots_s[-1], 9))
     three = simulate(SimulationJob(model, TISSUES, tuple(to_vector(TRUTH, TISSUES)), times))
     pair = ("skin", "muscle")

@@ -11,8 +11,8 @@ from seen_blocks import PUNCH, TRUTH, Made, SeenBlock
 
 import layered
 from layered import layered_block
-from limbfit.bench.blocks import block_site
-from limbfit.bench.blocks import layered_block as block_of
+from limbfit.bench.blocks import build_block_site
+from limbfit.bench.blocks import build_layered_block as block_of
 from limbfit.errors import ProblemError, TraceError
 from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_vector
 from limbfit.mesh import find_gauges_along
@@ -70,7 +70,9 @@ def test_compressions_follow_the_parameters(tmp_path: Path) -> None:
     """Together the layers lose about the indenter's depth (elements of 6 mm); slopes beside differences."""
     mesh = layered_block((3.0, 4.0, 9.0), half_mm=12.0, divisions=4, height_mm=4.0)
     steps = SolverTable(load_steps=3, unload_steps=2, penalty_per_mm=400.0)
-    model = replace(block_site("a", tmp_path / "a.vtu", mesh, 2.0, steps), layers=("fat", "muscle", "skin"))
+    model = replace(
+        build_block_site("a", tmp_path / "a.vtu", mesh, 2.0, steps), layers=("fat", "muscle", "skin")
+    )
     tissues, vector = layered.TISSUES, to_vector(layered.TRUTH, layered.TISSUES)
     times = tuple(np.linspace(0.2, 3.5, 12))
     found = simulate(SimulationJob(model, tissues, tuple(vector), times))

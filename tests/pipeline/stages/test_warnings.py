@@ -11,7 +11,7 @@ import numpy as np
 
 from limbfit.cli.commands import show_warnings
 from limbfit.execution import SerialExecutor
-from limbfit.fe import Doubt
+from limbfit.fe import SimulationWarning
 from limbfit.indentation import Simulation
 from limbfit.pipeline.shared import simulations
 from limbfit.pipeline.stages.doubted import Doubted, doubts_record
@@ -20,7 +20,7 @@ from limbfit.report import build_report
 sys.path.insert(0, str(Path(__file__).parents[2] / "report"))
 from stored_results import write_results
 
-FOLD = Doubt("folded", "7 elements are inside out at a node at 9.1 mm", 7, 9.1, 1.0)
+FOLD = SimulationWarning("folded", "7 elements are inside out at a node at 9.1 mm", 7, 9.1, 1.0)
 DOUBT = FOLD.text
 
 
@@ -47,7 +47,7 @@ def test_the_report_shows_them_and_counts_those_of_the_search(tmp_path):
     file.write_text(json.dumps(predicted))
     file = results / "calibrate" / "calibration.json"
     content = json.loads(file.read_text())
-    slip = Doubt("slipped", "the force falls from 5 N to 4 N", 1, 6.0, 0.75)
+    slip = SimulationWarning("slipped", "the force falls from 5 N to 4 N", 1, 6.0, 0.75)
     found = SimpleNamespace(names=("c",), history=[SimpleNamespace(parameters=(1.0,))])
     searched = [Doubted(1, "tibia", (1.0,), FOLD), Doubted(2, "tibia", (2.0,), slip)]
     answer = Simulation("tibia", np.arange(3.0), None, True, "", 0.02, {}, (FOLD,))

@@ -10,7 +10,7 @@ import pytest
 from seen_blocks import PUNCH, TRUTH, Made, SeenBlock
 
 from limbfit.errors import TraceError
-from limbfit.indentation import Simulation, SiteModel, waves_under
+from limbfit.indentation import Simulation, SiteModel, place_waves_under
 from limbfit.phantom.record import write_waves
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import SimulationCache, recorded_model
@@ -42,7 +42,7 @@ BLOCK = SeenBlock(
     4,
     PUNCH,
     "a-waves.csv",
-    lambda model, mesh: replace(model, waves=waves_under(model, mesh)),
+    lambda model, mesh: replace(model, waves=place_waves_under(model, mesh)),
     write_seen,
 )
 

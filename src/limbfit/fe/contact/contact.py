@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...errors import ProblemError
-from ..kernel.elements import Element, face_quadrature
+from ..kernel.elements import Element, build_face_quadrature
 from .rigid import RigidShape
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ class ContactSurface:
 
     @classmethod
     def build(cls, element: Element, points: Array, faces: NDArray[np.int64], rule: str) -> ContactSurface:
-        N, areas = face_quadrature(element, points, faces, rule)
+        N, areas = build_face_quadrature(element, points, faces, rule)
         if rule == "nodes":
             nodes, owner = np.unique(faces[:, N.argmax(axis=1)], return_inverse=True)
             share = np.asarray(np.bincount(owner.ravel(), areas.ravel()), dtype=float)
@@ -111,7 +111,7 @@ class Touch:
         return self.stick + pushing * closed[:, None, None], forces
 
 
-def touching_offset(surface: ContactSurface, indenter: RigidShape, tolerance: float = 1e-9) -> float:
+def find_touching_offset(surface: ContactSurface, indenter: RigidShape, tolerance: float = 1e-9) -> float:
     """Advance along the axis, mm, that brings the indenter to just touch the undeformed surface.
 
     From far outside it advances by the smallest distance, which cannot jump over the first touch, or by a
@@ -182,7 +182,7 @@ def contact(  # type: ignore[no-untyped-def]
                     h[i, j] = w * (g[i] * g[j] + (phi * bends[p, i, j] if phi > -flat_from else 0.0))
         if held[c]:
             energy += _hold(local[p], places[c], planes[c], bounds[c], pulls[c], hardness * w, t, hold)
-            _rotated(frame, hold, stick[c])
+            _rotate_tensor(frame, hold, stick[c])
             for i in range(3):
                 for j in range(3):
                     h[i, j] += hold[i, j]
@@ -190,12 +190,12 @@ def contact(  # type: ignore[no-untyped-def]
             continue
         for i in range(3):
             forces[c, i] = frame[0, i] * t[0] + frame[1, i] * t[1] + frame[2, i] * t[2]
-        _rotated(frame, h, blocks[c])
+        _rotate_tensor(frame, h, blocks[c])
     return energy, deepest, area
 
 
 @njit(cache=True)
-def _rotated(frame, h, out):  # type: ignore[no-untyped-def]
+def _rotate_tensor(frame, h, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` with the tensor ``h (3, 3)`` of the body's frame in space."""
     for i in range(3):
         for j in range(3):

@@ -43,13 +43,15 @@ class DistanceGrid:
         return cls(low, spacing, (x, y, z))
 
 
-def coefficients(grid: DistanceGrid, points: Array, faces: NDArray[np.int64], reach: float) -> Array:
+def fit_spline_coefficients(
+    grid: DistanceGrid, points: Array, faces: NDArray[np.int64], reach: float
+) -> Array:
     """(2, x, y, z) of the distance from the wall, positive on the side from which its triangles run
     counter-clockwise, and of the way beyond its brim, mm.
 
     Not a number where a spline would need samples farther away than the reach.
     """
-    whole, all_faces = _extended(points, faces, PAST * grid.spacing)
+    whole, all_faces = _extend_past_brim(points, faces, PAST * grid.spacing)
     corners = np.ascontiguousarray(whole[all_faces])
     normals = triangle_normals(corners)[0]
     sums = normal_spread(whole, all_faces, normals)[1]
@@ -72,7 +74,7 @@ def coefficients(grid: DistanceGrid, points: Array, faces: NDArray[np.int64], re
     return out
 
 
-def _extended(points: Array, faces: NDArray[np.int64], by: float) -> tuple[Array, NDArray[np.int64]]:
+def _extend_past_brim(points: Array, faces: NDArray[np.int64], by: float) -> tuple[Array, NDArray[np.int64]]:
     """The surface with a strip of ``by`` mm past its brim; the strip's faces are the last ones."""
     ahead = np.roll(faces, -1, axis=1)
     brim = beyond_edges(faces) < 0

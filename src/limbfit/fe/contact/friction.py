@@ -1,8 +1,8 @@
 """Coulomb friction as an incremental potential whose normal force and tangent plane are lagged.
 
-The force of a point in touch is at most ``mu`` times its normal force.  In a step it is that of a `Grip` with
-the bound ``mu <-phi> |grad phi|`` mm, where penetration and normal are those of the last equilibrium: a
-convex potential (as in incremental potential contact, Li et al. 2020).  The step is solved again with new
+The force of a point in touch is at most ``mu`` times its normal force.  In a step it is that of a
+`StickyContact` with the bound ``mu <-phi> |grad phi|`` mm, where penetration and normal are
+those of the last equilibrium: a convex potential (as in incremental potential contact, Li et al. 2020).  The step is solved again with new
 ones until they do not change; what is in equilibrium then is Coulomb's law.  Up to the bound a point sticks
 by ``hardness`` times the penalty of the contact, so the width in which sticking goes over into slipping is
 ``mu`` times the penetration over the hardness.
@@ -22,15 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .contact import ContactSurface
-from .grip import Grip
+from .grip import StickyContact
 from .tool import Distances, Tool
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Coulomb(Grip):
-    """A `Grip` whose bounds are ``mu`` times the penetration, over the ``hardness``."""
+class Coulomb(StickyContact):
+    """A `StickyContact` whose bounds are ``mu`` times the penetration, over the ``hardness``."""
 
     mu: float
     hardness: float
@@ -53,11 +53,14 @@ class Coulomb(Grip):
         """The grip with the pulls that its tangent foresees after a change ``du (r, 3)`` of ``u``."""
         slip = _Slip.of(self, tool.local)
         moved = tool.moved(du[..., None])[..., 0]
-        lead = _within(self.pulls, self.bounds) / np.where(self.bounds > 0.0, self.bounds, 1.0)[..., None]
+        lead = (
+            _shorten_to_bounds(self.pulls, self.bounds)
+            / np.where(self.bounds > 0.0, self.bounds, 1.0)[..., None]
+        )
         across = moved - np.einsum("fqi,fqi->fq", self.normals, moved)[..., None] * self.normals
         along = np.einsum("fqi,fqi->fq", slip.unit, across)[..., None]
         change = slip.share[..., 0] * (across - np.where(slip.stuck[..., None], 0.0, along * lead))
-        return replace(self, pulls=_within(slip.elastic + change, self.bounds))
+        return replace(self, pulls=_shorten_to_bounds(slip.elastic + change, self.bounds))
 
     def _at(self, near: Distances) -> Self:
         normals, bounds = np.zeros_like(self.normals), np.zeros_like(self.bounds)
@@ -109,7 +112,7 @@ class Coulomb(Grip):
         return np.where((self.held & (self.bounds > 0.0))[..., None, None], found, 0.0)
 
 
-def _within(vectors: Array, bounds: Array) -> Array:
+def _shorten_to_bounds(vectors: Array, bounds: Array) -> Array:
     """Vectors (f, q, 3) shortened to the bounds (f, q)."""
     length = np.linalg.norm(vectors, axis=-1)
     return vectors * np.minimum(1.0, bounds / np.where(length > 0.0, length, 1.0))[..., None]

@@ -29,7 +29,7 @@ Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Grip(ABC):
+class StickyContact(ABC):
     """The held points among the contact points (f, q), in the indenter's frame.
 
     Parameters
@@ -63,7 +63,7 @@ class Grip(ABC):
         """The grip without derivatives, to be kept."""
         return replace(self, d_places=np.zeros((*self.held.shape, 3, 0)))
 
-    def begun(self, tool: Tool) -> Grip:
+    def begun(self, tool: Tool) -> StickyContact:
         """The grip before the first step, with the tool where it starts."""
         return self
 
@@ -72,11 +72,11 @@ class Grip(ABC):
         return self
 
     @abstractmethod
-    def renewed(self, tool: Tool) -> Grip:
+    def renewed(self, tool: Tool) -> StickyContact:
         """The grip that an equilibrium with the tool where it is asks for; itself where it holds."""
 
     @abstractmethod
-    def after(self, tool: Tool, du: Array | None) -> Grip:
+    def after(self, tool: Tool, du: Array | None) -> StickyContact:
         """The grip after a step that ended there; ``du (r, 3, p)`` the derivative of the tool's ``u``, where
         wanted."""
 

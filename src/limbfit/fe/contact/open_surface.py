@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...errors import ProblemError
 from ...shapes.closest_point import INSIDE, Tree, build_tree, closest_point, curvature, feature_normal
 from ...shapes.triangles import beyond_edges, normal_spread, triangle_normals
-from .wall import Wall, checked
+from .wall import Wall, check_open_surface
 
 Array = NDArray[np.float64]
 # What lies beyond the brim by less than this share of the triangle beside it is still met.
@@ -42,7 +42,7 @@ class OpenSurface(Wall):
     reach: float = 20.0
 
     def __post_init__(self) -> None:
-        points, faces = checked(self.points, self.faces, "the open surface")
+        points, faces = check_open_surface(self.points, self.faces, "the open surface")
         if not self.reach > 0.0:
             raise ProblemError(f"a reach of {self.reach} mm is not positive")
         object.__setattr__(self, "points", points)
@@ -63,7 +63,7 @@ class OpenSurface(Wall):
         beyond = beyond_edges(self.faces)
         edges = normals[:, None] + np.where(beyond[..., None] >= 0, normals[beyond], 0.0)
         tree = build_tree(corners, np.arange(len(corners)))
-        return corners, normals, edges, sums[self.faces], _brim(self.faces, beyond < 0), tree
+        return corners, normals, edges, sums[self.faces], _find_brim(self.faces, beyond < 0), tree
 
     @property
     def grows(self) -> bool:
@@ -78,10 +78,10 @@ class OpenSurface(Wall):
         return np.asarray(((points >= low) & (points <= high)).all(axis=1))
 
     def _distances(self, x: Array) -> tuple[Array, Array, Array]:
-        return wall_distances(x, self._facets, self.reach)
+        return compute_wall_distances(x, self._facets, self.reach)
 
 
-def _brim(faces: NDArray[np.int64], open_edges: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _find_brim(faces: NDArray[np.int64], open_edges: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(m, 6) which edges and corners of each triangle are part of the brim."""
     ends = np.concatenate([faces[open_edges], np.roll(faces, -1, axis=1)[open_edges]])
     return np.concatenate([open_edges, np.isin(faces, ends)], axis=1)
@@ -124,7 +124,7 @@ def _wall_distance(wall, reach, x, gradient, hessian):  # type: ignore[no-untype
 
 
 @njit(cache=True)
-def wall_distances(points, wall, reach):  # type: ignore[no-untyped-def]
+def compute_wall_distances(points, wall, reach):  # type: ignore[no-untyped-def]
     """`_wall_distance` of many points (n, 3) with its derivatives."""
     n = len(points)
     values, slopes, bends = np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3))

@@ -22,8 +22,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...errors import ProblemError
-from .distance_grid import DistanceGrid, coefficients, spline
-from .wall import Wall, checked
+from .distance_grid import DistanceGrid, fit_spline_coefficients, spline
+from .wall import Wall, check_open_surface
 
 Array = NDArray[np.float64]
 
@@ -74,7 +74,7 @@ class SmoothSurface(Wall):
         ProblemError
             Where it is no triangle surface, its triangles do not agree on a side, or the shapes do not match.
         """
-        final, triangles = checked(points, faces, "the smooth surface")
+        final, triangles = check_open_surface(points, faces, "the smooth surface")
         if not (spacing > 0.0 and reach > 0.0):
             raise ProblemError("the spacing and the reach of a smooth surface are not positive")
         start = None
@@ -83,13 +83,13 @@ class SmoothSurface(Wall):
             clear = np.asarray(clear, dtype=float)
             if clear.shape != final.shape:
                 raise ProblemError(f"the clear shape has points {clear.shape}, the final one {final.shape}")
-            checked(clear, triangles, "the clear shape")
+            check_open_surface(clear, triangles, "the clear shape")
             both = np.concatenate([used, clear[np.unique(triangles)]])
             reach += float(np.linalg.norm(clear - final, axis=1)[np.unique(triangles)].max())
         grid = DistanceGrid.around(both, reach, spacing)
-        end = coefficients(grid, final, triangles, reach)
+        end = fit_spline_coefficients(grid, final, triangles, reach)
         if clear is not None:
-            start = coefficients(grid, clear, triangles, reach)
+            start = fit_spline_coefficients(grid, clear, triangles, reach)
         fade = 2.0 * spacing if fade is None else fade
         return cls(final, triangles, centre, axis, edge, clear, start, end, grid, reach, fade)
 

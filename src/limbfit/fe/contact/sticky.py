@@ -1,10 +1,10 @@
 """Sticky contact: a point that has touched does not slip along the indenter until it lets go.
 
 A contact point is anchored where it is at the end of the step in which it first touched, in the indenter's
-frame.  From then on ``eps/2 |P (x - a)|^2 dA_0`` holds it (`Grip` without bounds), with ``P = 1 - n n^T`` the
-tangent plane at the anchor: quadratic, so its tangent is constant, and without a part along the normal, so
-an anchor neither pulls nor pushes.  The anchors of a step that let go in it are dropped and the step is
-solved again.
+frame.  From then on ``eps/2 |P (x - a)|^2 dA_0`` holds it (`StickyContact` without bounds),
+with ``P = 1 - n n^T`` the tangent plane at the anchor: quadratic, so its
+tangent is constant, and without a part along the normal, so an anchor
+neither pulls nor pushes.  The anchors of a step that let go in it are dropped and the step is solved again.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .contact import ContactSurface
-from .grip import Grip
+from .grip import StickyContact
 from .tool import Distances, Tool
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Anchors(Grip):
-    """A `Grip` whose planes stay those at the anchors: ``d_normals (f, q, 3, p)`` is their derivative."""
+class Anchors(StickyContact):
+    """A `StickyContact` whose planes stay those at the anchors; ``d_normals (f, q, 3, p)`` is theirs."""
 
     d_normals: Array
 

@@ -86,7 +86,7 @@ class Wall:
         raise NotImplementedError
 
 
-def checked(points: Array, faces: NDArray, name: str) -> tuple[Array, NDArray[np.int64]]:
+def check_open_surface(points: Array, faces: NDArray, name: str) -> tuple[Array, NDArray[np.int64]]:
     """The arrays of a surface with one side.
 
     Raises

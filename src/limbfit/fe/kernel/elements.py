@@ -44,7 +44,7 @@ class Element:
     face_rules: Mapping[str, tuple[Array, Array]]
 
 
-def _orbit(*orbits: tuple[float, float], d: int) -> tuple[Array, Array]:
+def _build_orbit(*orbits: tuple[float, float], d: int) -> tuple[Array, Array]:
     """Quadrature of points (a, b, b, ..) and permutations; each orbit gives a and its relative weight."""
     points, weights = [], []
     for a, weight in orbits:
@@ -57,17 +57,17 @@ def _orbit(*orbits: tuple[float, float], d: int) -> tuple[Array, Array]:
     return np.array(points), np.array(weights) / (2.0 if d == 2 else 6.0)
 
 
-def _gauss(d: int, n: int) -> tuple[Array, Array]:
+def _build_gauss(d: int, n: int) -> tuple[Array, Array]:
     x, w = np.polynomial.legendre.leggauss(n)
     grids = np.meshgrid(*[x] * d, indexing="ij")
     weights = np.meshgrid(*[w] * d, indexing="ij")
     return np.column_stack([g.ravel() for g in grids]), np.prod([g.ravel() for g in weights], axis=0)
 
 
-def _triangle_7() -> tuple[Array, Array]:
+def _build_triangle_7() -> tuple[Array, Array]:
     """Degree 5, seven points (Radon 1948)."""
     root = np.sqrt(15.0)
-    points, weights = _orbit(
+    points, weights = _build_orbit(
         (1.0 - 2.0 * (6.0 - root) / 21.0, (155.0 - root) / 1200.0),
         (1.0 - 2.0 * (6.0 + root) / 21.0, (155.0 + root) / 1200.0),
         d=2,
@@ -76,26 +76,26 @@ def _triangle_7() -> tuple[Array, Array]:
 
 
 _TET_1 = (np.full((1, 3), 0.25), np.array([1.0 / 6.0]))
-_TET_4 = _orbit(((5.0 + 3.0 * np.sqrt(5.0)) / 20.0, 0.25), d=3)
+_TET_4 = _build_orbit(((5.0 + 3.0 * np.sqrt(5.0)) / 20.0, 0.25), d=3)
 # Degree 3, eight points: the rule of FEBio's default tet10.
-_TET_8 = _orbit((0.0158359099, 0.138527967), (0.6791431780, 0.111472033), d=3)
+_TET_8 = _build_orbit((0.0158359099, 0.138527967), (0.6791431780, 0.111472033), d=3)
 # Degree 3, vertices and middles of the faces: an element cannot fold in a corner unseen, as it can between
 # the inner points of the other rules.
-_TET_8_VERTICES = _orbit((1.0, 1.0 / 40.0), (0.0, 9.0 / 40.0), d=3)
+_TET_8_VERTICES = _build_orbit((1.0, 1.0 / 40.0), (0.0, 9.0 / 40.0), d=3)
 # Contact at points constrains them all.  Seven Gauss points of a quadratic face outnumber the nodes that can
 # give way threefold: stiff contact then opens at every other point; three are as many as its nodal rule has.
 # The nodal rule of a quadratic triangle has its corners at zero weight (it is exact to degree 2).
 _TRI3 = {
     "nodes": (np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), np.full(3, 1.0 / 6.0)),
-    "gauss": _triangle_7(),
+    "gauss": _build_triangle_7(),
 }
 _TRI6 = {
     "nodes": (np.array([[0.5, 0.0], [0.5, 0.5], [0.0, 0.5]]), np.full(3, 1.0 / 6.0)),
-    "gauss": _orbit((2.0 / 3.0, 1.0 / 3.0), d=2),
-    "gauss7": _triangle_7(),  # FEBio's
+    "gauss": _build_orbit((2.0 / 3.0, 1.0 / 3.0), d=2),
+    "gauss7": _build_triangle_7(),  # FEBio's
 }
-_QUAD4 = {"nodes": (QUAD_CORNERS, np.ones(4)), "gauss": _gauss(2, 2)}
-_HEX = _gauss(3, 2)
+_QUAD4 = {"nodes": (QUAD_CORNERS, np.ones(4)), "gauss": _build_gauss(2, 2)}
+_HEX = _build_gauss(3, 2)
 
 ELEMENTS: dict[str, Element] = {
     e.name: e
@@ -111,7 +111,9 @@ ELEMENTS: dict[str, Element] = {
 }
 
 
-def reference_gradients(element: Element, points: Array, cells: NDArray[np.int64]) -> tuple[Array, Array]:
+def compute_reference_gradients(
+    element: Element, points: Array, cells: NDArray[np.int64]
+) -> tuple[Array, Array]:
     """Gradients (m, q, 3, k) of the shape functions in the reference configuration and weights (m, q), mm^3.
 
     A weight is not positive where the cell is inverted.
@@ -126,7 +128,7 @@ def reference_gradients(element: Element, points: Array, cells: NDArray[np.int64
     return np.ascontiguousarray(gradients), weights
 
 
-def face_quadrature(
+def build_face_quadrature(
     element: Element, points: Array, faces: NDArray[np.int64], rule: str
 ) -> tuple[Array, Array]:
     """Shape values (q, k) and reference areas (f, q), mm^2, at the points of a face rule."""

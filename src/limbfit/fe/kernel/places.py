@@ -62,7 +62,7 @@ class Places:
         return self.cells, self.gradients, self.weights, self.regions, self.fibres, self.prestretch
 
 
-def elastic_at(places: Places, laws: Laws, u: Array) -> tuple[Array, Array, Array]:
+def evaluate_elastic_at(places: Places, laws: Laws, u: Array) -> tuple[Array, Array, Array]:
     """What the elastic laws give at displacements ``u (n, 3)``, mm.
 
     Returns
@@ -81,7 +81,7 @@ def elastic_at(places: Places, laws: Laws, u: Array) -> tuple[Array, Array, Arra
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _elastic_at(elements, tables, u, records, stress, D, F):  # type: ignore[no-untyped-def]
-    """The kernel of `elastic_at`, `LANES` places side by side."""
+    """The kernel of `evaluate_elastic_at`, `LANES` places side by side."""
     points, law, numbers, element = records
     p = points[0]
     m = len(stress)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..contact.friction import LAWS_OF_STICKING
-from ..contact.grip import Grip
+from ..contact.grip import StickyContact
 from ..contact.sticky import Anchors
 from ..history import Memory
 from ..kernel.laws import Laws
@@ -20,13 +20,13 @@ from ..system import System
 Array = NDArray[np.float64]
 
 
-def elastic_residual(system: System, laws: Laws, state: State) -> float:
+def compute_elastic_residual(system: System, laws: Laws, state: State) -> float:
     """Norm of the nodal forces of elastic tissue in a state, N."""
     still = Memory.rest(system, laws).increment(system, laws, 0.0, 1.0, state.displacement, 0.0, state.drives)
     return float(np.linalg.norm(system.evaluate(state.rows, laws, still, tangent=False).residual))
 
 
-def travel(system: System, modulus: float) -> float:
+def measure_indenter_travel(system: System, modulus: float) -> float:
     """The way against which penetration is judged, mm: the largest of a body that is driven by displacement,
     or how deep the tissue at rest lies in what a body grows to.
 
@@ -49,9 +49,9 @@ def travel(system: System, modulus: float) -> float:
     return max(min(way, width / 2) for way, width in zip(pushed, widths)) or max(widths) / 2
 
 
-def grips_of(system: System, parameters: int) -> tuple[Grip | None, ...]:
+def build_grips(system: System, parameters: int) -> tuple[StickyContact | None, ...]:
     """What holds the points of each body at first; None where nothing ever does."""
-    found: list[Grip | None] = []
+    found: list[StickyContact | None] = []
     for body in [] if system.bodies is None else system.bodies.all:
         friction = body.stated.friction
         if friction in ("frictionless", 0.0):
@@ -64,13 +64,15 @@ def grips_of(system: System, parameters: int) -> tuple[Grip | None, ...]:
     return tuple(found)
 
 
-def begun(system: System, grips: Sequence[Grip | None], u: Array, drives: Drives) -> tuple[Grip | None, ...]:
+def start_grips(
+    system: System, grips: Sequence[StickyContact | None], u: Array, drives: Drives
+) -> tuple[StickyContact | None, ...]:
     """The grips with which a run begins, its bodies at rest where they start."""
     tools = [] if system.bodies is None else system.bodies.tools(u, drives)
     return tuple(grip and grip.begun(tool) for grip, tool in zip(grips, tools, strict=True))
 
 
-def system_of(problem: Problem, warm_start: Result | None, system: System | None, threads: int) -> System:
+def build_system(problem: Problem, warm_start: Result | None, system: System | None, threads: int) -> System:
     for known in (system, warm_start.system if warm_start is not None else None):
         if known is not None and known.fits(problem):
             return known

@@ -11,7 +11,7 @@ from ..contact.indenter import Indenter
 from ..kernel.assembly import is_compiled
 from ..kernel.laws import Laws
 from ..materials import OgdenQLV
-from ..observables import element_fields
+from ..observables import compute_element_fields
 from ..problem import History, Problem
 from .control import StepControl
 from .sensitivity import explicit_derivatives
@@ -51,4 +51,4 @@ def compile_kernels(element: str = "tet10p0") -> None:
     )
     found = solve(problem, steps=StepControl(times=(0.5, 1.0)), sensitivities=True)
     if found.deepest is not None:
-        element_fields(found.system, Laws.build([tissue, tissue]), found.deepest)
+        compute_element_fields(found.system, Laws.build([tissue, tissue]), found.deepest)

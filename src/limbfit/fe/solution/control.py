@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..problem import History, ProblemError
 from .newton import NewtonControl
-from .schedule import graded, with_turns
+from .schedule import grade_steps, insert_turning_points
 
 Array = NDArray[np.float64]
 
@@ -68,14 +68,14 @@ class StepControl:
         return NewtonControl(tolerance=self.tolerance, max_iterations=self.max_iterations)
 
 
-def schedule(history: History, control: StepControl, turns: Sequence[float] | Array = ()) -> Array:
-    """Times (k,) of the steps, s, before any is cut: those stated, or as `graded` places them.
+def schedule_steps(history: History, control: StepControl, turns: Sequence[float] | Array = ()) -> Array:
+    """Times (k,) of the steps, s, before any is cut: those stated, or as `grade_steps` places them.
 
     The ``turns (k,)`` of further bodies are among those placed.
     """
     if control.times is None:
-        return with_turns(
-            graded(history, control.load_steps, control.unload_steps), np.asarray(turns, dtype=float)
+        return insert_turning_points(
+            grade_steps(history, control.load_steps, control.unload_steps), np.asarray(turns, dtype=float)
         )
     if control.times[-1] > history.times[-1] * (1.0 + 1e-9):
         raise ProblemError(

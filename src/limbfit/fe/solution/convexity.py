@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 _CELLS = 2000  # at a time
 
 
-def shear_stiffness(system: System, moduli: Array) -> Array:
+def compute_shear_stiffness(system: System, moduli: Array) -> Array:
     """Entries of the matrix of the integral of ``mu grad u : grad v``, in the pattern of ``system``.
 
     ``moduli (r,)``: shear modulus of each region, MPa.
@@ -36,12 +36,12 @@ def shear_stiffness(system: System, moduli: Array) -> Array:
         places = system.cell_positions[cells][:, same]
         held = places < 0
         data += np.bincount(places[~held], nodal[:, a, b][~held], minlength=len(data))
-    places, stiffness = body_stiffness(system, moduli)
+    places, stiffness = compute_body_stiffness(system, moduli)
     data[places] += stiffness / GROUNDING
     return data
 
 
-def body_stiffness(system: System, moduli: Array) -> tuple[NDArray[np.int32], Array]:
+def compute_body_stiffness(system: System, moduli: Array) -> tuple[NDArray[np.int32], Array]:
     """Diagonal entries of the coordinates that are free to move rigid bodies, and what holds those of bodies
     that touch nothing (k,), N/mm."""
     if system.bodies is None or not system.bodies.free:

@@ -18,13 +18,13 @@ import numpy as np
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
-from ..contact.grip import Grip
+from ..contact.grip import StickyContact
 from ..kernel.laws import Laws
 from ..system import Evaluation, Increment, System
-from .direction import preconditioner, touching
+from .direction import build_preconditioner, find_touching_bodies
 from .factor import Factor
 from .linear import NotPositiveDefiniteError
-from .newton import Equilibrium, NewtonControl, reaction_scale, residual_norm
+from .newton import Equilibrium, NewtonControl, compute_reaction_scale, compute_residual_norm
 from .sensitivity import solve_with_adjoint
 
 Array = NDArray[np.float64]
@@ -50,10 +50,10 @@ class Coupling:
             if found is None:
                 continue
             if self._blocks is None:
-                self._blocks = np.zeros((touching(system).count, 3, 3))
+                self._blocks = np.zeros((find_touching_bodies(system).count, 3, 3))
             stiff = (increment.penalty * tool.surface.areas)[..., None, None]
             in_space = tool.body.frame.T @ (stiff * found) @ tool.body.frame
-            self._blocks[touching(system).all[i].points] = in_space.reshape(-1, 3, 3)
+            self._blocks[find_touching_bodies(system).all[i].points] = in_space.reshape(-1, 3, 3)
 
     def __bool__(self) -> bool:
         return self._rims is not None or self._blocks is not None
@@ -77,7 +77,7 @@ class Coupling:
         return self._bodies.along(self._blocks @ self._bodies.springs_of(x))
 
 
-def renewed(system: System, increment: Increment, u: Array) -> Increment:
+def renew_increment(system: System, increment: Increment, u: Array) -> Increment:
     """The step with grips and rims as they are at ``u (r, 3)``; itself where nothing changes."""
     grips = tuple(g and g.renewed(tool) for g, tool in zip(increment.grips, system.tools(u, increment)))
     if not increment.pressures and all(new is old for new, old in zip(grips, increment.grips)):
@@ -94,15 +94,15 @@ def solve_coupled(
     if not coupling:
         x, advanced = solve_with_adjoint(at, factor, b, guess, advance)
         return x, -advanced
-    x = _gmres(at, factor, coupling, b, guess, TOLERANCE)
+    x = _solve_gmres(at, factor, coupling, b, guess, TOLERANCE)
     return x, coupling.along(x) - advance @ x
 
 
-def _gmres(
+def _solve_gmres(
     at: Evaluation, factor: Factor, coupling: Coupling, b: Array, guess: Array, tolerance: float
 ) -> Array:
     """Solutions (n, p) of ``(K + C) x = b``; columns that are not within the tolerance count as inexact."""
-    apply, shape = preconditioner(at, factor), (len(b), len(b))
+    apply, shape = build_preconditioner(at, factor), (len(b), len(b))
 
     def product(x: Array) -> Array:
         x = x.reshape(-1, 1)
@@ -132,9 +132,9 @@ def couple(
 
     def look(x: Array, by: Increment | None = None) -> tuple[Increment, Evaluation]:
         started = time.perf_counter()
-        there = renewed(system, increment, x)
+        there = renew_increment(system, increment, x)
         if by is not None:
-            there = replace(there, grips=_led(there.grips, by.grips))
+            there = replace(there, grips=_lead_grips(there.grips, by.grips))
         at = system.evaluate(x, laws, there)
         seconds["assembly"] += time.perf_counter() - started
         return there, at
@@ -142,7 +142,7 @@ def couple(
     lowest, vain = np.inf, 0
     now, here = look(u)
     for iteration in range(MOST_ITERATIONS):
-        norm, scale = residual_norm(system, here), reaction_scale(system, here, floor)
+        norm, scale = compute_residual_norm(system, here), compute_reaction_scale(system, here, floor)
         if norm <= control.tolerance * scale:
             now, here = look(u) if control.tangent else (now, here)  # derivatives take the slip as it is
             return (Equilibrium(u, here, iteration, residual=norm / max(scale, 1e-300)), now), iteration
@@ -152,7 +152,7 @@ def couple(
             return None, iteration
         b = -here.residual.ravel()[system.free][:, None]
         try:
-            d = _gmres(here, factor, Coupling(system, now, u), b, np.zeros_like(b), FORCING)
+            d = _solve_gmres(here, factor, Coupling(system, now, u), b, np.zeros_like(b), FORCING)
         except NotPositiveDefiniteError:
             return None, iteration + 1
         direction = np.zeros(here.residual.size)
@@ -170,6 +170,8 @@ def couple(
     return None, MOST_ITERATIONS
 
 
-def _led(grips: Sequence[Grip | None], by: Sequence[Grip | None]) -> tuple[Grip | None, ...]:
+def _lead_grips(
+    grips: Sequence[StickyContact | None], by: Sequence[StickyContact | None]
+) -> tuple[StickyContact | None, ...]:
     """The grips with the pulls of others."""
     return tuple(g and other and replace(g, pulls=other.pulls) for g, other in zip(grips, by))

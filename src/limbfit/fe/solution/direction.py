@@ -24,7 +24,7 @@ Bools = NDArray[np.bool_]
 SWEEPS, ROUNDS = 12, 4
 
 
-def newton_direction(
+def find_newton_direction(
     system: System, at: Evaluation, factor: Factor, tolerance: float, damping: float = 0.0
 ) -> Array:
     """Direction (n, 3) that solves the linear model within ``tolerance``, relative to the residual.
@@ -44,15 +44,15 @@ def newton_direction(
         if not found.converged and found.convex:
             found = factor.solve_anew(at.tangent, b, None, tolerance, found.x)
     else:
-        found = _with_contact(system, at, at.touch, factor, b, tolerance)
+        found = _solve_with_contact(system, at, at.touch, factor, b, tolerance)
         if float(b[:, 0] @ found.x[:, 0]) <= 0.0:
-            found = _plain(at, at.touch, factor, b, tolerance)
+            found = _solve_plain(at, at.touch, factor, b, tolerance)
     direction = np.zeros(at.residual.size)
     direction[system.free] = found.x[:, 0]
     return direction.reshape(at.residual.shape)
 
 
-def touching(system: System) -> Bodies:
+def find_touching_bodies(system: System) -> Bodies:
     """The rigid bodies of a system that has some."""
     assert system.bodies is not None
     return system.bodies
@@ -69,7 +69,9 @@ def _change(factor: Factor, at: Evaluation, touch: Touch, closed: Bools) -> Spri
     return factor.springs(closed != touch.closed, touch.normals, touch.under(closed)[0])
 
 
-def _matched(factor: Factor, at: Evaluation, touch: Touch, closed: Bools, data: Array) -> SpringChange | None:
+def _match_springs(
+    factor: Factor, at: Evaluation, touch: Touch, closed: Bools, data: Array
+) -> SpringChange | None:
     """`_change`; what does not last is made anew for ``data``, the tangent with those springs, instead."""
     if factor.lasting:
         return _change(factor, at, touch, closed)
@@ -77,37 +79,39 @@ def _matched(factor: Factor, at: Evaluation, touch: Touch, closed: Bools, data: 
     return None
 
 
-def _plain(at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: float) -> LinearSolution:
+def _solve_plain(at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: float) -> LinearSolution:
     """Without foresight: the closed points stay closed."""
-    return factor.solve(at.tangent, b, _matched(factor, at, touch, touch.closed, at.tangent), tolerance)
+    return factor.solve(at.tangent, b, _match_springs(factor, at, touch, touch.closed, at.tangent), tolerance)
 
 
-def _with_contact(
+def _solve_with_contact(
     system: System, at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: float
 ) -> LinearSolution:
-    bodies = touching(system)
+    bodies = find_touching_bodies(system)
     found, closed = LinearSolution(np.zeros_like(b), True, True), touch.closed
     for _ in range(ROUNDS):
         guess = found.x
         if factor.lasting:
-            guess, closed = _foresee(system, at, touch, factor, b, guess, closed)
+            guess, closed = _predict_closed(system, at, touch, factor, b, guess, closed)
         blocks, change = touch.under(closed)
         data = bodies.with_springs(at.tangent, blocks - touch.blocks)
-        springs = _matched(factor, at, touch, closed, data)
+        springs = _match_springs(factor, at, touch, closed, data)
         right = b - bodies.at_springs(change)[:, None]
         found = factor.solve(data, right, springs, tolerance, guess)
         if not found.converged and found.convex:
             found = factor.solve_anew(data, right, blocks, tolerance, found.x)
         if not found.convex and factor.lasting:
-            found = _of_descent(factor, data, right, blocks, tolerance)
-        foreseen = _closed(touch, bodies.springs_of(found.x[:, 0]))
+            found = _solve_for_descent(factor, data, right, blocks, tolerance)
+        foreseen = _find_closed(touch, bodies.springs_of(found.x[:, 0]))
         if (foreseen == closed).all() or (factor.lasting and springs is None) or not found.convex:
             break
         closed = foreseen
     return found
 
 
-def _of_descent(factor: Factor, data: Array, b: Array, blocks: Array, tolerance: float) -> LinearSolution:
+def _solve_for_descent(
+    factor: Factor, data: Array, b: Array, blocks: Array, tolerance: float
+) -> LinearSolution:
     """Where an old factor met negative curvature: the solution of a new one, stiffened where need be."""
     factor.factorise(data, blocks)
     if not factor.shifted:
@@ -117,18 +121,18 @@ def _of_descent(factor: Factor, data: Array, b: Array, blocks: Array, tolerance:
     return LinearSolution(factor.apply(b), False, False)
 
 
-def _closed(touch: Touch, moved: Array) -> Bools:
+def _find_closed(touch: Touch, moved: Array) -> Bools:
     return touch.gaps + np.einsum("ci,ci->c", touch.normals, moved) < 0.0
 
 
-def _foresee(
+def _predict_closed(
     system: System, at: Evaluation, touch: Touch, factor: Factor, b: Array, x: Array, closed: Bools
 ) -> tuple[Array, Bools]:
     """Displacement (n, 1) and closed points by the factor's model, from ``x (n, 1)`` on."""
     springs = _change(factor, at, touch, closed)
     if springs is None:
         return x, touch.closed
-    bodies = touching(system)
+    bodies = find_touching_bodies(system)
     before = bodies.springs_of(x[:, 0])
     y = factor.forward(b - factor.product(at.tangent, x) if x.any() else b)
     moved = factor.columns.moved(y, closed | touch.closed)
@@ -140,7 +144,7 @@ def _foresee(
             break
         forces = -change - np.einsum("cij,cj->ci", blocks - touch.blocks, before)
         part, kept = springs.coefficients(moved, forces), closed
-        closed = _closed(touch, before + moved + springs.at_points(part))
+        closed = _find_closed(touch, before + moved + springs.at_points(part))
         if (closed == kept).all():
             break
     if part is None:
@@ -150,7 +154,7 @@ def _foresee(
 
 def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: float) -> Array:
     """Solution (n, r) of the tangent at an equilibrium for ``b (n, r)``, from the guess ``x``."""
-    springs = _ready_at(at, factor)
+    springs = _update_springs(at, factor)
     found = factor.solve(at.tangent, b, springs, tolerance, x)
     if not found.converged:
         blocks = None if at.touch is None else at.touch.blocks
@@ -160,16 +164,16 @@ def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: floa
     return found.x
 
 
-def preconditioner(at: Evaluation, factor: Factor) -> Callable[[Array], Array]:
+def build_preconditioner(at: Evaluation, factor: Factor) -> Callable[[Array], Array]:
     """The factor's solution of vectors (n, r), with the contact springs of an evaluation."""
-    springs = _ready_at(at, factor)
+    springs = _update_springs(at, factor)
     return lambda r: factor.precondition(r, springs)
 
 
-def _ready_at(at: Evaluation, factor: Factor) -> SpringChange | None:
+def _update_springs(at: Evaluation, factor: Factor) -> SpringChange | None:
     """The springs by which an evaluation differs from what is factorised; what does not last is made anew."""
     if not factor.ready or not factor.lasting:
-        renew(at, factor)
+        refactor_at(at, factor)
     if at.touch is None or not factor.lasting:
         return None
     return _change(factor, at, at.touch, at.touch.closed)
@@ -180,10 +184,10 @@ def _begin(system: System, at: Evaluation, factor: Factor) -> None:
     if at.touch is None:
         factor.factorise(at.tangent)
     else:
-        without = touching(system).with_springs(at.tangent, -at.touch.blocks)
+        without = find_touching_bodies(system).with_springs(at.tangent, -at.touch.blocks)
         factor.factorise(without, np.zeros_like(at.touch.blocks))
 
 
-def renew(at: Evaluation, factor: Factor) -> None:
+def refactor_at(at: Evaluation, factor: Factor) -> None:
     """Factorise the tangent of an equilibrium: there it is positive definite."""
     factor.factorise(at.tangent, None if at.touch is None else at.touch.blocks)

@@ -18,17 +18,17 @@ import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
 from ..system import System
-from .convexity import body_stiffness, shear_stiffness
+from .convexity import compute_body_stiffness, compute_shear_stiffness
 from .linear import (
     NONE,
     Index,
     LinearSolver,
     NotPositiveDefiniteError,
-    factors_are_dear,
-    linear_solver,
+    build_linear_solver,
+    prefers_multigrid,
 )
 from .multigrid import Multigrid
-from .products import symmetric_product
+from .products import multiply_symmetric
 from .springs import SpringChange, SpringColumns
 
 Array = NDArray[np.float64]
@@ -70,11 +70,11 @@ class Factor:
         suits = not moving and system.cells.shape[1] == 10
         fewest = FEWEST_IN_MANY_STEPS if steps > MANY_STEPS else FEWEST_MULTIGRID
         many = system.unknowns >= fewest and not lasting
-        if name == "auto" and suits and (many or factors_are_dear()):
+        if name == "auto" and suits and (many or prefers_multigrid()):
             self._choice = Multigrid.name
         self._diagonal = system.indptr[:-1]
         self._shear: Array | None = None
-        self._ground = body_stiffness(system, moduli)
+        self._ground = compute_body_stiffness(system, moduli)
         self.counts: Counter[str] = Counter()
         self.seconds: defaultdict[str, float] = defaultdict(float)
         self._wanted = self._choice
@@ -98,7 +98,7 @@ class Factor:
         system, threads = self._system, self._threads
         if self._choice == Multigrid.name:
             return Multigrid(system, threads)
-        return linear_solver(system.indptr, system.indices, self._choice, threads, single, self._last)
+        return build_linear_solver(system.indptr, system.indices, self._choice, threads, single, self._last)
 
     def _give_up_multigrid(self) -> None:
         """From here on with a factor."""
@@ -171,7 +171,7 @@ class Factor:
     def stiffened(self, data: Array, share: float) -> Array:
         """The entries ``data`` of a tangent with a share of each tissue's own shear stiffness added."""
         if self._shear is None:
-            self._shear = shear_stiffness(self._system, self._moduli)
+            self._shear = compute_shear_stiffness(self._system, self._moduli)
         return data + share * self._shear
 
     def _factorised(self, data: Array, shift: float) -> bool:
@@ -223,7 +223,7 @@ class Factor:
         """``A x`` for the entries ``data`` of A."""
         started = time.perf_counter()
         self.counts["products"] += 1
-        y = symmetric_product(self._system.indptr, self._system.indices, data, x, self._threads)
+        y = multiply_symmetric(self._system.indptr, self._system.indices, data, x, self._threads)
         self.seconds["product"] += time.perf_counter() - started
         return y
 

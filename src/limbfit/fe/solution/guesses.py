@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bodies import extra_rows
+from ..bodies import count_body_rows
 from ..history import Memory
 from ..kernel.laws import Laws
 from ..problem import Problem
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 _SAME_S = 1e-9
 
 
-def extrapolation(travels: Sequence[float], travel: float) -> Array:
+def compute_extrapolation(travels: Sequence[float], travel: float) -> Array:
     """Weights (k,) of the last states' fields, at ``travels (k,)`` of the indenter, that foresee that at
     ``travel`` mm.
 
@@ -41,16 +41,16 @@ def extrapolation(travels: Sequence[float], travel: float) -> Array:
 
 
 @dataclass(frozen=True)
-class Warm:
+class WarmStart:
     """The displacements ``u`` (r, 3), rows of bodies included, of another simulation at ``times`` (k,) s."""
 
     times: Array
     u: tuple[Array, ...]
 
     @classmethod
-    def of(cls, problem: Problem, found: Result | None) -> Warm:
+    def of(cls, problem: Problem, found: Result | None) -> WarmStart:
         """Those of a result on the same mesh, moved to the new parameters along their sensitivities."""
-        rows = extra_rows(problem.rigid_bodies)
+        rows = count_body_rows(problem.rigid_bodies)
         shapes = [(state.u.shape, len(state.coordinates)) for state in found.states[:1]] if found else []
         if found is None or shapes != [(problem.mesh.points.shape, rows)]:
             return cls(np.zeros(0), ())
@@ -58,7 +58,7 @@ class Warm:
         with np.errstate(all="ignore"):  # moduli act by their ratio
             change = np.where(new * old > 0.0, old * np.log(new / old), new - old)
         times = np.array([state.time for state in found.states])
-        return cls(times, tuple(_moved(state, change) for state in found.states))
+        return cls(times, tuple(_move_state(state, change) for state in found.states))
 
     def at(self, t: float) -> Array | None:
         """Displacement (n, 3) at a time, linear between the states; None outside of them."""
@@ -72,12 +72,12 @@ class Warm:
         return self.u[before] + share * (self.u[after] - self.u[before])
 
 
-def _moved(state: State, change: Array) -> Array:
+def _move_state(state: State, change: Array) -> Array:
     """All rows (r, 3) of a state, after a ``change (p,)`` of the parameters if its derivatives are known."""
     return state.rows if state.sensitivity is None else state.rows + state.slopes @ change
 
 
-def tangent_at_rest(system: System) -> Array:
+def compute_tangent_at_rest(system: System) -> Array:
     """Entries of the tangent of the undeformed body, before contact, with its problem's materials."""
     problem = system.problem
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])

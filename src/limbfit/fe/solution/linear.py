@@ -20,7 +20,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
-from ..threads import quiet_openmp
+from ..threads import silence_openmp
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
@@ -85,7 +85,7 @@ class LinearSolver(Halves, Protocol):
 NONE: Index = np.zeros(0, dtype=np.int32)
 
 
-class Whole(LinearSolver):
+class SingleHalf(LinearSolver):
     """Halves of solutions for solvers that know none: the first is all of it."""
 
     transposed, last = False, NONE
@@ -129,11 +129,11 @@ class Pardiso:
         self._parameters[MANY_THREADS] = int(len(last) > 0 and threads > 1)
         if os.environ.get(WITHOUT_PARDISO):
             raise ImportError(f"PARDISO is left out: {WITHOUT_PARDISO} is set")
-        self._mkl = _mkl()
+        self._mkl = _load_mkl()
         # The factor lives outside Python's memory.
         self._release = weakref.finalize(self, _release, self._mkl, self._handle, self._parameters, self._n)
         self._checked(self._call(11, np.zeros(1), np.zeros(1), 1))
-        quiet_openmp()  # loaded by the first call
+        silence_openmp()  # loaded by the first call
         self._parameters[PARTIAL] = 0
         self.worth = max((float(self._parameters[17]) / self._n.value) ** (4 / 3) / ROW_PER_SOLUTION, 2.0)
 
@@ -183,14 +183,14 @@ class Pardiso:
 
     def _call(self, phase: int, b: Array, x: Array, count: int) -> int:
         self._mkl.MKL_Set_Num_Threads(self._threads)
-        return _pardiso(
+        return _call_pardiso(
             self._mkl, self._handle, self._parameters, self._n, phase,
             self._data, self._indptr, self._indices, self._marks, b, x, count,
         )  # fmt: skip
 
 
 @functools.cache
-def _mkl() -> Any:
+def _load_mkl() -> Any:
     """MKL's library: from the installed package, or as pypardiso finds it by searching the disk."""
     try:
         files = importlib.metadata.files("mkl") or []
@@ -202,7 +202,7 @@ def _mkl() -> Any:
     return importlib.import_module("pypardiso").PyPardisoSolver().libmkl
 
 
-def _pardiso(
+def _call_pardiso(
     mkl: Any,
     handle: NDArray[np.int64],
     parameters: Index,
@@ -234,10 +234,10 @@ def _pardiso(
 
 def _release(mkl: Any, handle: NDArray[np.int64], parameters: Index, n: ctypes.c_int32) -> None:
     empty, none = np.zeros(1), np.zeros(1, dtype=np.int32)
-    _pardiso(mkl, handle, parameters, n, -1, empty, none, none, none, empty, empty, 1)
+    _call_pardiso(mkl, handle, parameters, n, -1, empty, none, none, none, empty, empty, 1)
 
 
-class Cholmod(Whole):
+class Cholmod(SingleHalf):
     """Supernodal Cholesky by CHOLMOD, through scikit-sparse."""
 
     name = "cholmod"
@@ -265,7 +265,7 @@ class Cholmod(Whole):
         return self._factor(b)
 
 
-class SuperLU(Whole):
+class SuperLU(SingleHalf):
     """LU by SciPy's SuperLU: everywhere there is SciPy; slow, and blind to negative eigenvalues."""
 
     name = "superlu"
@@ -295,7 +295,7 @@ class SuperLU(Whole):
 SOLVERS: dict[str, type] = {solver.name: solver for solver in (Pardiso, Cholmod, SuperLU)}
 
 
-def linear_solver(
+def build_linear_solver(
     indptr: Index, indices: Index, name: str = "auto", threads: int = 1, single: bool = False,
     last: Index = NONE,
 ) -> LinearSolver:  # fmt: skip
@@ -313,6 +313,6 @@ def linear_solver(
     raise ImportError("no sparse solver works here")
 
 
-def factors_are_dear() -> bool:
+def prefers_multigrid() -> bool:
     """Whether the only factorisations of this machine are much slower than multigrid."""
-    return linear_solver(np.arange(2, dtype=np.int32), np.zeros(1, dtype=np.int32)).dear
+    return build_linear_solver(np.arange(2, dtype=np.int32), np.zeros(1, dtype=np.int32)).dear

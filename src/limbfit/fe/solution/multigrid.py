@@ -16,16 +16,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...mesh import TET10_EDGES
-from ..pattern import node_graph, place_of, upper_pattern
+from ..pattern import build_node_graph, place_of, upper_pattern
 from ..system import System
-from .linear import Index, NotPositiveDefiniteError, Whole, linear_solver
+from .linear import Index, NotPositiveDefiniteError, SingleHalf, build_linear_solver
 
 Array = NDArray[np.float64]
 # A block is added to the upper triangle turned where its parents are in reverse, both ways on the diagonal.
 _TURNED, _BOTH = 1, 2
 
 
-class Multigrid(Whole):
+class Multigrid(SingleHalf):
     """A peer of the solvers in `linear`, but its solutions are only near: they have to be iterated upon.
 
     For any of the quadratic tetrahedra in the element table.
@@ -38,23 +38,25 @@ class Multigrid(Whole):
     def __init__(self, system: System, threads: int = 1) -> None:
         linear_cells = system.cells[:, :4]
         corners = np.unique(linear_cells)
-        fine, self._slots = _numbered(system.numbers >= 0)
+        fine, self._slots = _number_nodes(system.numbers >= 0)
         moving = np.zeros_like(system.numbers, dtype=bool)
         moving[corners] = system.numbers[corners] >= 0
-        linear, coarse_slots = _numbered(moving)
+        linear, coarse_slots = _number_nodes(moving)
         self._coarse_slots = coarse_slots
-        self._fine, self._places = _blocked(system.cells, fine, system.indptr, system.indices, self._slots)
+        self._fine, self._places = _group_into_blocks(
+            system.cells, fine, system.indptr, system.indices, self._slots
+        )
         numbers = np.full(moving.shape, -1, dtype=np.int32)
         numbers[moving] = np.arange(len(coarse_slots), dtype=np.int32)
-        graph = node_graph(linear_cells, len(numbers))
+        graph = build_node_graph(linear_cells, len(numbers))
         indptr, indices = upper_pattern(numbers, graph.indptr, graph.indices, len(coarse_slots))
-        self._coarse, self._coarse_places = _blocked(
+        self._coarse, self._coarse_places = _group_into_blocks(
             system.cells[:, :4], linear, indptr, indices, coarse_slots
         )
-        self._parents = linear[_ends(system.cells, len(fine))][fine >= 0]
+        self._parents = linear[_find_ends(system.cells, len(fine))][fine >= 0]
         self._free = (system.numbers >= 0)[fine >= 0]
         self._targets = _coarse_targets(*self._fine, self._parents, *self._coarse)
-        self._solver = linear_solver(indptr, indices, threads=threads, single=True)
+        self._solver = build_linear_solver(indptr, indices, threads=threads, single=True)
 
     def factorise(self, data: Array) -> None:
         ptr, cols = self._fine
@@ -89,25 +91,25 @@ class Multigrid(Whole):
         return x.ravel()[self._slots].astype(np.float64)
 
 
-def _numbered(moving: NDArray[np.bool_]) -> tuple[Index, NDArray[np.int64]]:
+def _number_nodes(moving: NDArray[np.bool_]) -> tuple[Index, NDArray[np.int64]]:
     """Number of each node that can move in any component (else -1); places of the unknowns, 3 to a node."""
     active = moving.any(axis=1)
     number = np.where(active, np.cumsum(active) - 1, -1).astype(np.int32)
     return number, np.flatnonzero(moving[active].ravel())
 
 
-def _blocked(
+def _group_into_blocks(
     cells: NDArray, number: Index, indptr: Index, indices: Index, slots: NDArray[np.int64]
 ) -> tuple[tuple[Index, Index], NDArray[np.int64]]:
     """Rows and columns of the blocks, and the place in them of every entry of the matrix by unknowns."""
-    graph = sp.triu(node_graph(cells, len(number))[number >= 0][:, number >= 0], format="csr")
+    graph = sp.triu(build_node_graph(cells, len(number))[number >= 0][:, number >= 0], format="csr")
     graph.sort_indices()
     rows = np.repeat(slots, np.diff(indptr))
     blocks = graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
     return blocks, _places(rows, slots[indices], *blocks)
 
 
-def _ends(cells: NDArray, nodes: int) -> NDArray[np.int64]:
+def _find_ends(cells: NDArray, nodes: int) -> NDArray[np.int64]:
     """The two corners (n, 2) between which each node lies: a corner between itself and itself."""
     ends = np.stack([np.arange(nodes)] * 2, axis=1)
     ends[cells[:, 4:].ravel()] = cells[:, TET10_EDGES].reshape(-1, 2)

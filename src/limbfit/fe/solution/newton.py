@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ..kernel.laws import Laws
 from ..system import Evaluation, Increment, System
-from .direction import newton_direction
+from .direction import find_newton_direction
 from .factor import Factor
 from .linear import NotPositiveDefiniteError
 
@@ -85,13 +85,13 @@ def equilibrate(
     residual is judged, ``deep`` (mm) the penetration from which a guess is doubted.
     """
     evaluate = _Evaluator(system, laws, increment, seconds)
-    u, here = _lowest(evaluate, guesses, deep)
+    u, here = _select_lowest(evaluate, guesses, deep)
     if not np.isfinite(here.energy):
         return Equilibrium(u, here, 0, "an element is inverted at the start of the step")
     last, damping, damped, first = np.inf, control.damping, False, np.inf
     for iteration in range(control.max_iterations):
-        norm = residual_norm(system, here)
-        scale = reaction_scale(system, here, floor)
+        norm = compute_residual_norm(system, here)
+        scale = compute_reaction_scale(system, here, floor)
         share = norm / max(scale, TINY)
         first = first if iteration else share
         rounding = norm > 0.3 * last and norm <= 1e-9 * scale  # no further digits to be had
@@ -106,7 +106,7 @@ def equilibrate(
         sufficient = 0.3 * tolerance * scale / norm
         forcing = min(0.02, max(0.1 * norm / scale, sufficient))
         try:
-            direction = newton_direction(system, here, factor, forcing, damping)
+            direction = find_newton_direction(system, here, factor, forcing, damping)
         except NotPositiveDefiniteError:
             return Equilibrium(u, here, iteration, "the tangent cannot be factorised")
         last = norm
@@ -116,17 +116,17 @@ def equilibrate(
             direction = system.bodies.trusted_share(direction) * direction
         evaluate.foresee(u, direction)
         going_on = control.tangent or forcing > sufficient
-        found = _line_search(evaluate, u, here, direction, control.max_backtracks, going_on)
+        found = _search_along_line(evaluate, u, here, direction, control.max_backtracks, going_on)
         if found is None:
             if norm <= LOOSE * control.tolerance * scale:
                 return Equilibrium(u, here, iteration, damped=damped, residual=share, first=first)
             return Equilibrium(u, here, iteration, "the line search found no lower energy")
         u, here, step = found
-        damping, damped = _damped(damping, step), damped or step < SHORT_STEP
+        damping, damped = _update_damping(damping, step), damped or step < SHORT_STEP
     return Equilibrium(u, here, control.max_iterations, "Newton's method did not converge")
 
 
-def _damped(damping: float, step: float) -> float:
+def _update_damping(damping: float, step: float) -> float:
     """The damping after a step of this length."""
     if step < SHORT_STEP:
         return max(DAMPING_CHANGE * damping, FIRST_DAMPING)
@@ -135,7 +135,7 @@ def _damped(damping: float, step: float) -> float:
     return damping if damping >= LEAST_DAMPING else 0.0
 
 
-def _lowest(evaluate: _Evaluator, guesses: Sequence[Array], deep: float) -> tuple[Array, Evaluation]:
+def _select_lowest(evaluate: _Evaluator, guesses: Sequence[Array], deep: float) -> tuple[Array, Evaluation]:
     """The first guess; the one of lowest energy where the first runs deep into the indenter."""
     u, at = guesses[0], evaluate(guesses[0])
     if at.penetration > deep or not np.isfinite(at.energy):
@@ -146,12 +146,12 @@ def _lowest(evaluate: _Evaluator, guesses: Sequence[Array], deep: float) -> tupl
     return u, at
 
 
-def residual_norm(system: System, at: Evaluation) -> float:
+def compute_residual_norm(system: System, at: Evaluation) -> float:
     """Norm of the out-of-balance force, N."""
     return float(np.linalg.norm(at.residual.ravel()[system.free]))
 
 
-def reaction_scale(system: System, at: Evaluation, floor: float) -> float:
+def compute_reaction_scale(system: System, at: Evaluation, floor: float) -> float:
     """The force against which a residual is judged: contact or support reactions, at least ``floor``, N."""
     held = system.supported[: system.nodes]
     supports = float(np.linalg.norm(np.where(held, at.residual[: system.nodes], 0.0)))
@@ -182,7 +182,7 @@ class _Evaluator:
         return at
 
 
-def _line_search(
+def _search_along_line(
     evaluate: _Evaluator, u: Array, here: Evaluation, direction: Array, max_backtracks: int, going_on: bool
 ) -> tuple[Array, Evaluation, float] | None:
     """Backtrack until the energy falls (Armijo), or nearly so where the slope does (Hager and Zhang 2005).
@@ -203,12 +203,12 @@ def _line_search(
         rise = there.energy - here.energy
         end = float((there.residual * direction).sum())
         if rise <= 1e-4 * step * slope or (rise <= noise and abs(end) <= 0.9 * abs(slope)):
-            return _expanded(evaluate, u, there, direction, step, slope, end)
+            return _expand_step(evaluate, u, there, direction, step, slope, end)
         step *= min(0.6, max(0.1, -slope / max(end - slope, 1e-300))) if end > 0 else 0.5
     return None
 
 
-def _expanded(
+def _expand_step(
     evaluate: _Evaluator, u: Array, there: Evaluation, direction: Array, step: float, slope: float, end: float
 ) -> tuple[Array, Evaluation, float]:
     """A step of a shifted tangent is too short: it is doubled while the energy goes on falling as fast."""

@@ -16,7 +16,7 @@ CUT, CUTS_TO_PATIENCE, PATIENCE = 0.3, 2, 5
 
 
 @dataclass
-class Pace:
+class StepController:
     """How far the next step goes: to the next time wanted, or a part of the way after one that failed.
 
     ``usual`` iterations are allowed for an equilibrium as a rule; ``stride``, s, is the longest step now, and

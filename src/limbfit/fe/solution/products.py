@@ -11,19 +11,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..threads import thread_pool
+from ..threads import get_thread_pool
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 
 
-def symmetric_product(indptr: Index, indices: Index, data: Array, x: Array, threads: int = 1) -> Array:
+def multiply_symmetric(indptr: Index, indices: Index, data: Array, x: Array, threads: int = 1) -> Array:
     """``A x`` (n, r) of a symmetric matrix given by its upper triangle."""
     n, columns = x.shape
     if columns > 1 and columns % 8 == 1:  # the last one alone: cheaper than seven or more of padding
-        parts = (symmetric_product(indptr, indices, data, part, threads) for part in (x[:, :-1], x[:, -1:]))
+        parts = (multiply_symmetric(indptr, indices, data, part, threads) for part in (x[:, :-1], x[:, -1:]))
         return np.hstack(list(parts))
-    width = _width(columns)
+    width = _choose_width(columns)
     padded = np.ascontiguousarray(x) if width == columns else np.zeros((n, width))
     if width > columns:
         padded[:, :columns] = x
@@ -38,11 +38,11 @@ def symmetric_product(indptr: Index, indices: Index, data: Array, x: Array, thre
         y = product((0, n))
     else:
         ends = np.searchsorted(indptr, np.linspace(0, len(data), threads + 1)).astype(int)
-        y = np.asarray(sum(thread_pool(threads).map(product, list(pairwise(ends)))))
+        y = np.asarray(sum(get_thread_pool(threads).map(product, list(pairwise(ends)))))
     return np.ascontiguousarray(y[:, :columns])
 
 
-def _width(columns: int) -> int:
+def _choose_width(columns: int) -> int:
     """Columns with padding, where that pays: eight are written out, LLVM vectorises loops over 16."""
     if columns <= 3:
         return columns

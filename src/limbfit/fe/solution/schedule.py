@@ -30,11 +30,12 @@ AT_REST = 0.05  # of the deepest: an indenter that comes from there hardly touch
 PLACES, SHORT_OF_END, FORESIGHT = 4, 0.9, 1.1
 
 
-def graded(history: History, load_steps: int, unload_steps: int) -> Array:
+def grade_steps(history: History, load_steps: int, unload_steps: int) -> Array:
     """Times (k,) s of the steps, the end of every phase and every turn across the axis among them.
 
     Phases of one kind in a row share the number of steps by their lengths, but have no fewer than half of it;
-    a hold has as many as unloading.  One of those is left for the end of contact (see `foresee`).
+    a hold has as many as unloading.  One of those is left for the end of contact
+    (see `predict_remaining_times`).
     """
     budget = {"load": load_steps, "unload": unload_steps - 1, "hold": unload_steps}
     budget["approach"] = 2
@@ -50,17 +51,17 @@ def graded(history: History, load_steps: int, unload_steps: int) -> Array:
             power = FROM_REST if fresh else AFTER_TURN
             part = (np.arange(1, count + 1) / count) ** power
             times.append(phase.start_s + phase.duration_s * part)
-    return with_turns(np.concatenate(times), history.turns)
+    return insert_turning_points(np.concatenate(times), history.turns)
 
 
-def with_turns(times: Array, turns: Array) -> Array:
+def insert_turning_points(times: Array, turns: Array) -> Array:
     """The times and those of the ``turns (k,)`` that are not among them, up to the last time."""
     inside = turns[turns < times[-1]]
     apart = np.abs(times[:, None] - inside).min(axis=0) > 1e-9 * times[-1]
     return np.union1d(times, inside[apart])
 
 
-def foresee(
+def predict_remaining_times(
     history: History, planned: Array, left: Sequence[float], times: Sequence[float], forces: Sequence[float]
 ) -> list[float]:
     """The times still to be reached, s: those ``left`` of the ``planned``, given the ``forces`` at ``times``.
@@ -71,7 +72,7 @@ def foresee(
     targets, now = list(left), times[-1]
     if history.forced:  # contact ends where the force is stated to
         return targets
-    phase = _at(history, now, targets[0]) if targets else None
+    phase = _find_phase(history, now, targets[0]) if targets else None
     if phase is None or phase.kind != "unload":
         return targets
     if forces[-1] <= 0.0 and now > phase.start_s:
@@ -93,7 +94,7 @@ def _count(phase: MotionPhase, times: Array) -> int:
     return int(((times > phase.start_s + little) & (times <= phase.end_s + little)).sum())
 
 
-def _at(history: History, now: float, target: float) -> MotionPhase | None:
+def _find_phase(history: History, now: float, target: float) -> MotionPhase | None:
     """The phase of the step from ``now`` to ``target``."""
     middle = 0.5 * (now + target)
     return next((phase for phase in history.phases if phase.start_s <= middle <= phase.end_s), None)

@@ -133,7 +133,7 @@ def solve_with_adjoint(
     product of two errors (Pierce and Giles 2000).  Columns that are sums of others are not solved for: under
     a stated displacement nothing moves where all moduli grow alike.
     """
-    kept, weights = independent(b)
+    kept, weights = find_independent_columns(b)
     right = np.column_stack([b[:, kept], advance])
     found = solve_at(at, factor, right, np.column_stack([guess[:, kept], np.zeros(len(b))]), TOLERANCE)
     x, adjoint = found[:, :-1] @ weights, found[:, -1:].copy()
@@ -141,7 +141,7 @@ def solve_with_adjoint(
     return x, adjoint[:, 0] @ b + missed @ x
 
 
-def independent(b: Array) -> tuple[list[int], Array]:
+def find_independent_columns(b: Array) -> tuple[list[int], Array]:
     """Columns of ``b (n, p)`` of which the others are sums within `TOLERANCE`, and the weights (k, p)."""
     size = np.linalg.norm(b, axis=0)
     unit = b / np.where(size > 0.0, size, 1.0)

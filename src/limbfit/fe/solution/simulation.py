@@ -10,27 +10,33 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contact.grip import Grip
-from ..history import Memory, elastic_stresses
+from ..contact.grip import StickyContact
+from ..history import Memory, compute_elastic_stresses
 from ..kernel.laws import Laws
 from ..motion import Drives
 from ..problem import Problem
 from ..result import Result, State, Step
 from ..system import Evaluation, Increment, System
 from ..takeover import Takeover
-from ..threads import single_threaded_numpy
-from .beginning import begun, elastic_residual, grips_of, system_of, travel
-from .control import StepControl, schedule
-from .coupling import Coupling, couple, renewed, solve_coupled
-from .direction import renew
+from ..threads import limit_numpy_threads
+from .beginning import (
+    build_grips,
+    build_system,
+    compute_elastic_residual,
+    measure_indenter_travel,
+    start_grips,
+)
+from .control import StepControl, schedule_steps
+from .coupling import Coupling, couple, renew_increment, solve_coupled
+from .direction import refactor_at
 from .factor import Factor
-from .guesses import Warm, extrapolation
-from .linear import factors_are_dear
-from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, equilibrate, reaction_scale
-from .pace import Pace
-from .schedule import foresee
+from .guesses import WarmStart, compute_extrapolation
+from .linear import prefers_multigrid
+from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, compute_reaction_scale, equilibrate
+from .pace import StepController
+from .schedule import predict_remaining_times
 from .sensitivity import Explicit, MemoryDerivative
-from .springs import touched
+from .springs import find_touched_unknowns
 from .touchdown import IndenterStart
 
 Array = NDArray[np.float64]
@@ -70,16 +76,16 @@ class SteppedRun:
     ) -> None:
         started = time.perf_counter()
         self.problem, self.control = problem, control
-        self.system = system_of(problem, warm_start, system, control.threads)
+        self.system = build_system(problem, warm_start, system, control.threads)
         self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
         self.seconds: defaultdict[str, float] = defaultdict(float)
-        moduli, threads, last = self.laws.moduli, control.threads, touched(self.system, problem)
-        self.planned = schedule(problem.history, control, problem.turns)
+        moduli, threads, last = self.laws.moduli, control.threads, find_touched_unknowns(self.system, problem)
+        self.planned = schedule_steps(problem.history, control, problem.turns)
         self.factor = Factor(
             self.system, moduli, control.linear_solver, threads, last=last, steps=len(self.planned)
         )
         # Multigrid is for one right-hand side: sensitivities have many, and want them exactly.
-        apart = sensitivities and not self.factor.lasting and not factors_are_dear()
+        apart = sensitivities and not self.factor.lasting and not prefers_multigrid()
         self.slopes = self.factor
         if apart:
             self.slopes = Factor(self.system, moduli, threads=threads, lasting=True, last=last)
@@ -87,13 +93,13 @@ class SteppedRun:
         self.memory = Memory.rest(self.system, self.laws)
         self.slope = MemoryDerivative.rest(self.system, self.laws) if sensitivities else None
         self.damping = 0.0  # to begin a step with, after one that needed it
-        self.grips = grips_of(self.system, self.laws.count if sensitivities else 0)
-        self.warm = Warm.of(problem, warm_start)
+        self.grips = build_grips(self.system, self.laws.count if sensitivities else 0)
+        self.warm = WarmStart.of(problem, warm_start)
         widths = [body.shape.width for body in problem.rigid_bodies]
         width = min(widths, default=1.0)
         self.floor, self.pushing = NOTHING * self.laws.modulus * width**2, False
         self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
-        self.deepest = control.penetration * travel(self.system, self.laws.modulus)
+        self.deepest = control.penetration * measure_indenter_travel(self.system, self.laws.modulus)
         self.touch = IndenterStart.of(problem)
         rest, drives = np.zeros((self.system.rows, 3)), self.touch.drives(problem.drives(0.0))
         if self.system.bodies is not None:
@@ -102,12 +108,12 @@ class SteppedRun:
         self.rest = self._coordinates(rest, drives)
         self.rested: Array | None = None  # the same where pre-strained tissue is in equilibrium
         start = problem.history.displacement_at(0.0)
-        self.grips = begun(self.system, self.grips, rest, drives)
+        self.grips = start_grips(self.system, self.grips, rest, drives)
         self.states = [self._state(0.0, start, rest, self.stiffness, still, None, drives, self.grips)]
         self.takeover = None
         if still is not None:
             self.takeover = Takeover.never(problem.rigid_bodies, still[self.system.nodes :])
-        self.reason, self.pace = "", Pace(control.max_iterations)
+        self.reason, self.pace = "", StepController(control.max_iterations)
         self.unbalanced: list[tuple[float, float]] = []  # mm and residual of steps beyond the tolerance
         self.unsettled: list[tuple[float, float]] = []  # the same of steps whose grip goes on changing
         self.seconds["setup"] = time.perf_counter() - started
@@ -129,7 +135,7 @@ class SteppedRun:
                 return
             t = pace.next_time(now, targets[0])
             before = self.counts["newton_iterations"]
-            with single_threaded_numpy():
+            with limit_numpy_threads():
                 found = self._attempt(t, pace.patience)
             if isinstance(found, str):
                 self.counts["cuts"] += 1
@@ -144,7 +150,9 @@ class SteppedRun:
             if t == targets[0]:
                 targets = targets[1:]
                 if self.control.times is None:
-                    targets = foresee(self.problem.history, self.planned, targets, times, forces)
+                    targets = predict_remaining_times(
+                        self.problem.history, self.planned, targets, times, forces
+                    )
             yield found
 
     def _take_over(self, step: Step) -> None:
@@ -157,9 +165,9 @@ class SteppedRun:
 
     def _rested(self) -> bool:
         """Whether pre-strained tissue is brought to the equilibrium that it has had long since."""
-        strained = elastic_residual(self.system, self.laws, self.states[0])
+        strained = compute_elastic_residual(self.system, self.laws, self.states[0])
         self.floor = max(self.floor, 1e-2 * strained)  # it may be left without any stress
-        with single_threaded_numpy():
+        with limit_numpy_threads():
             found = self._attempt(0.0, self.control.max_iterations, LONG_SINCE)
         if isinstance(found, str):
             self.reason = f"the pre-strained tissue found no equilibrium: {found}"
@@ -222,7 +230,7 @@ class SteppedRun:
                     self.counts["newton_iterations"] += spent
                     return settled
                 self.counts["vain_iterations"] += spent
-            again = renewed(self.system, increment, found.u)
+            again = renew_increment(self.system, increment, found.u)
             if again is increment:
                 return found, increment
             increment = again
@@ -277,7 +285,7 @@ class SteppedRun:
         turned = max((turn for turn in self.problem.turns if turn < t - little), default=-np.inf)
         known = [state for state in self.states if state.time >= turned - little] or self.states[-1:]
         weights = np.zeros(len(self.states))
-        weights[-len(known) :] = extrapolation([travel(state.time) for state in known], travel(t))
+        weights[-len(known) :] = compute_extrapolation([travel(state.time) for state in known], travel(t))
         return weights
 
     def _accept(self, found: Equilibrium, increment: Increment, dt: float, stiffness: float) -> Step:
@@ -289,11 +297,11 @@ class SteppedRun:
             at = self.system.evaluate(u, self.laws, replace(increment, flat_from=np.inf))
             found = replace(found, at=at)
         if worn:
-            renew(at, self.slopes)
+            refactor_at(at, self.slopes)
         self.slopes.next_step()
         du = force_slope = None
         if self.slope is None:
-            stress = elastic_stresses(self.system, self.laws, u)
+            stress = compute_elastic_stresses(self.system, self.laws, u)
         else:
             explicit = self.slope.explicit(self.system, self.laws, self.memory, increment, u, dt)
             stress = explicit.stress
@@ -307,7 +315,7 @@ class SteppedRun:
         self.grips = tuple(g and g.after(tool, d) for g, tool, d in zip(increment.grips, tools, apart))
         self.memory, self.stiffness = after, stiffness
         self.damping = FIRST_DAMPING if found.damped else 0.0
-        self.floor = max(self.floor, 1e-2 * reaction_scale(self.system, at, 0.0))
+        self.floor = max(self.floor, 1e-2 * compute_reaction_scale(self.system, at, 0.0))
         coordinates, deepening = self._coordinates(u, increment.drives), None
         displacement = increment.displacement
         if self.problem.history.forced:
@@ -338,7 +346,7 @@ class SteppedRun:
 
     def _state(
         self, time: float, displacement: float, u: Array, stiffness: float, du: Array | None,
-        memory: Memory | None, drives: Drives, holding: Sequence[Grip | None],
+        memory: Memory | None, drives: Drives, holding: Sequence[StickyContact | None],
     ) -> State:  # fmt: skip
         n = self.system.nodes
         slopes = (None, None) if du is None else (du[:n], du[n:])

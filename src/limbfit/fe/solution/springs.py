@@ -29,7 +29,7 @@ MOST_COLUMNS = 500
 MOST_LAST = 1.5
 
 
-def touched(system: System, problem: Problem) -> Index:
+def find_touched_unknowns(system: System, problem: Problem) -> Index:
     """Unknowns where bodies will touch, for the factor to eliminate last; none where they are too many."""
     if system.bodies is None:
         return NONE

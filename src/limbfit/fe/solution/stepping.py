@@ -16,8 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import ProblemError
-from ..doubts import Doubt, folded, inexact, slipped, sunk, unbalanced, unsettled
-from ..observables import element_fields
+from ..doubts import (
+    SimulationWarning,
+    find_inexact_sensitivities,
+    find_inverted_elements,
+    find_penetration,
+    find_slip,
+    find_unbalanced_steps,
+    find_unconverged_friction,
+)
+from ..observables import compute_element_fields
 from ..problem import Problem
 from ..result import Result, State, Step
 from ..snapshot import Checkpoints, Snapshot
@@ -90,7 +98,7 @@ def solve(
     run = SteppedRun(problem, steps, sensitivities, warm_start, system)
     rows: list[Step] = []
     if begin is not None:
-        rows = _resumed(run, begin)
+        rows = _resume_run(run, begin)
         started -= begin["seconds"]
     kept: list[State] = []
     deepest_state: State | None = None
@@ -109,13 +117,15 @@ def solve(
         if on_step is not None:
             on_step(step)
         if checkpoints is not None and checkpoints.at(step.time):
-            checkpoints.keep(_snapshot(run, rows, time.perf_counter() - started))
+            checkpoints.keep(_take_snapshot(run, rows, time.perf_counter() - started))
             for factor in {id(one): one for one in (run.factor, run.slopes)}.values():
                 factor.begin_anew()  # as that of a run that begins here does
-    return _result(problem, run, rows, kept, deepest_state, sensitivities, time.perf_counter() - started)
+    return _build_result(
+        problem, run, rows, kept, deepest_state, sensitivities, time.perf_counter() - started
+    )
 
 
-def _snapshot(run: SteppedRun, rows: list[Step], seconds: float) -> Snapshot:
+def _take_snapshot(run: SteppedRun, rows: list[Step], seconds: float) -> Snapshot:
     """All that the further steps of a run, and its result, depend on."""
     columns = {name: [getattr(row, name) for row in rows] for name in _COLUMNS}
     return Snapshot.of(
@@ -131,7 +141,7 @@ def _snapshot(run: SteppedRun, rows: list[Step], seconds: float) -> Snapshot:
     )
 
 
-def _resumed(run: SteppedRun, begin: Snapshot) -> list[Step]:
+def _resume_run(run: SteppedRun, begin: Snapshot) -> list[Step]:
     """Put a run where another was; the steps up to there, without their states."""
     first = run.states[0]
     values = zip(run.problem.bodies, begin["driven"], strict=True)
@@ -168,7 +178,7 @@ class FirstStep:
     coordinates: Array
 
 
-def onset(problem: Problem, steps: StepControl = StepControl()) -> FirstStep:
+def solve_until_onset(problem: Problem, steps: StepControl = StepControl()) -> FirstStep:
     """Solve a problem until its indenter, which may wait for tissue that moves before, begins.
 
     Raises
@@ -190,7 +200,7 @@ def onset(problem: Problem, steps: StepControl = StepControl()) -> FirstStep:
     )
 
 
-def _result(
+def _build_result(
     problem: Problem,
     run: SteppedRun,
     rows: list[Step],
@@ -210,7 +220,7 @@ def _result(
             deepening = np.array([nothing, *(row.displacement_sensitivity for row in rows)])
     displacement, force = column("displacement", problem.history.displacement_at(0.0)), column("force")
     penetration, bodies = column("penetration"), len(problem.rigid_bodies)
-    doubts = _doubts(run, deepest, displacement, force, penetration)
+    doubts = _collect_warnings(run, deepest, displacement, force, penetration)
     return Result(
         problem=run.problem,
         times=column("time"),
@@ -227,36 +237,40 @@ def _result(
         completed=not run.reason,
         reason=run.reason,
         doubts=doubts,
-        statistics=_statistics(run, seconds, int((penetration > run.deepest).sum())),
+        statistics=_collect_statistics(run, seconds, int((penetration > run.deepest).sum())),
         system=run.system,
     )
 
 
-def _doubts(
+def _collect_warnings(
     run: SteppedRun, deepest: State | None, displacement: Array, force: Array, penetration: Array
-) -> tuple[Doubt, ...]:
+) -> tuple[SimulationWarning, ...]:
     """What is doubtful about the steps of a run, of which ``deepest`` is the one farthest in."""
-    folds: tuple[Doubt, ...] = ()
+    folds: tuple[SimulationWarning, ...] = ()
     if deepest is not None:
-        folds = folded(
-            run.problem.mesh, deepest.u, partial(_energies, run, deepest), deepest.displacement, displacement
+        folds = find_inverted_elements(
+            run.problem.mesh,
+            deepest.u,
+            partial(_compute_energies, run, deepest),
+            deepest.displacement,
+            displacement,
         )
     return (
         *folds,
-        *slipped(displacement, force),
-        *sunk(displacement, penetration, run.deepest, run.stiffness),
-        *unbalanced(displacement, run.unbalanced, run.control.tolerance),
-        *unsettled(displacement, run.unsettled),
-        *inexact(displacement, run.slopes.counts["inexact"]),
+        *find_slip(displacement, force),
+        *find_penetration(displacement, penetration, run.deepest, run.stiffness),
+        *find_unbalanced_steps(displacement, run.unbalanced, run.control.tolerance),
+        *find_unconverged_friction(displacement, run.unsettled),
+        *find_inexact_sensitivities(displacement, run.slopes.counts["inexact"]),
     )
 
 
-def _energies(run: SteppedRun, state: State) -> Array:
+def _compute_energies(run: SteppedRun, state: State) -> Array:
     """Long-term elastic strain energy (m,) of the elements, N mm."""
-    return element_fields(run.system, run.laws, state).energy * run.system.weights.sum(axis=1)
+    return compute_element_fields(run.system, run.laws, state).energy * run.system.weights.sum(axis=1)
 
 
-def _statistics(run: SteppedRun, seconds: float, sunk_steps: int) -> dict[str, Any]:
+def _collect_statistics(run: SteppedRun, seconds: float, sunk_steps: int) -> dict[str, Any]:
     used = [run.factor, *([run.slopes] if run.slopes is not run.factor else [])]
     parts = dict(run.seconds)
     for factor in used:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contact.contact import touching_offset
+from ..contact.contact import find_touching_offset
 from ..motion import Drives
 from ..problem import Problem
 from ..system import Evaluation, System
@@ -49,7 +49,7 @@ class IndenterStart:
         assert system.bodies is not None
         body = system.bodies.first
         surface = replace(body.surface, points=body.surface.points + u[: system.nodes])
-        offset = touching_offset(surface, body.start)
+        offset = find_touching_offset(surface, body.start)
         if du is None:
             return IndenterStart(False, offset)
         moved = IndenterStart(False, offset).drives(drives)

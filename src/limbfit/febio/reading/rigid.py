@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ...arrays import Array, Indices
 from ...errors import ProblemError
 from ...fe import ELEMENTS, Motion
-from ...fe.kernel.elements import reference_gradients
+from ...fe.kernel.elements import compute_reference_gradients
 from .controls import ControlPhase, compute_step_times
 from .curves import LoadCurve
 from .geometry import Geometry, Part, collect_nodes, find_node_set, split_into_triangles
@@ -50,7 +50,7 @@ def _lump_mass(points: Array, part: Part) -> tuple[Array, Array]:
     """Return a part as masses (k,) at places (k, 3)."""
     if part.cell_type in ELEMENTS:
         element = ELEMENTS[part.cell_type]
-        _, volumes = reference_gradients(element, points, part.cells)
+        _, volumes = compute_reference_gradients(element, points, part.cells)
         values, _ = element.shape(element.points)
         return np.abs(volumes).ravel(), np.einsum("qk,mki->mqi", values, points[part.cells]).reshape(-1, 3)
     if part.cell_type == "penta6":

@@ -19,8 +19,8 @@ from ...errors import InputError, RunError
 from ...fe import History, Material, Problem, StepControl, Support, System, iterate
 from ...fe.kernel.laws import Laws
 from ...fe.materials import PronyTerms
-from ...fe.observables import element_fields
-from ...indentation import materials
+from ...fe.observables import compute_element_fields
+from ...indentation import build_materials
 from ...laws import KPA, LAWS, OGDEN
 from ...mesh import Mesh
 from ...mesh.boxes import HEX, build_boxes
@@ -136,7 +136,7 @@ def run_cube(context: Context, folder: Path, *, compression_percent: float) -> d
 
 
 def _specimens(parameters: dict[str, dict[str, float]], kappa_ratio: float, law: str) -> list[Specimen]:
-    own = materials(parameters, kappa_ratio, law)
+    own = build_materials(parameters, kappa_ratio, law)
     found = []
     for i, (tissue, values) in enumerate(parameters.items()):
         words = ", ".join(f"{p.key} = {values[p.key]:.4g} {p.unit}".rstrip() for p in LAWS[law].parameters)
@@ -207,7 +207,7 @@ def compress(material: Material, times: Array, compression_percent: float) -> tu
     system, laws = System(problem), Laws.build([material])
     found: dict[float, tuple[float, float]] = {}
     for step in iterate(problem, StepControl(times=tuple(times), tolerance=1e-7)):
-        fields = element_fields(system, laws, step.state)
+        fields = compute_element_fields(system, laws, step.state)
         found[step.time] = (-float(fields.cauchy[0, 2]), float(fields.J[0]))
     missing = [t for t in times if t not in found]
     if missing:

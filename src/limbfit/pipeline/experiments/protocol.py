@@ -31,9 +31,9 @@ from ...indentation import (
     Parameters,
     Simulation,
     SimulationJob,
-    layers_under,
-    skin_beside,
-    waves_under,
+    find_layers_under,
+    find_nearby_skin_points,
+    place_waves_under,
 )
 from ...mesh import read_vtu
 from ...study import Site, Study
@@ -198,11 +198,11 @@ def _planned(
         for name in study.all_indenters:
             model = site_model(context, _with_tool(site, name), (0.0, 1.0), (0.0, max(wanted)), searched=True)
             if noises.layers is not None:
-                model = replace(model, layers=layers_under(model))
+                model = replace(model, layers=find_layers_under(model))
             if noises.skin is not None:
-                model = replace(model, skin_points=skin_beside(model))
+                model = replace(model, skin_points=find_nearby_skin_points(model))
             if noises.waves is not None:
-                model = replace(model, waves=waves_under(model, read_vtu(model.mesh)))
+                model = replace(model, waves=place_waves_under(model, read_vtu(model.mesh)))
             thickness = measure_tissue_under(anatomy, model.position, model.axis, model.indenter.width_mm)
             most = DEEPEST_SHARE * thickness
             if most < max(wanted):

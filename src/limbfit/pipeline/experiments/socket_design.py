@@ -23,7 +23,7 @@ from ...donning.relief import Relief, Trial
 from ...errors import RunError, SurfaceError
 from ...fe import Step
 from ...fe.materials import Material
-from ...indentation import Parameters, fibre_field
+from ...indentation import Parameters, build_fibre_field
 from ...mesh import Mesh, write_vtu
 from ...socket import Recipe, Socket, rectify_limb
 from ...socket.offsets import compute_offsets
@@ -196,7 +196,7 @@ class _Bench:
         middles = self.mesh.points[faces[:, :3]].mean(axis=1)
         pressure = target.at(middles, self.limb.anatomy, self.limb.regions, self.plain)
         problem = pressed_problem(self.mesh, self.laws, pressure, table.donning_s, table.hold_s)
-        problem = replace(problem, fibres=fibre_field(self.limb.fibres, self.mesh))
+        problem = replace(problem, fibres=build_fibre_field(self.limb.fibres, self.mesh))
         end = problem.history.times[-1]
 
         def on_step(step: Step) -> None:

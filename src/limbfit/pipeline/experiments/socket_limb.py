@@ -31,9 +31,9 @@ from ...donning import (
 from ...donning.model import OUTER
 from ...errors import RunError
 from ...execution import Executor, SerialExecutor, report_progress
-from ...fe import Doubt
+from ...fe import SimulationWarning
 from ...fe.materials import Material
-from ...indentation import Direction, Parameters, fibre_field, materials
+from ...indentation import Direction, Parameters, build_fibre_field, build_materials
 from ...mesh import Mesh, read_vtu
 from ...socket import Socket
 from ...socket.landmarks import find_directions, load_point
@@ -88,8 +88,8 @@ class SocketLimb:
     def materials(self, parameters: Parameters) -> dict[str, Material]:
         """Of the tissues and the liner."""
         kappa, liner = self.study.material.kappa_ratio, self.study.socket.liner
-        laws = materials(parameters, kappa, self.study.material.law, dict(self.fibres))
-        return laws | materials({LINER: liner.parameters}, kappa) if liner.thickness_mm else laws
+        laws = build_materials(parameters, kappa, self.study.material.law, dict(self.fibres))
+        return laws | build_materials({LINER: liner.parameters}, kappa) if liner.thickness_mm else laws
 
     def mesh(self, context: Context, name: str, folder: Path, brim: Socket) -> tuple[Mesh, dict[str, Any]]:
         """The whole limb's mesh and its facts; that of an interrupted run is kept."""
@@ -182,7 +182,9 @@ class SocketLimb:
             words = f"{row.time:.2f} of {end:g} s: {force:.0f} N, {row.whole.peak_kPa:.0f} kPa at most"
             told(row.time, end, words)
 
-        problem = replace(socket_problem(mesh, laws, socket, fit), fibres=fibre_field(self.fibres, mesh))
+        problem = replace(
+            socket_problem(mesh, laws, socket, fit), fibres=build_fibre_field(self.fibres, mesh)
+        )
         before = None if begun is None else begun.latest()
         found = don(
             problem,
@@ -306,7 +308,7 @@ def worn(job: Wearing) -> Made:
     return made
 
 
-def warning(doubt: Doubt) -> str:
+def warning(doubt: SimulationWarning) -> str:
     """A doubt about a simulation in the words of a socket: that of folded elements names an indenter."""
     if doubt.kind != "folded":
         return doubt.text

@@ -10,8 +10,8 @@ import numpy as np
 from ...arrays import Array
 from ...fe import Result, solve
 from ...fe.kernel.laws import Laws
-from ...fe.observables import element_fields
-from ...indentation import Simulation, SimulationJob, SiteModel, build_problem, steps_of, to_parameters
+from ...fe.observables import compute_element_fields
+from ...indentation import Simulation, SimulationJob, SiteModel, build_problem, build_steps, to_parameters
 from ...mesh import read_vtu
 from ..shared.simulations import SimulationCache
 
@@ -34,7 +34,7 @@ def simulate_with_volumes(job: SimulationJob) -> Simulation:
     model = job.model
     parameters = to_parameters(job.parameters, job.tissues, job.model.law)
     problem = build_problem(model, read_vtu(model.mesh), parameters)
-    result = solve(problem, steps=steps_of(model), store="peak")
+    result = solve(problem, steps=build_steps(model), store="peak")
     return Simulation(
         site=model.name,
         force_N=result.force_at(np.array(job.times_s) + model.waits_s),
@@ -52,7 +52,7 @@ def _volume(result: Result, model: SiteModel) -> dict[str, Any]:
         return dict(NO_VOLUME)
     problem = result.problem
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    J = element_fields(result.system, laws, result.states[-1]).J
+    J = compute_element_fields(result.system, laws, result.states[-1]).J
     centres = problem.mesh.points[problem.mesh.corners].mean(axis=1)
     near = np.linalg.norm(centres - np.array(model.position), axis=1) < model.indenter.width_mm
     return volume_facts(J[near], result.system.weights.sum(axis=1)[near])

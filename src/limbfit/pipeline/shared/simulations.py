@@ -15,17 +15,17 @@ from ...arrays import Array
 from ...errors import ProblemError, TraceError
 from ...execution import Executor
 from ...extensions import extensions_digest
-from ...fe import Doubt
+from ...fe import SimulationWarning
 from ...indentation import (
     Direction,
     Simulation,
     SimulationJob,
     SiteModel,
     WavePlace,
-    clamping_pins,
+    build_clamping_pins,
+    place_waves_under,
     read_indenter,
     simulate,
-    waves_under,
 )
 from ...mesh import read_vtu
 from ...study import Indentation, Record, Site, Study, Vector
@@ -130,7 +130,7 @@ def _load(file: Path) -> Simulation:
     with np.load(file, allow_pickle=False) as stored:
         facts: dict[str, Any] = json.loads(str(stored["facts"]))
         jacobian = stored.get("jacobian")
-        doubts = tuple(Doubt(**one) for one in facts.pop("doubts"))
+        doubts = tuple(SimulationWarning(**one) for one in facts.pop("doubts"))
         return Simulation(
             force_N=stored["force_N"],
             jacobian=jacobian,
@@ -263,7 +263,7 @@ def pins_met(
         return 0
     indenter = read_indenter(study.indenter_of(one), *place, None)
     try:
-        return len(clamping_pins(*skin, indenter, np.array(along), study.clamps))
+        return len(build_clamping_pins(*skin, indenter, np.array(along), study.clamps))
     except ProblemError as error:
         what = f"site {one.name}: {error.what}"
         raise ProblemError(what, file=study.file, place="clamps", remedy=error.remedy) from None
@@ -295,7 +295,7 @@ def _wave_places(
     assert record.shear_waves is not None
     mesh = read_vtu(context.store["mesh"] / f"{record.site.name}.vtu")
     try:
-        return waves_under(model, mesh, [(one["tissue"], one["depth_mm"]) for one in waves])
+        return place_waves_under(model, mesh, [(one["tissue"], one["depth_mm"]) for one in waves])
     except ProblemError as error:
         file = context.study.path(record.shear_waves)
         what = f"site {record.site.name}: {error.what}"

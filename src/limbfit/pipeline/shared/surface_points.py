@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...arrays import Array
 from ...errors import TraceError
-from ...indentation import OFF_SKIN_MM, as_vector, is_under, nearest_points, read_indenter
+from ...indentation import OFF_SKIN_MM, find_nearest_points, is_under, read_indenter, to_vector3
 from ...study import Record, Study, Vector
 from ...traces import SurfaceMotion
 from .artefacts import read_curves, write_curves
@@ -93,7 +93,7 @@ def chosen_points(
             place="x_mm, y_mm, z_mm",
             remedy=_remedy(record),
         )
-    found = nearest_points(*skin, points)
+    found = find_nearest_points(*skin, points)
     reasons = {
         f"farther than {NEAR_MM:g} mm from the site": away > NEAR_MM,
         f"more than {OFF_SKIN_MM:g} mm off the skin": found.off_mm > OFF_SKIN_MM,
@@ -117,8 +117,8 @@ def chosen_points(
     which = usable[_spread(found.points[usable], int(np.argmin(away[usable])))]
     if len(which) < len(usable):
         left_out[f"thinned out, to {MAX_POINTS}"] = len(usable) - len(which)
-    chosen = tuple(as_vector(point) for point in found.points[which])
-    x, y, z = (as_vector(axis) for axis in axes)
+    chosen = tuple(to_vector3(point) for point in found.points[which])
+    x, y, z = (to_vector3(axis) for axis in axes)
     return ChosenPoints(chosen, (x, y, z), which, left_out)
 
 

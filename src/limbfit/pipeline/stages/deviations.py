@@ -19,7 +19,7 @@ from ...arrays import Array
 from ...identify.checks.plausibility import compute_layer_factor
 from ...identify.fit.objective import SiteResponse
 from ...identify.uncertainty.noise import SiteNoise, estimate_record_noise
-from ...indentation import SiteModel, contact_radius
+from ...indentation import SiteModel, compute_contact_radius
 from ...mesh import read_vtu
 from ...study import Study
 from ..shared.context import Context
@@ -84,7 +84,7 @@ def site_deviation(context: Context, record: SiteRecord, response: SiteResponse,
 
 def expected_share(model: SiteModel, surface_mm: float) -> float:
     """Standard deviation of the force at a site over the force itself, where surfaces are off by as much."""
-    radius = contact_radius(model.indenter)
+    radius = compute_contact_radius(model.indenter)
     thickness = bone_distance_mm(model)
     if thickness is None:  # a half-space has no thickness to be wrong
         return LEAST_SHARE

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...fe import Doubt
+from ...fe import SimulationWarning
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.state import Calibration
 from ...indentation import Simulation
@@ -21,7 +21,7 @@ class Doubted:
     evaluation: int
     site: str
     parameters: tuple[float, ...]
-    doubt: Doubt
+    doubt: SimulationWarning
 
 
 def contact_record(

@@ -11,7 +11,7 @@ from ...anatomy.sites.sites import compute_indenter_axis
 from ...anatomy.sites.under import measure_tissue_under
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...identify.checks.plausibility import RecordFacts, RecordWarning, check_plausibility
-from ...indentation import contact_radius
+from ...indentation import compute_contact_radius
 from ...study import Record, Study
 from ..shared.artefacts import read_curves
 from ..shared.context import Context
@@ -58,7 +58,7 @@ def record_flags(
             one,
             records[one.name],
             steps_s[one.name],
-            contact_radius(study.indenter_of(one)),
+            compute_contact_radius(study.indenter_of(one)),
             placed.get(one.site.name),
             anatomy,
         )

@@ -17,7 +17,7 @@ from ...identify.fit.prediction import PredictionModel, compute_error_percent, s
 from ...indentation import (
     Simulation,
     SimulationJob,
-    job_fields,
+    store_job_fields,
 )
 from ...study import Study
 from ..shared.artefacts import write_curves, write_json
@@ -160,7 +160,7 @@ class FieldJob:
 
 
 def store_fields(wanted: FieldJob) -> str:
-    job_fields(wanted.job, wanted.file)
+    store_job_fields(wanted.job, wanted.file)
     return wanted.job.model.name
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
-from ...fe import texts_of
+from ...fe import list_texts
 from ...identify.fit.objective import MeasuredCurve, SiteResponse
 from ...identify.uncertainty.noise import compute_depth_slope
 from ...indentation import Simulation, SimulationJob, SiteModel
@@ -130,7 +130,7 @@ def as_response(simulation: Simulation) -> SiteResponse:
     """A simulation as it is; derivatives (n, 0) where it has none."""
     jacobian = np.zeros((simulation.force_N.size, 0)) if simulation.jacobian is None else simulation.jacobian
     ended = simulation.completed, simulation.reason
-    kinds = texts_of(simulation.doubts, "slipped", "folded")
+    kinds = list_texts(simulation.doubts, "slipped", "folded")
     return SiteResponse(simulation.force_N, jacobian, *ended, simulation.site, simulation.warnings, *kinds)
 
 

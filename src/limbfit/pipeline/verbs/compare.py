@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from ...arrays import Array
 from ...errors import ProblemError
 from ...fe import Problem, Result, System, solve
-from ...fe.solution.control import schedule
+from ...fe.solution.control import schedule_steps
 from ...febio import (
     TIME_TOLERANCE,
     FacePenalties,
@@ -26,7 +26,7 @@ from ...febio import (
     find_febio,
     read_log,
 )
-from ...indentation import Parameters, first_steps
+from ...indentation import Parameters, build_first_steps
 from ...study import Study
 from ..shared.artefacts import write_curves, write_json
 from ..shared.context import Listener, quiet
@@ -83,7 +83,7 @@ def compare_site(
 def solve_as_simulated(found: Indentation, problem: Problem, part: int) -> Result:
     """limbfit's own result, as ``limbfit simulate`` gets it."""
     found.context.tell("compare", part, 3, f"site {found.name}: limbfit")
-    return solve(problem, first_steps(found.model, found.context.study.tissues), store="none")
+    return solve(problem, build_first_steps(found.model, found.context.study.tissues), store="none")
 
 
 def _matched(found: Indentation, problem: Problem, other: Result) -> Result:
@@ -93,7 +93,7 @@ def _matched(found: Indentation, problem: Problem, other: Result) -> Result:
     end = float(problem.history.times[-1])
     times = np.minimum(other.times[1:], end)  # a table has nine digits
     if not len(times):  # FEBio got nowhere: all the way then
-        times = schedule(problem.history, settings.steps)
+        times = schedule_steps(problem.history, settings.steps)
     contact = build_contact(problem, settings)
     penalty = compute_mean_penalty(contact, problem, float(times[0]))
     steps = replace(settings.steps, times=tuple(times), penalty=penalty, penetration=FREE, stress="linear")

@@ -21,7 +21,7 @@ from ..._version import __version__
 from ...errors import InputError, LimbfitError
 from ...execution import THREAD_VARIABLES, ProcessExecutor, count_usable_cores
 from ...fe import OgdenQLV
-from ...fe.solution.linear import SOLVERS, factors_are_dear, linear_solver
+from ...fe.solution.linear import SOLVERS, build_linear_solver, prefers_multigrid
 from ...febio.program import find_febio
 from ...laws import KPA
 from ..experiments.cube import RAMP_S, compress
@@ -106,7 +106,7 @@ def _solvers() -> Iterator[Finding]:
     working = []
     for name in SOLVERS:
         try:
-            solver = linear_solver(*one, name)
+            solver = build_linear_solver(*one, name)
             solver.factorise(np.array([2.0]))
             assert abs(float(np.ravel(solver.solve(np.array([[1.0]])))[0]) - 0.5) < 1e-6
             working.append(name)
@@ -115,7 +115,7 @@ def _solvers() -> Iterator[Finding]:
     if not working:
         yield Finding("sparse solvers", "failed", "none works", "pip install pypardiso, or limbfit[cholmod]")
         return
-    slow = factors_are_dear()
+    slow = prefers_multigrid()
     yield Finding(
         "sparse solvers",
         "warning" if slow else "ok",

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
-from ...bench.blocks import block_model, layered_block
+from ...bench.blocks import build_block_model, build_layered_block
 from ...errors import InputError
 from ...execution import SerialExecutor
 from ...fe import ELEMENTS, Problem
@@ -121,7 +121,7 @@ def _is_forced(one: Planned) -> bool:
 
 def _block(study: Study) -> Mesh:
     """A block in layers of the study's tissues, under a skin, held below."""
-    mesh = layered_block(ELEMENTS[study.mesh.element].cell_type, _DIVISIONS)
+    mesh = build_layered_block(ELEMENTS[study.mesh.element].cell_type, _DIVISIONS)
     middles = mesh.points[mesh.corners].mean(axis=1)[:, 2]
     ranks = np.argsort(np.argsort(-middles, kind="stable"), kind="stable")
     count = len(study.tissues)
@@ -131,7 +131,7 @@ def _block(study: Study) -> Mesh:
 
 def _block_model(study: Study, one: Planned, file: Path) -> SiteModel:
     """An indentation in the middle of that block's top, without pins."""
-    model = block_model(one.name, file, study.solver, study.mesh.element)
+    model = build_block_model(one.name, file, study.solver, study.mesh.element)
     along = (0.0, 0.0, 1.0)
     return replace(
         model,

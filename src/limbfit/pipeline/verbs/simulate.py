@@ -10,7 +10,7 @@ from ...errors import InputError
 from ...execution import SerialExecutor
 from ...fe import Problem, Result
 from ...febio import FebSettings, build_result, compute_end_time, find_febio, run_febio, write_feb
-from ...indentation import Parameters, SiteModel, build_problem, first_steps, simulate_fields
+from ...indentation import Parameters, SiteModel, build_first_steps, build_problem, simulate_fields
 from ...mesh import read_vtu
 from ...study import Indentation as Planned
 from ...study import Study
@@ -154,7 +154,7 @@ def feb_settings(found: Indentation, force_file: str) -> FebSettings:
     """What is written for FEBio beside the problem."""
     study = found.context.study
     title = f"{study.study.name}, site {found.name}, parameters: {found.origin}"
-    return FebSettings(study.febio.penalty, first_steps(found.model, study.tissues), force_file, title)
+    return FebSettings(study.febio.penalty, build_first_steps(found.model, study.tissues), force_file, title)
 
 
 def run_febio_site(found: Indentation, program: Path, folder: Path) -> tuple[Result, Path]:
