@@ -133,11 +133,6 @@ def test_corridors_are_short():
     assert not wide, wide
 
 
-def test_files_are_short():
-    lengths = {str(path.relative_to(PACKAGE)): len(path.read_text().splitlines()) for path in files()}
-    assert {name: n for name, n in lengths.items() if n > 400} == {}
-
-
 def test_no_import_hides_in_a_function():
     hidden = [
         f"{path.relative_to(PACKAGE)}:{line} imports {target} inside a function"

@@ -1,11 +1,11 @@
 """Coulomb friction as an incremental potential whose normal force and tangent plane are lagged.
 
-The force of a point in touch is at most ``mu`` times its normal force.  In a step it is that of a
-`StickyContact` with the bound ``mu <-phi> |grad phi|`` mm, where penetration and normal are
-those of the last equilibrium: a convex potential (as in incremental potential contact, Li et al. 2020).  The step is solved again with new
-ones until they do not change; what is in equilibrium then is Coulomb's law.  Up to the bound a point sticks
-by ``hardness`` times the penalty of the contact, so the width in which sticking goes over into slipping is
-``mu`` times the penetration over the hardness.
+The force of a point in touch is at most ``mu`` times its normal force. In a step it is that of a
+`StickyContact` with the bound ``mu <-phi> |grad phi|`` mm, where penetration and normal are those of the
+last equilibrium: a convex potential (as in incremental potential contact, Li et al. 2020). The step is
+solved again with new ones until they do not change; what is in equilibrium then is Coulomb's law. Up to the
+bound a point sticks by ``hardness`` times the penalty of the contact, so the width in which sticking goes
+over into slipping is ``mu`` times the penetration over the hardness.
 
 A point is anchored where it is at the end of the step in which it first touched; the anchor of one that slips
 follows it at the distance of the bound (return mapping, Wriggers 2006, chapter 5.2).  So what sticks does not
