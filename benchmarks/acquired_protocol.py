@@ -30,8 +30,8 @@ import limbfit
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import to_vector
 from limbfit.pipeline.shared.artefacts import write_curves
-from limbfit.pipeline.shared.context import Context, quiet
-from limbfit.pipeline.shared.simulations import SimulationCache, curve_job, site_model
+from limbfit.pipeline.shared.context import Context, ignore_progress
+from limbfit.pipeline.shared.simulations import SimulationCache, build_curve_job, build_site_model
 from limbfit.pipeline.shared.store import Store
 
 COMMAND = (sys.executable, "-m", "limbfit")
@@ -113,8 +113,8 @@ def true_limb(folder: Path, plan: Path) -> Path:
         text += SITE.format(name=site.name, position=placed[site.name]["position_mm"], depth=max(depths))
     (place / "study.toml").write_text(text)
     limb = limbfit.load_study(place)
-    limbfit.run_study(limb, until="mesh", listener=quiet)
-    context = Context(limb, Store(limb.results), SerialExecutor(), quiet)
+    limbfit.run_study(limb, until="mesh", listener=ignore_progress)
+    context = Context(limb, Store(limb.results), SerialExecutor(), ignore_progress)
     truth = json.loads((patient / "truth.json").read_text())["parameters"]
     jobs = []
     for site in limb.sites:
@@ -122,8 +122,8 @@ def true_limb(folder: Path, plan: Path) -> Path:
         fast, slow = (depth / speed for speed in SPEEDS_MM_S)
         for duration in (fast, HOLD_S, fast, REST_S, slow, slow):
             times.append(times[-1] + duration)
-        model = site_model(context, site, times, [0.0, depth, depth, 0.0, 0.0, depth, 0.0])
-        job = curve_job(replace(model, name=site.name), limb.tissues, to_vector(truth, limb.tissues))
+        model = build_site_model(context, site, times, [0.0, depth, depth, 0.0, 0.0, depth, 0.0])
+        job = build_curve_job(replace(model, name=site.name), limb.tissues, to_vector(truth, limb.tissues))
         fine = np.unique(np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(times)]))
         jobs.append(replace(job, times_s=tuple(map(float, fine))))
     found = SimulationCache(place / "runs").run(jobs, context.executor)

@@ -45,9 +45,9 @@ from limbfit.phantom.record import DISPLACEMENT_NOISE_MM, RATE_HZ
 from limbfit.pipeline.experiments.emulator_file import EMULATOR, read_emulator
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.deviations import site_deviation
-from limbfit.pipeline.stages.laboratory import unknowns
-from limbfit.pipeline.stages.records import SiteRecord, site_record
+from limbfit.pipeline.stages.deviations import estimate_site_deviation
+from limbfit.pipeline.stages.laboratory import build_unknowns
+from limbfit.pipeline.stages.records import SiteRecord, load_site_record
 from limbfit.traces import Regularised, TouchDown, Trace, find_touch_down, regularise
 
 Array = NDArray[np.float64]
@@ -172,12 +172,14 @@ def study_robot(
     context = Context(study, store, SerialExecutor(), lambda progress: None)
     found = store.read("uncertainty", "uncertainty.json")
     truth = np.array([row["calibrated"] for row in found["parameters"]])
-    records = tuple(site_record(context, record) for record in study.records_at(*study.fitted))
+    records = tuple(load_site_record(context, record) for record in study.records_at(*study.fitted))
     emulator = read_emulator(store["uncertainty"] / EMULATOR)
 
     def deviation(responses: Sequence[SiteResponse], parameters: Array) -> tuple[Array, ...]:
         pairs = zip(records, responses, strict=True)
-        return tuple(site_deviation(context, record, response, parameters) for record, response in pairs)
+        return tuple(
+            estimate_site_deviation(context, record, response, parameters) for record, response in pairs
+        )
 
     true = list(emulator(truth))
     forces = tuple(response.force_N for response in true)
@@ -186,7 +188,7 @@ def study_robot(
     smoothing = tuple(best_smoothing(robot, *pair) for pair in zip(records, forces))
     responses = tuple(robot.response(*site) for site in zip(records, forces, smoothing))
     robot = replace(robot, smoothing=smoothing, responses=responses)
-    return robot, truth, Smoothed(emulator, responses), unknowns(study), deviation
+    return robot, truth, Smoothed(emulator, responses), build_unknowns(study), deviation
 
 
 def best_smoothing(robot: Robot, record: SiteRecord, force: Array) -> float:

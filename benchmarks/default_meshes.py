@@ -21,10 +21,10 @@ from limbfit.mesh import read_vtu
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import SimulationCache
 from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.laboratory import unknowns
+from limbfit.pipeline.stages.laboratory import build_unknowns
 from limbfit.pipeline.stages.mesh import mesh_settings
-from limbfit.pipeline.stages.records import site_record
-from limbfit.pipeline.stages.remesh import meshed_models
+from limbfit.pipeline.stages.records import load_site_record
+from limbfit.pipeline.stages.remesh import mesh_models
 
 FINER, FARTHER, FAR_MM, GROWTH, FLATNESS = 0.6, 1.5, 12.0, 0.4, 1.2
 
@@ -47,13 +47,13 @@ def main() -> None:
         growth=GROWTH,
         flatness=FLATNESS,
     )
-    start, cache = unknowns(study).start, SimulationCache(given.folder / "runs")
+    start, cache = build_unknowns(study).start, SimulationCache(given.folder / "runs")
     errors = []
     for recorded in study.recorded:
         if given.sites and recorded.site.name not in given.sites:
             continue
-        record = site_record(context, recorded)
-        (model,) = meshed_models(context, given.folder / "fine", [record.model], fine, "fine meshes")
+        record = load_site_record(context, recorded)
+        (model,) = mesh_models(context, given.folder / "fine", [record.model], fine, "fine meshes")
         jobs = [one.job(start, sensitivities=False) for one in (record, replace(record, model=model))]
         found = list(cache.run(jobs, context.executor))
         if failed := [one.reason for one in found if not one.completed]:

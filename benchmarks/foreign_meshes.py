@@ -50,7 +50,7 @@ from limbfit.errors import LimbfitError
 from limbfit.fe import solve
 from limbfit.indentation import SiteModel, build_problem, build_steps
 from limbfit.mesh import Mesh, boundary_faces, quality
-from limbfit.pipeline.stages.mesh import coarse_settings, mesh_settings
+from limbfit.pipeline.stages.mesh import build_coarse_settings, mesh_settings
 from limbfit.study import Study
 
 Array = NDArray[np.float64]
@@ -120,7 +120,7 @@ def default_settings() -> dict[str, MeshSettings]:
     """Settings of a study that says nothing about meshes: those of its own and of the coarse ones."""
     site = {"name": "1", "depth_mm": 5.0, "position": (0.0, 0.0, 0.0)}
     study = Study(study={"name": "foreign"}, surfaces={"skin": "skin.stl"}, sites=(site,))  # type: ignore[arg-type]
-    coarse = coarse_settings(study)
+    coarse = build_coarse_settings(study)
     return {"own": mesh_settings(study)} | ({} if coarse is None else {"coarse": coarse})
 
 

@@ -33,7 +33,7 @@ from limbfit.errors import LimbfitError
 from limbfit.identify.fit.multistart import draw_starts
 from limbfit.indentation import to_parameters, to_vector
 from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.laboratory import unknowns
+from limbfit.pipeline.stages.laboratory import build_unknowns
 
 SAME = 0.01  # of the squared error: as good a fit as the best
 
@@ -120,7 +120,7 @@ def run_start(study: Study, number: int, count: int, seed: int) -> Record:
     """The identification from one of the starts; the first is the paper's."""
     began = cpu_s()
     copy = study.copy(f"start-{seed}-{number}", study.made if number else study.clean())
-    start = draw_starts(unknowns(load_study(copy)), count, seed)[number]
+    start = draw_starts(build_unknowns(load_study(copy)), count, seed)[number]
     values = to_parameters(start, ("skin", "muscle"))["skin"]
     table = ", ".join(f"{name} = {value!r}" for name, value in values.items())
     write_study(copy, true_sites(), f"\n[material]\nstart = {{ {table} }}\n" if number else "")

@@ -19,8 +19,8 @@ from limbfit.execution import SerialExecutor, share_executor
 from limbfit.fe import solve
 from limbfit.indentation import Simulation, SimulationJob, build_problem, build_steps, to_parameters
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.shared.artefacts import digest, read_curves
-from limbfit.pipeline.shared.simulations import job_digest
+from limbfit.pipeline.shared.artefacts import compute_digest, read_curves
+from limbfit.pipeline.shared.simulations import compute_job_digest
 from limbfit.pipeline.shared.store import RUNS
 
 # Newton iterations of a step, none of which may be halved: the largest with which a simulation stops early.
@@ -46,7 +46,9 @@ class Failing(SerialExecutor):
         return (self._stopped(job) if self._fails(job) else function(job) for job in jobs)
 
     def _fails(self, job: Any) -> bool:
-        drawn = isinstance(job, SimulationJob) and int(digest(job_digest(job), self.seed)[:8], 16)
+        drawn = isinstance(job, SimulationJob) and int(
+            compute_digest(compute_job_digest(job), self.seed)[:8], 16
+        )
         return drawn is not False and drawn < self.rate * 2**32
 
     def _stopped(self, job: SimulationJob) -> Simulation:

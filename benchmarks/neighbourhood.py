@@ -26,7 +26,7 @@ from limbfit.indentation import SimulationJob, build_problem, simulate, to_param
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.records import as_response, site_record
+from limbfit.pipeline.stages.records import load_site_record, to_response
 
 MOVED = np.array(
     [0.15, -0.15, 0.1, 0.1]
@@ -35,7 +35,7 @@ MOVED = np.array(
 
 def timed(job: SimulationJob) -> tuple[Any, float]:
     started = time.process_time()
-    return as_response(simulate(job)), time.process_time() - started
+    return to_response(simulate(job)), time.process_time() - started
 
 
 def row(record: Any, best: np.ndarray, moved: np.ndarray, radius: float | None) -> dict[str, Any]:
@@ -71,7 +71,7 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|")
     for name in args.sites:
-        record = site_record(context, study.indentation(name))
+        record = load_site_record(context, study.indentation(name))
         simulate(replace(record, model=replace(record.model, within_mm=40.0)).job(best))  # compiles
         whole = row(record, best, moved, None)
         print(

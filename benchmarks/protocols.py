@@ -42,9 +42,9 @@ from limbfit.indentation import to_vector
 from limbfit.phantom.record import NOTHING, ULTRASOUND_NOISE_MM, WAVES_NOISE_M_S, SecondaryMeasurements
 from limbfit.pipeline.experiments.protocol import DETERMINED
 from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import SimulationCache, curve_job, site_model
+from limbfit.pipeline.shared.simulations import SimulationCache, build_curve_job, build_site_model
 from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.laboratory import unknowns
+from limbfit.pipeline.stages.laboratory import build_unknowns
 from limbfit.study import Study
 
 FAST, HOLD_S = 4.8, 30.0
@@ -136,8 +136,8 @@ def told_of(
     jobs = []
     for take in plain:
         site = study.site(take.site).model_copy(update={"indenter": "ball" if take.ball else None})
-        model = site_model(context, site, *take.knots, searched=True, layers=TISSUES)
-        jobs.append(curve_job(replace(model, name=take.name), study.tissues, truth))
+        model = build_site_model(context, site, *take.knots, searched=True, layers=TISSUES)
+        jobs.append(build_curve_job(replace(model, name=take.name), study.tissues, truth))
     found = {}
     done = SimulationCache(folder / f"expected-{limb.seed}").run(jobs, context.executor)
     for take, one in zip(takes, done, strict=True):
@@ -154,7 +154,9 @@ def told_of(
 
 def wanted_of(folder: Path, limb: Limb, edge_mm: float | None) -> DesignTarget:
     """All eight parameters, given the study's bounds."""
-    return DesignTarget(compute_bounds_information(unknowns(plan_study(folder, limb, edge_mm))), np.eye(8))
+    return DesignTarget(
+        compute_bounds_information(build_unknowns(plan_study(folder, limb, edge_mm))), np.eye(8)
+    )
 
 
 def best_at_truth(

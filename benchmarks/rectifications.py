@@ -35,10 +35,10 @@ from limbfit.mesh import Mesh
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.surfaces import build_true_anatomy
 from limbfit.pipeline.experiments.socket_limb import SocketLimb
-from limbfit.pipeline.shared.context import Context, quiet
-from limbfit.pipeline.shared.socket_shape import socket_of
+from limbfit.pipeline.shared.context import Context, ignore_progress
+from limbfit.pipeline.shared.socket_shape import build_socket
 from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.verbs.fitting import known_tissues
+from limbfit.pipeline.verbs.fitting import choose_tissues
 from limbfit.socket import Socket
 from limbfit.study.socket import SocketAreaTable
 
@@ -111,9 +111,9 @@ def bench_of(name: str, folder: Path, shared: Path) -> Bench:
         write_study(name, folder, shared)
     study = limbfit.load_study(folder)
     limbfit.run_study(study, until="surfaces")
-    context = Context(study, Store(study.results), SerialExecutor(), quiet)
+    context = Context(study, Store(study.results), SerialExecutor(), ignore_progress)
     limb = SocketLimb.of(context, "rectifications")
-    plain = socket_of(study, limb.anatomy, limb.outer.skin)
+    plain = build_socket(study, limb.anatomy, limb.outer.skin)
     return Bench(name, study, limb, limb.mesh(context, "rectifications", folder, plain)[0], plain)
 
 
@@ -154,12 +154,12 @@ def run(bench: Bench, seed: int, case: int) -> dict[str, Any]:
         print(f"  {words}", flush=True)
 
     try:
-        socket = socket_of(study, limb.anatomy, limb.outer.skin)
+        socket = build_socket(study, limb.anatomy, limb.outer.skin)
     except InputError as error:
         return row | {"outcome": "refused", "words": error.what}
     row["deepest_mm"] = float(socket.offset(limb.outer.skin).max())
     try:
-        found = limb.don(bench.mesh, limb.materials(known_tissues(study)[0]), socket, told)
+        found = limb.don(bench.mesh, limb.materials(choose_tissues(study)[0]), socket, told)
     except RunError as error:
         return row | {
             "outcome": "stopped",

@@ -32,10 +32,10 @@ from limbfit.identify.uncertainty.uncertainty import NORMAL_95
 from limbfit.indentation import flat_names, to_parameters, to_vector
 from limbfit.mesh import Mesh
 from limbfit.phantom.build import draw_true_parameters
-from limbfit.pipeline.experiments.socket_intervals import drawn, first_order
+from limbfit.pipeline.experiments.socket_intervals import draw_step, predict_change
 from limbfit.pipeline.experiments.socket_limb import SocketLimb
-from limbfit.pipeline.shared.context import Context, quiet
-from limbfit.pipeline.shared.socket_shape import socket_of
+from limbfit.pipeline.shared.context import Context, ignore_progress
+from limbfit.pipeline.shared.socket_shape import build_socket
 from limbfit.pipeline.shared.store import Store
 from limbfit.socket import Socket
 
@@ -48,14 +48,14 @@ class Bench:
 
     def __init__(self, study: limbfit.Study, identified: limbfit.Study, folder: Path) -> None:
         limbfit.run_study(study, until="surfaces")
-        context = Context(study, Store(study.results), SerialExecutor(), quiet)
+        context = Context(study, Store(study.results), SerialExecutor(), ignore_progress)
         found = Store(identified.results).read("calibrate", "calibration.json")
         self.study = study
         self.covariance = np.array(found["uncertainty"]["covariance_log"])
         self.centre = to_vector(found["stages"][-1]["parameters"], study.tissues)
         self.off = np.log(to_vector(found["uncertainty"]["most_probable"], study.tissues) / self.centre)
         self.limb = SocketLimb.of(context, "intervals")
-        self.socket: Socket = socket_of(study, self.limb.anatomy, self.limb.outer.skin)
+        self.socket: Socket = build_socket(study, self.limb.anatomy, self.limb.outer.skin)
         self.mesh: Mesh = self.limb.mesh(context, "intervals", folder, self.socket)[0]
 
     def run(self, parameters: np.ndarray, *, known: bool = False, friction: float = 1.0) -> dict[str, Any]:
@@ -86,13 +86,15 @@ class Bench:
         """A value of a draw, by the derivatives at the centre."""
         keys = [f"{tissue}.{key}" for tissue, key in flat_names(self.study.tissues)]
         row = {"change_kPa": centre["change"][name]}
-        return float(centre["values"][name]) + first_order(row, "", "kPa", dict(zip(keys, step, strict=True)))
+        return float(centre["values"][name]) + predict_change(
+            row, "", "kPa", dict(zip(keys, step, strict=True))
+        )
 
 
 def told(bench: Bench, rows: dict[str, Any], seed: int) -> list[dict[str, Any]]:
     """Of each region, and settling."""
     centre, draws = rows["centre"], {int(name): row for name, row in rows.items() if name.isdigit()}
-    steps = [drawn(bench.covariance, number, seed) for number in draws]
+    steps = [draw_step(bench.covariance, number, seed) for number in draws]
     found = []
     for name, value in centre["values"].items():
         sample, sd = np.array([draw["values"][name] for draw in draws.values()]), centre["sd"][name]
@@ -156,7 +158,9 @@ def main() -> None:
     for name in (*wanted, *map(str, range(asked.draws))):
         if name not in rows:
             if name.isdigit():
-                rows[name] = bench.run(bench.centre * np.exp(drawn(bench.covariance, int(name), asked.seed)))
+                rows[name] = bench.run(
+                    bench.centre * np.exp(draw_step(bench.covariance, int(name), asked.seed))
+                )
             elif name == "truth":
                 rows[name] = bench.run(to_vector(draw_true_parameters(asked.truth), study.tissues))
             else:

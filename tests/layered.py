@@ -19,7 +19,7 @@ from limbfit.mesh.boxes import SIX_TETS, build_boxes, turn_upright
 from limbfit.phantom.record import Ramp, record
 from limbfit.pipeline.shared.artefacts import write_json
 from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import COARSE, fibres_of
+from limbfit.pipeline.shared.simulations import COARSE, find_fibre_directions
 from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.curves import run_traces
 from limbfit.study import Study, load_study
@@ -140,7 +140,9 @@ def store_blocks(
             )
         model = replace(model, indenter=study.indenter, law=study.material.law, extensions=study.extensions)
         model = replace(model, course=study.material.course)
-        model = replace(model, fibres=fibres_of(Context(study, store, SerialExecutor(), lambda event: None)))
+        model = replace(
+            model, fibres=find_fibre_directions(Context(study, store, SerialExecutor(), lambda event: None))
+        )
         _write_record(study, model, truth, np.random.default_rng(i))
         places.append(
             {"site": name, "region": "", "fitted": fitted, "position_mm": [0.0] * 3, "axis": [0.0, 0.0, -1.0]}

@@ -15,7 +15,7 @@ from limbfit.anatomy.imaging import Volume, read_labels, read_volume, write_volu
 from limbfit.errors import ImageError, InputError
 from limbfit.extensions import load_extensions
 from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, Experiment, register_experiment
-from limbfit.pipeline.verbs.run import keys, study_status
+from limbfit.pipeline.verbs.run import compute_keys, study_status
 
 GEOMETRY = {"spacing_mm": np.array([1.0, 1.5, 2.0]), "origin_mm": np.array([3.0, -4.0, 50.0])}
 
@@ -88,10 +88,10 @@ def test_an_experiment_is_run_by_its_verb_kept_and_reported(study, extensions, l
     code, out, err = limbfit("experiment", study, "stiffness", "--option", f"depth_mm={deep}", "--json")
     assert code == 0, err
     assert json.loads(out)["N_per_mm"] == {}
-    before = keys(load_study(study))
+    before = compute_keys(load_study(study))
     assert limbfit("experiment", study, "stiffness", "--option", "colour=red")[0] == 2
     assert limbfit("experiment", study, "stiffness", "--option", "depth_mm")[0] == 2
-    assert keys(load_study(study)) == before
+    assert compute_keys(load_study(study)) == before
 
 
 def test_names_that_would_hide_results_are_refused(study, monkeypatch):

@@ -13,12 +13,12 @@ from limbfit.execution import SerialExecutor
 from limbfit.febio import read_feb, to_problem
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import job_digest, planned_model
+from limbfit.pipeline.shared.simulations import build_planned_model, compute_job_digest
 from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.mesh import coarse_settings, mesh_settings
+from limbfit.pipeline.stages.mesh import build_coarse_settings, mesh_settings
 from limbfit.pipeline.verbs.check import check_study
 from limbfit.pipeline.verbs.export import export_study
-from limbfit.pipeline.verbs.run import keys, run_study
+from limbfit.pipeline.verbs.run import compute_keys, run_study
 from limbfit.study import Study, load_study
 from small_limb import small_limb
 
@@ -47,7 +47,7 @@ def test_the_table_alone_turns_them_on(tmp_path):
 
 def test_their_force_decides_simulations_and_their_width_the_mesh_too(tmp_path):
     def decided(text: str) -> dict[str, str]:
-        return keys(study_of(tmp_path, COARSE + text))
+        return compute_keys(study_of(tmp_path, COARSE + text))
 
     without, plain = decided(""), decided("[clamps]\n")
     later = {"calibrate", "predict", "report"}
@@ -59,7 +59,7 @@ def test_their_force_decides_simulations_and_their_width_the_mesh_too(tmp_path):
 
 def test_the_mesh_is_no_coarser_than_they_are_wide_and_searched_as_a_whole(tmp_path):
     study = study_of(tmp_path, COARSE + "[mesh.coarse]\nedge_near_mm = 9.0\n[clamps]\nwidth_mm = 15.0\n")
-    coarse = coarse_settings(study)
+    coarse = build_coarse_settings(study)
     assert coarse is not None
     assert mesh_settings(study).edge_far_mm == coarse.edge_far_mm == 15.0
     assert study.within_mm is None
@@ -69,7 +69,7 @@ def test_the_mesh_is_no_coarser_than_they_are_wide_and_searched_as_a_whole(tmp_p
 def test_a_clamped_site_is_indented_from_where_its_skin_is_then(context):
     """Force and its derivatives, which follow the place where the indenter touches too."""
     study = context.study
-    model = planned_model(context, study.sites[0])
+    model = build_planned_model(context, study.sites[0])
     start = np.array([study.material.of(tissue, "start")[key] for tissue, key in study.parameters])
     times = (0.0, 0.5 * model.knots_s[1], model.knots_s[1])  # the way in
 
@@ -112,14 +112,14 @@ def test_a_clamped_site_goes_to_febio(context, tmp_path):
 
 
 def test_they_are_among_what_decides_a_kept_simulation(context):
-    model = planned_model(context, context.study.sites[0])
+    model = build_planned_model(context, context.study.sites[0])
     clamps = model.clamps
     assert clamps is not None
     others = [None, clamps.model_copy(update={"force_N": 5.0})]
     jobs = [
         SimulationJob(replace(model, clamps=one), ("muscle",), (1.0,), (0.0,)) for one in (clamps, *others)
     ]
-    assert len({job_digest(job) for job in jobs}) == 3
+    assert len({compute_job_digest(job) for job in jobs}) == 3
 
 
 def test_the_check_says_how_many_hold_the_limb(context, tmp_path):
@@ -137,7 +137,7 @@ def test_pins_that_miss_are_refused_with_the_study_s_file(context):
     assert clamps is not None
     above = context.study.model_copy(update={"clamps": clamps.model_copy(update={"levels_mm": (300.0,)})})
     with pytest.raises(ProblemError) as caught:
-        planned_model(replace(context, study=above), above.sites[0])
+        build_planned_model(replace(context, study=above), above.sites[0])
     told = str(caught.value)
     assert "study.toml: clamps: site 1: no clamping pin meets the skin; give clamps.angles_degrees" in told
     assert "\n" not in told

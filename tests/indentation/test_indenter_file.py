@@ -10,8 +10,8 @@ import pyvista as pv
 
 from limbfit.errors import InputError, StudyError
 from limbfit.indentation import SiteModel, read_indenter
-from limbfit.pipeline.shared.simulations import SimulationJob, job_digest
-from limbfit.pipeline.verbs.run import keys
+from limbfit.pipeline.shared.simulations import SimulationJob, compute_job_digest
+from limbfit.pipeline.verbs.run import compute_keys
 from limbfit.study import IndenterTable, Study, load_study
 
 TEXT = """
@@ -72,16 +72,17 @@ def test_a_file_that_is_no_stl_is_named(study):
 
 
 def test_a_changed_file_makes_calibration_and_simulations_stale(study):
-    before = keys(study)
+    before = compute_keys(study)
     pv.Sphere(radius=8.0).save(table(study).file)
-    after = keys(study)
+    after = compute_keys(study)
     stale = {name for name in before if before[name] != after[name]}
     assert stale == {"calibrate", "predict", "report"}
     model = SiteModel("1", Path("1.vtu"), "", (0, 0, 0), (0, 0, -1), (0, 1), (0, 1), indenter=table(study))
     other = SiteModel(**{**vars(model), "indenter_digest": "changed"})
     moved = SiteModel(**{**vars(model), "indenter": study.indenter})
     digests = [
-        job_digest(SimulationJob(m, ("skin", "muscle"), (1.0,), (0.0, 1.0))) for m in (model, other, moved)
+        compute_job_digest(SimulationJob(m, ("skin", "muscle"), (1.0,), (0.0, 1.0)))
+        for m in (model, other, moved)
     ]
     assert digests[0] != digests[1]
     assert digests[0] == digests[2]

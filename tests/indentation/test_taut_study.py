@@ -13,8 +13,8 @@ from limbfit.indentation import SimulationJob, build_problem, simulate
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.experiments.socket import check_socket
 from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import job_digest, recorded_model
-from limbfit.pipeline.verbs.run import keys
+from limbfit.pipeline.shared.simulations import build_recorded_model, compute_job_digest
+from limbfit.pipeline.verbs.run import compute_keys
 
 TAUT = "prestretch = { skin = 1.1 }\n"
 VALUES = {"c_kPa": 6.0, "m": 5.0, "gamma": 1.2, "tau_s": 0.5}
@@ -27,7 +27,7 @@ def context(tmp_path_factory) -> Context:
 
 
 def test_a_layer_is_stretched_in_its_plane_and_fibres_along_themselves(context):
-    model = replace(recorded_model(context, context.study.recorded[0]))
+    model = replace(build_recorded_model(context, context.study.recorded[0]))
     assert model.prestretch == (("skin", 1.1),)
     mesh = read_vtu(model.mesh)
     G = np.asarray(build_problem(model, mesh, TRUTH).prestretch)
@@ -42,18 +42,18 @@ def test_a_layer_is_stretched_in_its_plane_and_fibres_along_themselves(context):
 
 def test_it_decides_the_calibration_on_whole_meshes(tmp_path):
     plain, taut = block_study(tmp_path, ""), block_study(tmp_path, TAUT)
-    before, after = keys(plain), keys(taut)
+    before, after = compute_keys(plain), compute_keys(taut)
     assert {stage for stage in before if before[stage] != after[stage]} == {"calibrate", "predict", "report"}
     assert plain.within_mm == 65.0
     assert taut.within_mm is None
 
 
 def test_force_follows_tissue_by_its_derivatives(context):
-    study, model = context.study, recorded_model(context, context.study.recorded[0])
+    study, model = context.study, build_recorded_model(context, context.study.recorded[0])
     flat, times = study.vector(TRUTH), (0.5 * model.knots_s[1], model.knots_s[1], 1.5 * model.knots_s[1])
     names = [f"{tissue}.{key}" for tissue, key in study.parameters]
     jobs = [SimulationJob(one, study.tissues, tuple(flat), times) for one in (model, model.bare)]
-    assert job_digest(jobs[0]) != job_digest(jobs[1])
+    assert compute_job_digest(jobs[0]) != compute_job_digest(jobs[1])
     found, slack = (simulate(job) for job in jobs)
     assert found.completed, found.reason
     assert np.abs(found.force_N - slack.force_N).max() > 0.02 * slack.force_N.max()

@@ -18,7 +18,7 @@ from limbfit.fe import StepControl, System, solve
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.system import Increment
 from limbfit.laws import LAWS, Parameter, TissueLaw, register_law
-from limbfit.pipeline.verbs.run import keys
+from limbfit.pipeline.verbs.run import compute_keys
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "fe"))
 from blocks import block, check_tangent, punch
@@ -163,11 +163,11 @@ def test_a_study_names_it_and_follows_its_file(tmp_path, file, law):
     assert study.parameters[:4] == tuple(("skin", key) for key in TRUTH)
     assert study.material.start == {"a_kPa": 4.0, "b": 2.0, "gamma": 1.2, "tau_s": 1.0}
     assert study.material.upper["b"] == 10.0
-    before = keys(study)
+    before = compute_keys(study)
     (tmp_path / "fung.py").write_text((tmp_path / "fung.py").read_text() + "# another thought\n")
     with pytest.raises(InputError, match="tissue law 'fung' exists already"):
         load_study(tmp_path)  # one that is known here from another file
-    assert keys(study) != before
+    assert compute_keys(study) != before
     wrong = GIVEN.replace("b = 2.0", "c_kPa = 2.0")
     shutil.copy(file, tmp_path / "fung.py")
     (tmp_path / "study.toml").write_text(wrong)

@@ -13,7 +13,7 @@ from limbfit.anatomy.surfaces.surfaces import load_anatomy, write_surface
 from limbfit.phantom import make_limb, make_phantom
 from limbfit.phantom.socket import LINER_MM, make_socket
 from limbfit.phantom.surfaces import build_outer_surface, build_true_anatomy
-from limbfit.pipeline.shared.socket_shape import socket_of
+from limbfit.pipeline.shared.socket_shape import build_socket
 from limbfit.socket import read_socket
 from limbfit.study import load_study
 
@@ -29,7 +29,7 @@ def test_a_socket_beside_the_patient(tmp_path: Path) -> None:
     assert study.socket.liner.thickness_mm == truth["liner_mm"]
     anatomy = load_anatomy(tmp_path / "study" / "truth")
     liner = build_outer_surface(make_limb(2), LINER_MM)
-    socket = socket_of(study, anatomy, liner)
+    socket = build_socket(study, anatomy, liner)
     assert socket.notes == ()
     assert socket.volume_mm3 == pytest.approx(truth["volume_mm3"], rel=1e-4)
     depth = socket.offset(liner)

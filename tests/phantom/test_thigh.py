@@ -20,7 +20,7 @@ from limbfit.phantom.mri import build_image, make_grid
 from limbfit.phantom.sites import DETAIL_SITES, SAFE_SHARE
 from limbfit.phantom.socket import LINER_MM, make_socket
 from limbfit.phantom.surfaces import build_outer_surface, build_true_anatomy
-from limbfit.pipeline.shared.socket_shape import load_of, regions_of
+from limbfit.pipeline.shared.socket_shape import build_regions, load_of
 from limbfit.pipeline.verbs.check import check_study
 from limbfit.study import load_study
 
@@ -98,7 +98,7 @@ def test_its_study_needs_no_tibia(tmp_path: Path) -> None:
     study = load_study(tmp_path / "study")
     assert study.socket.side == "right"
     anatomy = build_true_anatomy(thigh(0), 8.0)
-    names = set(regions_of(study, anatomy))
+    names = set(build_regions(study, anatomy))
     assert {"anterior proximal", "medial distal", "lateral middle"} <= names
     assert not {name for name in names if "tibia" in name or "patella" in name}
     socket, _ = make_socket(anatomy, build_outer_surface(thigh(0), LINER_MM, 8.0), THIGH)

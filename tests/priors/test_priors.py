@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from limbfit.errors import InputError, StudyError
-from limbfit.pipeline.stages.laboratory import unknowns
+from limbfit.pipeline.stages.laboratory import build_unknowns
 from limbfit.pipeline.verbs.check import check_study
-from limbfit.pipeline.verbs.run import keys
+from limbfit.pipeline.verbs.run import compute_keys
 from limbfit.priors import LITERATURE, PRIORS, of_tissues
 from limbfit.study import Study, load_study
 
@@ -25,15 +25,15 @@ def with_settings(folder: Path, more: str) -> Study:
 
 
 def names(study: Study) -> set[str]:
-    return {prior.name for prior in unknowns(study).priors}
+    return {prior.name for prior in build_unknowns(study).priors}
 
 
 def test_a_study_has_no_priors_of_its_own(study: Path) -> None:
-    assert unknowns(load_study(study)).priors == ()
+    assert build_unknowns(load_study(study)).priors == ()
 
 
 def test_a_skin_without_fat_below_it_is_skin_with_its_fat(study: Path) -> None:
-    found = {prior.name: prior for prior in unknowns(with_settings(study, PEOPLE)).priors}
+    found = {prior.name: prior for prior in build_unknowns(with_settings(study, PEOPLE)).priors}
     assert set(found) == {"skin.c_kPa", "skin.m", "muscle.c_kPa", "muscle.m"}
     known = PRIORS["skin_fat"]["c_kPa"]
     assert (found["skin.c_kPa"].median, found["skin.c_kPa"].factor) == (known["median"], known["factor"])
@@ -52,14 +52,14 @@ def test_the_study_says_what_another_name_means(study: Path) -> None:
 
 def test_what_is_stated_or_fixed_is_not_people_s(study: Path) -> None:
     more = "fixed = ['skin.m']\nprior = { 'muscle.c_kPa' = { median = 9.0, factor = 1.1 } }\n"
-    found = {prior.name: prior for prior in unknowns(with_settings(study, PEOPLE + more)).priors}
+    found = {prior.name: prior for prior in build_unknowns(with_settings(study, PEOPLE + more)).priors}
     assert set(found) == {"skin.c_kPa", "muscle.c_kPa", "muscle.m"}
     assert (found["muscle.c_kPa"].median, found["muscle.c_kPa"].factor) == (9.0, 1.1)
 
 
 def test_what_a_tissue_is_decides_the_calibration_alone(study: Path) -> None:
-    plain = keys(with_settings(study, PEOPLE))
-    other = keys(with_settings(study, 'prior_tissues = { skin = "none" }\n'))
+    plain = compute_keys(with_settings(study, PEOPLE))
+    other = compute_keys(with_settings(study, 'prior_tissues = { skin = "none" }\n'))
     assert {stage for stage in plain if plain[stage] != other[stage]} == {"calibrate", "predict", "report"}
 
 

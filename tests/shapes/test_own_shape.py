@@ -18,9 +18,9 @@ from limbfit.extensions import load_extensions
 from limbfit.fe import StepControl, solve
 from limbfit.febio import FebSettings, read_feb, to_problem, write_feb, write_inp
 from limbfit.indentation import SiteModel
-from limbfit.pipeline.experiments.sensitivity import other_indenters
-from limbfit.pipeline.shared.simulations import SimulationJob, job_digest
-from limbfit.pipeline.verbs.run import keys
+from limbfit.pipeline.experiments.sensitivity import list_other_indenters
+from limbfit.pipeline.shared.simulations import SimulationJob, compute_job_digest
+from limbfit.pipeline.verbs.run import compute_keys
 from limbfit.shapes import SHAPES, TAKEN, Shape
 from limbfit.study import IndenterTable
 
@@ -165,12 +165,12 @@ def test_a_study_gives_its_measures(study):
     assert whole.indenter.model_dump()["taper_deg"] == 10.0
     usual = load_study(changed(study, "taper_deg = 10.0\n", ""))
     assert usual.indenter.measures == {"taper_deg": 15.0}
-    before, after = keys(whole), keys(usual)
+    before, after = compute_keys(whole), compute_keys(usual)
     stale = {name for name in before if before[name] != after[name]}
     assert {"calibrate", "predict"} <= stale
     model = SiteModel("1", Path("1.vtu"), "", (0, 0, 0), (0, 0, -1), (0, 1), (0, 1), indenter=whole.indenter)
     other = replace(model, indenter=usual.indenter)
-    digests = [job_digest(SimulationJob(m, ("skin",), (1.0,), (0.0, 1.0))) for m in (model, other)]
+    digests = [compute_job_digest(SimulationJob(m, ("skin",), (1.0,), (0.0, 1.0))) for m in (model, other)]
     assert digests[0] != digests[1]
 
 
@@ -198,7 +198,7 @@ def test_what_is_wrong_names_its_key(study, old, new, what):
 
 def test_the_experiment_compares_it_with_the_others(study):
     own = load_study(study).indenter
-    rows = other_indenters(own)
+    rows = list_other_indenters(own)
     assert [label for label, _, _ in rows] == [
         "tapered of the study", "square", "square, rounded edge", "sphere", "cylinder", "tapered",
     ]  # fmt: skip

@@ -21,7 +21,7 @@ from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.donning import Load, SocketFit, don, pack, socket_problem, unpack
 from limbfit.errors import ProblemError
 from limbfit.fe import Checkpoints, OgdenQLV, StepControl, solve
-from limbfit.pipeline.shared.kept import Begun, Kept
+from limbfit.pipeline.shared.kept import Begun, ResultFiles
 from limbfit.socket import Recipe, rectify_limb
 from limbfit.socket.trim import Trim
 
@@ -51,7 +51,7 @@ def donned(tmp_path_factory):
     places: list[Begun] = []
 
     def keep(part):
-        places.append(Begun(Kept(folder), str(len(places))))
+        places.append(Begun(ResultFiles(folder), str(len(places))))
         places[-1].put(pack(part))
 
     return given, don(*given, sensitivities=True, threads=1, keep=keep), places
@@ -88,7 +88,7 @@ def test_what_goes_on_from_a_part_is_what_went_through(donned, which):
 
 
 def test_what_is_at_its_end_is_not_kept_on(tmp_path):
-    begun = Begun(Kept(tmp_path), "a")
+    begun = Begun(ResultFiles(tmp_path), "a")
     assert begun.latest() is None
     begun.put(({"n": 1}, {"x": np.arange(3.0)}))
     begun.put(({"n": 2}, {"x": np.arange(4.0)}))

@@ -7,8 +7,13 @@ import pytest
 
 from limbfit.fe import SimulationWarning
 from limbfit.identify.uncertainty.uncertainty import NORMAL_95
-from limbfit.pipeline.experiments.socket_intervals import Spread, drawn, spread_facts, widen
-from limbfit.pipeline.experiments.socket_limb import warning
+from limbfit.pipeline.experiments.socket_intervals import (
+    ParameterSpread,
+    draw_step,
+    spread_to_facts,
+    widen_intervals,
+)
+from limbfit.pipeline.experiments.socket_limb import format_warning
 
 NAMES = ("skin.c_kPa", "skin.tau_s", "liner.c_kPa")
 SLOPES = np.array([3.0, -1.0, 2.0])
@@ -16,7 +21,7 @@ COVARIANCE = np.array([[0.04, -0.015], [-0.015, 0.09]])
 
 
 def test_interval_and_shares_are_those_of_drawn_parameters():
-    spread = Spread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
+    spread = ParameterSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
     interval, shares, changes = spread.told(50.0, SLOPES)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(2), COVARIANCE, 200_000)
     values = 50.0 + draws @ SLOPES[:2]
@@ -29,16 +34,18 @@ def test_interval_and_shares_are_those_of_drawn_parameters():
 
 
 def test_an_interval_covers_the_most_probable_parameters_too():
-    plain, _, _ = Spread(NAMES, (0, 1), COVARIANCE, np.zeros(2)).told(50.0, SLOPES)
+    plain, _, _ = ParameterSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2)).told(50.0, SLOPES)
     for step in (0.3, -0.3):  # of the skin's c, whose slope is 3 kPa
-        (low, high), _, _ = Spread(NAMES, (0, 1), COVARIANCE, np.array([step, 0.0])).told(50.0, SLOPES)
+        (low, high), _, _ = ParameterSpread(NAMES, (0, 1), COVARIANCE, np.array([step, 0.0])).told(
+            50.0, SLOPES
+        )
         assert (low, high) == pytest.approx((plain[0] + min(3 * step, 0.0), plain[1] + max(3 * step, 0.0)))
 
 
 def test_what_is_stored_has_the_same_keys_with_and_without_intervals():
-    spread = Spread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
-    known = spread_facts(spread, "settling_", "mm", 5.0, SLOPES)
-    assert known.keys() == spread_facts(None, "settling_", "mm", 5.0, None).keys()
+    spread = ParameterSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
+    known = spread_to_facts(spread, "settling_", "mm", 5.0, SLOPES)
+    assert known.keys() == spread_to_facts(None, "settling_", "mm", 5.0, None).keys()
     assert known["settling_interval_mm"][0] >= 0.0
 
 
@@ -52,21 +59,23 @@ def facts(value: float, **known) -> dict:
 
 def test_what_derivatives_miss_of_simulated_draws_widens_the_intervals():
     """A value that bends by as much as it slopes: its 95 % interval holds 83 % of other draws, then 91 %."""
-    spread = Spread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
+    spread = ParameterSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
 
     def value(step) -> float:
         return 50.0 + step @ SLOPES[:2] + 8.0 * step[1] ** 2
 
-    found = facts(50.0, **spread_facts(spread, "", "kPa", 50.0, SLOPES))
+    found = facts(50.0, **spread_to_facts(spread, "", "kPa", 50.0, SLOPES))
     (load,) = found["loads"]
-    steps = [drawn(COVARIANCE, number) for number in range(1000)]
+    steps = [draw_step(COVARIANCE, number) for number in range(1000)]
     values = np.array([value(step) for step in steps])
 
     def held(interval) -> float:
         return float(np.mean((values >= interval[0]) & (values <= interval[1])))
 
     assert held(load["regions"][0]["interval_kPa"]) < 0.85
-    widen(found, [(dict(zip(NAMES, step, strict=False)), facts(value(step))) for step in steps[:100]])
+    widen_intervals(
+        found, [(dict(zip(NAMES, step, strict=False)), facts(value(step))) for step in steps[:100]]
+    )
     assert held(load["regions"][0]["interval_kPa"]) > 0.9
     assert load["settling_interval_mm"] == load["regions"][0]["interval_kPa"]
     curved = np.array([8.0 * step[1] ** 2 for step in steps[:100]])
@@ -74,10 +83,10 @@ def test_what_derivatives_miss_of_simulated_draws_widens_the_intervals():
 
 
 def test_folded_elements_are_told_with_a_remedy_that_a_socket_has():
-    found = warning(
+    found = format_warning(
         SimulationWarning("folded", "27 elements are inside out: a rounded indenter", 27, 0.0, 0.0)
     )
     assert found.startswith("27 elements of the limb")
     assert "socket.edge_mm" in found
     assert "indenter" not in found
-    assert warning(SimulationWarning("unsettled", "use more steps", 1, 0.0, 0.0)) == "use more steps"
+    assert format_warning(SimulationWarning("unsettled", "use more steps", 1, 0.0, 0.0)) == "use more steps"

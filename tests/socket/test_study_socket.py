@@ -13,7 +13,7 @@ from socket_limbs import round_limb
 from limbfit.anatomy.surfaces.surfacefiles import write_surface
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import StudyError
-from limbfit.pipeline.shared.socket_shape import load_of, regions_of, socket_of
+from limbfit.pipeline.shared.socket_shape import build_regions, build_socket, load_of
 from limbfit.pipeline.verbs.check import check_study
 from limbfit.socket import Socket
 from limbfit.socket.landmarks import find_knee_centre
@@ -37,7 +37,7 @@ def study_of(folder: Path, text: str = "", bones: bool = True) -> Study:
 
 
 def drawn(study: Study) -> Socket:
-    return socket_of(study, round_limb(), round_limb().skin)
+    return build_socket(study, round_limb(), round_limb().skin)
 
 
 def test_a_study_without_the_table_has_a_socket(tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_the_table_says_the_shape(tmp_path: Path) -> None:
     deepest = socket.points[depth.argmax()]
     assert depth.max() == pytest.approx(4.0, rel=0.05)
     assert np.linalg.norm(deepest - [0.0, -42.0, 60.0]) < 6.0
-    assert regions_of(study, round_limb())["shin"].faces.any()
+    assert build_regions(study, round_limb())["shin"].faces.any()
 
 
 def test_loads_of_ones_own(tmp_path: Path) -> None:
@@ -97,13 +97,13 @@ def test_a_limb_without_a_tibia_is_loaded_through_its_middle_at_the_brim(tmp_pat
     bare = replace(
         limb, bones={}, skin=Surface(limb.skin.points + np.array([7.0, -3.0, 0.0]), limb.skin.faces)
     )
-    socket = socket_of(study, bare, bare.skin)
+    socket = build_socket(study, bare, bare.skin)
     force, moment, point = load_of(study, study.socket.loads[0], bare, socket)
     np.testing.assert_allclose(force, [0.0, 0.0, 800.0], atol=1e-9)
     np.testing.assert_allclose(moment, 0.0, atol=1e-9)
     np.testing.assert_allclose(point, [7.0, -3.0, socket.points[socket.brim, 2].mean()], atol=0.1)
     assert point[2] == pytest.approx(120.0, abs=2.0)  # 30 mm below the cut, less what the flare takes
-    assert not {name for name in regions_of(study, bare) if "tibia" in name or "knee" in name}
+    assert not {name for name in build_regions(study, bare) if "tibia" in name or "knee" in name}
 
 
 def test_check_draws_the_socket(tmp_path: Path) -> None:

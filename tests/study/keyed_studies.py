@@ -12,9 +12,9 @@ from typing import Any
 from test_study_docs import KEYS
 
 from limbfit.extensions import load_extensions
-from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, experiment_key
+from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, compute_experiment_key
 from limbfit.pipeline.shared.keys import Keys
-from limbfit.pipeline.verbs.run import keys
+from limbfit.pipeline.verbs.run import compute_keys
 from limbfit.study import Study, load_study
 
 SEEN = {"ultrasound": "3.csv", "surface": "3.csv", "shear_waves": "3.csv"}
@@ -284,9 +284,9 @@ def loaded(folder: Path, content: Mapping[str, Any]) -> Study:
 
 def decided(study: Study) -> dict[str, str]:
     """The key of every stage, and of the experiments that read more of a study."""
-    known, stages = Keys(study), keys(study)
+    known, stages = Keys(study), compute_keys(study)
     more = [e for e in EXPERIMENTS if e.name in ("uncertainty", "design")]
-    return stages | {e.name: experiment_key(e, known, stages, e.options) for e in more}
+    return stages | {e.name: compute_experiment_key(e, known, stages, e.options) for e in more}
 
 
 @cache

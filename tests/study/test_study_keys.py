@@ -25,9 +25,9 @@ from test_study_docs import KEYS
 
 import limbfit
 from limbfit.acquire import Settings
-from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, experiment_key
+from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, compute_experiment_key
 from limbfit.pipeline.shared.keys import Keys
-from limbfit.pipeline.verbs.run import keys
+from limbfit.pipeline.verbs.run import compute_keys
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +68,11 @@ def test_a_session_takes_every_key_of_acquire(folder: Path) -> None:
 def test_the_design_of_a_socket_is_no_reason_to_put_it_on_again(folder: Path) -> None:
     def of(content: Mapping[str, Any]) -> list[str]:
         study = loaded(folder, content)
-        stages = keys(study)
+        stages = compute_keys(study)
         names = ("socket", "socket_design")
-        return [experiment_key(EXPERIMENTS[n], Keys(study), stages, EXPERIMENTS[n].options) for n in names]
+        return [
+            compute_experiment_key(EXPERIMENTS[n], Keys(study), stages, EXPERIMENTS[n].options) for n in names
+        ]
 
     put_on, designed = of(GIVEN)
     other = of(changed(GIVEN, "socket.design.pressure_kPa", 12.0))

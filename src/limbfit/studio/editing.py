@@ -24,7 +24,7 @@ from tomlkit.items import AoT
 
 from ..anatomy.imaging import LabelMap, read_labels, write_labels
 from ..errors import StudyError
-from ..pipeline.shared.artefacts import file_digest
+from ..pipeline.shared.artefacts import compute_file_digest
 from ..study import Record, Study, load_study
 from .folder import StudyFolder
 
@@ -230,7 +230,7 @@ def find_shown_labels(folder: StudyFolder) -> Shown | None:
     file = folder.results / "segment" / LABELS
     if given == Path(BESIDE) and (folder.folder / BESIDE).is_file():
         file = folder.folder / BESIDE
-    return Shown(file, file_digest(file)) if file.is_file() else None
+    return Shown(file, compute_file_digest(file)) if file.is_file() else None
 
 
 @lru_cache(maxsize=1)

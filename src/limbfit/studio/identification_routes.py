@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict
 
 from ..pipeline import STAGE_NAMES
 from ..pipeline.shared.artefacts import read_curves
-from ..pipeline.shared.simulations import newest_simulations
+from ..pipeline.shared.simulations import find_newest_simulations
 from ..study import Record
 from .folder import StudyFolder
 from .processes import find_running, find_starting, start_run, stop_run
@@ -173,7 +173,7 @@ def _read_events(log: Path) -> list[dict[str, Any]]:
 
 def _read_newest(folder: StudyFolder, site: str) -> list[float] | None:
     for runs in sorted(folder.results.glob(".work-calibrate-*/runs")):
-        found = newest_simulations(runs, (site,)).get(site)
+        found = find_newest_simulations(runs, (site,)).get(site)
         if found is not None and found.completed:
             return list(map(float, found.force_N))
     return None

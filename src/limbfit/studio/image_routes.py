@@ -15,7 +15,7 @@ from ..anatomy.imaging import LabelMap, Volume
 from ..anatomy.labels.labelfiles import colour_of
 from ..anatomy.surfaces.surfaces import read_surface
 from ..errors import InputError, RunError
-from ..pipeline.stages.inputs import plain_image
+from ..pipeline.stages.inputs import read_plain_image
 from ..study import Study
 from .editing import LABELS, find_shown_labels, read_shown_labels, save_labels
 from .processes import find_running
@@ -137,7 +137,7 @@ def _read_study_volume(study: Study) -> Volume:
     """The image as it is; what ``segment`` asks of it besides, one limb, is for that stage to say."""
     if study.image is None:
         raise InputError("the study has no image", file=study.file, place="image")
-    return plain_image(study)
+    return read_plain_image(study)
 
 
 def _respond_nifti(grid: Volume | LabelMap) -> Response:

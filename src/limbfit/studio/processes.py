@@ -15,7 +15,7 @@ import psutil
 
 from ..errors import InputError, RunError
 from ..pipeline import STAGE_NAMES
-from ..pipeline.shared.store import holder_of, is_held
+from ..pipeline.shared.store import find_holder, is_held
 from ..study import load_study
 from .commands import PROGRAM, find_command, interrupt_process, start_command
 from .folder import StudyFolder
@@ -26,7 +26,7 @@ _HOLDER = re.compile(r"process (\d+) \(since ([^)]*)\)")
 
 def find_running(folder: StudyFolder) -> dict[str, Any] | None:
     """``process`` and ``since`` of the run that holds the study; None where none does."""
-    found = _HOLDER.match(holder_of(folder.results))
+    found = _HOLDER.match(find_holder(folder.results))
     if found is None or not psutil.pid_exists(int(found[1])) or not is_held(folder.results):
         return None
     return {"process": int(found[1]), "since": found[2]}

@@ -14,9 +14,9 @@ from ..anatomy.sites.sites import project_to_skin
 from ..anatomy.surfaces.surfaces import Anatomy, Surface, load_anatomy, read_surface
 from ..errors import InputError, SiteError
 from ..mesh import read_vtu
-from ..pipeline.shared.artefacts import digest
+from ..pipeline.shared.artefacts import compute_digest
 from ..pipeline.stages.sites import place_site
-from ..pipeline.stages.surfaces import given_anatomy
+from ..pipeline.stages.surfaces import read_given_anatomy
 from ..study import Site, Study
 from ..web.arrays import pack
 from ..web.shapes import Shell, build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape
@@ -36,7 +36,7 @@ def mark_surfaces(folder: StudyFolder, study: Study) -> str:
     files = [] if given is None else [given.skin, *given.bones.values()]
     files += [one.surface for one in geometry.regions if one.surface is not None]
     made = sorted((folder.results / "surfaces").glob("*"))
-    stated = digest(*(one and one.model_dump(mode="json") for one in (given, geometry)))
+    stated = compute_digest(*(one and one.model_dump(mode="json") for one in (given, geometry)))
     return f"{compute_fingerprint([*made, *map(study.path, files)])} {stated}"
 
 
@@ -46,7 +46,7 @@ def _read_marked_anatomy(folder: StudyFolder, mark: str) -> Anatomy | None:
     study = folder.load()
     if _is_made(folder):
         return load_anatomy(folder.results / "surfaces")
-    return None if study.surfaces is None else given_anatomy(study)[0]
+    return None if study.surfaces is None else read_given_anatomy(study)[0]
 
 
 def describe_scene(folder: StudyFolder) -> dict[str, Any]:

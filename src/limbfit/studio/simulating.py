@@ -13,7 +13,7 @@ from typing import Any
 import psutil
 
 from ..errors import RunError
-from ..pipeline.verbs.journal import discreet
+from ..pipeline.verbs.journal import redact_paths
 from .commands import PROGRAM, find_command, interrupt_process, start_command
 from .folder import StudyFolder
 from .processes import find_running
@@ -79,4 +79,4 @@ def read_failure(folder: StudyFolder, site: str) -> str | None:
         return None
     lines = [line.strip() for line in file.read_text(encoding="utf-8", errors="replace").splitlines()]
     told = [line for line in lines if line.startswith("error:")]
-    return discreet(told[-1], folder.load())[:_SAID] if told else None
+    return redact_paths(told[-1], folder.load())[:_SAID] if told else None

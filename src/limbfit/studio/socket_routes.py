@@ -15,8 +15,8 @@ from pydantic import Field
 from ..anatomy.frame import build_limb_frame
 from ..errors import InputError, SurfaceError
 from ..mesh import read_vtu
-from ..pipeline.shared.artefacts import digest
-from ..pipeline.shared.socket_shape import blaming, regions_of, socket_of, trim_of
+from ..pipeline.shared.artefacts import compute_digest
+from ..pipeline.shared.socket_shape import build_regions, build_socket, place_errors, trim_of
 from ..socket import Socket
 from ..socket.rays import LimbProfile, compute_profile
 from ..socket.trim import Trim, find_brim, trim_limb, wrap_trimline
@@ -114,7 +114,7 @@ def _name_places(folder: StudyFolder, points: np.ndarray) -> tuple[np.ndarray, l
     anatomy = read_anatomy(folder, study)
     if anatomy is None:
         return np.zeros(len(points), np.uint16), [""]
-    skin, regions = anatomy.skin, regions_of(study, anatomy)
+    skin, regions = anatomy.skin, build_regions(study, anatomy)
     nearest = igl.point_mesh_squared_distance(points, skin.points, skin.faces)[1]
     inside = np.column_stack([region.faces[nearest] for region in regions.values()])
     kinds, place = np.unique(inside, axis=0, return_inverse=True)
@@ -145,7 +145,7 @@ def describe_shape(folder: StudyFolder) -> dict[str, Any]:
     """
     study = folder.load()
     table, anatomy = study.socket, read_anatomy(folder, study)
-    regions = {} if anatomy is None else regions_of(study, anatomy)
+    regions = {} if anatomy is None else build_regions(study, anatomy)
     mark = _mark(folder, study)
     found = _build_face(folder, mark)
     drawn = isinstance(found, Socket)
@@ -227,7 +227,7 @@ def _mark(folder: StudyFolder, study: Study) -> str:
     """Changes with the limb's surfaces, the socket's file and what the table says of the shape."""
     table = study.socket
     file = compute_fingerprint([] if table.file is None else [study.path(table.file)])
-    stated = digest(table.model_dump(mode="json", exclude={"design", "loads"}))
+    stated = compute_digest(table.model_dump(mode="json", exclude={"design", "loads"}))
     return f"{mark_surfaces(folder, study)} {file} {stated}"
 
 
@@ -237,7 +237,7 @@ def _build_face(folder: StudyFolder, mark: str) -> Socket | str:
     study = folder.load()
     try:
         anatomy = read_anatomy(folder, study)
-        return NONE_YET if anatomy is None else socket_of(study, anatomy, anatomy.skin)
+        return NONE_YET if anatomy is None else build_socket(study, anatomy, anatomy.skin)
     except InputError as error:
         return f"{error.what}; {error.remedy}" if error.remedy else error.what
 
@@ -285,7 +285,7 @@ def post_trimline(folder: Folder, line: LineOfPage) -> dict[str, Any]:
     if anatomy is None:
         raise InputError(NONE_YET)
     frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
-    with blaming(study, "socket.trimline"):
+    with place_errors(study, "socket.trimline"):
         limb = _compute_profile(folder, mark_surfaces(folder, study))
         points = wrap_trimline(limb, frame, np.array(line.points))
         trim_limb(limb, frame, Trim(line=points))

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Request
 from fastapi.responses import FileResponse
 
 from ..pipeline import study_status
-from ..pipeline.shared.provenance import input_files
+from ..pipeline.shared.provenance import list_input_files
 from ..study import Study
 from .folder import StudyFolder, compute_fingerprint
 from .processes import find_running
@@ -123,7 +123,7 @@ def list_stages(folder: StudyFolder) -> list[dict[str, Any]]:
 
 
 def _mark(folder: StudyFolder, study: Study) -> str:
-    inputs = {study.path(path) for paths in input_files(study).values() for path in paths}
+    inputs = {study.path(path) for paths in list_input_files(study).values() for path in paths}
     below = [
         file for path in sorted(inputs) for file in (sorted(path.rglob("*")) if path.is_dir() else [path])
     ]

@@ -12,7 +12,7 @@ from limbfit.errors import InputError
 from limbfit.pipeline import Progress, study_status
 from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, Experiment, register_experiment
 from limbfit.pipeline.shared.artefacts import write_json
-from limbfit.pipeline.verbs.run import keys
+from limbfit.pipeline.verbs.run import compute_keys
 from limbfit.study import load_study
 
 
@@ -90,9 +90,9 @@ def test_options_settings_and_records_decide_an_experiment(study):
 
 
 def test_the_report_is_stale_once_there_is_an_experiment_to_show(study):
-    before = keys(load_study(study))
+    before = compute_keys(load_study(study))
     run_experiment(load_study(study), "peaks", listener=quiet)
-    after = keys(load_study(study))
+    after = compute_keys(load_study(study))
     assert after.pop("report") != before.pop("report")
     assert after == before
 

@@ -8,7 +8,7 @@ import pytest
 from limbfit.fe import ELEMENTS, ORDER_IN_TIME
 from limbfit.fe.materials import prony_factors
 from limbfit.pipeline.experiments.uncertainty_sources import FINER, mesh_share
-from limbfit.pipeline.shared.extrapolation import MESH_ORDERS, error_of_coarser, richardson
+from limbfit.pipeline.shared.extrapolation import MESH_ORDERS, estimate_coarse_error, extrapolate_richardson
 from limbfit.study import load_study
 
 COARSE = "[mesh.coarse]\nedge_near_mm = 5.0\n"
@@ -76,7 +76,7 @@ def test_every_element_of_studies_has_an_order_or_is_known_to_have_none():
 
 
 def test_nothing_is_extrapolated_where_forces_do_not_change_in_one_direction():
-    found = richardson([4.0, 2.8, 2.0], [10.4, 10.2, 10.1], None)
+    found = extrapolate_richardson([4.0, 2.8, 2.0], [10.4, 10.2, 10.1], None)
     assert found.order is None
     assert not found.measured
     assert found.error_percent(10.4) == pytest.approx(100 * (10.4 / 10.1 - 1))
@@ -97,5 +97,5 @@ def test_steps_in_time_are_extrapolated_at_the_order_of_the_scheme():
     errors = np.array([relaxing(n) - limit for n in (16, 32, 64)])
     orders = np.log2(np.abs(errors[:-1] / errors[1:]))
     assert orders[-1] > ORDER_IN_TIME - 0.2
-    told = error_of_coarser(ORDER_IN_TIME, 2) * (relaxing(64) - relaxing(32))
+    told = estimate_coarse_error(ORDER_IN_TIME, 2) * (relaxing(64) - relaxing(32))
     assert told == pytest.approx(-errors[1], rel=0.1)

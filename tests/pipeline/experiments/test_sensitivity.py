@@ -10,17 +10,17 @@ from limbfit.errors import InputError
 from limbfit.execution import SerialExecutor
 from limbfit.pipeline import run_study
 from limbfit.pipeline.experiments.sensitivity import (
-    other_indenters,
+    list_other_indenters,
     run_contact,
     run_indenter,
     run_kappa,
     run_stiffness,
 )
 from limbfit.pipeline.experiments.variants import choose_sites
-from limbfit.pipeline.experiments.volumes import volume_facts
+from limbfit.pipeline.experiments.volumes import summarise_volumes
 from limbfit.pipeline.shared.artefacts import read_json, write_json
 from limbfit.pipeline.shared.context import Context, Progress
-from limbfit.pipeline.shared.extrapolation import richardson
+from limbfit.pipeline.shared.extrapolation import extrapolate_richardson
 from limbfit.pipeline.shared.store import Store
 from limbfit.study import IndenterTable, load_study
 
@@ -104,7 +104,7 @@ def test_a_sphere_pushes_less_than_the_square(context, tmp_path):
 
 def test_other_indenters_have_the_studys_width_and_are_not_its_own():
     own = IndenterTable(shape="sphere", width_mm=12.0)
-    found = other_indenters(own)
+    found = list_other_indenters(own)
     assert [label for label, _, base in found if base] == ["sphere of the study"]
     assert [label for label, _, base in found if not base] == ["square", "square, rounded edge", "cylinder"]
     assert {table.width_mm for _, table, _ in found} == {12.0}
@@ -113,7 +113,7 @@ def test_other_indenters_have_the_studys_width_and_are_not_its_own():
 @pytest.mark.parametrize("order", [1.0, 2.0, 3.5])
 def test_extrapolation_finds_limit_and_order(order):
     edges = np.array([4.0, 5.6, 2.8])
-    found = richardson(edges, 10.0 + 0.05 * edges**order, 2.0)
+    found = extrapolate_richardson(edges, 10.0 + 0.05 * edges**order, 2.0)
     assert found.measured
     assert found.order == pytest.approx(order, rel=1e-6)
     assert found.limit == pytest.approx(10.0)
@@ -121,8 +121,8 @@ def test_extrapolation_finds_limit_and_order(order):
 
 
 def test_extrapolation_assumes_an_order_where_none_shows():
-    swinging = richardson([4.0, 2.8, 2.0], [10.1, 9.9, 10.05], 2.0)
-    two = richardson([4.0, 2.0], [10.4, 10.1], 2.0)
+    swinging = extrapolate_richardson([4.0, 2.8, 2.0], [10.1, 9.9, 10.05], 2.0)
+    two = extrapolate_richardson([4.0, 2.0], [10.4, 10.1], 2.0)
     assert not swinging.measured
     assert not two.measured
     assert two.limit == pytest.approx(10.0)
@@ -130,7 +130,7 @@ def test_extrapolation_assumes_an_order_where_none_shows():
 
 def test_volumes_are_weighed():
     J, volumes = np.array([0.95, 1.0, 1.0, 1.02]), np.array([1.0, 50.0, 48.0, 1.0])
-    found = volume_facts(J, volumes)
+    found = summarise_volumes(J, volumes)
     assert found["J_min"] == 0.95
     assert found["J_max"] == 1.02
     assert found["beyond_percent"] == pytest.approx(2.0)

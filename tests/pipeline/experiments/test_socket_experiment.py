@@ -26,7 +26,7 @@ from limbfit.fe import OgdenQLV
 from limbfit.fe.kernel.laws import Laws
 from limbfit.identify.uncertainty.uncertainty import NORMAL_95
 from limbfit.indentation import to_parameters
-from limbfit.pipeline.shared.socket_shape import socket_of
+from limbfit.pipeline.shared.socket_shape import build_socket
 from limbfit.pipeline.verbs.run import run_experiment
 from small_limb import limb, small_limb
 
@@ -248,7 +248,7 @@ def test_slopes_of_pressure_and_settling_are_central_differences(folder):
     on them too.
     """
     study, anatomy = load_study(folder), limb()
-    socket = socket_of(study, anatomy, anatomy.skin)
+    socket = build_socket(study, anatomy, anatomy.skin)
     settings = MeshSettings(edge_near_mm=14.0, edge_far_mm=24.0, growth=0.6, layers=(LayerSpec("skin", 3.0),))
     mesh, _ = mesh_limb(anatomy, settings, 10.0)
     up = np.array([0.0, 0.0, 1.0])

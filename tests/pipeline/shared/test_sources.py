@@ -15,14 +15,14 @@ import pytest
 
 from limbfit.indentation import simulate
 from limbfit.pipeline.experiments.catalogue import EXPERIMENTS
-from limbfit.pipeline.shared.sources import PACKAGE, shown, sources_of
+from limbfit.pipeline.shared.sources import PACKAGE, find_sources, format_source
 from limbfit.pipeline.verbs.run import STAGES
 
 RUNS = {stage.name: stage.run for stage in (*STAGES, *EXPERIMENTS)} | {"simulation": simulate}
 
 
 def names(of: str) -> set[str]:
-    return {shown(file) for file in sources_of(RUNS[of])}
+    return {format_source(file) for file in find_sources(RUNS[of])}
 
 
 def used_by(module: ModuleType) -> set[str]:
@@ -43,12 +43,12 @@ def used_by(module: ModuleType) -> set[str]:
 @pytest.mark.parametrize("name", RUNS)
 def test_what_a_module_uses_is_in_the_closure(name):
     """The objects of the loaded modules, found without reading any import."""
-    files = sources_of(RUNS[name])
+    files = find_sources(RUNS[name])
     modules = [file for file in files if file.suffix == ".py" and not file.stem.endswith("_worker")]
     for file in modules:
         parts = file.relative_to(PACKAGE.parent).with_suffix("").parts
         missing = used_by(import_module(".".join(parts).removesuffix(".__init__"))) - set(map(str, files))
-        assert not missing, f"{shown(file)} uses {missing}"
+        assert not missing, f"{format_source(file)} uses {missing}"
 
 
 def test_it_is_no_wider():

@@ -10,8 +10,8 @@ import sys
 import pytest
 
 from limbfit.errors import RunError
-from limbfit.pipeline.shared.artefacts import file_digest, read_json, write_json
-from limbfit.pipeline.shared.store import EARLIER, Store, disk_errors, lock
+from limbfit.pipeline.shared.artefacts import compute_file_digest, read_json, write_json
+from limbfit.pipeline.shared.store import EARLIER, Store, lock, translate_disk_errors
 
 
 def test_stage_is_done_only_for_its_key(tmp_path):
@@ -111,11 +111,11 @@ def test_failed_rewrite_leaves_the_old_file(tmp_path):
 def test_file_digest_sees_names_and_contents(tmp_path):
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "1").write_text("x")
-    before = file_digest(tmp_path / "d")
+    before = compute_file_digest(tmp_path / "d")
     (tmp_path / "d" / "1").rename(tmp_path / "d" / "2")
-    renamed = file_digest(tmp_path / "d")
+    renamed = compute_file_digest(tmp_path / "d")
     (tmp_path / "d" / "2").write_text("y")
-    assert len({before, renamed, file_digest(tmp_path / "d")}) == 3
+    assert len({before, renamed, compute_file_digest(tmp_path / "d")}) == 3
 
 
 def test_second_run_is_refused_while_the_first_lives(tmp_path):
@@ -142,7 +142,7 @@ def test_second_run_is_refused_while_the_first_lives(tmp_path):
 
 
 def test_full_disk_is_one_clear_line(tmp_path):
-    with pytest.raises(RunError, match="disk is full"), disk_errors(tmp_path):
+    with pytest.raises(RunError, match="disk is full"), translate_disk_errors(tmp_path):
         raise OSError(errno.ENOSPC, "no space")
-    with pytest.raises(FileNotFoundError), disk_errors(tmp_path):
+    with pytest.raises(FileNotFoundError), translate_disk_errors(tmp_path):
         raise FileNotFoundError(errno.ENOENT, "gone")

@@ -13,8 +13,8 @@ from limbfit.bench.blocks import SPEED, build_block_site
 from limbfit.errors import StudyError
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.indentation.sites import ROUGHLY
-from limbfit.pipeline.shared.provenance import settings_record
-from limbfit.pipeline.stages.mesh import coarse_settings, mesh_settings
+from limbfit.pipeline.shared.provenance import record_settings
+from limbfit.pipeline.stages.mesh import build_coarse_settings, mesh_settings
 from limbfit.pipeline.stages.records import is_moved
 from limbfit.study import Study, load_study
 from limbfit.study.meshing import ACCURACIES, estimated_cells
@@ -48,7 +48,7 @@ def stated(tmp_path: Path) -> Any:
 
 
 def accuracy(study: Study) -> Any:
-    return settings_record(study, dict.fromkeys(study.inputs, "0" * 64))["mesh"]["accuracy"]
+    return record_settings(study, dict.fromkeys(study.inputs, "0" * 64))["mesh"]["accuracy"]
 
 
 def edges(settings: object) -> tuple[float, ...]:
@@ -80,7 +80,7 @@ def test_a_bare_study_is_searched_on_less_and_corrected(stated: Any) -> None:
     assert edges(mesh_settings(study)) == (3.5, 30.0, 14.0, 0.6, 1.6)
     assert mesh_settings(study).element == "tet10"
     assert study.mesh.element == "tet10p0"
-    assert coarse_settings(study) is None
+    assert build_coarse_settings(study) is None
     assert study.within_mm == 65.0
     assert study.is_searched_apart
     assert (study.solver.load_steps, study.solver.unload_steps, study.solver.penalty_per_mm) == (8, 10, None)
@@ -99,7 +99,7 @@ def test_a_finer_accuracy_has_more_cells(stated: Any) -> None:
 
 
 def test_fine_meshes_are_corrected_on_coarser_ones(stated: Any) -> None:
-    coarse = coarse_settings(stated('[mesh]\naccuracy = "fine"\n'))
+    coarse = build_coarse_settings(stated('[mesh]\naccuracy = "fine"\n'))
     assert coarse is not None
     assert edges(coarse) == tuple((ACCURACIES["fine"][1] or {})[key] for key in EDGES)
 
@@ -107,10 +107,10 @@ def test_fine_meshes_are_corrected_on_coarser_ones(stated: Any) -> None:
 def test_what_is_stated_goes_before_the_knob(stated: Any) -> None:
     study = stated('[mesh]\naccuracy = "fine"\nedge_near_mm = 2.5\ngrowth = 0.5\n')
     assert edges(mesh_settings(study)) == (2.5, 24.0, 14.0, 0.5, 1.6)
-    assert coarse_settings(study) is not None  # it is the knob's still
+    assert build_coarse_settings(study) is not None  # it is the knob's still
     assert accuracy(study) is None
     other = stated('[mesh]\naccuracy = "fine"\n[mesh.coarse]\nedge_near_mm = 4.5\n')
-    assert edges(coarse_settings(other)) == (4.5, 30.0, 12.0, 0.9, 1.6)
+    assert edges(build_coarse_settings(other)) == (4.5, 30.0, 12.0, 0.9, 1.6)
     assert accuracy(other) is None
 
 
@@ -125,7 +125,7 @@ def test_edges_suit_the_indenters(stated: Any, widths: tuple[float, ...], near: 
     study = stated(indenters)
     assert edges(mesh_settings(study)) == pytest.approx((near, 30.0, radius, 0.6, 1.6))
     assert accuracy(study) == "standard"
-    fine = coarse_settings(stated('[mesh]\naccuracy = "fine"\n' + indenters))
+    fine = build_coarse_settings(stated('[mesh]\naccuracy = "fine"\n' + indenters))
     assert fine is not None
     assert fine.edge_near_mm == pytest.approx(5.5 * min(1.0, min(widths) / 20.0))
     own = stated("[mesh]\nedge_near_mm = 3.0\n" + indenters)
@@ -134,9 +134,9 @@ def test_edges_suit_the_indenters(stated: Any, widths: tuple[float, ...], near: 
 
 
 def test_no_coarse_mesh_is_finer_than_the_own(stated: Any) -> None:
-    assert coarse_settings(stated('[mesh]\naccuracy = "fine"\nedge_near_mm = 6.0\n')) is None
+    assert build_coarse_settings(stated('[mesh]\naccuracy = "fine"\nedge_near_mm = 6.0\n')) is None
     narrow = "[indenter]\nwidth_mm = 12.0\n"  # its coarse edges are 3.3 mm
-    assert coarse_settings(stated('[mesh]\naccuracy = "fine"\nedge_near_mm = 4.0\n' + narrow)) is None
+    assert build_coarse_settings(stated('[mesh]\naccuracy = "fine"\nedge_near_mm = 4.0\n' + narrow)) is None
 
 
 def test_an_unknown_accuracy_is_refused(stated: Any) -> None:

@@ -17,7 +17,7 @@ from limbfit.indentation import to_vector
 from limbfit.pipeline.shared.context import Context, Progress
 from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.calibrate import run_calibrate
-from limbfit.pipeline.stages.laboratory import groupings
+from limbfit.pipeline.stages.laboratory import build_groupings
 from limbfit.pipeline.stages.predict import run_predict
 from limbfit.priors import SOURCE
 from limbfit.study import Study, load_study
@@ -216,10 +216,10 @@ def test_groups_of_a_study(tmp_path):
     study = write_study(
         tmp_path, "[calibration]\nfixed = ['skin.m']\ntied = [['skin.c_kPa', 'muscle.c_kPa']]\n"
     )
-    assert groupings(study) == ((0, -1, 2, 3, 0, 1, 2, 3), (0, -1, 2, 3, 0, 5, 6, 7))
+    assert build_groupings(study) == ((0, -1, 2, 3, 0, 1, 2, 3), (0, -1, 2, 3, 0, 5, 6, 7))
     ties = ", ".join(f"['skin.{name}', 'muscle.{name}']" for name in ("c_kPa", "m", "gamma", "tau_s"))
     study = write_study(tmp_path, f"[calibration]\ntied = [{ties}]\n")
-    assert groupings(study) == ((0, 1, 2, 3) * 2,)
+    assert build_groupings(study) == ((0, 1, 2, 3) * 2,)
 
 
 @pytest.mark.parametrize(

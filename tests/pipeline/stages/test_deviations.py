@@ -17,14 +17,14 @@ from limbfit.pipeline.stages.deviations import (
     GIVEN_MM,
     LEAST_SHARE,
     OF_A_VOXEL,
-    bone_distance_mm,
-    by_thickness,
-    expected_share,
-    site_deviation,
-    surface_error_mm,
+    compute_expected_share,
+    compute_thickness_slope,
+    estimate_site_deviation,
+    estimate_surface_error_mm,
+    measure_bone_distance_mm,
 )
-from limbfit.pipeline.stages.observed import SeenWave
-from limbfit.pipeline.stages.records import SiteRecord, site_record
+from limbfit.pipeline.stages.observed import WaveMeasurement
+from limbfit.pipeline.stages.records import SiteRecord, load_site_record
 
 TRUTH = {"skin": {"c_kPa": 8.0, "m": 5.0, "gamma": 2.0, "tau_s": 0.5}}
 TRUTH["muscle"] = TRUTH["skin"] | {"c_kPa": 4.0}
@@ -36,7 +36,7 @@ def context(folder: Path, more: str = "") -> Context:
 
 def over_bone(context: Context) -> SiteRecord:
     """The block of 18 mm, whose bottom is bone."""
-    record = site_record(context, context.study.recorded[0])
+    record = load_site_record(context, context.study.recorded[0])
     mesh = read_vtu(record.model.mesh)
     bone = {"fixed_bone": mesh.node_sets["fixed_bottom"]}
     file = record.model.mesh.with_name("bone.vtu")
@@ -46,31 +46,35 @@ def over_bone(context: Context) -> SiteRecord:
 
 def test_thin_tissue_is_stiffer_by_its_thickness() -> None:
     """Hayes's table between a / h = 0.8 and 1.0; a thin layer goes with the cube, a thick one is none."""
-    assert by_thickness(0.9, 1.0) == pytest.approx(np.log(3.609 / 2.855) / np.log(1.0 / 0.8), rel=0.1)
-    assert by_thickness(10.0, 1.0) == pytest.approx(3.0)
-    assert by_thickness(0.01, 1.0) < 0.03
+    assert compute_thickness_slope(0.9, 1.0) == pytest.approx(
+        np.log(3.609 / 2.855) / np.log(1.0 / 0.8), rel=0.1
+    )
+    assert compute_thickness_slope(10.0, 1.0) == pytest.approx(3.0)
+    assert compute_thickness_slope(0.01, 1.0) < 0.03
 
 
 def test_a_site_is_off_by_its_surfaces_and_a_little_more(tmp_path: Path) -> None:
     found = context(tmp_path)
     radius = 20.0 / np.sqrt(np.pi)
-    share = expected_share(over_bone(found).model, 0.5)
-    assert share == pytest.approx(np.hypot(LEAST_SHARE, by_thickness(radius, 18.0) * 0.5 / 18.0), rel=0.02)
-    assert expected_share(site_record(found, found.study.recorded[0]).model, 0.5) == LEAST_SHARE
+    share = compute_expected_share(over_bone(found).model, 0.5)
+    assert share == pytest.approx(
+        np.hypot(LEAST_SHARE, compute_thickness_slope(radius, 18.0) * 0.5 / 18.0), rel=0.02
+    )
+    assert compute_expected_share(load_site_record(found, found.study.recorded[0]).model, 0.5) == LEAST_SHARE
 
 
 def test_where_surfaces_are_known_from(tmp_path: Path) -> None:
     """Of files, of an image by its voxels, or as stated."""
     (tmp_path / "stated").mkdir()
     found = context(tmp_path)
-    assert surface_error_mm(found) == GIVEN_MM
+    assert estimate_surface_error_mm(found) == GIVEN_MM
     labels = sitk.Image(4, 4, 4, sitk.sitkUInt8)
     labels.SetSpacing((1.0, 1.0, 8.0))
     found.store["segment"].mkdir(parents=True)
     sitk.WriteImage(labels, str(found.store["segment"] / "labels.seg.nrrd"))
-    assert surface_error_mm(found) == pytest.approx(2.0 * OF_A_VOXEL)
+    assert estimate_surface_error_mm(found) == pytest.approx(2.0 * OF_A_VOXEL)
     stated = context(tmp_path / "stated", "[calibration]\nsurface_error_mm = 0.1\n")
-    assert surface_error_mm(stated) == 0.1
+    assert estimate_surface_error_mm(stated) == 0.1
 
 
 def test_a_stiffer_site_moves_its_force_along_all_moduli(tmp_path: Path) -> None:
@@ -82,8 +86,8 @@ def test_a_stiffer_site_moves_its_force_along_all_moduli(tmp_path: Path) -> None
     jacobian = np.zeros((5, len(parameters)))
     jacobian[:, moduli] = np.linspace(0, 1, 5)[:, None]
     jacobian[:, moduli[0] + 1] = 7.0
-    off = site_deviation(found, record, SiteResponse(np.ones(5), jacobian), parameters)
-    assert off == pytest.approx(12.0 * np.linspace(0, 1, 5) * expected_share(record.model, GIVEN_MM))
+    off = estimate_site_deviation(found, record, SiteResponse(np.ones(5), jacobian), parameters)
+    assert off == pytest.approx(12.0 * np.linspace(0, 1, 5) * compute_expected_share(record.model, GIVEN_MM))
 
 
 def test_thinner_tissue_under_an_indenter_has_faster_waves(tmp_path: Path) -> None:
@@ -92,10 +96,14 @@ def test_thinner_tissue_under_an_indenter_has_faster_waves(tmp_path: Path) -> No
     record, parameters = over_bone(found), found.study.vector(TRUTH)
     speeds = np.array([4.0, 4.0, 4.5, 6.0])
     at = np.eye(4, len(record.times_s))
-    seen = SeenWave("w", speeds, np.array([0.0, 0.0, 1.0, 2.0]), np.zeros(4, int), at, np.eye(4), {"sd": 0.1})
+    seen = WaveMeasurement(
+        "w", speeds, np.array([0.0, 0.0, 1.0, 2.0]), np.zeros(4, int), at, np.eye(4), {"sd": 0.1}
+    )
     jacobian = np.zeros((4, len(parameters)))
     jacobian[:, 0] = 0.5 * speeds / parameters[0]
-    off = site_deviation(found, replace(record, seen=seen), SiteResponse(speeds, jacobian), parameters)
-    thickness = bone_distance_mm(record.model)
+    off = estimate_site_deviation(
+        found, replace(record, seen=seen), SiteResponse(speeds, jacobian), parameters
+    )
+    thickness = measure_bone_distance_mm(record.model)
     assert thickness is not None
     assert off == pytest.approx(0.5 * LEAST_SHARE * speeds + (speeds - 4.0) * GIVEN_MM / thickness)

@@ -15,9 +15,9 @@ from limbfit.indentation import SimulationJob, build_materials, build_problem, s
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.experiments.cube import check_cube
 from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import fibres_of, recorded_model
-from limbfit.pipeline.stages.laboratory import groupings, unknowns
-from limbfit.pipeline.verbs.run import keys
+from limbfit.pipeline.shared.simulations import build_recorded_model, find_fibre_directions
+from limbfit.pipeline.stages.laboratory import build_groupings, build_unknowns
+from limbfit.pipeline.verbs.run import compute_keys
 from limbfit.study import Study
 
 VALUES = {"c_kPa": 6.0, "m": 5.0, "gamma": 1.2, "tau_s": 0.5, "k1_kPa": 30.0, "k2": 3.0}
@@ -42,34 +42,34 @@ def test_the_core_has_fibres_along_the_limb_and_no_other_tissue(tmp_path):
     assert isinstance(made["skin"], OgdenQLV)
     assert isinstance(made["muscle"], Fibred)
     assert made["muscle"].parameters == pytest.approx((0.006, 5.0, 1.2, 0.5, 0.03, 3.0))
-    names = unknowns(study).names
-    still = [name for name, group in zip(names, groupings(study)[-1], strict=True) if group < 0]
+    names = build_unknowns(study).names
+    still = [name for name, group in zip(names, build_groupings(study)[-1], strict=True) if group < 0]
     assert still == ["skin.k1_kPa", "skin.k2"]
 
 
 def test_their_direction_decides_the_calibration(tmp_path):
-    before = keys(study_of(tmp_path))
-    after = keys(study_of(tmp_path, "fibres = { muscle = [0.0, 1.0, 0.0] }"))
+    before = compute_keys(study_of(tmp_path))
+    after = compute_keys(study_of(tmp_path, "fibres = { muscle = [0.0, 1.0, 0.0] }"))
     assert {stage for stage in before if before[stage] != after[stage]} == {"calibrate", "predict", "report"}
 
 
 def test_the_axis_is_the_normal_of_the_proximal_cut(context):
-    assert fibres_of(context) == (("muscle", (1.0, 0.0, 0.0)),)
+    assert find_fibre_directions(context) == (("muscle", (1.0, 0.0, 0.0)),)
     along = study_of(context.study.folder)
-    axis = fibres_of(Context(along, context.store, context.executor, context.listener))
+    axis = find_fibre_directions(Context(along, context.store, context.executor, context.listener))
     assert axis == (("muscle", (0.0, 0.0, -1.0)),)
 
 
 def test_a_flow_is_known_site_by_site(context):
     """The study names it; the directions follow from each mesh."""
     study = study_of(context.study.folder, 'fibres = { muscle = "flow" }')
-    assert fibres_of(Context(study, context.store, context.executor, context.listener)) == (
+    assert find_fibre_directions(Context(study, context.store, context.executor, context.listener)) == (
         ("muscle", "flow"),
     )
 
 
 def test_a_site_s_problem_has_them_and_its_force_their_derivatives(context):
-    model = recorded_model(context, context.study.recorded[0])
+    model = build_recorded_model(context, context.study.recorded[0])
     problem = build_problem(model, read_vtu(model.mesh), TRUTH)
     inside = problem.mesh.regions == problem.mesh.region_names.index("muscle")
     np.testing.assert_array_equal(problem.fibres[inside], np.tile([1.0, 0.0, 0.0], (inside.sum(), 1)))

@@ -17,7 +17,7 @@ from limbfit.indentation import simulating as indentation
 from limbfit.mesh import write_vtu
 from limbfit.pipeline.shared.artefacts import read_curves, write_json
 from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import COARSE, job_digest
+from limbfit.pipeline.shared.simulations import COARSE, compute_job_digest
 from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.predict import run_predict
 from limbfit.study import Study, load_study
@@ -72,7 +72,7 @@ class Losing(SerialExecutor):
             elif self.anew(job):
                 yield simulate(job)
             else:
-                digest = job_digest(job)
+                digest = compute_job_digest(job)
                 if digest not in self.known:
                     self.known[digest] = simulate(job)
                 yield self.known[digest]

@@ -18,8 +18,8 @@ from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.simulations import CURVE_POINTS
 from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.curves import run_traces
-from limbfit.pipeline.stages.deviations import site_noise
-from limbfit.pipeline.stages.records import site_record
+from limbfit.pipeline.stages.deviations import estimate_site_noise
+from limbfit.pipeline.stages.records import load_site_record
 from limbfit.report.sections.records import draw_record_figure, make_trace_table
 from limbfit.report.store import load_store
 
@@ -112,14 +112,14 @@ def test_a_protocol_goes_from_its_record_to_residuals_and_report(tmp_path, name)
     assert facts["phases"][0]["kind"] == "approach"
     assert facts["peak_s"] == pytest.approx(0.3 + knots_s[1], abs=0.02)
 
-    record = site_record(context, study.indentation(name))
+    record = load_site_record(context, study.indentation(name))
     assert len(record.times_s) <= 1.4 * CURVE_POINTS  # a hold has its own
     response = record.respond(simulate(record.job(np.array(truth))))
     error = response.force_N - record.force_N
     peak = record.force_N.max()
     assert np.sqrt(np.mean(error**2)) < 0.01 * peak
     assert np.abs(error).max() < 0.04 * peak
-    noise = site_noise(study, record, response.force_N)
+    noise = estimate_site_noise(study, record, response.force_N)
     assert np.isfinite(np.linalg.cholesky(noise.covariance)).all()
     assert np.sqrt(np.diag(noise.covariance)).max() < 0.05 * peak
 

@@ -20,7 +20,7 @@ from limbfit.pipeline.shared.context import Context
 from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.curves import read_record
 from limbfit.pipeline.stages.mesh import mesh_job, mesh_settings
-from limbfit.pipeline.verbs.run import keys
+from limbfit.pipeline.verbs.run import compute_keys
 from limbfit.report.sections.prediction import make_site_table
 from limbfit.report.store import load_store
 from limbfit.study import Record, Study, load_study
@@ -131,9 +131,9 @@ def test_a_site_with_several_records_does_not_stand_for_one(folder: Path) -> Non
 
 
 def test_records_held_out_do_not_touch_the_calibration(folder: Path) -> None:
-    before = keys(read(folder))
+    before = compute_keys(read(folder))
     more = '[[records]]\nsite = "{}"\nname = "more"\ntrace = "c.csv"\n'
-    held, fitted = (keys(read(folder, STUDY + more.format(site))) for site in ("2", "1"))
+    held, fitted = (compute_keys(read(folder, STUDY + more.format(site))) for site in ("2", "1"))
     assert held["traces"] != before["traces"]
     assert held["calibrate"] == before["calibrate"] != fitted["calibrate"]
     assert held["mesh"] != before["mesh"]  # another indenter may be wider

@@ -17,8 +17,8 @@ from limbfit.indentation import SimulationJob, SiteModel, simulate
 from limbfit.mesh import write_vtu
 from limbfit.pipeline.shared.context import Context, Progress
 from limbfit.pipeline.shared.simulations import COARSE, SimulationCache
-from limbfit.pipeline.stages.laboratory import Laboratory, linearised
-from limbfit.pipeline.stages.records import as_response, site_record
+from limbfit.pipeline.stages.laboratory import RecordSimulator, estimate_linearised
+from limbfit.pipeline.stages.records import load_site_record, to_response
 from limbfit.study import Record, Study, load_study
 
 TRUTH = {
@@ -134,11 +134,11 @@ def test_further_records_narrow_every_interval(tmp_path: Path, no_own_record: No
         (tmp_path / name).mkdir()
         context = stored(tmp_path / name, text)
         study, cache = context.study, SimulationCache(tmp_path / name / "runs")
-        laboratory = Laboratory(context, cache, study.records_at(*study.fitted))
+        laboratory = RecordSimulator(context, cache, study.records_at(*study.fitted))
         at = laboratory.anchored(study.vector(TRUTH))
         for record, response in zip(laboratory.records, at.responses, strict=True):
             assert np.abs(response.force_N - record.compared).mean() < 0.04 * record.compared.max()
-        known.append(linearised(context, laboratory.records, study.vector(TRUTH), at))
+        known.append(estimate_linearised(context, laboratory.records, study.vector(TRUTH), at))
     every = known[1]
     assert {noise.name: noise.unit for noise in every.residual_model.noise} == {
         name: "mm" if name == "a-creep" else "N" for name in HISTORIES
@@ -151,10 +151,10 @@ def test_depths_under_a_force_follow_the_parameters(tmp_path: Path, no_own_recor
     """The derivatives that a creep is fitted with, in the units of the study, beside differences."""
     text = STUDY.replace("load_steps = 10", "load_steps = 3").replace("unload_steps = 10", "unload_steps = 3")
     context = stored(tmp_path, text.replace('"a.csv"', '"a-creep.csv"\ncontrol = "force"'))
-    (record,) = (site_record(context, record) for record in context.study.recorded)
+    (record,) = (load_site_record(context, record) for record in context.study.recorded)
     assert record.measured.unit == "mm"
     vector = context.study.vector(TRUTH)
-    found = as_response(simulate(record.job(vector)))
+    found = to_response(simulate(record.job(vector)))
     assert found.completed
     for i in (0, 6):  # the skin's modulus and the muscle's amplitude
         step = 1e-3 * vector[i] * np.eye(len(vector))[i]

@@ -23,7 +23,7 @@ from limbfit.indentation import SimulationJob, SiteModel, build_problem, simulat
 from limbfit.mesh import read_vtu, write_vtu
 from limbfit.phantom.record import Ramp, record
 from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.verbs.run import keys
+from limbfit.pipeline.verbs.run import compute_keys
 from limbfit.study import IndenterTable, SolverTable, Study
 
 CUT = np.array([12.0, -80.0, 300.0])  # the middle of the limb's proximal cut, LPS mm
@@ -154,9 +154,9 @@ def test_it_is_a_part_of_its_own_in_febio_s_input(over: SiteModel, tmp_path) -> 
 def test_a_study_has_it_among_its_tissues(tmp_path) -> None:
     study = write_study(tmp_path)
     assert study.tissues == TISSUES
-    before = keys(study)
+    before = compute_keys(study)
     write_surface(tmp_path / "scar.stl", ellipsoid(at(-18.0, 0.0, -40.0), np.array([6.0, 11.0, 15.0])))
-    after = keys(load_study(tmp_path))
+    after = compute_keys(load_study(tmp_path))
     assert before["surfaces"] != after["surfaces"]
     assert before["traces"] == after["traces"]
 

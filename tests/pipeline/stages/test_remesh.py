@@ -10,8 +10,8 @@ from limbfit.execution import SerialExecutor
 from limbfit.pipeline.shared.context import Context, Progress
 from limbfit.pipeline.shared.store import Store
 from limbfit.pipeline.stages.mesh import mesh_settings
-from limbfit.pipeline.stages.records import site_record
-from limbfit.pipeline.stages.remesh import meshed_models, meshed_where_possible, scaled_edges
+from limbfit.pipeline.stages.records import load_site_record
+from limbfit.pipeline.stages.remesh import mesh_models, mesh_where_possible, scale_edges
 
 
 def test_a_site_without_such_a_mesh_is_left_out_and_named(study):
@@ -21,11 +21,11 @@ def test_a_site_without_such_a_mesh_is_left_out_and_named(study):
     loaded, told = load_study(study), list[Progress]()
     run_study(loaded, until="mesh")
     context = Context(loaded, Store(loaded.results), SerialExecutor(), told.append)
-    models = [site_record(context, record).model for record in loaded.recorded]
-    coarser, folder = scaled_edges(mesh_settings(loaded), 1.3), study / "coarser"
-    meshed_models(context, folder, models[:1], coarser, "calibrate")
+    models = [load_site_record(context, record).model for record in loaded.recorded]
+    coarser, folder = scale_edges(mesh_settings(loaded), 1.3), study / "coarser"
+    mesh_models(context, folder, models[:1], coarser, "calibrate")
     hurried = replace(coarser, time_limit_s=0.01)
-    found = meshed_where_possible(context, folder, models, hurried, "calibrate", "its error is not counted")
+    found = mesh_where_possible(context, folder, models, hurried, "calibrate", "its error is not counted")
     assert found == [replace(models[0], mesh=folder / "1.vtu", mesh_digest=found[0].mesh_digest), None]
     assert found[0].mesh_digest != models[0].mesh_digest
     made, lost = (event.text for event in told)

@@ -12,7 +12,7 @@ from limbfit.identify.fit.objective import MeasuredCurve
 from limbfit.identify.fit.parameters import FIXED, Unknowns
 from limbfit.identify.fit.state import CalibrationSettings
 from limbfit.indentation import SimulationJob, simulate
-from limbfit.pipeline.stages.records import as_response
+from limbfit.pipeline.stages.records import to_response
 from limbfit.study import SolverTable
 
 TISSUES = ("skin", "muscle")
@@ -34,7 +34,7 @@ class Block:
         values = tuple(map(float, parameters))
         found = simulate(SimulationJob(self.model, TISSUES, values, self.times))
         self.doubts[self.key(values)] = {doubt.kind for doubt in found.doubts}
-        return [as_response(found)]
+        return [to_response(found)]
 
     def kinds(self, parameters):
         return self.doubts[self.key(parameters)]

@@ -20,10 +20,10 @@ from limbfit.indentation import (
 from limbfit.mesh import Mesh
 from limbfit.phantom.record import write_surface
 from limbfit.pipeline.shared.simulations import SimulationCache
-from limbfit.pipeline.shared.surface_points import MAX_POINTS, ChosenPoints, chosen_points
+from limbfit.pipeline.shared.surface_points import MAX_POINTS, ChosenPoints, choose_points
 from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.curves import run_traces
-from limbfit.pipeline.stages.laboratory import Laboratory, linearised
+from limbfit.pipeline.stages.laboratory import RecordSimulator, estimate_linearised
 from limbfit.pipeline.stages.predict import run_predict
 from limbfit.report.drawing.figures import draw_skin_figure
 from limbfit.report.sections.prediction import make_observed_table
@@ -79,9 +79,9 @@ def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -
         (tmp_path / name).mkdir()
         context = BLOCK.stored(tmp_path / name, monkeypatch, more)
         study = context.study
-        laboratory = Laboratory(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
+        laboratory = RecordSimulator(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
         at = laboratory.anchored(study.vector(TRUTH))
-        known = linearised(context, laboratory.records, study.vector(TRUTH), at)
+        known = estimate_linearised(context, laboratory.records, study.vector(TRUTH), at)
         widths.append(np.sqrt(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
     assert [one.name for one in laboratory.records] == ["a", "a+surface"]
     assert [one.unit for one in laboratory.measured] == ["N", "mm"]
@@ -129,7 +129,7 @@ def test_one_component_in_the_frame_of_the_indenter(tmp_path: Path, monkeypatch)
         file, rows[:, [0, 1, 2, 3, 6]], delimiter=",", header="time_s,x_mm,y_mm,z_mm,uz_mm", comments=""
     )
     run_traces(context, context.store["traces"])
-    laboratory = Laboratory(context, SimulationCache(tmp_path / "runs"), context.study.recorded)
+    laboratory = RecordSimulator(context, SimulationCache(tmp_path / "runs"), context.study.recorded)
     at = laboratory.anchored(context.study.vector(TRUTH))
     seen = laboratory.records[1]
     assert set(seen.seen.components.tolist()) == {2}
@@ -147,7 +147,7 @@ def chosen(study: Study, points: np.ndarray | list) -> ChosenPoints:
     moved = np.tile([0.0, 0.0, -1.0], (1, len(points), 1))
     motion = SurfaceMotion(np.asarray(points, dtype=float), np.array([1.0]), moved)
     skin = mesh.points, mesh.face_sets["skin"]
-    return chosen_points(study, study.recorded[0], PLACE, skin, motion)
+    return choose_points(study, study.recorded[0], PLACE, skin, motion)
 
 
 def test_points_that_are_not_compared_are_counted(tmp_path: Path) -> None:

@@ -17,9 +17,9 @@ from limbfit.indentation import SimulationJob, flat_names, simulate, to_paramete
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.shared.context import Context, Progress
 from limbfit.pipeline.stages.calibrate import run_calibrate
-from limbfit.pipeline.stages.laboratory import unknowns
+from limbfit.pipeline.stages.laboratory import build_unknowns
 from limbfit.pipeline.stages.predict import run_predict
-from limbfit.pipeline.verbs.run import keys
+from limbfit.pipeline.verbs.run import compute_keys
 from limbfit.report import build_report
 from limbfit.study import SolverTable, Study, load_study
 
@@ -112,7 +112,7 @@ def test_a_tissue_that_does_not_reach_the_site_has_no_influence(tmp_path):
 
 def test_overrides_reach_the_tissue_that_they_name(tmp_path):
     more = "[material.tissues.fat]\nstart = { c_kPa = 2.0 }\nupper = { c_kPa = 10.0, tau_s = 5.0 }\n"
-    found = unknowns(write_study(tmp_path, LAYERS + more))
+    found = build_unknowns(write_study(tmp_path, LAYERS + more))
     assert isinstance(found, Unknowns)
     assert found.names[4:8] == ("fat.c_kPa", "fat.m", "fat.gamma", "fat.tau_s")
     assert found.start.tolist() == [4.7, 3.0, 1.2, 2.0, 2.0, 3.0, 1.2, 2.0, 4.7, 3.0, 1.2, 2.0]
@@ -142,7 +142,7 @@ def test_overrides_that_cannot_be_are_refused(tmp_path, override, message):
 
 
 def stale(before: dict[str, str], study: Study) -> set[str]:
-    after = keys(study)
+    after = compute_keys(study)
     return {name for name in before if before[name] != after[name]}
 
 
@@ -151,11 +151,11 @@ MODEL = {"calibrate", "predict", "report"}
 
 def test_what_is_held_out_does_not_make_a_calibration_stale(tmp_path):
     both = (("1", True), ("2", False))
-    before = keys(write_study(tmp_path, sites=both))
+    before = compute_keys(write_study(tmp_path, sites=both))
     (tmp_path / "2.csv").write_text("another record")
     assert stale(before, load_study(tmp_path)) == {"traces", "predict", "report"}
     alone = write_study(tmp_path, sites=both[:1])
-    assert keys(alone)["calibrate"] == before["calibrate"]
+    assert compute_keys(alone)["calibrate"] == before["calibrate"]
     fitted = write_study(tmp_path, sites=(("1", True), ("2", True)))
     assert stale(before, fitted) >= MODEL
     (tmp_path / "1.csv").write_text("another record")
@@ -163,7 +163,7 @@ def test_what_is_held_out_does_not_make_a_calibration_stale(tmp_path):
 
 
 def test_other_tissues_or_another_start_make_a_calibration_stale(tmp_path):
-    before = keys(write_study(tmp_path, LAYERS))
+    before = compute_keys(write_study(tmp_path, LAYERS))
     renamed = write_study(tmp_path, LAYERS.replace('"fat"', '"adipose"'))
     assert {"mesh", *MODEL} <= stale(before, renamed)
     started = write_study(tmp_path, LAYERS + "[material.tissues.fat]\nstart = { m = 4.0 }\n")
@@ -186,7 +186,7 @@ def test_places_that_share_markers_decide_together(tmp_path):
         )
         return load_study(tmp_path)
 
-    before = keys(marked(0.0))
+    before = compute_keys(marked(0.0))
     (tmp_path / "2.csv").write_text("another record")
     assert "calibrate" not in stale(before, marked(0.0))
     assert "calibrate" in stale(before, marked(1.0))

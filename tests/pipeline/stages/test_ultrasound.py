@@ -19,7 +19,7 @@ from limbfit.mesh import find_gauges_along
 from limbfit.phantom.record import write_ultrasound
 from limbfit.pipeline.shared.simulations import SimulationCache
 from limbfit.pipeline.stages.calibrate import run_calibrate
-from limbfit.pipeline.stages.laboratory import Laboratory, linearised
+from limbfit.pipeline.stages.laboratory import RecordSimulator, estimate_linearised
 from limbfit.pipeline.stages.predict import run_predict
 from limbfit.report.drawing.figures import draw_layer_figure
 from limbfit.report.store import load_store
@@ -165,9 +165,9 @@ def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatc
         (tmp_path / name).mkdir()
         context = BLOCK.stored(tmp_path / name, monkeypatch, more)
         study = context.study
-        laboratory = Laboratory(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
+        laboratory = RecordSimulator(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
         at = laboratory.anchored(study.vector(TRUTH))
-        known = linearised(context, laboratory.records, study.vector(TRUTH), at)
+        known = estimate_linearised(context, laboratory.records, study.vector(TRUTH), at)
         widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
     assert [one.name for one in laboratory.records] == ["a", "a+skin", "a+muscle"]
     assert [one.unit for one in laboratory.measured] == ["N", "mm", "mm"]

@@ -14,7 +14,7 @@ from limbfit.execution import SerialExecutor
 from limbfit.fe import SimulationWarning
 from limbfit.indentation import Simulation
 from limbfit.pipeline.shared import simulations
-from limbfit.pipeline.stages.doubted import Doubted, doubts_record
+from limbfit.pipeline.stages.doubted import SearchWarning, warnings_to_dict
 from limbfit.report import build_report
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "report"))
@@ -49,9 +49,9 @@ def test_the_report_shows_them_and_counts_those_of_the_search(tmp_path):
     content = json.loads(file.read_text())
     slip = SimulationWarning("slipped", "the force falls from 5 N to 4 N", 1, 6.0, 0.75)
     found = SimpleNamespace(names=("c",), history=[SimpleNamespace(parameters=(1.0,))])
-    searched = [Doubted(1, "tibia", (1.0,), FOLD), Doubted(2, "tibia", (2.0,), slip)]
+    searched = [SearchWarning(1, "tibia", (1.0,), FOLD), SearchWarning(2, "tibia", (2.0,), slip)]
     answer = Simulation("tibia", np.arange(3.0), None, True, "", 0.02, {}, (FOLD,))
-    content["doubts"] = doubts_record(searched, {"tibia": answer}, 8, found)
+    content["doubts"] = warnings_to_dict(searched, {"tibia": answer}, 8, found)
     content["contact"] = {"tibia": {"from_rest_percent": 0.3}}
     file.write_text(json.dumps(content))
     text = build_report(results, tmp_path / "report.html").read_text()

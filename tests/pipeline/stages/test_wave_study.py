@@ -13,10 +13,10 @@ from limbfit.errors import TraceError
 from limbfit.indentation import Simulation, SiteModel, place_waves_under
 from limbfit.phantom.record import write_waves
 from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import SimulationCache, recorded_model
+from limbfit.pipeline.shared.simulations import SimulationCache, build_recorded_model
 from limbfit.pipeline.stages.calibrate import run_calibrate
 from limbfit.pipeline.stages.curves import run_traces
-from limbfit.pipeline.stages.laboratory import Laboratory, linearised
+from limbfit.pipeline.stages.laboratory import RecordSimulator, estimate_linearised
 from limbfit.pipeline.stages.predict import run_predict
 from limbfit.report.drawing.figures import draw_wave_figure
 from limbfit.report.sections.prediction import make_observed_table
@@ -56,9 +56,9 @@ def test_speeds_are_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
         (tmp_path / name).mkdir()
         context = BLOCK.stored(tmp_path / name, monkeypatch, more)
         study = context.study
-        laboratory = Laboratory(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
+        laboratory = RecordSimulator(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
         at = laboratory.anchored(study.vector(TRUTH))
-        known = linearised(context, laboratory.records, study.vector(TRUTH), at)
+        known = estimate_linearised(context, laboratory.records, study.vector(TRUTH), at)
         widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
     assert [one.name for one in laboratory.records] == ["a", "a+skin-waves", "a+muscle-waves"]
     assert [one.unit for one in laboratory.measured] == ["N", "m/s", "m/s"]
@@ -110,4 +110,4 @@ def test_a_place_that_is_not_there_is_refused(tmp_path: Path, monkeypatch) -> No
 
 def _model_anew(context: Context) -> SiteModel:
     run_traces(context, context.store["traces"])
-    return recorded_model(context, context.study.recorded[0])
+    return build_recorded_model(context, context.study.recorded[0])

@@ -21,7 +21,7 @@ from limbfit import (
 )
 from limbfit.anatomy.imaging import LabelMap, Volume, write_labels, write_volume
 from limbfit.errors import InputError
-from limbfit.pipeline.verbs.refusals import refused_commands
+from limbfit.pipeline.verbs.refusals import list_refused_commands
 
 UNFITTED = ("fitted = true", "")
 BOTH_FITTED = ('trace = "2.csv"', 'trace = "2.csv"\nfitted = true')
@@ -82,7 +82,7 @@ BY_STUDY = {
 def test_what_the_study_file_decides_is_said_at_once(study, command):
     change, call, words = BY_STUDY[command]
     given = with_change(study, change)
-    rows = [row for row in refused_commands(given, None) if command in row["commands"]]
+    rows = [row for row in list_refused_commands(given, None) if command in row["commands"]]
     assert len(rows) == 1
     assert words in rows[0]["why"]
     with pytest.raises(InputError, match=re.escape(words)):

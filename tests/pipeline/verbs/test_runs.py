@@ -17,8 +17,8 @@ import pytest
 from limbfit.errors import InputError, RunError
 from limbfit.execution import Limits, SerialExecutor, make_executor, share_executor
 from limbfit.pipeline import Progress, diagnose, run_batch, run_study, study_status
-from limbfit.pipeline.verbs.doctor import judge_self_test, squeeze_cube
-from limbfit.pipeline.verbs.journal import discreet
+from limbfit.pipeline.verbs.doctor import compress_test_cube, judge_self_test
+from limbfit.pipeline.verbs.journal import redact_paths
 from limbfit.study import load_study
 
 
@@ -84,7 +84,7 @@ def test_the_log_tells_what_happened_and_no_names_of_files(alone):
     for text in (first.read_text(), second.read_text()):
         assert "Doe" not in text
         assert str(alone) not in text
-    assert discreet("see /home/jane/x/y.dcm", load_study(alone)) == "see <path>"
+    assert redact_paths("see /home/jane/x/y.dcm", load_study(alone)) == "see <path>"
 
 
 def test_a_batch_lists_failures_and_does_the_rest(alone, tmp_path):
@@ -168,7 +168,7 @@ def test_a_folder_that_cannot_be_written_is_one_clear_line(alone, monkeypatch):
 
 
 def test_the_self_test_knows_its_answer():
-    found, wanted = squeeze_cube(1e-4)
+    found, wanted = compress_test_cube(1e-4)
     assert found == pytest.approx(wanted, rel=1e-3)
     right = judge_self_test(found, wanted, seconds=3600.0)  # a compiler may take its time
     assert (right.state, right.remedy) == ("ok", "")

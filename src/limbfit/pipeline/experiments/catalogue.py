@@ -54,7 +54,7 @@ _SIMULATED = ("sites", "traces", "mesh", "calibrate")
 _INDENTERS, _RECORD = ("indenter", "indenters", "clamps"), ("site", "name", "indenter")
 
 
-def _sensitivity(
+def _build_sensitivity(
     name: str, run: Callable[..., dict[str, Any]], check: Check = check_variants, **options: Any
 ) -> Experiment:
     return Experiment(
@@ -88,11 +88,11 @@ _OWN: tuple[Experiment, ...] = (
         options={"sites": "all"},
         check=check_regions,
     ),
-    _sensitivity("c", run_stiffness),
-    _sensitivity("kappa", run_kappa, ratios=list(KAPPA_RATIOS)),
-    _sensitivity("contact", run_contact),
-    _sensitivity("indenter", run_indenter),
-    _sensitivity("mesh", run_refinement, check_refinement, factors=list(FACTORS)),
+    _build_sensitivity("c", run_stiffness),
+    _build_sensitivity("kappa", run_kappa, ratios=list(KAPPA_RATIOS)),
+    _build_sensitivity("contact", run_contact),
+    _build_sensitivity("indenter", run_indenter),
+    _build_sensitivity("mesh", run_refinement, check_refinement, factors=list(FACTORS)),
     Experiment(
         "uncertainty",
         run_uncertainty,
@@ -181,7 +181,7 @@ def register_experiment(experiment: Experiment, section: Maker | None = None) ->
         SECTIONS.add(name, section)
 
 
-def options_of(experiment: Experiment, given: Mapping[str, Any]) -> dict[str, Any]:
+def merge_options(experiment: Experiment, given: Mapping[str, Any]) -> dict[str, Any]:
     """The given options over the defaults."""
     unknown = ", ".join(sorted(set(given) - set(experiment.options)))
     if unknown:
@@ -205,20 +205,20 @@ def check_experiment(
         experiment.check(study, limb, options)
 
 
-def experiment_key(
+def compute_experiment_key(
     experiment: Experiment, keys: Keys, stages: Mapping[str, str], options: Mapping[str, Any]
 ) -> str:
     """The key of an experiment with its options; ``stages`` are the keys of the chain."""
     return keys.of([experiment], stages, options={experiment.name: options})[experiment.name]
 
 
-def experiment_rows(study: Study, keys: Keys, stages: Mapping[str, str]) -> list[dict[str, Any]]:
+def list_experiment_rows(study: Study, keys: Keys, stages: Mapping[str, str]) -> list[dict[str, Any]]:
     """State of every experiment, as of a stage, each judged with the options that it was run with."""
     store, rows = Store(study.results), []
     for experiment in EXPERIMENTS:
         stamp = store.stamp(experiment.name) or {}
         options = {**experiment.options, **stamp.get("options", {})}
-        key = experiment_key(experiment, keys, stages, options)
+        key = compute_experiment_key(experiment, keys, stages, options)
         state = store.state(experiment.name, key)
         rows.append(
             {

@@ -38,8 +38,8 @@ from ...study import Study
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.limb import LimbGeometry
-from ..shared.simulations import experiment_cache
-from ..stages.laboratory import Laboratory, unknowns
+from ..shared.simulations import open_experiment_cache
+from ..stages.laboratory import RecordSimulator, build_unknowns
 
 Runs = list[list[SiteResponse]]
 
@@ -77,8 +77,8 @@ def run_crossvalidate(
     study = context.study
     recorded = [site for site in study.sites if study.records_at(site)]
     size = fit or len(study.fitted)
-    laboratory = Laboratory(
-        context, experiment_cache(context, folder), study.records_at(*recorded), "crossvalidate"
+    laboratory = RecordSimulator(
+        context, open_experiment_cache(context, folder), study.records_at(*recorded), "crossvalidate"
     )
     bench = _Bench(context, laboratory, seed, runs)
     own_choice = tuple(i for i, site in enumerate(recorded) if site.fitted)
@@ -88,7 +88,7 @@ def run_crossvalidate(
     checks = bench.check(first.spread(_CHECKED), 1)
     found = bench.validate(own_choice, chosen, regions)
     checks += bench.check(found.spread(_CHECKED), 2)
-    content = _content(context, bench, found, size, comb(len(recorded), size), checks)
+    content = _to_content(context, bench, found, size, comb(len(recorded), size), checks)
     write_json(folder / "crossvalidate.json", content)
     _write_tables(folder, content)
     return {}
@@ -110,12 +110,12 @@ class _Found:
 class _Bench:
     """Simulations of all recorded sites, the emulator made of them, and the fits on it."""
 
-    def __init__(self, context: Context, laboratory: Laboratory, seed: int, runs: int) -> None:
+    def __init__(self, context: Context, laboratory: RecordSimulator, seed: int, runs: int) -> None:
         self.context, self.laboratory = context, laboratory
         study = context.study
         stored = context.stored("calibrate", "calibration.json")
         self.best = study.vector(stored["stages"][-1]["parameters"])
-        self.bounds = unknowns(study).with_start(self.best)
+        self.bounds = build_unknowns(study).with_start(self.best)
         self.measured = laboratory.measured
         of_site: dict[str, list[int]] = {}
         for i, one in enumerate(self.measured):
@@ -136,7 +136,7 @@ class _Bench:
             self.context.tell("crossvalidate", i, len(points), f"simulation {i + 1} of {len(points)}")
             runs.append(self.as_fine(self.laboratory.search(point)))
         for point, run in zip(points, runs, strict=True):
-            if failed := _failed(run):
+            if failed := _describe_failed(run):
                 told = f"warning: a simulation failed at site {failed}: the emulator does without it"
                 self.context.tell("crossvalidate", 0, 0, told)
             else:
@@ -177,7 +177,7 @@ class _Bench:
         runs = self.learn([fold.parameters for fold in folds])
         rows = []
         for fold, cheap, run in zip(folds, emulated, runs):
-            if _failed(run):
+            if _describe_failed(run):
                 continue
             held = [self.groups[site] for site in fold.heldout]
             solved = [
@@ -198,12 +198,12 @@ class _Bench:
         return rows
 
 
-def _failed(run: Sequence[SiteResponse]) -> str:
+def _describe_failed(run: Sequence[SiteResponse]) -> str:
     """The sites whose simulation did not complete, in words; empty where all did."""
     return ", ".join(response.site for response in run if not response.completed)
 
 
-def _content(
+def _to_content(
     context: Context, bench: _Bench, found: _Found, size: int, possible: int, checks: list[dict[str, Any]]
 ) -> dict[str, Any]:
     """What ``crossvalidate.json`` holds."""
@@ -228,8 +228,8 @@ def _content(
                 "region": regions[name],
                 "fitted": i in found.own.fitted,
                 "left_out_of": summary.sites,
-                "mean_percent": _plain(summary.mean_percent),
-                "sd_percent": _plain(summary.sd_percent),
+                "mean_percent": _to_plain(summary.mean_percent),
+                "sd_percent": _to_plain(summary.sd_percent),
                 "own_percent": found.own.errors_percent[i],
             }
             for i, (name, summary) in enumerate(zip(sites, by_site))
@@ -245,7 +245,7 @@ def _content(
     }
 
 
-def _plain(value: float) -> float | None:
+def _to_plain(value: float) -> float | None:
     return None if np.isnan(value) else value
 
 

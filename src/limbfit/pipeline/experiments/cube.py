@@ -77,12 +77,12 @@ def compress_cube(
         For a compression that is no compression.
     """
     check_compression(compression_percent)
-    times = _times()
+    times = _build_times()
     rows, stresses = [], {}
-    for specimen in _specimens(parameters or {}, kappa_ratio, law):
+    for specimen in _build_specimens(parameters or {}, kappa_ratio, law):
         stress, least, most = compress(specimen.material, times, compression_percent)
         stresses[specimen.name] = stress
-        rows.append(specimen.row | _summary(times, stress) | {"J_min": least, "J_max": most})
+        rows.append(specimen.row | _summarise(times, stress) | {"J_min": least, "J_max": most})
     content = {
         "side_mm": SIDE_MM,
         "compression_percent": compression_percent,
@@ -135,14 +135,14 @@ def run_cube(context: Context, folder: Path, *, compression_percent: float) -> d
     return {}
 
 
-def _specimens(parameters: dict[str, dict[str, float]], kappa_ratio: float, law: str) -> list[Specimen]:
+def _build_specimens(parameters: dict[str, dict[str, float]], kappa_ratio: float, law: str) -> list[Specimen]:
     own = build_materials(parameters, kappa_ratio, law)
     found = []
     for i, (tissue, values) in enumerate(parameters.items()):
         words = ", ".join(f"{p.key} = {values[p.key]:.4g} {p.unit}".rstrip() for p in LAWS[law].parameters)
         kind = "muscle" if i == len(parameters) - 1 else "skin"
         row = {"values": words, "conversion": "none", "source": "this study"}
-        found.append(_specimen(f"{tissue} (this study)", kind, own[tissue], LAWS[law].words, row))
+        found.append(_build_specimen(f"{tissue} (this study)", kind, own[tissue], LAWS[law].words, row))
     # The paper's, where no study gives its own.
     relaxation: dict[str, PronyTerms] = {"skin": ((3.57, 0.32),), "muscle": ((3.47, 0.34),)}
     if parameters:
@@ -151,14 +151,14 @@ def _specimens(parameters: dict[str, dict[str, float]], kappa_ratio: float, law:
     for known in PUBLISHED:
         row = {"values": known.values, "conversion": known.conversion, "source": known.source}
         found.append(
-            _specimen(
+            _build_specimen(
                 known.name, known.kind, known.material(relaxation[known.kind]), "sum of Ogden terms", row
             )
         )
     return found
 
 
-def _specimen(name: str, kind: str, material: Material, law: str, row: dict[str, Any]) -> Specimen:
+def _build_specimen(name: str, kind: str, material: Material, law: str, row: dict[str, Any]) -> Specimen:
     table = material.table()
     relaxation = 1.0 + float(table.prony[:, 0].sum())
     terms = table.terms.tolist() if table.has_terms else []
@@ -175,13 +175,13 @@ def _specimen(name: str, kind: str, material: Material, law: str, row: dict[str,
     return Specimen(name, kind, material, facts | row)
 
 
-def _times() -> Array:
+def _build_times() -> Array:
     """Steps (k,) in s: even in each ramp, dense at first while the cube is held."""
     ramp = np.arange(1, STEPS + 1) / STEPS
     return np.concatenate([RAMP_S * ramp, RAMP_S * (1 + ramp), 2 * RAMP_S + HOLD_S * ramp**1.5])
 
 
-def cube_mesh(cells: int = 1) -> Mesh:
+def build_cube_mesh(cells: int = 1) -> Mesh:
     """The cube of ``cells`` hexahedra along a side, from the origin, mm."""
     lines = np.linspace(0.0, SIDE_MM, cells + 1)
     points, corners = build_boxes(lines, lines, lines)
@@ -192,7 +192,7 @@ def compress(material: Material, times: Array, compression_percent: float) -> tu
     """Stress (k,) in kPa at ``times`` s, and the least and largest ratio of volumes."""
     depth = SIDE_MM * compression_percent / 100.0
     ramp = np.array([0.0, RAMP_S, 2 * RAMP_S, 2 * RAMP_S + HOLD_S])
-    mesh = cube_mesh()
+    mesh = build_cube_mesh()
     planes = [Support(np.flatnonzero(mesh.points[:, i] == 0.0), i) for i in range(3)]
     top = Support(np.flatnonzero(mesh.points[:, 2] == SIDE_MM), 2, -1.0)
     problem = Problem(
@@ -216,7 +216,7 @@ def compress(material: Material, times: Array, compression_percent: float) -> tu
     return stress / KPA, float(volume.min()), float(volume.max())
 
 
-def _summary(times: Array, stress: Array) -> dict[str, float]:
+def _summarise(times: Array, stress: Array) -> dict[str, float]:
     """Peak, and the tension that stays when the cube is back at its height, at once and at the end."""
     back = int(np.argmin(np.abs(times - 2 * RAMP_S)))
     return {
@@ -232,13 +232,13 @@ def _write(folder: Path, content: dict[str, Any]) -> None:
     stored = read_json(folder / "cube.json")
     columns = [np.array([0.0, *content["time_s"]])]
     columns += [np.array([0.0, *values]) for values in content["stress_kPa"].values()]
-    heads = ["time_s", *(_column(name) for name in content["stress_kPa"])]
+    heads = ["time_s", *(_format_column(name) for name in content["stress_kPa"])]
     table = np.column_stack(columns)
     np.savetxt(folder / "cube.csv", table, fmt="%.9g", delimiter=",", header=",".join(heads), comments="")
     (folder / "cube.svg").write_text(report.cube_drawing(stored), encoding="utf-8")
 
 
-def _column(name: str) -> str:
+def _format_column(name: str) -> str:
     """A tissue's name as the head of a CSV column, with the unit."""
     plain = "".join(c if c.isalnum() and c.isascii() else " " for c in name)
     return "_".join(plain.split()) + "_kPa"

@@ -29,8 +29,8 @@ from ...study import Site, Study
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.limb import LimbGeometry
-from ..shared.simulations import curve_job, experiment_cache, model_of
-from ..stages.laboratory import unknowns
+from ..shared.simulations import build_curve_job, build_model, open_experiment_cache
+from ..stages.laboratory import build_unknowns
 
 DEFAULT_SITES = 4
 DEEPEST_SHARE = 0.5  # of the tissue's thickness that a candidate may go
@@ -43,7 +43,7 @@ def check_design(study: Study, limb: LimbGeometry | None, options: Mapping[str, 
     ------
     InputError
     """
-    sites, depths = wanted_sites(study, options["sites"]), options["depths_mm"]
+    sites, depths = count_wanted_sites(study, options["sites"]), options["depths_mm"]
     if not 0 < sites <= len(study.sites):
         raise InputError(f"{sites} sites are wanted of {len(study.sites)}", place="--sites")
     for site in study.sites:
@@ -57,7 +57,7 @@ def check_design(study: Study, limb: LimbGeometry | None, options: Mapping[str, 
             )
     if limb is None or not depths:
         return
-    fitting = [site for site in study.sites if min(depths) <= _deepest_mm(study, limb, site)]
+    fitting = [site for site in study.sites if min(depths) <= _find_deepest_mm(study, limb, site)]
     if len(fitting) < sites:
         what = f"{min(depths):g} mm is no deeper than half of the tissue at {len(fitting)} of {sites} sites"
         raise StudyError(
@@ -65,12 +65,12 @@ def check_design(study: Study, limb: LimbGeometry | None, options: Mapping[str, 
         )
 
 
-def wanted_sites(study: Study, sites: int) -> int:
+def count_wanted_sites(study: Study, sites: int) -> int:
     """How many sites to choose: of 0 as many as the study fits, else four, or all where it has fewer."""
     return sites or len(study.fitted) or min(DEFAULT_SITES, len(study.sites))
 
 
-def _deepest_mm(study: Study, limb: LimbGeometry, site: Site) -> float:
+def _find_deepest_mm(study: Study, limb: LimbGeometry, site: Site) -> float:
     """How deep a candidate at a site may go."""
     width = study.indenter_of((study.records_at(site) or (site,))[0]).width_mm
     return DEEPEST_SHARE * measure_tissue_under(limb.anatomy, *limb.place(site), width)
@@ -89,9 +89,9 @@ def run_design(
     """Simulate every candidate once, with derivatives, and choose."""
     study = context.study
     vector = study.vector(parameters)
-    models, left_out = _candidate_models(context, depths_mm)
-    cache = experiment_cache(context, folder)
-    jobs = [curve_job(model, study.tissues, vector) for model in models]
+    models, left_out = _build_candidate_models(context, depths_mm)
+    cache = open_experiment_cache(context, folder)
+    jobs = [build_curve_job(model, study.tissues, vector) for model in models]
     model_noise, found = NoiseModel(**noise), []
     for i, (model, simulation) in enumerate(zip(models, cache.run(jobs, context.executor))):
         depth = float(max(model.knots_mm))
@@ -104,19 +104,21 @@ def run_design(
         found.append(
             (build_candidate(model.site, depth, response, vector, model_noise), simulation.force_N.max())
         )
-    content = _content(context, found, wanted_sites(study, sites), vector, left_out)
+    content = _to_content(context, found, count_wanted_sites(study, sites), vector, left_out)
     content |= {"parameters": parameters, "parameters_from": parameters_from, "noise": noise}
     write_json(folder / "design.json", content)
     _write_tables(folder, content)
     return {}
 
 
-def _candidate_models(context: Context, depths_mm: Sequence[float]) -> tuple[list[SiteModel], list[str]]:
+def _build_candidate_models(
+    context: Context, depths_mm: Sequence[float]
+) -> tuple[list[SiteModel], list[str]]:
     """Each site as recorded or planned, or at each depth that its tissue allows; and what was left out."""
     study, models, left_out = context.study, [], []
     anatomy = load_anatomy(context.store["surfaces"]) if depths_mm else None
     for one in study.indentations:
-        own = model_of(context, one)
+        own = build_model(context, one)
         if anatomy is None:
             models.append(own)
             continue
@@ -125,11 +127,11 @@ def _candidate_models(context: Context, depths_mm: Sequence[float]) -> tuple[lis
             if depth > DEEPEST_SHARE * thickness:
                 left_out.append(f"site {own.site} at {depth:g} mm: the tissue is {thickness:.1f} mm thick")
             else:
-                models.append(_at_depth(own, depth))
+                models.append(_scale_to_depth(own, depth))
     return models, left_out
 
 
-def _at_depth(own: SiteModel, depth: float) -> SiteModel:
+def _scale_to_depth(own: SiteModel, depth: float) -> SiteModel:
     """The phases of the record, or of the plan, to another depth: at the same rates, held for as long."""
     phases, share = own.history.phases, depth / max(own.knots_mm)
     seconds = [phase.duration_s * (1.0 if phase.kind == "hold" else share) for phase in phases]
@@ -138,7 +140,7 @@ def _at_depth(own: SiteModel, depth: float) -> SiteModel:
     return replace(own, knots_s=tuple(knots_s.tolist()), knots_mm=tuple(knots_mm.tolist()))
 
 
-def _content(
+def _to_content(
     context: Context,
     found: Sequence[tuple[Candidate, float]],
     sites: int,
@@ -150,7 +152,7 @@ def _content(
     every = [one for one, _ in found]
     if len({one.site for one in every}) < sites:
         raise RunError(f"only {len(every)} candidates could be simulated: {'; '.join(left_out)}")
-    bounds = unknowns(study)
+    bounds = build_unknowns(study)
     prior = compute_bounds_information(bounds)
     designs = {
         "D-optimal": choose_design(every, sites, prior, "D"),
@@ -159,7 +161,7 @@ def _content(
     own = _own_choice(study, every)
     if own:
         designs["the study's own"] = evaluate_design(every, own, prior)
-    designs["all sites"] = evaluate_design(every, _deepest(every), prior)
+    designs["all sites"] = evaluate_design(every, _select_deepest(every), prior)
     best_d, best_a = designs["D-optimal"], designs["A-optimal"]
     rows = []
     for name, design in designs.items():
@@ -177,13 +179,13 @@ def _content(
     return {
         "wanted": sites,
         "designs": rows,
-        "verdict": _verdict(designs, bounds.names),
-        "candidates": [_row(one, peak, prior) for one, peak in found],
+        "verdict": _describe_verdict(designs, bounds.names),
+        "candidates": [_to_row(one, peak, prior) for one, peak in found],
         "left_out": left_out,
     }
 
 
-def _row(one: Candidate, peak: float, prior: Array) -> dict[str, Any]:
+def _to_row(one: Candidate, peak: float, prior: Array) -> dict[str, Any]:
     """A candidate, and what it tells alone: bits of information over the bounds."""
     gain = np.linalg.slogdet(prior + one.information)[1] - np.linalg.slogdet(prior)[1]
     return {
@@ -197,10 +199,10 @@ def _row(one: Candidate, peak: float, prior: Array) -> dict[str, Any]:
 def _own_choice(study: Study, every: Sequence[Candidate]) -> tuple[int, ...]:
     """The study's fitted sites at the depth nearest to the recorded one; its deepest candidate otherwise."""
     fitted = {site.name for site in study.fitted}
-    return tuple(i for i in _deepest(every) if every[i].site in fitted)
+    return tuple(i for i in _select_deepest(every) if every[i].site in fitted)
 
 
-def _deepest(every: Sequence[Candidate]) -> tuple[int, ...]:
+def _select_deepest(every: Sequence[Candidate]) -> tuple[int, ...]:
     """The deepest candidate of each site."""
     best: dict[str, int] = {}
     for i, one in enumerate(every):
@@ -209,7 +211,7 @@ def _deepest(every: Sequence[Candidate]) -> tuple[int, ...]:
     return tuple(best.values())
 
 
-def _verdict(designs: dict[str, Design], names: Sequence[str]) -> str:
+def _describe_verdict(designs: dict[str, Design], names: Sequence[str]) -> str:
     """In words: what the study's own choice gives away, and what no choice determines."""
     best, every = designs["D-optimal"], designs["all sites"]
     words = []

@@ -11,7 +11,7 @@ from ...arrays import Array
 from ...errors import InputError
 from ...identify.fit.objective import SiteResponse
 from ...identify.uncertainty.emulator import Emulator
-from ..shared.artefacts import atomic
+from ..shared.artefacts import write_atomically
 
 EMULATOR = "emulator.npz"
 
@@ -20,7 +20,7 @@ def write_runs(
     file: Path, names: Sequence[str], points: Array, responses: Sequence[Sequence[SiteResponse]]
 ) -> None:
     """Parameters (k, p), forces (k, N) and derivatives (k, N, p) of all sites, one after the other."""
-    with atomic(file) as stream:
+    with write_atomically(file) as stream:
         np.savez(
             stream,
             names=np.array(names),

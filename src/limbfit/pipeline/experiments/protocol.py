@@ -40,10 +40,10 @@ from ...study import Site, Study
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.limb import LimbGeometry
-from ..shared.planned import Planned, press, write_records
-from ..shared.simulations import curve_job, experiment_cache, model_of, site_model
-from ..stages.deviations import expected_share, is_modulus, surface_error_mm
-from ..stages.laboratory import unknowns
+from ..shared.planned import PlannedRecord, press, write_records
+from ..shared.simulations import build_curve_job, build_model, build_site_model, open_experiment_cache
+from ..stages.deviations import compute_expected_share, estimate_surface_error_mm, is_modulus
+from ..stages.laboratory import build_unknowns
 from .design import DEEPEST_SHARE
 
 DETERMINED = 1.25  # largest factor of a 95 % interval that counts as determined
@@ -58,7 +58,7 @@ def check_protocol(study: Study, limb: LimbGeometry | None, options: Mapping[str
     ------
     InputError
     """
-    _named(unknowns(study), options["determine"])
+    _select_named(build_unknowns(study), options["determine"])
     budget = Budget(60.0 * options["minutes"], options["setup_s"])
     _check_minutes([options["rest_s"] + min(options["holds_s"], default=0.0)], budget)
 
@@ -101,24 +101,26 @@ def run_protocol(
     logarithms by those of the parameters; none: parameters count.
     """
     study = context.study
-    known = unknowns(study)
-    which = _named(known, determine)
+    known = build_unknowns(study)
+    which = _select_named(known, determine)
     rows = np.array(list(pressures.values())) if pressures else np.eye(len(known.names))[list(which)]
     tissues = sample_tissues(known, study.vector(parameters), draws, seed)
     noises = RecordNoise.from_sds(NoiseModel(**noise), **seen)
-    planned, left_out = _planned(context, speeds_mm_s, holds_s, depths_mm, noises)
+    planned, left_out = _plan_records(context, speeds_mm_s, holds_s, depths_mm, noises)
     budget = Budget(60.0 * minutes, setup_s)
     _check_minutes([one.seconds + rest_s for one in planned], budget)
-    found, options, blind, peaks = _options(context, folder, planned, tissues, noises, rest_s, left_out)
+    found, options, blind, peaks = _build_options(context, folder, planned, tissues, noises, rest_s, left_out)
     if not found:
         raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
     stiffness = is_modulus(study).astype(np.float64)
     wanted = DesignTarget(
         compute_bounds_information(known), rows, "A" if criterion == "A" else "D", stiffness
     )
-    plans, told_by = _plans_told(found, options, blind if noises.has_secondary else None, budget, wanted)
+    plans, told_by = _build_and_report_plans(
+        found, options, blind if noises.has_secondary else None, budget, wanted
+    )
     told = [
-        _row(name, chosen, told_by[name], budget, wanted, (known.names, which), pressures, len(tissues))
+        _to_row(name, chosen, told_by[name], budget, wanted, (known.names, which), pressures, len(tissues))
         for name, chosen in plans.items()
     ]
     content = {
@@ -131,7 +133,7 @@ def run_protocol(
         "records": [_record(found[i], options[i], peaks[i]) for i in plans[DESIGNED]],
         "pressures": list(pressures),
         "protocols": told,
-        "verdict": _verdict(told[0], [known.names[i] for i in which]),
+        "verdict": _describe_verdict(told[0], [known.names[i] for i in which]),
         "candidates": [_record(one, option, peak) for one, option, peak in zip(found, options, peaks)],
         "left_out": left_out,
         "parameters": parameters,
@@ -145,7 +147,7 @@ def run_protocol(
     return {}
 
 
-def _named(known: Unknowns, determine: Sequence[str]) -> tuple[int, ...]:
+def _select_named(known: Unknowns, determine: Sequence[str]) -> tuple[int, ...]:
     """Numbers of the parameters to be determined: all where none is named."""
     strange = [name for name in determine if name not in known.names]
     if strange:
@@ -157,31 +159,31 @@ def _named(known: Unknowns, determine: Sequence[str]) -> tuple[int, ...]:
     return tuple(i for i, name in enumerate(known.names) if not determine or name in determine)
 
 
-def _plans_told(
-    found: Sequence[Planned],
+def _build_and_report_plans(
+    found: Sequence[PlannedRecord],
     options: Sequence[RecordOption],
     blind: Sequence[RecordOption] | None,
     budget: Budget,
     wanted: DesignTarget,
 ) -> tuple[dict[str, tuple[int, ...]], dict[str, Sequence[RecordOption]]]:
     """The plans by name, and what their records tell; ``blind``: by force alone, if more is seen."""
-    plans = _plans(found, options, budget, wanted)
+    plans = _build_plans(found, options, budget, wanted)
     if DESIGNED not in plans:
         raise RunError(f"no record that could be simulated fits into {budget.seconds / 60:g} min")
     told_by: dict[str, Sequence[RecordOption]] = dict.fromkeys(plans, options)
     if blind is not None:
-        plans[UNSEEN] = _plans(found, blind, budget, wanted)[DESIGNED]
+        plans[UNSEEN] = _build_plans(found, blind, budget, wanted)[DESIGNED]
         told_by |= dict.fromkeys((UNSEEN, PLAIN), blind)
     return plans, told_by
 
 
-def _planned(
+def _plan_records(
     context: Context,
     speeds_mm_s: Sequence[float],
     holds_s: Sequence[float],
     depths_mm: Sequence[float],
     noises: RecordNoise,
-) -> tuple[list[Planned], list[str]]:
+) -> tuple[list[PlannedRecord], list[str]]:
     """Every site with every indenter, speed and hold, as deep as asked for, else as recorded or planned.
 
     Nowhere deeper than its tissue allows.
@@ -190,13 +192,15 @@ def _planned(
     anatomy = load_anatomy(context.store["surfaces"])
     deepest: dict[str, float] = {}
     for one in study.indentations:
-        own = model_of(context, one)
+        own = build_model(context, one)
         deepest[own.site] = max(deepest.get(own.site, 0.0), max(own.knots_mm))
     for site in study.sites:
         usual = deepest[site.name]
         wanted = depths_mm or (usual,)
         for name in study.all_indenters:
-            model = site_model(context, _with_tool(site, name), (0.0, 1.0), (0.0, max(wanted)), searched=True)
+            model = build_site_model(
+                context, _replace_indenter(site, name), (0.0, 1.0), (0.0, max(wanted)), searched=True
+            )
             if noises.layers is not None:
                 model = replace(model, layers=find_layers_under(model))
             if noises.skin is not None:
@@ -212,31 +216,31 @@ def _planned(
             nearest = min(depths, key=lambda depth: abs(depth - usual))
             for depth, speed, hold in product(depths, speeds_mm_s, holds_s):
                 planned = press(model, depth, speed, hold)
-                found.append(Planned(site.name, name, depth, speed, hold, planned, depth == nearest))
+                found.append(PlannedRecord(site.name, name, depth, speed, hold, planned, depth == nearest))
     return found, list(dict.fromkeys(left_out))
 
 
-def _with_tool(site: Site, name: str | None) -> Site:
+def _replace_indenter(site: Site, name: str | None) -> Site:
     return site.model_copy(update={"indenter": name})
 
 
-def _options(
+def _build_options(
     context: Context,
     folder: Path,
-    planned: Sequence[Planned],
+    planned: Sequence[PlannedRecord],
     tissues: Array,
     noise: RecordNoise,
     rest_s: float,
     left_out: list[str],
-) -> tuple[list[Planned], list[RecordOption], list[RecordOption], list[float]]:
+) -> tuple[list[PlannedRecord], list[RecordOption], list[RecordOption], list[float]]:
     """What each record would tell at each draw, and its force alone: nothing where its simulation does not
     come to its end.
 
     Records that press harder than the device may at the first draw are left out.
     """
-    study, cache = context.study, experiment_cache(context, folder)
+    study, cache = context.study, open_experiment_cache(context, folder)
     limit = study.acquire.force_limit_N
-    jobs = [curve_job(one.model, study.tissues, tissue) for one in planned for tissue in tissues]
+    jobs = [build_curve_job(one.model, study.tissues, tissue) for one in planned for tissue in tissues]
     infos = np.zeros((2, len(planned), *tissues.shape, tissues.shape[1]))
     peaks, failed = np.zeros(len(planned)), [0] * len(planned)
     for i, (job, simulation) in enumerate(zip(jobs, cache.run(jobs, context.executor))):
@@ -246,7 +250,7 @@ def _options(
         if draw == 0:
             peaks[k] = simulation.force_N.max()
         if simulation.completed:
-            infos[:, k, draw] = _told_by(job, simulation, noise)
+            infos[:, k, draw] = _compute_information(job, simulation, noise)
         else:
             failed[k] += 1
     kept = []
@@ -262,13 +266,15 @@ def _options(
                 left_out.append(f"{one.told}: not simulated to the end {where}, and is not counted there")
     places = [(planned[k].site, planned[k].tool) for k in kept]
     seconds = [planned[k].seconds + rest_s for k in kept]
-    off_mm = surface_error_mm(context)
-    shares = [expected_share(planned[k].model, off_mm) for k in kept]
+    off_mm = estimate_surface_error_mm(context)
+    shares = [compute_expected_share(planned[k].model, off_mm) for k in kept]
     seeing, blind = (list(map(RecordOption, places, seconds, info[kept], shares)) for info in infos)
     return [planned[k] for k in kept], seeing, blind, [float(peaks[k]) for k in kept]
 
 
-def _told_by(job: SimulationJob, simulation: Simulation, noises: RecordNoise) -> tuple[Array, Array]:
+def _compute_information(
+    job: SimulationJob, simulation: Simulation, noises: RecordNoise
+) -> tuple[Array, Array]:
     """The information (p, p) of a record with what is seen beside its force, and of its force alone."""
     assert simulation.jacobian is not None
     parameters, points = np.array(job.parameters), np.array(job.model.skin_points).reshape(-1, 3)
@@ -283,8 +289,8 @@ def _told_by(job: SimulationJob, simulation: Simulation, noises: RecordNoise) ->
     )
 
 
-def _plans(
-    found: Sequence[Planned], options: Sequence[RecordOption], budget: Budget, wanted: DesignTarget
+def _build_plans(
+    found: Sequence[PlannedRecord], options: Sequence[RecordOption], budget: Budget, wanted: DesignTarget
 ) -> dict[str, tuple[int, ...]]:
     """The designed protocol, one slow ramp at every site, as deep as usual, and the best without each
     ingredient."""
@@ -316,7 +322,7 @@ def _plans(
     return plans
 
 
-def _row(
+def _to_row(
     name: str,
     chosen: Sequence[int],
     options: Sequence[RecordOption],
@@ -347,7 +353,7 @@ def _row(
     }
 
 
-def _record(one: Planned, option: RecordOption, peak: float) -> dict[str, Any]:
+def _record(one: PlannedRecord, option: RecordOption, peak: float) -> dict[str, Any]:
     return {
         "site": one.site,
         "indenter": one.tool,
@@ -359,7 +365,7 @@ def _record(one: Planned, option: RecordOption, peak: float) -> dict[str, Any]:
     }
 
 
-def _verdict(best: Mapping[str, Any], wanted: Sequence[str]) -> str:
+def _describe_verdict(best: Mapping[str, Any], wanted: Sequence[str]) -> str:
     """In words: how much of what is wanted the protocol determines."""
     if best["pressures_95"]:
         worst = max(best["pressures_95"], key=best["pressures_95"].__getitem__)

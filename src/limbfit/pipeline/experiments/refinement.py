@@ -10,19 +10,19 @@ from typing import Any
 from ...errors import InputError
 from ...indentation import Simulation
 from ...study import Study
-from ..shared.artefacts import file_digest, read_json
+from ..shared.artefacts import compute_file_digest, read_json
 from ..shared.context import Context
-from ..shared.extrapolation import MESH_ORDERS, richardson
+from ..shared.extrapolation import MESH_ORDERS, extrapolate_richardson
 from ..shared.limb import LimbGeometry
-from ..shared.simulations import experiment_cache
+from ..shared.simulations import open_experiment_cache
 from ..stages.mesh import make_mesh, mesh_job, mesh_settings
-from .sensitivity import identified_parameters, store_runs
+from .sensitivity import read_identified_parameters, store_runs
 from .variants import (
     ChosenSite,
     Variant,
     check_variants,
     choose_sites,
-    compared,
+    compare_variants,
     run_variants,
     write_variants,
 )
@@ -39,12 +39,12 @@ def check_refinement(study: Study, limb: LimbGeometry | None, options: Mapping[s
     InputError
     """
     check_variants(study, limb, options)
-    wanted = _factors(options["factors"])
+    wanted = _choose_factors(options["factors"])
     if len(wanted) < 2 or wanted[-1] <= 0.0:
         raise InputError("one mesh cannot be compared", place="factors", remedy="give another edge length")
 
 
-def _factors(given: Sequence[float]) -> list[float]:
+def _choose_factors(given: Sequence[float]) -> list[float]:
     """Of the edges, the coarsest first; the study's own among them."""
     return sorted({1.0, *map(float, given)}, reverse=True)
 
@@ -53,14 +53,14 @@ def run_refinement(
     context: Context, folder: Path, *, sites: Sequence[str], factors: Sequence[float]
 ) -> dict[str, Any]:
     """Force at sites on meshes whose edges are ``factors`` times the study's, and what it tends to."""
-    wanted = _factors(factors)
-    parameters = identified_parameters(context)
+    wanted = _choose_factors(factors)
+    parameters = read_identified_parameters(context)
     chosen = choose_sites(context, sites)
-    facts = _meshes(context, folder, chosen, wanted)
+    facts = _make_meshes(context, folder, chosen, wanted)
     variants = [
         Variant(
             one,
-            replace(one.model, mesh=file, mesh_digest=file_digest(file)),
+            replace(one.model, mesh=file, mesh_digest=compute_file_digest(file)),
             parameters,
             f"edge x {factor:g}",
             facts[one.name, factor],
@@ -68,24 +68,24 @@ def run_refinement(
         )
         for one in chosen
         for factor in wanted
-        for file in [_file(context, folder, one, factor)]
+        for file in [_find_file(context, folder, one, factor)]
     ]
-    simulations = run_variants(context, "sensitivity-mesh", experiment_cache(context, folder), variants)
+    simulations = run_variants(context, "sensitivity-mesh", open_experiment_cache(context, folder), variants)
     write_variants(folder, variants, simulations)
     content = {
         "sites": [one.facts | _limit(one, variants, simulations) for one in chosen],
-        "runs": compared(variants, simulations),
+        "runs": compare_variants(variants, simulations),
         "parameters": parameters,
     }
     store_runs(folder, "sensitivity-mesh", content)
     return {}
 
 
-def _file(context: Context, folder: Path, one: ChosenSite, factor: float) -> Path:
+def _find_file(context: Context, folder: Path, one: ChosenSite, factor: float) -> Path:
     return one.model.mesh if factor == 1.0 else folder / f"{one.site.name}-{factor:g}.vtu"
 
 
-def _meshes(
+def _make_meshes(
     context: Context, folder: Path, chosen: Sequence[ChosenSite], factors: Sequence[float]
 ) -> dict[tuple[str, float], dict[str, Any]]:
     """Make the meshes that are not there yet; what is told of each, by site and factor."""
@@ -103,7 +103,7 @@ def _meshes(
                 edge_near_mm=factor * settings.edge_near_mm,
                 edge_far_mm=factor * settings.edge_far_mm,
             ),
-            _file(context, folder, one, factor),
+            _find_file(context, folder, one, factor),
         )
         for one, factor in pairs
         if factor != 1.0
@@ -141,7 +141,7 @@ def _limit(one: ChosenSite, variants: Sequence[Variant], simulations: Sequence[S
     nothing = dict.fromkeys(("limit_N", "order", "order_measured", "error_percent"))
     if len(done) < 2 or edge not in done:
         return nothing
-    found = richardson(list(done), list(done.values()), MESH_ORDERS[own.facts["element"]])
+    found = extrapolate_richardson(list(done), list(done.values()), MESH_ORDERS[own.facts["element"]])
     finest = done[min(done)]
     if abs(found.limit - finest) > FARTHEST * finest:
         return nothing

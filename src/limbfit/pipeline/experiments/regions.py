@@ -16,9 +16,9 @@ from ...study import Site, Study
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.limb import LimbGeometry
-from ..shared.simulations import SimulationCache, experiment_cache
-from ..stages.laboratory import Laboratory, groupings, unknowns
-from ..stages.records import SiteRecord, as_response, site_record
+from ..shared.simulations import SimulationCache, open_experiment_cache
+from ..stages.laboratory import RecordSimulator, build_groupings, build_unknowns
+from ..stages.records import SiteRecord, load_site_record, to_response
 
 CHOICES = ("all", "fitted")
 
@@ -30,20 +30,20 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]
     study fits, and the others of the region are predicted.
     """
     study = context.study
-    members = _members(context, sites)
+    members = _group_by_region(context, sites)
     stages = context.stored("calibrate", "calibration.json")["stages"]
     whole = study.vector(stages[-1]["parameters"])
-    cache = experiment_cache(context, folder)
+    cache = open_experiment_cache(context, folder)
     benches = {
-        name: Laboratory(context, cache, study.records_at(*fitted), "regions")
+        name: RecordSimulator(context, cache, study.records_at(*fitted), "regions")
         for name, (fitted, _) in members.items()
     }
-    made = {name: _region(context, cache, benches[name], mine) for name, (_, mine) in members.items()}
-    found = fit_regions(made, unknowns(study), whole)
-    rows = [_row(context, name, benches[name], members[name], fit, folder) for name, fit in found.items()]
+    made = {name: _build_region(context, cache, benches[name], mine) for name, (_, mine) in members.items()}
+    found = fit_regions(made, build_unknowns(study), whole)
+    rows = [_to_row(context, name, benches[name], members[name], fit, folder) for name, fit in found.items()]
     content = {
         "sites_used": sites,
-        "left_out": _left_out(context, members),
+        "left_out": _describe_left_out(context, members),
         "whole": {
             "name": stages[-1]["name"],
             "start": stages[0]["start"],
@@ -51,7 +51,7 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]
             "fitted_sites": [site.name for site in study.fitted],
         },
         "regions": rows,
-        **_means(rows),
+        **_compute_means(rows),
     }
     write_json(folder / "regions.json", content)
     _write_tables(folder, content)
@@ -76,7 +76,7 @@ def check_regions(study: Study, limb: LimbGeometry | None, options: Mapping[str,
         )
 
 
-def _members(context: Context, sites: str) -> dict[str, tuple[list[Site], list[Site]]]:
+def _group_by_region(context: Context, sites: str) -> dict[str, tuple[list[Site], list[Site]]]:
     """By region: the sites that it is fitted on, and all that have a record."""
     study = context.study
     recorded = [site for site in study.sites if study.records_at(site)]
@@ -90,7 +90,7 @@ def _members(context: Context, sites: str) -> dict[str, tuple[list[Site], list[S
     return found
 
 
-def _left_out(context: Context, members: dict[str, Any]) -> list[str]:
+def _describe_left_out(context: Context, members: dict[str, Any]) -> list[str]:
     """What no region's model is judged on, in words."""
     recorded = [site for site in context.study.sites if context.study.records_at(site)]
     without = [site.name for site in recorded if not site.region]
@@ -99,34 +99,34 @@ def _left_out(context: Context, members: dict[str, Any]) -> list[str]:
     return words + ([f"sites without a region: {', '.join(without)}"] if without else [])
 
 
-def _region(
-    context: Context, cache: SimulationCache, laboratory: Laboratory, mine: Sequence[Site]
+def _build_region(
+    context: Context, cache: SimulationCache, laboratory: RecordSimulator, mine: Sequence[Site]
 ) -> RegionRecords:
-    records = [site_record(context, record) for record in context.study.records_at(*mine)]
-    stage = groupings(context.study)[-1:]
+    records = [load_site_record(context, record) for record in context.study.records_at(*mine)]
+    stage = build_groupings(context.study)[-1:]
 
     def identify(start: Unknowns) -> Calibration:
         return laboratory.identify(start, stage)[0]
 
     def simulate(parameters: Array) -> list[SiteResponse]:
-        return _forces(context, cache, records, parameters)
+        return _simulate_forces(context, cache, records, parameters)
 
     return RegionRecords(identify, simulate, tuple(record.measured for record in records))
 
 
-def _forces(
+def _simulate_forces(
     context: Context, cache: SimulationCache, records: Sequence[SiteRecord], parameters: Array
 ) -> list[SiteResponse]:
     """Forces on the study's own meshes; with derivatives where the study's prediction has made them so."""
     apart = context.study.is_searched_apart
     jobs = [record.own_job(parameters) if apart else record.job(parameters) for record in records]
-    return [as_response(one) for one in cache.run(jobs, context.executor)]
+    return [to_response(one) for one in cache.run(jobs, context.executor)]
 
 
-def _row(
+def _to_row(
     context: Context,
     name: str,
-    laboratory: Laboratory,
+    laboratory: RecordSimulator,
     chosen: tuple[list[Site], list[Site]],
     fit: RegionFit,
     folder: Path,
@@ -134,7 +134,7 @@ def _row(
     """What ``regions.json`` holds of a region."""
     study, found = context.study, fit.calibration
     fitted, mine = chosen
-    _, known = laboratory.uncertainty(found, groupings(study)[-1], folder / "coarser", moves=False)
+    _, known = laboratory.uncertainty(found, build_groupings(study)[-1], folder / "coarser", moves=False)
     intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in study.tissues}
     for (tissue, key), limits in zip(study.parameters, known.intervals_95.tolist(), strict=True):
         intervals[tissue][key] = limits
@@ -155,7 +155,7 @@ def _row(
     }
 
 
-def _means(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+def _compute_means(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     """Mean error over all sites, each with its own region's model and with the whole limb's."""
     return {
         f"mean_{which}_error_percent": average_errors(

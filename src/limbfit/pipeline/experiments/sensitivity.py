@@ -18,18 +18,18 @@ from ...shapes import OWN, SHAPES
 from ...study import IndenterTable
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
-from ..shared.simulations import experiment_cache
-from ..stages.records import as_searched, site_record
+from ..shared.simulations import open_experiment_cache
+from ..stages.records import coarsen_records, load_site_record
 from .variants import (
     ChosenSite,
     Variant,
     choose_sites,
-    compared,
+    compare_variants,
+    measure_tissue_over_bone,
     run_variants,
-    tissue_over_bone,
     write_variants,
 )
-from .volumes import NO_VOLUME, volume_cache
+from .volumes import NO_VOLUME, open_volume_cache
 
 FACTORS = (0.5, 2.0)
 KAPPA_RATIOS = (10.0, 25.0, 50.0, 100.0, 200.0, 400.0)
@@ -40,16 +40,16 @@ def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str]) -> di
 
     Beside it the exact derivatives at all recorded sites, with the identified ``m``.
     """
-    identified, law = identified_parameters(context), context.study.law
+    identified, law = read_identified_parameters(context), context.study.law
     m, equal = None, identified
     if "m" in law.keys:
         m = float(np.exp(np.mean([np.log(values["m"]) for values in identified.values()])))
         equal = {tissue: values | {"m": m} for tissue, values in identified.items()}
     chosen = choose_sites(context, sites)
-    variants = [variant for one in chosen for variant in _stiffer(one, equal, law.moduli)]
+    variants = [variant for one in chosen for variant in _build_stiffer(one, equal, law.moduli)]
     content = _run(context, folder, "sensitivity-c", chosen, variants)
     content |= {"parameters": identified, "equal_m": m, "factors": list(FACTORS)}
-    content["local"] = _derivatives(context, folder, identified)
+    content["local"] = _collect_derivatives(context, folder, identified)
     store_runs(folder, "sensitivity-c", content)
     heads = ["site", "region", "tissue_mm", *(f"{tissue}_c" for tissue in identified)]
     rows = [
@@ -60,7 +60,7 @@ def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str]) -> di
     return {}
 
 
-def _stiffer(chosen: ChosenSite, equal: Parameters, moduli: Sequence[str]) -> list[Variant]:
+def _build_stiffer(chosen: ChosenSite, equal: Parameters, moduli: Sequence[str]) -> list[Variant]:
     base = Variant(chosen, chosen.model, equal, "as identified", {"tissue": None, "factor": 1.0}, base=True)
     changed = [
         Variant(
@@ -76,15 +76,15 @@ def _stiffer(chosen: ChosenSite, equal: Parameters, moduli: Sequence[str]) -> li
     return [base, *changed]
 
 
-def _derivatives(context: Context, folder: Path, identified: Parameters) -> list[dict[str, Any]]:
+def _collect_derivatives(context: Context, folder: Path, identified: Parameters) -> list[dict[str, Any]]:
     """Of every record of a force: change of the largest one in percent for one percent more of a modulus.
 
     It is each tissue's first.  They are of where parameters are searched, as those of the prediction.
     """
     study = context.study
-    own = [site_record(context, record) for record in study.recorded if not record.forced]
-    records, best = as_searched(context, own), study.vector(identified)
-    cache = experiment_cache(context, folder)
+    own = [load_site_record(context, record) for record in study.recorded if not record.forced]
+    records, best = coarsen_records(context, own), study.vector(identified)
+    cache = open_experiment_cache(context, folder)
     rows: list[dict[str, Any]] = []
     for record, found in zip(
         records, cache.run([record.job(best) for record in records], context.executor), strict=True
@@ -97,7 +97,7 @@ def _derivatives(context: Context, folder: Path, identified: Parameters) -> list
             {
                 "site": record.name,
                 "region": record.site.region,
-                "tissue_mm": tissue_over_bone(record.model),
+                "tissue_mm": measure_tissue_over_bone(record.model),
                 "completed": found.completed,
                 "peak_percent_per_percent": {
                     tissue: float(value) if found.completed else None
@@ -113,7 +113,7 @@ def run_kappa(
     context: Context, folder: Path, *, sites: Sequence[str], ratios: Sequence[float]
 ) -> dict[str, Any]:
     """Force and change of volume against the ratio of bulk modulus and ``c``."""
-    identified, own = identified_parameters(context), context.study.material.kappa_ratio
+    identified, own = read_identified_parameters(context), context.study.material.kappa_ratio
     chosen = choose_sites(context, sites)
     variants = [
         Variant(
@@ -135,7 +135,7 @@ def run_kappa(
 
 def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> dict[str, Any]:
     """Force where the skin slips freely under the indenter, and where it sticks to it."""
-    identified, chosen = identified_parameters(context), choose_sites(context, sites)
+    identified, chosen = read_identified_parameters(context), choose_sites(context, sites)
     variants = [
         Variant(
             one,
@@ -159,7 +159,7 @@ def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> dict
 
 def run_indenter(context: Context, folder: Path, *, sites: Sequence[str]) -> dict[str, Any]:
     """Force and effort with the indenter as it is, and with others of its width: a sphere before all."""
-    identified, chosen = identified_parameters(context), choose_sites(context, sites)
+    identified, chosen = read_identified_parameters(context), choose_sites(context, sites)
     variants = [
         Variant(
             one,
@@ -170,14 +170,14 @@ def run_indenter(context: Context, folder: Path, *, sites: Sequence[str]) -> dic
             base=base,
         )
         for one in chosen
-        for label, table, base in other_indenters(one.model.indenter)
+        for label, table, base in list_other_indenters(one.model.indenter)
     ]
     content = _run(context, folder, "sensitivity-indenter", chosen, variants)
     store_runs(folder, "sensitivity-indenter", content | {"parameters": identified})
     return {}
 
 
-def other_indenters(own: IndenterTable) -> list[tuple[str, IndenterTable, bool]]:
+def list_other_indenters(own: IndenterTable) -> list[tuple[str, IndenterTable, bool]]:
     """(label, indenter, is the study's): its own, and those of its width that it is not."""
     width = own.width_mm
     found = [(f"{own.shape} of the study", own, True)]
@@ -191,7 +191,7 @@ def other_indenters(own: IndenterTable) -> list[tuple[str, IndenterTable, bool]]
     return found
 
 
-def identified_parameters(context: Context) -> Parameters:
+def read_identified_parameters(context: Context) -> Parameters:
     """The last stage of the calibration."""
     return context.stored("calibrate", "calibration.json")["stages"][-1]["parameters"]
 
@@ -205,10 +205,10 @@ def _run(
     volumes: bool = False,
 ) -> dict[str, Any]:
     """Simulate the variants, write their curves, and what all experiments of sensitivity store."""
-    cache = volume_cache(folder) if volumes else experiment_cache(context, folder)
+    cache = open_volume_cache(folder) if volumes else open_experiment_cache(context, folder)
     simulations = run_variants(context, name, cache, variants)
     write_variants(folder, variants, simulations)
-    rows = compared(variants, simulations)
+    rows = compare_variants(variants, simulations)
     if volumes:
         for row, simulation in zip(rows, simulations, strict=True):
             row |= simulation.facts.get("volume", NO_VOLUME)

@@ -20,11 +20,11 @@ from ...socket.published import select_published_findings
 from ...study import Study
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
-from ..shared.kept import Begun, Kept
+from ..shared.kept import Begun, ResultFiles
 from ..shared.limb import LimbGeometry
-from ..shared.socket_shape import check_at_rest, loadable_socket
-from .socket_intervals import CHANGE_PERCENT, FRICTION, drawn, tell_change, widen
-from .socket_limb import SocketLimb, Wearing, wear_all, worn
+from ..shared.socket_shape import build_loadable_socket, check_at_rest
+from .socket_intervals import CHANGE_PERCENT, FRICTION, draw_step, store_change, widen_intervals
+from .socket_limb import SocketLimb, SocketRun, run_sockets, simulate_socket
 
 NAME = "socket"
 
@@ -38,7 +38,7 @@ def check_socket(study: Study, limb: LimbGeometry | None, options: Mapping[str, 
     """
     check_at_rest(study)
     if limb is not None:
-        loadable_socket(study, limb.anatomy, limb.anatomy.skin)
+        build_loadable_socket(study, limb.anatomy, limb.anatomy.skin)
 
 
 def run_socket(
@@ -61,7 +61,7 @@ def run_socket(
         derivatives miss.
     """
     limb = SocketLimb.of(context, NAME)
-    socket = loadable_socket(context.study, limb.anatomy, limb.outer.skin)
+    socket = build_loadable_socket(context.study, limb.anatomy, limb.outer.skin)
     write_surface(folder / "socket.stl", socket.surface)
     mesh, facts = limb.mesh(context, NAME, folder, socket)
 
@@ -69,7 +69,7 @@ def run_socket(
         context.tell(NAME, time, end, words)
 
     covariance = None if covariance_log is None else np.array(covariance_log)
-    begun = Begun(Kept(folder), limb.key(folder, parameters, socket, covariance is not None))
+    begun = Begun(ResultFiles(folder), limb.key(folder, parameters, socket, covariance is not None))
     found = limb.don(mesh, limb.materials(parameters), socket, told, covariance is not None, begun=begun)
     known = None
     if covariance is not None:
@@ -78,7 +78,7 @@ def run_socket(
     content = limb.facts(found, socket, known) | {
         "parameters": parameters,
         "parameters_from": parameters_from,
-        "socket": _shape(limb, socket),
+        "socket": _describe_shape(limb, socket),
         "mesh": facts,
         # All that was found is of transtibial limbs.
         "published": select_published_findings(limb.faces(mesh, socket))
@@ -87,8 +87,8 @@ def run_socket(
         "samples": None,
     }
     if covariance is not None and samples:
-        steps = [drawn(covariance, number) for number in range(samples)]
-        content["samples"] = _sampled(context, folder, (limb, mesh, socket), content, steps)
+        steps = [draw_step(covariance, number) for number in range(samples)]
+        content["samples"] = _simulate_samples(context, folder, (limb, mesh, socket), content, steps)
     write_json(folder / "socket.json", content)
     _write_fields(folder, mesh, found)
     _write_tables(folder, content)
@@ -96,7 +96,7 @@ def run_socket(
     return {}
 
 
-def _sampled(
+def _simulate_samples(
     context: Context,
     folder: Path,
     donned: tuple[SocketLimb, Mesh, Socket],
@@ -109,21 +109,23 @@ def _sampled(
     draws came to their end, and why others did not.
     """
     (limb, mesh, socket), study = donned, context.study
-    kept = Kept(folder, also=[context.store[NAME]])
+    kept = ResultFiles(folder, also=[context.store[NAME]])
 
-    def job(name: str, on: SocketLimb, parameters: Parameters) -> Wearing:
+    def job(name: str, on: SocketLimb, parameters: Parameters) -> SocketRun:
         key = on.key(folder, parameters, socket)
-        return Wearing(name, on, mesh, on.materials(parameters), socket, kept, key)
+        return SocketRun(name, on, mesh, on.materials(parameters), socket, kept, key)
 
     simulated, at = content["parameters"], study.vector(content["parameters"])
     draws = [job(f"draw {n}", limb, study.by_tissue(at * np.exp(step))) for n, step in enumerate(steps, 1)]
-    rougher = _rougher(limb)
+    rougher = _build_rougher(limb)
     more = [] if rougher is None else [job(FRICTION, rougher, simulated)]
     jobs = [*draws, *more]
-    reasons = wear_all(jobs, context.executor, lambda done, words: context.tell(NAME, done, len(jobs), words))
-    ended = [None if reason else worn(one)[0] for one, reason in zip(jobs, reasons, strict=True)]
+    reasons = run_sockets(
+        jobs, context.executor, lambda done, words: context.tell(NAME, done, len(jobs), words)
+    )
+    ended = [None if reason else simulate_socket(one)[0] for one, reason in zip(jobs, reasons, strict=True)]
     for other in filter(None, ended[len(draws) :]):
-        tell_change(content, other, FRICTION)
+        store_change(content, other, FRICTION)
     names = [f"{tissue}.{name}" for tissue, name in study.parameters]
     found = [
         (dict(zip(names, step, strict=True)), facts)
@@ -133,11 +135,11 @@ def _sampled(
     if len(found) < 2:  # one says nothing of a spread
         found = []
     else:
-        widen(content, found)
+        widen_intervals(content, found)
     return {"simulated": len(found), "failed": [reason for reason in reasons if reason]}
 
 
-def _rougher(limb: SocketLimb) -> SocketLimb | None:
+def _build_rougher(limb: SocketLimb) -> SocketLimb | None:
     """The same with a larger coefficient of friction; None where contact has none."""
     table = limb.study.socket
     if isinstance(table.friction, str) or table.friction == 0.0:
@@ -146,7 +148,7 @@ def _rougher(limb: SocketLimb) -> SocketLimb | None:
     return replace(limb, study=limb.study.model_copy(update={"socket": more}))
 
 
-def _shape(limb: SocketLimb, socket: Socket) -> dict[str, Any]:
+def _describe_shape(limb: SocketLimb, socket: Socket) -> dict[str, Any]:
     """What is told of the socket's shape."""
     table, depth = limb.study.socket, socket.offset(limb.outer.skin)
     return {
@@ -171,7 +173,7 @@ def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:
     """Regions and steps as CSV."""
     columns = ("mean_kPa", "peak_kPa", "shear_kPa", "shear_peak_kPa")
     rows = [
-        [name, region["region"], *(region[key] for key in columns), *_known(region)]
+        [name, region["region"], *(region[key] for key in columns), *_describe_interval(region)]
         for name, held in (("donning", content["donning"]), *((one["name"], one) for one in content["loads"]))
         for region in held["regions"]
     ]
@@ -183,7 +185,7 @@ def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:
     write_table(folder / "steps.csv", heads, lines)
 
 
-def _known(region: Mapping[str, Any]) -> tuple[Any, ...]:
+def _describe_interval(region: Mapping[str, Any]) -> tuple[Any, ...]:
     """Interval of a region's mean, and the parameter that most of it comes from; empty where not known."""
     if region["interval_kPa"] is None:
         return "", "", ""

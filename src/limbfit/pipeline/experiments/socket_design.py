@@ -32,23 +32,23 @@ from ...socket.rectify import reduce_to_volume
 from ...socket.targets import Target, build_zone
 from ...socket.wall import measure_thickness
 from ...study import Study
-from ..shared.artefacts import digest, write_json, write_table
+from ..shared.artefacts import compute_digest, write_json, write_table
 from ..shared.context import Context
-from ..shared.kept import Kept, Made
+from ..shared.kept import Made, ResultFiles
 from ..shared.limb import LimbGeometry
 from ..shared.socket_shape import (
-    blaming,
+    build_recipe,
+    build_regions,
+    build_socket_wall,
+    build_target,
     check_at_rest,
     check_regions,
-    covered_regions,
+    find_covered_regions,
     load_of,
-    recipe_of,
-    regions_of,
-    target_of,
-    wall_of,
+    place_errors,
 )
 from ..shared.sources import code_digest
-from .socket_limb import SocketLimb, Wearing, wear_all, worn
+from .socket_limb import SocketLimb, SocketRun, run_sockets, simulate_socket
 
 NAME, PLACE = "socket_design", "socket.design"
 CONTROL, DESIGN, OPTIMISED = "control", "design", "optimised"
@@ -63,10 +63,10 @@ def check_socket_design(study: Study, limb: LimbGeometry | None, options: Mappin
     """
     check_at_rest(study)
     if limb is not None:
-        undeformed_socket(study, limb.anatomy, limb.anatomy.skin, options["optimise"])
+        build_undeformed_socket(study, limb.anatomy, limb.anatomy.skin, options["optimise"])
 
 
-def undeformed_socket(
+def build_undeformed_socket(
     study: Study, anatomy: Anatomy, outer: Surface, optimise: Sequence[str]
 ) -> tuple[Recipe, Socket]:
     """The recipe of all designs, and the face on the limb as it is, with whose shape a wall can be made.
@@ -76,20 +76,20 @@ def undeformed_socket(
     StudyError
         Where loads, regions or the target pressure are not those of this limb, or the wall cannot be made.
     """
-    with blaming(study, PLACE):
-        recipe, frame = recipe_of(study, anatomy), build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    with place_errors(study, PLACE):
+        recipe, frame = build_recipe(study, anatomy), build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
         plain = rectify_limb(outer, frame, replace(recipe, reduction_percent=0.0))
         for load in study.socket.loads:
             load_of(study, load, anatomy, plain)
-        regions, middles = regions_of(study, anatomy), outer.triangles.mean(axis=1)
-        covered = covered_regions(middles, anatomy.skin, regions, plain)
+        regions, middles = build_regions(study, anatomy), outer.triangles.mean(axis=1)
+        covered = find_covered_regions(middles, anatomy.skin, regions, plain)
         check_regions(study, [one.region for one in study.socket.design.regions], f"{PLACE}.regions", covered)
         check_regions(study, optimise, "--optimise", covered)
-        if not target_of(study).at(middles, anatomy, regions, plain).any():
+        if not build_target(study).at(middles, anatomy, regions, plain).any():
             raise SurfaceError(
                 "no pressure is stated anywhere on the limb", remedy="state one below the brim"
             )
-        wall_of(study, anatomy, plain)
+        build_socket_wall(study, anatomy, plain)
     return recipe, plain
 
 
@@ -109,9 +109,9 @@ def run_socket_design(
     optimise : regions whose largest pressures are to be lowered.
     simulations : at most so many for that, beside those of control and design.
     """
-    with blaming(context.study, PLACE):
+    with place_errors(context.study, PLACE):
         bench = _Bench.of(context, folder, parameters, optimise, simulations)
-        target = target_of(context.study)
+        target = build_target(context.study)
         recipe = bench.designed(target)
         design = bench.made(DESIGN, recipe)
         control_face, reduction = reduce_to_volume(
@@ -121,17 +121,17 @@ def run_socket_design(
         done = {one.name: one for one in bench.put_on(control, design)}
         found: dict[str, Any] = {}
         if optimise:
-            best, found = _optimised(bench, recipe, done, optimise, simulations)
+            best, found = _optimise_depths(bench, recipe, done, optimise, simulations)
             done[OPTIMISED] = best
     last = list(done.values())[-1]
-    walled = wall_of(context.study, bench.limb.anatomy, last.face)
+    walled = build_socket_wall(context.study, bench.limb.anatomy, last.face)
     write_surface(folder / "socket.stl", walled)
     content = {
         "target": {"pressure": target.kind, "pressure_kPa": target.pressure_kPa}
         | {"regions": dict(target.regions)},
         "designs": [bench.told(one) for one in done.values()],
         "optimisation": found or None,
-        "wall": _wall_facts(bench, walled, last),
+        "wall": _build_wall_facts(bench, walled, last),
         "parameters": parameters,
         "parameters_from": parameters_from,
         "liner": bench.limb.liner,
@@ -166,7 +166,7 @@ class _Bench:
     laws: Mapping[str, Material]
     recipe: Recipe
     plain: Socket
-    kept: Kept
+    kept: ResultFiles
     parameters: Parameters
     total: int
     count: int = 0
@@ -176,9 +176,9 @@ class _Bench:
         cls, context: Context, folder: Path, parameters: Parameters, optimise: Sequence[str], count: int
     ) -> _Bench:
         limb = SocketLimb.of(context, NAME)
-        recipe, plain = undeformed_socket(context.study, limb.anatomy, limb.outer.skin, optimise)
+        recipe, plain = build_undeformed_socket(context.study, limb.anatomy, limb.outer.skin, optimise)
         mesh, facts = limb.mesh(context, NAME, folder, plain)
-        kept = Kept(folder, also=[context.store[NAME]])
+        kept = ResultFiles(folder, also=[context.store[NAME]])
         laws = limb.materials(parameters)
         total = 3 + (count if optimise else 0)
         return cls(context, limb, mesh, facts, laws, recipe, plain, kept, parameters, total)
@@ -212,7 +212,7 @@ class _Bench:
             return {"statistics": result.statistics}, {"displacement": result.states[-1].u}
 
         given = self._key(self.plain), code_digest(press), pressure.tolist()
-        _, fields = self.kept.get(digest("pressed", *given), make)
+        _, fields = self.kept.get(compute_digest("pressed", *given), make)
         self.count += 1
         limb = compute_profile(self.limb.outer.skin, self.frame)
         before, after = outer_surface(self.mesh), outer_surface(self.mesh, fields["displacement"])
@@ -225,25 +225,25 @@ class _Bench:
             for region, depth in (depths or {}).items()
         ]
         face = rectify_limb(self.limb.outer.skin, self.frame, replace(recipe, areas=zones))
-        wall_of(self.limb.study, self.limb.anatomy, face)
+        build_socket_wall(self.limb.study, self.limb.anatomy, face)
         return _Made(name, face, {"depths_mm": dict(depths or {})})
 
     def put_on(self, *made: _Made) -> list[_Made]:
         """With what happens when each is put on and loaded: several side by side on the study's workers."""
         jobs = [self._job(one) for one in made]
-        for reason in filter(None, wear_all(jobs, self.context.executor, self.tell)):
+        for reason in filter(None, run_sockets(jobs, self.context.executor, self.tell)):
             raise RunError(reason)
         self.count += len(jobs)
         done = []
         for one, job in zip(made, jobs, strict=True):
-            facts, fields = worn(job)
-            self.tell(0.0, f"{one.name}: {_peak(facts):.0f} kPa at most")
+            facts, fields = simulate_socket(job)
+            self.tell(0.0, f"{one.name}: {_find_peak(facts):.0f} kPa at most")
             done.append(replace(one, facts={**one.facts, "simulation": facts}, fields=fields))
         return done
 
-    def _job(self, one: _Made) -> Wearing:
+    def _job(self, one: _Made) -> SocketRun:
         key = self._key(one.face)
-        return Wearing(one.name, self.limb, self.mesh, self.laws, one.face, self.kept, key)
+        return SocketRun(one.name, self.limb, self.mesh, self.laws, one.face, self.kept, key)
 
     def _key(self, face: Socket) -> str:
         return self.limb.key(self.kept.folder.parent, self.parameters, face)
@@ -252,7 +252,7 @@ class _Bench:
         """What is stored of a design."""
         offset = -one.face.offset(self.limb.outer.skin)
         shape = {"volume_cm3": one.face.volume_mm3 / 1000.0, "offset_mm": [offset.min(), offset.max()]}
-        return {"name": one.name, **shape, "peaks_kPa": _peaks(one.facts["simulation"]), **one.facts}
+        return {"name": one.name, **shape, "peaks_kPa": _collect_peaks(one.facts["simulation"]), **one.facts}
 
     def write(self, folder: Path, one: _Made) -> None:
         """The face with its offset from the unloaded limb, and the fields after donning and each load."""
@@ -266,31 +266,31 @@ class _Bench:
             write_vtu(self.mesh, folder / f"{one.name}-{i}.vtu", point_data=data)
 
 
-def _optimised(
+def _optimise_depths(
     bench: _Bench, recipe: Recipe, done: Mapping[str, _Made], optimise: Sequence[str], count: int
 ) -> tuple[_Made, dict[str, Any]]:
     """The best of the designs that depths over the named regions give, and how it was found."""
-    control, start = (_peaks(done[name].facts["simulation"]) for name in (CONTROL, DESIGN))
+    control, start = (_collect_peaks(done[name].facts["simulation"]) for name in (CONTROL, DESIGN))
     regions = [name for name in start if name in control]
-    limits = _limits(bench, control, regions)
+    limits = _find_limits(bench, control, regions)
     order = [regions.index(name) for name in optimise]
 
     def vector(peaks: Mapping[str, float]) -> Array:
         return np.array([peaks.get(name, 0.0) for name in regions])
 
     search = Relief(order, vector(control), vector(limits), vector(start))
-    best, rows = done[DESIGN], [_row(search.trials[0], optimise, start)]
+    best, rows = done[DESIGN], [_to_row(search.trials[0], optimise, start)]
     for number in range(1, count + 1):
         depths = search.propose()
         if depths is None:
             break
-        made = _tried(bench, recipe, dict(zip(optimise, map(float, depths), strict=True)), number)
-        peaks = _peaks(made.facts["simulation"]) if isinstance(made, _Made) else None
+        made = _try_design(bench, recipe, dict(zip(optimise, map(float, depths), strict=True)), number)
+        peaks = _collect_peaks(made.facts["simulation"]) if isinstance(made, _Made) else None
         trial = search.tell(depths, None if peaks is None else vector(peaks))
-        rows.append(_row(trial, optimise, peaks, "" if isinstance(made, _Made) else made))
+        rows.append(_to_row(trial, optimise, peaks, "" if isinstance(made, _Made) else made))
         if isinstance(made, _Made) and trial is search.best:
             best = made
-    peaks = _peaks(best.facts["simulation"])
+    peaks = _collect_peaks(best.facts["simulation"])
     gains = [
         {
             "region": name,
@@ -306,7 +306,7 @@ def _optimised(
     return replace(best, name=OPTIMISED), found | {"simulations": count, "trials": rows}
 
 
-def _tried(bench: _Bench, recipe: Recipe, depths: Mapping[str, float], number: int) -> _Made | str:
+def _try_design(bench: _Bench, recipe: Recipe, depths: Mapping[str, float], number: int) -> _Made | str:
     """A design put on the limb; words where it cannot be."""
     try:
         return bench.put_on(bench.made(f"{OPTIMISED}, {number}", recipe, depths))[0]
@@ -316,13 +316,13 @@ def _tried(bench: _Bench, recipe: Recipe, depths: Mapping[str, float], number: i
         return str(error)
 
 
-def _limits(bench: _Bench, control: Mapping[str, float], regions: Sequence[str]) -> dict[str, float]:
+def _find_limits(bench: _Bench, control: Mapping[str, float], regions: Sequence[str]) -> dict[str, float]:
     """As stated; else no region is to bear more than the control's most loaded one."""
     stated = {one.region: one.limit_kPa for one in bench.limb.study.socket.design.regions if one.limit_kPa}
     return {name: stated.get(name, max(control.values())) for name in regions}
 
 
-def _row(
+def _to_row(
     trial: Trial, optimise: Sequence[str], peaks: Mapping[str, float] | None, reason: str = ""
 ) -> dict[str, Any]:
     return {
@@ -333,7 +333,7 @@ def _row(
     }
 
 
-def _peaks(simulation: Mapping[str, Any]) -> dict[str, float]:
+def _collect_peaks(simulation: Mapping[str, Any]) -> dict[str, float]:
     """The largest pressure of each region over all loads, kPa; after donning where there are none."""
     peaks: dict[str, float] = {}
     for held in simulation["loads"] or [simulation["donning"]]:
@@ -342,11 +342,11 @@ def _peaks(simulation: Mapping[str, Any]) -> dict[str, float]:
     return peaks
 
 
-def _peak(simulation: Mapping[str, Any]) -> float:
+def _find_peak(simulation: Mapping[str, Any]) -> float:
     return float(max(held["peak_kPa"] for held in simulation["loads"] or [simulation["donning"]]))
 
 
-def _wall_facts(bench: _Bench, body: Surface, one: _Made) -> dict[str, Any]:
+def _build_wall_facts(bench: _Bench, body: Surface, one: _Made) -> dict[str, Any]:
     measured = measure_thickness(body, one.face)
     return {
         "of": one.name,

@@ -28,7 +28,7 @@ _CHANGE = float(np.log1p(CHANGE_PERCENT / 100.0))
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
+class ParameterSpread:
     """How well a simulation's parameters are known.
 
     Attributes
@@ -45,7 +45,9 @@ class Spread:
     off: Array
 
     @classmethod
-    def of(cls, study: Study, names: Sequence[tuple[str, str]], covariance: Array, off: Array) -> Spread:
+    def of(
+        cls, study: Study, names: Sequence[tuple[str, str]], covariance: Array, off: Array
+    ) -> ParameterSpread:
         """For a simulation whose parameters have ``names``, tissue and name, of `Problem.parameter_names`.
 
         ``covariance`` and ``off`` are those of all of the study's parameters, tissue by tissue.
@@ -54,7 +56,7 @@ class Spread:
         own = [(tissue, parameter.name) for tissue in study.tissues for parameter in study.law.parameters]
         known = np.array([name in names for name in own])  # fibres that a tissue has not change nothing
         order = [list(names).index(name) for name in own if name in names]
-        keyed = [f"{region}.{_key(laws.get(region, LAWS[OGDEN]), name)}" for region, name in names]
+        keyed = [f"{region}.{_find_key(laws.get(region, LAWS[OGDEN]), name)}" for region, name in names]
         return cls(keyed, order, covariance[np.ix_(known, known)], off[known])
 
     def told(self, value: float, slopes: Array) -> tuple[list[float], dict[str, float], dict[str, float]]:
@@ -79,12 +81,12 @@ class Spread:
         return [max(ends[0] - half, 0.0), ends[1] + half], found, changes
 
 
-def _key(law: TissueLaw, name: str) -> str:
+def _find_key(law: TissueLaw, name: str) -> str:
     return next(parameter.key for parameter in law.parameters if parameter.name == name)
 
 
-def spread_facts(
-    spread: Spread | None, name: str, unit: str, value: float, slopes: Array | None
+def spread_to_facts(
+    spread: ParameterSpread | None, name: str, unit: str, value: float, slopes: Array | None
 ) -> dict[str, Any]:
     """As it is stored: interval, shares and changes of a value, by keys with its name and unit; or none."""
     keys = (f"{name}interval_{unit}", f"{name}interval_from", f"{name}change_{unit}")
@@ -92,29 +94,31 @@ def spread_facts(
     return dict(zip(keys, found, strict=True))
 
 
-def drawn(covariance: Array, number: int, seed: int = 0) -> Array:
+def draw_step(covariance: Array, number: int, seed: int = 0) -> Array:
     """The ``number``-th draw (k,) from the ``covariance (k, k)``, of the logarithms of parameters."""
     random = np.random.default_rng([seed, number])
     return random.multivariate_normal(np.zeros(len(covariance)), covariance, method="eigh")
 
 
-def first_order(row: Mapping[str, Any], name: str, unit: str, step: Mapping[str, float]) -> float:
+def predict_change(row: Mapping[str, Any], name: str, unit: str, step: Mapping[str, float]) -> float:
     """A stored value's change by its derivatives, where the logarithms of parameters change by ``step``."""
     slopes = row[f"{name}change_{unit}"]
     return float(sum(slopes[key] * by for key, by in step.items() if key in slopes)) / _CHANGE
 
 
-def widen(facts: Mapping[str, Any], draws: Sequence[tuple[Mapping[str, float], Mapping[str, Any]]]) -> None:
+def widen_intervals(
+    facts: Mapping[str, Any], draws: Sequence[tuple[Mapping[str, float], Mapping[str, Any]]]
+) -> None:
     """Widen the intervals of stored facts by what derivatives miss of ``draws``: steps, and facts there.
 
     That, mean and standard deviation, is stored beside each interval: ``missed_kPa``, ``settling_missed_mm``.
     There are two draws or more.
     """
-    others = [list(_values(found)) for _, found in draws]
-    for i, (row, key, name, unit) in enumerate(_values(facts)):
+    others = [list(_iterate_values(found)) for _, found in draws]
+    for i, (row, key, name, unit) in enumerate(_iterate_values(facts)):
         value, (low, high) = row[key], row[f"{name}interval_{unit}"]
         missed = [
-            other[i][0][key] - value - first_order(row, name, unit, step)
+            other[i][0][key] - value - predict_change(row, name, unit, step)
             for (step, _), other in zip(draws, others, strict=True)
         ]
         mean, sd = float(np.mean(missed)), float(np.std(missed, ddof=1))
@@ -123,13 +127,15 @@ def widen(facts: Mapping[str, Any], draws: Sequence[tuple[Mapping[str, float], M
         row[f"{name}missed_{unit}"] = [mean, sd]
 
 
-def tell_change(facts: Mapping[str, Any], other: Mapping[str, Any], of: str) -> None:
+def store_change(facts: Mapping[str, Any], other: Mapping[str, Any], of: str) -> None:
     """Store how every value with an interval changes to that of ``other`` facts, beside its other changes."""
-    for (row, key, name, unit), (there, *_) in zip(_values(facts), _values(other), strict=True):
+    for (row, key, name, unit), (there, *_) in zip(
+        _iterate_values(facts), _iterate_values(other), strict=True
+    ):
         row[f"{name}change_{unit}"][of] = there[key] - row[key]
 
 
-def _values(facts: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], str, str, str]]:
+def _iterate_values(facts: Mapping[str, Any]) -> Iterator[tuple[dict[str, Any], str, str, str]]:
     """Every value with an interval: its row, its key there, how names of its facts begin, and its unit."""
     for held in (facts["donning"], *facts["loads"]):
         for row in held["regions"]:

@@ -39,14 +39,14 @@ from ...socket import Socket
 from ...socket.landmarks import find_directions, load_point
 from ...socket.regions import SkinRegion
 from ...study import Study
-from ..shared.artefacts import digest, file_digest, read_json
+from ..shared.artefacts import compute_digest, compute_file_digest, read_json
 from ..shared.context import Context
-from ..shared.kept import Begun, Kept, Made
-from ..shared.simulations import fibres_of
-from ..shared.socket_shape import covered_regions, load_of, mesh_edge_mm, regions_of
+from ..shared.kept import Begun, Made, ResultFiles
+from ..shared.simulations import find_fibre_directions
+from ..shared.socket_shape import build_regions, find_covered_regions, load_of, mesh_edge_mm
 from ..shared.sources import code_digest
-from ..stages.mesh import is_meshed, keep_mesh, mesh_settings, stored_depth
-from .socket_intervals import Spread, spread_facts
+from ..stages.mesh import is_meshed, keep_mesh, mesh_settings, read_stored_depth
+from .socket_intervals import ParameterSpread, spread_to_facts
 
 Mask = NDArray[np.bool_]
 
@@ -79,11 +79,13 @@ class SocketLimb:
         """That of a study whose surfaces are stored; ``name`` is the experiment's, for its progress."""
         study, surfaces = context.study, context.store["surfaces"]
         anatomy, thickness = load_anatomy(surfaces), study.socket.liner.thickness_mm
-        outer, depth = anatomy, stored_depth(surfaces, anatomy, mesh_settings(study))
+        outer, depth = anatomy, read_stored_depth(surfaces, anatomy, mesh_settings(study))
         if thickness:
             context.tell(name, 0, 0, f"a liner of {thickness:g} mm around the limb")
             outer, depth = build_liner_surface(anatomy, thickness, depth)
-        return cls(study, anatomy, outer, depth, regions_of(study, anatomy), fibres_of(context))
+        return cls(
+            study, anatomy, outer, depth, build_regions(study, anatomy), find_fibre_directions(context)
+        )
 
     def materials(self, parameters: Parameters) -> dict[str, Material]:
         """Of the tissues and the liner."""
@@ -140,14 +142,14 @@ class SocketLimb:
     def faces(self, mesh: Mesh, socket: Socket) -> dict[str, Mask]:
         """Which faces (f,) under a socket belong to each region: those whose nearest skin does."""
         middles = mesh.points[mesh.face_sets[OUTER][:, :3]].mean(axis=1)
-        return covered_regions(middles, self.anatomy.skin, self.regions, socket)
+        return find_covered_regions(middles, self.anatomy.skin, self.regions, socket)
 
     def key(self, folder: Path, parameters: Parameters, socket: Socket, sensitivities: bool = False) -> str:
         """Of all that decides what a socket does to this limb, whose `mesh` is kept in the folder."""
         table = self.study.socket.model_dump(mode="json", exclude={"design"})
-        return digest(
+        return compute_digest(
             *(table, self.study.material.model_dump(mode="json"), parameters, sensitivities),
-            *(file_digest(folder / MESH), code_digest(SocketLimb.of), code_digest(don)),
+            *(compute_file_digest(folder / MESH), code_digest(SocketLimb.of), code_digest(don)),
             *(socket.points.tolist(), socket.clear.tolist()),
         )
 
@@ -197,7 +199,7 @@ class SocketLimb:
             begin=None if before is None else unpack(*before),
         )
         if not found.result.completed:
-            raise RunError(_stopped(found, fit))
+            raise RunError(_describe_stop(found, fit))
         return found
 
     def facts(
@@ -205,11 +207,13 @@ class SocketLimb:
     ) -> dict[str, Any]:
         """What is stored of a simulation, with intervals where covariance (p, p) and ``off`` (p,) are."""
         fit = self.fit(socket)
-        spread = None if known is None else Spread.of(self.study, found.result.parameter_names, *known)
+        spread = (
+            None if known is None else ParameterSpread.of(self.study, found.result.parameter_names, *known)
+        )
         mesh = found.result.problem.mesh
         faces = self.faces(mesh, socket)
         held = {
-            name: _held(one, spread) | {"inside": _inside(mesh, one, faces)}
+            name: _loaded_to_dict(one, spread) | {"inside": _summarise_strain(mesh, one, faces)}
             for name, one in found.held.items()
         }
         donned, base = held.pop("donning"), found.held["donning"].row
@@ -218,7 +222,7 @@ class SocketLimb:
             here = found.held[load.name]
             depth = float(here.row.move[2] - base.move[2])
             settled = {"settling_mm": depth}
-            settled |= spread_facts(spread, "settling_", "mm", depth, here.slopes.get(SETTLING))
+            settled |= spread_to_facts(spread, "settling_", "mm", depth, here.slopes.get(SETTLING))
             stated = {"name": load.name, "force_N": load.force, "moment_Nmm": load.moment}
             loads.append({**stated, **settled, **held[load.name]})
         statistics = found.result.statistics
@@ -231,7 +235,7 @@ class SocketLimb:
             "loads": loads,
             "steps": [_step(row, fit) for row in found.rows],
             # How far it sinks in is told by itself: the wall's stiffness is stated, and no study's.
-            "warnings": [warning(doubt) for doubt in found.result.doubts if doubt.kind != "sunk"],
+            "warnings": [format_warning(doubt) for doubt in found.result.doubts if doubt.kind != "sunk"],
             "statistics": {
                 key: statistics[key] for key in ("steps", "cuts", "newton_iterations", "unknowns")
             },
@@ -245,7 +249,7 @@ class SocketLimb:
 
 
 @dataclass(frozen=True, eq=False)
-class Wearing:
+class SocketRun:
     """A job: a socket's face that is put on a limb and loaded, and where what comes of it is kept."""
 
     name: str
@@ -253,12 +257,14 @@ class Wearing:
     mesh: Mesh
     laws: Mapping[str, Material]
     face: Socket
-    kept: Kept
+    kept: ResultFiles
     key: str
     threads: int | None = None
 
 
-def wear_all(jobs: Sequence[Wearing], executor: Executor, tell: Callable[[float, str], None]) -> list[str]:
+def run_sockets(
+    jobs: Sequence[SocketRun], executor: Executor, tell: Callable[[float, str], None]
+) -> list[str]:
     """Do the jobs side by side; why each could not be done, in words, nothing where it was.
 
     ``tell`` is given how many are done, with parts, and words. What was kept before is not done again.
@@ -267,26 +273,26 @@ def wear_all(jobs: Sequence[Wearing], executor: Executor, tell: Callable[[float,
     beside: Executor = executor if len(left) > 1 else SerialExecutor()
     shares, before = dict.fromkeys((job.name for job in left), 0.0), len(jobs) - len(left)
 
-    def told(job: Wearing, message: tuple[float, str]) -> None:
+    def told(job: SocketRun, message: tuple[float, str]) -> None:
         shares[job.name], words = message
         tell(before + sum(shares.values()), f"{job.name}: {words}")
 
     threads = beside.threads_for(len(left))
-    reasons = beside.map(_wear, [replace(job, threads=threads) for job in left], on_report=told)
+    reasons = beside.map(_run_socket, [replace(job, threads=threads) for job in left], on_report=told)
     found = dict(zip(shares, reasons, strict=True))
     return [found.get(job.name, "") for job in jobs]
 
 
-def _wear(job: Wearing) -> str:
+def _run_socket(job: SocketRun) -> str:
     """Do a job, which reports how far it is, from 0 to 1, in words; why it does not come to its end."""
     try:
-        worn(job)
+        simulate_socket(job)
     except RunError as error:
         return str(error)
     return ""
 
 
-def worn(job: Wearing) -> Made:
+def simulate_socket(job: SocketRun) -> Made:
     """Facts, and pressure, shear and displacement at the mesh's nodes after donning and each load."""
 
     begun = Begun(job.kept, job.key)
@@ -308,7 +314,7 @@ def worn(job: Wearing) -> Made:
     return made
 
 
-def warning(doubt: SimulationWarning) -> str:
+def format_warning(doubt: SimulationWarning) -> str:
     """A doubt about a simulation in the words of a socket: that of folded elements names an indenter."""
     if doubt.kind != "folded":
         return doubt.text
@@ -318,7 +324,7 @@ def warning(doubt: SimulationWarning) -> str:
     )
 
 
-def _stopped(found: Donned, fit: SocketFit) -> str:
+def _describe_stop(found: Donned, fit: SocketFit) -> str:
     """Why a simulation did not come to its end, and what may be done about it."""
     last = found.rows[-1] if found.rows else None
     time = 0.0 if last is None else last.time
@@ -337,9 +343,9 @@ def _stopped(found: Donned, fit: SocketFit) -> str:
     )
 
 
-def _held(one: Held, spread: Spread | None) -> dict[str, Any]:
+def _loaded_to_dict(one: Held, spread: ParameterSpread | None) -> dict[str, Any]:
     def of(name: str, patch: Patch) -> dict[str, Any]:
-        known = spread_facts(spread, "", "kPa", patch.mean_kPa, one.slopes.get(name))
+        known = spread_to_facts(spread, "", "kPa", patch.mean_kPa, one.slopes.get(name))
         return {"region": name, **asdict(patch), **known}
 
     row = one.row
@@ -353,7 +359,7 @@ def _held(one: Held, spread: Spread | None) -> dict[str, Any]:
     }
 
 
-def _inside(mesh: Mesh, one: Held, faces: Mapping[str, Mask]) -> list[dict[str, Any]]:
+def _summarise_strain(mesh: Mesh, one: Held, faces: Mapping[str, Mask]) -> list[dict[str, Any]]:
     """Strain of each tissue under the liner, and where most: the place at rest, the region nearest to it."""
     middles = mesh.points[mesh.face_sets[OUTER][:, :3]].mean(axis=1)
     rows = []

@@ -19,19 +19,25 @@ from ...identify.uncertainty.exploration import Exploration, ExplorationSettings
 from ...identify.uncertainty.likelihood import Likelihood
 from ...identify.uncertainty.model_comparison import ModelComparison, compare_models, fit_alternative
 from ..shared.context import Context
-from ..shared.simulations import experiment_cache
-from ..stages.deviations import site_noise
-from ..stages.laboratory import Laboratory, groupings, linearised, stage_titles, unknowns
-from ..stages.predict import Answer, answer_jobs
-from ..stages.records import as_response, as_searched, site_record
+from ..shared.simulations import open_experiment_cache
+from ..stages.deviations import estimate_site_noise
+from ..stages.laboratory import (
+    RecordSimulator,
+    build_groupings,
+    build_unknowns,
+    estimate_linearised,
+    list_stage_titles,
+)
+from ..stages.predict import Answer, build_answer_jobs
+from ..stages.records import coarsen_records, load_site_record, to_response
 from .uncertainty_record import Found, Predicted, write_results
-from .uncertainty_sources import Change, changes, variants
+from .uncertainty_sources import Change, build_variants, simulate_changes
 
 _NEAR = 4.0  # runs of the calibration whose error is at most this many times the least, plus 3 %, are used
 NAME = "uncertainty"
 
 
-class FittedSites(Laboratory):
+class FittedSites(RecordSimulator):
     """The fitted sites, simulated with derivatives; brought to the fine meshes' forces where those exist."""
 
     def __init__(
@@ -43,7 +49,7 @@ class FittedSites(Laboratory):
     ) -> None:
         """``earlier``: parameters that the calibration simulated, and where it started them from."""
         records = context.study.records_at(*context.study.fitted)
-        super().__init__(context, experiment_cache(context, folder), records, NAME)
+        super().__init__(context, open_experiment_cache(context, folder), records, NAME)
         self.best, self.earlier = best, earlier
         self.at_best = self.anchored(best)
 
@@ -72,38 +78,38 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     study = context.study
     calibration = context.stored("calibrate", "calibration.json")
     best = study.vector(calibration["stages"][-1]["parameters"])
-    earlier = _earlier_points(context, calibration)
+    earlier = _select_earlier_points(context, calibration)
     sites = FittedSites(context, folder, best, earlier)
-    known = linearised(context, sites.records, best, sites.at_best)
-    table, grouping = study.uncertainty, groupings(study)[-1]
-    space = build_space(unknowns(study), grouping)
+    known = estimate_linearised(context, sites.records, best, sites.at_best)
+    table, grouping = study.uncertainty, build_groupings(study)[-1]
+    space = build_space(build_unknowns(study), grouping)
     settings = ExplorationSettings(
         table.runs, max(4, table.runs // 4), checked=table.checked, seed=table.seed
     )
     explored = explore_posterior(
         sites.simulate,
         sites.measured,
-        unknowns(study),
+        build_unknowns(study),
         space,
         known,
         [np.array(point) for point in sorted(earlier)],
         settings,
         report=lambda text: context.tell(NAME, 0, 0, text),
     )
-    evidence = _evidence(context, explored, known.residual_model) if len(study.tissues) > 1 else None
+    evidence = _compare_groupings(context, explored, known.residual_model) if len(study.tissues) > 1 else None
     gain = FitSensitivity.linearise(
-        best, sites.at_best.responses, known.residual_model, unknowns(study), space
+        best, sites.at_best.responses, known.residual_model, build_unknowns(study), space
     )
     found: list[Change] = []
     if table.sources:
-        wanted = variants(context, folder, sites.searched, best)
-        found = changes(context, sites.cache, wanted, sites.records)
-    result = Found(known, explored, evidence, gain, tuple(found), unknowns(study))
-    write_results(folder, result, _predicted(context, sites))
+        wanted = build_variants(context, folder, sites.searched, best)
+        found = simulate_changes(context, sites.cache, wanted, sites.records)
+    result = Found(known, explored, evidence, gain, tuple(found), build_unknowns(study))
+    write_results(folder, result, _predict_sites(context, sites))
     return {"runs": explored.rounds[-1].runs}
 
 
-def _earlier_points(
+def _select_earlier_points(
     context: Context, calibration: dict[str, Any]
 ) -> dict[tuple[float, ...], Sequence[Array]]:
     """Parameters of the calibration's iterates that came near the records, and where it started them from."""
@@ -117,12 +123,12 @@ def _earlier_points(
     }
 
 
-def _evidence(context: Context, explored: Exploration, model: ResidualModel) -> ModelComparison:
+def _compare_groupings(context: Context, explored: Exploration, model: ResidualModel) -> ModelComparison:
     """One material against the study's own, on one emulator and covariance, and where nothing was fitted."""
     study, likelihood = context.study, explored.likelihood
-    space = build_space(unknowns(study), group_by_kind(unknowns(study).names))
-    single = Likelihood(explored.emulator, likelihood.measured, model, unknowns(study), space)
-    titles = stage_titles(study.tissues)
+    space = build_space(build_unknowns(study), group_by_kind(build_unknowns(study).names))
+    single = Likelihood(explored.emulator, likelihood.measured, model, build_unknowns(study), space)
+    titles = list_stage_titles(study.tissues)
     calibration = context.stored("calibrate", "calibration.json")
     start = study.vector(calibration["stages"][0]["parameters"])
     one, _ = fit_alternative(titles[0], single, space.reduce(np.log(start)))
@@ -133,17 +139,17 @@ def _evidence(context: Context, explored: Exploration, model: ResidualModel) -> 
     return compare_models(one, several, *([row[column] for row in held] for column in columns))
 
 
-def _predicted(context: Context, sites: FittedSites) -> list[Predicted]:
+def _predict_sites(context: Context, sites: FittedSites) -> list[Predicted]:
     """Every recorded site at the identified parameters, from what the stage ``predict`` has simulated."""
     study = context.study
-    records = [site_record(context, record) for record in study.recorded]
-    searched = as_searched(context, records)
+    records = [load_site_record(context, record) for record in study.recorded]
+    searched = coarsen_records(context, records)
     answer = Answer.of(context.stored("calibrate", "calibration.json")["stages"][-1], study)
-    jobs = answer_jobs(records, searched, answer)
-    ends = [as_response(end) for end in sites.cache.run(jobs, context.executor)]
+    jobs = build_answer_jobs(records, searched, answer)
+    ends = [to_response(end) for end in sites.cache.run(jobs, context.executor)]
     n = len(records)
     responses = ends if searched is records else MeshCorrection(ends[n:], ends[:n])(ends[n:])
     return [
-        Predicted(r, end, site_noise(study, r, end.force_N) if end.completed else None)
+        Predicted(r, end, estimate_site_noise(study, r, end.force_N) if end.completed else None)
         for r, end in zip(searched, responses)
     ]

@@ -69,36 +69,36 @@ class Predicted:
 def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) -> None:
     """``uncertainty.json``, and CSV: parameters, draws, profiles, sources, predictions."""
     (folder / "predictions").mkdir(exist_ok=True)
-    parameters, combinations = _parameters(found), _combinations(found)
-    rows = [_prediction(folder, found, one) for one in predicted]
+    parameters, combinations = _parameters_to_rows(found), _combinations_to_rows(found)
+    rows = [_write_prediction(folder, found, one) for one in predicted]
     explored, posterior = found.explored, found.explored.posterior
     content = {
         "parameters": parameters,
         "combinations": combinations,
         "correlation": {
             "names": list(found.known.names),
-            "matrix": _correlation(posterior.covariance).tolist(),
+            "matrix": _compute_correlation(posterior.covariance).tolist(),
         },
         "covariance_log": posterior.covariance.tolist(),
         "covariance_sources_log": found.source_covariance.tolist(),
         "residuals": found.known.residual_model.to_dict(),
-        "emulator": _emulator(found),
+        "emulator": _emulator_to_dict(found),
         "posterior": posterior.to_dict(),
         "profiles": {one.name: one.to_dict() for one in explored.profiles},
         "checks": [asdict(check) for check in explored.checks],
         "evidence": None if found.evidence is None else found.evidence.to_dict(),
-        "sources": [_source(found, change) for change in found.changes],
-        "predictions": {"sites": rows, **_coverage(rows)},
-        "verdict": _verdict(found, parameters, combinations, rows),
+        "sources": [_source_to_row(found, change) for change in found.changes],
+        "predictions": {"sites": rows, **_compute_coverage(rows)},
+        "verdict": _describe_verdict(found, parameters, combinations, rows),
     }
     write_json(folder / "uncertainty.json", content)
-    _table(folder / "parameters.csv", [_flat(row) for row in parameters])
-    _table(folder / "sources.csv", [_flat(row) for row in content["sources"]])
-    _table(folder / "predictions.csv", rows)
+    _write_table(folder / "parameters.csv", [_flatten_row(row) for row in parameters])
+    _write_table(folder / "sources.csv", [_flatten_row(row) for row in content["sources"]])
+    _write_table(folder / "predictions.csv", rows)
     write_runs(folder / EMULATOR, found.known.names, explored.emulator.points, explored.runs)
     draws = posterior.samples[:: max(len(posterior.samples) // _DRAWS, 1)]
     write_curves(folder / "draws.csv", **dict(zip(found.known.names, draws.T)))
-    _table(
+    _write_table(
         folder / "profiles.csv",
         [
             {"parameter": one.name, "value": value, "rise": rise, "extrapolated": bool(beyond)}
@@ -108,7 +108,7 @@ def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) ->
     )
 
 
-def _parameters(found: Found) -> list[dict[str, Any]]:
+def _parameters_to_rows(found: Found) -> list[dict[str, Any]]:
     """One row for every parameter: calibrated, its interval by every method, the verdict on all sources."""
     known, explored = found.known, found.explored
     posterior = explored.posterior
@@ -145,7 +145,7 @@ def _parameters(found: Found) -> list[dict[str, Any]]:
     return rows
 
 
-def _combinations(found: Found) -> list[dict[str, Any]]:
+def _combinations_to_rows(found: Found) -> list[dict[str, Any]]:
     """The principal axes of the posterior, as its draws, the linearisation and the sources see them."""
     known, explored = found.known, found.explored
     logs = np.log(explored.posterior.samples)
@@ -173,7 +173,7 @@ def _combinations(found: Found) -> list[dict[str, Any]]:
     return rows
 
 
-def _emulator(found: Found) -> dict[str, Any]:
+def _emulator_to_dict(found: Found) -> dict[str, Any]:
     explored = found.explored
     emulator = explored.emulator
     return {
@@ -188,7 +188,7 @@ def _emulator(found: Found) -> dict[str, Any]:
     }
 
 
-def _source(found: Found, change: Change) -> dict[str, Any]:
+def _source_to_row(found: Found, change: Change) -> dict[str, Any]:
     """One line of the table: change of force in percent of the largest, change of parameters in percent.
 
     A source of each site's own changes parameters by the root of the sum of squares over sites.
@@ -211,7 +211,7 @@ def _source(found: Found, change: Change) -> dict[str, Any]:
     }
 
 
-def _prediction(folder: Path, found: Found, one: Predicted) -> dict[str, Any]:
+def _write_prediction(folder: Path, found: Found, one: Predicted) -> dict[str, Any]:
     """A site's interval as CSV, and its row: how wide, why, and how much of the record lies inside.
 
     Of a site whose prediction failed there is the reason only.
@@ -259,7 +259,7 @@ def _prediction(folder: Path, found: Found, one: Predicted) -> dict[str, Any]:
     }
 
 
-def _coverage(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+def _compute_coverage(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     """Mean share of the records inside their intervals, in percent."""
     found: dict[str, float | None] = {}
     for kind, fitted in (("fitted", True), ("heldout", False)):
@@ -268,7 +268,7 @@ def _coverage(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     return found
 
 
-def _verdict(
+def _describe_verdict(
     found: Found,
     parameters: Sequence[dict[str, Any]],
     combinations: Sequence[dict[str, Any]],
@@ -309,11 +309,11 @@ def _verdict(
             f"Beyond the records, {largest.variant.source} ({largest.variant.change}) would change the "
             "parameters most."
         )
-    coverage = _coverage(rows)["coverage_heldout_percent"]
+    coverage = _compute_coverage(rows)["coverage_heldout_percent"]
     if coverage is not None:
         words.append(f"{coverage:.0f} % of the held-out records lies inside the 95 % prediction intervals.")
     words += [f"Site {row['record']} is not predicted: {row['reason']}." for row in rows if row["reason"]]
-    words += _of_profiles(found.explored)
+    words += _describe_profiles(found.explored)
     if not found.explored.good_enough:
         words.append("The emulator is less accurate than the records: raise uncertainty.runs.")
     if not found.explored.posterior.long_enough:
@@ -321,7 +321,7 @@ def _verdict(
     return words
 
 
-def _of_profiles(explored: Exploration) -> list[str]:
+def _describe_profiles(explored: Exploration) -> list[str]:
     """Where profiles rest on an emulator beyond its runs, and what the solver said there."""
     beyond = [one.name for one in explored.profiles if any(one.ends_extrapolated)]
     words = []
@@ -344,13 +344,13 @@ def _of_profiles(explored: Exploration) -> list[str]:
     return words
 
 
-def _correlation(covariance: Array) -> Array:
+def _compute_correlation(covariance: Array) -> Array:
     sd = np.sqrt(np.diag(covariance))
     sd = np.where(sd > 0, sd, 1.0)
     return covariance / np.outer(sd, sd)
 
 
-def _flat(row: dict[str, Any]) -> dict[str, Any]:
+def _flatten_row(row: dict[str, Any]) -> dict[str, Any]:
     """Lists and dictionaries of a row as columns."""
     flat: dict[str, Any] = {}
     for key, value in row.items():
@@ -365,6 +365,6 @@ def _flat(row: dict[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def _table(file: Path, rows: Sequence[dict[str, Any]]) -> None:
+def _write_table(file: Path, rows: Sequence[dict[str, Any]]) -> None:
     """Rows with the same columns as CSV."""
     write_table(file, list(rows[0]) if rows else [], [list(row.values()) for row in rows])

@@ -23,12 +23,12 @@ from ...indentation import SimulationJob, SiteModel
 from ...shapes import SHAPES
 from ...study import SolverTable, Study, Vector
 from ..shared.context import Context
-from ..shared.extrapolation import MESH_ORDERS, error_of_coarser
+from ..shared.extrapolation import MESH_ORDERS, estimate_coarse_error
 from ..shared.simulations import SimulationCache
-from ..stages.laboratory import error_of_own_mesh
-from ..stages.mesh import coarse_settings, mesh_settings
-from ..stages.records import SiteRecord, site_record
-from ..stages.remesh import meshed_models, scaled_edges
+from ..stages.laboratory import estimate_own_mesh_error
+from ..stages.mesh import build_coarse_settings, mesh_settings
+from ..stages.records import SiteRecord, load_site_record
+from ..stages.remesh import mesh_models, scale_edges
 
 FINER = 0.75  # edges of the finer mesh, where the study has no coarse one to compare with
 MORE_STEPS = 2
@@ -66,7 +66,7 @@ class Change:
     failed: tuple[str, ...]
 
 
-def variants(
+def build_variants(
     context: Context, folder: Path, records: Sequence[SiteRecord], parameters: Array
 ) -> list[SourceVariant]:
     """All variants of the study, their meshes made; ``records`` are those whose meshes are searched on."""
@@ -82,37 +82,41 @@ def variants(
     models = [record.model for record in records]
     found = [
         vary(
-            "layer thickness", f"{table.layer_mm:g} mm thicker", _thicker(context, folder, models), True, True
+            "layer thickness",
+            f"{table.layer_mm:g} mm thicker",
+            _thicken_layer(context, folder, models),
+            True,
+            True,
         )
     ]
     for number, word in enumerate(("along the limb", "around the limb")):
-        moved = [_moved(context, model, number, table.position_mm) for model in models]
+        moved = [_move_site(context, model, number, table.position_mm) for model in models]
         found.append(vary("site position", f"{table.position_mm:g} mm {word}", moved, False, True))
     for number, word in enumerate(("along the limb", "around the limb")):
-        tilted = [replace(m, axis=_tilted(m, number, table.axis_degrees)) for m in models]
+        tilted = [replace(m, axis=_tilt_axis(m, number, table.axis_degrees)) for m in models]
         found.append(vary("site axis", f"{table.axis_degrees:g} degrees {word}", tilted, False, True))
-    found += _of_contact(context.study, models, vary)
-    finer = [replace(m, steps=_more_steps(m)) for m in models]
+    found += _build_contact_variants(context.study, models, vary)
+    finer = [replace(m, steps=_refine_steps(m)) for m in models]
     change = f"{MORE_STEPS} times as many, extrapolated at order {ORDER_IN_TIME:g}"
     in_time = vary("time steps", change, finer, True, True)
-    found.append(replace(in_time, scale=error_of_coarser(ORDER_IN_TIME, MORE_STEPS)))
-    found.append(_of_mesh(context, folder, records, plain, parameters))
+    found.append(replace(in_time, scale=estimate_coarse_error(ORDER_IN_TIME, MORE_STEPS)))
+    found.append(_build_mesh_variant(context, folder, records, plain, parameters))
     return found
 
 
-def _of_contact(study: Study, models: Sequence[SiteModel], vary: Vary) -> list[SourceVariant]:
+def _build_contact_variants(study: Study, models: Sequence[SiteModel], vary: Vary) -> list[SourceVariant]:
     """Edge radius, friction and bulk modulus; the last two are alternatives, no spreads."""
     radius = study.uncertainty.edge_radius_mm
     found = []
     if radius > 0 and any(SHAPES[m.indenter.shape].is_edge_doubted for m in models):
         rounded = [
-            _with_indenter(m, edge_radius_mm=m.indenter.edge_radius_mm + radius)
+            _change_indenter(m, edge_radius_mm=m.indenter.edge_radius_mm + radius)
             if SHAPES[m.indenter.shape].is_edge_doubted
             else m
             for m in models
         ]
         found.append(vary("indenter edge", f"radius {radius:g} mm larger", rounded, True, True))
-    others = [_other_friction(m) for m in models]
+    others = [_change_friction(m) for m in models]
     word = " or ".join(dict.fromkeys(str(m.indenter.friction) for m in others))
     found.append(vary("friction", word, others, True, False))
     softer = [replace(m, kappa_ratio=m.kappa_ratio / 2) for m in models]
@@ -120,22 +124,22 @@ def _of_contact(study: Study, models: Sequence[SiteModel], vary: Vary) -> list[S
     return found
 
 
-def _other_friction(model: SiteModel) -> SiteModel:
+def _change_friction(model: SiteModel) -> SiteModel:
     other = "sticky" if model.indenter.friction == "frictionless" else "frictionless"
-    return _with_indenter(model, friction=other)
+    return _change_indenter(model, friction=other)
 
 
-def _with_indenter(model: SiteModel, **changes: object) -> SiteModel:
+def _change_indenter(model: SiteModel, **changes: object) -> SiteModel:
     return replace(model, indenter=model.indenter.model_copy(update=changes))
 
 
-def _more_steps(model: SiteModel) -> SolverTable:
+def _refine_steps(model: SiteModel) -> SolverTable:
     steps = model.steps
     update = {"load_steps": MORE_STEPS * steps.load_steps, "unload_steps": MORE_STEPS * steps.unload_steps}
     return steps.model_copy(update=update)
 
 
-def _tangents(axis: Array) -> tuple[Array, Array]:
+def _build_tangents(axis: Array) -> tuple[Array, Array]:
     """Two unit vectors across an axis: along the limb (the image's z) and around it."""
     up = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
     along = up - (up @ axis) * axis
@@ -143,11 +147,11 @@ def _tangents(axis: Array) -> tuple[Array, Array]:
     return along, np.cross(axis, along)
 
 
-def _moved(context: Context, model: SiteModel, number: int, distance_mm: float) -> SiteModel:
+def _move_site(context: Context, model: SiteModel, number: int, distance_mm: float) -> SiteModel:
     """The site elsewhere on the skin, its axis found anew; the mesh is refined widely enough around it."""
     anatomy = load_anatomy(context.store["surfaces"])
     axis = np.array(model.axis)
-    wanted = np.array(model.position) + distance_mm * _tangents(axis)[number]
+    wanted = np.array(model.position) + distance_mm * _build_tangents(axis)[number]
     point, _ = project_to_skin(anatomy, wanted)
     width = context.study.width_at(context.study.site(model.site))
     turned = compute_indenter_axis(anatomy.skin, point, width) - compute_indenter_axis(
@@ -155,28 +159,28 @@ def _moved(context: Context, model: SiteModel, number: int, distance_mm: float) 
     )
     axis = axis + turned
     axis /= np.linalg.norm(axis)
-    return replace(model, position=_vector(point), axis=_vector(axis))
+    return replace(model, position=_to_vector(point), axis=_to_vector(axis))
 
 
-def _tilted(model: SiteModel, number: int, degrees: float) -> Vector:
+def _tilt_axis(model: SiteModel, number: int, degrees: float) -> Vector:
     axis, angle = np.array(model.axis), np.radians(degrees)
-    turned = np.cos(angle) * axis + np.sin(angle) * _tangents(axis)[number]
-    return _vector(turned)
+    turned = np.cos(angle) * axis + np.sin(angle) * _build_tangents(axis)[number]
+    return _to_vector(turned)
 
 
-def _vector(values: Array) -> Vector:
+def _to_vector(values: Array) -> Vector:
     x, y, z = map(float, values)
     return x, y, z
 
 
-def searched_settings(study: Study) -> MeshSettings:
+def choose_searched_settings(study: Study) -> MeshSettings:
     """Of the meshes on which parameters are searched: the coarse ones where there are."""
-    return coarse_settings(study) or mesh_settings(study)
+    return build_coarse_settings(study) or mesh_settings(study)
 
 
-def _thicker(context: Context, folder: Path, models: Sequence[SiteModel]) -> list[SiteModel]:
+def _thicken_layer(context: Context, folder: Path, models: Sequence[SiteModel]) -> list[SiteModel]:
     """The sites meshed anew with the outermost layer of given thickness made thicker."""
-    settings = searched_settings(context.study)
+    settings = choose_searched_settings(context.study)
     layers = list(settings.layers)
     index = next((i for i, layer in enumerate(layers) if layer.thickness_mm is not None), 0)
     layer, more = layers[index], context.study.uncertainty.layer_mm
@@ -184,12 +188,12 @@ def _thicker(context: Context, folder: Path, models: Sequence[SiteModel]) -> lis
         layers[index] = replace(layer, min_thickness_mm=(layer.min_thickness_mm or 0.0) + more)
     else:
         layers[index] = replace(layer, thickness_mm=layer.thickness_mm + more)
-    return meshed_models(
+    return mesh_models(
         context, folder / "thicker", models, replace(settings, layers=tuple(layers)), "uncertainty"
     )
 
 
-def _of_mesh(
+def _build_mesh_variant(
     context: Context,
     folder: Path,
     records: Sequence[SiteRecord],
@@ -198,14 +202,14 @@ def _of_mesh(
 ) -> SourceVariant:
     """How far forces are from those of an infinitely fine mesh, from two."""
     study = context.study
-    settings = searched_settings(study)
+    settings = choose_searched_settings(study)
     if study.mesh.coarse is not None:
-        own = [site_record(context, record.record).model for record in records]
+        own = [load_site_record(context, record.record).model for record in records]
         models = [replace(model, within_mm=study.within_mm) for model in own]
         jobs = [replace(job, model=model) for job, model in zip(plain, models, strict=True)]
     else:
-        finer = scaled_edges(settings, FINER)
-        models = meshed_models(
+        finer = scale_edges(settings, FINER)
+        models = mesh_models(
             context, folder / "finer", [record.model for record in records], finer, "uncertainty"
         )
         jobs = [replace(job, model=model) for job, model in zip(plain, models, strict=True)]
@@ -220,12 +224,14 @@ def mesh_share(study: Study) -> tuple[str, float]:
     order = MESH_ORDERS[study.mesh.element]
     how = "the difference itself" if order is None else f"extrapolated at order {order:g}"
     if study.mesh.coarse is not None:
-        return f"error of the fine mesh, in every interval already: {how}", error_of_own_mesh(study.mesh)
+        return f"error of the fine mesh, in every interval already: {how}", estimate_own_mesh_error(
+            study.mesh
+        )
     what = f"error of the mesh, from edges {FINER:g} times as long: {how}"
-    return what, error_of_coarser(order, 1 / FINER)
+    return what, estimate_coarse_error(order, 1 / FINER)
 
 
-def changes(
+def simulate_changes(
     context: Context, cache: SimulationCache, wanted: Sequence[SourceVariant], records: Sequence[SiteRecord]
 ) -> list[Change]:
     """Simulate the variants of the ``records``."""

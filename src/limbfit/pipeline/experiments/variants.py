@@ -16,8 +16,8 @@ from ...study import Indentation, Record, Site, Study
 from ..shared.artefacts import write_curves
 from ..shared.context import Context
 from ..shared.limb import LimbGeometry
-from ..shared.simulations import CURVE_POINTS, SimulationCache, model_of
-from ..stages.deviations import bone_distance_mm
+from ..shared.simulations import CURVE_POINTS, SimulationCache, build_model
+from ..stages.deviations import measure_bone_distance_mm
 
 
 @dataclass(frozen=True)
@@ -75,13 +75,13 @@ def check_variants(study: Study, limb: LimbGeometry | None, options: Mapping[str
     ------
     InputError
     """
-    _driven(study, options["sites"])
+    _select_driven(study, options["sites"])
     if limb is not None and not limb.anatomy.bones:
         what = "the limb has no bone, and this compares tissue by its thickness over bone"
         raise InputError(what, file=study.file)
 
 
-def _driven(study: Study, names: Sequence[str]) -> list[Indentation]:
+def _select_driven(study: Study, names: Sequence[str]) -> list[Indentation]:
     """The named indentations, or all, under a stated displacement."""
     chosen = [study.indentation(name) for name in names] or list(study.indentations)
     driven = [one for one in chosen if not (isinstance(one, Record) and one.forced)]
@@ -102,29 +102,29 @@ def choose_sites(context: Context, names: Sequence[str]) -> list[ChosenSite]:
     InputError
         For a site or record that the study does not have, and a site with several.
     """
-    every = [_chosen(context, one) for one in _driven(context.study, names)]
+    every = [_choose_site(context, one) for one in _select_driven(context.study, names)]
     if names:
         return every
-    thin, thick = min(every, key=_tissue), max(every, key=_tissue)
+    thin, thick = min(every, key=_get_tissue), max(every, key=_get_tissue)
     if thin is thick:
         return [thin]
-    return [_with_role(thin, "thin"), _with_role(thick, "thick")]
+    return [_add_role(thin, "thin"), _add_role(thick, "thick")]
 
 
-def _tissue(chosen: ChosenSite) -> float:
+def _get_tissue(chosen: ChosenSite) -> float:
     return chosen.tissue_mm
 
 
-def _with_role(chosen: ChosenSite, role: str) -> ChosenSite:
+def _add_role(chosen: ChosenSite, role: str) -> ChosenSite:
     return ChosenSite(chosen.site, chosen.model, chosen.tissue_mm, role)
 
 
-def _chosen(context: Context, one: Indentation) -> ChosenSite:
-    model = model_of(context, one)
-    return ChosenSite(context.study.site(model.site), model, tissue_over_bone(model), "")
+def _choose_site(context: Context, one: Indentation) -> ChosenSite:
+    model = build_model(context, one)
+    return ChosenSite(context.study.site(model.site), model, measure_tissue_over_bone(model), "")
 
 
-def tissue_over_bone(model: SiteModel) -> float:
+def measure_tissue_over_bone(model: SiteModel) -> float:
     """Distance in mm from a site to the nearest point of a bone in its mesh.
 
     Raises
@@ -132,7 +132,7 @@ def tissue_over_bone(model: SiteModel) -> float:
     InputError
         Where the mesh has no bone.
     """
-    found = bone_distance_mm(model)
+    found = measure_bone_distance_mm(model)
     if found is None:
         raise InputError("there is no bone in the mesh", file=model.mesh, remedy="name the sites to be used")
     return found
@@ -150,7 +150,7 @@ def run_variants(
     return done
 
 
-def compared(variants: Sequence[Variant], simulations: Sequence[Simulation]) -> list[dict[str, Any]]:
+def compare_variants(variants: Sequence[Variant], simulations: Sequence[Simulation]) -> list[dict[str, Any]]:
     """A row of each: what was changed, its largest force, and how it differs from its site's base.
 
     Changes are in percent of the base's largest force: of the largest force, and the mean over the trace.
@@ -196,7 +196,9 @@ def write_variants(folder: Path, variants: Sequence[Variant], simulations: Seque
     for name in dict.fromkeys(variant.chosen.name for variant in variants):
         mine = [i for i, variant in enumerate(variants) if variant.chosen.name == name]
         first = variants[mine[0]]
-        forces = {column(variants[i].label): simulations[i].force_N for i in mine if simulations[i].completed}
+        forces = {
+            format_column(variants[i].label): simulations[i].force_N for i in mine if simulations[i].completed
+        }
         write_curves(
             folder / f"{name}.csv",
             time_s=first.times,
@@ -205,7 +207,7 @@ def write_variants(folder: Path, variants: Sequence[Variant], simulations: Seque
         )
 
 
-def column(label: str) -> str:
+def format_column(label: str) -> str:
     """The head of a variant's column of forces."""
     plain = "".join(c if (c.isalnum() and c.isascii()) or c == "." else " " for c in label)
     return "_".join(plain.split()) + "_N"

@@ -19,7 +19,7 @@ NO_VOLUME = dict.fromkeys(("J_min", "J_low", "J_high", "J_max", "beyond_percent"
 ALLOWED = 0.01  # departure of J from one that the paper's bulk modulus is to keep to
 
 
-def volume_cache(folder: Path) -> SimulationCache:
+def open_volume_cache(folder: Path) -> SimulationCache:
     """Kept apart from simulations without volumes, which have the same key."""
     return SimulationCache(folder / "volumes", work=simulate_with_volumes)
 
@@ -42,12 +42,12 @@ def simulate_with_volumes(job: SimulationJob) -> Simulation:
         completed=result.completed,
         reason=result.reason,
         penetration_mm=float(result.penetration.max(initial=0.0)),
-        facts=dict(result.statistics) | {"volume": _volume(result, model)},
+        facts=dict(result.statistics) | {"volume": _compute_volume_ratio(result, model)},
         doubts=result.doubts,
     )
 
 
-def _volume(result: Result, model: SiteModel) -> dict[str, Any]:
+def _compute_volume_ratio(result: Result, model: SiteModel) -> dict[str, Any]:
     if not result.states:
         return dict(NO_VOLUME)
     problem = result.problem
@@ -55,10 +55,10 @@ def _volume(result: Result, model: SiteModel) -> dict[str, Any]:
     J = compute_element_fields(result.system, laws, result.states[-1]).J
     centres = problem.mesh.points[problem.mesh.corners].mean(axis=1)
     near = np.linalg.norm(centres - np.array(model.position), axis=1) < model.indenter.width_mm
-    return volume_facts(J[near], result.system.weights.sum(axis=1)[near])
+    return summarise_volumes(J[near], result.system.weights.sum(axis=1)[near])
 
 
-def volume_facts(J: Array, volumes: Array) -> dict[str, float]:
+def summarise_volumes(J: Array, volumes: Array) -> dict[str, float]:
     """What is told of ratios of volumes J (m,) of elements of ``volumes`` (m,)."""
     order = np.argsort(J)
     share = np.cumsum(volumes[order]) / volumes.sum()

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 DRAFT = ".part"
 
 
-def digest(*parts: Any) -> str:
+def compute_digest(*parts: Any) -> str:
     """A short stable digest of JSON-like values."""
     text = json.dumps(parts, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def file_digest(path: Path) -> str:
+def compute_file_digest(path: Path) -> str:
     """SHA-256 of a file, or of the names and contents of all files below a folder."""
     sha = hashlib.sha256()
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
@@ -39,8 +39,8 @@ def file_digest(path: Path) -> str:
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON so that a reader sees the old file or the new one, never half of it."""
-    text = json.dumps(content, indent=1, allow_nan=False, default=plain)
-    with atomic(path) as stream:
+    text = json.dumps(content, indent=1, allow_nan=False, default=to_plain)
+    with write_atomically(path) as stream:
         stream.write(text.encode())
 
 
@@ -48,7 +48,7 @@ def read_json(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def plain(value: Any) -> Any:
+def to_plain(value: Any) -> Any:
     """NumPy scalars and arrays as what JSON knows."""
     if hasattr(value, "tolist"):
         return value.tolist()
@@ -56,7 +56,7 @@ def plain(value: Any) -> Any:
 
 
 @contextmanager
-def atomic(path: Path) -> Iterator[BinaryIO]:
+def write_atomically(path: Path) -> Iterator[BinaryIO]:
     """A binary stream whose content appears at ``path`` only when the block ends well."""
     draft = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}{DRAFT}")
     try:
@@ -73,10 +73,10 @@ def write_table(file: Path, heads: Sequence[str], rows: Iterable[Sequence[Any]])
     with file.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(heads)
-        writer.writerows([_cell(value) for value in row] for row in rows)
+        writer.writerows([_format_cell(value) for value in row] for row in rows)
 
 
-def _cell(value: Any) -> str:
+def _format_cell(value: Any) -> str:
     if value is None:
         return ""
     if isinstance(value, bool):

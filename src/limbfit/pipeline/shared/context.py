@@ -34,7 +34,7 @@ class Progress:
 Listener = Callable[[Progress], None]
 
 
-def quiet(progress: Progress) -> None:
+def ignore_progress(progress: Progress) -> None:
     """The listener of a call that names none: progress is not shown."""
 
 
@@ -63,7 +63,7 @@ class Context:
         return self.store.read(stage, name)
 
 
-def executor_of(study: Study) -> Executor:
+def build_executor(study: Study) -> Executor:
     """What a study's jobs run on, with its limits."""
     table = study.execution
     return make_executor(table.workers, Limits(table.time_limit_s, table.memory_limit_GB))

@@ -15,7 +15,7 @@ MEASURED_ORDERS = (0.3, 6.0)  # in which an order that three meshes show is beli
 _MOST = 5.0  # times a difference: two edges that are nearly the same tell no limit
 
 
-def error_of_coarser(order: float | None, ratio: float) -> float:
+def estimate_coarse_error(order: float | None, ratio: float) -> float:
     """Error of the coarser of two over their difference (Richardson), where edges or steps have this ratio.
 
     ``limit - coarser`` is this times ``finer - coarser``; where there is no order, the difference itself.
@@ -23,7 +23,7 @@ def error_of_coarser(order: float | None, ratio: float) -> float:
     return 1.0 if order is None else min(1.0 / (1.0 - ratio**-order), _MOST)
 
 
-def error_of_finer(order: float | None, ratio: float) -> float:
+def estimate_fine_error(order: float | None, ratio: float) -> float:
     """The same of the finer of the two."""
     return 1.0 if order is None else min(1.0 / max(ratio**order - 1.0, 1e-9), _MOST)
 
@@ -45,7 +45,9 @@ class Extrapolation:
         return 100.0 * (value / self.limit - 1.0)
 
 
-def richardson(edges: Sequence[float], values: Sequence[float], assumed: float | None) -> Extrapolation:
+def extrapolate_richardson(
+    edges: Sequence[float], values: Sequence[float], assumed: float | None
+) -> Extrapolation:
     """``value = limit + a edge^order`` through the three finest meshes (Richardson; Roache 1998).
 
     Where the values do not change in one direction, or at no order of `MEASURED_ORDERS`, it is ``assumed``.

@@ -10,14 +10,14 @@ import shutil
 from pathlib import Path
 
 from ...study import Study
-from .artefacts import atomic, file_digest, read_json
+from .artefacts import compute_file_digest, read_json, write_atomically
 
 LABELS = "labels.seg.nrrd"
 DIGEST = "labels_sha256"  # key of segment.json: the label map as the stage wrote it
 _BY_HAND = Path("results") / "by-hand" / LABELS
 
 
-def hand_labels(study: Study) -> Path | None:
+def find_hand_labels(study: Study) -> Path | None:
     """The label map corrected by hand, relative to the study; None where the study names its own labels."""
     if study.segmentation.is_given:
         return None
@@ -32,7 +32,7 @@ def keep_hand_labels(study: Study) -> Path | None:
         return None
     kept = study.path(_BY_HAND)
     kept.parent.mkdir(parents=True, exist_ok=True)
-    with (study.results / "segment" / LABELS).open("rb") as edited, atomic(kept) as stream:
+    with (study.results / "segment" / LABELS).open("rb") as edited, write_atomically(kept) as stream:
         shutil.copyfileobj(edited, stream)
     return kept
 
@@ -43,7 +43,7 @@ def _is_edited(study: Study) -> bool:
     if not labels.is_file() or not facts.is_file():
         return False
     written = read_json(facts).get(DIGEST)
-    if written is None or file_digest(labels) == written:
+    if written is None or compute_file_digest(labels) == written:
         return False
     kept = study.path(_BY_HAND)
-    return not (kept.is_file() and file_digest(kept) == file_digest(labels))
+    return not (kept.is_file() and compute_file_digest(kept) == compute_file_digest(labels))

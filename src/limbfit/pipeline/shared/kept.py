@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .artefacts import atomic, plain
+from .artefacts import to_plain, write_atomically
 from .store import EARLIER, RUNS
 
 Facts = dict[str, Any]
@@ -19,7 +19,7 @@ Arrays = Mapping[str, NDArray[np.float64]]
 Made = tuple[Facts, Arrays]
 
 
-class Kept:
+class ResultFiles:
     """One file for each key, in ``folder/runs``.
 
     ``also`` are folders of earlier results, beside that of interrupted attempts: what is found there is
@@ -42,22 +42,22 @@ class Kept:
         if found is None:
             self.put(key, make())
         elif found.parent != self.folder:
-            with atomic(self.folder / name) as stream:
+            with write_atomically(self.folder / name) as stream:
                 stream.write(found.read_bytes())
         return _read(self.folder / name)
 
     def put(self, key: str, made: Made) -> None:
         """Keep it under a key, in the place of what was there."""
         facts, arrays = made
-        with atomic(self.folder / f"{key}.npz") as stream:
-            np.savez(stream, facts=json.dumps(facts, default=plain), **arrays)  # type: ignore[arg-type]
+        with write_atomically(self.folder / f"{key}.npz") as stream:
+            np.savez(stream, facts=json.dumps(facts, default=to_plain), **arrays)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
 class Begun:
     """What is known of something that is not at its end: under the ``key`` that this will have."""
 
-    kept: Kept
+    kept: ResultFiles
     key: str
 
     @property

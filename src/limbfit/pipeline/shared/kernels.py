@@ -10,7 +10,7 @@ from ...fe import are_compiled, compile_kernels
 
 
 @contextmanager
-def kernels_compiling(wanted: bool = True) -> Iterator[Callable[[], None]]:
+def compile_in_background(wanted: bool = True) -> Iterator[Callable[[], None]]:
     """The block is given a function that waits until the kernels are there, where they are ``wanted``.
 
     Where they are not stored yet, one process compiles them while the block goes on: workers that began to

@@ -10,8 +10,8 @@ from typing import Any
 
 from ...extensions import extensions_digest
 from ...study import Study
-from .artefacts import digest, file_digest
-from .provenance import input_files
+from .artefacts import compute_digest, compute_file_digest
+from .provenance import list_input_files
 from .sources import code_digest
 
 
@@ -39,7 +39,7 @@ class Stage:
         return found
 
 
-def records_read(stage: Stage, stated: Mapping[str, Any]) -> list[dict[str, Any]]:
+def select_records_read(stage: Stage, stated: Mapping[str, Any]) -> list[dict[str, Any]]:
     """What a stage reads of ``[[records]]``, one after the other; nothing where there are none."""
     rows = stated["records"] if stage.record_keys else []
     return [{key: row[key] for key in stage.record_keys} for row in rows]
@@ -53,10 +53,10 @@ class Keys:
 
     @cached_property
     def digests(self) -> dict[Path, str]:
-        named = {path for paths in input_files(self.study).values() for path in paths}
+        named = {path for paths in list_input_files(self.study).values() for path in paths}
         places = {path: self.study.path(path) for path in named}
         # A record that is yet to be made has none.
-        return {path: file_digest(place) if place.exists() else "" for path, place in places.items()}
+        return {path: compute_file_digest(place) if place.exists() else "" for path, place in places.items()}
 
     @cached_property
     def extensions(self) -> str:
@@ -79,16 +79,16 @@ class Keys:
         options : what a stage is run with beside the study, by its name.
         """
         known, options, study = known or {}, options or {}, study or self.study
-        stated, files = study.model_dump(mode="json"), input_files(study)
+        stated, files = study.model_dump(mode="json"), list_input_files(study)
         found: dict[str, str] = {}
         for stage in stages:
             read = files.get(stage.name)
             extra = [options[stage.name]] if options.get(stage.name) else []
-            found[stage.name] = known.get(stage.name) or digest(
+            found[stage.name] = known.get(stage.name) or compute_digest(
                 stage.name,
                 stage.read(stated),
                 [{key: site[key] for key in stage.site_keys} for site in stated["sites"]],
-                *records_read(stage, stated),
+                *select_records_read(stage, stated),
                 None if read is None else {str(path): self.digests[path] for path in read},
                 code_digest(stage.run),
                 *([self.extensions] if self.extensions else []),

@@ -9,9 +9,9 @@ from typing import Any
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...study import Site, Study, Vector
 from ...traces import SurfaceMotion
-from .simulations import pins_met
+from .simulations import count_pins_met
 from .store import Store
-from .surface_points import ChosenPoints, chosen_points
+from .surface_points import ChosenPoints, choose_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class LimbGeometry:
         found = {}
         for site in study.sites:
             one, faces = (study.records_at(site) or (site,))[0], (skin.points, skin.faces)
-            found[site.name] = pins_met(study, one, self.place(site), faces, (x, y, z))
+            found[site.name] = count_pins_met(study, one, self.place(site), faces, (x, y, z))
         return found
 
     def surface_points(
@@ -61,7 +61,7 @@ class LimbGeometry:
         for record in study.recorded:
             motion = motions.get(record.name)
             if motion is not None:
-                found[record.name] = chosen_points(study, record, self.place(record.site), faces, motion)
+                found[record.name] = choose_points(study, record, self.place(record.site), faces, motion)
         return found
 
 

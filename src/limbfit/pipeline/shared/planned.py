@@ -20,7 +20,7 @@ SEEN = {
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedRecord:
     """A record that could be made: the indenter pressed in at one rate, held, and taken back at that rate.
 
     ``usual``: as deep as the site was recorded or is planned, or nearest to that.

@@ -12,8 +12,8 @@ from typing import Any
 from ...anatomy.labels.labelfiles import find_sidecar
 from ...fe import StepControl
 from ...study import Study
-from .artefacts import digest, file_digest
-from .hand_labels import hand_labels
+from .artefacts import compute_digest, compute_file_digest
+from .hand_labels import find_hand_labels
 
 LIBRARIES = (
     "numpy",
@@ -32,7 +32,7 @@ LIBRARIES = (
 )
 
 
-def versions() -> dict[str, str]:
+def collect_versions() -> dict[str, str]:
     """Versions of the libraries that decide numbers; a library that is not installed is left out."""
     found = {}
     for name in LIBRARIES:
@@ -43,7 +43,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def machine() -> dict[str, Any]:
+def describe_machine() -> dict[str, Any]:
     """The machine in figures, without its name or its user's."""
     facts: dict[str, Any] = {
         "cores": os.cpu_count(),
@@ -56,12 +56,12 @@ def machine() -> dict[str, Any]:
     return facts
 
 
-def input_files(study: Study) -> dict[str, list[Path]]:
+def list_input_files(study: Study) -> dict[str, list[Path]]:
     """The study's input files and folders by the stage that reads them."""
     files: dict[str, list[Path]] = {"segment": [], "surfaces": [], "traces": []}
     if study.image is not None:
         files["segment"] += [study.image.path, *filter(None, [study.image.marked])]
-    files["segment"] += [path for path in (study.segmentation.contours, hand_labels(study)) if path]
+    files["segment"] += [path for path in (study.segmentation.contours, find_hand_labels(study)) if path]
     if study.segmentation.labels is not None:
         files["segment"].append(study.segmentation.labels)
         names = find_sidecar(study.segmentation.labels)
@@ -78,12 +78,12 @@ def input_files(study: Study) -> dict[str, list[Path]]:
     return files
 
 
-def input_digests(study: Study) -> dict[str, str]:
+def compute_input_digests(study: Study) -> dict[str, str]:
     """SHA-256 of every input by its key in the study file; names of files and folders may be a patient's."""
-    return {key: file_digest(study.path(path)) for key, path in study.inputs.items()}
+    return {key: compute_file_digest(study.path(path)) for key, path in study.inputs.items()}
 
 
-def settings_record(study: Study, digests: Mapping[str, str]) -> dict[str, Any]:
+def record_settings(study: Study, digests: Mapping[str, str]) -> dict[str, Any]:
     """Every setting of a study, with digests in place of paths and series, which may identify a person.
 
     Beside them: what the solver takes that no study sets.
@@ -100,7 +100,7 @@ def settings_record(study: Study, digests: Mapping[str, str]) -> dict[str, Any]:
     record = plain(study.model_dump())
     for key in ("series", "markers_series"):
         if record["image"] and record["image"][key]:
-            record["image"][key] = f"sha256:{digest(record['image'][key])}"
+            record["image"][key] = f"sha256:{compute_digest(record['image'][key])}"
     widths_mm = [indenter.width_mm for indenter in study.all_indenters.values()]
     record["mesh"]["accuracy"] = study.mesh.stands_for(widths_mm)
     control = StepControl()

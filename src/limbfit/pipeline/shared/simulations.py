@@ -29,11 +29,11 @@ from ...indentation import (
 )
 from ...mesh import read_vtu
 from ...study import Indentation, Record, Site, Study, Vector
-from .artefacts import atomic, digest, file_digest
+from .artefacts import compute_digest, compute_file_digest, write_atomically
 from .context import Context
 from .sources import code_digest
 from .store import COARSE, EARLIER, RUNS
-from .surface_points import ChosenPoints, chosen_points, read_motion
+from .surface_points import ChosenPoints, choose_points, read_motion
 
 CURVE_POINTS = 81  # times, about, at which measured and simulated force are compared
 
@@ -67,7 +67,7 @@ class SimulationCache:
         if again:
             found = {job: kept for job, kept in found.items() if kept.completed}
         missing = [job for job in dict.fromkeys(jobs) if job not in found]
-        made = executor.map(self.work, missing, keys=[job.model.name for job in missing], on_lost=_lost)
+        made = executor.map(self.work, missing, keys=[job.model.name for job in missing], on_lost=_build_lost)
         for job in jobs:
             if job not in found:
                 simulation = found[job] = next(made)
@@ -88,17 +88,17 @@ class SimulationCache:
         return sum(_load(file).jacobian is not None for file in self.folder.glob("*.npz"))
 
     def _find(self, job: SimulationJob) -> Simulation | None:
-        name = f"{job_digest(job)}.npz"
+        name = f"{compute_job_digest(job)}.npz"
         for place in self.places:
             if (place / name).is_file():
                 if place != self.folder:
-                    with atomic(self.folder / name) as stream:
+                    with write_atomically(self.folder / name) as stream:
                         stream.write((place / name).read_bytes())
                 return _load(self.folder / name)
         return None
 
     def _keep(self, job: SimulationJob, simulation: Simulation) -> None:
-        with atomic(self.folder / f"{job_digest(job)}.npz") as stream:
+        with write_atomically(self.folder / f"{compute_job_digest(job)}.npz") as stream:
             arrays = {"force_N": simulation.force_N}
             if simulation.jacobian is not None:
                 arrays["jacobian"] = simulation.jacobian
@@ -117,7 +117,7 @@ class SimulationCache:
             np.savez(stream, facts=json.dumps(facts), **arrays)  # type: ignore[arg-type]
 
 
-def _lost(job: SimulationJob, reason: str) -> Simulation:
+def _build_lost(job: SimulationJob, reason: str) -> Simulation:
     """A failed simulation in place of one whose worker died or went over its limits."""
     n, site = len(job.times_s), job.model.name
     slopes = np.zeros((n, len(job.parameters))) if job.sensitivities else None
@@ -141,14 +141,14 @@ def _load(file: Path) -> Simulation:
         )
 
 
-def job_digest(job: SimulationJob) -> str:
+def compute_job_digest(job: SimulationJob) -> str:
     """What decides a simulation, code included, wherever its mesh file happens to lie."""
     model = {key: value for key, value in vars(job.model).items() if key not in ("mesh", "extensions")}
     indenter = job.model.indenter.model_dump(exclude={"file"})  # its digest is in the model
     clamps = None if job.model.clamps is None else job.model.clamps.model_dump()
     model["extensions_digest"] = extensions_digest(job.model.extensions)
     model |= {"indenter": indenter, "steps": job.model.steps.model_dump(), "clamps": clamps}
-    return digest(
+    return compute_digest(
         code_digest(simulate),
         model,
         job.tissues,
@@ -160,28 +160,28 @@ def job_digest(job: SimulationJob) -> str:
     )
 
 
-def fibres_of(context: Context) -> tuple[tuple[str, Direction], ...]:
+def find_fibre_directions(context: Context) -> tuple[tuple[str, Direction], ...]:
     """The direction of the fibres in each tissue that has some, of length one, or that of a flow."""
     found: list[tuple[str, Direction]] = []
     for tissue, stated in context.study.fibres.items():
         if stated == "flow":
             found.append((tissue, "flow"))
         else:
-            found.append((tissue, limb_axis(context) if stated == "axis" else _unit(stated)))
+            found.append((tissue, read_limb_axis(context) if stated == "axis" else _normalise(stated)))
     return tuple(found)
 
 
-def limb_axis(context: Context) -> Vector:
+def read_limb_axis(context: Context) -> Vector:
     """The limb's axis, proximally: the unit normal of its proximal cut."""
-    return _unit(context.stored("surfaces", "surfaces.json")["cut_normal"])
+    return _normalise(context.stored("surfaces", "surfaces.json")["cut_normal"])
 
 
-def _unit(along: Sequence[float]) -> Vector:
+def _normalise(along: Sequence[float]) -> Vector:
     x, y, z = (float(value) for value in np.array(along) / np.linalg.norm(along))
     return x, y, z
 
 
-def site_model(
+def build_site_model(
     context: Context,
     one: Indentation,
     knots_s: Sequence[float],
@@ -209,14 +209,14 @@ def site_model(
     place = tuple(placed["position_mm"]), tuple(placed["axis"])
     clamped: dict[str, Any] = {}
     if study.clamps is not None:  # said here, with the study's file, before workers build the site
-        whole, along = read_vtu(mesh), limb_axis(context)
-        pins_met(study, one, place, (whole.points, whole.face_sets["skin"]), along)
+        whole, along = read_vtu(mesh), read_limb_axis(context)
+        count_pins_met(study, one, place, (whole.points, whole.face_sets["skin"]), along)
         clamped = {"clamps": study.clamps, "along": along}
     return SiteModel(
         name=one.name,
         site=site.name,
         mesh=mesh,
-        mesh_digest=file_digest(mesh),
+        mesh_digest=compute_file_digest(mesh),
         position=place[0],
         axis=place[1],
         knots_s=tuple(knots_s),
@@ -224,13 +224,13 @@ def site_model(
         knots_N=tuple(knots_N),
         edge=site.edge,
         indenter=indenter,
-        indenter_digest="" if indenter.file is None else file_digest(indenter.file),
+        indenter_digest="" if indenter.file is None else compute_file_digest(indenter.file),
         kappa_ratio=study.material.kappa_ratio,
         steps=study.solver,
         element=study.mesh.element,
         within_mm=study.within_mm if searched else None,
         law=study.material.law,
-        fibres=fibres_of(context),
+        fibres=find_fibre_directions(context),
         extensions=study.extensions,
         layers=tuple(layers),
         course=study.material.course,
@@ -239,7 +239,7 @@ def site_model(
     )
 
 
-def pins_met(
+def count_pins_met(
     study: Study,
     one: Indentation,
     place: tuple[Vector, Vector],
@@ -269,20 +269,20 @@ def pins_met(
         raise ProblemError(what, file=study.file, place="clamps", remedy=error.remedy) from None
 
 
-def recorded_model(context: Context, record: Record, searched: bool = False) -> SiteModel:
-    """A site driven by one of its records, from touch-down; ``searched``: see `site_model`."""
+def build_recorded_model(context: Context, record: Record, searched: bool = False) -> SiteModel:
+    """A site driven by one of its records, from touch-down; ``searched``: see `build_site_model`."""
     facts = context.stored("traces", "traces.json")["sites"][record.name]
     force = facts["knots_N"] if record.forced else ()
     layers = [tissue for tissue, one in facts.get("layers", {}).items() if one["compared"]]
-    model = site_model(context, record, facts["knots_s"], facts["knots_mm"], searched, force, layers)
-    points = surface_points(context, record)
+    model = build_site_model(context, record, facts["knots_s"], facts["knots_mm"], searched, force, layers)
+    points = find_surface_points(context, record)
     if points is not None:
         model = replace(model, skin_points=points.points, skin_axes=points.axes)
     waves = facts.get("waves", [])
-    return replace(model, waves=_wave_places(context, record, model, waves)) if waves else model
+    return replace(model, waves=_place_waves(context, record, model, waves)) if waves else model
 
 
-def _wave_places(
+def _place_waves(
     context: Context, record: Record, model: SiteModel, waves: Sequence[Mapping[str, Any]]
 ) -> tuple[WavePlace, ...]:
     """Where the shear waves of a record are, in the site's own mesh.
@@ -302,7 +302,7 @@ def _wave_places(
         raise TraceError(what, file=file, place="header", remedy=error.remedy) from None
 
 
-def surface_points(context: Context, record: Record) -> ChosenPoints | None:
+def find_surface_points(context: Context, record: Record) -> ChosenPoints | None:
     """The points of a record's surface that are compared, on the skin of the site's own mesh; None: nothing.
 
     Raises
@@ -319,34 +319,36 @@ def surface_points(context: Context, record: Record) -> ChosenPoints | None:
     mesh = read_vtu(context.store["mesh"] / f"{record.site.name}.vtu")
     place = tuple(placed["position_mm"]), tuple(placed["axis"])
     motion = read_motion(context.store["traces"], record)
-    return chosen_points(context.study, record, place, (mesh.points, mesh.face_sets["skin"]), motion)
+    return choose_points(context.study, record, place, (mesh.points, mesh.face_sets["skin"]), motion)
 
 
-def planned_model(context: Context, site: Site) -> SiteModel:
+def build_planned_model(context: Context, site: Site) -> SiteModel:
     """The site driven by the depth and speed that the study plans for it, in and out."""
     assert site.depth_mm is not None
     ramp = site.depth_mm / site.speed_mm_s
-    return site_model(context, site, (0.0, ramp, 2 * ramp), (0.0, site.depth_mm, 0.0))
+    return build_site_model(context, site, (0.0, ramp, 2 * ramp), (0.0, site.depth_mm, 0.0))
 
 
-def model_of(context: Context, one: Indentation) -> SiteModel:
+def build_model(context: Context, one: Indentation) -> SiteModel:
     """An indentation as it was recorded, or as the study plans it."""
-    return recorded_model(context, one) if isinstance(one, Record) else planned_model(context, one)
+    return (
+        build_recorded_model(context, one) if isinstance(one, Record) else build_planned_model(context, one)
+    )
 
 
-def curve_job(model: SiteModel, tissues: tuple[str, ...], parameters: Iterable[float]) -> SimulationJob:
+def build_curve_job(model: SiteModel, tissues: tuple[str, ...], parameters: Iterable[float]) -> SimulationJob:
     """An indentation at flat ``parameters``, with derivatives, at the times of a curve."""
     times = model.curve_times(CURVE_POINTS)
     return SimulationJob(model, tissues, tuple(map(float, parameters)), tuple(map(float, times)))
 
 
-def experiment_cache(context: Context, folder: Path) -> SimulationCache:
+def open_experiment_cache(context: Context, folder: Path) -> SimulationCache:
     """Simulations of the experiment in ``folder``; all others of the study count as done."""
     others = sorted(place for place in context.store.folder.glob(f"*/{RUNS}") if place.parent != folder)
     return SimulationCache(folder / RUNS, also=others)
 
 
-def newest_simulations(folder: Path, sites: Sequence[str]) -> dict[str, Simulation]:
+def find_newest_simulations(folder: Path, sites: Sequence[str]) -> dict[str, Simulation]:
     """The last kept simulation of each of the sites, of those that have one, while a stage goes on."""
     found: dict[str, Simulation] = {}
     files = [(file.stat().st_mtime_ns, file) for file in folder.glob("*.npz")]

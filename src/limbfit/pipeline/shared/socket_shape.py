@@ -33,7 +33,7 @@ BELOW_CUT_MM = 30.0  # of the proximal cut, where no bone is a tibia
 EDGE_MM, FACE_MM2 = 10.0, 8e4
 
 
-def socket_of(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
+def build_socket(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
     """The study's socket around a limb: read from its file, or rectified from the limb.
 
     Parameters
@@ -48,14 +48,14 @@ def socket_of(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
         With the key and the remedy.
     """
     table, frame = study.socket, build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
-    with blaming(study):
+    with place_errors(study):
         if table.file is not None:
             return read_socket(
                 study.path(table.file), table.unit, table.space, outer=outer, frame=frame, bones=anatomy.bones
             )
-        regions = regions_of(study, anatomy)
-        areas = [_area(study, area, regions) for area in table.areas]
-        socket = rectify_limb(outer, frame, replace(recipe_of(study, anatomy), areas=areas))
+        regions = build_regions(study, anatomy)
+        areas = [_build_area(study, area, regions) for area in table.areas]
+        socket = rectify_limb(outer, frame, replace(build_recipe(study, anatomy), areas=areas))
         refuse_bones(
             socket.points,
             socket.faces,
@@ -78,7 +78,7 @@ def mesh_edge_mm(study: Study, socket: Socket) -> float:
     return EDGE_MM * max(1.0, socket.surface.area / FACE_MM2) ** 0.5 if stated is None else stated
 
 
-def recipe_of(study: Study, anatomy: Anatomy) -> Recipe:
+def build_recipe(study: Study, anatomy: Anatomy) -> Recipe:
     """The study's rectification but for its areas."""
     table = study.socket
     return Recipe(
@@ -100,26 +100,26 @@ def trim_of(study: Study, anatomy: Anatomy) -> Trim:
         return Trim(planes, line)
     knee = find_knee_centre(anatomy)
     below = table.trim_mm if table.trim_mm is not None else (BELOW_CUT_MM if knee is None else BELOW_KNEE_MM)
-    return Trim([(anatomy.cut_point + (_top(anatomy) - below) * anatomy.cut_normal, anatomy.cut_normal)])
+    return Trim([(anatomy.cut_point + (_find_top(anatomy) - below) * anatomy.cut_normal, anatomy.cut_normal)])
 
 
-def _top(anatomy: Anatomy) -> float:
+def _find_top(anatomy: Anatomy) -> float:
     """Height of the tibia's top over the proximal cut, mm; that of the cut where no bone is a tibia."""
     tibia = find_bone(anatomy, "tibia")
     return 0.0 if tibia is None else float(anatomy.height(tibia.points).max())
 
 
-def regions_of(study: Study, anatomy: Anatomy) -> dict[str, SkinRegion]:
+def build_regions(study: Study, anatomy: Anatomy) -> dict[str, SkinRegion]:
     """Named regions of the skin: those of any limb, and the study's own, which win."""
     known = find_directions(anatomy, study.socket.side)
     regions = build_default_regions(anatomy, known)
-    with blaming(study):
+    with place_errors(study):
         for one in study.socket.regions:
             regions[one.name] = build_stated_region(anatomy, one.name, np.array(one.position), one.radius_mm)
     return regions
 
 
-def _area(study: Study, area: SocketAreaTable, regions: Mapping[str, SkinRegion]) -> Area:
+def _build_area(study: Study, area: SocketAreaTable, regions: Mapping[str, SkinRegion]) -> Area:
     if area.position is not None:
         return Area(area.name, np.array(area.position), area.radius_mm, area.depth_mm)
     name = area.region or ""
@@ -161,7 +161,7 @@ def load_of(
     if load.preset is None:
         return np.array(load.force_N), np.array(load.moment_Nmm), point
     standard, weight = STANDARD_LOADS[load.preset], study.socket.body_weight_N
-    with blaming(study):
+    with place_errors(study):
         known = find_directions(anatomy, study.socket.side)
         return standard.force(weight, known), standard.moment(weight, known), point
 
@@ -210,21 +210,21 @@ def check_at_rest(study: Study) -> None:
             raise StudyError(what, file=study.file, place=place, remedy=remedy)
 
 
-def loadable_socket(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
-    """`socket_of` a limb on which the study's loads are known, too.
+def build_loadable_socket(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
+    """`build_socket` a limb on which the study's loads are known, too.
 
     Raises
     ------
     StudyError
         With the key and the remedy.
     """
-    socket = socket_of(study, anatomy, outer)
+    socket = build_socket(study, anatomy, outer)
     for load in study.socket.loads:
         load_of(study, load, anatomy, socket)
     return socket
 
 
-def covered_regions(
+def find_covered_regions(
     middles: Array, skin: Surface, regions: Mapping[str, SkinRegion], socket: Socket
 ) -> dict[str, NDArray[np.bool_]]:
     """Which faces (f,) of an outer surface, with ``middles`` (f, 3) mm, are each region's under a socket.
@@ -238,14 +238,14 @@ def covered_regions(
     return {name: mask for name, mask in masks.items() if mask.any()}
 
 
-def target_of(study: Study) -> Target:
+def build_target(study: Study) -> Target:
     """The pressure that the limb is to bear."""
     table = study.socket.design
     stated = {one.region: one.pressure_kPa for one in table.regions if one.pressure_kPa is not None}
     return Target(table.pressure, table.pressure_kPa, stated)
 
 
-def wall_of(study: Study, anatomy: Anatomy, face: Socket) -> Surface:
+def build_socket_wall(study: Study, anatomy: Anatomy, face: Socket) -> Surface:
     """A face with the wall and the adapter of the study."""
     table = study.socket.design
     return build_wall(
@@ -258,7 +258,7 @@ def wall_of(study: Study, anatomy: Anatomy, face: Socket) -> Surface:
 
 
 @contextmanager
-def blaming(study: Study, place: str = "socket") -> Iterator[None]:
+def place_errors(study: Study, place: str = "socket") -> Iterator[None]:
     """What is wrong with the shape is said of the study's table."""
     try:
         yield

@@ -77,7 +77,7 @@ class Store:
         complete when a run was killed is only put in its place.
         """
         work = self.work_folder(stage, key)
-        with disk_errors(self.folder):
+        with translate_disk_errors(self.folder):
             work.mkdir(parents=True, exist_ok=True)
             if not (work / STAMP).is_file():
                 self._take_over_others(stage, work)
@@ -151,7 +151,7 @@ class _Clock:
 
 
 @contextmanager
-def disk_errors(folder: Path) -> Iterator[None]:
+def translate_disk_errors(folder: Path) -> Iterator[None]:
     """Turn a full or read-only disk into one clear line."""
     remedies = {
         errno.ENOSPC: "the disk is full; free some space and run again: finished work is kept",
@@ -184,18 +184,18 @@ def lock(folder: Path) -> Iterator[None]:
     if folder.is_symlink():
         raise RunError(f"{folder}: is a link, and nothing outside the study is written; make it a folder")
     own = FileLock(folder / LOCK, timeout=_PATIENCE_S)
-    with disk_errors(folder):
+    with translate_disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try:
             own.acquire()
         except Timeout:
-            holder = holder_of(folder) or "another process"
+            holder = find_holder(folder) or "another process"
             raise RunError(
                 f"{folder}: {holder} is running this study; wait for it or end it (kill PID): its lock "
                 "ends with it, and the next run continues where it stopped"
             ) from None
     try:
-        with disk_errors(folder):
+        with translate_disk_errors(folder):
             since = f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
             (folder / HOLDER).write_text(f"process {os.getpid()} (since {since})", encoding="utf-8")
             Store(folder).mend()
@@ -205,7 +205,7 @@ def lock(folder: Path) -> Iterator[None]:
         own.release()
 
 
-def holder_of(folder: Path) -> str:
+def find_holder(folder: Path) -> str:
     """Which process says that it holds a study, and since when; empty where none does."""
     try:
         return (folder / HOLDER).read_text(encoding="utf-8").strip()

@@ -58,7 +58,7 @@ def read_motion(folder: Path, record: Record) -> SurfaceMotion:
     return SurfaceMotion.of_rows(columns["time_s"], rows[:, :3], rows[:, 3:])
 
 
-def chosen_points(
+def choose_points(
     study: Study,
     record: Record,
     place: tuple[Vector, Vector],
@@ -91,7 +91,7 @@ def chosen_points(
             f"{away.min():.0f} mm away",
             file=study.path(record.surface),
             place="x_mm, y_mm, z_mm",
-            remedy=_remedy(record),
+            remedy=_describe_remedy(record),
         )
     found = find_nearest_points(*skin, points)
     reasons = {
@@ -111,7 +111,7 @@ def chosen_points(
             f"no point can be compared: {told}",
             file=study.path(record.surface),
             place="x_mm, y_mm, z_mm",
-            remedy=_remedy(record),
+            remedy=_describe_remedy(record),
         )
     usable = np.flatnonzero(left)
     which = usable[_spread(found.points[usable], int(np.argmin(away[usable])))]
@@ -122,7 +122,7 @@ def chosen_points(
     return ChosenPoints(chosen, (x, y, z), which, left_out)
 
 
-def _remedy(record: Record) -> str:
+def _describe_remedy(record: Record) -> str:
     if record.surface_frame == "site":
         return 'give millimetres from the site, or surface_frame = "limb"'
     return 'give LPS millimetres of the skin at rest, or surface_frame = "site"'

@@ -20,8 +20,8 @@ from ...study import Study
 from ..shared.artefacts import write_json
 from ..shared.context import Context
 from ..shared.simulations import SimulationCache
-from .doubted import contact_record, doubts_record
-from .laboratory import Array, Laboratory, groupings, stage_titles, unknowns
+from .doubted import contact_to_dict, warnings_to_dict
+from .laboratory import Array, RecordSimulator, build_groupings, build_unknowns, list_stage_titles
 
 
 def check_fitted(study: Study) -> None:
@@ -44,8 +44,8 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     """
     study, table = context.study, context.study.calibration
     cache = SimulationCache(folder / "runs", also=[context.store["calibrate"] / "runs"])
-    laboratory = Laboratory(context, cache, study.records_at(*study.fitted))
-    stages = groupings(study)
+    laboratory = RecordSimulator(context, cache, study.records_at(*study.fitted))
+    stages = build_groupings(study)
     rounds_of: dict[int, tuple[CorrectionRound, ...]] = {}
 
     def run(number: int, start: Unknowns) -> Calibration:
@@ -55,25 +55,25 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
         return found
 
     with laboratory.meshing(folder / "coarser") as meshed:
-        tried = run_multistart(run, unknowns(study), table.starts, table.seed, stages[0])
+        tried = run_multistart(run, build_unknowns(study), table.starts, table.seed, stages[0])
         meshed()
     found, known = laboratory.uncertainty(tried.best, stages[-1], folder / "coarser")
     rounds = rounds_of[tried.number]
     answers = laboratory.answer(found.parameters)
     for site, texts in laboratory.warnings.items():
         context.tell("calibrate", 0, 0, f"warning: site {site}, at the answer: {'; '.join(texts)}")
-    content = _calibration_record(context, found, known, laboratory)
+    content = _calibration_to_dict(context, found, known, laboratory)
     content |= {
         "corrections": [_round_record(one, found.sites, study) for one in rounds],
-        "multistart": _multistart_record(tried, study) if table.starts > 1 else None,
+        "multistart": _multistart_to_dict(tried, study) if table.starts > 1 else None,
         "warnings": laboratory.warnings,
-        "contact": contact_record(
+        "contact": contact_to_dict(
             laboratory.latest,
             laboratory.penalties,
             laboratory.of_records(answers),
             laboratory.of_records(found.responses),
         ),
-        "doubts": doubts_record(
+        "doubts": warnings_to_dict(
             laboratory.doubts, laboratory.latest, laboratory.evaluations * laboratory.simulated, found
         ),
     }
@@ -81,16 +81,16 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     return {}
 
 
-def _calibration_record(
-    context: Context, found: Calibration, known: Uncertainty, laboratory: Laboratory
+def _calibration_to_dict(
+    context: Context, found: Calibration, known: Uncertainty, laboratory: RecordSimulator
 ) -> dict[str, Any]:
     """What ``calibration.json`` holds."""
     study, cache = context.study, laboratory.cache
-    bounds = unknowns(study)
+    bounds = build_unknowns(study)
     example = cache.example()
     return {
         "stages": [
-            _stage_record(found, i, bounds.start, study, laboratory) for i in range(len(found.stages))
+            _stage_to_dict(found, i, bounds.start, study, laboratory) for i in range(len(found.stages))
         ],
         "bounds": {
             "lower": study.by_tissue(bounds.lower),
@@ -98,7 +98,7 @@ def _calibration_record(
         },
         "law": study.law.record(),
         "objective": study.calibration.objective,
-        "uncertainty": _uncertainty_record(known, study),
+        "uncertainty": _uncertainty_to_dict(known, study),
         "forward_runs": len(cache),
         "forward_runs_with_sensitivities": cache.with_sensitivities(),
         "linear_solver": example.facts["linear_solver"] if example else None,
@@ -106,8 +106,8 @@ def _calibration_record(
     }
 
 
-def _stage_record(
-    found: Calibration, number: int, start: Array, study: Study, laboratory: Laboratory
+def _stage_to_dict(
+    found: Calibration, number: int, start: Array, study: Study, laboratory: RecordSimulator
 ) -> dict[str, Any]:
     """One stage: from ``start`` (the first) or the end of the stage before to its own end."""
     stage = found.stages[number]
@@ -118,7 +118,7 @@ def _stage_record(
         return [study.by_tissue(one) for one in laboratory.starts(np.array(parameters))]
 
     return {
-        "name": stage_titles(study.tissues)[number],
+        "name": list_stage_titles(study.tissues)[number],
         "start": study.by_tissue(before),
         "parameters": study.by_tissue(np.array(stage.parameters)),
         "cost": stage.cost,
@@ -142,7 +142,7 @@ def _stage_record(
 def _round_record(one: CorrectionRound, sites: Sequence[str], study: Study) -> dict[str, Any]:
     """One correction of the search by the whole meshes; percentages are of each site's largest force."""
     return {
-        "stage": stage_titles(study.tissues)[one.stage] if one.stage >= 0 else "start",
+        "stage": list_stage_titles(study.tissues)[one.stage] if one.stage >= 0 else "start",
         "parameters": study.by_tissue(np.array(one.parameters)),
         "scale_by_site": dict(zip(sites, one.scales, strict=True)),
         "difference_percent_by_site": dict(zip(sites, one.difference_percent, strict=True)),
@@ -151,7 +151,7 @@ def _round_record(one: CorrectionRound, sites: Sequence[str], study: Study) -> d
     }
 
 
-def _multistart_record(tried: MultistartResult, study: Study) -> dict[str, Any]:
+def _multistart_to_dict(tried: MultistartResult, study: Study) -> dict[str, Any]:
     """What came of every start."""
     names = [f"{tissue}.{name}" for tissue, name in study.parameters]
     return {
@@ -171,7 +171,7 @@ def _multistart_record(tried: MultistartResult, study: Study) -> dict[str, Any]:
     }
 
 
-def _uncertainty_record(known: Uncertainty, study: Study) -> dict[str, Any]:
+def _uncertainty_to_dict(known: Uncertainty, study: Study) -> dict[str, Any]:
     """What is stored of the uncertainty; intervals by tissue and name, like the parameters."""
     intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in study.tissues}
     for (tissue, name), interval in zip(study.parameters, known.intervals_95.tolist(), strict=True):
@@ -186,12 +186,12 @@ def _uncertainty_record(known: Uncertainty, study: Study) -> dict[str, Any]:
         "at_bound": dict(zip(known.names, map(bool, known.at_bound), strict=True)),
         "combinations": [f"{c.text}: {c.verdict}" for c in known.combinations],
         "most_probable": study.by_tissue(known.centre),
-        "priors": _priors_record(known, study),
+        "priors": _priors_to_dict(known, study),
         "residuals": known.residual_model.to_dict(),
     }
 
 
-def _priors_record(known: Uncertainty, study: Study) -> dict[str, Any] | None:
+def _priors_to_dict(known: Uncertainty, study: Study) -> dict[str, Any] | None:
     """The priors that counted, and how much of each interval comes from them; none where none were stated."""
     if not study.priors:
         return None

@@ -42,7 +42,7 @@ END_SHARE = 0.05  # of the largest force: an indenter that hardly pushes does no
 SEEN = 3.0  # standard deviations that the skin must move by to be compared
 
 
-class Beside(NamedTuple):
+class SecondaryMeasurement(NamedTuple):
     """What was seen beside a record's force: layers, the skin, shear waves at places under the indenter."""
 
     layers: tuple[Thinning, ...] = ()
@@ -74,17 +74,17 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, dict[
         "noise_N": smooth.noise_N,
         "speed_load_mm_s": smooth.speed_load_mm_s,
         "speed_unload_mm_s": None if np.isnan(smooth.speed_unload_mm_s) else smooth.speed_unload_mm_s,
-        "phases": _phase_rows(trace, smooth, touch),
+        "phases": _phases_to_rows(trace, smooth, touch),
         "phases_in_words": in_words(smooth.phases),
         "knots_s": smooth.knots_s.tolist(),
         "knots_mm": smooth.knots_mm.tolist(),
         "knots_N": smooth.knots_N.tolist() if isinstance(smooth, Creep) else None,
-        "remarks": [asdict(remark) for remark in (*_reading_remarks(trace), *known.remarks)],
+        "remarks": [asdict(remark) for remark in (*_list_reading_remarks(trace), *known.remarks)],
     }
     return trace, smooth, facts
 
 
-def _reading_remarks(trace: Trace) -> tuple[Remark, ...]:
+def _list_reading_remarks(trace: Trace) -> tuple[Remark, ...]:
     """What was done to read a file that is no plain table in s, mm and N."""
     if not trace.notes:
         return ()
@@ -92,7 +92,7 @@ def _reading_remarks(trace: Trace) -> tuple[Remark, ...]:
     return (Remark("reading", "; ".join(trace.notes), cause, remedy, {}),)
 
 
-def _phase_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[dict[str, Any]]:
+def _phases_to_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[dict[str, Any]]:
     """What the indenter does, in times of the record and in mm from touch-down."""
     first_s, first_mm = float(trace.time_s[0]), float(trace.displacement_mm[0]) - touch.displacement_mm
     phases = [phase.later(touch.time_s) for phase in smooth.phases]
@@ -124,9 +124,9 @@ def run_traces(context: Context, folder: Path) -> dict[str, Any]:
         )
         np.save(folder / SMOOTHING.format(record.name), smooth.curve.response(even.time_s))
         seen = read_observed(context.study, record, trace, told["touch_down_s"], smooth)
-        told |= observed_facts(record, seen)
+        told |= observed_to_facts(record, seen)
         store_observed(folder, record, seen)
-        for what in not_compared(told):
+        for what in describe_still_values(told):
             words = f"site {record.name}, {what} hardly gives way, and is not compared"
             context.tell("traces", i, len(recorded), words)
     write_json(folder / "traces.json", {"sites": facts})
@@ -135,7 +135,7 @@ def run_traces(context: Context, folder: Path) -> dict[str, Any]:
 
 def read_observed(
     study: Study, record: Record, trace: Trace, touch_down_s: float, smooth: Regularised
-) -> Beside:
+) -> SecondaryMeasurement:
     """What was seen while the record's force is 5 % of its largest or more.
 
     Raises
@@ -145,7 +145,7 @@ def read_observed(
     """
     pressed = smooth.time_s[smooth.force_N >= END_SHARE * smooth.force_N.max()]
     end_s = touch_down_s + float(pressed[-1])
-    found = Beside()
+    found = SecondaryMeasurement()
     if record.ultrasound is not None:
         found = found._replace(layers=_read_thinnings(study, record, touch_down_s, end_s))
     if record.shear_waves is not None:
@@ -199,7 +199,7 @@ def _read_thinnings(study: Study, record: Record, touch_down_s: float, end_s: fl
     return found
 
 
-def observed_facts(record: Record, seen: Beside) -> dict[str, Any]:
+def observed_to_facts(record: Record, seen: SecondaryMeasurement) -> dict[str, Any]:
     """What ``traces.json`` says of it."""
     facts: dict[str, Any] = {}
     if seen.layers:
@@ -237,14 +237,14 @@ def observed_facts(record: Record, seen: Beside) -> dict[str, Any]:
     return facts
 
 
-def not_compared(facts: dict[str, Any]) -> tuple[str, ...]:
+def describe_still_values(facts: dict[str, Any]) -> tuple[str, ...]:
     """What of the facts hardly moves, in words."""
     layers = [f"ultrasound: {name}" for name, one in facts.get("layers", {}).items() if not one["compared"]]
     still = "surface" in facts and not facts["surface"]["compared"]
     return (*layers, *(["surface: the skin"] if still else []))
 
 
-def store_observed(folder: Path, record: Record, seen: Beside) -> None:
+def store_observed(folder: Path, record: Record, seen: SecondaryMeasurement) -> None:
     """Write the curves of a record's tissues, the moves of its surface and the speeds of its shear waves."""
     if layers := seen.layers:
         columns = {f"{one.tissue}_mm": one.compression_mm for one in layers}

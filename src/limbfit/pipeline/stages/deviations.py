@@ -34,21 +34,21 @@ LEAST_SHARE = 0.01  # of the force: what is left on the true surfaces of those p
 _STEP = 1.1
 
 
-def site_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
+def estimate_site_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
     """Noise of a record at the times of comparison, its touch-down included.
 
     ``force_N`` (n,) is the simulated one: what a wrong touch-down does is told by its slope, which is smooth.
     Under a stated force it is the depth, mm, and so is the noise; and so it is with what is seen beside it.
     """
     if record.seen is None:
-        found = _curve_noise(study, record, force_N)
+        found = _estimate_curve_noise(study, record, force_N)
     else:
         depth = None if record.record.forced else record.displacement_mm
         found = record.seen.noise(record.name, force_N, depth, record.touch_down_sd_mm)
     return replace(found, site=record.site.name)
 
 
-def _curve_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
+def _estimate_curve_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
     """Of a record, by what regularising took away from it."""
     trace, smooth, facts = read_record(study, record.record)
     since = trace.time_s - facts["touch_down_s"]
@@ -68,30 +68,32 @@ def _curve_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
     )
 
 
-def site_deviation(context: Context, record: SiteRecord, response: SiteResponse, parameters: Array) -> Array:
+def estimate_site_deviation(
+    context: Context, record: SiteRecord, response: SiteResponse, parameters: Array
+) -> Array:
     """One standard deviation (n,) of what a record would be off by, as its site's tissue were stiffer.
 
     In N, or mm where the record compares depths, from the derivatives at ``parameters`` (p,). What thinner
     tissue is strained more by shows in what is seen of it (`Observed.by_strain`), not in its moduli.
     """
     stiffer = np.asarray(response.jacobian @ (parameters * is_modulus(context.study)))
-    surface_mm, thickness_mm = surface_error_mm(context), bone_distance_mm(record.model)
+    surface_mm, thickness_mm = estimate_surface_error_mm(context), measure_bone_distance_mm(record.model)
     strained = None if record.seen is None else record.seen.by_strain(response.force_N)
     if strained is None or thickness_mm is None:
-        return stiffer * expected_share(record.model, surface_mm)
+        return stiffer * compute_expected_share(record.model, surface_mm)
     return stiffer * LEAST_SHARE + strained * surface_mm / thickness_mm
 
 
-def expected_share(model: SiteModel, surface_mm: float) -> float:
+def compute_expected_share(model: SiteModel, surface_mm: float) -> float:
     """Standard deviation of the force at a site over the force itself, where surfaces are off by as much."""
     radius = compute_contact_radius(model.indenter)
-    thickness = bone_distance_mm(model)
+    thickness = measure_bone_distance_mm(model)
     if thickness is None:  # a half-space has no thickness to be wrong
         return LEAST_SHARE
-    return float(np.hypot(LEAST_SHARE, by_thickness(radius, thickness) * surface_mm / thickness))
+    return float(np.hypot(LEAST_SHARE, compute_thickness_slope(radius, thickness) * surface_mm / thickness))
 
 
-def by_thickness(radius_mm: float, thickness_mm: float) -> float:
+def compute_thickness_slope(radius_mm: float, thickness_mm: float) -> float:
     """``-d log F / d log h`` of a flat punch on a bonded layer."""
     ratio = radius_mm / thickness_mm
     return float(
@@ -99,7 +101,7 @@ def by_thickness(radius_mm: float, thickness_mm: float) -> float:
     )
 
 
-def surface_error_mm(context: Context) -> float:
+def estimate_surface_error_mm(context: Context) -> float:
     """Standard deviation of where the study's surfaces are: as stated, by the voxels, or of files."""
     stated = context.study.calibration.surface_error_mm
     labels = context.store["segment"] / "labels.seg.nrrd"
@@ -113,13 +115,13 @@ def surface_error_mm(context: Context) -> float:
     return OF_A_VOXEL * float(np.prod(reader.GetSpacing()[:3])) ** (1 / 3)
 
 
-def bone_distance_mm(model: SiteModel) -> float | None:
+def measure_bone_distance_mm(model: SiteModel) -> float | None:
     """From a site to the nearest point of a bone in its mesh; None where the mesh has none."""
-    return _distance(model.mesh, model.mesh_digest, model.position)
+    return _measure_distance(model.mesh, model.mesh_digest, model.position)
 
 
 @lru_cache(maxsize=64)
-def _distance(file: Path, digest: str, position: tuple[float, float, float]) -> float | None:
+def _measure_distance(file: Path, digest: str, position: tuple[float, float, float]) -> float | None:
     """All records of a site share its mesh, which is read once."""
     mesh = read_vtu(file)
     bone = mesh.node_sets.get("fixed_bone", np.zeros(0, dtype=int))

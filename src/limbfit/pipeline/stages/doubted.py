@@ -15,7 +15,7 @@ from ...indentation import Simulation
 
 
 @dataclass(frozen=True)
-class Doubted:
+class SearchWarning:
     """A doubt about a simulation of the search: in which evaluation, where, with which parameters."""
 
     evaluation: int
@@ -24,7 +24,7 @@ class Doubted:
     doubt: SimulationWarning
 
 
-def contact_record(
+def contact_to_dict(
     answers: Mapping[str, Simulation],
     searched: Mapping[str, float | None],
     rested: Sequence[SiteResponse],
@@ -49,8 +49,8 @@ def contact_record(
     return content
 
 
-def doubts_record(
-    searched: Sequence[Doubted], answers: Mapping[str, Simulation], simulations: int, found: Calibration
+def warnings_to_dict(
+    searched: Sequence[SearchWarning], answers: Mapping[str, Simulation], simulations: int, found: Calibration
 ) -> dict[str, Any]:
     """How many of the ``simulations`` of the search are doubtful, which, and what is at the answer.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ...errors import InputError
 from ...study import Study
-from ..shared.hand_labels import hand_labels
+from ..shared.hand_labels import find_hand_labels
 
 THICKNESS = "fat-depth.vtp"
 MARKED_SKIN = "skin-markers.stl"
@@ -17,15 +17,15 @@ WAVES = "{}-waves.csv"  # of a record: how fast shear waves were
 LAYERS = "{}-layers.csv"  # of a record: how its tissues gave way
 
 
-def labelled_file(study: Study) -> Path:
+def find_labelled_file(study: Study) -> Path:
     """What the labels of a study come from: its label map, or the image."""
     assert study.image is not None
     table = study.segmentation
-    return study.path(table.labels or table.contours or hand_labels(study) or study.image.path)
+    return study.path(table.labels or table.contours or find_hand_labels(study) or study.image.path)
 
 
 @contextmanager
-def naming(file: Path) -> Iterator[None]:
+def name_file_in_errors(file: Path) -> Iterator[None]:
     """Say which file an error is about, where it does not say so itself."""
     try:
         yield

@@ -12,47 +12,47 @@ from ...anatomy.labels.placement import place_on_grid
 from ...anatomy.segmentation.one_limb import check_one_limb
 from ...anatomy.segmentation.segmentation import segment
 from ...study import Study
-from ..shared.hand_labels import hand_labels
-from .files import naming
+from ..shared.hand_labels import find_hand_labels
+from .files import name_file_in_errors
 
 
-def study_image(study: Study) -> Volume:
+def read_study_image(study: Study) -> Volume:
     """The study's image; of one limb, unless its labels are given too."""
-    volume = plain_image(study)
+    volume = read_plain_image(study)
     if not study.segmentation.is_given:
         assert study.image is not None
-        with naming(study.path(study.image.path)):
+        with name_file_in_errors(study.path(study.image.path)):
             check_one_limb(volume)
     return volume
 
 
-def plain_image(study: Study) -> Volume:
+def read_plain_image(study: Study) -> Volume:
     """The study's image, however many limbs it shows."""
     assert study.image is not None
-    return _image(study.path(study.image.path), study.image.series)
+    return _read_image(study.path(study.image.path), study.image.series)
 
 
-def marked_image(study: Study) -> Volume | None:
+def read_marked_image(study: Study) -> Volume | None:
     """The second image of the limb, with markers on, if the study has one."""
     assert study.image is not None
     if study.image.marked is None:
         return None
-    return _image(study.path(study.image.marked), study.image.markers_series)
+    return _read_image(study.path(study.image.marked), study.image.markers_series)
 
 
-def _image(path: Path, series: str | None) -> Volume:
+def _read_image(path: Path, series: str | None) -> Volume:
     volume = read_volume(path, series)
     check_image(volume, path)
     return volume
 
 
-def study_labels(study: Study, volume: Volume) -> tuple[LabelMap, list[str]] | None:
+def read_study_labels(study: Study, volume: Volume) -> tuple[LabelMap, list[str]] | None:
     """The label map or contours that the study gives, on the image's grid, and what was repaired in it.
 
     A label map that was corrected by hand in the results counts, unless the study names one of its own.
     """
     table = study.segmentation
-    given = table.contours or table.labels or hand_labels(study)
+    given = table.contours or table.labels or find_hand_labels(study)
     if given is None:
         return None
     path = study.path(given)
@@ -60,7 +60,7 @@ def study_labels(study: Study, volume: Volume) -> tuple[LabelMap, list[str]] | N
     return clean_labels(read(path, volume), path)
 
 
-def automatic_labels(study: Study, volume: Volume) -> LabelMap:
+def segment_automatically(study: Study, volume: Volume) -> LabelMap:
     """The automatic segmentation, on the image's grid.
 
     It is made in a frame that does not depend on the order of the axes in the file nor on its rounding: near
@@ -69,7 +69,7 @@ def automatic_labels(study: Study, volume: Volume) -> LabelMap:
     assert study.image is not None
     path, table = study.path(study.image.path), study.segmentation
     near = volume.nearest_lps()
-    with naming(path):
+    with name_file_in_errors(path):
         found = segment(
             near.in_own_frame(),
             bias_correction=table.bias_correction,

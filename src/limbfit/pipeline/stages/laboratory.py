@@ -27,13 +27,13 @@ from ...indentation import Simulation, SimulationJob, SiteModel
 from ...study import Record, Study
 from ...study.meshing import MeshTable
 from ..shared.context import Context
-from ..shared.extrapolation import MESH_ORDERS, error_of_finer
+from ..shared.extrapolation import MESH_ORDERS, estimate_fine_error
 from ..shared.simulations import SimulationCache
-from .deviations import site_deviation, site_noise
-from .doubted import Doubted
+from .deviations import estimate_site_deviation, estimate_site_noise
+from .doubted import SearchWarning
 from .mesh import mesh_settings
-from .records import SiteRecord, all_compared, as_searched, is_moved, site_record
-from .remesh import meshed_meanwhile, meshed_where_possible, scaled_edges
+from .records import SiteRecord, coarsen_records, is_moved, load_site_record, select_compared_records
+from .remesh import mesh_in_background, mesh_where_possible, scale_edges
 
 Responses = list[SiteResponse]
 COARSER = 1.3  # times the edges: another mesh that tells the error of the study's own
@@ -45,14 +45,14 @@ STAYS = "what is most probable cannot be simulated, and the least squares are th
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
 
-def stage_titles(tissues: Sequence[str]) -> tuple[str, ...]:
+def list_stage_titles(tissues: Sequence[str]) -> tuple[str, ...]:
     """Names of the stages of the identification; a single tissue has one."""
     n = len(tissues)
     return ("one material", f"{COUNTS[n] if n < len(COUNTS) else n} materials")[: min(n, 2)]
 
 
 @dataclass(frozen=True)
-class Anchored:
+class FineMeshCorrection:
     """Responses at an answer, what brings those of a search to the study's own meshes as they were there,
     and one standard deviation (n,) N of what these lack at every site: none where no other mesh tells."""
 
@@ -61,7 +61,7 @@ class Anchored:
     mesh_N: tuple[Array, ...]
 
 
-class Laboratory:
+class RecordSimulator:
     """Simulates some records: with derivatives as parameters are searched, without on their own whole meshes.
 
     ``title`` is the stage or experiment that is told of progress.
@@ -72,13 +72,15 @@ class Laboratory:
     ) -> None:
         self.context, self.cache = context, cache
         self.title = title
-        self.records = all_compared(context, [site_record(context, record) for record in records])
-        self.searched = as_searched(context, self.records)
+        self.records = select_compared_records(
+            context, [load_site_record(context, record) for record in records]
+        )
+        self.searched = coarsen_records(context, self.records)
         self.evaluations = self.corrections = 0
         self.warnings: dict[str, list[str]] = {}
         self.latest: dict[str, Simulation] = {}
         self.penalties: dict[str, float | None] = {}
-        self.doubts: list[Doubted] = []
+        self.doubts: list[SearchWarning] = []
         self.kept = EvaluationStore()
         self._chain: tuple[Array, ...] = ()
         self._starts: dict[bytes, tuple[Array, ...]] = {}
@@ -143,7 +145,7 @@ class Laboratory:
         jobs = [record.own_job(parameters, starts) for record in self.records]
         return self._run(jobs, f"correction {self.corrections}", again=True)
 
-    def anchored(self, parameters: Array) -> Anchored:
+    def anchored(self, parameters: Array) -> FineMeshCorrection:
         """The responses at an answer, and what brings those of `search` to the study's own meshes.
 
         Raises
@@ -151,10 +153,10 @@ class Laboratory:
         RunError
             Where a site cannot be simulated there.
         """
-        anchored = Anchored(found := self.search(parameters), list, ())
+        anchored = FineMeshCorrection(found := self.search(parameters), list, ())
         if self.is_apart:
             correction = MeshCorrection(found, self.check(parameters))
-            anchored = Anchored(correction(found), correction, ())
+            anchored = FineMeshCorrection(correction(found), correction, ())
         if self.context.study.mesh.coarse is not None:
             anchored = replace(anchored, mesh_N=self._mesh_error(parameters, found, self.records))
         for one in anchored.responses:
@@ -172,14 +174,14 @@ class Laboratory:
         of the study's own, where it has no others.
         """
         study, spent = self.context.study, 0
-        anchored = Anchored(list(found.responses), list, ())
+        anchored = FineMeshCorrection(list(found.responses), list, ())
         if self.is_apart:
             anchored = self.anchored(found.parameters)
         if study.mesh.coarse is None and any(coarser := self._coarser(meshes)):
             searched = self.search(found.parameters) if self.is_apart else anchored.responses
             anchored = replace(anchored, mesh_N=self._mesh_error(found.parameters, searched, coarser))
             spent = self.simulated
-        known = linearised(self.context, self.records, found.parameters, anchored)
+        known = estimate_linearised(self.context, self.records, found.parameters, anchored)
         kept = EvaluationStore()
         for point, run in zip(self.kept.points, self.kept.responses, strict=True):
             kept.add(point, anchored.as_fine(list(run)))
@@ -188,7 +190,7 @@ class Laboratory:
             self.context.tell(self.title, 0, 0, "a further evaluation, for the intervals")
             return anchored.as_fine(self.search(parameters))
 
-        space = build_space(bounds := unknowns(study), grouping)
+        space = build_space(bounds := build_unknowns(study), grouping)
         evaluations = count_further_evaluations(self.simulated, spent)
         about = known, self.measured, bounds, space, kept, simulate, evaluations
         moves = moves and is_moved(study)
@@ -210,7 +212,7 @@ class Laboratory:
         if self.context.study.mesh.coarse is not None:
             yield lambda: None
             return
-        with meshed_meanwhile(self.context, folder, self._models, self._coarser_edges) as wait:
+        with mesh_in_background(self.context, folder, self._models, self._coarser_edges) as wait:
             yield wait
 
     @property
@@ -219,7 +221,7 @@ class Laboratory:
 
     @property
     def _coarser_edges(self) -> MeshSettings:
-        return scaled_edges(mesh_settings(self.context.study), COARSER)
+        return scale_edges(mesh_settings(self.context.study), COARSER)
 
     def _coarser(self, folder: Path) -> list[SiteRecord | None]:
         """The records on coarser meshes than the study's own, which are made in ``folder``.
@@ -228,7 +230,7 @@ class Laboratory:
         """
         lost = "intervals do not count the error of the site's own mesh"
         edges, title = self._coarser_edges, self.title
-        models = meshed_where_possible(self.context, folder, self._models, edges, title, lost)
+        models = mesh_where_possible(self.context, folder, self._models, edges, title, lost)
         pairs = zip(self.records, models, strict=True)
         return [replace(record, model=model) if model else None for record, model in pairs]
 
@@ -241,7 +243,7 @@ class Laboratory:
         edges. Zero where there are none, or these cannot be simulated: a line says so.
         """
         study, lacking = self.context.study, [0.0 * record.compared for record in self.records]
-        share = error_of_own_mesh(study.mesh)
+        share = estimate_own_mesh_error(study.mesh)
         there = [(i, other) for i, other in enumerate(others) if other is not None]
         near = [replace(one, model=replace(one.model, within_mm=study.within_mm)) for _, one in there]
         jobs = [other.job(parameters, sensitivities=False) for other in near]
@@ -291,7 +293,7 @@ class Laboratory:
             if searched is not None:
                 self.penalties[simulation.site] = simulation.facts.get("penalty_per_mm")
                 self.doubts += [
-                    Doubted(self.evaluations, simulation.site, tuple(searched.tolist()), doubt)
+                    SearchWarning(self.evaluations, simulation.site, tuple(searched.tolist()), doubt)
                     for doubt in simulation.doubts
                 ]
             self.context.tell(self.title, 0, 0, f"{what}, site {simulation.site}")
@@ -310,7 +312,7 @@ class Laboratory:
 
     def _identify(self, start: Unknowns, stages: Sequence[Grouping]) -> SearchResult:
         study, table = self.context.study, self.context.study.calibration
-        titles = stage_titles(study.tissues)[-len(stages) :]
+        titles = list_stage_titles(study.tissues)[-len(stages) :]
 
         def tell(state: SearchState) -> None:
             name = titles[state.history[-1].stage]
@@ -320,46 +322,46 @@ class Laboratory:
 
         if not self.is_apart:
             found = calibrate(
-                self.search, self.measured, start, settings(study), stages=stages, on_iterate=tell
+                self.search, self.measured, start, build_settings(study), stages=stages, on_iterate=tell
             )
             return found, ()
         corrected = calibrate_with_correction(
-            self.search, self.check, self.measured, start, settings(study),
+            self.search, self.check, self.measured, start, build_settings(study),
             CorrectionSettings(table.corrections, table.correction_tolerance_percent),
             stages=stages, on_iterate=tell,
         )  # fmt: skip
         return corrected.calibration, corrected.rounds
 
 
-def linearised(
-    context: Context, records: Sequence[SiteRecord], parameters: Array, at: Anchored
+def estimate_linearised(
+    context: Context, records: Sequence[SiteRecord], parameters: Array, at: FineMeshCorrection
 ) -> Uncertainty:
     """What fitted records tell about ``parameters`` (p,), whose responses are given."""
     study = context.study
     pairs = list(zip(records, at.responses, strict=True))
-    noise = [site_noise(study, record, response.force_N) for record, response in pairs]
-    off = [site_deviation(context, record, response, parameters) for record, response in pairs]
+    noise = [estimate_site_noise(study, record, response.force_N) for record, response in pairs]
+    off = [estimate_site_deviation(context, record, response, parameters) for record, response in pairs]
     measured = [record.measured for record in records]
     return estimate_uncertainty(
         parameters,
         at.responses,
         measured,
-        unknowns(study),
+        build_unknowns(study),
         noise,
-        groupings(study)[-1],
-        settings(study),
+        build_groupings(study)[-1],
+        build_settings(study),
         at.mesh_N,
         off,
     )
 
 
-def error_of_own_mesh(table: MeshTable) -> float:
+def estimate_own_mesh_error(table: MeshTable) -> float:
     """One standard deviation of what the study's own mesh lacks, over its difference from the coarser one."""
     ratio = COARSER if table.coarse is None else table.coarse.edge_near_mm / table.edge_near_mm
-    return error_of_finer(MESH_ORDERS[table.element], ratio)
+    return estimate_fine_error(MESH_ORDERS[table.element], ratio)
 
 
-def settings(study: Study) -> CalibrationSettings:
+def build_settings(study: Study) -> CalibrationSettings:
     """How the study wants its parameters found."""
     table = study.calibration
     return CalibrationSettings(
@@ -371,14 +373,14 @@ def settings(study: Study) -> CalibrationSettings:
     )
 
 
-def groupings(study: Study) -> tuple[Grouping, ...]:
+def build_groupings(study: Study) -> tuple[Grouping, ...]:
     """Which parameters move together in each stage, as far as the study lets them move."""
-    names = unknowns(study).names
+    names = build_unknowns(study).names
     made = [constrain(one, names, study.fixed, study.calibration.tied) for one in stage_groupings(names)]
     return tuple(dict.fromkeys(made))
 
 
-def unknowns(study: Study) -> Unknowns:
+def build_unknowns(study: Study) -> Unknowns:
     """The parameters of each tissue with the study's start and bounds."""
 
     def flat(which: Literal["start", "lower", "upper"]) -> Array:

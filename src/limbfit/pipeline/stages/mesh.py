@@ -60,7 +60,7 @@ def mesh_job(
 def make_mesh(job: MeshJob) -> dict[str, Any]:
     """Mesh one site and store it; returns the facts that ``mesh.json`` holds."""
     shared = replace(job.settings, near_radius_mm=0.0)
-    anatomy, base = _base(job.surfaces, job.surfaces_key, shared)
+    anatomy, base = _build_base(job.surfaces, job.surfaces_key, shared)
     mesh, report = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.settings, base)
     return keep_mesh(mesh, report, job.settings, job.file)
 
@@ -75,13 +75,13 @@ def keep_mesh(mesh: Mesh, report: MeshReport, settings: MeshSettings, file: Path
 
 
 @lru_cache(maxsize=1)
-def _base(surfaces: Path, key: str, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
+def _build_base(surfaces: Path, key: str, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
     """What all sites of a study share, whatever their ``near_radius_mm``; a worker makes it once."""
     anatomy = load_anatomy(surfaces)
-    return anatomy, build_base_mesh(anatomy, settings, stored_depth(surfaces, anatomy, settings))
+    return anatomy, build_base_mesh(anatomy, settings, read_stored_depth(surfaces, anatomy, settings))
 
 
-def stored_depth(surfaces: Path, anatomy: Anatomy, settings: MeshSettings) -> Array | None:
+def read_stored_depth(surfaces: Path, anatomy: Anatomy, settings: MeshSettings) -> Array | None:
     """Thickness of the mapped layer at the skin's points, mm; none where every layer's is stated."""
     mapped = any(layer.thickness_mm is None for layer in settings.layers)
     return read_thickness(surfaces / THICKNESS, anatomy.skin) if mapped else None
@@ -93,7 +93,7 @@ def mesh_settings(study: Study) -> MeshSettings:
     return MeshSettings(
         element=table.cell_type,
         edge_near_mm=table.edge_near_mm,
-        edge_far_mm=_far_mm(study, table.edge_far_mm),
+        edge_far_mm=_choose_far_mm(study, table.edge_far_mm),
         near_radius_mm=table.near_radius_mm,
         growth=table.growth,
         flatness=table.flatness,
@@ -109,16 +109,16 @@ def mesh_settings(study: Study) -> MeshSettings:
     )
 
 
-def coarse_settings(study: Study) -> MeshSettings | None:
+def build_coarse_settings(study: Study) -> MeshSettings | None:
     """How the second, coarse meshes are made; None where the study wants none."""
     table = study.mesh.coarse
     if table is None:
         return None
     coarse = replace(mesh_settings(study), **table.model_dump())
-    return replace(coarse, edge_far_mm=_far_mm(study, table.edge_far_mm))
+    return replace(coarse, edge_far_mm=_choose_far_mm(study, table.edge_far_mm))
 
 
-def _far_mm(study: Study, stated: float) -> float:
+def _choose_far_mm(study: Study, stated: float) -> float:
     """Edge length far from the site: no longer than pins that press there are wide."""
     return stated if study.clamps is None else min(stated, study.clamps.width_mm)
 
@@ -130,7 +130,7 @@ def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
     """
     study = context.study
     content = _make_meshes(context, folder, mesh_settings(study), "")
-    coarse = coarse_settings(study)
+    coarse = build_coarse_settings(study)
     if coarse is not None:
         (folder / COARSE).mkdir(exist_ok=True)
         content["coarse"] = _make_meshes(context, folder / COARSE, coarse, "coarse, ")

@@ -6,7 +6,7 @@ from ...anatomy.imaging import LabelMap
 from ...anatomy.labels.naming import normalise_name
 from ...anatomy.surfaces.thickness import check_fat
 from ...study import Study
-from .files import labelled_file, naming
+from .files import find_labelled_file, name_file_in_errors
 
 
 def check_labels(study: Study, labels: LabelMap) -> None:
@@ -16,17 +16,17 @@ def check_labels(study: Study, labels: LabelMap) -> None:
     ------
     LabelError
     """
-    with naming(labelled_file(study)):
-        labels.with_regions(labelled_regions(study))
-        if maps_fat(study):
+    with name_file_in_errors(find_labelled_file(study)):
+        labels.with_regions(list_labelled_regions(study))
+        if has_mapped_fat(study):
             check_fat(labels)
 
 
-def labelled_regions(study: Study) -> dict[str, str]:
+def list_labelled_regions(study: Study) -> dict[str, str]:
     """The label of each region that has one, by the region's name."""
     return {one.name: normalise_name(one.label) for one in study.geometry.regions if one.label is not None}
 
 
-def maps_fat(study: Study) -> bool:
+def has_mapped_fat(study: Study) -> bool:
     """True if a layer is as thick as the fat in the label map."""
     return any(layer.thickness == "map" for layer in study.geometry.model_layers)

@@ -21,7 +21,7 @@ _LEAST_DEPTH = 0.1  # of the largest: nearer to touch-down moves are not in prop
 
 
 @dataclass(frozen=True)
-class Observed:
+class SecondaryValues:
     """What is seen beside a record's force: values (n,), and where a simulation of it shows them.
 
     Each is a mean over time of one gauge: ``at`` (n, t) of the record's times, of number ``gauge`` (n,) in
@@ -104,7 +104,7 @@ class Observed:
 
 
 @dataclass(frozen=True)
-class SeenLayer(Observed):
+class LayerMeasurement(SecondaryValues):
     """The compression of a tissue under the indenter."""
 
     kind: ClassVar = "ultrasound"
@@ -115,7 +115,7 @@ class SeenLayer(Observed):
 
 
 @dataclass(frozen=True)
-class SeenSurface(Observed):
+class SurfaceMeasurement(SecondaryValues):
     """The displacement of the skin around the indenter: ``points`` (n, 3) mm along ``components`` (n,)."""
 
     points: Array
@@ -130,7 +130,7 @@ class SeenSurface(Observed):
 
     def by_depth(self, depth_mm: Array, simulated: Array) -> Array:
         """Moves of the skin are nearly in proportion to the depth."""
-        return _per_depth(depth_mm, simulated)
+        return _divide_by_depth(depth_mm, simulated)
 
     @property
     def columns(self) -> dict[str, Array]:
@@ -139,7 +139,7 @@ class SeenSurface(Observed):
 
 
 @dataclass(frozen=True)
-class SeenWave(Observed):
+class WaveMeasurement(SecondaryValues):
     """Speeds of shear waves, m/s, at one place under the indenter: at rest, and while it presses."""
 
     kind: ClassVar = "shear waves"
@@ -148,14 +148,14 @@ class SeenWave(Observed):
 
     def by_depth(self, depth_mm: Array, simulated: Array) -> Array:
         """What strain adds to a speed is nearly in proportion to the depth."""
-        return _per_depth(depth_mm, simulated - simulated[np.argmin(depth_mm)])
+        return _divide_by_depth(depth_mm, simulated - simulated[np.argmin(depth_mm)])
 
     def by_strain(self, simulated: Array) -> Array:
         """As much as strain adds to a speed since the first reading."""
         return np.asarray(simulated - simulated[np.argmin(self.time_s)])
 
 
-def _per_depth(depth_mm: Array, values: Array) -> Array:
+def _divide_by_depth(depth_mm: Array, values: Array) -> Array:
     """Values (n,) over depths (n,), mm; none where the indenter is not in."""
     deepest = float(depth_mm.max())
     if deepest <= 0.0:

@@ -17,11 +17,11 @@ from ...identify.fit.objective import SiteResponse
 from ...indentation import SimulationJob
 from ..shared.context import Context
 from ..shared.simulations import SimulationCache
-from .plausible import stored_flags
-from .records import SiteRecord, as_response
+from .plausible import read_record_warnings
+from .records import SiteRecord, to_response
 
 
-def outlier_record(
+def outliers_to_dict(
     context: Context,
     cache: SimulationCache,
     records: Sequence[SiteRecord],
@@ -41,7 +41,7 @@ def outlier_record(
     searched : the records on the meshes on which parameters are searched.
     correction : brings responses there to those of the study's own meshes; None where they are the same.
     """
-    plain = stored_flags(context)
+    plain = read_record_warnings(context)
     whole = [i for i, response in enumerate(ours) if response.completed]
     records, searched = [records[i] for i in whole], [searched[i] for i in whole]
     known, failed = [ours[i] for i in whole], list[str]()
@@ -55,7 +55,7 @@ def outlier_record(
         return found
 
     def exactly(parameters: Array, i: int, j: int) -> tuple[SiteResponse, SiteResponse]:
-        jobs = [_driven_by(searched[a], searched[b], parameters) for a, b in ((i, j), (j, i))]
+        jobs = [_build_driven_job(searched[a], searched[b], parameters) for a, b in ((i, j), (j, i))]
         one, two = _run(context, cache, jobs)
         pairs = ((one, two), (two, one))
         failed.extend(f"site {a.site}, record of {b.site}: {a.reason}" for a, b in pairs if not a.completed)
@@ -65,7 +65,7 @@ def outlier_record(
         simulate,
         [replace(record.measured, weight=1.0 / record.record.of_site) for record in records],
         best,
-        _exchange(records),
+        _build_exchange(records),
         exactly,
         one,
     )
@@ -76,7 +76,7 @@ def outlier_record(
     return {"flags": flags, "left_out": left_out, "failed": list(dict.fromkeys(failed))}
 
 
-def _exchange(records: Sequence[SiteRecord]) -> Callable[[LogLinearModel], Exchange]:
+def _build_exchange(records: Sequence[SiteRecord]) -> Callable[[LogLinearModel], Exchange]:
     """From the expansion of all sites to about what two answer to each other's record."""
 
     def build(first: LogLinearModel) -> Exchange:
@@ -90,7 +90,7 @@ def _exchange(records: Sequence[SiteRecord]) -> Callable[[LogLinearModel], Excha
     return build
 
 
-def _driven_by(site: SiteRecord, other: SiteRecord, parameters: Array) -> SimulationJob:
+def _build_driven_job(site: SiteRecord, other: SiteRecord, parameters: Array) -> SimulationJob:
     """The site driven by the record of another one, and indented by what made that."""
     driven = other.model
     model = replace(
@@ -110,5 +110,5 @@ def _run(context: Context, cache: SimulationCache, jobs: Sequence[SimulationJob]
     found = []
     for simulation in cache.run(jobs, context.executor):
         context.tell("predict", 0, 0, f"looking at site {simulation.site} for what is wrong")
-        found.append(as_response(simulation))
+        found.append(to_response(simulation))
     return found

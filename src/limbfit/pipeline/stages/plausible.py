@@ -19,7 +19,7 @@ from ..shared.context import Context
 Placed = Mapping[str, Mapping[str, Any]]
 
 
-def stored_flags(context: Context) -> tuple[RecordWarning, ...]:
+def read_record_warnings(context: Context) -> tuple[RecordWarning, ...]:
     """Flags on all records from the stages ``surfaces``, ``sites`` and ``traces``."""
     study = context.study
     traces = context.stored("traces", "traces.json")["sites"]
@@ -32,7 +32,7 @@ def stored_flags(context: Context) -> tuple[RecordWarning, ...]:
 
 def tell_flags(context: Context) -> None:
     """Warn of what is wrong with records before parameters are identified from them."""
-    for flag in stored_flags(context):
+    for flag in read_record_warnings(context):
         context.tell("calibrate", 0, 0, f"warning: {flag.text}")
 
 
@@ -54,7 +54,7 @@ def record_flags(
     """
     recorded = [record for record in study.recorded if record.name in records]
     facts = [
-        _facts(
+        _collect_facts(
             one,
             records[one.name],
             steps_s[one.name],
@@ -73,7 +73,7 @@ def _flag(site: str, remark: Mapping[str, Any]) -> RecordWarning:
     return RecordWarning((site,), **remark)
 
 
-def _facts(
+def _collect_facts(
     stated: Record,
     record: Mapping[str, Any],
     step_s: float,

@@ -23,9 +23,9 @@ from ...study import Study
 from ..shared.artefacts import write_curves, write_json
 from ..shared.context import Context
 from ..shared.simulations import SimulationCache
-from .deviations import site_deviation
-from .outliers import outlier_record
-from .records import SiteRecord, all_compared, as_response, as_searched, site_record
+from .deviations import estimate_site_deviation
+from .outliers import outliers_to_dict
+from .records import SiteRecord, coarsen_records, load_site_record, select_compared_records, to_response
 
 _MISSING = {
     "force": "no force is predicted",
@@ -41,22 +41,22 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     answers = [Answer.of(stage, study) for stage in calibration["stages"]]
     one, best = answers[0].parameters, answers[-1].parameters
     known = PredictionModel.from_stored(calibration["uncertainty"])
-    records = [site_record(context, record) for record in study.recorded]
+    records = [load_site_record(context, record) for record in study.recorded]
     cache = SimulationCache(
         folder / "runs", also=[context.store[stage] / "runs" for stage in ("calibrate", "predict")]
     )
-    searched = as_searched(context, records)
-    jobs = answer_jobs(records, searched, answers[-1])
+    searched = coarsen_records(context, records)
+    jobs = build_answer_jobs(records, searched, answers[-1])
     if len(answers) > 1:
-        jobs += _one_material_jobs(records, searched, answers[0], best)
+        jobs += _build_one_material_jobs(records, searched, answers[0], best)
     simulations = []
     for simulation in cache.run(jobs, context.executor):
         simulations.append(simulation)
         context.tell("predict", len(simulations), len(jobs) + len(records), f"site {simulation.site}")
     n = len(records)
     near = simulations[n : 2 * n] if searched is not records else None
-    ours = own = [as_response(simulation) for simulation in simulations[:n]]
-    others = [as_response(simulation) for simulation in simulations[n:]]
+    ours = own = [to_response(simulation) for simulation in simulations[:n]]
+    others = [to_response(simulation) for simulation in simulations[n:]]
     correction = None
     if searched is not records:
         coarse, others = others[:n], others[n:]
@@ -69,11 +69,13 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     _write_fields(context, folder, whole, len(jobs))
     for site in sites:
         _write_curves(context, folder, site, best, known)
-    rows = [_row(site) for site in sites]
+    rows = [_to_row(site) for site in sites]
     for i, site in enumerate(sites):
-        rows[i]["observed"] = _observed(context, folder, site, None if near is None else near[i], best, known)
-    doubts = outlier_record(context, cache, records, ours, best, one, searched, correction)
-    write_json(folder / "predict.json", {"sites": rows, **_means(rows), **doubts})
+        rows[i]["observed"] = _write_observed(
+            context, folder, site, None if near is None else near[i], best, known
+        )
+    doubts = outliers_to_dict(context, cache, records, ours, best, one, searched, correction)
+    write_json(folder / "predict.json", {"sites": rows, **_compute_means(rows), **doubts})
     return {}
 
 
@@ -91,7 +93,7 @@ class Answer:
         return cls(study.vector(stage["parameters"]), tuple(study.vector(one) for one in starts))
 
 
-def answer_jobs(
+def build_answer_jobs(
     records: Sequence[SiteRecord], searched: Sequence[SiteRecord], answer: Answer
 ) -> list[SimulationJob]:
     """Every record at the answer, then so with derivatives as it is ``searched``, if that is another model.
@@ -106,7 +108,7 @@ def answer_jobs(
     return own + [record.job(best, starts=before) for record, before in zip(searched, starts)]
 
 
-def _one_material_jobs(
+def _build_one_material_jobs(
     records: Sequence[SiteRecord], searched: Sequence[SiteRecord], one: Answer, best: Array
 ) -> list[SimulationJob]:
     """Every record with one material: at the fitted sites as the calibration has simulated it already.
@@ -189,13 +191,13 @@ def _write_curves(
     if site.one is not None and "one_material" not in missing:
         columns[f"{name}_one_material_{unit}"] = site.one.force_N
     if ours.completed:
-        own = 0.0 if record.site.fitted else site_deviation(context, record, ours, best)
+        own = 0.0 if record.site.fitted else estimate_site_deviation(context, record, ours, best)
         low, high = known.compute_interval_95(ours, best, record.name, unit, own)
         columns |= {f"{name}_low_{unit}": np.maximum(low, 0.0), f"{name}_high_{unit}": high}
     write_curves(folder / f"{record.name}.csv", **columns)
 
 
-def _observed(
+def _write_observed(
     context: Context,
     folder: Path,
     site: SitePrediction,
@@ -208,7 +210,7 @@ def _observed(
     ``near`` is the simulation with derivatives where that is another than the site's own.
     """
     rows = []
-    for one in all_compared(context, [site.record])[1:]:
+    for one in select_compared_records(context, [site.record])[1:]:
         assert one.seen is not None
         ours = whole = one.respond(site.own)
         if near is not None:
@@ -239,7 +241,7 @@ def _observed(
     return rows
 
 
-def _row(site: SitePrediction) -> dict[str, Any]:
+def _to_row(site: SitePrediction) -> dict[str, Any]:
     record, own = site.record, site.own
 
     def error(found: Simulation | SiteResponse | None) -> float | None:
@@ -267,7 +269,7 @@ def _row(site: SitePrediction) -> dict[str, Any]:
     }
 
 
-def _means(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _compute_means(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Mean and standard deviation of the errors of fitted and held-out sites; None where there are none.
 
     A site's is the mean of its records'.

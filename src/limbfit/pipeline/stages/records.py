@@ -18,10 +18,10 @@ from ...study import Record, Site, Study
 from ...traces import SurfaceMotion, Thinning, WaveMeans
 from ..shared.artefacts import read_curves
 from ..shared.context import Context
-from ..shared.simulations import recorded_model, surface_points
+from ..shared.simulations import build_recorded_model, find_surface_points
 from ..shared.surface_points import ChosenPoints, read_motion
 from .files import LAYERS, SMOOTHING, WAVES
-from .observed import Observed, SeenLayer, SeenSurface, SeenWave
+from .observed import LayerMeasurement, SecondaryValues, SurfaceMeasurement, WaveMeasurement
 
 
 def is_moved(study: Study) -> bool:
@@ -57,7 +57,7 @@ class SiteRecord:
     force_N: Array
     smoothing: Array
     nested_mm: float | None = None
-    seen: Observed | None = None
+    seen: SecondaryValues | None = None
     touch_down_sd_mm: float = 0.0
     error_share: float = 0.01
 
@@ -100,7 +100,7 @@ class SiteRecord:
 
     def respond(self, simulation: Simulation) -> SiteResponse:
         """What this record would show of a simulation."""
-        plain = as_response(simulation)
+        plain = to_response(simulation)
         if self.seen is not None:
             values, slopes = self.seen.of(simulation)
             return replace(plain, force_N=values, jacobian=slopes)
@@ -126,7 +126,7 @@ class SiteRecord:
         return replace(self.job(parameters, sensitivities=False, starts=starts), nested_mm=self.nested_mm)
 
 
-def as_response(simulation: Simulation) -> SiteResponse:
+def to_response(simulation: Simulation) -> SiteResponse:
     """A simulation as it is; derivatives (n, 0) where it has none."""
     jacobian = np.zeros((simulation.force_N.size, 0)) if simulation.jacobian is None else simulation.jacobian
     ended = simulation.completed, simulation.reason
@@ -134,14 +134,14 @@ def as_response(simulation: Simulation) -> SiteResponse:
     return SiteResponse(simulation.force_N, jacobian, *ended, simulation.site, simulation.warnings, *kinds)
 
 
-def site_record(context: Context, record: Record) -> SiteRecord:
+def load_site_record(context: Context, record: Record) -> SiteRecord:
     """A stored record and its site's model, on the whole of its own mesh."""
     curves = read_curves(context.store["traces"] / f"{record.name}.csv")
     facts = context.stored("traces", "traces.json")["sites"][record.name]
     return SiteRecord(
         record=record,
         tissues=context.study.tissues,
-        model=recorded_model(context, record),
+        model=build_recorded_model(context, record),
         times_s=curves["time_s"],
         displacement_mm=curves["displacement_mm"],
         force_N=curves["force_N"],
@@ -152,23 +152,23 @@ def site_record(context: Context, record: Record) -> SiteRecord:
     )
 
 
-def all_compared(context: Context, records: Sequence[SiteRecord]) -> list[SiteRecord]:
+def select_compared_records(context: Context, records: Sequence[SiteRecord]) -> list[SiteRecord]:
     """The records, each followed by one for everything that was seen beside it."""
     facts, folder = context.stored("traces", "traces.json")["sites"], context.store["traces"]
     found = []
     for one in records:
         found.append(one)
-        own, points = facts[one.record.name], surface_points(context, one.record)
+        own, points = facts[one.record.name], find_surface_points(context, one.record)
         observed = _load_observed(folder, one.record, own, one.times_s, points)
         found += [replace(one, seen=seen) for seen in observed]
     return found
 
 
-def as_searched(context: Context, records: Sequence[SiteRecord]) -> Sequence[SiteRecord]:
+def coarsen_records(context: Context, records: Sequence[SiteRecord]) -> Sequence[SiteRecord]:
     """The records as parameters are searched (`site_model`); ``records`` itself where that is the same."""
     if not context.study.is_searched_apart:
         return records
-    return [replace(one, model=recorded_model(context, one.record, searched=True)) for one in records]
+    return [replace(one, model=build_recorded_model(context, one.record, searched=True)) for one in records]
 
 
 def _load_observed(
@@ -177,33 +177,33 @@ def _load_observed(
     facts: dict[str, Any],
     times_s: Array,
     points: ChosenPoints | None,
-) -> tuple[Observed, ...]:
+) -> tuple[SecondaryValues, ...]:
     """What is compared beside a record, in the order of a simulation's gauges.
 
     ``times_s`` (t,) are those of the record's simulation, ``points`` those of its surface.
     """
     stated = facts.get("layers", {})
     tissues = [tissue for tissue, one in stated.items() if one["compared"]]
-    found: list[Observed] = []
+    found: list[SecondaryValues] = []
     if tissues:
         curves = read_curves(folder / LAYERS.format(record.name))
         for number, tissue in enumerate(tissues):
-            found.append(_seen_layer(tissue, stated[tissue], curves, number, times_s))
+            found.append(_build_layer_measurement(tissue, stated[tissue], curves, number, times_s))
     if points is not None:
         motion = read_motion(folder, record)
-        found.append(_seen_surface(record, points, motion, len(tissues), times_s))
+        found.append(_build_surface_measurement(record, points, motion, len(tissues), times_s))
     first = len(tissues) + (0 if points is None else 3 * len(points.points))
     if places := facts.get("waves", []):
         curves = read_curves(folder / WAVES.format(record.name))
         for number, place in enumerate(places):
             own = {name: values[curves["place"] == number] for name, values in curves.items()}
-            found.append(_seen_wave(record, place["name"], own, first + number, times_s))
+            found.append(_build_wave_measurement(record, place["name"], own, first + number, times_s))
     return tuple(found)
 
 
-def _seen_layer(
+def _build_layer_measurement(
     tissue: str, stated: dict[str, Any], curves: dict[str, Array], number: int, times_s: Array
-) -> SeenLayer:
+) -> LayerMeasurement:
     thinning = Thinning(
         tissue,
         stated["thickness_mm"],
@@ -214,20 +214,20 @@ def _seen_layer(
         stated["sd_mm"],
     )
     n = len(thinning.time_s)
-    return SeenLayer(
+    return LayerMeasurement(
         tissue,
         thinning.compression_mm,
         thinning.time_s,
         np.full(n, number),
-        _interpolating(times_s, thinning.time_s),
+        _build_interpolation(times_s, thinning.time_s),
         thinning.covariance,
         {"sd": stated["sd_mm"], "thickness_mm": stated["thickness_mm"], "compared": f"{n} times"},
     )
 
 
-def _seen_surface(
+def _build_surface_measurement(
     record: Record, points: ChosenPoints, motion: SurfaceMotion, first: int, times_s: Array
-) -> SeenSurface:
+) -> SurfaceMeasurement:
     means = motion.means(points.which)
     sd, words = record.surface_sd_mm, ("x", "y", "z")
     if record.surface_frame == "site":
@@ -238,12 +238,12 @@ def _seen_surface(
         "components": list(words),
         "compared": f"{len(points.points)} points, {len(means.moved_mm)} values",
     }
-    return SeenSurface(
+    return SurfaceMeasurement(
         "surface",
         means.moved_mm,
         means.time_s,
         first + 3 * means.point + means.component,
-        means.frames @ _interpolating(times_s, motion.time_s),
+        means.frames @ _build_interpolation(times_s, motion.time_s),
         np.diag(sd**2 / means.samples),
         facts,
         np.array(points.points)[means.point],
@@ -251,20 +251,22 @@ def _seen_surface(
     )
 
 
-def _seen_wave(record: Record, name: str, curves: dict[str, Array], gauge: int, times_s: Array) -> SeenWave:
+def _build_wave_measurement(
+    record: Record, name: str, curves: dict[str, Array], gauge: int, times_s: Array
+) -> WaveMeasurement:
     means, n = WaveMeans(curves["time_s"], curves["speed_m_s"], curves["samples"]), len(curves["time_s"])
     sd, bias = record.shear_waves_sd_m_s, record.shear_waves_bias_m_s
-    return SeenWave(
+    return WaveMeasurement(
         f"{name}-waves",
         means.speed_m_s,
         means.time_s,
         np.full(n, gauge),
-        _interpolating(times_s, means.time_s),
+        _build_interpolation(times_s, means.time_s),
         means.covariance(sd, bias),
         {"sd": sd, "bias": bias, "compared": f"{n} times"},
     )
 
 
-def _interpolating(from_s: Array, to_s: Array) -> Array:
+def _build_interpolation(from_s: Array, to_s: Array) -> Array:
     """Matrix (n, t) of linear interpolation from times (t,) to times (n,)."""
     return np.array([np.interp(to_s, from_s, row) for row in np.eye(len(from_s))]).T

@@ -12,41 +12,41 @@ from ...anatomy.meshing.meshing import MeshSettings
 from ...errors import MeshingError
 from ...execution import run_in_background
 from ...indentation import SiteModel
-from ..shared.artefacts import file_digest
+from ..shared.artefacts import compute_file_digest
 from ..shared.context import Context
 from .mesh import MeshJob, is_meshed, make_mesh, mesh_job
 
 
-def meshed_models(
+def mesh_models(
     context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings, title: str
 ) -> list[SiteModel]:
     """The models on meshes of other settings, in ``folder``; those of an interrupted run are kept.
 
     ``title`` is the stage or experiment that is told of progress.
     """
-    jobs = _jobs(context, folder, models, settings)
-    missing = _missing(jobs)
+    jobs = _build_jobs(context, folder, models, settings)
+    missing = _select_missing(jobs)
     for job, _ in zip(missing, context.executor.map(make_mesh, missing), strict=True):
         context.tell(title, 0, 0, f"mesh of site {job.site}, {folder.name}")
-    return [_on_mesh(model, job) for model, job in zip(models, jobs, strict=True)]
+    return [_replace_mesh(model, job) for model, job in zip(models, jobs, strict=True)]
 
 
-def meshed_where_possible(
+def mesh_where_possible(
     context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings, title: str, lost: str
 ) -> list[SiteModel | None]:
-    """As `meshed_models`, but None for a site of which no such mesh can be made; a line says so, and that
+    """As `mesh_models`, but None for a site of which no such mesh can be made; a line says so, and that
     ``lost`` with it."""
-    jobs = _jobs(context, folder, models, settings)
-    missing = _missing(jobs)
+    jobs = _build_jobs(context, folder, models, settings)
+    missing = _select_missing(jobs)
     for job, error in zip(missing, context.executor.map(_try_mesh, missing), strict=True):
         told = f"mesh of site {job.site}, {folder.name}"
         context.tell(title, 0, 0, f"warning: {told}: {error}; {lost}" if error else told)
     pairs = zip(models, jobs, strict=True)
-    return [_on_mesh(model, job) if is_meshed(job.file) else None for model, job in pairs]
+    return [_replace_mesh(model, job) if is_meshed(job.file) else None for model, job in pairs]
 
 
-def _on_mesh(model: SiteModel, job: MeshJob) -> SiteModel:
-    return replace(model, mesh=job.file, mesh_digest=file_digest(job.file))
+def _replace_mesh(model: SiteModel, job: MeshJob) -> SiteModel:
+    return replace(model, mesh=job.file, mesh_digest=compute_file_digest(job.file))
 
 
 def _try_mesh(job: MeshJob) -> str:
@@ -59,14 +59,14 @@ def _try_mesh(job: MeshJob) -> str:
 
 
 @contextmanager
-def meshed_meanwhile(
+def mesh_in_background(
     context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings
 ) -> Iterator[Callable[[], None]]:
-    """Makes the meshes of `meshed_models` beside the block, while a core is idle; with one worker none is.
+    """Makes the meshes of `mesh_models` beside the block, while a core is idle; with one worker none is.
 
     The block is given a function that waits for them.
     """
-    missing = _missing(_jobs(context, folder, models, settings))
+    missing = _select_missing(_build_jobs(context, folder, models, settings))
     if not missing or context.executor.workers < 2:
         yield lambda: None
         return
@@ -81,7 +81,7 @@ def _mesh_idly(jobs: Sequence[MeshJob]) -> None:
         _try_mesh(job)  # why it cannot is told where the mesh is wanted
 
 
-def _jobs(
+def _build_jobs(
     context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings
 ) -> list[MeshJob]:
     folder.mkdir(parents=True, exist_ok=True)
@@ -91,11 +91,11 @@ def _jobs(
     ]
 
 
-def _missing(jobs: Sequence[MeshJob]) -> list[MeshJob]:
+def _select_missing(jobs: Sequence[MeshJob]) -> list[MeshJob]:
     return [job for job in dict.fromkeys(jobs) if not is_meshed(job.file)]
 
 
-def scaled_edges(settings: MeshSettings, factor: float) -> MeshSettings:
+def scale_edges(settings: MeshSettings, factor: float) -> MeshSettings:
     """The same with edges ``factor`` times as long."""
     near, far = factor * settings.edge_near_mm, factor * settings.edge_far_mm
     return replace(settings, edge_near_mm=near, edge_far_mm=far)

@@ -16,11 +16,11 @@ from ...anatomy.sites.registration import register_limb
 from ...anatomy.surfaces.surfaces import write_surface
 from ...report.drawing.sheet import draw_sheet
 from ...study import Study
-from ..shared.artefacts import file_digest, write_json
+from ..shared.artefacts import compute_file_digest, write_json
 from ..shared.context import Context
 from ..shared.hand_labels import DIGEST, LABELS
-from .files import MARKED_SKIN, naming
-from .inputs import automatic_labels, marked_image, study_image, study_labels
+from .files import MARKED_SKIN, name_file_in_errors
+from .inputs import read_marked_image, read_study_image, read_study_labels, segment_automatically
 
 
 def run_segment(context: Context, folder: Path) -> dict[str, Any]:
@@ -28,17 +28,17 @@ def run_segment(context: Context, folder: Path) -> dict[str, Any]:
     study = context.study
     assert study.image is not None
     context.tell("segment", 0, 3, "reading the image")
-    volume, removed = without_own_markers(study, study_image(study), folder)
+    volume, removed = remove_own_markers(study, read_study_image(study), folder)
     for note in volume.notes:
         context.tell("segment", 0, 3, f"warning: image: {note}")
     context.tell("segment", 1, 3, "labelling tissues")
-    given = study_labels(study, volume)
+    given = read_study_labels(study, volume)
     if given is not None:
         (labels, notes), method = given, "corrected by hand"
         for note in notes:
             context.tell("segment", 1, 3, f"label map: {note}")
     else:
-        labels, notes, method = automatic_labels(study, volume), [], "automatic"
+        labels, notes, method = segment_automatically(study, volume), [], "automatic"
     write_labels(folder / LABELS, labels)
     write_contours(folder / "contours.csv", labels)
     quality = assess_labels(labels)
@@ -47,8 +47,8 @@ def run_segment(context: Context, folder: Path) -> dict[str, Any]:
     context.tell("segment", 2, 3, "outlining the skin with markers")
     facts = {"method": method, "volumes_cm3": label_volumes(labels), "repairs": notes}
     facts["warnings"] = [f"image: {note}" for note in volume.notes]
-    facts[DIGEST] = file_digest(folder / LABELS)
-    write_json(folder / "segment.json", facts | removed | second_skin(study, volume, labels, folder))
+    facts[DIGEST] = compute_file_digest(folder / LABELS)
+    write_json(folder / "segment.json", facts | removed | store_second_skin(study, volume, labels, folder))
     return {}
 
 
@@ -61,7 +61,7 @@ def label_volumes(labels: LabelMap) -> dict[str, float]:
     }
 
 
-def without_own_markers(study: Study, volume: Volume, folder: Path) -> tuple[Volume, dict[str, Any]]:
+def remove_own_markers(study: Study, volume: Volume, folder: Path) -> tuple[Volume, dict[str, Any]]:
     """The image without the markers on its skin, if the study says that there are some; else as it is.
 
     The skin with them on is stored in ``folder``. The facts say how many were taken off.
@@ -69,21 +69,21 @@ def without_own_markers(study: Study, volume: Volume, folder: Path) -> tuple[Vol
     assert study.image is not None
     if study.image.markers != "same":
         return volume, {}
-    with naming(study.path(study.image.path)):
+    with name_file_in_errors(study.path(study.image.path)):
         skin, _ = extract_marked_skin(volume)
         plain, count = remove_markers(volume, skin)
     write_surface(folder / MARKED_SKIN, skin)
     return plain, {"markers_removed": count}
 
 
-def second_skin(study: Study, volume: Volume, labels: LabelMap, folder: Path) -> dict[str, Any]:
+def store_second_skin(study: Study, volume: Volume, labels: LabelMap, folder: Path) -> dict[str, Any]:
     """Store the skin of the second image, moved to where the limb lies in the first; how it was moved."""
-    marked = marked_image(study)
+    marked = read_marked_image(study)
     if marked is None:
         return {}
     assert study.image is not None
     assert study.image.marked is not None
-    with naming(study.path(study.image.marked)):
+    with name_file_in_errors(study.path(study.image.marked)):
         skin, _ = extract_marked_skin(marked)
         motion = register_limb(volume, marked, labels.limb)
     write_surface(folder / MARKED_SKIN, replace(skin, points=motion.apply(skin.points)))

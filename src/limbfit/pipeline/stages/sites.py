@@ -24,13 +24,13 @@ def run_sites(context: Context, folder: Path) -> dict[str, Any]:
     for note in study.notes:
         context.tell("sites", 0, 1, note)
     context.tell("sites", 0, 1, "placing sites")
-    markers = _matched_markers(context, anatomy)
+    markers = _match_markers(context, anatomy)
     placed = [place_site(site, study, anatomy, markers.get(site.name)) for site in study.sites]
     write_json(folder / "sites.json", {"sites": placed})
     return {}
 
 
-def _matched_markers(context: Context, anatomy: Anatomy) -> dict[str, Any]:
+def _match_markers(context: Context, anatomy: Anatomy) -> dict[str, Any]:
     hints = {site.name: np.array(site.near) for site in context.study.sites if site.near is not None}
     if not hints:
         return {}

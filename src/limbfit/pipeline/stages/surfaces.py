@@ -16,8 +16,8 @@ from ...anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, 
 from ...anatomy.surfaces.thickness import measure_fat_depth, write_thickness
 from ...study import Study
 from ..shared.context import Context
-from .files import THICKNESS, labelled_file, naming
-from .needed_labels import labelled_regions, maps_fat
+from .files import THICKNESS, find_labelled_file, name_file_in_errors
+from .needed_labels import has_mapped_fat, list_labelled_regions
 
 
 def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
@@ -25,11 +25,11 @@ def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
     study = context.study
     context.tell("surfaces", 0, 2, "building surfaces")
     if study.surfaces is not None:
-        anatomy, notes = given_anatomy(study)
+        anatomy, notes = read_given_anatomy(study)
     else:
-        labels = _limb_labels(context)
-        anatomy, notes = _imaged_anatomy(study, labels)
-        if maps_fat(study):
+        labels = _read_limb_labels(context)
+        anatomy, notes = _build_imaged_anatomy(study, labels)
+        if has_mapped_fat(study):
             depth = measure_fat_depth(labels, anatomy, study.geometry.surface_edge_mm)
             write_thickness(folder / THICKNESS, anatomy.skin, depth)
     for note in notes:
@@ -38,11 +38,11 @@ def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
     return {}
 
 
-def _limb_labels(context: Context) -> LabelMap:
+def _read_limb_labels(context: Context) -> LabelMap:
     """The label map of the segment stage, after the virtual amputation where there is one."""
     geometry = context.study.geometry
-    named = labelled_regions(context.study)
-    with naming(labelled_file(context.study)):
+    named = list_labelled_regions(context.study)
+    with name_file_in_errors(find_labelled_file(context.study)):
         labels = read_labels(context.store["segment"] / "labels.seg.nrrd").with_regions(named)
     if geometry.amputation is None:
         return labels
@@ -50,22 +50,22 @@ def _limb_labels(context: Context) -> LabelMap:
     return amputate_limb(labels, plane.point, plane.normal, pad_mm=geometry.amputation_pad_mm)
 
 
-def _imaged_anatomy(study: Study, labels: LabelMap) -> tuple[Anatomy, tuple[str, ...]]:
+def _build_imaged_anatomy(study: Study, labels: LabelMap) -> tuple[Anatomy, tuple[str, ...]]:
     geometry = study.geometry
     cut = geometry.proximal_cut
-    with naming(labelled_file(study)):
+    with name_file_in_errors(find_labelled_file(study)):
         anatomy = build_anatomy(
             labels,
             edge_mm=geometry.surface_edge_mm,
             proximal_cut=None if cut is None else (np.array(cut.point), np.array(cut.normal)),
         )
-    anatomy, files, notes = _with_given_regions(study, anatomy)
-    with naming(labelled_file(study)):
+    anatomy, files, notes = _add_given_regions(study, anatomy)
+    with name_file_in_errors(find_labelled_file(study)):
         check_anatomy(anatomy, files)
     return anatomy, notes
 
 
-def _with_given_regions(study: Study, anatomy: Anatomy) -> tuple[Anatomy, dict[str, Path], tuple[str, ...]]:
+def _add_given_regions(study: Study, anatomy: Anatomy) -> tuple[Anatomy, dict[str, Path], tuple[str, ...]]:
     """The anatomy with the regions that come as surfaces, in the study's order, their files by name, and
     what was mended in them."""
     files = {one.name: study.path(one.surface) for one in study.geometry.regions if one.surface is not None}
@@ -80,7 +80,7 @@ def _with_given_regions(study: Study, anatomy: Anatomy) -> tuple[Anatomy, dict[s
     return replace(anatomy, regions={name: found[name] for name in order}), files, notes
 
 
-def given_anatomy(study: Study) -> tuple[Anatomy, tuple[str, ...]]:
+def read_given_anatomy(study: Study) -> tuple[Anatomy, tuple[str, ...]]:
     """The checked anatomy of given surfaces, after the virtual amputation where there is one.
 
     Returns
@@ -97,13 +97,13 @@ def given_anatomy(study: Study) -> tuple[Anatomy, tuple[str, ...]]:
         skin, surfaces, None if cut is None else (cut.point, cut.normal), files
     )
     if geometry.regions:
-        anatomy, region_files, told = _with_given_regions(study, anatomy)
+        anatomy, region_files, told = _add_given_regions(study, anatomy)
         notes += told
         check_anatomy(anatomy, files | region_files)
     if geometry.amputation is None:
         return anatomy, notes
     plane, pad = geometry.amputation, geometry.amputation_pad_mm
-    with naming(files["skin"]):
+    with name_file_in_errors(files["skin"]):
         stump = amputate_anatomy(anatomy, plane.point, plane.normal, pad, geometry.surface_edge_mm)
         check_anatomy(stump)
     return stump, notes

@@ -35,7 +35,7 @@ from ...acquire.virtual import Fault, Serving, Surrogate, VirtualFitSocket, Virt
 from ...errors import InputError, TraceError
 from ...study import AcquireTable, Indentation, Record, Site, Study
 from ..shared.artefacts import read_curves, write_curves, write_json
-from ..shared.store import Store, disk_errors
+from ..shared.store import Store, translate_disk_errors
 
 FOLDER = "acquired"  # beside the study file: measured data, no result
 RECORD, VERDICT = "record.csv", "verdict.json"
@@ -94,14 +94,14 @@ def acquire_site(
     )
     device = LineDevice(connect(address))
     try:
-        with disk_errors(study.folder):
-            folder = _new_folder(study, one)
+        with translate_disk_errors(study.folder):
+            folder = _make_folder(study, one)
             recorder = Recorder(folder / RECORD, _head(one, site, settings, device, operator is None))
     except BaseException:
         device.close()
         raise
     events = operator if operator is not None else stops if stops is not None else SimpleQueue()
-    told = _both(NoOperator(events), listener) if operator is None else listener
+    told = _join_listeners(NoOperator(events), listener) if operator is None else listener
     try:
         session = Session(settings, device, site=site.name, recorder=recorder, listener=told)
         ending = run_session(session, events)
@@ -149,7 +149,7 @@ def check_recording(
             remedy='leave out control = "force", or record it elsewhere',
         )
     _check_inside(study, one)
-    return device_settings(study, one, depth_mm, unattended)
+    return build_device_settings(study, one, depth_mm, unattended)
 
 
 def judge_recording(file: Path) -> dict[str, Any]:
@@ -201,7 +201,9 @@ def _check_inside(study: Study, one: Indentation) -> None:
             )
 
 
-def device_settings(study: Study, one: Indentation, depth_mm: float | None, unattended: bool) -> Settings:
+def build_device_settings(
+    study: Study, one: Indentation, depth_mm: float | None, unattended: bool
+) -> Settings:
     """Those of ``[acquire]``, with what the record states of its own."""
     own = {"ramp_speed_mm_s": one.speed_mm_s, "hold_s": one.hold_s} if isinstance(one, Record) else {}
     stated = {key: value for key, value in own.items() if value is not None}
@@ -214,7 +216,7 @@ def device_settings(study: Study, one: Indentation, depth_mm: float | None, unat
     if depth_mm is None and isinstance(one, Record):
         depth_mm = one.depth_mm
     if depth_mm is None and unattended:
-        depth_mm = one.depth_mm or _recorded_depth(study, one)
+        depth_mm = one.depth_mm or _find_recorded_depth(study, one)
         if depth_mm is None:
             remedy = "give --depth, or state its depth_mm"
             raise InputError(
@@ -234,7 +236,7 @@ def device_settings(study: Study, one: Indentation, depth_mm: float | None, unat
     return replace(settings, search_depth_mm=depth_mm)
 
 
-def _recorded_depth(study: Study, one: Indentation) -> float | None:
+def _find_recorded_depth(study: Study, one: Indentation) -> float | None:
     file = Store(study.results)["traces"] / "traces.json"
     if not file.is_file():
         return None
@@ -242,7 +244,7 @@ def _recorded_depth(study: Study, one: Indentation) -> float | None:
     return None if facts is None else float(facts["depth_mm"])
 
 
-def _new_folder(study: Study, one: Indentation) -> Path:
+def _make_folder(study: Study, one: Indentation) -> Path:
     stamp = f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"[:-3]
     folder = study.folder / FOLDER / one.name / stamp
     folder.mkdir(parents=True)
@@ -267,7 +269,7 @@ def _head(
     }
 
 
-def _both(first: Listener, second: Listener | None) -> Listener:
+def _join_listeners(first: Listener, second: Listener | None) -> Listener:
     def tell(told: Update) -> None:
         first(told)
         if second is not None:
@@ -284,7 +286,7 @@ def _keep(study: Study, one: Indentation, folder: Path, completed: bool) -> dict
     recording = read_recording(folder / RECORD)
     verdict = check_record(recording).to_dict()
     found = find_ramps(recording)
-    with disk_errors(study.folder):
+    with translate_disk_errors(study.folder):
         for ramp in found:
             _write_ramp(study, folder / f"ramp-{ramp.cycle}.csv", ramp)
         counted = [ramp for ramp in found if ramp.cycle > study.acquire.precondition]
@@ -335,12 +337,12 @@ def virtual_fitsocket(
     InputError
         Where no site has a stored simulation.
     """
-    sites = stored_surrogates(study)
+    sites = read_surrogates(study)
     limb = VirtualLimb(sites, np.random.default_rng(seed))
     return VirtualFitSocket(limb, seed=seed, faults=faults, clock="paced" if paced else "real")
 
 
-def stored_surrogates(study: Study) -> dict[str, Surrogate]:
+def read_surrogates(study: Study) -> dict[str, Surrogate]:
     """Each site that has a stored simulation: of the prediction, else of `limbfit simulate`."""
     found: dict[str, Surrogate] = {}
     columns = (("predict", "force_simulated_N"), ("simulate", "force_N"))
@@ -349,14 +351,14 @@ def stored_surrogates(study: Study) -> dict[str, Surrogate]:
         for (folder, column), name in product(columns, dict.fromkeys((one.name, site))):
             file = study.results / folder / f"{name}.csv"
             if site not in found and file.is_file() and (folder == "simulate" or column in read_curves(file)):
-                found[site] = _surrogate(file, column)
+                found[site] = _read_surrogate(file, column)
     if not found:
         remedy = "run it first (limbfit run), or simulate sites (limbfit simulate)"
         raise InputError("the study has no stored simulation", file=study.results, remedy=remedy)
     return found
 
 
-def _surrogate(file: Path, column: str) -> Surrogate:
+def _read_surrogate(file: Path, column: str) -> Surrogate:
     try:
         curves = read_curves(file)
         return fit_surrogate(curves["time_s"], curves["displacement_mm"], curves[column])

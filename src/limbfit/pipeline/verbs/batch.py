@@ -10,14 +10,18 @@ from typing import Any
 from ...errors import InputError, LimbfitError
 from ...execution import make_executor, share_executor
 from ...study import load_study
-from ..shared.context import Listener, Progress, quiet
+from ..shared.context import Listener, Progress, ignore_progress
 from .run import STAGE_NAMES, run_study
 
 _FIGURES = ("mean_error_fitted_percent", "mean_error_heldout_percent", "report")
 
 
 def run_batch(
-    paths: Sequence[str | Path], *, until: str | None = None, workers: int = 0, listener: Listener = quiet
+    paths: Sequence[str | Path],
+    *,
+    until: str | None = None,
+    workers: int = 0,
+    listener: Listener = ignore_progress,
 ) -> Iterator[dict[str, Any]]:
     """Run studies one after the other on the same workers; a study that fails does not stop the others.
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from ...bench.forward import FEBIO_SECONDS
 from ...study import Study, load_study
-from ..shared.context import Listener, quiet
+from ..shared.context import Listener, ignore_progress
 from ..shared.simulations import SimulationCache
 from ..shared.store import Store
 from .demo import make_phantom_study
@@ -19,7 +19,7 @@ FEBIO_CASE, FEBIO_ITERATIONS = "residuum/posterior_tet10", 10
 _AFRESH = ("calibrate", "predict", "report")
 
 
-def bench_calibrate(folder: Path | None = None, *, listener: Listener = quiet) -> dict[str, Any]:
+def bench_calibrate(folder: Path | None = None, *, listener: Listener = ignore_progress) -> dict[str, Any]:
     """Identify a study afresh, in a copy of it, and time the stages after meshing.
 
     Parameters
@@ -47,22 +47,22 @@ def bench_calibrate(folder: Path | None = None, *, listener: Listener = quiet) -
         else:
             source = load_study(folder)
             assert source.file is not None
-            shutil.copytree(source.file.parent, place, ignore=_left_out)
+            shutil.copytree(source.file.parent, place, ignore=_select_left_out)
             if source.file.name != "study.toml":
                 (place / source.file.name).rename(place / "study.toml")
         study = load_study(place)
         run_study(study, until="predict", listener=listener)
-        return _facts(study)
+        return _collect_facts(study)
 
 
-def _left_out(folder: str, names: list[str]) -> set[str]:
+def _select_left_out(folder: str, names: list[str]) -> set[str]:
     """Results that stand on the meshes, locks and unfinished work."""
     if Path(folder).name != "results":
         return set()
     return {name for name in names if name in _AFRESH or name.startswith(".")}
 
 
-def _facts(study: Study) -> dict[str, Any]:
+def _collect_facts(study: Study) -> dict[str, Any]:
     store = Store(study.results)
     predicted = store.read("predict", "predict.json")
     seconds = {stage: (store.stamp(stage) or {})["seconds"] for stage in ("calibrate", "predict")}

@@ -12,21 +12,21 @@ from ...anatomy.surfaces.surfaces import Anatomy
 from ...indentation import read_indenter
 from ...study import ClampsTable, Record, Study
 from ...traces import Regularised, SurfaceMotion, Trace
-from ..shared.context import Listener, Progress, quiet
+from ..shared.context import Listener, Progress, ignore_progress
 from ..shared.limb import LimbGeometry
-from ..shared.socket_shape import check_load, check_regions, loadable_socket, regions_of
+from ..shared.socket_shape import build_loadable_socket, build_regions, check_load, check_regions
 from ..shared.store import Store
-from ..stages.curves import Beside, read_observed, read_record
-from ..stages.inputs import marked_image, study_image, study_labels
+from ..stages.curves import SecondaryMeasurement, read_observed, read_record
+from ..stages.inputs import read_marked_image, read_study_image, read_study_labels
 from ..stages.needed_labels import check_labels
 from ..stages.plausible import record_flags
 from ..stages.sites import place_site
-from ..stages.surfaces import given_anatomy
-from .refusals import refused_commands
-from .run import keys
+from ..stages.surfaces import read_given_anatomy
+from .refusals import list_refused_commands
+from .run import compute_keys
 
 
-def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
+def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[str, Any]:
     """Facts about a study's inputs; raises at the first that cannot be used.
 
     Returns
@@ -43,8 +43,10 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
     """
     facts = list(study.notes)
     listener(Progress("check", 0, 2, "geometry"))
-    given, notes = given_anatomy(study) if study.surfaces is not None else (None, ())
-    told, bones = _image_facts(study) if given is None else ([*notes, *_surface_facts(study, given)], None)
+    given, notes = read_given_anatomy(study) if study.surfaces is not None else (None, ())
+    told, bones = (
+        _describe_image(study) if given is None else ([*notes, *_describe_surfaces(study, given)], None)
+    )
     facts += told
     for name, table in study.used_indenters.items():
         if table.file is not None:
@@ -54,7 +56,7 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
     listener(Progress("check", 1, 2, "records"))
     read = {record.name: read_record(study, record) for record in study.recorded}
     records = {name: record for name, (_, _, record) in read.items()}
-    seen = {record.name: _beside(study, record, read[record.name]) for record in study.recorded}
+    seen = {record.name: _read_secondary(study, record, read[record.name]) for record in study.recorded}
     for name, record in records.items():
         facts.append(
             f"site {name}: peak force {record['peak_force_N']:.2f} N at {record['depth_mm']:.2f} mm, "
@@ -71,20 +73,20 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
         known = (f"{name} {p.median:g}, factor {p.factor:g}" for name, p in study.priors.items())
         facts.append(f"lognormal priors (median, one standard deviation): {'; '.join(known)}")
     steps = {name: float(np.median(np.diff(trace.time_s))) for name, (trace, _, _) in read.items()}
-    limb = _limb(study, given)
+    limb = _read_limb(study, given)
     placed, anatomy = (limb.places, limb.anatomy) if limb is not None else ({}, None)
-    facts += _surface_motion_facts(study, {name: one.motion for name, one in seen.items()}, limb)
-    facts += [told for name, one in seen.items() for told in _wave_facts(name, one)]
+    facts += _describe_surface_motion(study, {name: one.motion for name, one in seen.items()}, limb)
+    facts += [told for name, one in seen.items() for told in _describe_waves(name, one)]
     if records and not placed:
         facts.append(
             "the sites are not placed yet: stiffness is compared without the thickness of the tissue "
             "(limbfit run --until sites, then check again)"
         )
     if "socket" in study.model_fields_set:
-        facts += _socket_facts(study, anatomy, bones)
+        facts += _describe_socket(study, anatomy, bones)
     if study.clamps is not None:
-        facts.append(_clamps_fact(study, study.clamps, limb))
-    refused = refused_commands(study, limb)
+        facts.append(_describe_clamps(study, study.clamps, limb))
+    refused = list_refused_commands(study, limb)
     facts += [f"cannot run: limbfit {', '.join(row['commands'])}: {row['why']}" for row in refused]
     flags = record_flags(study, records, steps, placed, anatomy)
     listener(Progress("check", 2, 2))
@@ -97,13 +99,15 @@ def check_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
     }
 
 
-def _beside(study: Study, record: Record, read: tuple[Trace, Regularised, dict[str, Any]]) -> Beside:
+def _read_secondary(
+    study: Study, record: Record, read: tuple[Trace, Regularised, dict[str, Any]]
+) -> SecondaryMeasurement:
     """What was seen beside a record."""
     trace, smooth, facts = read
     return read_observed(study, record, trace, facts["touch_down_s"], smooth)
 
 
-def _wave_facts(name: str, seen: Beside) -> Iterator[str]:
+def _describe_waves(name: str, seen: SecondaryMeasurement) -> Iterator[str]:
     """How fast shear waves are."""
     for place, means in seen.waves:
         speeds = f"{means.speed_m_s.min():.2f} to {means.speed_m_s.max():.2f} m/s"
@@ -111,7 +115,7 @@ def _wave_facts(name: str, seen: Beside) -> Iterator[str]:
         yield f"site {name}: shear waves at {place.name}, {speeds} in {readings} readings"
 
 
-def _surface_motion_facts(
+def _describe_surface_motion(
     study: Study,
     motions: Mapping[str, SurfaceMotion | None],
     limb: LimbGeometry | None,
@@ -131,25 +135,25 @@ def _surface_motion_facts(
         yield said
 
 
-def _limb(study: Study, given: Anatomy | None) -> LimbGeometry | None:
+def _read_limb(study: Study, given: Anatomy | None) -> LimbGeometry | None:
     """The limb of given surfaces or of stages that are done; else None."""
     if given is not None:
         return LimbGeometry(given, {site.name: place_site(site, study, given, None) for site in study.sites})
     store = Store(study.results)
-    if store.stamp("sites") is None or store.state("sites", keys(study)["sites"]).state != "done":
+    if store.stamp("sites") is None or store.state("sites", compute_keys(study)["sites"]).state != "done":
         return None
     return LimbGeometry.stored(store)
 
 
-def _image_facts(study: Study) -> tuple[list[str], tuple[str, ...] | None]:
+def _describe_image(study: Study) -> tuple[list[str], tuple[str, ...] | None]:
     """Facts, and the names of the bones where a label map is given."""
-    volume = study_image(study)
-    facts = [_sampling("image", volume), *(f"warning: image: {note}" for note in volume.notes)]
-    marked = marked_image(study)
+    volume = read_study_image(study)
+    facts = [_describe_sampling("image", volume), *(f"warning: image: {note}" for note in volume.notes)]
+    marked = read_marked_image(study)
     if marked is not None:
-        facts.append(_sampling("image with markers", marked))
+        facts.append(_describe_sampling("image with markers", marked))
         facts += [f"warning: image with markers: {note}" for note in marked.notes]
-    given, bones = study_labels(study, volume), None
+    given, bones = read_study_labels(study, volume), None
     if given is not None:
         labels, notes = given
         check_labels(study, labels)
@@ -159,7 +163,7 @@ def _image_facts(study: Study) -> tuple[list[str], tuple[str, ...] | None]:
     return facts, bones
 
 
-def _clamps_fact(study: Study, clamps: ClampsTable, limb: LimbGeometry | None) -> str:
+def _describe_clamps(study: Study, clamps: ClampsTable, limb: LimbGeometry | None) -> str:
     """What ``[clamps]`` says; where the limb is known, how many of the pins hold it at each site."""
     said = (
         f"clamps: {len(clamps.angles)} pins of {clamps.force_N:g} N, {clamps.begun_s:g} s before touch-down"
@@ -170,7 +174,7 @@ def _clamps_fact(study: Study, clamps: ClampsTable, limb: LimbGeometry | None) -
     return f"{said}; {', '.join(held)} meet the skin"
 
 
-def _socket_facts(study: Study, anatomy: Anatomy | None, bones: Collection[str] | None) -> list[str]:
+def _describe_socket(study: Study, anatomy: Anatomy | None, bones: Collection[str] | None) -> list[str]:
     """What ``[socket]`` says; where the limb is known, the socket around its bare skin.
 
     Loads are checked where at least the names of the ``bones`` are known.
@@ -191,9 +195,9 @@ def _socket_facts(study: Study, anatomy: Anatomy | None, bones: Collection[str] 
             *facts,
             "the socket's shape is checked after limbfit run --until sites",
         ]
-    socket = loadable_socket(study, anatomy, anatomy.skin)
+    socket = build_loadable_socket(study, anatomy, anatomy.skin)
     named = [one.region for one in table.design.regions]
-    check_regions(study, named, "socket.design.regions", regions_of(study, anatomy))
+    check_regions(study, named, "socket.design.regions", build_regions(study, anatomy))
     depth = socket.offset(anatomy.skin)
     return [
         *facts,
@@ -203,13 +207,13 @@ def _socket_facts(study: Study, anatomy: Anatomy | None, bones: Collection[str] 
     ]
 
 
-def _sampling(name: str, volume: Volume) -> str:
+def _describe_sampling(name: str, volume: Volume) -> str:
     size = " x ".join(str(n) for n in volume.size)
     spacing = " x ".join(f"{s:.3g}" for s in volume.spacing)
     return f"{name}: {size} voxels of {spacing} mm"
 
 
-def _surface_facts(study: Study, anatomy: Anatomy) -> list[str]:
+def _describe_surfaces(study: Study, anatomy: Anatomy) -> list[str]:
     facts = [
         f"{name}: {surface.volume / 1000:.1f} cm3, {len(surface.faces)} triangles"
         for name, surface in {"skin": anatomy.skin, **anatomy.bones, **anatomy.regions}.items()

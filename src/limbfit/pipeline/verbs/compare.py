@@ -29,8 +29,8 @@ from ...febio import (
 from ...indentation import Parameters, build_first_steps
 from ...study import Study
 from ..shared.artefacts import write_curves, write_json
-from ..shared.context import Listener, quiet
-from .simulate import Indentation, feb_settings, prepare_site, run_febio_site, site_problem
+from ..shared.context import Listener, ignore_progress
+from .simulate import Indentation, build_feb_settings, build_site_problem, prepare_site, run_febio_site
 
 FREE = 1.0  # penetration over the depth: FEBio's punch sinks in as far as its penalty lets it
 
@@ -41,7 +41,7 @@ def compare_site(
     *,
     parameters: Parameters | None = None,
     febio_log: str | Path | None = None,
-    listener: Listener = quiet,
+    listener: Listener = ignore_progress,
 ) -> dict[str, Any]:
     """Solve a site by limbfit and by FEBio; JSON, CSV and a picture go to ``results/compare``.
 
@@ -65,17 +65,17 @@ def compare_site(
     found = prepare_site(study, name, parameters=parameters, listener=listener)
     folder, name = found.context.store["compare"], found.name
     folder.mkdir(parents=True, exist_ok=True)
-    problem = site_problem(found)
+    problem = build_site_problem(found)
     found.context.tell("compare", 0, 3, f"site {name}: FEBio")
     if program is not None:
         other, _ = run_febio_site(found, program, folder / f"{name}.febio")
     else:
         assert log is not None
-        other = _of_log(problem, log, Path(str(febio_log)))
+        other = _build_log_result(problem, log, Path(str(febio_log)))
     runs = {"limbfit": solve_as_simulated(found, problem, 1)}
-    runs["limbfit_matched"] = _matched(found, problem, other)
+    runs["limbfit_matched"] = _solve_matched(found, problem, other)
     found.context.tell("compare", 3, 3, f"site {name}")
-    summary = _summary(found, other, runs) | {"febio_log": None if febio_log is None else str(febio_log)}
+    summary = _summarise(found, other, runs) | {"febio_log": None if febio_log is None else str(febio_log)}
     _write(folder, name, found, other, runs, summary)
     return summary
 
@@ -86,10 +86,10 @@ def solve_as_simulated(found: Indentation, problem: Problem, part: int) -> Resul
     return solve(problem, build_first_steps(found.model, found.context.study.tissues), store="none")
 
 
-def _matched(found: Indentation, problem: Problem, other: Result) -> Result:
+def _solve_matched(found: Indentation, problem: Problem, other: Result) -> Result:
     """limbfit with FEBio's steps, its course of the stress in them and its contact penalty."""
     found.context.tell("compare", 2, 3, f"site {found.name}: limbfit with FEBio's contact and steps")
-    settings = feb_settings(found, "")
+    settings = build_feb_settings(found, "")
     end = float(problem.history.times[-1])
     times = np.minimum(other.times[1:], end)  # a table has nine digits
     if not len(times):  # FEBio got nowhere: all the way then
@@ -102,7 +102,7 @@ def _matched(found: Indentation, problem: Problem, other: Result) -> Result:
     return solve(problem, steps, store="none", on_step=weights.update_after, system=system)
 
 
-def _of_log(problem: Problem, log: FebioLog, file: Path) -> Result:
+def _build_log_result(problem: Problem, log: FebioLog, file: Path) -> Result:
     """A table from elsewhere, complete where it reaches the end of the history."""
     reached, end = float(log.times[-1]), compute_end_time(problem)
     reason = (
@@ -115,14 +115,14 @@ def _of_log(problem: Problem, log: FebioLog, file: Path) -> Result:
         raise ProblemError(error.what, file=file, remedy=error.remedy) from None
 
 
-def _common(other: Result, mine: Result) -> Array:
+def _select_common_times(other: Result, mine: Result) -> Array:
     """FEBio's own times, as far as both went."""
     return other.times[other.times <= mine.times[-1] * (1.0 + 1e-9)]
 
 
 def difference(other: Result, mine: Result) -> dict[str, float | None]:
     """limbfit less FEBio at FEBio's own times, in percent of FEBio's largest force."""
-    times = _common(other, mine)
+    times = _select_common_times(other, mine)
     peak = float(other.force[: len(times)].max(initial=0.0))
     if peak <= 0.0:
         return dict.fromkeys(("max_percent", "mean_percent", "peak_percent"))
@@ -134,7 +134,7 @@ def difference(other: Result, mine: Result) -> dict[str, float | None]:
     }
 
 
-def _summary(found: Indentation, other: Result, runs: dict[str, Result]) -> dict[str, Any]:
+def _summarise(found: Indentation, other: Result, runs: dict[str, Result]) -> dict[str, Any]:
     return {
         "site": found.name,
         "parameters": found.parameters,
@@ -173,7 +173,7 @@ def _write(
     runs: dict[str, Result],
     summary: dict[str, Any],
 ) -> None:
-    times = _common(other, min(runs.values(), key=lambda run: run.times[-1]))
+    times = _select_common_times(other, min(runs.values(), key=lambda run: run.times[-1]))
     curves = {key: run.force_at(times) for key, run in runs.items()}
     write_curves(
         folder / f"{name}.csv",

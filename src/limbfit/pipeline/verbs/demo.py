@@ -12,8 +12,8 @@ from ...phantom.build import make_phantom
 from ...phantom.forces import simulate_true_force
 from ...study import load_study
 from ..shared.artefacts import read_json
-from ..shared.context import Listener, Progress, quiet
-from ..shared.kernels import kernels_compiling
+from ..shared.context import Listener, Progress, ignore_progress
+from ..shared.kernels import compile_in_background
 from .run import run_study
 
 
@@ -29,11 +29,11 @@ def make_phantom_study(
     shear_waves: bool = False,
     tendon: bool = False,
     limb: str = "transtibial",
-    listener: Listener = quiet,
+    listener: Listener = ignore_progress,
     workers: int = 0,
 ) -> dict[str, Any]:
     """Make a synthetic patient in ``folder``; returns its truth (see ``make_phantom``)."""
-    with kernels_compiling() as compiled, make_executor(workers) as executor:
+    with compile_in_background() as compiled, make_executor(workers) as executor:
 
         def mapping(function: Callable, jobs: Iterable) -> Iterable:
             if function is simulate_true_force:
@@ -56,7 +56,7 @@ def make_phantom_study(
         )
 
 
-def run_demo(folder: str | Path, *, seed: int = 0, listener: Listener = quiet) -> dict[str, Any]:
+def run_demo(folder: str | Path, *, seed: int = 0, listener: Listener = ignore_progress) -> dict[str, Any]:
     """A coarse synthetic patient identified from its DICOM images and records; goes on where it was stopped.
 
     Returns

@@ -25,7 +25,7 @@ from ...fe.solution.linear import SOLVERS, build_linear_solver, prefers_multigri
 from ...febio.program import find_febio
 from ...laws import KPA
 from ..experiments.cube import RAMP_S, compress
-from ..shared.provenance import machine, versions
+from ..shared.provenance import collect_versions, describe_machine
 
 NEEDED_GB = 4.0  # of memory, for one site at the paper's size
 FREE_GB = 2.0  # of disk, for the results of a study
@@ -54,18 +54,18 @@ def diagnose(folder: Path = Path(".")) -> dict[str, Any]:
         ``healthy`` (nothing failed) and ``checks``, each with ``check``, ``state`` (``ok``, ``warning``,
         ``failed``), ``found`` and ``remedy``.
     """
-    checks = [finding for look in (*_LOOKS, _self_test) for finding in look()]
-    checks += list(_writing(folder))
+    checks = [finding for look in (*_LOOKS, _check_self_test) for finding in look()]
+    checks += list(_check_writing(folder))
     return {
         "healthy": all(one.state != "failed" for one in checks),
-        "versions": {"limbfit": __version__, **versions()},
-        "machine": machine(),
+        "versions": {"limbfit": __version__, **collect_versions()},
+        "machine": describe_machine(),
         "checks": [asdict(one) for one in checks],
     }
 
 
-def _python() -> Iterator[Finding]:
-    yield Finding("limbfit", "ok", f"{__version__}, Python {machine()['python']}")
+def _check_python() -> Iterator[Finding]:
+    yield Finding("limbfit", "ok", f"{__version__}, Python {describe_machine()['python']}")
     missing = []
     for line in metadata.requires("limbfit") or []:
         if "extra ==" in line or ";" in line:
@@ -81,14 +81,14 @@ def _python() -> Iterator[Finding]:
         yield Finding("libraries", "ok", "all there")
 
 
-def _cores() -> Iterator[Finding]:
+def _check_cores() -> Iterator[Finding]:
     usable, there = count_usable_cores(), os.cpu_count() or 1
     set_here = [f"{name}={os.environ[name]}" for name in THREAD_VARIABLES if name in os.environ]
     yield Finding("cores", "ok", f"{usable} of {there} may be used: {usable} workers of one thread each")
     yield Finding("threads", "ok", ", ".join(set_here) or "not set here; workers get one each")
 
 
-def _memory() -> Iterator[Finding]:
+def _check_memory() -> Iterator[Finding]:
     free, workers = psutil.virtual_memory().available / 1e9, count_usable_cores()
     enough = free >= NEEDED_GB
     yield Finding(
@@ -101,7 +101,7 @@ def _memory() -> Iterator[Finding]:
     )
 
 
-def _solvers() -> Iterator[Finding]:
+def _check_solvers() -> Iterator[Finding]:
     one = np.array([0, 1], dtype=np.int32), np.array([0], dtype=np.int32)
     working = []
     for name in SOLVERS:
@@ -124,7 +124,7 @@ def _solvers() -> Iterator[Finding]:
     )
 
 
-def _meshers() -> Iterator[Finding]:
+def _check_meshers() -> Iterator[Finding]:
     """In a process of their own: some crash the interpreter."""
     for name, module, required in (("MMG", "mmgpy", True), ("Netgen", "netgen.meshing", False)):
         try:
@@ -142,7 +142,7 @@ def _meshers() -> Iterator[Finding]:
         yield Finding(f"mesher {name}", "ok" if works or not required else "failed", found, remedy)
 
 
-def _programs() -> Iterator[Finding]:
+def _check_programs() -> Iterator[Finding]:
     try:
         yield Finding("FEBio", "ok", find_febio().name)
     except InputError as error:
@@ -160,7 +160,7 @@ def _programs() -> Iterator[Finding]:
             yield Finding(module, "ok", "not installed (optional)", remedy)
 
 
-def _writing(folder: Path) -> Iterator[Finding]:
+def _check_writing(folder: Path) -> Iterator[Finding]:
     try:
         with tempfile.NamedTemporaryFile(dir=folder, prefix=".limbfit-doctor-") as stream:
             stream.write(b"x" * 4096)
@@ -175,12 +175,12 @@ def _writing(folder: Path) -> Iterator[Finding]:
     yield Finding("write access", state, f"{folder}: {free:.1f} GB free", remedy)
 
 
-def _self_test() -> Iterator[Finding]:
+def _check_self_test() -> Iterator[Finding]:
     """A slightly compressed cube in a worker process, against Young's modulus."""
     start = perf_counter()
     try:
         with ProcessExecutor(1) as executor:
-            found, wanted = next(executor.map(squeeze_cube, [1e-4]))
+            found, wanted = next(executor.map(compress_test_cube, [1e-4]))
     except (LimbfitError, ArithmeticError, ImportError, OSError, ValueError) as error:
         yield Finding("self-test", "failed", f"{type(error).__name__}: {error}", _SELF_TEST_REMEDY)
         return
@@ -196,7 +196,7 @@ def judge_self_test(found: float, wanted: float, seconds: float) -> Finding:
     return Finding("self-test", "failed", text, _SELF_TEST_REMEDY)
 
 
-def squeeze_cube(strain: float) -> tuple[float, float]:
+def compress_test_cube(strain: float) -> tuple[float, float]:
     """Stress of a cube in slight uniaxial compression, and what linear elasticity says, kPa."""
     c, ratio = 5.0, 100.0
     material = OgdenQLV(c=c * KPA, m=4.0, gamma=0.0, tau=1.0, kappa_ratio=ratio)
@@ -205,10 +205,10 @@ def squeeze_cube(strain: float) -> tuple[float, float]:
 
 
 _LOOKS: tuple[Callable[[], Iterator[Finding]], ...] = (
-    _python,
-    _cores,
-    _memory,
-    _solvers,
-    _meshers,
-    _programs,
+    _check_python,
+    _check_cores,
+    _check_memory,
+    _check_solvers,
+    _check_meshers,
+    _check_programs,
 )

@@ -28,10 +28,10 @@ from ...indentation import Parameters, SiteModel, build_problem
 from ...mesh import Mesh, write_vtu
 from ...study import Indentation as Planned
 from ...study import Record, Study
-from ..shared.context import Context, Listener, quiet
+from ..shared.context import Context, Listener, ignore_progress
 from ..shared.store import Store
-from ..stages.records import site_record
-from .simulate import Indentation, feb_settings, known_parameters, prepare_site, site_problem
+from ..stages.records import load_site_record
+from .simulate import Indentation, build_feb_settings, build_site_problem, choose_parameters, prepare_site
 
 FITTED = "febio-optimize"
 FORMATS = ("feb", FITTED, "inp", "calculix")
@@ -46,7 +46,7 @@ def export_study(
     site: str | None = None,
     output: str | Path | None = None,
     parameters: Parameters | None = None,
-    listener: Listener = quiet,
+    listener: Listener = ignore_progress,
 ) -> dict[str, Any]:
     """Write one indentation, or all of them, for another solver; meshes are made where missing.
 
@@ -70,8 +70,8 @@ def export_study(
     for one in chosen:
         found = prepare_site(study, one.name, parameters=parameters, listener=listener)
         folder.mkdir(parents=True, exist_ok=True)
-        curve = _curve(found) if to == FITTED else _NO_CURVE
-        files, notes = _write(found, site_problem(found), to, folder, curve)
+        curve = _build_curve(found) if to == FITTED else _NO_CURVE
+        files, notes = _write(found, build_site_problem(found), to, folder, curve)
         rows.append(
             {
                 "site": one.name,
@@ -96,16 +96,16 @@ def check_export(
     """
     if to not in FORMATS:
         raise InputError(f"{to!r} is no format", place="--to", remedy=f"give one of {', '.join(FORMATS)}")
-    chosen, store = _chosen(study, to, site), Store(study.results)
-    used, origin = (parameters, "given") if parameters else known_parameters(study, store)
-    context = Context(study, store, SerialExecutor(), quiet)
+    chosen, store = _select_chosen(study, to, site), Store(study.results)
+    used, origin = (parameters, "given") if parameters else choose_parameters(study, store)
+    context = Context(study, store, SerialExecutor(), ignore_progress)
     kinds = {(one.indenter, _is_forced(one)): one for one in chosen}
     with TemporaryDirectory() as folder:
         file = Path(folder) / "block.vtu"
-        block = _block(study)
+        block = _build_block(study)
         write_vtu(block, file)
         for one in kinds.values():
-            model = _block_model(study, one, file)
+            model = _build_block_model(study, one, file)
             problem = build_problem(model, block, used)
             if study.clamps is not None:
                 later = problem.history.later(study.clamps.begun_s)
@@ -119,7 +119,7 @@ def _is_forced(one: Planned) -> bool:
     return isinstance(one, Record) and one.forced
 
 
-def _block(study: Study) -> Mesh:
+def _build_block(study: Study) -> Mesh:
     """A block in layers of the study's tissues, under a skin, held below."""
     mesh = build_layered_block(ELEMENTS[study.mesh.element].cell_type, _DIVISIONS)
     middles = mesh.points[mesh.corners].mean(axis=1)[:, 2]
@@ -129,7 +129,7 @@ def _block(study: Study) -> Mesh:
     return replace(mesh, regions=ranks * count // len(ranks), region_names=study.tissues, node_sets=held)
 
 
-def _block_model(study: Study, one: Planned, file: Path) -> SiteModel:
+def _build_block_model(study: Study, one: Planned, file: Path) -> SiteModel:
     """An indentation in the middle of that block's top, without pins."""
     model = build_block_model(one.name, file, study.solver, study.mesh.element)
     along = (0.0, 0.0, 1.0)
@@ -146,15 +146,15 @@ def _block_model(study: Study, one: Planned, file: Path) -> SiteModel:
     )
 
 
-def _curve(found: Indentation) -> tuple[Array, Array]:
+def _build_curve(found: Indentation) -> tuple[Array, Array]:
     """Times, s, from touch-down and forces, N, of an indentation's record."""
     assert isinstance(found.stated, Record)
-    record = site_record(found.context, found.stated)
+    record = load_site_record(found.context, found.stated)
     inside = (record.times_s >= 0.0) & (record.times_s <= found.model.knots_s[-1])
     return record.times_s[inside], record.force_N[inside]
 
 
-def _chosen(study: Study, to: str, site: str | None) -> Sequence[Planned]:
+def _select_chosen(study: Study, to: str, site: str | None) -> Sequence[Planned]:
     if site is not None:
         one = study.indentation(site)
         if to == FITTED and not isinstance(one, Record):
@@ -172,7 +172,7 @@ def _write(
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """The files of a site, and what the other solver does otherwise; ``curve``: what its fit compares."""
     name = found.name
-    settings = feb_settings(found, f"{name}-forces.txt")
+    settings = build_feb_settings(found, f"{name}-forces.txt")
     if to == "feb":
         write_feb(problem, folder / f"{name}.feb", settings)
         return (folder / f"{name}.feb",), describe_differences(problem, settings)
@@ -185,7 +185,7 @@ def _write(
         settings = replace(settings, penalty=None)
         turned = turn_to_indenter_frame(problem)
         write_feb(turned, model, settings)
-        ranges = _ranges(found, problem.mesh.region_names)
+        ranges = _build_ranges(found, problem.mesh.region_names)
         iterations = found.context.study.calibration.max_iterations
         write_optimisation(control, ranges, *curve, iterations=iterations)
         return (control, model), describe_differences(turned, settings)
@@ -194,7 +194,7 @@ def _write(
     return (folder / f"{name}.inp",), ()
 
 
-def _ranges(found: Indentation, tissues: Sequence[str]) -> dict[str, ParameterRange]:
+def _build_ranges(found: Indentation, tissues: Sequence[str]) -> dict[str, ParameterRange]:
     """Start and bounds of the tissues, in the solver's units."""
     study = found.context.study
     ranges = {}

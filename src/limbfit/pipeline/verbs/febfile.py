@@ -8,11 +8,15 @@ from typing import Any
 from ...fe import Step
 from ...febio import run_feb
 from ...fields import write_fields
-from ..shared.context import Listener, Progress, quiet
+from ..shared.context import Listener, Progress, ignore_progress
 
 
 def simulate_feb(
-    file: str | Path, output: str | Path | None = None, *, threads: int = 1, listener: Listener = quiet
+    file: str | Path,
+    output: str | Path | None = None,
+    *,
+    threads: int = 1,
+    listener: Listener = ignore_progress,
 ) -> dict[str, Any]:
     """Solve a FEBio 3 or 4 input; the tables that it asks for go to ``output``, by default beside it.
 

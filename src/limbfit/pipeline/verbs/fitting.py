@@ -9,10 +9,10 @@ from ...errors import InputError
 from ...indentation import Parameters
 from ...priors import of_tissues
 from ...study import Study
-from ..shared.context import Listener, quiet
+from ..shared.context import Listener, ignore_progress
 from ..shared.store import Store
 from .run import run_experiment
-from .simulate import IDENTIFIED, known_parameters
+from .simulate import IDENTIFIED, choose_parameters
 
 LITERATURE = "literature"
 SIMULATIONS = 6
@@ -24,7 +24,7 @@ def fit_socket(
     parameters: Parameters | None = None,
     literature: bool = False,
     samples: int = 0,
-    listener: Listener = quiet,
+    listener: Listener = ignore_progress,
 ) -> dict[str, Any]:
     """Put the study's socket on its limb and load it.
 
@@ -50,7 +50,7 @@ def fit_socket(
     RunError
         Where the simulation does not come to its end.
     """
-    used, origin = (parameters, "given") if parameters else known_tissues(study, literature)
+    used, origin = (parameters, "given") if parameters else choose_tissues(study, literature)
     known: dict[str, Any] = {}
     if origin == IDENTIFIED:
         calibration = Store(study.results).read("calibrate", "calibration.json")
@@ -76,7 +76,7 @@ def design_socket(
     simulations: int = SIMULATIONS,
     parameters: Parameters | None = None,
     literature: bool = False,
-    listener: Listener = quiet,
+    listener: Listener = ignore_progress,
 ) -> dict[str, Any]:
     """Design a socket from the study's target pressure, and compare it with a uniformly reduced one.
 
@@ -106,7 +106,7 @@ def design_socket(
     doubled = sorted({name for name in optimise if list(optimise).count(name) > 1})
     if doubled:
         raise InputError(f"region {doubled[0]!r} is named twice", remedy="name it once")
-    used, origin = (parameters, "given") if parameters else known_tissues(study, literature)
+    used, origin = (parameters, "given") if parameters else choose_tissues(study, literature)
     return run_experiment(
         study,
         "socket_design",
@@ -118,11 +118,11 @@ def design_socket(
     )
 
 
-def known_tissues(study: Study, literature: bool = False) -> tuple[Parameters, str]:
+def choose_tissues(study: Study, literature: bool = False) -> tuple[Parameters, str]:
     """Parameters of a study's tissues, and where they are from: identified, or ``literature``: of people."""
     store = Store(study.results)
     if not literature and store.stamp("calibrate") is not None:
-        return known_parameters(study, store)
+        return choose_parameters(study, store)
     values = {tissue: study.material.of(tissue, "start") for tissue in study.tissues}
     try:
         medians = of_tissues(study.tissues, study.calibration.prior_tissues)

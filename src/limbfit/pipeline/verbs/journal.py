@@ -19,7 +19,7 @@ from typing import Any, TextIO
 from ..._version import __version__
 from ...study import Study
 from ..shared.context import Listener, Progress
-from ..shared.store import disk_errors
+from ..shared.store import translate_disk_errors
 
 FOLDER = "log"
 KEPT = 50  # logs of a study; older ones go
@@ -27,10 +27,10 @@ _PATH = re.compile(r"(?<![\w.<])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:;,'\"]+[/\\])+[^\s
 
 
 @contextmanager
-def journal(study: Study, what: str, listener: Listener) -> Iterator[Listener]:
+def write_journal(study: Study, what: str, listener: Listener) -> Iterator[Listener]:
     """A listener that also writes the log; the way the block ends is its last line."""
     folder, start = study.results / FOLDER, perf_counter()
-    with disk_errors(study.results):
+    with translate_disk_errors(study.results):
         folder.mkdir(parents=True, exist_ok=True)
         for old in sorted(folder.glob("*.jsonl"))[: -KEPT + 1]:
             old.unlink()
@@ -40,12 +40,12 @@ def journal(study: Study, what: str, listener: Listener) -> Iterator[Listener]:
     def write(event: str, **more: Any) -> None:
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
         row = {"time": now, "seconds": round(perf_counter() - start, 3), "event": event, **more}
-        with disk_errors(study.results):
+        with translate_disk_errors(study.results):
             stream.write(json.dumps(row) + "\n")
             stream.flush()
 
     def listen(event: Progress) -> None:
-        text = discreet(event.text, study)
+        text = redact_paths(event.text, study)
         write(
             "fit" if event.fit else "progress",
             stage=event.stage,
@@ -56,20 +56,20 @@ def journal(study: Study, what: str, listener: Listener) -> Iterator[Listener]:
         )
         listener(event)
 
-    with _closed(stream):
+    with _close_at_end(stream):
         write("begin", what=what, limbfit=__version__, process=os.getpid())
         try:
             yield listen
         except BaseException as error:
             with suppress(Exception):  # the error itself matters more, such as that the disk is full
                 kind = "interrupted" if isinstance(error, KeyboardInterrupt | GeneratorExit) else "failed"
-                write(kind, error=type(error).__name__, text=discreet(str(error), study))
+                write(kind, error=type(error).__name__, text=redact_paths(str(error), study))
             raise
         write("end")
 
 
 @contextmanager
-def _closed(stream: TextIO) -> Iterator[None]:
+def _close_at_end(stream: TextIO) -> Iterator[None]:
     """The stream is closed at the end, where a full disk would be told of once more."""
     try:
         yield
@@ -78,7 +78,7 @@ def _closed(stream: TextIO) -> Iterator[None]:
             stream.close()
 
 
-def discreet(text: str, study: Study) -> str:
+def redact_paths(text: str, study: Study) -> str:
     """A text without the names of input files, and without paths outside the study."""
     for key, path in sorted(study.inputs.items(), key=lambda item: -len(str(item[1]))):
         for name in (str(study.path(path)), str(path)):

@@ -13,11 +13,11 @@ from ...indentation import Parameters
 from ...study import Study
 from ..experiments.socket import NAME as SOCKET
 from ..experiments.socket_intervals import CHANGE_PERCENT
-from ..shared.context import Listener, quiet
+from ..shared.context import Listener, ignore_progress
 from ..shared.planned import SEEN
 from ..shared.store import Store
 from .run import run_experiment, study_status
-from .simulate import IDENTIFIED, known_parameters
+from .simulate import IDENTIFIED, choose_parameters
 
 _SENSOR_N, _MISFIT = 0.05, 0.02  # where no calibration tells: noise, and the model's error over the peak
 _FASTER = 5.0  # the second speed that a protocol may have, over the first
@@ -30,7 +30,7 @@ def design_study(
     sites: int = 0,
     depths_mm: Sequence[float] = (),
     parameters: Parameters | None = None,
-    listener: Listener = quiet,
+    listener: Listener = ignore_progress,
 ) -> dict[str, Any]:
     """The best choice of sites and depths at known parameters, beside the study's own choice.
 
@@ -50,7 +50,7 @@ def design_study(
     InputError
         For more sites than there are, or identified parameters that are stale.
     """
-    used, origin = (parameters, "given") if parameters else known_parameters(study, Store(study.results))
+    used, origin = (parameters, "given") if parameters else choose_parameters(study, Store(study.results))
     return run_experiment(
         study,
         "design",
@@ -59,7 +59,7 @@ def design_study(
         depths_mm=[float(depth) for depth in depths_mm],
         parameters=used,
         parameters_from=origin,
-        noise=_noise_of(study, origin),
+        noise=_find_noise(study, origin),
     )
 
 
@@ -80,7 +80,7 @@ def plan_protocol(
     surface_sd_mm: float | None = None,
     shear_waves_sd_m_s: float | None = None,
     parameters: Parameters | None = None,
-    listener: Listener = quiet,
+    listener: Listener = ignore_progress,
 ) -> dict[str, Any]:
     """The records that determine the parameters best in a patient's time, at several draws of the tissues.
 
@@ -115,7 +115,7 @@ def plan_protocol(
         For unknown parameters, a time too short for any record, identified parameters that are stale, or
         pressures that are not stored with their derivatives.
     """
-    pressures = _socket_pressures(study) if SOCKET in determine else {}
+    pressures = _read_socket_pressures(study) if SOCKET in determine else {}
     if pressures and (len(determine) > 1 or criterion == "D"):
         what = "with other parameters" if len(determine) > 1 else 'by the criterion "D"'
         raise InputError(
@@ -123,7 +123,7 @@ def plan_protocol(
             place="--determine",
             remedy="state socket alone, and A or no criterion",
         )
-    used, origin = (parameters, "given") if parameters else known_parameters(study, Store(study.results))
+    used, origin = (parameters, "given") if parameters else choose_parameters(study, Store(study.results))
     slow = study.acquire.ramp_speed_mm_s
     return run_experiment(
         study,
@@ -143,12 +143,12 @@ def plan_protocol(
         seed=seed,
         parameters=used,
         parameters_from=origin,
-        noise=_noise_of(study, origin),
+        noise=_find_noise(study, origin),
         seen=dict(zip(SEEN, (ultrasound_sd_mm, surface_sd_mm, shear_waves_sd_m_s), strict=True)),
     )
 
 
-def _socket_pressures(study: Study) -> dict[str, list[float]]:
+def _read_socket_pressures(study: Study) -> dict[str, list[float]]:
     """Derivatives (p,) of the logarithm of every mean pressure by those of the parameters.
 
     Raises
@@ -173,7 +173,7 @@ def _socket_pressures(study: Study) -> dict[str, list[float]]:
     return found
 
 
-def _noise_of(study: Study, origin: str) -> dict[str, float]:
+def _find_noise(study: Study, origin: str) -> dict[str, float]:
     """Sensor noise and the model's own error, from the calibration's residuals where there is one."""
     if origin != IDENTIFIED:
         return {"sensor_N": _SENSOR_N, "misfit": _MISFIT, "correlation": _CORRELATION}

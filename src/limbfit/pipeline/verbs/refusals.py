@@ -11,16 +11,16 @@ from ...study import Study
 from ..experiments.catalogue import EXPERIMENTS, check_experiment
 from ..shared.limb import LimbGeometry
 from ..stages.calibrate import check_fitted
-from .acquire import device_settings
+from .acquire import build_device_settings
 from .export import FORMATS, check_export
 
 _COMMANDS = {"protocol": "design --protocol", "socket_design": "socket design"}
 
 
-def refused_commands(study: Study, limb: LimbGeometry | None) -> list[dict[str, Any]]:
+def list_refused_commands(study: Study, limb: LimbGeometry | None) -> list[dict[str, Any]]:
     """``commands`` that would be refused, and ``why``; ``limb``: None where it is not known yet."""
     found: dict[str, list[str]] = {}
-    for command, check in _checks(study, limb):
+    for command, check in _iterate_checks(study, limb):
         try:
             check()
         except InputError as error:
@@ -29,7 +29,7 @@ def refused_commands(study: Study, limb: LimbGeometry | None) -> list[dict[str, 
     return [{"commands": commands, "why": why} for why, commands in found.items()]
 
 
-def _checks(study: Study, limb: LimbGeometry | None) -> Iterator[tuple[str, Callable[[], Any]]]:
+def _iterate_checks(study: Study, limb: LimbGeometry | None) -> Iterator[tuple[str, Callable[[], Any]]]:
     yield "run", partial(check_fitted, study)
     for experiment in EXPERIMENTS:
         name = experiment.name
@@ -38,4 +38,4 @@ def _checks(study: Study, limb: LimbGeometry | None) -> Iterator[tuple[str, Call
     for to in FORMATS:
         yield f"export --to {to}", partial(check_export, study, to)
     for one in study.indentations:
-        yield f"acquire --site {one.name}", partial(device_settings, study, one, None, False)
+        yield f"acquire --site {one.name}", partial(build_device_settings, study, one, None, False)

@@ -14,9 +14,9 @@ from ..._version import __version__
 from ...errors import InputError
 from ...study import Study, load_study
 from ..shared.artefacts import read_curves, read_json
-from ..shared.context import Listener, quiet
-from ..shared.hand_labels import hand_labels
-from ..shared.provenance import input_digests, settings_record, versions
+from ..shared.context import Listener, ignore_progress
+from ..shared.hand_labels import find_hand_labels
+from ..shared.provenance import collect_versions, compute_input_digests, record_settings
 from ..shared.store import Store
 from .run import run_study
 
@@ -25,7 +25,11 @@ RECORD = "run.json"
 
 
 def reproduce_study(
-    record: str | Path, folder: str | Path, *, tolerance: float = TOLERANCE, listener: Listener = quiet
+    record: str | Path,
+    folder: str | Path,
+    *,
+    tolerance: float = TOLERANCE,
+    listener: Listener = ignore_progress,
 ) -> dict[str, Any]:
     """Copy the inputs of a study to a new folder, run it there, and compare.
 
@@ -55,14 +59,14 @@ def reproduce_study(
     _copy_inputs(study, folder)
     summary = run_study(load_study(folder), listener=listener)
     then = Store(study.results).read("calibrate", "calibration.json")["stages"][-1]["parameters"]
-    parameters = dict(_relative(then, summary["parameters"]))
-    forces = dict(_forces(study.results / "predict", folder / "results" / "predict"))
+    parameters = dict(_compute_relative(then, summary["parameters"]))
+    forces = dict(_compare_forces(study.results / "predict", folder / "results" / "predict"))
     return {
         "same": bool(max([*parameters.values(), *forces.values()]) <= tolerance),
         "tolerance": tolerance,
         "parameters": parameters,
         "forces": forces,
-        "versions": _version_changes(known),
+        "versions": _list_version_changes(known),
         "folder": str(folder),
     }
 
@@ -85,10 +89,10 @@ def _read(file: Path) -> dict[str, Any]:
 
 def _check_unchanged(study: Study, known: Mapping[str, Any], file: Path) -> None:
     """The inputs and settings must be those that the record tells of: else nothing is to be compared."""
-    found = input_digests(study)
+    found = compute_input_digests(study)
     changed = [key for key in {**known["inputs"], **found} if known["inputs"].get(key) != found.get(key)]
     if not changed:
-        now = json.loads(json.dumps(settings_record(study, found), default=str))
+        now = json.loads(json.dumps(record_settings(study, found), default=str))
         changed = [
             table
             for table in {**known["settings"], **now}
@@ -110,7 +114,7 @@ def _copy_inputs(study: Study, folder: Path) -> None:
     if study.file is None:
         raise InputError("the study has no file")
     root = study.folder.resolve()
-    edited = hand_labels(study)
+    edited = find_hand_labels(study)
     for path in {*study.inputs.values(), Path(study.file.name), *([edited] if edited else [])}:
         source = study.path(path)
         if path.is_absolute():
@@ -128,29 +132,29 @@ def _copy_inputs(study: Study, folder: Path) -> None:
                 shutil.copyfile(one, target.with_name(target.name + one.name[len(source.name) :]))
 
 
-def _relative(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+def _compute_relative(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
     for tissue, values in then.items():
         for name, value in values.items():
             yield f"{tissue}.{name}", abs(now[tissue][name] - value) / max(abs(value), 1e-300)
 
 
-def _simulated(curves: Mapping[str, np.ndarray]) -> np.ndarray | None:
+def _select_simulated(curves: Mapping[str, np.ndarray]) -> np.ndarray | None:
     """What is compared of a prediction, simulated: force, or displacement under a stated force."""
     return curves.get("force_simulated_N", curves.get("displacement_simulated_mm"))
 
 
-def _forces(then: Path, now: Path) -> Iterator[tuple[str, float]]:
+def _compare_forces(then: Path, now: Path) -> Iterator[tuple[str, float]]:
     for file in sorted(then.glob("*.csv")):
-        a, b = (_simulated(read_curves(folder / file.name)) for folder in (then, now))
+        a, b = (_select_simulated(read_curves(folder / file.name)) for folder in (then, now))
         if a is not None and b is not None:
             yield file.stem, float(np.abs(a - b).max() / max(np.abs(a).max(), 1e-300))
         elif a is not b:  # one of them could not be predicted: all of the force is missing
             yield file.stem, 1.0
 
 
-def _version_changes(known: Mapping[str, Any]) -> dict[str, list[str | None]]:
+def _list_version_changes(known: Mapping[str, Any]) -> dict[str, list[str | None]]:
     then = {"limbfit": known.get("limbfit"), **known["versions"]}
-    now: dict[str, str] = {"limbfit": __version__, **versions()}
+    now: dict[str, str] = {"limbfit": __version__, **collect_versions()}
     return {
         name: [then.get(name), now.get(name)] for name in {**then, **now} if then.get(name) != now.get(name)
     }

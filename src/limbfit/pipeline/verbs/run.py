@@ -11,19 +11,19 @@ from ...study import Study
 from ..experiments.catalogue import (
     EXPERIMENTS,
     check_experiment,
+    compute_experiment_key,
     do_experiment,
-    experiment_key,
-    experiment_rows,
-    options_of,
+    list_experiment_rows,
+    merge_options,
 )
 from ..shared.artefacts import write_json
-from ..shared.causes import causes, parts_of
-from ..shared.context import Context, Listener, executor_of, quiet
+from ..shared.causes import collect_parts, describe_causes
+from ..shared.context import Context, Listener, build_executor, ignore_progress
 from ..shared.hand_labels import keep_hand_labels
-from ..shared.kernels import kernels_compiling
+from ..shared.kernels import compile_in_background
 from ..shared.keys import Keys, Stage
 from ..shared.limb import LimbGeometry
-from ..shared.provenance import input_digests, machine, settings_record, versions
+from ..shared.provenance import collect_versions, compute_input_digests, describe_machine, record_settings
 from ..shared.store import Store, lock
 from ..shared.surface_points import read_motion
 from ..stages.calibrate import check_fitted, run_calibrate
@@ -35,7 +35,7 @@ from ..stages.report import run_report
 from ..stages.segment import run_segment
 from ..stages.sites import run_sites
 from ..stages.surfaces import run_surfaces
-from .journal import journal
+from .journal import write_journal
 
 _PLACE = ("name", "position", "near", "axis", "region", "fitted", "indenter")
 _WAVES = ("shear_waves", "shear_waves_sd_m_s", "shear_waves_bias_m_s")
@@ -81,30 +81,30 @@ _FOLDERS = frozenset(("compare", "export", "simulate", *(stage.name for stage in
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 
 
-def stages_of(study: Study) -> tuple[Stage, ...]:
+def list_stages(study: Study) -> tuple[Stage, ...]:
     """The stages that a study has: without an image there is nothing to segment."""
     return tuple(stage for stage in STAGES if stage.name != "segment" or study.image is not None)
 
 
-def keys(study: Study) -> dict[str, str]:
+def compute_keys(study: Study) -> dict[str, str]:
     """The key of every stage: a digest of its settings, input files, code and of the stages it stands on.
 
     The calibration's is the one that it has in the study of its fitted sites alone: whatever is held out can
     change, come and go without it. The report's covers the experiments that it shows.
     """
-    return _chain(Keys(study))
+    return _chain_keys(Keys(study))
 
 
-def _chain(known: Keys) -> dict[str, str]:
+def _chain_keys(known: Keys) -> dict[str, str]:
     study = known.study
-    stages = stages_of(study)
-    calibrate = known.of(stages, study=_seen_by_calibration(study))["calibrate"]
+    stages = list_stages(study)
+    calibrate = known.of(stages, study=_select_calibration_inputs(study))["calibrate"]
     found = known.of(stages[:-1], {"calibrate": calibrate})
-    shown = [row["key"] for row in experiment_rows(study, known, found) if row["state"] == "done"]
+    shown = [row["key"] for row in list_experiment_rows(study, known, found) if row["state"] == "done"]
     return found | known.of(stages[-1:], found, options={"report": {"experiments": shown} if shown else {}})
 
 
-def _seen_by_calibration(study: Study) -> Study:
+def _select_calibration_inputs(study: Study) -> Study:
     """The study's fitted sites; with markers the others' places too, since each marker goes to one site."""
     sites = [site.model_copy(update={"region": ""}) for site in study.fitted]
     if any(site.near is not None for site in sites):
@@ -122,8 +122,8 @@ def study_status(study: Study) -> list[dict[str, Any]]:
     or done.
     """
     store, known = Store(study.results), Keys(study)
-    wanted, rows = _chain(known), []
-    for stage in stages_of(study):
+    wanted, rows = _chain_keys(known), []
+    for stage in list_stages(study):
         state = store.state(stage.name, wanted[stage.name])
         rows.append(
             {
@@ -131,26 +131,30 @@ def study_status(study: Study) -> list[dict[str, Any]]:
                 "state": state.state,
                 "seconds": state.seconds,
                 "finished": state.finished,
-                "why": _why(known, stage, wanted) if state.state == "stale" else [],
+                "why": _describe_why(known, stage, wanted) if state.state == "stale" else [],
             }
         )
     columns = ("state", "seconds", "finished")
-    for row in experiment_rows(study, known, wanted):
+    for row in list_experiment_rows(study, known, wanted):
         if row["state"] != "missing":
-            why = _why(known, EXPERIMENTS[row["experiment"]], wanted) if row["state"] == "stale" else []
+            why = (
+                _describe_why(known, EXPERIMENTS[row["experiment"]], wanted)
+                if row["state"] == "stale"
+                else []
+            )
             rows.append({"stage": row["experiment"], **{key: row[key] for key in columns}, "why": why})
     return rows
 
 
-def _parts(known: Keys, stage: Stage, chain: Mapping[str, str]) -> dict[str, dict[str, str]]:
+def _collect_parts(known: Keys, stage: Stage, chain: Mapping[str, str]) -> dict[str, dict[str, str]]:
     """What the key of a stage is made of, for a later status to say what changed."""
-    seen = _seen_by_calibration(known.study) if stage.name == "calibrate" else known.study
-    return parts_of(stage, known, seen, chain)
+    seen = _select_calibration_inputs(known.study) if stage.name == "calibrate" else known.study
+    return collect_parts(stage, known, seen, chain)
 
 
-def _why(known: Keys, stage: Stage, chain: Mapping[str, str]) -> list[str]:
+def _describe_why(known: Keys, stage: Stage, chain: Mapping[str, str]) -> list[str]:
     stamp = Store(known.study.results).stamp(stage.name) or {}
-    return causes(stamp.get("parts"), _parts(known, stage, chain))
+    return describe_causes(stamp.get("parts"), _collect_parts(known, stage, chain))
 
 
 def run_study(
@@ -159,7 +163,7 @@ def run_study(
     until: str | None = None,
     start: str | None = None,
     force: Sequence[str] = (),
-    listener: Listener = quiet,
+    listener: Listener = ignore_progress,
 ) -> dict[str, Any]:
     """Do every stage that is not done, in order; return the summary of the study.
 
@@ -190,25 +194,25 @@ def _run_stages(
     check: Callable[[LimbGeometry], None] | None = None,
 ) -> dict[str, Any]:
     """See `run_study`; ``check`` is given the limb before anything is meshed."""
-    anew = _anew(study, until, start, force)
+    anew = _select_stages_to_redo(study, until, start, force)
     store = Store(study.results)
     with (
         lock(study.results),
-        journal(study, "run", listener) as listener,
-        executor_of(study) as executor,
+        write_journal(study, "run", listener) as listener,
+        build_executor(study) as executor,
     ):
         context = Context(study, store, executor, listener)
         kept = keep_hand_labels(study)
         if kept is not None:
             context.tell("segment", 0, 1, f"label map corrected by hand: kept as {kept}")
         known = Keys(study)
-        chain = _chain(known)
+        chain = _chain_keys(known)
         wanted = list(chain) if until is None else list(chain)[: list(chain).index(until) + 1]
         missing = {name for name in wanted if name in anew or store.state(name, chain[name]).state != "done"}
         if "calibrate" in missing:
             check_fitted(study)
         wanted.sort(key=lambda name: name != "traces")  # records need no limb: what is wrong is said at once
-        with kernels_compiling("calibrate" in missing) as compiled:
+        with compile_in_background("calibrate" in missing) as compiled:
             for name in wanted:
                 if name == "mesh":
                     _check_limb(context, check, name in missing)
@@ -241,9 +245,11 @@ def _check_limb(context: Context, check: Callable[[LimbGeometry], None] | None, 
         check(limb)
 
 
-def _anew(study: Study, until: str | None, start: str | None, force: Sequence[str]) -> set[str]:
+def _select_stages_to_redo(
+    study: Study, until: str | None, start: str | None, force: Sequence[str]
+) -> set[str]:
     """Stages that are done whether they are up to date or not."""
-    names = [stage.name for stage in stages_of(study)]
+    names = [stage.name for stage in list_stages(study)]
     for name in (until, start, *force):
         if name is not None and name not in names:
             raise InputError(f"no stage is named {name!r}", remedy="stages are " + ", ".join(names))
@@ -252,7 +258,9 @@ def _anew(study: Study, until: str | None, start: str | None, force: Sequence[st
     return {*force, *(names[names.index(start) :] if start is not None else ())}
 
 
-def run_experiment(study: Study, name: str, *, listener: Listener = quiet, **options: Any) -> dict[str, Any]:
+def run_experiment(
+    study: Study, name: str, *, listener: Listener = ignore_progress, **options: Any
+) -> dict[str, Any]:
     """Do an experiment of a study, and before it every stage that it needs and that is not done.
 
     Its results lie in ``results/<name>``; ``limbfit report`` shows them.
@@ -279,7 +287,7 @@ def run_experiment(study: Study, name: str, *, listener: Listener = quiet, **opt
     experiment = EXPERIMENTS[name]
     if name in _FOLDERS:
         raise InputError(f"results/{name} is not for an experiment", remedy="give it another name")
-    chosen = options_of(experiment, options)
+    chosen = merge_options(experiment, options)
     check_experiment(experiment, study, None, chosen)
     last = [stage.name for stage in STAGES if stage.name in experiment.needs][-1:]
     if last:
@@ -291,12 +299,15 @@ def run_experiment(study: Study, name: str, *, listener: Listener = quiet, **opt
     store = Store(study.results)
     with (
         lock(study.results),
-        journal(study, name, listener) as listener,
-        executor_of(study) as executor,
+        write_journal(study, name, listener) as listener,
+        build_executor(study) as executor,
     ):
         known = Keys(study)
-        chain = _chain(known)
-        key, parts = experiment_key(experiment, known, chain, chosen), _parts(known, experiment, chain)
+        chain = _chain_keys(known)
+        key, parts = (
+            compute_experiment_key(experiment, known, chain, chosen),
+            _collect_parts(known, experiment, chain),
+        )
         context = Context(study, store, executor, listener)
         found = do_experiment(context, experiment, key, chosen, parts)
     return found | {"folder": str(store[name])}
@@ -306,7 +317,7 @@ def _do(context: Context, name: str, known: Keys, chain: Mapping[str, str]) -> N
     stage = next(stage for stage in STAGES if stage.name == name)
     if name == "report":
         write_json(context.store.folder / "run.json", run_record(context.study))
-    parts = _parts(known, stage, chain)
+    parts = _collect_parts(known, stage, chain)
     stamp = context.store.make(
         name, chain[name], lambda folder: {**stage.run(context, folder), "parts": parts}
     )
@@ -316,14 +327,14 @@ def _do(context: Context, name: str, known: Keys, chain: Mapping[str, str]) -> N
 def run_record(study: Study) -> dict[str, Any]:
     """``run.json``: versions, settings, digests of the inputs, how long each stage took."""
     store = Store(study.results)
-    stamps = {stage.name: store.stamp(stage.name) for stage in stages_of(study)}
-    inputs, known = input_digests(study), Keys(study)
+    stamps = {stage.name: store.stamp(stage.name) for stage in list_stages(study)}
+    inputs, known = compute_input_digests(study), Keys(study)
     return {
         "limbfit": __version__,
         "study": study.study.model_dump(mode="json"),
-        "settings": settings_record(study, inputs),
-        "versions": versions(),
-        "machine": machine(),
+        "settings": record_settings(study, inputs),
+        "versions": collect_versions(),
+        "machine": describe_machine(),
         "inputs": inputs,
         "stages": {
             name: {"seconds": stamp["seconds"], "finished": stamp["finished"], "key": stamp["key"]}
@@ -332,19 +343,19 @@ def run_record(study: Study) -> dict[str, Any]:
         },
         "experiments": {
             row["experiment"]: {key: row[key] for key in ("state", "seconds", "finished", "options", "key")}
-            for row in experiment_rows(study, known, _chain(known))
+            for row in list_experiment_rows(study, known, _chain_keys(known))
             if row["state"] in ("done", "stale")
         },
     }
 
 
-def report_study(study: Study, *, listener: Listener = quiet) -> dict[str, Any]:
+def report_study(study: Study, *, listener: Listener = ignore_progress) -> dict[str, Any]:
     """Make the report anew from what is stored, stale or not; nothing is solved."""
     store = Store(study.results)
-    with lock(study.results), executor_of(study) as executor:
+    with lock(study.results), build_executor(study) as executor:
         context = Context(study, store, executor, listener)
         known = Keys(study)
-        _do(context, "report", known, _chain(known))
+        _do(context, "report", known, _chain_keys(known))
         return summarise(study)
 
 

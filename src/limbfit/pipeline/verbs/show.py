@@ -13,14 +13,14 @@ from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...errors import InputError
 from ...report.drawing.stage_pictures import draw_stage
 from ...study import Study
-from ..shared.context import Listener, Progress, executor_of, quiet
+from ..shared.context import Listener, Progress, build_executor, ignore_progress
 from ..shared.store import Store, lock
 from .run import run_study
 
 SHOWN = ("segment", "surfaces", "sites", "mesh")
 
 
-def show_stage(study: Study, stage: str, *, listener: Listener = quiet) -> dict[str, Any]:
+def show_stage(study: Study, stage: str, *, listener: Listener = ignore_progress) -> dict[str, Any]:
     """Run a study until a stage of the geometry, and say what came of it.
 
     Parameters
@@ -62,7 +62,7 @@ def show_stage(study: Study, stage: str, *, listener: Listener = quiet) -> dict[
 def _draw(study: Study, stage: str, file: Path, listener: Listener) -> None:
     """On the executor: graphics libraries can crash, and a worker that dies is an error in words."""
     listener(Progress(stage, 0, 1, "drawing"))
-    with lock(study.results), executor_of(study) as executor:
+    with lock(study.results), build_executor(study) as executor:
         list(executor.map(_draw_one, [(study.results, stage, file)]))
     listener(Progress(stage, 1, 1, "drawn"))
 
@@ -76,7 +76,7 @@ def _segment_facts(study: Study, store: Store) -> dict[str, Any]:
     return {**found, "labels": str(store["segment"] / "labels.seg.nrrd")}
 
 
-def _surface_facts(study: Study, store: Store) -> dict[str, Any]:
+def _describe_surfaces(study: Study, store: Store) -> dict[str, Any]:
     anatomy = load_anatomy(store["surfaces"])
     plane = study.geometry.amputation
     bodies = {"skin": anatomy.skin, **anatomy.bones, **anatomy.regions}
@@ -84,20 +84,20 @@ def _surface_facts(study: Study, store: Store) -> dict[str, Any]:
         "volumes_cm3": {name: round(body.volume / 1000, 2) for name, body in bodies.items()},
         "triangles": {name: len(body.faces) for name, body in bodies.items()},
         "closed_bodies": len(bodies),
-        "thinnest_mm": {name: _thinnest(anatomy, name) for name in anatomy.bones},
+        "thinnest_mm": {name: _describe_thinnest(anatomy, name) for name in anatomy.bones},
         "cut_point": anatomy.cut_point.tolist(),
         "cut_normal": anatomy.cut_normal.tolist(),
-        "amputation": None if plane is None else _amputation_facts(study, anatomy),
+        "amputation": None if plane is None else _describe_amputation(study, anatomy),
     }
 
 
-def _thinnest(anatomy: Anatomy, name: str) -> dict[str, Any]:
+def _describe_thinnest(anatomy: Anatomy, name: str) -> dict[str, Any]:
     """Where a bone comes nearest to the skin: thickness of the tissue and the place on the bone."""
     thickness, place = find_thinnest_tissue(anatomy, name)
     return {"tissue_mm": round(thickness, 2), "at": np.round(place, 1).tolist()}
 
 
-def _amputation_facts(study: Study, anatomy: Anatomy) -> dict[str, Any]:
+def _describe_amputation(study: Study, anatomy: Anatomy) -> dict[str, Any]:
     """How far skin and bones reach beyond the plane of the virtual amputation."""
     plane = study.geometry.amputation
     assert plane is not None
@@ -109,7 +109,7 @@ def _amputation_facts(study: Study, anatomy: Anatomy) -> dict[str, Any]:
     return {"pad_mm": study.geometry.amputation_pad_mm, "beyond_plane_mm": ends}
 
 
-def _site_facts(study: Study, store: Store) -> dict[str, Any]:
+def _describe_sites(study: Study, store: Store) -> dict[str, Any]:
     return {"sites": store.read("sites", "sites.json")["sites"]}
 
 
@@ -119,7 +119,7 @@ def _mesh_facts(study: Study, store: Store) -> dict[str, Any]:
 
 _FACTS: dict[str, Callable[[Study, Store], dict[str, Any]]] = {
     "segment": _segment_facts,
-    "surfaces": _surface_facts,
-    "sites": _site_facts,
+    "surfaces": _describe_surfaces,
+    "sites": _describe_sites,
     "mesh": _mesh_facts,
 }

@@ -15,10 +15,10 @@ from ...mesh import read_vtu
 from ...study import Indentation as Planned
 from ...study import Study
 from ..shared.artefacts import write_curves, write_json
-from ..shared.context import Context, Listener, quiet
-from ..shared.simulations import CURVE_POINTS, model_of
+from ..shared.context import Context, Listener, ignore_progress
+from ..shared.simulations import CURVE_POINTS, build_model
 from ..shared.store import Store
-from .run import keys, run_study
+from .run import compute_keys, run_study
 
 IDENTIFIED = "identified"
 FEB_NAME, FORCES = "model.feb", "forces.txt"
@@ -41,7 +41,7 @@ class Indentation:
 
 
 def prepare_site(
-    study: Study, name: str, *, parameters: Parameters | None = None, listener: Listener = quiet
+    study: Study, name: str, *, parameters: Parameters | None = None, listener: Listener = ignore_progress
 ) -> Indentation:
     """A site as recorded, or as the study plans it; meshes are made where missing.
 
@@ -58,10 +58,10 @@ def prepare_site(
     """
     stated = study.indentation(name)
     store = Store(study.results)
-    used, origin = (parameters, "given") if parameters else known_parameters(study, store)
+    used, origin = (parameters, "given") if parameters else choose_parameters(study, store)
     run_study(study, until="mesh", listener=listener)
     context = Context(study, store, SerialExecutor(), listener)
-    return Indentation(context, stated, model_of(context, stated), used, origin)
+    return Indentation(context, stated, build_model(context, stated), used, origin)
 
 
 def simulate_site(
@@ -71,7 +71,7 @@ def simulate_site(
     parameters: Parameters | None = None,
     animation: bool = False,
     solver: str | None = None,
-    listener: Listener = quiet,
+    listener: Listener = ignore_progress,
 ) -> dict[str, Any]:
     """Simulate one indentation (see `prepare_site`).
 
@@ -114,7 +114,7 @@ def simulate_site(
         displacement_mm=result.displacement_at(times) if model.forced else model.history.at(times),
         force_N=result.force_at(times + model.waits_s),
     )
-    summary = _summary(found, result, "limbfit" if program is None else result.statistics["linear_solver"])
+    summary = _summarise(found, result, "limbfit" if program is None else result.statistics["linear_solver"])
     files = {
         "curve": curve,
         "fields": fields if fields.is_file() and (by_febio or result.states) else None,
@@ -126,7 +126,7 @@ def simulate_site(
     return summary | {kind: file and str(file) for kind, file in files.items()}
 
 
-def _summary(found: Indentation, result: Result, solver: str) -> dict[str, Any]:
+def _summarise(found: Indentation, result: Result, solver: str) -> dict[str, Any]:
     """What is told of a simulation; FEBio says nothing of its penetration."""
     own = solver == "limbfit"
     return {
@@ -145,12 +145,12 @@ def _summary(found: Indentation, result: Result, solver: str) -> dict[str, Any]:
     }
 
 
-def site_problem(found: Indentation) -> Problem:
+def build_site_problem(found: Indentation) -> Problem:
     """The site's problem, as `simulate_site` solves it."""
     return build_problem(found.model, read_vtu(found.model.mesh), found.parameters)
 
 
-def feb_settings(found: Indentation, force_file: str) -> FebSettings:
+def build_feb_settings(found: Indentation, force_file: str) -> FebSettings:
     """What is written for FEBio beside the problem."""
     study = found.context.study
     title = f"{study.study.name}, site {found.name}, parameters: {found.origin}"
@@ -159,15 +159,15 @@ def feb_settings(found: Indentation, force_file: str) -> FebSettings:
 
 def run_febio_site(found: Indentation, program: Path, folder: Path) -> tuple[Result, Path]:
     """The site solved by FEBio in ``folder``, and its plot file; a failure is a result with its reason."""
-    problem, options = site_problem(found), found.context.study.febio
+    problem, options = build_site_problem(found), found.context.study.febio
     folder.mkdir(parents=True, exist_ok=True)
-    write_feb(problem, folder / FEB_NAME, feb_settings(found, FORCES))
+    write_feb(problem, folder / FEB_NAME, build_feb_settings(found, FORCES))
     end = compute_end_time(problem)
     run = run_febio(program, folder, end, FORCES, threads=options.threads, time_limit_s=options.time_limit_s)
     return build_result(problem, run.log, run.verdict, run.seconds), folder / "model.xplt"
 
 
-def known_parameters(study: Study, store: Store) -> tuple[Parameters, str]:
+def choose_parameters(study: Study, store: Store) -> tuple[Parameters, str]:
     """The identified parameters, else the study's start, and which they are.
 
     Neither will do where the calibration is stale: it is not this study's, and who has identified a model
@@ -176,7 +176,7 @@ def known_parameters(study: Study, store: Store) -> tuple[Parameters, str]:
     if store.stamp("calibrate") is None:
         start = {tissue: study.material.of(tissue, "start") for tissue in study.tissues}
         return start, "start of the study"
-    if store.state("calibrate", keys(study)["calibrate"]).state != "done":
+    if store.state("calibrate", compute_keys(study)["calibrate"]).state != "done":
         raise InputError(
             "the identified parameters are stale: made from other inputs, settings or code",
             file=store["calibrate"] / "calibration.json",
