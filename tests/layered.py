@@ -140,6 +140,7 @@ def store_blocks(
             )
         model = replace(model, indenter=study.indenter, law=study.material.law, extensions=study.extensions)
         model = replace(model, course=study.material.course)
+        model = replace(model, relaxation_span_s=study.material.relaxation_span_s)
         model = replace(
             model, fibres=find_fibre_directions(Context(study, store, SerialExecutor(), lambda event: None))
         )

@@ -23,7 +23,7 @@ FLOORS = [
     {"socket"},
     {"identify", "execution", "traces", "anatomy", "fe", "web"},
     {"mesh", "phases", "autoregressive", "laws", "shapes", "priors"},
-    {"extensions"},
+    {"extensions", "relaxation"},
     {"errors", "arrays", "_version"},
 ]
 HEIGHT = {room: -level for level, rooms in enumerate(FLOORS) for room in rooms}

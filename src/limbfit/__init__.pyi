@@ -18,6 +18,7 @@ from .fe import (
     Motion as Motion,
     NeoHookean as NeoHookean,
     Ogden as Ogden,
+    OgdenPower as OgdenPower,
     OgdenQLV as OgdenQLV,
     OpenSurface as OpenSurface,
     Pressure as Pressure,

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from limbfit.fe import Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
+from limbfit.fe import Material, MooneyRivlin, NeoHookean, Ogden, OgdenPower, OgdenQLV
 from limbfit.fe.kernel.kinematics import invert, principal_axes
 from limbfit.fe.kernel.response import respond, stress_rates
 from limbfit.fe.lanes import LANES, workspace
@@ -15,6 +15,7 @@ SIX = ((0.004, 4.8), (0.003, -4.8), (-0.001, 2.5), (0.002, -1.7), (0.0005, 9.0),
 SAMPLES: dict[str, Material] = {
     "paper": OgdenQLV(0.00522, 4.79, 3.57, 0.32),
     "two times": OgdenQLV(0.006, 5.2, (2.1, 0.8), (0.08, 1.7)),
+    "power": OgdenPower(0.0045, 4.6, 0.4, 0.22, (0.05, 0.5, 5.0, 50.0, 500.0)),
     "ogden": Ogden(SIX, ((2.0, 0.1), (0.7, 0.9), (0.4, 6.0)), 120.0, "nike3d"),
     "neo-hookean": NeoHookean(0.005, ((1.5, 0.3), (0.5, 2.0)), 80.0, "abaqus"),
     "mooney-rivlin": MooneyRivlin(0.003, -0.0006, ((1.2, 0.4),), 100.0, "abaqus-goh"),
@@ -36,7 +37,7 @@ def energy(material: Material, stretches: NDArray) -> NDArray:
         return material.mu / 2 * first
     if isinstance(material, MooneyRivlin):
         return material.c1 * first + material.c2 * second
-    if isinstance(material, OgdenQLV):
+    if isinstance(material, OgdenQLV | OgdenPower):
         c, m = material.c, material.m
         return c / m**2 * (lt**m + lt**-m - 2).sum(axis=-1)
     return sum(c / m**2 * ((lt**m).sum(axis=-1) - 3) for c, m in material.terms)

@@ -192,6 +192,21 @@ def test_relaxation_equals_the_integrated_convolution(law):
         assert errors[0] < 1e-10
 
 
+@pytest.mark.parametrize("law", [SAMPLES["paper"], SAMPLES["power"]], ids=["one term", "power of time"])
+def test_a_held_strain_relaxes_as_the_closed_form(law):
+    """Of 1 %, ramped in 0.1 s and held for 1000 s, in steps that grow."""
+    strain, seconds = 0.01 * np.array([0.5, 0.5, -1.0]), 0.1
+    history = History(np.array([0.0, seconds, 1000.0]), np.array([0.0, 1.0, 1.0]))
+    times = np.concatenate([np.linspace(0.0, seconds, 6)[1:], seconds + np.geomspace(0.01, 999.9, 100)])
+    found = np.array(affine(law, strain, times, history))
+    g, tau = np.array(law.prony).T
+    t = times[times >= seconds - 1e-12][:, None]
+    ramped = tau / seconds * (np.exp(-(t - seconds) / tau) - np.exp(-t / tau))
+    elastic = kirchhoff(law, 1.0 + strain) / (1.0 + strain).prod()
+    expected = (elastic[2] - elastic[0]) * (1.0 + ramped @ g)
+    np.testing.assert_allclose((found[:, 2] - found[:, 0])[-len(t) :], expected, rtol=1e-3)
+
+
 @every_law
 def test_every_parameter_of_a_simulation_has_its_sensitivity(law):
     problem = punch("tet4", 2, 1, materials={"skin": law, "muscle": SAMPLES["paper"]})

@@ -158,6 +158,7 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
         "sites.indenter",
     ),
     (GIVEN, {"material.fibres": {"muscle": "axis"}}, "material.fibres"),
+    (GIVEN, {"material.relaxation_span_s": [0.1, 1e3]}, "material.relaxation_span_s"),
     (GIVEN, {"material.activation": {"time_s": [0.0, 1.0], "share": [1.0, 0.5]}}, "material.activation"),
     (GIVEN, {"sites.1.control": "force"}, "sites.control"),
     (GIVEN, {"sites.0.ultrasound_sd_mm": 0.2}, "sites.ultrasound_sd_mm"),

@@ -38,6 +38,7 @@ from .materials import (
     MooneyRivlin,
     NeoHookean,
     Ogden,
+    OgdenPower,
     OgdenQLV,
 )
 from .motion import Motion, RigidBody
@@ -69,6 +70,7 @@ __all__ = [
     "Motion",
     "NeoHookean",
     "Ogden",
+    "OgdenPower",
     "OgdenQLV",
     "OpenSurface",
     "Pressure",

@@ -25,14 +25,16 @@ from ..fe import (
     History,
     Indenter,
     Material,
+    OgdenPower,
     OgdenQLV,
     Problem,
     RigidSurface,
     StepControl,
 )
-from ..laws import LAWS, OGDEN, Parameters
+from ..laws import LAWS, OGDEN, POWER, Parameters
 from ..mesh import Mesh
 from ..phases import spread
+from ..relaxation import DEFAULT_SPAN_S, choose_relaxation_times
 from ..study import ClampsTable, IndenterTable, SolverTable, Vector
 from .clamps import clamp_problem
 from .fibres import Direction, build_fibre_field
@@ -72,6 +74,7 @@ class SiteModel:
     element: str = ""  # row of the element table; by default that of the mesh's cell type
     within_mm: float | None = None  # no more of the mesh than this far from the site
     law: str = OGDEN  # of all tissues
+    relaxation_span_s: tuple[float, float] = DEFAULT_SPAN_S  # of relaxation as a power of time
     fibres: tuple[tuple[str, Direction], ...] = ()  # direction in each tissue that has some
     extensions: tuple[Path, ...] = ()  # files that register what the study has of its own
     site: str = ""
@@ -141,15 +144,26 @@ class SiteModel:
 
 
 def build_materials(
-    parameters: Parameters, kappa_ratio: float, law: str = OGDEN, fibred: Container[str] = ()
+    parameters: Parameters,
+    kappa_ratio: float,
+    law: str = OGDEN,
+    fibred: Container[str] = (),
+    relaxation_span_s: tuple[float, float] = DEFAULT_SPAN_S,
 ) -> dict[str, Material]:
-    """The tissues for the solver, in MPa; those in ``fibred`` have fibres, where their law knows some."""
+    """The tissues for the solver, in MPa; those in ``fibred`` have fibres, where their law knows some.
+
+    ``relaxation_span_s``: first and last time of relaxation as a power of time.
+    """
     stated = LAWS[law]
     found: dict[str, Material] = {}
     for tissue, values in parameters.items():
         own = stated.in_solver_units(values)
         if stated.material is not None:
             found[tissue] = stated.material(**own, kappa_ratio=kappa_ratio)
+            continue
+        if law == POWER:
+            times = tuple(choose_relaxation_times(*relaxation_span_s).tolist())
+            found[tissue] = OgdenPower(**own, times_s=times, kappa_ratio=kappa_ratio)
             continue
         fibre = {name: own.pop(name) for name in ("k1", "k2") if name in own}
         active = own.pop("active", None)
@@ -165,7 +179,9 @@ def build_materials(
 def build_site_materials(model: SiteModel, parameters: Parameters) -> dict[str, Material]:
     """The tissues of a site for the solver, whose law may be the study's own."""
     load_extensions(model.extensions)
-    return build_materials(parameters, model.kappa_ratio, model.law, dict(model.fibres))
+    return build_materials(
+        parameters, model.kappa_ratio, model.law, dict(model.fibres), model.relaxation_span_s
+    )
 
 
 def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Problem:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from ..errors import InputError
-from ..laws import ACTIVE, LAWS, OGDEN
+from ..laws import ACTIVE, LAWS, OGDEN, POWER, TissueLaw
+from ..relaxation import DEFAULT_SPAN_S, choose_relaxation_times
 from .tables import Positive, TomlTable, Vector
 
 KAPPA_RATIO = (10.0, 1e4)
@@ -43,6 +45,7 @@ class ActivationTable(TomlTable):
 class MaterialTable(TomlTable):
     """The law of all tissues, and start and bounds of its parameters; those that are not given are the law's.
 
+    ``relaxation_span_s``: first and last time of relaxation as a power of time.
     ``tissues`` overrides them, tissue by tissue (see :meth:`of`).  ``fibres``: their direction in the tissues
     that have some: a vector, that of the limb's axis, or a flow from the proximal cut to the bone's end.
     ``activation``: how much of their active stress acts, all of it where it is not stated.
@@ -50,6 +53,7 @@ class MaterialTable(TomlTable):
     """
 
     law: str = OGDEN
+    relaxation_span_s: tuple[float, float] = DEFAULT_SPAN_S
     kappa_ratio: float = 100.0
     start: dict[str, Positive] = Field(default={})
     lower: dict[str, Positive] = Field(default={})
@@ -66,6 +70,15 @@ class MaterialTable(TomlTable):
             return ()
         stated = self.activation
         return ((0.0, 1.0),) if stated is None else tuple(zip(stated.time_s, stated.share, strict=True))
+
+    @property
+    def tissue_law(self) -> TissueLaw:
+        """The law with the study's relaxation times, where it has some."""
+        law = LAWS[self.law]
+        if self.law != POWER:
+            return law
+        times = choose_relaxation_times(*self.relaxation_span_s)
+        return replace(law, relaxation_times_s=tuple(times.tolist()))
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -99,6 +112,15 @@ class MaterialTable(TomlTable):
             if not any(direction):
                 raise ValueError(f'{tissue}: a direction of no length; give [x, y, z], "axis" or "flow"')
         return fibres
+
+    @field_validator("relaxation_span_s")
+    @classmethod
+    def _spanned(cls, span: tuple[float, float]) -> tuple[float, float]:
+        try:
+            choose_relaxation_times(*span)
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        return span
 
     @field_validator("kappa_ratio")
     @classmethod

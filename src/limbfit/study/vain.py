@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StudyError
-from ..laws import ACTIVE, FIBRED, has_fibres
+from ..laws import ACTIVE, FIBRED, POWER, has_fibres
 from ..shapes import SHAPES
 from .meshing import ACCURACIES, CoarseMeshTable, MeshTable
 from .records import Site
@@ -164,6 +164,12 @@ VAIN: tuple[Vain, ...] = (
         ("uncertainty.edge_radius_mm",),
         lambda s: not any(SHAPES[one.shape].is_edge_doubted for one in s.used_indenters.values()),
         "it is that of a square indenter",
+    ),
+    Vain(
+        ("material.relaxation_span_s",),
+        lambda s: s.material.law != POWER,
+        "the tissues' law does not relax as a power of time",
+        f'give material.law = "{POWER}", or leave it out',
     ),
     Vain(
         ("material.fibres",),

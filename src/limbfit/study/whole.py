@@ -13,7 +13,6 @@ from pydantic import Field, field_validator, model_validator
 from ..errors import InputError, StudyError
 from ..laws import (
     FIBRE_KEYS,
-    LAWS,
     OGDEN,
     Parameters,
     TissueLaw,
@@ -120,7 +119,7 @@ class Study(TomlTable):
     @property
     def law(self) -> TissueLaw:
         """The law of all tissues."""
-        return LAWS[self.material.law]
+        return self.material.tissue_law
 
     @property
     def fibres(self) -> dict[str, Literal["axis", "flow"] | Vector]:

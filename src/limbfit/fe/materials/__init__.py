@@ -5,7 +5,7 @@ from __future__ import annotations
 from .contractile import Contractile
 from .elastic import ElasticLaw, lane_function, mean_exponential
 from .fibred import Fibred
-from .hyperelastic import MooneyRivlin, NeoHookean, Ogden, OgdenQLV
+from .hyperelastic import MooneyRivlin, NeoHookean, Ogden, OgdenPower, OgdenQLV
 from .material import LawTable, Material, PronyTerms, Uncoupled
 from .viscoelastic import ORDER_IN_TIME, prony_factors
 from .volumetric import VOLUMETRIC_LAWS
@@ -21,6 +21,7 @@ __all__ = [
     "MooneyRivlin",
     "NeoHookean",
     "Ogden",
+    "OgdenPower",
     "OgdenQLV",
     "PronyTerms",
     "Uncoupled",

@@ -2,6 +2,7 @@
 
 ==================  ===================================================================================
 `OgdenQLV`          ``c/m^2 sum_i (lt_i^m + lt_i^-m - 2)``: the paper's tissue
+`OgdenPower`        the same, relaxing as a power of time
 `Ogden`             ``sum_k c_k/m_k^2 (lt_1^m_k + lt_2^m_k + lt_3^m_k - 3)``, up to six terms
 `NeoHookean`        ``mu/2 (I1 - 3)``
 `MooneyRivlin`      ``c1 (I1 - 3) + c2 (I2 - 3)``
@@ -21,6 +22,7 @@ from typing import Any, Self, cast
 import numpy as np
 
 from ...errors import ProblemError
+from ...relaxation import DEFAULT_SPAN_S, choose_relaxation_times, compute_power_law_terms
 from .material import Array, PronyTerms, Uncoupled, finite, not_negative, pairs, positive
 
 MAX_OGDEN_TERMS = 6  # as FEBio
@@ -69,8 +71,26 @@ class OgdenSum(Uncoupled):
         return {**dict(zip(self.parameter_names, elastic, strict=False)), "prony": prony}
 
 
+class SymmetricOgden(OgdenSum):
+    """The elastic law of the paper's tissue, with a modulus ``c`` (MPa) and an exponent ``m``."""
+
+    c: float
+    m: float
+    volumetric = "log"
+
+    @property
+    def elastic_parameters(self) -> tuple[float, ...]:
+        return self.c, self.m
+
+    def ogden_terms(self) -> Array:
+        return np.array([[self.c, self.m], [self.c, -self.m]])
+
+    def ogden_term_derivatives(self) -> Array:
+        return np.array([[[1.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [0.0, -1.0]]])
+
+
 @dataclass(frozen=True)
-class OgdenQLV(OgdenSum):
+class OgdenQLV(SymmetricOgden):
     """The paper's tissue: symmetric second-order Ogden with relaxation.
 
     ``W = c/m^2 sum_i (lt_i^m + lt_i^-m - 2) + kappa/2 (ln J)^2``, ``G(t) = 1 + gamma exp(-t/tau)``, or with
@@ -91,8 +111,6 @@ class OgdenQLV(OgdenSum):
     gamma: float | Sequence[float]
     tau: float | Sequence[float]
     kappa_ratio: float = 100.0
-
-    volumetric = "log"
 
     def __post_init__(self) -> None:
         for name in ("gamma", "tau"):
@@ -117,19 +135,67 @@ class OgdenQLV(OgdenSum):
         gamma, tau = np.atleast_1d(self.gamma), np.atleast_1d(self.tau)
         return tuple(zip(gamma.tolist(), tau.tolist(), strict=True))
 
-    @property
-    def elastic_parameters(self) -> tuple[float, ...]:
-        return self.c, self.m
-
-    def ogden_terms(self) -> Array:
-        return np.array([[self.c, self.m], [self.c, -self.m]])
-
-    def ogden_term_derivatives(self) -> Array:
-        return np.array([[[1.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [0.0, -1.0]]])
-
     def _fields(self, elastic: tuple[float, ...], prony: PronyTerms) -> dict[str, Any]:
         gamma, tau = zip(*prony, strict=True)
         return {"c": elastic[0], "m": elastic[1], "gamma": gamma, "tau": tau}
+
+
+@dataclass(frozen=True)
+class OgdenPower(SymmetricOgden):
+    """The paper's tissue with relaxation as a power of time (`limbfit.relaxation`).
+
+    ``G(t) = 1 + sum_i gamma (tau_i / 1 s)^(-slope) exp(-t/tau_i)`` with fixed times. The parameters are
+    ``c, m, gamma, slope``.
+
+    Parameters
+    ----------
+    c : shear modulus of small strains after the last of the times, MPa.
+    m : exponent.
+    gamma : relaxation amplitude of a time of 1 s, dimensionless; it belongs to the spacing of the times.
+    slope : minus the power of time, dimensionless; 0: the logarithm of time.
+    times_s : relaxation times, s.
+    kappa_ratio : bulk modulus over ``c``; the bulk modulus moves with ``c``.
+    """
+
+    c: float
+    m: float
+    gamma: float
+    slope: float
+    times_s: Sequence[float] = tuple(choose_relaxation_times(*DEFAULT_SPAN_S).tolist())
+    kappa_ratio: float = 100.0
+
+    def __post_init__(self) -> None:
+        for name in ("c", "m", "kappa_ratio"):
+            positive(name, getattr(self, name))
+        not_negative("gamma", self.gamma)
+        not_negative("slope", self.slope)
+        times = np.atleast_1d(_one_or_several("times_s", self.times_s)).tolist()
+        for l, time in enumerate(times, 1):
+            positive(f"tau{l}", time)
+        object.__setattr__(self, "times_s", tuple(times))
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        return "c", "m", "gamma", "slope"
+
+    @property
+    def relaxation_parameters(self) -> tuple[float, ...]:
+        return self.gamma, self.slope
+
+    @property
+    def prony(self) -> PronyTerms:
+        terms = compute_power_law_terms(self.gamma, self.slope, np.array(self.times_s))
+        return tuple(zip(terms.tolist(), self.times_s, strict=True))
+
+    def prony_derivatives(self) -> Array:
+        times = np.array(self.times_s)
+        unit = compute_power_law_terms(1.0, self.slope, times)
+        amplitudes = np.array([unit, -self.gamma * unit * np.log(times)])
+        return np.stack([amplitudes, np.zeros_like(amplitudes)], axis=-1)
+
+    def with_parameters(self, values: Mapping[str, float]) -> Self:
+        """The material with other values of some of its parameters, by name."""
+        return Uncoupled.with_parameters(self, values)
 
 
 @dataclass(frozen=True)

@@ -157,8 +157,18 @@ class Uncoupled(ABC):
 
     @property
     def parameters(self) -> tuple[float, ...]:
-        """Elastic parameters, then g_1, tau_1, g_2, ..."""
-        return *self.elastic_parameters, *(value for term in self.prony for value in term)
+        """Those of the elastic law, then of the relaxation."""
+        return *self.elastic_parameters, *self.relaxation_parameters
+
+    @property
+    def relaxation_parameters(self) -> tuple[float, ...]:
+        """What `prony` follows from: itself, g_1, tau_1, g_2, ..., unless a law says otherwise."""
+        return tuple(value for term in self.prony for value in term)
+
+    def prony_derivatives(self) -> Array:
+        """Derivative (p, l, 2) of `prony` with respect to each of `relaxation_parameters`."""
+        count = len(self.prony)
+        return np.eye(2 * count).reshape(2 * count, count, 2)
 
     @property
     def instantaneous_modulus(self) -> float:
@@ -169,7 +179,8 @@ class Uncoupled(ABC):
     def instantaneous_modulus_gradient(self) -> tuple[float, ...]:
         """Derivative of `instantaneous_modulus` with respect to each parameter."""
         elastic = [float(d) * self._relaxation for d in self.shear_modulus_gradient]
-        return *elastic, *[self.shear_modulus, 0.0] * len(self.prony)
+        amplitudes = self.prony_derivatives()[..., 0].sum(axis=1)
+        return *elastic, *(self.shear_modulus * float(d) for d in amplitudes)
 
     @property
     def _relaxation(self) -> float:
@@ -188,8 +199,8 @@ class Uncoupled(ABC):
             LawTable(numbers, float(self.kappa_ratio * slope), still, fibre=(0.0, 0.0))
             for numbers, slope in zip(self.number_derivatives(), slopes, strict=True)
         ]
-        rest, units = np.zeros_like(self.numbers()), np.eye(2 * len(self.prony))
-        return *elastic, *(LawTable(rest, 0.0, unit.reshape(-1, 2), fibre=(0.0, 0.0)) for unit in units)
+        rest, relaxation = np.zeros_like(self.numbers()), self.prony_derivatives()
+        return *elastic, *(LawTable(rest, 0.0, prony, fibre=(0.0, 0.0)) for prony in relaxation)
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
         """The material with other values of some of its parameters, by name; here fields of a dataclass."""

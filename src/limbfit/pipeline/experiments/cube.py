@@ -24,6 +24,7 @@ from ...indentation import build_materials
 from ...laws import KPA, LAWS, OGDEN
 from ...mesh import Mesh
 from ...mesh.boxes import HEX, build_boxes
+from ...relaxation import DEFAULT_SPAN_S
 from ...study import Study
 from ..shared.artefacts import read_json, write_json
 from ..shared.context import Context
@@ -51,6 +52,7 @@ def compress_cube(
     parameters: dict[str, dict[str, float]] | None = None,
     kappa_ratio: float = 100.0,
     law: str = OGDEN,
+    relaxation_span_s: tuple[float, float] = DEFAULT_SPAN_S,
     compression_percent: float = COMPRESSION_PERCENT,
 ) -> dict[str, Any]:
     """Compress a cube of each given tissue, of the paper's and of the published ones.
@@ -62,6 +64,7 @@ def compress_cube(
         muscle, all others beside published skin. None: published tissues only.
     kappa_ratio : bulk modulus over the shear modulus of the given tissues.
     law : name of their law.
+    relaxation_span_s : first and last time of relaxation as a power of time.
     compression_percent : of the side of the cube.
 
     Returns
@@ -79,7 +82,8 @@ def compress_cube(
     check_compression(compression_percent)
     times = _build_times()
     rows, stresses = [], {}
-    for specimen in _build_specimens(parameters or {}, kappa_ratio, law):
+    own = build_materials(parameters or {}, kappa_ratio, law, relaxation_span_s=relaxation_span_s)
+    for specimen in _build_specimens(parameters or {}, own, law):
         stress, least, most = compress(specimen.material, times, compression_percent)
         stresses[specimen.name] = stress
         rows.append(specimen.row | _summarise(times, stress) | {"J_min": least, "J_max": most})
@@ -130,13 +134,15 @@ def run_cube(context: Context, folder: Path, *, compression_percent: float) -> d
         parameters=stages[-1]["parameters"],
         kappa_ratio=context.study.material.kappa_ratio,
         law=context.study.material.law,
+        relaxation_span_s=context.study.material.relaxation_span_s,
         compression_percent=compression_percent,
     )
     return {}
 
 
-def _build_specimens(parameters: dict[str, dict[str, float]], kappa_ratio: float, law: str) -> list[Specimen]:
-    own = build_materials(parameters, kappa_ratio, law)
+def _build_specimens(
+    parameters: dict[str, dict[str, float]], own: dict[str, Material], law: str
+) -> list[Specimen]:
     found = []
     for i, (tissue, values) in enumerate(parameters.items()):
         words = ", ".join(f"{p.key} = {values[p.key]:.4g} {p.unit}".rstrip() for p in LAWS[law].parameters)

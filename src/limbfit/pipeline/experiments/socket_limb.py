@@ -89,8 +89,9 @@ class SocketLimb:
 
     def materials(self, parameters: Parameters) -> dict[str, Material]:
         """Of the tissues and the liner."""
-        kappa, liner = self.study.material.kappa_ratio, self.study.socket.liner
-        laws = build_materials(parameters, kappa, self.study.material.law, dict(self.fibres))
+        table, liner = self.study.material, self.study.socket.liner
+        kappa = table.kappa_ratio
+        laws = build_materials(parameters, kappa, table.law, dict(self.fibres), table.relaxation_span_s)
         return laws | build_materials({LINER: liner.parameters}, kappa) if liner.thickness_mm else laws
 
     def mesh(self, context: Context, name: str, folder: Path, brim: Socket) -> tuple[Mesh, dict[str, Any]]:

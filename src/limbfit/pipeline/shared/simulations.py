@@ -230,6 +230,7 @@ def build_site_model(
         element=study.mesh.element,
         within_mm=study.within_mm if searched else None,
         law=study.material.law,
+        relaxation_span_s=study.material.relaxation_span_s,
         fibres=find_fibre_directions(context),
         extensions=study.extensions,
         layers=tuple(layers),

@@ -25,6 +25,7 @@ from ...febio import (
     write_optimisation,
 )
 from ...indentation import Parameters, SiteModel, build_problem
+from ...laws import POWER
 from ...mesh import Mesh, write_vtu
 from ...study import Indentation as Planned
 from ...study import Record, Study
@@ -139,6 +140,7 @@ def _build_block_model(study: Study, one: Planned, file: Path) -> SiteModel:
         indenter=study.indenter_of(one),
         kappa_ratio=study.material.kappa_ratio,
         law=study.material.law,
+        relaxation_span_s=study.material.relaxation_span_s,
         fibres=tuple((tissue, along) for tissue in study.fibres),
         extensions=study.extensions,
         course=study.material.course,
@@ -179,6 +181,9 @@ def _write(
     if to == FITTED:
         if problem.fibres is not None:
             raise InputError("FEBio's fit is written for tissues without fibres", place="--to")
+        if found.context.study.material.law == POWER:
+            what = f'FEBio\'s fit cannot tie the relaxation terms that make the power of time of "{POWER}"'
+            raise InputError(what, place="--to", remedy="identify with limbfit")
         check_optimisable(problem)
         control, model = folder / f"{name}-optimize.feb", folder / f"{name}-model.feb"
         # FEBio's fit takes its automatic penalty of a step of no time: another one than in a plain run.
