@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from limbfit.anatomy.surfaces.mending import open_loops
-from limbfit.anatomy.surfaces.surfaces import Surface, bodies, read_surface, write_surface
+from limbfit.anatomy.surfaces.surfaces import Surface, find_bodies, read_surface, write_surface
 
 PROMINENCES = ("tibial crest", "fibular head", "distal tibia")
 CASES = {
@@ -63,7 +63,7 @@ EDGE_MM = 16.0
 
 def named_bodies(file: Path) -> dict[str, Surface]:
     """The five bodies: the skin is the largest, the femur open, the patella the highest, the fibula thin."""
-    parts = [part for part in bodies(read_surface(file)) if len(part.faces) > 100]
+    parts = [part for part in find_bodies(read_surface(file)) if len(part.faces) > 100]
     parts.sort(key=lambda part: -float(np.prod(np.ptp(part.points, axis=0))))
     skin, *bones = parts
     femur = next(bone for bone in bones if len(open_loops(bone)))
