@@ -49,7 +49,7 @@ from limbfit.bench.meshing import measure_cpu_seconds
 from limbfit.errors import LimbfitError
 from limbfit.fe import solve
 from limbfit.indentation import SiteModel, build_problem, build_steps
-from limbfit.mesh import Mesh, boundary_faces, quality
+from limbfit.mesh import Mesh, boundary_faces, measure_quality
 from limbfit.pipeline.stages.mesh import build_coarse_settings, mesh_settings
 from limbfit.study import Study
 
@@ -135,7 +135,7 @@ def settings_of(limb: Limb) -> dict[str, MeshSettings]:
 def faults(mesh: Mesh, report: Any) -> list[str]:
     """What keeps a mesh from being sound."""
     found = []
-    if quality(mesh).inverted:
+    if measure_quality(mesh).inverted:
         found.append("inverted cells")
     faces = boundary_faces(mesh)[:, :3]
     edges = np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)

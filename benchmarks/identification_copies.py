@@ -10,11 +10,11 @@ from typing import Any
 from identification_cases import make_study
 
 from limbfit import load_study, run_study
-from limbfit.indentation import flat_names, to_vector
+from limbfit.indentation import list_flat_names, to_vector
 from limbfit.pipeline.shared.store import Store
 
 Record = dict[str, Any]
-NAMES = tuple(f"{tissue}.{name}" for tissue, name in flat_names(("skin", "muscle")))
+NAMES = tuple(f"{tissue}.{name}" for tissue, name in list_flat_names(("skin", "muscle")))
 
 
 def quiet(progress: Any) -> None:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from limbfit import load_study, run_study
-from limbfit.indentation import flat_names, to_vector
+from limbfit.indentation import list_flat_names, to_vector
 from limbfit.pipeline.shared.artefacts import read_json
 from limbfit.pipeline.shared.context import Progress
 from limbfit.pipeline.shared.store import Store
@@ -48,9 +48,9 @@ def run_patient(folder: Path, seed: int, detail: str) -> Record:
     found, predicted = store.read("calibrate", "calibration.json"), store.read("predict", "predict.json")
     truth = to_vector(read_json(folder / "truth.json")["parameters"], study.tissues)
     best = to_vector(found["stages"][-1]["parameters"], study.tissues)
-    names = [f"{tissue}.{name}" for tissue, name in flat_names(study.tissues)]
+    names = [f"{tissue}.{name}" for tissue, name in list_flat_names(study.tissues)]
     known = found["uncertainty"]
-    low, high = np.array([known["intervals_95"][t][n] for t, n in flat_names(study.tissues)]).T
+    low, high = np.array([known["intervals_95"][t][n] for t, n in list_flat_names(study.tissues)]).T
     return {
         "seed": seed,
         "error_fitted_percent": predicted["mean_error_fitted_percent"],

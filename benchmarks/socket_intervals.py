@@ -29,7 +29,7 @@ import numpy as np
 import limbfit
 from limbfit.execution import SerialExecutor
 from limbfit.identify.uncertainty.uncertainty import NORMAL_95
-from limbfit.indentation import flat_names, to_parameters, to_vector
+from limbfit.indentation import list_flat_names, to_parameters, to_vector
 from limbfit.mesh import Mesh
 from limbfit.phantom.build import draw_true_parameters
 from limbfit.pipeline.experiments.socket_intervals import draw_step, predict_change
@@ -84,7 +84,7 @@ class Bench:
 
     def foreseen(self, centre: dict[str, Any], name: str, step: np.ndarray) -> float:
         """A value of a draw, by the derivatives at the centre."""
-        keys = [f"{tissue}.{key}" for tissue, key in flat_names(self.study.tissues)]
+        keys = [f"{tissue}.{key}" for tissue, key in list_flat_names(self.study.tissues)]
         row = {"change_kPa": centre["change"][name]}
         return float(centre["values"][name]) + predict_change(
             row, "", "kPa", dict(zip(keys, step, strict=True))

@@ -15,7 +15,7 @@ from .arrays import Array
 _MOST_CORRELATED = 0.999
 
 
-def block_covariance(sd: float, lag: float, samples: NDArray[np.int64]) -> Array:
+def compute_block_covariance(sd: float, lag: float, samples: NDArray[np.int64]) -> Array:
     """Covariance (n, n) of means of ``samples`` (n,) neighbours of a noise of deviation ``sd``."""
     lags = np.arange(samples.max())
     powers = lag**lags
@@ -28,13 +28,13 @@ def block_covariance(sd: float, lag: float, samples: NDArray[np.int64]) -> Array
     return np.asarray(sd**2 * (np.diag(own) + later + later.T))
 
 
-def lag_one(residual: Array) -> float:
+def estimate_lag_one(residual: Array) -> float:
     """Correlation of neighbours in a residual (n,) of mean zero; none where it is negative."""
     squares = float(residual @ residual)
     lag = float(residual[1:] @ residual[:-1]) / squares if squares > 0 else 0.0
-    return bounded(lag)
+    return clip_lag(lag)
 
 
-def bounded(lag: float) -> float:
+def clip_lag(lag: float) -> float:
     """A correlation of neighbours that a covariance can be made of."""
     return float(np.clip(lag, 0.0, _MOST_CORRELATED))

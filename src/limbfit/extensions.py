@@ -77,19 +77,19 @@ def load_extensions(files: Iterable[Path]) -> None:
         For a file that cannot be run, with what it raised.
     """
     for file in files:
-        digest = _digest(file)
+        digest = _compute_digest(file)
         if digest not in _loaded:
             _run(file.resolve(), f"limbfit_extension_{digest[:16]}")
             _loaded[digest] = file
 
 
-def extensions_digest(files: Iterable[Path]) -> str:
+def compute_extensions_digest(files: Iterable[Path]) -> str:
     """SHA-256 of what extension files hold; empty where there are none."""
-    each = [_digest(file) for file in files]
+    each = [_compute_digest(file) for file in files]
     return sha256("".join(each).encode()).hexdigest() if each else ""
 
 
-def _digest(file: Path) -> str:
+def _compute_digest(file: Path) -> str:
     try:
         return sha256(file.read_bytes()).hexdigest()
     except OSError as error:

@@ -37,7 +37,7 @@ def state_fields(system: System, problem: Problem, state: State) -> tuple[dict[s
     ``displacement_mm`` moves the points from rest.  The state is one of a `Step` that `iterate` yields, or
     the one kept with ``store="peak"``.
     """
-    laws = _laws(problem)
+    laws = _build_laws(problem)
     fields = compute_element_fields(system, laws, state)
     cauchy = fields.cauchy / KPA
     point_data = {
@@ -59,7 +59,7 @@ def state_fields(system: System, problem: Problem, state: State) -> tuple[dict[s
 
 def rest(system: System, problem: Problem) -> State:
     """The state before the first step."""
-    memory = Memory.rest(system, _laws(problem))
+    memory = Memory.rest(system, _build_laws(problem))
     return State(
         0.0, problem.history.displacement_at(0.0), np.zeros_like(problem.mesh.points), 0.0, memory=memory
     )
@@ -93,5 +93,5 @@ class Animation:
         write_pvd(self.file, self.frames)
 
 
-def _laws(problem: Problem) -> Laws:
+def _build_laws(problem: Problem) -> Laws:
     return Laws.build([problem.materials[region] for region in problem.mesh.region_names])

@@ -122,7 +122,7 @@ _AMPLITUDE = Parameter("gamma", 1.2, 0.01, 10.0, "", "relaxation amplitude")
 _TIME = Parameter("tau", 2.0, 0.01, 10.0, "s", "relaxation time")
 
 
-def _ogden(terms: int) -> TissueLaw:
+def _build_ogden(terms: int) -> TissueLaw:
     """The paper's law with so many relaxation terms.
 
     Several share out the bounds of the one time in equal ratios, so that none can change places with another,
@@ -178,24 +178,24 @@ _FIBRES = (
 _TENSION = Parameter("active", 5.0, 0.05, 200.0, "kPa", "active stress along the fibres")
 
 
-def _fibred() -> TissueLaw:
+def _build_fibred() -> TissueLaw:
     """The paper's law with fibres."""
-    plain = _ogden(1)
+    plain = _build_ogden(1)
     words, energy = f"{plain.words} with fibres", f"{plain.energy}; where fibres are stretched (I₄ > 1), "
     energy += "k₁/(2 k₂) (exp(k₂ (I₄ − 1)²) − 1) is added to Ψ, I₄ the isochoric squared stretch along them"
     return TissueLaw(FIBRED, words, energy, (*plain.parameters, *_FIBRES))
 
 
-def _active() -> TissueLaw:
+def _build_active() -> TissueLaw:
     """The paper's law with fibres that contract."""
-    plain = _fibred()
+    plain = _build_fibred()
     energy = f"{plain.energy}; along them acts the active stress times the share s(t) of its activation"
     return TissueLaw(ACTIVE, f"{plain.words} that contract", energy, (*plain.parameters, _TENSION))
 
 
 FIBRE_KEYS = tuple(parameter.key for parameter in (*_FIBRES, _TENSION))
-_OWN = {law.name: law for law in map(_ogden, range(1, MOST_RELAXATIONS + 1))}
-LAWS = Registry("tissue law", _OWN | {POWER: _power(), FIBRED: _fibred(), ACTIVE: _active()})
+_OWN = {law.name: law for law in map(_build_ogden, range(1, MOST_RELAXATIONS + 1))}
+LAWS = Registry("tissue law", _OWN | {POWER: _power(), FIBRED: _build_fibred(), ACTIVE: _build_active()})
 
 
 def is_ogden(name: str) -> bool:
@@ -237,19 +237,19 @@ def split_key(key: str) -> tuple[str, str]:
     return (name, unit) if unit in UNITS else (key, "")
 
 
-def flat_names(tissues: Sequence[str], law: str = OGDEN) -> tuple[tuple[str, str], ...]:
+def list_flat_names(tissues: Sequence[str], law: str = OGDEN) -> tuple[tuple[str, str], ...]:
     """(tissue, parameter) in the order of every flat vector: all of one tissue, then of the next one."""
     return tuple((tissue, name) for tissue in tissues for name in LAWS[law].keys)
 
 
 def to_vector(parameters: Parameters, tissues: Sequence[str], law: str = OGDEN) -> Array:
     """The numbers of each tissue in flat order (moduli in kPa)."""
-    return np.array([parameters[tissue][name] for tissue, name in flat_names(tissues, law)])
+    return np.array([parameters[tissue][name] for tissue, name in list_flat_names(tissues, law)])
 
 
 def to_parameters(vector: Iterable[float], tissues: Sequence[str], law: str = OGDEN) -> Parameters:
     """The flat vector as ``{tissue: {name: value}}``, tissues in their order."""
     result: Parameters = {tissue: {} for tissue in tissues}
-    for (tissue, name), value in zip(flat_names(tissues, law), vector, strict=True):
+    for (tissue, name), value in zip(list_flat_names(tissues, law), vector, strict=True):
         result[tissue][name] = float(value)
     return result

@@ -54,7 +54,7 @@ class MotionPhase:
         return replace(self, start_s=self.start_s + seconds, end_s=self.end_s + seconds)
 
 
-def tolerance_mm(displacement: Array) -> float:
+def choose_tolerance_mm(displacement: Array) -> float:
     """The change of displacement (n,), mm, that counts as none: half a percent of the travel."""
     return SHARE * float(np.ptp(displacement))
 
@@ -75,11 +75,11 @@ def find_phases(
     contact_s : when the skin is met: all before is one ``approach``.
     """
     times, displacement = np.asarray(times, dtype=float), np.asarray(displacement, dtype=float)
-    allowed = tolerance_mm(displacement) if tolerance is None else tolerance
-    corners = _corners(times, displacement, allowed)
+    allowed = choose_tolerance_mm(displacement) if tolerance is None else tolerance
+    corners = _find_corners(times, displacement, allowed)
     found: list[MotionPhase] = []
     for a, b in pairwise(corners):
-        piece = _piece(
+        piece = _build_piece(
             float(times[a]), float(times[b]), float(displacement[a]), float(displacement[b]), allowed
         )
         if found and piece.kind == found[-1].kind == "hold":
@@ -88,17 +88,17 @@ def find_phases(
     return tuple(found) if contact_s is None else _from_contact(found, contact_s)
 
 
-def loading_end(phases: Sequence[MotionPhase]) -> MotionPhase | None:
+def find_loading_end(phases: Sequence[MotionPhase]) -> MotionPhase | None:
     """The loading that first reaches the largest displacement, to the tolerance; None where nothing advances.
 
     Its end is the peak that people mean: what creeps on afterwards is the hold.
     """
     ends = np.array([value for phase in phases for value in (phase.start_mm, phase.end_mm)])
-    enough = ends.max() - tolerance_mm(ends)
+    enough = ends.max() - choose_tolerance_mm(ends)
     return next((phase for phase in phases if phase.kind == "load" and phase.end_mm >= enough), None)
 
 
-def way_in(phases: Sequence[MotionPhase]) -> MotionPhase | None:
+def find_way_in(phases: Sequence[MotionPhase]) -> MotionPhase | None:
     """The loading with which the first advance ends, holds and other rates before it; None where none is.
 
     An advance of less than a tenth of the travel that is taken back is not counted.
@@ -116,7 +116,7 @@ def way_in(phases: Sequence[MotionPhase]) -> MotionPhase | None:
     return last
 
 
-def boundaries(phases: Sequence[MotionPhase]) -> Array:
+def find_boundaries(phases: Sequence[MotionPhase]) -> Array:
     """Times (k,) s at which phases begin or end: the kinks of the displacement, both its ends among them."""
     return np.array([phases[0].start_s, *(phase.end_s for phase in phases)])
 
@@ -146,19 +146,19 @@ def spread(phases: Sequence[MotionPhase], points: int, among: Array | None = Non
     return np.concatenate(grid)
 
 
-def in_words(phases: Sequence[MotionPhase]) -> str:
+def describe_phases(phases: Sequence[MotionPhase]) -> str:
     """The phases as people say them, cycles that repeat within 5 % counted; the approach left out."""
     named = [phase for phase in phases if phase.kind != "approach"]
     for length in range(1, len(named) // 2 + 1):
         cycles = len(named) // length
         if cycles * length == len(named) and all(
-            _alike(a, b) for a, b in zip(named, named[length:], strict=False)
+            _is_alike(a, b) for a, b in zip(named, named[length:], strict=False)
         ):
-            return f"{cycles} cycles of {', '.join(map(_word, named[:length]))}"
-    return ", ".join(map(_word, named))
+            return f"{cycles} cycles of {', '.join(map(_describe_phase, named[:length]))}"
+    return ", ".join(map(_describe_phase, named))
 
 
-def _alike(one: MotionPhase, other: MotionPhase) -> bool:
+def _is_alike(one: MotionPhase, other: MotionPhase) -> bool:
     """Whether two phases are the same part of two cycles: the first one's way is from touch-down."""
     if one.kind != other.kind:
         return False
@@ -166,13 +166,13 @@ def _alike(one: MotionPhase, other: MotionPhase) -> bool:
     return abs(a - b) <= 0.05 * abs(a)
 
 
-def _word(phase: MotionPhase) -> str:
+def _describe_phase(phase: MotionPhase) -> str:
     if phase.kind == "hold":
         return f"hold for {phase.duration_s:.3g} s"
     return f"{phase.kind} at {abs(phase.rate_mm_s):.3g} mm/s"
 
 
-def _piece(start_s: float, end_s: float, start_mm: float, end_mm: float, allowed: float) -> MotionPhase:
+def _build_piece(start_s: float, end_s: float, start_mm: float, end_mm: float, allowed: float) -> MotionPhase:
     change = end_mm - start_mm
     kind: Kind = "hold" if abs(change) <= allowed else "load" if change > 0.0 else "unload"
     return MotionPhase(kind, start_s, end_s, start_mm, end_mm)
@@ -192,7 +192,7 @@ def _from_contact(phases: Sequence[MotionPhase], contact_s: float) -> tuple[Moti
     )
 
 
-def _corners(times: Array, values: Array, allowed: float) -> list[int]:
+def _find_corners(times: Array, values: Array, allowed: float) -> list[int]:
     """Indices of the fewest samples between which straight lines follow all others to ``allowed``.
 
     Split where the misfit is largest (Douglas and Peucker, Cartographica 10, 1973, here along the
@@ -201,14 +201,14 @@ def _corners(times: Array, values: Array, allowed: float) -> list[int]:
     corners, open_pieces = {0, len(times) - 1}, [(0, len(times) - 1)]
     while open_pieces:
         a, b = open_pieces.pop()
-        miss = _misfit(times, values, a, b)
+        miss = _compute_misfit(times, values, a, b)
         if miss.size and miss.max() > allowed:
             middle = a + 1 + int(np.argmax(miss))
             corners.add(middle)
             open_pieces += [(a, middle), (middle, b)]
     kept = sorted(corners)
     while len(kept) > 2:
-        without = [_misfit(times, values, a, b).max() for a, b in zip(kept, kept[2:])]
+        without = [_compute_misfit(times, values, a, b).max() for a, b in zip(kept, kept[2:])]
         least = int(np.argmin(without))
         if without[least] > allowed:
             break
@@ -216,7 +216,7 @@ def _corners(times: Array, values: Array, allowed: float) -> list[int]:
     return kept
 
 
-def _misfit(times: Array, values: Array, a: int, b: int) -> Array:
+def _compute_misfit(times: Array, values: Array, a: int, b: int) -> Array:
     """How far the samples between two are from the straight line through those, mm."""
     inside = slice(a + 1, b)
     straight = np.interp(times[inside], [times[a], times[b]], [values[a], values[b]])

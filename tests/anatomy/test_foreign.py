@@ -26,7 +26,7 @@ from limbfit.anatomy.meshing.untangling import (
 )
 from limbfit.anatomy.sites.sites import compute_indenter_axis, project_to_skin
 from limbfit.errors import MeshingError
-from limbfit.mesh import check, quality
+from limbfit.mesh import check, measure_quality
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import foreign_meshes
@@ -99,7 +99,7 @@ def test_inverted_cells_are_mended_and_told(monkeypatch, anatomy, site, where):
     base = build_base_mesh(anatomy, COARSE)
     mesh, report = mesh_site(anatomy, *site, COARSE, base)
     check(mesh)
-    assert quality(mesh).inverted == 0
+    assert measure_quality(mesh).inverted == 0
     assert sum(repair.cells for repair in report.repairs) > 0
     told = np.array(report.repairs[0].place_mm)
     assert np.linalg.norm(told - base.fields.frame.to_patient(places[0])) < 25.0

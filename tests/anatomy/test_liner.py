@@ -12,7 +12,7 @@ from limbfit.anatomy.meshing.liner import build_liner_surface
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.anatomy.surfaces.surfaces import Anatomy
 from limbfit.anatomy.surfaces.triangles import check_closed
-from limbfit.mesh import quality
+from limbfit.mesh import measure_quality
 
 THICKNESS = 6.0
 SETTINGS = MeshSettings(
@@ -50,7 +50,7 @@ def test_depth_of_fat_is_counted_from_the_outer_face(oblique: Anatomy) -> None:
 
 def test_a_whole_limb_is_fine_all_around(oblique: Anatomy, lined: Anatomy) -> None:
     mesh, report = mesh_limb(lined, SETTINGS, fine_to_mm=30.0)
-    assert quality(mesh).inverted == 0
+    assert measure_quality(mesh).inverted == 0
     assert mesh.region_names == ("liner", "skin", "muscle")
     assert report.layer_thickness_mm["liner"]["mean"] == pytest.approx(THICKNESS, rel=0.02)
     assert report.layer_thickness_mm["skin"]["mean"] == pytest.approx(3.0, rel=0.03)

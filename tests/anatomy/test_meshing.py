@@ -22,7 +22,7 @@ from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_
 from limbfit.anatomy.meshing.meshreport import mesh_warnings
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, read_surface
 from limbfit.errors import MeshingError, SurfaceError
-from limbfit.mesh import Mesh, boundary_faces, quality, to_tet10
+from limbfit.mesh import Mesh, boundary_faces, measure_quality, to_tet10
 from limbfit.mesh.cells import quadratic_simplex
 
 OPENLIMB = SHARED / "reference" / "openlimb-study"
@@ -65,7 +65,7 @@ def test_volume_layer_and_quality(meshed: tuple) -> None:
     assert report.layer_std_mm < 0.05
     assert report.min_dihedral_deg >= 8.0
     assert report.min_scaled_jacobian > 0.1
-    assert quality(mesh).inverted == 0
+    assert measure_quality(mesh).inverted == 0
     assert report.interface_error_mm["mean"] < 0.1
     assert report.warnings == ()
     assert sum(report.region_cells.values()) == report.cells == len(mesh.cells)
@@ -82,13 +82,13 @@ def test_a_flat_element_is_told_where_it_matters(meshed: tuple) -> None:
         foot = points[[a, b, c]].mean(axis=0)
         points[top] = foot + height * (points[top] - foot)
         flat = mesh.with_points(points)
-        return mesh_warnings(flat, quality(flat), 0.0, (position, 20.0))
+        return mesh_warnings(flat, measure_quality(flat), 0.0, (position, 20.0))
 
     near, far = int(distance.argmin()), int(distance.argmax())
-    assert mesh_warnings(mesh, quality(mesh), 0.01, (position, 20.0)) == ()
+    assert mesh_warnings(mesh, measure_quality(mesh), 0.01, (position, 20.0)) == ()
     assert [text.startswith("smallest dihedral angle within 20 mm") for text in told(near, 0.06)] == [True]
     assert told(far, 0.001)[0].startswith("smallest dihedral angle 0.")
-    assert "volume differs by 3.0 %" in mesh_warnings(mesh, quality(mesh), 0.03)[0]
+    assert "volume differs by 3.0 %" in mesh_warnings(mesh, measure_quality(mesh), 0.03)[0]
 
 
 def test_nodes_of_the_skin_stay_on_a_rough_one(oblique: Anatomy) -> None:
@@ -284,7 +284,7 @@ def test_netgen_makes_the_same_limb(oblique: Anatomy, meshed: tuple) -> None:
     position, axis = site_of(oblique, np.array([1.0, 0.2, 0.1]), -35.0)
     mesh, report = mesh_site(oblique, position, axis, replace(COARSE, engine="netgen"))
     conforms(mesh)
-    assert quality(mesh).inverted == 0
+    assert measure_quality(mesh).inverted == 0
     assert report.engine == "netgen"
     assert report.min_dihedral_deg >= 7.0
     assert report.layer_mean_mm == pytest.approx(3.0, abs=0.05)

@@ -8,7 +8,7 @@ import pyvista as pv
 
 from limbfit.anatomy.meshing.smoothing import OPPOSITE, compute_worst_angles
 from limbfit.anatomy.surfaces.triangles import Surface, from_pyvista
-from limbfit.mesh import dihedral_angles
+from limbfit.mesh import compute_dihedral_angles
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_smallest_angles_are_those_of_the_mesh(corner) -> None:
     points = random.normal(size=(200, 4, 3))
     volume = np.linalg.det(points[:, 1:] - points[:, :1])
     flat = points.reshape(-1, 3)
-    wanted = dihedral_angles(flat, np.arange(800).reshape(-1, 4)).min(axis=1)
+    wanted = compute_dihedral_angles(flat, np.arange(800).reshape(-1, 4)).min(axis=1)
     found = compute_worst_angles(points[:, corner, None], points[:, OPPOSITE[corner]])[:, 0]
     assert (volume > 0).sum() > 50
     np.testing.assert_allclose(found[volume > 0], wanted[volume > 0], atol=1e-6)

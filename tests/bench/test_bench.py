@@ -23,7 +23,7 @@ from limbfit.bench.socket import SOCKET
 from limbfit.cli import main
 from limbfit.errors import InputError
 from limbfit.fe import ELEMENTS, StepControl, System
-from limbfit.mesh import cell_volumes, check, quality
+from limbfit.mesh import cell_volumes, check, measure_quality
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
 with_reference = pytest.mark.skipif(
@@ -40,7 +40,7 @@ def silent(done: int, total: int, text: str) -> None:
 def test_block_fills_its_box(cell_type):
     mesh = build_layered_block(cell_type, 8)
     check(mesh)
-    found = quality(mesh)
+    found = measure_quality(mesh)
     assert found.region_volumes_mm3["skin"] == pytest.approx(60 * 60 * 3)
     assert found.region_volumes_mm3["muscle"] == pytest.approx(60 * 60 * 27)
     skin = mesh.points[mesh.face_sets["skin"]]

@@ -23,7 +23,7 @@ from limbfit.fe import (
     solve,
 )
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.materials import prony_factors
+from limbfit.fe.materials import compute_prony_factors
 from limbfit.fe.materials.volumetric import volumetric
 from limbfit.fe.observables import compute_element_fields
 from limbfit.fe.system import Increment
@@ -240,10 +240,10 @@ def test_volumetric_laws(law, J):
 @pytest.mark.parametrize("dt", [1e-6, 1e-3, 0.1, 10.0])
 def test_prony_factors_and_their_derivatives(dt):
     tau, h = 0.32, 1e-5
-    _, ramp, _, d_decay, d_ramp, _ = prony_factors(dt, tau)
+    _, ramp, _, d_decay, d_ramp, _ = compute_prony_factors(dt, tau)
     grid = np.linspace(0.0, dt, 20001)
     assert ramp == pytest.approx(np.trapezoid(np.exp(-(dt - grid) / tau), grid) / dt, rel=1e-6)
-    ahead, back = prony_factors(dt, tau + h), prony_factors(dt, tau - h)
+    ahead, back = compute_prony_factors(dt, tau + h), compute_prony_factors(dt, tau - h)
     assert d_decay == pytest.approx((ahead[0] - back[0]) / (2 * h), rel=1e-5)
     assert d_ramp == pytest.approx((ahead[1] - back[1]) / (2 * h), rel=1e-4, abs=1e-10)
 

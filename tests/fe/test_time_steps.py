@@ -8,7 +8,7 @@ from blocks import punch
 
 from limbfit.bench.layer import compute_curve_error, solve_layer, solve_reference_layer
 from limbfit.fe import History, StepControl, solve
-from limbfit.fe.materials import prony_factors
+from limbfit.fe.materials import compute_prony_factors
 from limbfit.fe.solution.schedule import grade_steps, predict_remaining_times
 from limbfit.phantom.forces import DISCRETISATIONS
 from limbfit.study import SolverTable
@@ -99,11 +99,11 @@ def test_the_history_of_a_quadratic_stress_is_exact(x, q):
     s, w = np.polynomial.legendre.leggauss(40)
     s = 0.5 * dt * (s + 1.0)
     whole = 0.5 * dt * w @ (np.exp(-(dt - s) / tau) * (0.3 + 2.0 * 0.7 * s / dt))
-    f = prony_factors(dt, tau, q * dt)
+    f = compute_prony_factors(dt, tau, q * dt)
     change, before = 0.3 * dt + 0.7 * dt, 0.3 * q * dt - 0.7 * q**2 * dt
     assert f.ramp * change + f.back * before == pytest.approx(whole, rel=1e-9)
     h = 1e-5 * tau
-    ends = [prony_factors(dt, tau + sign * h, q * dt) for sign in (1, -1)]
+    ends = [compute_prony_factors(dt, tau + sign * h, q * dt) for sign in (1, -1)]
     for name in ("decay", "ramp", "back"):
         slope = (getattr(ends[0], name) - getattr(ends[1], name)) / (2 * h)
         assert getattr(f, f"d_{name}") == pytest.approx(slope, rel=1e-5, abs=1e-9)

@@ -16,10 +16,10 @@ from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import (
     FIXED,
     Prior,
+    build_stage_groupings,
     constrain,
     group_by_kind,
     group_separately,
-    stage_groupings,
 )
 from limbfit.identify.fit.state import CalibrationSettings
 
@@ -29,7 +29,7 @@ GAMMA, TAU = NAMES.index("skin.gamma"), NAMES.index("skin.tau_s")
 def test_fixed_names_move_in_no_stage():
     start = PAPER.start.copy()
     start[GAMMA] = TRUTH[GAMMA]
-    stages = [constrain(grouping, NAMES, ["skin.gamma"]) for grouping in stage_groupings(NAMES)]
+    stages = [constrain(grouping, NAMES, ["skin.gamma"]) for grouping in build_stage_groupings(NAMES)]
     assert [stage[GAMMA] for stage in stages] == [FIXED, FIXED]
     tight = CalibrationSettings(relative_tolerance=1e-4)
     found = calibrate(simulate, records(), replace(PAPER, start=start), tight, stages=stages)

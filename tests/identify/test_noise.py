@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from limbfit.autoregressive import block_covariance
+from limbfit.autoregressive import compute_block_covariance
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.uncertainty.discrepancy import ResidualModel, compute_matern
 from limbfit.identify.uncertainty.noise import (
@@ -32,7 +32,9 @@ def test_the_covariance_of_means_is_that_of_sampled_means(lag):
     index = np.arange(n * samples)
     full = lag ** np.abs(index[:, None] - index[None, :])
     average = np.kron(np.eye(n), np.full((1, samples), 1 / samples))
-    assert block_covariance(1.0, lag, np.full(n, samples)) == pytest.approx(average @ full @ average.T)
+    assert compute_block_covariance(1.0, lag, np.full(n, samples)) == pytest.approx(
+        average @ full @ average.T
+    )
 
 
 def test_the_covariance_of_means_of_unequal_numbers():
@@ -40,7 +42,7 @@ def test_the_covariance_of_means_of_unequal_numbers():
     index = np.arange(samples.sum())
     full = 0.8 ** np.abs(index[:, None] - index[None, :])
     average = np.repeat(np.diag(1 / samples), samples, axis=1)
-    assert block_covariance(1.0, 0.8, samples) == pytest.approx(average @ full @ average.T)
+    assert compute_block_covariance(1.0, 0.8, samples) == pytest.approx(average @ full @ average.T)
 
 
 def test_a_record_tells_its_noise():

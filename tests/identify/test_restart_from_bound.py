@@ -10,7 +10,7 @@ from bars import NAMES, PAPER, TRUTH, Counted, records
 
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.multistart import combine_searches, continue_from_bound, find_start_inside
-from limbfit.identify.fit.parameters import FIXED, group_separately, stage_groupings
+from limbfit.identify.fit.parameters import FIXED, build_stage_groupings, group_separately
 from limbfit.identify.fit.state import Calibration
 
 GAMMA = NAMES.index("skin.gamma")
@@ -60,7 +60,7 @@ def test_a_smaller_error_is_the_answer_and_its_way_follows_the_first(bounded):
     found = combine_searches(bounded, second, ["skin.gamma"])
     assert found.parameters == pytest.approx(TRUTH, rel=0.02)
     assert found.cost == second.cost < bounded.cost
-    assert [stage.grouping for stage in found.stages] == list(stage_groupings(NAMES))
+    assert [stage.grouping for stage in found.stages] == list(build_stage_groupings(NAMES))
     assert [one.stage for one in found.history] == sorted(one.stage for one in found.history)
     assert found.history[-1].parameters == second.history[-1].parameters
     assert found.history[-1].evaluations == found.evaluations
@@ -76,6 +76,6 @@ def test_a_second_search_that_fails_leaves_the_answer_and_is_told(bounded):
 
     said = []
     first = bounded, ()
-    assert continue_from_bound(first, LOW, stage_groupings(NAMES), search, said.append) is first
+    assert continue_from_bound(first, LOW, build_stage_groupings(NAMES), search, said.append) is first
     assert said[0] == "skin.gamma at a bound: searched again from inside"
     assert said[1].startswith("warning: skin.gamma at a bound: searched again from inside, which fails: ")

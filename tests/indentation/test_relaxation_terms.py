@@ -11,7 +11,7 @@ from limbfit.errors import StudyError
 from limbfit.fe import OgdenQLV
 from limbfit.indentation import build_materials
 from limbfit.laws import LAWS, MOST_RELAXATIONS, TissueLaw, is_ogden
-from limbfit.report.formats import symbol, unit_of
+from limbfit.report.formats import format_symbol, get_unit
 from limbfit.study import load_study
 
 TEXT = """
@@ -80,8 +80,8 @@ def test_what_cannot_be_is_said_in_a_line(tmp_path, law, more, what):
 
 
 def test_symbols_have_their_numbers_below():
-    assert [symbol(key) for key in ("tau_s", "tau2_s", "gamma1", "c_kPa")] == ["τ", "τ₂", "γ₁", "c"]
-    assert unit_of("tau2_s") == "s"
+    assert [format_symbol(key) for key in ("tau_s", "tau2_s", "gamma1", "c_kPa")] == ["τ", "τ₂", "γ₁", "c"]
+    assert get_unit("tau2_s") == "s"
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from limbfit.mesh import (
     boundary_faces,
     cell_volumes,
     check,
-    quality,
+    measure_quality,
     read_vtu,
     to_tet10,
     write_pvd,
@@ -40,14 +40,14 @@ def cube(cell_type: str = "tet4") -> Mesh:
 
 @pytest.mark.parametrize("cell_type", ["tet4", "tet10", "hex8"])
 def test_volume_and_jacobian_of_a_cube(cell_type: str) -> None:
-    found = quality(cube(cell_type))
+    found = measure_quality(cube(cell_type))
     assert found.volume_mm3 == pytest.approx(8.0, rel=1e-12)
     assert found.min_scaled_jacobian == pytest.approx(1.0, rel=1e-12)
     assert found.inverted == 0
 
 
 def test_dihedral_angles_of_the_kuhn_tetrahedron() -> None:
-    found = quality(cube())
+    found = measure_quality(cube())
     assert found.min_dihedral_deg == pytest.approx(45.0)
     assert found.max_dihedral_deg == pytest.approx(90.0)
     assert found.region_volumes_mm3 == pytest.approx({"skin": 4.0, "muscle": 4.0})

@@ -9,7 +9,7 @@ import pytest
 
 from limbfit.fe import History
 from limbfit.fe.solution.control import StepControl, schedule_steps
-from limbfit.phases import boundaries, find_phases, in_words, loading_end
+from limbfit.phases import describe_phases, find_boundaries, find_loading_end, find_phases
 
 
 def kinds(times, displacement, **settings):
@@ -58,7 +58,7 @@ def test_corners_and_samples_give_the_same_phases(name):
 def test_phases_meet_and_cover_the_history():
     for times, displacement, _ in HISTORIES.values():
         phases = find_phases(np.array(times), np.array(displacement))
-        ends = boundaries(phases)
+        ends = find_boundaries(phases)
         assert ends[0] == times[0]
         assert ends[-1] == times[-1]
         np.testing.assert_array_equal(ends[1:-1], [phase.start_s for phase in phases[1:]])
@@ -82,7 +82,7 @@ def test_all_before_contact_is_one_approach():
 
 def test_phases_in_words():
     def words(times, displacement):
-        return in_words(find_phases(np.array(times), np.array(displacement)))
+        return describe_phases(find_phases(np.array(times), np.array(displacement)))
 
     held = words([0.0, 1.0, 31.0, 33.0], [0.0, 5.0, 5.0, 0.0])
     assert held == "load at 5 mm/s, hold for 30 s, unload at 2.5 mm/s"
@@ -108,11 +108,11 @@ def test_loading_ends_where_the_hold_begins(end_mm):
 
 def test_loading_ends_at_the_first_of_equal_cycles():
     times, displacement = np.array(CYCLES[0]), np.array(CYCLES[1])
-    assert loading_end(find_phases(times, displacement)).end_s == 1.0
+    assert find_loading_end(find_phases(times, displacement)).end_s == 1.0
     displacement[3] = 10.02  # the second is deeper by less than the tolerance
-    assert loading_end(find_phases(times, displacement)).end_s == 1.0
+    assert find_loading_end(find_phases(times, displacement)).end_s == 1.0
     displacement[3] = 11.0
-    assert loading_end(find_phases(times, displacement)).end_s == 3.0
+    assert find_loading_end(find_phases(times, displacement)).end_s == 3.0
 
 
 def test_a_history_without_loading_has_its_peak_at_rest():

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from limbfit.report.formats import duration, fixed, number
+from limbfit.report.formats import format_duration, format_fixed, number
 from limbfit.report.sections.provenance import flatten_settings
 
 
@@ -30,7 +30,12 @@ def test_number(value: float | None, text: str) -> None:
 
 
 def test_fixed() -> None:
-    assert [fixed(6.749), fixed(-0.26, 2), fixed(None), fixed(math.nan)] == ["6.7", "−0.26", "–", "–"]
+    assert [format_fixed(6.749), format_fixed(-0.26, 2), format_fixed(None), format_fixed(math.nan)] == [
+        "6.7",
+        "−0.26",
+        "–",
+        "–",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -38,7 +43,7 @@ def test_fixed() -> None:
     [(4.26, "4.3 s"), (151.2, "2 min 31 s"), (5700, "1 h 35 min"), (None, "–")],
 )
 def test_duration(seconds: float | None, text: str) -> None:
-    assert duration(seconds) == text
+    assert format_duration(seconds) == text
 
 
 def test_flatten_names_sites_and_keeps_order() -> None:

@@ -18,7 +18,7 @@ from bodies import limb
 from limbfit.anatomy.frame import build_limb_frame
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
-from limbfit.donning import Load, SocketFit, don, pack, socket_problem, unpack
+from limbfit.donning import Load, SocketFit, build_socket_problem, don, pack, unpack
 from limbfit.errors import ProblemError
 from limbfit.fe import Checkpoints, OgdenQLV, StepControl, solve
 from limbfit.pipeline.shared.kept import Begun, ResultFiles
@@ -45,7 +45,7 @@ def donned(tmp_path_factory):
         for name, force, hold in (("stance", 60.0, 0.0), ("walk", 90.0, 1.0))
     ]
     fit = SocketFit(anatomy.cut_point, UP, np.array([0.0, -1.0, 0.0]), 0.3, 1.0, 0.5, loads=loads)
-    problem = socket_problem(mesh, TISSUES, socket, fit)
+    problem = build_socket_problem(mesh, TISSUES, socket, fit)
     middles = mesh.points[mesh.face_sets["skin"][:, :3]].mean(axis=1)
     given = problem, fit, {"front": middles[:, 1] < anatomy.cut_point[1] - 20.0}
     places: list[Begun] = []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from limbfit.donning import outer_surface, press, pressed_problem
+from limbfit.donning import build_pressed_problem, extract_outer_surface, press
 from limbfit.errors import ProblemError
 from limbfit.fe import NeoHookean
 from limbfit.mesh import TET10_EDGES, Mesh, boundary_faces, to_tet10
@@ -54,7 +54,7 @@ def test_a_ball_around_a_rigid_one_is_the_closed_form() -> None:
     mesh = ball()
     count = len(mesh.face_sets["skin"])
     pressure = 1e-3 * MU * 1e3  # kPa: a thousandth of the shear modulus
-    problem = pressed_problem(
+    problem = build_pressed_problem(
         mesh, {"muscle": NeoHookean(MU, kappa_ratio=RATIO)}, np.full(count, pressure), 1.0, 0.0
     )
     result = press(problem)
@@ -62,7 +62,7 @@ def test_a_ball_around_a_rigid_one_is_the_closed_form() -> None:
     bulk = RATIO * MU
     a = -1e-3 * pressure / (3 * bulk + 4 * MU * (INNER / OUTER) ** 3)
     expected = a * (OUTER - INNER**3 / OUTER**2)
-    before, after = outer_surface(mesh), outer_surface(mesh, result.states[-1].u)
+    before, after = extract_outer_surface(mesh), extract_outer_surface(mesh, result.states[-1].u)
     inwards = np.linalg.norm(after.points, axis=1) - np.linalg.norm(before.points, axis=1)
     assert inwards.mean() == pytest.approx(expected, rel=0.01)
     assert np.abs(inwards - expected).max() < 0.05 * abs(expected)
@@ -72,17 +72,17 @@ def test_the_pressure_is_kept_in_levels() -> None:
     mesh = ball()
     count = len(mesh.face_sets["skin"])
     field = np.linspace(0.0, 8.0, count)
-    problem = pressed_problem(mesh, {"muscle": NeoHookean(MU)}, field, 2.0, 10.0)
+    problem = build_pressed_problem(mesh, {"muscle": NeoHookean(MU)}, field, 2.0, 10.0)
     found = np.zeros(count)
     rows = {tuple(face): i for i, face in enumerate(mesh.face_sets["skin"])}
     for one in problem.pressures:
         found[[rows[tuple(face)] for face in one.faces]] = 1e3 * one.at(12.0)
     assert np.abs(found - field).max() <= 0.5 * 8.0 / 32 + 1e-9
     with pytest.raises(ProblemError, match="no pressure is stated"):
-        pressed_problem(mesh, {"muscle": NeoHookean(MU)}, np.zeros(count), 2.0, 0.0)
+        build_pressed_problem(mesh, {"muscle": NeoHookean(MU)}, np.zeros(count), 2.0, 0.0)
 
 
 def test_the_surface_has_the_area_of_a_sphere() -> None:
-    surface = outer_surface(ball())
+    surface = extract_outer_surface(ball())
     assert surface.face_areas.sum() == pytest.approx(4 * np.pi * OUTER**2, rel=0.01)
     assert surface.volume == pytest.approx(4 / 3 * np.pi * OUTER**3, rel=0.01)  # closed, outwards

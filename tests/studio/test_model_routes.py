@@ -11,7 +11,7 @@ import pyvista as pv
 from fastapi.testclient import TestClient
 
 from limbfit import load_study
-from limbfit.mesh import Mesh, boundary_faces, quality, write_vtu
+from limbfit.mesh import Mesh, boundary_faces, measure_quality, write_vtu
 from limbfit.studio.app import create_app
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import Door
@@ -167,7 +167,7 @@ def test_a_mesh_is_sent_with_the_quality_of_its_cells(page, study):
     assert scene["quality"]["1"]["min_dihedral_deg"] == 54.7
     arrays, facts = unpack(page.get("/api/model/mesh/1").content)
     assert facts["regions"] == ["skin", "muscle"]
-    assert arrays["min_dihedral_deg"].min() == pytest.approx(quality(mesh).min_dihedral_deg, rel=1e-5)
+    assert arrays["min_dihedral_deg"].min() == pytest.approx(measure_quality(mesh).min_dihedral_deg, rel=1e-5)
     assert (arrays["neighbours"] < 0).sum() == len(boundary_faces(mesh))
     layer, _ = unpack(page.get("/api/model/layer/1/skin").content)
     np.testing.assert_allclose(layer["points"][:, 2], 6.0)

@@ -7,7 +7,7 @@ import pytest
 from made_records import OPENLIMB, RELAXATION, needs_openlimb, needs_relaxation, record
 
 from limbfit.errors import TraceError
-from limbfit.phases import boundaries
+from limbfit.phases import find_boundaries
 from limbfit.traces import Trace, find_touch_down, read_trace, regularise, touch_down_at
 
 
@@ -85,9 +85,9 @@ def test_stated_touch_down_and_peak_are_taken():
     assert stated.baseline_N == found.baseline_N
     turn = 5.4 / 0.96
     later = regularise(trace, stated, peak_s=turn + 0.1)
-    assert boundaries(later.phases)[1] == pytest.approx(turn + 0.1 - stated.time_s)
+    assert find_boundaries(later.phases)[1] == pytest.approx(turn + 0.1 - stated.time_s)
     assert later.depth_mm == pytest.approx(5.0 - 0.3 * 0.96, abs=0.12)
-    assert boundaries(regularise(trace, found).phases)[1] == pytest.approx(turn - found.time_s, abs=0.01)
+    assert find_boundaries(regularise(trace, found).phases)[1] == pytest.approx(turn - found.time_s, abs=0.01)
 
 
 def test_stated_times_off_the_record_are_refused():

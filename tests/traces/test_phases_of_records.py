@@ -7,7 +7,7 @@ import pytest
 from made_records import RELAXATION, needs_relaxation, path_record
 
 from limbfit.errors import TraceError
-from limbfit.phases import boundaries
+from limbfit.phases import find_boundaries
 from limbfit.traces import TouchDown, Trace, check_trace, find_touch_down, read_trace, regularise
 
 PROTOCOLS = {
@@ -43,7 +43,7 @@ def test_every_phase_of_a_record_is_found_and_smoothed_by_itself(name):
     assert touch.displacement_mm == pytest.approx(0.4, abs=0.1)
     curve = regularise(trace, touch)
     assert [phase.kind for phase in curve.phases] == expected.split()
-    ends = boundaries(curve.phases)[1:-1] + touch.time_s
+    ends = find_boundaries(curve.phases)[1:-1] + touch.time_s
     assert ends == pytest.approx(corners_s[1:-1], abs=0.01)
     error = curve.force_N - truth(curve.time_s + touch.time_s)
     assert np.sqrt(np.mean(error**2)) < 0.01

@@ -87,7 +87,7 @@ class SerialLink:
         try:
             self._port: Any = serial.Serial(port, baud, timeout=0, write_timeout=0, exclusive=True)
         except _REFUSALS as error:
-            raise RunError(f"{port} cannot be opened: {_why(error, baud)}") from None
+            raise RunError(f"{port} cannot be opened: {_describe_why(error, baud)}") from None
         self._port.reset_input_buffer()
 
     def fileno(self) -> int:
@@ -112,7 +112,7 @@ class SerialLink:
             self._port.close()
 
 
-def _why(error: Exception, baud: int) -> str:
+def _describe_why(error: Exception, baud: int) -> str:
     """Why a port does not open: pyserial wraps the system's reason in words of its own."""
     if isinstance(error, ValueError):
         return f"it does not support {baud} baud; give another after @"

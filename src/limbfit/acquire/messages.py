@@ -113,9 +113,9 @@ def parse_command(body: str) -> Command | None:
     if verb in ("SITE", "PHASE") and len(words) == 1:
         return NoteCommand(verb, words[0]) if _WORD.match(words[0]) else None
     if verb == "HELLO" and len(words) == 2:
-        version = _integers(words[:1])
+        version = _read_integers(words[:1])
         return Hello(words[1], version[0]) if version and _NONCE.match(words[1]) else None
-    numbers = _integers(words)
+    numbers = _read_integers(words)
     if numbers is None or any(abs(n) > MAX_MICRO for n in numbers if verb != "BEAT"):
         return None
     match verb, numbers:
@@ -140,7 +140,7 @@ def _is_pin(pin: int) -> bool:
     return 1 <= pin <= PINS
 
 
-def _integers(words: list[str]) -> list[int] | None:
+def _read_integers(words: list[str]) -> list[int] | None:
     return [int(word) for word in words] if all(_INTEGER.match(word) for word in words) else None
 
 
@@ -223,13 +223,13 @@ def parse_report(body: str, number: int) -> Report | None:
         return _sample(body, number)
     verb, *words = body.split(" ")
     if verb == "ID" and len(words) == 11:
-        return _identity(words)
+        return _read_identity(words)
     if verb == "NO" and len(words) == 2 and _INTEGER.match(words[0]) and _WORD.match(words[1]):
         return Declined(int(words[0]), words[1])
     if verb == "FAULT" and len(words) == 2 and _WORD.match(words[0]) and _INTEGER.match(words[1]):
         pin = int(words[1])
         return LimitTripped(words[0], pin) if pin == 0 or _is_pin(pin) else None
-    numbers = _integers(words)
+    numbers = _read_integers(words)
     match verb, numbers:
         case "OK", [done]:
             return Accepted(done)
@@ -254,8 +254,8 @@ def _sample(body: str, number: int) -> Sample | None:
     )
 
 
-def _identity(words: list[str]) -> Identity | None:
-    numbers = _integers([words[0], *words[2:7]])
+def _read_identity(words: list[str]) -> Identity | None:
+    numbers = _read_integers([words[0], *words[2:7]])
     names = words[8:]
     if numbers is None or not _NONCE.match(words[1]) or not all(map(_WORD.match, names)):
         return None

@@ -50,7 +50,7 @@ _MEANINGS = {
 }
 
 
-def _why(code: str) -> str:
+def _describe_why(code: str) -> str:
     return f" ({_MEANINGS[code]})" if code in _MEANINGS else ""
 
 
@@ -158,11 +158,13 @@ class Session:
                     self.counts.declined[code] = self.counts.declined.get(code, 0) + 1
                     self._record("declined", now, code=code)
                     if not self.protocol.is_over and self.protocol.phase is not Phase.STOPPING:
-                        self.handle(Abort(f"the device declined a command: {code}{_why(code)}"), now)
+                        self.handle(Abort(f"the device declined a command: {code}{_describe_why(code)}"), now)
                 case LimitTripped(code=code, pin=pin):
                     self._record("fault", now, code=code, pin=pin)
                     where = f", pin {pin}" if pin else ""
-                    self.handle(Abort(f"the device stopped by itself: {code}{where}{_why(code)}"), now)
+                    self.handle(
+                        Abort(f"the device stopped by itself: {code}{where}{_describe_why(code)}"), now
+                    )
                 case OutOfReach(pins=pins):
                     self.unreachable = tuple(k + 1 for k in range(pins.bit_length()) if pins >> k & 1)
                     self._record("unreachable", now, pins=list(self.unreachable))
@@ -298,7 +300,7 @@ def run_session(session: Session, operator: SimpleQueue[Event]) -> Ending:
     gc.collect()
     gc.disable()
     try:
-        _loop(session, operator)
+        _run_loop(session, operator)
     finally:
         gc.enable()
         sys.setswitchinterval(interval)
@@ -308,7 +310,7 @@ def run_session(session: Session, operator: SimpleQueue[Event]) -> Ending:
     return session.ending()
 
 
-def _loop(session: Session, operator: SimpleQueue[Event]) -> None:
+def _run_loop(session: Session, operator: SimpleQueue[Event]) -> None:
     device, paced = session.device, session._paced
     now = 0.0 if paced else time.monotonic()
     heard = time.monotonic()

@@ -4,10 +4,10 @@ Or the other way round: under a stated pressure, whose shape is a socket's.
 """
 
 from .inside import RARE, SHEAR_LEVELS, Strains, TissueStrain
-from .model import Load, SocketFit, socket_problem, socket_steps
+from .model import Load, SocketFit, build_socket_problem, build_socket_steps
 from .outcome import SETTLING, WHOLE, Donned, DonnedPart, Held, Patch, SocketStep, don
 from .parts import pack, unpack
-from .pressing import outer_surface, press, pressed_problem
+from .pressing import build_pressed_problem, extract_outer_surface, press
 
 __all__ = [
     "RARE",
@@ -23,12 +23,12 @@ __all__ = [
     "SocketStep",
     "Strains",
     "TissueStrain",
+    "build_pressed_problem",
+    "build_socket_problem",
+    "build_socket_steps",
     "don",
-    "outer_surface",
+    "extract_outer_surface",
     "pack",
     "press",
-    "pressed_problem",
-    "socket_problem",
-    "socket_steps",
     "unpack",
 ]

@@ -60,9 +60,9 @@ class Strains:
         return TissueStrain(
             volume_mm3=float(volume.sum()),
             shear=float(shear.max()),
-            shear_rare=_exceeded(shear, volume),
+            shear_rare=_compute_exceeded(shear, volume),
             compression=float(compression.max()),
-            compression_rare=_exceeded(compression, volume),
+            compression_rare=_compute_exceeded(compression, volume),
             energy_kPa=float(self.energy_kPa[cells].max()),
             sheared_mm3={f"{level:g}": float(volume[shear > level].sum()) for level in SHEAR_LEVELS},
             cell=int(np.flatnonzero(cells)[np.argmax(shear)]),
@@ -87,7 +87,7 @@ class TissueStrain:
     cell: int
 
 
-def _exceeded(values: Array, volume: Array) -> float:
+def _compute_exceeded(values: Array, volume: Array) -> float:
     """The value that ``RARE`` of the volume exceeds."""
     order = np.argsort(values)[::-1]
     above = np.cumsum(volume[order])

@@ -81,7 +81,9 @@ class SocketFit:
         return tuple(ends)
 
 
-def socket_problem(mesh: Mesh, materials: Mapping[str, Material], socket: Socket, fit: SocketFit) -> Problem:
+def build_socket_problem(
+    mesh: Mesh, materials: Mapping[str, Material], socket: Socket, fit: SocketFit
+) -> Problem:
     """The limb's mesh in a socket that is put on and loaded.
 
     Bones and the proximal cut are held, so the socket moves: its loads are those that it exerts.
@@ -95,11 +97,11 @@ def socket_problem(mesh: Mesh, materials: Mapping[str, Material], socket: Socket
     local = (socket.points - fit.pivot) @ frame.T
     clear = None if fit.travel_mm is not None else (socket.clear - fit.pivot) @ frame.T
     shape = SmoothSurface.of(local, socket.faces, clear, centre=fit.pivot, axis=frame[2], edge=frame[0])
-    motion = _donning(fit)
+    motion = _build_donning(fit)
     before = None
     for load in fit.loads:
-        after = _wrench(load, fit)
-        motion, before = motion.then(_loading(load, before, after)), after
+        after = _build_wrench(load, fit)
+        motion, before = motion.then(_build_loading(load, before, after)), after
     body = RigidBody(shape, mesh.face_sets[OUTER], motion, fit.friction, name="socket")
     return Problem(
         mesh=mesh,
@@ -113,7 +115,7 @@ def socket_problem(mesh: Mesh, materials: Mapping[str, Material], socket: Socket
     )
 
 
-def _donning(fit: SocketFit) -> Motion:
+def _build_donning(fit: SocketFit) -> Motion:
     times, growth, z = [0.0, fit.donning_s], [0.0, 1.0], [0.0, 0.0]
     if fit.travel_mm is not None:
         growth, z = [1.0, 1.0], [-fit.travel_mm, 0.0]
@@ -122,14 +124,14 @@ def _donning(fit: SocketFit) -> Motion:
     return Motion.of(times, growth=growth, z=z)
 
 
-def _wrench(load: Load, fit: SocketFit) -> Array:
+def _build_wrench(load: Load, fit: SocketFit) -> Array:
     """(6,) force, N, and moment about the pivot, N mm, in the socket's coordinates."""
     force = np.asarray(load.force, dtype=float)
     moment = np.asarray(load.moment) + np.cross(np.asarray(load.point) - fit.pivot, force)
     return np.concatenate([fit.frame @ force, fit.frame @ moment])
 
 
-def _loading(load: Load, before: Array | None, after: Array) -> Motion:
+def _build_loading(load: Load, before: Array | None, after: Array) -> Motion:
     """From the last load, or from what holds the donned socket, to this one."""
     if not load.ramp_s > 0.0:
         raise ProblemError(f"the load {load.name!r} comes on within {load.ramp_s:g} s", remedy="give it time")
@@ -140,7 +142,7 @@ def _loading(load: Load, before: Array | None, after: Array) -> Motion:
     return Motion.of(times[:count], force=dict(zip(COORDINATES, values.T, strict=True)))
 
 
-def socket_steps(fit: SocketFit, modulus: float, threads: int | None = None) -> StepControl:
+def build_socket_steps(fit: SocketFit, modulus: float, threads: int | None = None) -> StepControl:
     """When a socket's simulation steps, and its contact stiffness; ``modulus`` as `Laws.modulus`, MPa.
 
     ``threads``: those that it may have, of which it takes no more than are of use; by default the machine's.
@@ -153,10 +155,10 @@ def socket_steps(fit: SocketFit, modulus: float, threads: int | None = None) -> 
         if off > on:
             times += [on + (off - on) * (k / HELD) ** RELAXING for k in range(1, HELD + 1)]
     return StepControl(
-        times=tuple(times), penalty=STIFFNESS / modulus, hold_penalty=True, threads=most_threads(threads)
+        times=tuple(times), penalty=STIFFNESS / modulus, hold_penalty=True, threads=choose_threads(threads)
     )
 
 
-def most_threads(given: int | None = None) -> int:
+def choose_threads(given: int | None = None) -> int:
     """Threads of one simulation, of those ``given``; by default it has the machine to itself."""
     return min(given or count_usable_cores(), MOST_THREADS)

@@ -24,7 +24,7 @@ from ..fe import (
 )
 from ..fe.kernel.laws import Laws
 from .inside import Strains
-from .model import SocketFit, socket_steps
+from .model import SocketFit, build_socket_steps
 
 Mask = NDArray[np.bool_]
 WHOLE, SETTLING = "the limb", "settling"
@@ -50,7 +50,7 @@ class Patch:
         areas = found.areas.sum(axis=1)
         shear = np.linalg.norm(found.face_shear_kPa[chosen], axis=1)
         return cls(
-            mean_kPa=_mean(found, areas, chosen),
+            mean_kPa=_compute_mean(found, areas, chosen),
             peak_kPa=float(found.face_pressure_kPa[chosen].max()),
             shear_kPa=float(areas[chosen] @ shear / areas[chosen].sum()),
             shear_peak_kPa=float(shear.max()),
@@ -137,9 +137,9 @@ def don(
     regions : masks (f,) of the faces of the socket's body.
     sensitivities : also derivatives with respect to every material parameter.
     on_row : called after every step.
-    steps : by default `socket_steps`. Derivatives are those at a contact stiffness over the mean modulus, so
-        that runs to be compared with them have the same steps.
-    threads : of those steps, as in `socket_steps`.
+    steps : by default `build_socket_steps`. Derivatives are those at a contact stiffness over the mean
+        modulus, so that runs to be compared with them have the same steps.
+    threads : of those steps, as in `build_socket_steps`.
     keep : called when donning and each load but the last have been held.
     begin : of an earlier call of the same, which goes on from there.
     """
@@ -151,17 +151,17 @@ def don(
 
     def note(step: Step) -> None:
         found = compute_tractions(system, laws, step.state)
-        rows.append(_row(step, found, patches))
+        rows.append(_to_row(step, found, patches))
         for name, _, off in fit.ends:
             if np.isclose(step.time, off):
                 pressure, shear = found.at_nodes(len(problem.mesh.points))
-                slopes = _slopes(problem, system, laws, step.state, patches) if sensitivities else {}
+                slopes = _compute_slopes(problem, system, laws, step.state, patches) if sensitivities else {}
                 strains = Strains.of(system, laws, step.state)
                 held[name] = Held(rows[-1], pressure, shear, step.state.u, strains, slopes)
         if on_row is not None:
             on_row(rows[-1])
 
-    control = steps or socket_steps(fit, laws.modulus, threads)
+    control = steps or build_socket_steps(fit, laws.modulus, threads)
     checkpoints = None
     if keep is not None:
         ends = [off for _, _, off in fit.ends[:-1]]
@@ -175,7 +175,7 @@ def don(
     return Donned(result, told, held)
 
 
-def _row(step: Step, found: Tractions, patches: Mapping[str, Mask]) -> SocketStep:
+def _to_row(step: Step, found: Tractions, patches: Mapping[str, Mask]) -> SocketStep:
     values = {name: Patch.of(found, mask) for name, mask in patches.items()}
     return SocketStep(
         time=step.time,
@@ -191,7 +191,7 @@ def _row(step: Step, found: Tractions, patches: Mapping[str, Mask]) -> SocketSte
     )
 
 
-def _slopes(
+def _compute_slopes(
     problem: Problem, system: System, laws: Laws, state: State, patches: Mapping[str, Mask]
 ) -> dict[str, Array]:
     """Derivatives (p,) of what `Held` tells: the state's own carry them to the contact's pressure."""
@@ -209,7 +209,7 @@ def _slopes(
             )
             at = compute_tractions(system, laws, there)
             areas = at.areas.sum(axis=1)
-            ways.append({name: _mean(at, areas, mask) for name, mask in patches.items()})
+            ways.append({name: _compute_mean(at, areas, mask) for name, mask in patches.items()})
         for name in patches:
             found[name][i] = (ways[0][name] - ways[1][name]) / (2.0 * LITTLE)
         if len(state.bodies):
@@ -217,5 +217,5 @@ def _slopes(
     return found
 
 
-def _mean(found: Tractions, areas: Array, chosen: Mask) -> float:
+def _compute_mean(found: Tractions, areas: Array, chosen: Mask) -> float:
     return float(areas[chosen] @ found.face_pressure_kPa[chosen] / areas[chosen].sum())

@@ -41,11 +41,11 @@ def unpack(facts: Facts, arrays: Mapping[str, Array]) -> DonnedPart:
         slopes = {patch: arrays[f"{i}.slopes.{patch}"] for patch in one["slopes"]}
         strains = Strains(**{field: arrays[f"{i}.strains.{field}"] for field in STRAINS})
         fields = {field: arrays[f"{i}.{field}"] for field in FIELDS}
-        held[name] = Held(row=_row(one["row"]), strains=strains, slopes=slopes, **fields)
-    return DonnedPart(Snapshot(facts["solver"], own), tuple(map(_row, facts["rows"])), held)
+        held[name] = Held(row=_to_row(one["row"]), strains=strains, slopes=slopes, **fields)
+    return DonnedPart(Snapshot(facts["solver"], own), tuple(map(_to_row, facts["rows"])), held)
 
 
-def _row(told: Facts) -> SocketStep:
+def _to_row(told: Facts) -> SocketStep:
     vectors = {name: np.array(told[name]) for name in ("force", "moment", "move", "turn")}
     regions = {name: Patch(**patch) for name, patch in told["regions"].items()}
     return SocketStep(**{**told, **vectors, "whole": Patch(**told["whole"]), "regions": regions})

@@ -12,14 +12,14 @@ from ..errors import ProblemError
 from ..fe import History, Pressure, Problem, Result, Step, StepControl, solve
 from ..fe.materials import Material
 from ..mesh import Mesh
-from .model import ELEMENT, OUTER, most_threads
+from .model import ELEMENT, OUTER, choose_threads
 
 LEVELS = 32  # of pressure, up to the largest: what a face has is rounded to them
 COMING_ON, HELD = 6, 4  # steps
 RELAXING = 2.0  # power of the step's number that the time of the hold goes with
 
 
-def pressed_problem(
+def build_pressed_problem(
     mesh: Mesh, materials: Mapping[str, Material], pressure_kPa: Array, on_s: float, hold_s: float
 ) -> Problem:
     """A limb whose outer surface bears a pressure that follows it; bones and proximal cut are held.
@@ -58,16 +58,16 @@ def pressed_problem(
 
 
 def press(problem: Problem, on_step: Callable[[Step], None] | None = None) -> Result:
-    """Simulate a problem of `pressed_problem`; the last state is kept."""
+    """Simulate a problem of `build_pressed_problem`; the last state is kept."""
     times = np.asarray(problem.pressures[0].times)
     on = times[1] * np.arange(1, COMING_ON + 1) / COMING_ON
     held = times[1] + (times[-1] - times[1]) * (np.arange(1, HELD + 1) / HELD) ** RELAXING
     steps = np.concatenate([on, held]) if times[-1] > times[1] else on
-    control = StepControl(times=tuple(map(float, steps)), threads=most_threads())
+    control = StepControl(times=tuple(map(float, steps)), threads=choose_threads())
     return solve(problem, control, on_step=on_step, store="all")
 
 
-def outer_surface(mesh: Mesh, displacement: Array | None = None) -> Surface:
+def extract_outer_surface(mesh: Mesh, displacement: Array | None = None) -> Surface:
     """The limb's outer surface, open at the proximal cut, LPS mm, moved by a displacement (n, 3) of nodes.
 
     The faces of quadratic cells are each four triangles.

@@ -61,7 +61,7 @@ def _run_contained(
         executor = _local.executor = ProcessExecutor(1)
     executor.limits = limits
     on_lost = (lambda _, reason: _LostJob(reason)) if contained else None
-    worker = _dask("distributed").get_worker()
+    worker = _import_dask("distributed").get_worker()
     on_report = (lambda _, message: worker.log_event(topic, (number, message))) if topic else None
     return next(executor.map(function, [job], on_lost=on_lost, on_report=on_report))
 
@@ -90,7 +90,7 @@ class DaskExecutor:
             If Dask is not installed, or no scheduler answers.
         """
         try:
-            client = _dask("distributed").Client(address, timeout=_CONNECT_S, set_as_default=False)
+            client = _import_dask("distributed").Client(address, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             raise InputError(
                 f"no Dask scheduler answers at {address!r}",
@@ -111,13 +111,13 @@ class DaskExecutor:
             For an unknown batch system, or one that cannot be used as configured.
         """
         if queue == LOCAL_QUEUE:
-            cluster = _dask("distributed").LocalCluster(
+            cluster = _import_dask("distributed").LocalCluster(
                 n_workers=workers, threads_per_worker=1, dashboard_address=None, memory_limit=0
             )
         elif queue in QUEUES:
             memory = f"{limits.memory_GB or _DEFAULT_MEMORY_GB:g}GB"
             try:
-                kind = getattr(_dask("dask_jobqueue"), QUEUES[queue])
+                kind = getattr(_import_dask("dask_jobqueue"), QUEUES[queue])
                 cluster = kind(cores=1, processes=1, memory=memory)
                 cluster.scale(jobs=workers)
             except (OSError, ValueError, TypeError, RuntimeError) as error:
@@ -132,7 +132,7 @@ class DaskExecutor:
                 place="--dask",
                 remedy=f"use {', '.join((*QUEUES, LOCAL_QUEUE))}",
             )
-        client = _dask("distributed").Client(cluster, set_as_default=False)
+        client = _import_dask("distributed").Client(cluster, set_as_default=False)
         return cls(client, limits, cluster, workers)
 
     @property
@@ -226,7 +226,7 @@ class DaskExecutor:
         return [self._home[key]]
 
     def _result(self, future: Any, contained: bool) -> Any:
-        distributed = _dask("distributed")
+        distributed = _import_dask("distributed")
         try:
             return future.result()
         except distributed.KilledWorker as error:
@@ -249,7 +249,7 @@ class DaskExecutor:
                 self._cluster.close(timeout=2)
 
 
-def _dask(module: str) -> Any:
+def _import_dask(module: str) -> Any:
     """A module of Dask's, an optional part of limbfit."""
     try:
         return __import__(module)

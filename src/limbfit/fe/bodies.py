@@ -20,7 +20,7 @@ from .contact.rigid import RigidShape
 from .contact.tool import Distances, Tool
 from .kernel.elements import Element
 from .motion import Drives, Motion, RigidBody
-from .pattern import Pattern, places_of, positions
+from .pattern import Pattern, find_places, find_positions
 from .problem import Problem, ProblemError
 
 Array = NDArray[np.float64]
@@ -135,7 +135,7 @@ class Bodies:
             [np.broadcast_to(b.frame, (b.surface.areas.size, 3, 3)) for b in self.all]
         )
         self._spread = sp.hstack([self._share(body.surface) for body in self.all], format="csr")
-        self._positions = [positions(b.surface.faces, pattern.numbers, pattern.indptr, pattern.indices)
+        self._positions = [find_positions(b.surface.faces, pattern.numbers, pattern.indptr, pattern.indices)
                            for b in self.all]  # fmt: skip
         self._border()
 
@@ -155,10 +155,10 @@ class Bodies:
         own = np.arange(start, self.unknowns)
         touching = np.flatnonzero(np.diff(self._spread.indptr))
         pairs = np.array([(r, c) for r in touching for c in own], dtype=np.int64).reshape(-1, 2)
-        places = places_of(self.pattern.indptr, self.pattern.indices, pairs)
+        places = find_places(self.pattern.indptr, self.pattern.indices, pairs)
         self._beside = pairs[places >= 0] - [0, start], places[places >= 0]
         corner = np.array([(r, c) for r in own for c in own if c >= r], dtype=np.int64).reshape(-1, 2)
-        places = places_of(self.pattern.indptr, self.pattern.indices, corner)
+        places = find_places(self.pattern.indptr, self.pattern.indices, corner)
         self._corner = corner[places >= 0] - start, places[places >= 0]
 
     @property

@@ -12,7 +12,7 @@ from .kernel.fibres import add_stress_at_rest
 from .kernel.laws import Laws
 from .kernel.response import elastic_response, elastic_stress
 from .lanes import LANES, workspace
-from .materials import prony_factors
+from .materials import compute_prony_factors
 from .motion import Drives
 from .system import Increment, Points, System
 
@@ -50,7 +50,7 @@ class Memory:
         drives: Drives,
     ) -> Increment:  # fmt: skip
         """The step of ``dt`` s that ends at ``time``."""
-        decay, ramp, back, *_ = prony_factors(dt, laws.prony[..., 1], self.duration)
+        decay, ramp, back, *_ = compute_prony_factors(dt, laws.prony[..., 1], self.duration)
         gamma = laws.prony[..., 0]
         of = points.regions
         K = ((gamma * (back - ramp)).sum(axis=1))[of][:, None, None] * self.elastic
@@ -63,7 +63,7 @@ class Memory:
 
     def advanced(self, points: Points, laws: Laws, elastic: Array, dt: float) -> Memory:
         """The memory at the end of a step of ``dt`` s that ended with the elastic stress ``elastic``."""
-        decay, ramp, back, *_ = prony_factors(dt, laws.prony[..., 1], self.duration)
+        decay, ramp, back, *_ = compute_prony_factors(dt, laws.prony[..., 1], self.duration)
         of = points.regions
         prony = np.empty_like(self.prony)
         for l in range(len(prony)):
@@ -81,14 +81,14 @@ def compute_elastic_stresses(system: System, laws: Laws, u: Array) -> Array:
     def part(cells: slice) -> None:
         elements = system.elements(cells)
         records = workspace(0, system.weights.shape[1], laws.numbers.shape[1])[:3]
-        _elastic_stresses(elements, laws.tables, u, records, stress[cells])
+        _compute_elastic_stresses(elements, laws.tables, u, records, stress[cells])
 
     system.over_cells(part)
     return stress
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _elastic_stresses(elements, tables, u, records, out):  # type: ignore[no-untyped-def]
+def _compute_elastic_stresses(elements, tables, u, records, out):  # type: ignore[no-untyped-def]
     """The kernel of `compute_elastic_stresses`, `LANES` elements side by side."""
     points, law, numbers = records
     m, q = elements[2].shape

@@ -42,7 +42,7 @@ def compute_element_fields(system: System, laws: Laws, state: State) -> ElementF
     records = points, law, numbers, element
     mean, every = system.element.mean_dilatation, slice(0, len(system.cells))
     tables = laws.acting(state.activation, np.ones(len(laws.prony)))
-    _fields(system.elements(every), mean, tables, history, state.u, records, out)
+    _compute_fields(system.elements(every), mean, tables, history, state.u, records, out)
     return ElementFields(out[:, :6], out[:, 6:9], out[:, 9], out[:, 10])
 
 
@@ -147,7 +147,7 @@ def compute_von_mises(cauchy: Array) -> Array:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _fields(elements, mean, tables, history, u, records, out):  # type: ignore[no-untyped-def]
+def _compute_fields(elements, mean, tables, history, u, records, out):  # type: ignore[no-untyped-def]
     """The kernel of `compute_element_fields`, `LANES` elements side by side; adds to ``out (m, 11)``."""
     points, law, numbers, element = records
     weights, regions = elements[2], elements[3]

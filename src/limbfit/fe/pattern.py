@@ -53,7 +53,7 @@ def append_rows(graph: sp.csr_matrix, borders: Sequence[NDArray[np.int64]]) -> s
 
 
 @njit(cache=True)
-def upper_pattern(numbers, start, neighbours, n):  # type: ignore[no-untyped-def]
+def build_upper_pattern(numbers, start, neighbours, n):  # type: ignore[no-untyped-def]
     """Upper triangle of the unknowns' graph, rows sorted, from the sorted graph of the nodes."""
     indptr = np.zeros(n + 1, dtype=np.int32)
     for sweep in range(2):
@@ -92,7 +92,7 @@ def place_of(columns, left, right, column):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def positions(cells, numbers, indptr, indices):  # type: ignore[no-untyped-def]
+def find_positions(cells, numbers, indptr, indices):  # type: ignore[no-untyped-def]
     """Place of each upper-triangle entry (component-major rows) of each cell in the sparse data."""
     m, k = cells.shape
     n = 3 * k
@@ -112,7 +112,7 @@ def positions(cells, numbers, indptr, indices):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def places_of(indptr, indices, pairs):  # type: ignore[no-untyped-def]
+def find_places(indptr, indices, pairs):  # type: ignore[no-untyped-def]
     """Place (k,) in the data of the entries at ``pairs (k, 2)`` of row and column; -1 where there is none."""
     out = np.full(len(pairs), -1, dtype=np.int64)
     for i in range(len(pairs)):

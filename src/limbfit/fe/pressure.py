@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..errors import ProblemError
 from .kernel.elements import Element
-from .pattern import Pattern, positions
+from .pattern import Pattern, find_positions
 
 Array = NDArray[np.float64]
 
@@ -134,7 +134,7 @@ class Pressures:
         self._points, self._pattern = points, pattern
         self.all = [Pressed(element, points, np.asarray(one.faces, dtype=np.int64)) for one in stated]
         self._positions = [
-            positions(one.faces, pattern.numbers, pattern.indptr, pattern.indices) for one in self.all
+            find_positions(one.faces, pattern.numbers, pattern.indptr, pattern.indices) for one in self.all
         ]
 
     def evaluate(self, u: Array, values: Sequence[float], rims: Array | float) -> tuple[float, Array, float]:

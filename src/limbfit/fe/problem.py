@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ProblemError
 from ..mesh import Mesh
-from ..phases import MotionPhase, boundaries, find_phases, loading_end
+from ..phases import MotionPhase, find_boundaries, find_loading_end, find_phases
 from .activation import Activation
 from .contact.indenter import Indenter
 from .kernel.elements import ELEMENTS, Element
@@ -111,7 +111,7 @@ class History:
     @property
     def kinks(self) -> NDArray[np.float64]:
         """Times where phases begin or end, or a move across the axis turns, s, both ends among them."""
-        found = boundaries(self.phases)
+        found = find_boundaries(self.phases)
         apart = np.abs(found[:, None] - self.turns).min(axis=0, initial=np.inf) > 1e-9 * self.times[-1]
         return np.union1d(found, self.turns[apart])
 
@@ -127,7 +127,7 @@ class History:
     @property
     def peak(self) -> float:
         """End of the loading that first reaches the largest displacement, s; 0 where nothing advances."""
-        loading = loading_end(self.phases)
+        loading = find_loading_end(self.phases)
         return 0.0 if loading is None else loading.end_s
 
     @property

@@ -24,7 +24,7 @@ from .kernel.assembly import Elements, assemble
 from .kernel.elements import Element, compute_reference_gradients
 from .kernel.laws import Laws
 from .motion import Drives
-from .pattern import Pattern, append_rows, build_node_graph, positions, upper_pattern
+from .pattern import Pattern, append_rows, build_node_graph, build_upper_pattern, find_positions
 from .pressure import Pressures
 from .prestretch import apply_prestretch
 from .problem import Problem, ProblemError
@@ -177,8 +177,8 @@ class System:
     def _build_pattern(self, problem: Problem) -> None:
         moved = [np.unique(body.faces) for body in problem.rigid_bodies if body.motion.free.any()]
         graph, numbers = append_rows(build_node_graph(self.cells, self.nodes), moved), self.numbers
-        self.indptr, self.indices = upper_pattern(numbers, graph.indptr, graph.indices, len(self.free))
-        self.cell_positions = positions(self.cells, numbers, self.indptr, self.indices)
+        self.indptr, self.indices = build_upper_pattern(numbers, graph.indptr, graph.indices, len(self.free))
+        self.cell_positions = find_positions(self.cells, numbers, self.indptr, self.indices)
 
     @property
     def unknowns(self) -> int:

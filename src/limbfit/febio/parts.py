@@ -15,9 +15,9 @@ from ..mesh import Mesh
 from ..shapes import SHARP_EDGE
 from .penalty import find_smallest_depth
 from .reading.geometry import (
+    build_part_error,
     find_boundary_faces,
     is_closed,
-    part_error,
     split_convexly,
     split_into_triangles,
 )
@@ -156,7 +156,7 @@ def _build_wall(
 def _name_part(model: FebModel, name: str, error: ProblemError) -> ProblemError:
     """Return the error of a surface, with the part that it is made of."""
     part_name, part = next(iter(model.select_parts({name: None}).items()))
-    return part_error(part, part_name, error.what)
+    return build_part_error(part, part_name, error.what)
 
 
 def _merge_faces(groups: Sequence[Indices]) -> Indices:
@@ -192,9 +192,9 @@ def build_tissue(model: FebModel) -> TissueMesh:
     first = next(iter(parts.values()))
     for name, part in parts.items():
         if not part.element:
-            raise part_error(part, name, "only tet4, tet10 and hex8 can deform")
+            raise build_part_error(part, name, "only tet4, tet10 and hex8 can deform")
         if part.element != first.element:
-            raise part_error(
+            raise build_part_error(
                 part, name, f"all tissue must be of one element type, not also {first.cell_type}"
             )
     cells = np.vstack([part.cells for part in parts.values()])
@@ -212,7 +212,7 @@ def build_tissue(model: FebModel) -> TissueMesh:
     if len(bad):
         part_name = mesh.region_names[regions[bad[0]]]
         what = f"{len(bad)} elements are inverted or flat, the first is element {ids[bad[0]]}"
-        raise part_error(parts[part_name], part_name, what)
+        raise build_part_error(parts[part_name], part_name, what)
     return TissueMesh(mesh, nodes, number)
 
 

@@ -20,7 +20,7 @@ from ..errors import ProblemError
 from ..fe import ELEMENTS, Material, Problem, Step, StepControl, System
 from ..fe.contact.contact import ContactSurface, find_touching_offset
 from ..fe.kernel.elements import build_face_quadrature, compute_reference_gradients
-from ..fe.materials import prony_factors
+from ..fe.materials import compute_prony_factors
 from ..mesh import Mesh
 from .reading.model import Contact
 
@@ -215,6 +215,6 @@ def _compute_moduli(material: Material, dt: float) -> tuple[float, float]:
     table = material.table()
     mu = float(table.terms[:, 0].sum()) / 2.0
     if len(table.prony):
-        ramp = prony_factors(dt, table.prony[:, 1])[1]
+        ramp = compute_prony_factors(dt, table.prony[:, 1])[1]
         mu *= 1.0 + float(table.prony[:, 0] @ ramp)
     return mu, float(table.kappa)

@@ -1,6 +1,6 @@
 """A study's site as a mechanical problem, and what is observed in it."""
 
-from ..laws import Parameters, flat_names, to_parameters, to_vector
+from ..laws import Parameters, list_flat_names, to_parameters, to_vector
 from .clamps import build_clamping_pins, clamp_problem
 from .fibres import Direction, build_fibre_field
 from .neighbourhood import Extension, cut_neighbourhood
@@ -57,8 +57,8 @@ __all__ = [
     "find_nearby_skin_points",
     "find_nearest_points",
     "find_skin_points",
-    "flat_names",
     "is_under",
+    "list_flat_names",
     "observe_result",
     "place_waves_under",
     "read_indenter",

@@ -3,7 +3,7 @@
 from .cells import CELLS, TET10_EDGES, TET_FACES, TRI6_EDGES, CellType
 from .gauges import Gauge, LayerGauge, find_gauges_along
 from .locating import locate
-from .measures import MeshQuality, dihedral_angles, quality
+from .measures import MeshQuality, compute_dihedral_angles, measure_quality
 from .volume import (
     Mesh,
     boundary_faces,
@@ -12,7 +12,7 @@ from .volume import (
     node_jacobians,
     to_tet10,
 )
-from .vtu import read_grid, read_vtu, silent_vtk, write_pvd, write_vtu
+from .vtu import read_grid, read_vtu, silence_vtk, write_pvd, write_vtu
 
 __all__ = [
     "CELLS",
@@ -27,14 +27,14 @@ __all__ = [
     "boundary_faces",
     "cell_volumes",
     "check",
-    "dihedral_angles",
+    "compute_dihedral_angles",
     "find_gauges_along",
     "locate",
+    "measure_quality",
     "node_jacobians",
-    "quality",
     "read_grid",
     "read_vtu",
-    "silent_vtk",
+    "silence_vtk",
     "to_tet10",
     "write_pvd",
     "write_vtu",

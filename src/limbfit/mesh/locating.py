@@ -42,7 +42,7 @@ def locate(mesh: Mesh, points: Array, region: int) -> tuple[Ints, Array, Array]:
     )
     for k, point in enumerate(points):
         near = own[np.argsort(np.linalg.norm(middles - point, axis=1))[:NEAREST]]
-        inside = _inside(mesh, _local(mesh, near, point))
+        inside = _clip_into_cell(mesh, _find_local_coordinates(mesh, near, point))
         values, _ = mesh.kind.shape(inside)
         away = np.linalg.norm(np.einsum("mk,mki->mi", values, mesh.points[mesh.cells[near]]) - point, axis=1)
         best = int(np.argmin(away))
@@ -50,7 +50,7 @@ def locate(mesh: Mesh, points: Array, region: int) -> tuple[Ints, Array, Array]:
     return cells, local, off
 
 
-def _local(mesh: Mesh, cells: Ints, point: Array) -> Array:
+def _find_local_coordinates(mesh: Mesh, cells: Ints, point: Array) -> Array:
     """Local coordinates (m, 3) of a point in each of the cells (m,), inside or not."""
     corners = mesh.points[mesh.cells[cells]]
     middle = mesh.kind.nodes[: mesh.kind.corners].mean(axis=0)
@@ -63,7 +63,7 @@ def _local(mesh: Mesh, cells: Ints, point: Array) -> Array:
     return x
 
 
-def _inside(mesh: Mesh, local: Array) -> Array:
+def _clip_into_cell(mesh: Mesh, local: Array) -> Array:
     """Local coordinates (m, 3), moved into the cell."""
     if not mesh.kind.is_tetrahedron:
         return np.asarray(np.clip(local, -1.0, 1.0))

@@ -30,13 +30,13 @@ class MeshQuality:
     inverted: int
 
 
-def quality(mesh: Mesh) -> MeshQuality:
+def measure_quality(mesh: Mesh) -> MeshQuality:
     """Quality of a mesh; ``inverted`` counts cells whose Jacobian is not positive at some node."""
     size = cell_volumes(mesh)
     jacobians = node_jacobians(mesh)
     scaled = jacobians.min(axis=1) / np.abs(jacobians.mean(axis=1))
     angles = (
-        dihedral_angles(mesh.points, mesh.cells[:, :4])
+        compute_dihedral_angles(mesh.points, mesh.cells[:, :4])
         if mesh.kind.is_tetrahedron
         else np.full((1, 6), np.nan)
     )
@@ -56,7 +56,7 @@ def quality(mesh: Mesh) -> MeshQuality:
     )
 
 
-def dihedral_angles(points: NDArray[np.float64], tets: NDArray[np.int64]) -> NDArray[np.float64]:
+def compute_dihedral_angles(points: NDArray[np.float64], tets: NDArray[np.int64]) -> NDArray[np.float64]:
     """The six dihedral angles (m, 6) of straight tetrahedra (m, 4), in degrees."""
     corners = points[tets]
     faces = corners[:, TET_FACES]

@@ -47,7 +47,9 @@ class Mesh:
     def __repr__(self) -> str:
         numbers = np.bincount(self.regions, minlength=len(self.region_names))
         tissues = ", ".join(f"{name} {count}" for name, count in zip(self.region_names, numbers))
-        return f"<Mesh: {self.cell_type} ({tissues}), {len(self.points)} nodes, {_extent(self.points)}>"
+        return (
+            f"<Mesh: {self.cell_type} ({tissues}), {len(self.points)} nodes, {_format_extent(self.points)}>"
+        )
 
     @property
     def kind(self) -> CellType:
@@ -100,8 +102,8 @@ class Mesh:
         See `from_arrays`.
         """
         blocks = [(_VTK_NAMES.get(int(k), f"VTK type {k}"), v) for k, v in grid.cells_dict.items()]
-        tissues = _cell_array(grid.cell_data, region) if region else None
-        kind, cells = _one_kind(blocks)
+        tissues = _read_cell_array(grid.cell_data, region) if region else None
+        kind, cells = _select_one_kind(blocks)
         if tissues is not None:
             tissues = np.asarray(tissues)[np.asarray(grid.celltypes) == CELLS[kind].vtk]
         return cls.from_arrays(grid.points, cells, tissues)
@@ -113,9 +115,15 @@ class Mesh:
         By default Gmsh's physical groups, with their names, or Medit's references, where there are any.
         Cells of fewer dimensions are left out. See `from_arrays`.
         """
-        kind, cells = _one_kind([(_MESHIO_NAMES.get(b.type, b.type), b.data) for b in mesh.cells])
+        kind, cells = _select_one_kind([(_MESHIO_NAMES.get(b.type, b.type), b.data) for b in mesh.cells])
         known = [name for name in _MESHIO_REGIONS if name in mesh.cell_data]
-        data = _cell_array(mesh.cell_data, region) if region else mesh.cell_data[known[0]] if known else None
+        data = (
+            _read_cell_array(mesh.cell_data, region)
+            if region
+            else mesh.cell_data[known[0]]
+            if known
+            else None
+        )
         chosen = [k for k, block in enumerate(mesh.cells) if _MESHIO_NAMES.get(block.type) == kind]
         tissues = None if data is None else np.concatenate([np.asarray(data[k]) for k in chosen])
         names = {int(number): name for name, (number, dim) in mesh.field_data.items() if dim == 3}
@@ -125,7 +133,7 @@ class Mesh:
         """Numbers (k,) of the nodes at which ``where(points)`` holds: ``lambda p: p[:, 2] < -19.9``."""
         found = np.flatnonzero(where(self.points))
         if not len(found):
-            raise ProblemError("no node is there", remedy=f"the mesh spans {_extent(self.points)}")
+            raise ProblemError("no node is there", remedy=f"the mesh spans {_format_extent(self.points)}")
         return found
 
     def faces_where(self, where: Callable[[NDArray[np.float64]], NDArray[np.bool_]]) -> NDArray[np.int64]:
@@ -133,7 +141,9 @@ class Mesh:
         faces = boundary_faces(self)
         found = faces[np.asarray(where(self.points))[faces].all(axis=1)]
         if not len(found):
-            raise ProblemError("no boundary face is there", remedy=f"the mesh spans {_extent(self.points)}")
+            raise ProblemError(
+                "no boundary face is there", remedy=f"the mesh spans {_format_extent(self.points)}"
+            )
         return found
 
 
@@ -234,7 +244,7 @@ _MESHIO_NAMES = {cell.meshio: cell.name for cell in CELLS.values()} | dict.fromk
 _MESHIO_REGIONS = ("gmsh:physical", "medit:ref", "region")
 
 
-def _one_kind(blocks: Iterable[tuple[str, Any]]) -> tuple[str, NDArray[np.int64]]:
+def _select_one_kind(blocks: Iterable[tuple[str, Any]]) -> tuple[str, NDArray[np.int64]]:
     """The one supported kind of volume cells among named blocks, and its cells; surfaces are named ``""``."""
     solid: dict[str, list[Any]] = {}
     for name, cells in blocks:
@@ -251,7 +261,7 @@ def _one_kind(blocks: Iterable[tuple[str, Any]]) -> tuple[str, NDArray[np.int64]
     return kind, np.concatenate(cells).astype(np.int64)
 
 
-def _cell_array(data: Mapping[str, Any], name: str) -> Any:
+def _read_cell_array(data: Mapping[str, Any], name: str) -> Any:
     if name not in data:
         known = ", ".join(map(str, data)) or "none"
         raise ProblemError(f"no cell data {name!r}", remedy=f"there is {known}")
@@ -274,7 +284,7 @@ def _from_arrays(
         )
     if cells.min() < 0 or cells.max() >= len(points):
         raise ProblemError("cells name nodes that do not exist", remedy="count nodes from 0")
-    numbers, tissues = _tissues(regions, len(cells), names or {})
+    numbers, tissues = _read_tissues(regions, len(cells), names or {})
     used, inverse = np.unique(cells, return_inverse=True)
     mesh = Mesh(points[used], inverse.reshape(cells.shape), kinds[width], numbers, tissues)
     turned = cell_volumes(mesh) < 0.0
@@ -283,7 +293,7 @@ def _from_arrays(
     return mesh
 
 
-def _tissues(
+def _read_tissues(
     regions: ArrayLike | None, count: int, names: Mapping[int, str]
 ) -> tuple[NDArray[np.int64], tuple[str, ...]]:
     """The number of each cell's tissue (m,) and the tissues, in the order of their names or numbers."""
@@ -300,6 +310,6 @@ def _tissues(
     return numbers.astype(np.int64), tuple(names.get(int(k), f"region {int(k)}") for k in kinds)
 
 
-def _extent(points: NDArray[np.float64]) -> str:
+def _format_extent(points: NDArray[np.float64]) -> str:
     low, high = points.min(axis=0), points.max(axis=0)
     return ", ".join(f"{axis} {a:g} to {b:g} mm" for axis, a, b in zip("xyz", low, high))

@@ -68,7 +68,7 @@ def _add_arrays(data: vtkFieldData, arrays: Mapping[str, NDArray]) -> None:
 
 
 @contextmanager
-def silent_vtk() -> Iterator[None]:
+def silence_vtk() -> Iterator[None]:
     """VTK's own reports stay out of the terminal: what fails is said in words by who called it."""
     shown = vtkObject.GetGlobalWarningDisplay()
     vtkObject.SetGlobalWarningDisplay(0)
@@ -85,7 +85,7 @@ def _write(grid: vtkUnstructuredGrid, path: Path) -> None:
     writer.SetInputData(grid)
     writer.SetDataModeToAppended()
     writer.EncodeAppendedDataOff()
-    with silent_vtk():
+    with silence_vtk():
         written = writer.Write()
     if not written:
         draft.unlink(missing_ok=True)
@@ -116,8 +116,8 @@ def read_vtu(path: str | Path) -> Mesh:
         region_names=("all",)
         if names is None
         else tuple(names.GetValue(i) for i in range(names.GetNumberOfValues())),
-        node_sets=_stored_sets(grid, _NODE_SET),
-        face_sets=_stored_sets(grid, _FACE_SET),
+        node_sets=_read_sets(grid, _NODE_SET),
+        face_sets=_read_sets(grid, _FACE_SET),
     )
 
 
@@ -140,7 +140,7 @@ def read_grid(path: Path) -> vtkUnstructuredGrid:
     return grid
 
 
-def _stored_sets(grid: vtkUnstructuredGrid, prefix: str) -> dict[str, NDArray[np.int64]]:
+def _read_sets(grid: vtkUnstructuredGrid, prefix: str) -> dict[str, NDArray[np.int64]]:
     data = grid.GetFieldData()
     names = [data.GetAbstractArray(i).GetName() for i in range(data.GetNumberOfArrays())]
     chosen = [name for name in names if name and name.startswith(prefix)]

@@ -53,7 +53,7 @@ class Fit:
 
         Noise is taken from how neighbouring differences scatter, smooth misfit from their size.
         """
-        measured = _measured(self.curves)
+        measured = _to_measured(self.curves)
         best = np.array(list(self.parameters.values()))
         noise = estimate_curve_noise(self.responses, measured)
         return estimate_uncertainty(best, self.responses, measured, self.unknowns, noise)
@@ -120,11 +120,13 @@ def calibrate(
         Where no simulation completes at the start.
     """
     cases = (problems,) if isinstance(problems, Problem) else tuple(problems)
-    given = _paired(cast("Sequence[Curve]", (curves,) if isinstance(problems, Problem) else curves), cases)
-    unknowns = _unknowns(cases, start, bounds or {})
+    given = _pair_curves(
+        cast("Sequence[Curve]", (curves,) if isinstance(problems, Problem) else curves), cases
+    )
+    unknowns = _build_unknowns(cases, start, bounds or {})
     announce_compilation()
     model = _Model(cases, given, unknowns.names, steps or StepControl(), listener)
-    measured = _measured(given)
+    measured = _to_measured(given)
     found = search(
         model, measured, unknowns, CalibrationSettings(), stages=[group_separately(unknowns.names)]
     )
@@ -195,7 +197,7 @@ class _Model:
         return SiteResponse(*answer, f"curve {number + 1}", found.warnings, *kinds)
 
 
-def _paired(curves: Sequence[Curve], problems: Sequence[Problem]) -> tuple[tuple[Array, Array], ...]:
+def _pair_curves(curves: Sequence[Curve], problems: Sequence[Problem]) -> tuple[tuple[Array, Array], ...]:
     if len(curves) != len(problems):
         raise ProblemError(f"{len(curves)} curves for {len(problems)} problems", remedy="give one for each")
     found = []
@@ -216,7 +218,7 @@ def _paired(curves: Sequence[Curve], problems: Sequence[Problem]) -> tuple[tuple
     return tuple(found)
 
 
-def _unknowns(
+def _build_unknowns(
     problems: Sequence[Problem], start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
 ) -> Unknowns:
     for problem in problems:
@@ -233,5 +235,5 @@ def _unknowns(
     return Unknowns(tuple(start), values, low, high)
 
 
-def _measured(curves: Sequence[tuple[Array, Array]]) -> list[MeasuredCurve]:
+def _to_measured(curves: Sequence[tuple[Array, Array]]) -> list[MeasuredCurve]:
     return [MeasuredCurve(f"curve {k + 1}", force) for k, (_, force) in enumerate(curves)]

@@ -49,11 +49,11 @@ def of_tissues(
         if name not in tissues:
             raise InputError(f"the model has no tissue {name!r}", remedy=f"use {', '.join(tissues)}")
         if kind not in known:
-            raise InputError(f"{kind!r} is no tissue of people", place=name, remedy=f"use {_listed()}")
+            raise InputError(f"{kind!r} is no tissue of people", place=name, remedy=f"use {_list_names()}")
     kinds = {name: stated.get(name, name) for name in tissues}
     strange = [name for name, kind in kinds.items() if kind not in known]
     if strange:
-        raise InputError(f"which tissue of people is {strange[0]!r}", remedy=f"state {_listed()} for it")
+        raise InputError(f"which tissue of people is {strange[0]!r}", remedy=f"state {_list_names()} for it")
     if "fat" not in kinds.values():
         kinds |= {name: "skin_fat" for name, kind in kinds.items() if kind == "skin" and name not in stated}
     return {
@@ -64,5 +64,5 @@ def of_tissues(
     }
 
 
-def _listed() -> str:
+def _list_names() -> str:
     return ", ".join(f'"{name}"' for name in (*TISSUES, NONE))

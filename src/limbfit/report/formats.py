@@ -23,14 +23,14 @@ def number(value: Any, digits: int = 3) -> str:
     return f"{value:.{digits - 1}e}".replace("-", "−")
 
 
-def fixed(value: Any, decimals: int = 1) -> str:
+def format_fixed(value: Any, decimals: int = 1) -> str:
     """A number to so many decimals."""
     if not isinstance(value, int | float) or value != value:
         return NOTHING
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
-def symbol(key: str) -> str:
+def format_symbol(key: str) -> str:
     """A parameter as formulas write it: ``tau_s`` is τ, ``tau2_s`` τ₂."""
     name, _ = split_key(key)
     letter = name.rstrip("0123456789")
@@ -40,26 +40,26 @@ def symbol(key: str) -> str:
 def label(name: str) -> str:
     """``skin.c_kPa`` as ``skin c``."""
     tissue, _, kind = name.rpartition(".")
-    return f"{tissue} {symbol(kind)}".strip()
+    return f"{tissue} {format_symbol(kind)}".strip()
 
 
-def unit_of(key: str) -> str:
+def get_unit(key: str) -> str:
     """Its unit: ``tau_s`` is in s."""
     return split_key(key)[1] or NOTHING
 
 
-def with_unit(key: str) -> str:
+def format_with_unit(key: str) -> str:
     """A parameter with its unit where it has one: ``τ (s)``, ``m``."""
     unit = split_key(key)[1]
-    return f"{symbol(key)} ({unit})" if unit else symbol(key)
+    return f"{format_symbol(key)} ({unit})" if unit else format_symbol(key)
 
 
-def with_value(key: str, value: Any) -> str:
+def format_with_value(key: str, value: Any) -> str:
     """A parameter with its value: ``τ = 0.391 s``."""
-    return f"{symbol(key)} = {number(value)} {split_key(key)[1]}".strip()
+    return f"{format_symbol(key)} = {number(value)} {split_key(key)[1]}".strip()
 
 
-def limits(values: Any, digits: int = 3) -> str:
+def format_limits(values: Any, digits: int = 3) -> str:
     """An interval: ``1.2 to 3.4``."""
     return f"{number(values[0], digits)} to {number(values[1], digits)}" if values else NOTHING
 
@@ -69,7 +69,7 @@ def count(value: Any) -> str:
     return f"{value:,}".replace(",", " ") if isinstance(value, int) else NOTHING
 
 
-def duration(seconds: Any) -> str:
+def format_duration(seconds: Any) -> str:
     """Seconds as a person says them."""
     if not isinstance(seconds, int | float):
         return NOTHING
@@ -81,6 +81,6 @@ def duration(seconds: Any) -> str:
     return f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def friction(value: Any) -> str:
+def format_friction(value: Any) -> str:
     """How contact is, by the study's key: a word, or a coefficient."""
     return value if isinstance(value, str) else f"with friction of coefficient {number(value)}"

@@ -13,7 +13,7 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError
 from ..laws import TissueLaw
-from .formats import fixed, symbol
+from .formats import format_fixed, format_symbol
 
 Curves = dict[str, Array]
 Json = dict[str, Any]
@@ -90,7 +90,7 @@ class Results:
     def mean_error(self, use: str) -> str:
         """``4.5 ± 1.0``: mean and standard deviation of the errors at ``fitted`` or ``heldout`` sites, %."""
         mean, sd = (self.predict.get(f"{kind}_error_{use}_percent") for kind in ("mean", "sd"))
-        return fixed(mean) if sd is None else f"{fixed(mean)} ± {fixed(sd)}"
+        return format_fixed(mean) if sd is None else f"{format_fixed(mean)} ± {format_fixed(sd)}"
 
     @property
     def uncertainty(self) -> Json:
@@ -105,7 +105,7 @@ class Results:
     def describe_parameter(self, name: str) -> str:
         """A parameter's symbol and what it is."""
         words = {parameter.key: parameter.words for parameter in self.law.parameters}
-        return ", ".join(part for part in (symbol(name), words.get(name, "")) if part)
+        return ", ".join(part for part in (format_symbol(name), words.get(name, "")) if part)
 
     def describe_tissue(self, tissue: str) -> str:
         """A tissue as the head of a row; the two of the paper as the paper names them."""

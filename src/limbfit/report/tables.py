@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from .formats import NOTHING, fixed
+from .formats import NOTHING, format_fixed
 from .page import Cell, Row, Table
 
 
-def numeric(text: Any, share: float | None = None) -> Cell:
+def to_numeric(text: Any, share: float | None = None) -> Cell:
     """A cell that holds a number."""
     return Cell(str(text), number=True, share=share)
 
@@ -55,5 +55,5 @@ def _read_cell(row: Any, what: Path | Callable[[Any], Any], decimals: int | None
     for key in (what,) if isinstance(what, str) else what:
         row = (row or {}).get(key)
     if decimals is not None:
-        return numeric(fixed(row, decimals))
+        return to_numeric(format_fixed(row, decimals))
     return NOTHING if row is None or row == "" else row

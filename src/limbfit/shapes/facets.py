@@ -39,7 +39,7 @@ def steps(steepest_deg: float = STEEPEST_DEG) -> Array:
     return np.linspace(0.0, np.radians(steepest_deg), ARC + 1)[1:]
 
 
-def quadrilaterals(number: Indices) -> Indices:
+def build_quadrilaterals(number: Indices) -> Indices:
     """Faces (f, 4) of a grid (k, l) of node numbers, counter-clockwise where the axes are."""
     corners = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
     return np.stack(corners, axis=-1).reshape(-1, 4)
@@ -56,14 +56,14 @@ def revolved(
     beyond : (k,) arc lengths of the circles around it.
     outline : radius and z, mm, at arc lengths from the axis.
     """
-    plane, faces = _disk(disk, beyond)
+    plane, faces = _build_disk(disk, beyond)
     length = np.linalg.norm(plane, axis=1)
     rho, z = outline(length)
     direction = plane / np.maximum(length, 1e-300)[:, None]
     return np.column_stack([rho[:, None] * direction, z]), faces
 
 
-def _disk(radius: float, beyond: Array) -> tuple[Array, Indices]:
+def _build_disk(radius: float, beyond: Array) -> tuple[Array, Indices]:
     """Points (n, 2) and faces (f, 4) of a disk and of circles ``beyond`` it: a grid, rings around it."""
     side = np.linspace(-1.0, 1.0, 2 * FLAT + 1)
     square = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1)
@@ -80,6 +80,6 @@ def _disk(radius: float, beyond: Array) -> tuple[Array, Indices]:
     numbers = np.vstack(
         [around, number.size + np.arange(rings.shape[0] * len(around)).reshape(len(rings), -1)]
     )
-    outside = quadrilaterals(np.hstack([numbers, numbers[:, :1]]))
+    outside = build_quadrilaterals(np.hstack([numbers, numbers[:, :1]]))
     points = np.concatenate([core.reshape(-1, 2), rings.reshape(-1, 2)])
-    return points, np.vstack([quadrilaterals(number), outside])
+    return points, np.vstack([build_quadrilaterals(number), outside])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..errors import ProblemError
 from .closest_point import INSIDE, Tree, build_tree, closest_point, curvature, feature_normal
-from .triangles import beyond_edges, check_triangles, normal_spread, triangle_normals
+from .triangles import check_triangles, compute_normal_spread, compute_triangle_normals, find_neighbours
 
 Faces = NDArray[np.int64]
 # Corners (m, 3, 3); unit normals (m, 3) of faces and (m, 3, 3) of their edges and corners; directions
@@ -86,7 +86,7 @@ class RigidSurface:
             r = radius / 2**k
             moved = self._shrunk(r)
             if moved is not None:
-                return r, _body(moved, self.faces)
+                return r, _build_body(moved, self.faces)
         raise ProblemError(
             f"the indenter's surface has details that cannot be rounded by {radius:g} mm",
             remedy="give a smaller edge radius or a coarser surface",
@@ -94,13 +94,13 @@ class RigidSurface:
 
     def _shrunk(self, radius: float) -> Array | None:
         """Points (n, 3) of the surface whose faces moved in by ``radius``; None where a face turns over."""
-        normals, areas = triangle_normals(self.points[self.faces])
-        spread, along = normal_spread(self.points, self.faces, normals)
+        normals, areas = compute_triangle_normals(self.points[self.faces])
+        spread, along = compute_normal_spread(self.points, self.faces, normals)
         values, axes = np.linalg.eigh(spread)
         keep = values > SPREAD * values[:, -1:]
         inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)
         moved = self.points - radius * np.einsum("nij,nj,nkj,nk->ni", axes, inverse, axes, along)
-        after, left = triangle_normals(moved[self.faces])
+        after, left = compute_triangle_normals(moved[self.faces])
         solid = areas > 1e-12 * areas.max()
         upright = (np.einsum("mi,mi->m", normals, after) > 0.5) & (left > 0.0)
         return moved if upright[solid].all() else None
@@ -134,11 +134,11 @@ def _check_size(points: Array) -> None:
         )
 
 
-def _body(points: Array, faces: Faces) -> Body:
+def _build_body(points: Array, faces: Faces) -> Body:
     """The arrays of the kernels; pseudo-normals after Baerentzen and Aanaes (2005)."""
     corners = np.ascontiguousarray(points[faces])
-    normals, areas = triangle_normals(corners)
-    spread, sums = normal_spread(points, faces, normals)
+    normals, areas = compute_triangle_normals(corners)
+    spread, sums = compute_normal_spread(points, faces, normals)
     values, axes = np.linalg.eigh(spread)
     on_edge = (values[:, 0] < STRAIGHT * values[:, 2]) & (values[:, 1] > STRAIGHT * values[:, 2])
     along = np.where(on_edge[:, None], axes[:, :, 0], 0.0)
@@ -148,7 +148,7 @@ def _body(points: Array, faces: Faces) -> Body:
     return (
         corners,
         normals,
-        normals[:, None] + normals[beyond_edges(faces)],
+        normals[:, None] + normals[find_neighbours(faces)],
         sums[faces],
         along[faces],
         *trees,

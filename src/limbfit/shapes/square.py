@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numba import njit
 
-from .facets import ARC, FLAT, Facets, quadrilaterals, steps
+from .facets import ARC, FLAT, Facets, build_quadrilaterals, steps
 from .shape import Array, Distance, Shape
 
 
@@ -37,7 +37,7 @@ class Square(Shape):
         length = np.sqrt(a**2 + b**2 + 1.0)
         grid = np.stack([x + radius * a / length, y + radius * b / length, radius / length - radius], axis=-1)
         return Facets(
-            grid.reshape(-1, 3), quadrilaterals(np.arange(x.size).reshape(x.shape)), rounding=radius
+            grid.reshape(-1, 3), build_quadrilaterals(np.arange(x.size).reshape(x.shape)), rounding=radius
         )
 
 

@@ -21,7 +21,7 @@ def check_triangles(points: Array, faces: NDArray, name: str) -> None:
         raise ProblemError(f"the faces of {name} refer to points that it does not have")
 
 
-def triangle_normals(corners: Array) -> tuple[Array, Array]:
+def compute_triangle_normals(corners: Array) -> tuple[Array, Array]:
     """Unit normals (m, 3), zero for degenerate triangles, and areas (m,)."""
     vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(vectors, axis=1)
@@ -29,7 +29,7 @@ def triangle_normals(corners: Array) -> tuple[Array, Array]:
     return np.where(flat[:, None], 0.0, vectors / np.where(flat, 1.0, length)[:, None]), 0.5 * length
 
 
-def _angles(corners: Array) -> Array:
+def _compute_angles(corners: Array) -> Array:
     """Angles (m, 3) of triangles at their corners."""
     ahead = np.roll(corners, -1, axis=1) - corners
     back = np.roll(corners, 1, axis=1) - corners
@@ -37,9 +37,9 @@ def _angles(corners: Array) -> Array:
     return np.arctan2(sine, np.einsum("mij,mij->mi", ahead, back))
 
 
-def normal_spread(points: Array, faces: Faces, normals: Array) -> tuple[Array, Array]:
+def compute_normal_spread(points: Array, faces: Faces, normals: Array) -> tuple[Array, Array]:
     """Sums over the faces at each point, weighted by angle, of ``n n^T (n, 3, 3)`` and ``n (n, 3)``."""
-    weights = _angles(points[faces])
+    weights = _compute_angles(points[faces])
     outer, sums = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
     for corner in range(3):
         w = weights[:, corner, None] * normals
@@ -48,7 +48,7 @@ def normal_spread(points: Array, faces: Faces, normals: Array) -> tuple[Array, A
     return outer, sums
 
 
-def beyond_edges(faces: Faces) -> Faces:
+def find_neighbours(faces: Faces) -> Faces:
     """(m, 3): the triangle beyond each edge, from each corner to the next; -1 where there is none."""
     ahead = np.roll(faces, -1, axis=1)
     count = int(faces.max()) + 1

@@ -13,7 +13,7 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 
 from ..errors import InputError
 from ..mesh import read_grid, read_vtu
-from ..phases import find_phases, loading_end
+from ..phases import find_loading_end, find_phases
 from ..pipeline.shared.artefacts import read_curves
 from ..web.arrays import pack
 from ..web.shapes import to_volume_shape
@@ -106,7 +106,7 @@ def _find_deepest(folder: StudyFolder, site: str, times_s: list[float]) -> int:
 def _find_peak_time(curve: Path) -> float:
     columns = read_curves(curve)
     stated = columns["displacement_mm"] if "displacement_mm" in columns else columns["force_N"]
-    loading = loading_end(find_phases(columns["time_s"], stated))
+    loading = find_loading_end(find_phases(columns["time_s"], stated))
     return 0.0 if loading is None else loading.end_s
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator
 
 
-def _checked(value: Any) -> Any:
+def _check(value: Any) -> Any:
     """One line for all that it cannot be, instead of one for each kind of value."""
     number = isinstance(value, int | float) and not isinstance(value, bool) and 0.0 <= value < math.inf
     if not number and value not in ("frictionless", "sticky"):
@@ -16,4 +16,4 @@ def _checked(value: Any) -> Any:
     return value
 
 
-Friction = Annotated[Literal["frictionless", "sticky"] | float, BeforeValidator(_checked)]
+Friction = Annotated[Literal["frictionless", "sticky"] | float, BeforeValidator(_check)]

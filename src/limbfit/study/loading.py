@@ -45,7 +45,7 @@ def load_study(path: str | Path, *, recorded: bool = True) -> Study:
         told = [f"indenters.{name}: no record names it; only limbfit design --protocol does" for name in idle]
         study = study.model_copy(update={"notes": (*notes, *told)})
     except ValidationError as error:
-        raise _study_error(error, file) from None
+        raise _build_study_error(error, file) from None
     _check_paths(study, recorded)
     refuse_vain(study, content)
     return study
@@ -94,7 +94,7 @@ def _load_extensions(content: dict[str, Any], file: Path) -> None:
         load_extensions(file.parent / one for one in named)
 
 
-def _study_error(error: ValidationError, file: Path) -> StudyError:
+def _build_study_error(error: ValidationError, file: Path) -> StudyError:
     first = error.errors()[0]
     place = ".".join(str(part) for part in first["loc"]) or None
     more = len(error.errors()) - 1

@@ -16,7 +16,7 @@ _DEPTH_RATIO = 1.5  # the fine zone is an ellipsoid, shallower than wide by this
 _CELLS_PER_CUBE = 6.0 * np.sqrt(2.0)  # regular tetrahedra in the cube of their edge
 
 
-def estimated_cells(edge_near_mm: float, edge_far_mm: float, near_radius_mm: float, growth: float) -> float:
+def estimate_cells(edge_near_mm: float, edge_far_mm: float, near_radius_mm: float, growth: float) -> float:
     """About how many tetrahedra the mesh of a site has: those that fill half an ellipsoid around it."""
     radius = np.linspace(0.0, _LIMB_MM, 2001)
     edge = np.minimum(edge_near_mm + growth * np.maximum(radius - near_radius_mm, 0.0), edge_far_mm)
@@ -24,21 +24,21 @@ def estimated_cells(edge_near_mm: float, edge_far_mm: float, near_radius_mm: flo
     return float(np.sum(volume * _CELLS_PER_CUBE / ((edge[1:] + edge[:-1]) / 2) ** 3))
 
 
-def smallest_edge_mm(edge_far_mm: float, near_radius_mm: float, growth: float) -> float:
+def find_smallest_edge_mm(edge_far_mm: float, near_radius_mm: float, growth: float) -> float:
     """The shortest ``edge_near_mm`` that keeps a mesh within ``MOST_CELLS``; the far edge follows it down."""
     edges = np.geomspace(0.01, 20.0, 400)
-    cells = [estimated_cells(e, max(edge_far_mm, e), near_radius_mm, growth) for e in edges]
+    cells = [estimate_cells(e, max(edge_far_mm, e), near_radius_mm, growth) for e in edges]
     return float(edges[np.argmax(np.array(cells) <= MOST_CELLS)])
 
 
 def _refuse_too_many(table: CoarseMeshTable | MeshTable) -> None:
     far, radius, growth = table.edge_far_mm, table.near_radius_mm, table.growth
-    cells = estimated_cells(table.edge_near_mm, far, radius, growth)
+    cells = estimate_cells(table.edge_near_mm, far, radius, growth)
     if cells <= MOST_CELLS:
         return
     counted = f"{cells / 1e9:.2g} billion" if cells > 5e8 else f"{cells / 1e6:.2g} million"
     where = f"edge_near_mm = {table.edge_near_mm:g} with edge_far_mm = {far:g}"
-    least = smallest_edge_mm(far, radius, growth)
+    least = find_smallest_edge_mm(far, radius, growth)
     finest = np.ceil(100 * least) / 100
     raise ValueError(
         f"{where} makes about {counted} cells per site, and {MOST_CELLS / 1e6:g} million are the most; give "
@@ -46,7 +46,7 @@ def _refuse_too_many(table: CoarseMeshTable | MeshTable) -> None:
     )
 
 
-def _edges(near: float, far: float, radius: float, growth: float, flatness: float) -> dict[str, float]:
+def _list_edges(near: float, far: float, radius: float, growth: float, flatness: float) -> dict[str, float]:
     return {
         "edge_near_mm": near,
         "edge_far_mm": far,
@@ -60,15 +60,15 @@ def _edges(near: float, far: float, radius: float, growth: float, flatness: floa
 # from the indenter, where tissue hardly strains, cost unknowns and change the force little
 # (docs/convergence.md).
 ACCURACIES: Mapping[str, tuple[dict[str, float], dict[str, float] | None]] = {
-    "fast": (_edges(4.5, 30.0, 12.0, 0.9, 1.6), None),
-    "standard": (_edges(3.5, 30.0, 14.0, 0.6, 1.6), None),
-    "fine": (_edges(3.0, 24.0, 14.0, 0.6, 1.6), _edges(5.5, 30.0, 12.0, 0.9, 1.6)),
+    "fast": (_list_edges(4.5, 30.0, 12.0, 0.9, 1.6), None),
+    "standard": (_list_edges(3.5, 30.0, 14.0, 0.6, 1.6), None),
+    "fine": (_list_edges(3.0, 24.0, 14.0, 0.6, 1.6), _list_edges(5.5, 30.0, 12.0, 0.9, 1.6)),
 }
 _OWN = ACCURACIES["standard"][0]
 USUAL_MM = 20.0  # width of the indenter for which those edges are made
 
 
-def stated_widths(content: Mapping[str, Any]) -> list[float]:
+def list_stated_widths(content: Mapping[str, Any]) -> list[float]:
     """Widths of the indenters of a study file's ``content``, mm; its tables refuse those that are none."""
     more = content.get("indenters", {})
     tables = [content.get("indenter", {}), *(more.values() if isinstance(more, Mapping) else ())]
@@ -76,7 +76,7 @@ def stated_widths(content: Mapping[str, Any]) -> list[float]:
     return [float(width) for width in widths if isinstance(width, int | float) and width > 0] or [USUAL_MM]
 
 
-def with_edges(mesh: Any, widths_mm: Sequence[float] = (USUAL_MM,)) -> Any:
+def replace_edges(mesh: Any, widths_mm: Sequence[float] = (USUAL_MM,)) -> Any:
     """The table ``mesh`` as stated, with the edge lengths that it leaves open.
 
     They are those of its accuracy. Near a site they are as much shorter as the narrowest of ``widths_mm`` is
@@ -136,7 +136,7 @@ class MeshTable(TomlTable):
     @model_validator(mode="before")
     @classmethod
     def _from_accuracy(cls, given: Any) -> Any:
-        return with_edges(given)
+        return replace_edges(given)
 
     @model_validator(mode="after")
     def _few_enough(self) -> MeshTable:
@@ -148,7 +148,7 @@ class MeshTable(TomlTable):
         apart = {"element", "engine", "time_limit_s"}
         edges = self.model_dump(exclude=apart)
         for name in ACCURACIES:
-            usual = MeshTable.model_validate(with_edges({"accuracy": name}, widths_mm))
+            usual = MeshTable.model_validate(replace_edges({"accuracy": name}, widths_mm))
             if edges == usual.model_dump(exclude=apart):
                 return name
         return None

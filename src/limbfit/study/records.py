@@ -167,7 +167,7 @@ class Record:
 Indentation = Record | Site  # a site is one where it plans an indentation
 
 
-def records_of(site: Site, tables: tuple[RecordTable, ...]) -> tuple[Record, ...]:
+def list_records(site: Site, tables: tuple[RecordTable, ...]) -> tuple[Record, ...]:
     """The records of a site: its own, then those of the study's tables that name it."""
     stated: list[tuple[str, str, _Stated | RecordTable]] = []
     if site.trace is not None:

@@ -74,7 +74,9 @@ VAIN: tuple[Vain, ...] = (
     Vain(("image.series",), _is_one_file, "image.path is a file, not a folder of series"),
     Vain(
         ("image.markers",),
-        lambda s: s.image is not None and s.image.marked is not None and all(_placed(t) for t in s.sites),
+        lambda s: (
+            s.image is not None and s.image.marked is not None and all(_find_placed(t) for t in s.sites)
+        ),
         "no site is matched to a marker",
         "give near instead of position, or leave it out",
     ),
@@ -265,21 +267,21 @@ def refuse_vain(study: Study, content: Mapping[str, Any]) -> None:
     """
     for rule in VAIN:
         for key in rule.keys:
-            if _states(content, key) and rule.when(study):
-                raise _error(study.file, key, rule.why, rule.remedy)
+            if _list_states(content, key) and rule.when(study):
+                raise _build_error(study.file, key, rule.why, rule.remedy)
     for name, indenter in study.indenters.items():
         if "edge_radius_mm" in content["indenters"][name] and not SHAPES[indenter.shape].has_edge:
             place = f"indenters.{name}.edge_radius_mm"
-            raise _error(study.file, place, "the indenter has no edge to round", "leave it out")
+            raise _build_error(study.file, place, "the indenter has no edge to round", "leave it out")
     if _has_every_edge(content.get("mesh", {})):
-        raise _error(study.file, "mesh.accuracy", "all edge lengths are stated", "leave it or them out")
+        raise _build_error(study.file, "mesh.accuracy", "all edge lengths are stated", "leave it or them out")
     for site, stated in zip(study.sites, content["sites"], strict=True):
         for one in VAIN_OF_SITE:
             if one.key in stated and one.when(study, site):
-                raise _error(study.file, f"sites.{site.name}.{one.key}", one.why, one.remedy)
+                raise _build_error(study.file, f"sites.{site.name}.{one.key}", one.why, one.remedy)
 
 
-def _placed(site: Site) -> bool:
+def _find_placed(site: Site) -> bool:
     return site.near is None
 
 
@@ -287,16 +289,16 @@ def _has_every_edge(mesh: Mapping[str, Any]) -> bool:
     return "accuracy" in mesh and ACCURACIES["standard"][0].keys() <= mesh.keys()
 
 
-def _states(content: Mapping[str, Any], key: str) -> bool:
+def _list_states(content: Mapping[str, Any], key: str) -> bool:
     """Whether a table states a dotted key; an empty table states nothing."""
     head, _, rest = key.partition(".")
     if head not in content:
         return False
     value = content[head]
     if rest:
-        return isinstance(value, Mapping) and _states(value, rest)
+        return isinstance(value, Mapping) and _list_states(value, rest)
     return value != {}
 
 
-def _error(file: Path, key: str, why: str, remedy: str) -> StudyError:
+def _build_error(file: Path, key: str, why: str, remedy: str) -> StudyError:
     return StudyError(f"without effect: {why}", file=file, place=key, remedy=remedy)

@@ -16,9 +16,9 @@ from ..laws import (
     OGDEN,
     Parameters,
     TissueLaw,
-    flat_names,
     has_fibres,
     is_ogden,
+    list_flat_names,
     to_parameters,
     to_vector,
 )
@@ -26,8 +26,8 @@ from ..priors import of_tissues
 from .acquisition import AcquireTable
 from .clamps import ClampsTable
 from .material import MaterialTable
-from .meshing import MeshTable, stated_widths, with_edges
-from .records import RECORDED, Indentation, Record, RecordTable, Site, records_of
+from .meshing import MeshTable, list_stated_widths, replace_edges
+from .records import RECORDED, Indentation, Record, RecordTable, Site, list_records
 from .socket import SocketTable
 from .tables import (
     CalibrationTable,
@@ -79,7 +79,7 @@ class Study(TomlTable):
     @model_validator(mode="before")
     @classmethod
     def _suit_the_mesh(cls, given: dict[str, Any]) -> dict[str, Any]:
-        return {**given, "mesh": with_edges(given.get("mesh", {}), stated_widths(given))}
+        return {**given, "mesh": replace_edges(given.get("mesh", {}), list_stated_widths(given))}
 
     @property
     def folder(self) -> Path:
@@ -95,7 +95,7 @@ class Study(TomlTable):
 
     def records_at(self, *sites: Site) -> tuple[Record, ...]:
         """The records of some sites, site by site."""
-        return tuple(record for site in sites for record in records_of(site, self.records))
+        return tuple(record for site in sites for record in list_records(site, self.records))
 
     @property
     def recorded(self) -> tuple[Record, ...]:
@@ -170,7 +170,7 @@ class Study(TomlTable):
     @property
     def parameters(self) -> tuple[tuple[str, str], ...]:
         """(tissue, parameter) in the order of every flat vector."""
-        return flat_names(self.tissues, self.material.law)
+        return list_flat_names(self.tissues, self.material.law)
 
     def by_tissue(self, vector: Iterable[float]) -> Parameters:
         """A flat vector as ``{tissue: {name: value}}``."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..phases import MotionPhase, boundaries, find_phases, spread
+from ..phases import MotionPhase, find_boundaries, find_phases, spread
 from .displacement import fit_broken_line
 from .numerics import Array, compute_rms
 from .record import Trace
@@ -71,7 +71,7 @@ def regularise_creep(
     knots_N[0] = 0.0
     of_force = find_phases(knots, knots_N)
     moved = trace.displacement_mm - touch_down.displacement_mm
-    parts = select_sampled_corners(boundaries(of_force), since)
+    parts = select_sampled_corners(find_boundaries(of_force), since)
     curve = SmoothCurve(since, moved, parts, smoothing, find_holds(parts, of_force))
     inside = (since >= 0.0) & (since <= end)
     phases = tuple(_with_displacements(phase, curve) for phase in of_force)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from ..errors import TraceError
-from ..phases import MotionPhase, find_phases, tolerance_mm, way_in
+from ..phases import MotionPhase, choose_tolerance_mm, find_phases, find_way_in
 from .numerics import (
     Array,
     average_in_bins,
@@ -36,12 +36,14 @@ class BrokenLine:
     @cached_property
     def phases(self) -> tuple[MotionPhase, ...]:
         """What the indenter does, from the first sample to the last."""
-        return find_phases(self.times, self.values, tolerance=max(tolerance_mm(self.values), self.tolerance))
+        return find_phases(
+            self.times, self.values, tolerance=max(choose_tolerance_mm(self.values), self.tolerance)
+        )
 
     @property
     def peak_s(self) -> float:
         """When the (first) way in ends."""
-        last = way_in(self.phases)
+        last = find_way_in(self.phases)
         return float(self.times[-1]) if last is None else last.end_s
 
     @property
@@ -110,7 +112,7 @@ def fit_broken_line(
             )
         knots = np.sort(np.append(knots, at[np.argmax(miss)]))
     line = BrokenLine(knots, values, tolerance)
-    if way_in(line.phases) is None:
+    if find_way_in(line.phases) is None:
         raise TraceError(f"the {quantity} never advances", place=quantity, remedy="check the column")
     return line if peak_s is None else _fit_line_turning_at(peak_s, line, t, u)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..autoregressive import block_covariance
+from ..autoregressive import compute_block_covariance
 from .numerics import Array
 from .scatter import Scatter
 
@@ -67,7 +67,7 @@ def find_onset(
     what was found so.  With ``before_mm`` it may lie by so much before the part, and the sensor was zeroed
     wherever the part begins.
     """
-    covariance = block_covariance(scatter.sd_N, scatter.lag, np.full(len(part.time_s), part.samples))
+    covariance = compute_block_covariance(scatter.sd_N, scatter.lag, np.full(len(part.time_s), part.samples))
     covariance += (_LEAST_NOISE * part.rise_N) ** 2 * np.eye(len(part.time_s))
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     low, high = part.travel_mm[0], part.travel_mm[-1]

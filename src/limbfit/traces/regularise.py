@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import BSpline, make_smoothing_spline
 
 from ..errors import TraceError
-from ..phases import DENSER, MotionPhase, boundaries, find_phases, spread, way_in
+from ..phases import DENSER, MotionPhase, find_boundaries, find_phases, find_way_in, spread
 from .displacement import fit_broken_line
 from .numerics import Array, average_in_bins, build_cubic_interpolation, compute_rms
 from .record import Trace
@@ -48,7 +48,7 @@ class Regularised:
     @property
     def peak_s(self) -> float:
         """When the first way in ends."""
-        last = way_in(self.phases)
+        last = find_way_in(self.phases)
         assert last is not None  # touch-down lies on it
         return last.end_s
 
@@ -112,7 +112,7 @@ def regularise(
     force = trace.force_N - touch_down.baseline_N
     if ((trace.time_s >= start) & (trace.time_s <= line.peak_s)).sum() < 8:
         raise TraceError("fewer than 8 samples between touch-down and peak", remedy="check the record")
-    corners = select_sampled_corners(boundaries(phases), trace.time_s - start)
+    corners = select_sampled_corners(find_boundaries(phases), trace.time_s - start)
     curve = SmoothCurve(trace.time_s - start, force, corners, smoothing, find_holds(corners, phases))
     inside = (trace.time_s >= start) & (trace.time_s <= end)
     time = spread(phases, 1000, knots - start)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import make_lsq_spline
 
-from ..autoregressive import bounded, lag_one
+from ..autoregressive import clip_lag, estimate_lag_one
 from .numerics import Array
 
 _PIECES = 10  # of a cubic spline along the way in: follows any onset, and no noise faster than a tenth of it
@@ -40,8 +40,8 @@ def estimate_scatter(*parts: Array) -> Scatter:
         residuals = [(np.diff(np.concatenate(parts), 2) / np.sqrt(6.0), 0)]
     left, taken = np.concatenate([r for r, _ in residuals]), sum(k for _, k in residuals)
     n = len(left)
-    lag = lag_one(left)
-    lag = bounded(lag + (taken * (1.0 + lag) + 2.0 * lag) / n) if lag > 2.0 / np.sqrt(n) else 0.0
+    lag = estimate_lag_one(left)
+    lag = clip_lag(lag + (taken * (1.0 + lag) + 2.0 * lag) / n) if lag > 2.0 / np.sqrt(n) else 0.0
     new = left[1:] - lag * left[:-1]
     innovation = float(new @ new) / max(n - taken, 1)
     return Scatter(float(np.sqrt(innovation / (1.0 - lag**2))), lag)

@@ -14,7 +14,7 @@ import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ProblemError
-from ..mesh import TET_FACES, Mesh, cell_volumes, dihedral_angles, node_jacobians
+from ..mesh import TET_FACES, Mesh, cell_volumes, compute_dihedral_angles, node_jacobians
 
 Floats = NDArray[np.float32]
 Indices = NDArray[np.uint32]
@@ -138,7 +138,7 @@ def compute_cell_quality(mesh: Mesh) -> dict[str, Floats]:
     jacobians = node_jacobians(mesh)
     scaled = jacobians.min(axis=1) / np.abs(jacobians.mean(axis=1))
     found = {
-        "min_dihedral_deg": dihedral_angles(mesh.points, mesh.cells[:, :4]).min(axis=1),
+        "min_dihedral_deg": compute_dihedral_angles(mesh.points, mesh.cells[:, :4]).min(axis=1),
         "scaled_jacobian": scaled,
         "volume_mm3": cell_volumes(mesh),
     }

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limbfit.fe import ELEMENTS, ORDER_IN_TIME
-from limbfit.fe.materials import prony_factors
+from limbfit.fe.materials import compute_prony_factors
 from limbfit.pipeline.experiments.uncertainty_sources import FINER, mesh_share
 from limbfit.pipeline.shared.extrapolation import MESH_ORDERS, estimate_coarse_error, extrapolate_richardson
 from limbfit.study import load_study
@@ -85,7 +85,7 @@ def test_nothing_is_extrapolated_where_forces_do_not_change_in_one_direction():
 def relaxing(steps):
     """Overstress of one Prony term at the end of an elastic stress that rises as the cube of time."""
     times = np.linspace(0.0, 4.0, steps + 1)
-    decay, ramp, back, *_ = prony_factors(4.0 / steps, 0.32, 4.0 / steps)
+    decay, ramp, back, *_ = compute_prony_factors(4.0 / steps, 0.32, 4.0 / steps)
     found, before = 0.0, 0.0
     for change in np.diff(times**3):
         found, before = decay * found + ramp * change + back * before, change

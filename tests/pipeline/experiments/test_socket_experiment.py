@@ -20,7 +20,7 @@ from limbfit import fit_socket, load_study, report_study
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.cli.socket import show_socket
-from limbfit.donning import Load, SocketFit, don, socket_problem, socket_steps
+from limbfit.donning import Load, SocketFit, build_socket_problem, build_socket_steps, don
 from limbfit.errors import InputError, RunError
 from limbfit.fe import OgdenQLV
 from limbfit.fe.kernel.laws import Laws
@@ -255,12 +255,12 @@ def test_slopes_of_pressure_and_settling_are_central_differences(folder):
     load = Load("stance", 60.0 * up, np.zeros(3), anatomy.cut_point, 1.0, 0.0)
     fit = SocketFit(anatomy.cut_point, up, np.array([0.0, -1.0, 0.0]), 0.3, 1.0, 0.0, loads=(load,))
     tissues = {"skin": OgdenQLV(0.009, 6.0, 2.0, 0.5), "muscle": OgdenQLV(0.004, 4.0, 3.0, 0.3)}
-    problem = socket_problem(mesh, tissues, socket, fit)
+    problem = build_socket_problem(mesh, tissues, socket, fit)
     middles = mesh.points[mesh.face_sets["skin"][:, :3]].mean(axis=1)
     regions = {"front": middles[:, 1] < anatomy.cut_point[1] - 20.0}
     names = [f"{region}.{name}" for region, name in problem.parameter_names]
     laws = Laws.build([tissues[name] for name in mesh.region_names])
-    steps = socket_steps(fit, laws.modulus)
+    steps = build_socket_steps(fit, laws.modulus)
     whole = don(problem, fit, regions, sensitivities=True, steps=steps)
     centre = whole.held
     for tissue in ("muscle", "skin"):

@@ -17,7 +17,7 @@ from limbfit.pipeline.shared.provenance import record_settings
 from limbfit.pipeline.stages.mesh import build_coarse_settings, mesh_settings
 from limbfit.pipeline.stages.records import is_moved
 from limbfit.study import Study, load_study
-from limbfit.study.meshing import ACCURACIES, estimated_cells
+from limbfit.study.meshing import ACCURACIES, estimate_cells
 from limbfit.study.tables import SolverTable
 
 EDGES = ("edge_near_mm", "edge_far_mm", "near_radius_mm", "growth", "flatness")
@@ -93,7 +93,7 @@ def test_a_finer_accuracy_has_more_cells(stated: Any) -> None:
         table = stated(f'[mesh]\naccuracy = "{name}"\n').mesh
         assert table.stands_for([20.0]) == name
         counts.append(
-            estimated_cells(table.edge_near_mm, table.edge_far_mm, table.near_radius_mm, table.growth)
+            estimate_cells(table.edge_near_mm, table.edge_far_mm, table.near_radius_mm, table.growth)
         )
     assert counts[0] < 0.75 * counts[1] < 0.75**2 * counts[2]
 

@@ -12,8 +12,8 @@ from limbfit.bench.blocks import build_block_site
 from limbfit.cli.commands import parse_parameters
 from limbfit.errors import InputError, StudyError
 from limbfit.execution import SerialExecutor
-from limbfit.identify.fit.parameters import Unknowns, group_by_kind, group_separately, stage_groupings
-from limbfit.indentation import SimulationJob, flat_names, simulate, to_parameters, to_vector
+from limbfit.identify.fit.parameters import Unknowns, build_stage_groupings, group_by_kind, group_separately
+from limbfit.indentation import SimulationJob, list_flat_names, simulate, to_parameters, to_vector
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.shared.context import Context, Progress
 from limbfit.pipeline.stages.calibrate import run_calibrate
@@ -70,11 +70,11 @@ def test_flat_vectors_go_by_tissue_then_parameter():
 
 
 def test_stages_share_by_parameter_and_a_single_tissue_has_one():
-    names = tuple(f"{tissue}.{name}" for tissue, name in flat_names(TISSUES))
+    names = tuple(f"{tissue}.{name}" for tissue, name in list_flat_names(TISSUES))
     assert group_by_kind(names) == (0, 1, 2, 3) * 3
     assert group_separately(names) == tuple(range(12))
-    assert stage_groupings(names) == (group_by_kind(names), group_separately(names))
-    assert stage_groupings(names[:4]) == ((0, 1, 2, 3),)
+    assert build_stage_groupings(names) == (group_by_kind(names), group_separately(names))
+    assert build_stage_groupings(names[:4]) == ((0, 1, 2, 3),)
 
 
 def test_forces_and_sensitivities_of_three_tissues_equal_central_differences(tmp_path):

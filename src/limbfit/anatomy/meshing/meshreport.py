@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array
-from ...mesh import Mesh, MeshQuality, dihedral_angles, quality
+from ...mesh import Mesh, MeshQuality, compute_dihedral_angles, measure_quality
 from ..surfaces.surfaces import Anatomy, Surface
 from .layered import find_inner_faces
 from .layers import LimbFields, ThinnedSkin, TrimmedBone
@@ -75,7 +75,7 @@ def mesh_report(
 
     ``near``: the place (3,) and radius (mm) within which elements have to be good.
     """
-    found = quality(mesh)
+    found = measure_quality(mesh)
     volume_error = found.volume_mm3 / enclosed_mm3 - 1.0
     layers = len(fields.depths)
     faces = [
@@ -135,7 +135,7 @@ def mesh_warnings(
     if near is not None and smallest >= SOUND_DIHEDRAL_DEG:
         place, radius = near
         inside = np.linalg.norm(mesh.points[mesh.corners].mean(axis=1) - place, axis=1) < radius
-        angles = dihedral_angles(mesh.points, mesh.corners[inside])
+        angles = compute_dihedral_angles(mesh.points, mesh.corners[inside])
         smallest, least = float(angles.min(initial=180.0)), GOOD_DIHEDRAL_DEG
         where = f" within {radius:g} mm of the site"
     if smallest < least:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array
-from ...mesh import dihedral_angles
+from ...mesh import compute_dihedral_angles
 from .background import compute_volumes
 
 Ints = NDArray[np.int64]
@@ -35,11 +35,11 @@ def project_to_level(field: Field, points: Array, z_freedom: Array) -> Array:
 def project_safely(points: Array, target: Array, tets: Ints, floor_deg: float) -> Array:
     """Points moved towards ``target`` as far as no dihedral angle falls below the floor or sinks under it."""
     share = np.ones(len(points))
-    before = np.minimum(dihedral_angles(points, tets).min(axis=1), floor_deg)
+    before = np.minimum(compute_dihedral_angles(points, tets).min(axis=1), floor_deg)
     for attempt in range(BISECTIONS + 1):
         moved = points + share[:, None] * (target - points)
         sound = compute_volumes(moved, tets) > 0
-        after = np.where(sound, dihedral_angles(moved, tets).min(axis=1), -1.0)
+        after = np.where(sound, compute_dihedral_angles(moved, tets).min(axis=1), -1.0)
         bad = np.unique(tets[after < before - 1e-6])
         if not len(bad):
             return moved

@@ -14,7 +14,7 @@ import pyvista as pv
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
 from ...errors import SurfaceError
-from ...mesh import silent_vtk
+from ...mesh import silence_vtk
 from ..bounds import check_items
 from .triangles import Surface, from_pyvista, remove_unused_points
 
@@ -85,7 +85,7 @@ def _read_poly(path: Path) -> pv.PolyData:
     if path.suffix.lower() == ".vtp":
         check_items(path)
     try:
-        with silent_vtk(), warnings.catch_warnings():
+        with silence_vtk(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             poly = _read_ply(path) if path.suffix.lower() == ".ply" else pv.read(str(path))
     except Exception:  # readers raise many kinds; all mean the same to the user
@@ -119,5 +119,5 @@ def write_surface(path: str | Path, surface: Surface) -> None:
     """Write .stl (binary), .ply, .vtp or .obj by the suffix, in LPS mm."""
     path = Path(path)
     _check_suffix(path)
-    with silent_vtk():
+    with silence_vtk():
         surface.to_pyvista().save(str(path), recompute_normals=False)

@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...shapes.closest_point import Tree, build_tree, closest_point, feature_normal
-from ...shapes.triangles import beyond_edges, normal_spread, triangle_normals
+from ...shapes.triangles import compute_normal_spread, compute_triangle_normals, find_neighbours
 
 Array = NDArray[np.float64]
 # In grid spacings: how far the wall goes on past its brim, how far behind the brim is told, and how often the
@@ -53,9 +53,9 @@ def fit_spline_coefficients(
     """
     whole, all_faces = _extend_past_brim(points, faces, PAST * grid.spacing)
     corners = np.ascontiguousarray(whole[all_faces])
-    normals = triangle_normals(corners)[0]
-    sums = normal_spread(whole, all_faces, normals)[1]
-    beyond = beyond_edges(all_faces)
+    normals = compute_triangle_normals(corners)[0]
+    sums = compute_normal_spread(whole, all_faces, normals)[1]
+    beyond = find_neighbours(all_faces)
     edges = normals[:, None] + np.where(beyond[..., None] >= 0, normals[beyond], 0.0)
     own, past = np.arange(len(faces)), np.arange(len(faces), len(all_faces))
     trees: tuple[Tree, Tree, Tree] = (
@@ -77,12 +77,12 @@ def fit_spline_coefficients(
 def _extend_past_brim(points: Array, faces: NDArray[np.int64], by: float) -> tuple[Array, NDArray[np.int64]]:
     """The surface with a strip of ``by`` mm past its brim; the strip's faces are the last ones."""
     ahead = np.roll(faces, -1, axis=1)
-    brim = beyond_edges(faces) < 0
+    brim = find_neighbours(faces) < 0
     if not brim.any():
         return points, faces
     a, b = faces[brim], ahead[brim]
-    normals = triangle_normals(points[faces])[0]
-    spread = normal_spread(points, faces, normals)[1]
+    normals = compute_triangle_normals(points[faces])[0]
+    spread = compute_normal_spread(points, faces, normals)[1]
     outward = np.cross(points[b] - points[a], normals[np.nonzero(brim)[0]])
     outward /= np.linalg.norm(outward, axis=1)[:, None]
     used, places = np.unique(np.concatenate([a, b]), return_inverse=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...errors import ProblemError
 from ...shapes.closest_point import INSIDE, Tree, build_tree, closest_point, curvature, feature_normal
-from ...shapes.triangles import beyond_edges, normal_spread, triangle_normals
+from ...shapes.triangles import compute_normal_spread, compute_triangle_normals, find_neighbours
 from .wall import Wall, check_open_surface
 
 Array = NDArray[np.float64]
@@ -58,9 +58,9 @@ class OpenSurface(Wall):
     @cached_property
     def _facets(self) -> Facets:
         corners = np.ascontiguousarray(self.points[self.faces])
-        normals = triangle_normals(corners)[0]
-        sums = normal_spread(self.points, self.faces, normals)[1]
-        beyond = beyond_edges(self.faces)
+        normals = compute_triangle_normals(corners)[0]
+        sums = compute_normal_spread(self.points, self.faces, normals)[1]
+        beyond = find_neighbours(self.faces)
         edges = normals[:, None] + np.where(beyond[..., None] >= 0, normals[beyond], 0.0)
         tree = build_tree(corners, np.arange(len(corners)))
         return corners, normals, edges, sums[self.faces], _find_brim(self.faces, beyond < 0), tree

@@ -75,12 +75,12 @@ def evaluate_elastic_at(places: Places, laws: Laws, u: Array) -> tuple[Array, Ar
     stress, D, F = np.empty((m, 6)), np.empty((m, 6, 6)), np.empty((m, 3, 3))
     points, law, numbers, _, _, element, *_ = workspace(0, 1, laws.numbers.shape[1])
     records = points, law, numbers, element
-    _elastic_at(places.elements, laws.tables, u, records, stress, D, F)
+    _evaluate_elastic_at(places.elements, laws.tables, u, records, stress, D, F)
     return stress, D, F
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _elastic_at(elements, tables, u, records, stress, D, F):  # type: ignore[no-untyped-def]
+def _evaluate_elastic_at(elements, tables, u, records, stress, D, F):  # type: ignore[no-untyped-def]
     """The kernel of `evaluate_elastic_at`, `LANES` places side by side."""
     points, law, numbers, element = records
     p = points[0]

@@ -7,7 +7,7 @@ from .elastic import ElasticLaw, lane_function, mean_exponential
 from .fibred import Fibred
 from .hyperelastic import MooneyRivlin, NeoHookean, Ogden, OgdenPower, OgdenQLV
 from .material import LawTable, Material, PronyTerms, Uncoupled
-from .viscoelastic import ORDER_IN_TIME, prony_factors
+from .viscoelastic import ORDER_IN_TIME, compute_prony_factors
 from .volumetric import VOLUMETRIC_LAWS
 
 __all__ = [
@@ -25,7 +25,7 @@ __all__ = [
     "OgdenQLV",
     "PronyTerms",
     "Uncoupled",
+    "compute_prony_factors",
     "lane_function",
     "mean_exponential",
-    "prony_factors",
 ]

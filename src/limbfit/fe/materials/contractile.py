@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 from .fibred import Fibred
-from .material import LawTable, not_negative
+from .material import LawTable, check_not_negative
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Contractile:
     active: float
 
     def __post_init__(self) -> None:
-        not_negative("active", self.active)
+        check_not_negative("active", self.active)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

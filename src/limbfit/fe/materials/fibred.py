@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from .material import LawTable, Uncoupled, not_negative, positive
+from .material import LawTable, Uncoupled, check_not_negative, check_positive
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,8 @@ class Fibred:
     k2: float
 
     def __post_init__(self) -> None:
-        not_negative("k1", self.k1)
-        positive("k2", self.k2)
+        check_not_negative("k1", self.k1)
+        check_positive("k2", self.k2)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ import numpy as np
 
 from ...errors import ProblemError
 from ...relaxation import DEFAULT_SPAN_S, choose_relaxation_times, compute_power_law_terms
-from .material import Array, PronyTerms, Uncoupled, finite, not_negative, pairs, positive
+from .material import Array, PronyTerms, Uncoupled, check_finite, check_not_negative, check_positive, to_pairs
 
 MAX_OGDEN_TERMS = 6  # as FEBio
 
@@ -114,21 +114,21 @@ class OgdenQLV(SymmetricOgden):
 
     def __post_init__(self) -> None:
         for name in ("gamma", "tau"):
-            object.__setattr__(self, name, _one_or_several(name, getattr(self, name)))
+            object.__setattr__(self, name, _to_one_or_several(name, getattr(self, name)))
         if np.shape(self.gamma) != np.shape(self.tau):
             raise ProblemError(
                 f"{np.size(self.gamma)} gamma and {np.size(self.tau)} tau", remedy="give as many of each"
             )
         for name in ("c", "m", "kappa_ratio"):
-            positive(name, getattr(self, name))
+            check_positive(name, getattr(self, name))
         for name, value in zip(self.parameter_names[2:], self.parameters[2:], strict=True):
-            (not_negative if name.startswith("gamma") else positive)(name, value)
+            (check_not_negative if name.startswith("gamma") else check_positive)(name, value)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
         if np.ndim(self.gamma) == 0:
             return "c", "m", "gamma", "tau"
-        return "c", "m", *_numbered(("gamma", "tau"), np.size(self.gamma))
+        return "c", "m", *_number_names(("gamma", "tau"), np.size(self.gamma))
 
     @property
     def prony(self) -> PronyTerms:
@@ -166,12 +166,12 @@ class OgdenPower(SymmetricOgden):
 
     def __post_init__(self) -> None:
         for name in ("c", "m", "kappa_ratio"):
-            positive(name, getattr(self, name))
-        not_negative("gamma", self.gamma)
-        not_negative("slope", self.slope)
-        times = np.atleast_1d(_one_or_several("times_s", self.times_s)).tolist()
+            check_positive(name, getattr(self, name))
+        check_not_negative("gamma", self.gamma)
+        check_not_negative("slope", self.slope)
+        times = np.atleast_1d(_to_one_or_several("times_s", self.times_s)).tolist()
         for l, time in enumerate(times, 1):
-            positive(f"tau{l}", time)
+            check_positive(f"tau{l}", time)
         object.__setattr__(self, "times_s", tuple(times))
 
     @property
@@ -222,20 +222,20 @@ class Ogden(OgdenSum):
     volumetric: str = "log"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "terms", pairs("the terms", self.terms))
-        object.__setattr__(self, "prony", pairs("the Prony terms", self.prony))
+        object.__setattr__(self, "terms", to_pairs("the terms", self.terms))
+        object.__setattr__(self, "prony", to_pairs("the Prony terms", self.prony))
         if not 1 <= len(self.terms) <= MAX_OGDEN_TERMS:
             raise ProblemError(f"an Ogden material has 1 to {MAX_OGDEN_TERMS} terms, not {len(self.terms)}")
         for k, (c, m) in enumerate(self.terms, 1):
-            finite(f"c{k}", c)
-            finite(f"m{k}", m)
+            check_finite(f"c{k}", c)
+            check_finite(f"m{k}", m)
             if m == 0.0:
                 raise ProblemError(f"material parameter m{k} is zero")
         self._check_shared()
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        return *_numbered(("c", "m"), len(self.terms)), *_prony_names(self)
+        return *_number_names(("c", "m"), len(self.terms)), *_list_prony_names(self)
 
     @property
     def elastic_parameters(self) -> tuple[float, ...]:
@@ -268,13 +268,13 @@ class NeoHookean(OgdenSum):
     volumetric: str = "log"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "prony", pairs("the Prony terms", self.prony))
-        positive("mu", self.mu)
+        object.__setattr__(self, "prony", to_pairs("the Prony terms", self.prony))
+        check_positive("mu", self.mu)
         self._check_shared()
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        return "mu", *_prony_names(self)
+        return "mu", *_list_prony_names(self)
 
     @property
     def elastic_parameters(self) -> tuple[float, ...]:
@@ -304,14 +304,14 @@ class MooneyRivlin(OgdenSum):
     volumetric: str = "log"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "prony", pairs("the Prony terms", self.prony))
-        finite("c1", self.c1)
-        finite("c2", self.c2)
+        object.__setattr__(self, "prony", to_pairs("the Prony terms", self.prony))
+        check_finite("c1", self.c1)
+        check_finite("c2", self.c2)
         self._check_shared()
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        return "c1", "c2", *_prony_names(self)
+        return "c1", "c2", *_list_prony_names(self)
 
     @property
     def elastic_parameters(self) -> tuple[float, ...]:
@@ -324,7 +324,7 @@ class MooneyRivlin(OgdenSum):
         return np.array([[[4.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [4.0, 0.0]]])
 
 
-def _one_or_several(name: str, values: float | Sequence[float]) -> float | tuple[float, ...]:
+def _to_one_or_several(name: str, values: float | Sequence[float]) -> float | tuple[float, ...]:
     """A number, or several as a tuple."""
     try:
         found = np.asarray(values, dtype=float)
@@ -335,9 +335,9 @@ def _one_or_several(name: str, values: float | Sequence[float]) -> float | tuple
     return float(found.reshape(-1)[0]) if found.size == 1 else tuple(found.tolist())
 
 
-def _prony_names(material: Uncoupled) -> tuple[str, ...]:
-    return _numbered(("g", "tau"), len(material.prony))
+def _list_prony_names(material: Uncoupled) -> tuple[str, ...]:
+    return _number_names(("g", "tau"), len(material.prony))
 
 
-def _numbered(names: tuple[str, ...], count: int) -> tuple[str, ...]:
+def _number_names(names: tuple[str, ...], count: int) -> tuple[str, ...]:
     return tuple(f"{name}{k}" for k in range(1, count + 1) for name in names)

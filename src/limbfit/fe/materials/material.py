@@ -208,13 +208,13 @@ class Uncoupled(ABC):
 
     def _check_shared(self) -> None:
         """Raise `ProblemError` where what all laws share is impossible."""
-        positive("kappa_ratio", self.kappa_ratio)
+        check_positive("kappa_ratio", self.kappa_ratio)
         if self.volumetric not in VOLUMETRIC_LAWS:
             known = ", ".join(VOLUMETRIC_LAWS)
             raise ProblemError(f"unknown volumetric law {self.volumetric!r}", remedy=f"use one of {known}")
         for l, (g, tau) in enumerate(self.prony, 1):
-            not_negative(f"g{l}", g)
-            positive(f"tau{l}", tau)
+            check_not_negative(f"g{l}", g)
+            check_positive(f"tau{l}", tau)
         if not self.shear_modulus > 0:
             raise ProblemError(
                 f"the shear modulus of small strains is {self.shear_modulus:.4g} MPa, not positive",
@@ -222,27 +222,27 @@ class Uncoupled(ABC):
             )
 
 
-def finite(name: str, value: float) -> None:
+def check_finite(name: str, value: float) -> None:
     """Raise `ProblemError` unless ``value`` is a finite number."""
     if not math.isfinite(value):
         raise ProblemError(f"material parameter {name} = {value} is not finite")
 
 
-def positive(name: str, value: float) -> None:
+def check_positive(name: str, value: float) -> None:
     """Raise `ProblemError` unless ``value`` is finite and above zero."""
-    finite(name, value)
+    check_finite(name, value)
     if not value > 0:
         raise ProblemError(f"material parameter {name} = {value} is not positive")
 
 
-def not_negative(name: str, value: float) -> None:
+def check_not_negative(name: str, value: float) -> None:
     """Raise `ProblemError` unless ``value`` is finite and zero or above."""
-    finite(name, value)
+    check_finite(name, value)
     if value < 0:
         raise ProblemError(f"material parameter {name} = {value} is negative")
 
 
-def pairs(name: str, values: Sequence[Sequence[float]]) -> tuple[tuple[float, float], ...]:
+def to_pairs(name: str, values: Sequence[Sequence[float]]) -> tuple[tuple[float, float], ...]:
     """``values`` as a tuple of pairs of numbers."""
     try:
         return tuple((float(a), float(b)) for a, b in values)

@@ -36,7 +36,7 @@ class Factors(NamedTuple):
     d_back: Array
 
 
-def prony_factors(dt: float, tau: ArrayLike, before: float = np.inf) -> Factors:
+def compute_prony_factors(dt: float, tau: ArrayLike, before: float = np.inf) -> Factors:
     """Factors for relaxation times ``tau`` and a step of ``dt`` after one of ``before`` (s).
 
     ``before`` is infinite where the stress is linear over the step.

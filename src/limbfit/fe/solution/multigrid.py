@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...mesh import TET10_EDGES
-from ..pattern import build_node_graph, place_of, upper_pattern
+from ..pattern import build_node_graph, build_upper_pattern, place_of
 from ..system import System
 from .linear import Index, NotPositiveDefiniteError, SingleHalf, build_linear_solver
 
@@ -49,7 +49,7 @@ class Multigrid(SingleHalf):
         numbers = np.full(moving.shape, -1, dtype=np.int32)
         numbers[moving] = np.arange(len(coarse_slots), dtype=np.int32)
         graph = build_node_graph(linear_cells, len(numbers))
-        indptr, indices = upper_pattern(numbers, graph.indptr, graph.indices, len(coarse_slots))
+        indptr, indices = build_upper_pattern(numbers, graph.indptr, graph.indices, len(coarse_slots))
         self._coarse, self._coarse_places = _group_into_blocks(
             system.cells[:, :4], linear, indptr, indices, coarse_slots
         )

@@ -19,7 +19,7 @@ from ..kernel.fibres import add_moduli_at_rest, add_stress_at_rest
 from ..kernel.laws import Laws
 from ..kernel.response import elastic_response, elastic_stress, moduli, pressures, stress_rates
 from ..lanes import LANES, workspace
-from ..materials import prony_factors
+from ..materials import compute_prony_factors
 from ..system import Evaluation, Increment, System
 from .direction import solve_at
 from .factor import Factor
@@ -102,7 +102,7 @@ class MemoryDerivative:
         self, system: System, laws: Laws, before: Memory, step: Explicit, du: Array, dt: float
     ) -> MemoryDerivative:
         """The derivative of the memory after the step, given ``du (n, 3, p)``; uses up ``step.elastic``."""
-        found = prony_factors(dt, laws.prony[..., 1], before.duration)
+        found = compute_prony_factors(dt, laws.prony[..., 1], before.duration)
         slopes = (found.d_decay, found.d_ramp, found.d_back)
         d_factors = tuple(laws.d_prony[..., 1] * slope[:, None] for slope in slopes)
         factors = (found.decay, found.ramp, found.back, *d_factors)
@@ -159,7 +159,7 @@ def find_independent_columns(b: Array) -> tuple[list[int], Array]:
 def _step_coefficients(laws: Laws, dt: float, before: float) -> tuple[Array, ...]:
     """Weights in the history tensor K of H, of Se and of Se a step earlier, their explicit derivatives (for
     the changes of Se: in this step, that of the scale, and in the one before)."""
-    f = prony_factors(dt, laws.prony[..., 1], before)
+    f = compute_prony_factors(dt, laws.prony[..., 1], before)
     gamma = laws.prony[..., 0]
     d_gamma, d_tau = laws.d_prony[..., 0], laws.d_prony[..., 1]
     on_prony = gamma * f.decay

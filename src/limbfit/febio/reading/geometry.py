@@ -320,7 +320,7 @@ def split_convexly(points: Array, faces: Iterable[Indices]) -> Indices:
     return split_into_triangles(parted)
 
 
-def part_error(part: Part, name: str, what: str) -> ProblemError:
+def build_part_error(part: Part, name: str, what: str) -> ProblemError:
     """Return the error that names a part and its line."""
     ids = f"elements {part.ids.min()} to {part.ids.max()}"
     return ProblemError(f"part {name!r} ({part.cell_type}, {ids}): {what}", place=f"line {part.line}")

@@ -100,7 +100,7 @@ def _read_uncoupled(node: XmlNode, k: float, law: str) -> Material:
     if kind == _RELAXED:
         return _read_relaxing(node, k, law)
     if kind not in (*ELASTIC, _MIXTURE):
-        raise _kind_error(node, kind)
+        raise _build_kind_error(node, kind)
     if kind == _MIXTURE:
         active = [one for one in node.all("solid") if one.attribute("type") == ACTIVE]
         if active:
@@ -111,7 +111,7 @@ def _read_uncoupled(node: XmlNode, k: float, law: str) -> Material:
 def _read_relaxing(node: XmlNode, k: float, law: str) -> Material:
     elastic = node.child("elastic")
     if elastic.attribute("type") not in (*ELASTIC, _MIXTURE):
-        raise _kind_error(elastic, elastic.attribute("type"))
+        raise _build_kind_error(elastic, elastic.attribute("type"))
     _check_parameters(node, _RELAXING | _SHARED)
     g0 = node.number("g0", 1.0)
     if not g0 > 0.0:
@@ -186,7 +186,7 @@ def _read_mixture(
     return Fibred(made, scale * fibre.number("ksi"), fibre.number("alpha"))
 
 
-def _kind_error(node: XmlNode, kind: str) -> ProblemError:
+def _build_kind_error(node: XmlNode, kind: str) -> ProblemError:
     remedy = "limbfit has uncoupled materials: " + ", ".join(ELASTIC) + ", uncoupled viscoelastic"
     if kind in ("neo-Hookean", "isotropic elastic"):
         remedy = "use 'incomp neo-Hookean' with G = E / (2 (1 + v)) and k = E / (3 (1 - 2 v))"

@@ -151,12 +151,12 @@ def compute_settling_time_s(
     steady = [one for one in prestrains.values() if not one.curve]
     if steady and slowest > 0.0:
         remedy = "let its ramp grow in a first step of its own, and rest"
-        raise _prestrain_error("acts at once in tissue that relaxes", steady[0], remedy)
+        raise _build_prestrain_error("acts at once in tissue that relaxes", steady[0], remedy)
     if not growing:
         return 0.0
     first = phases[0].seconds
     if len(phases) < 2:
-        raise _prestrain_error(
+        raise _build_prestrain_error(
             "grows in the only step", growing[0], "let it grow in a first step of its own, and rest"
         )
     rested = max(_compute_rest_start(one, first, slowest, curves) for one in growing)
@@ -164,14 +164,16 @@ def compute_settling_time_s(
     for number, description in other_curves.items():
         values = curves[number].at(times)
         if np.abs(values - values[0]).max() > 0.0:
-            raise _prestrain_error(
+            raise _build_prestrain_error(
                 f"settles while {description} changes", growing[0], "let it change after the first step"
             )
     for held in conditions:
         gone = held.curve and held.step == 0 and held.kind == "moved"
         later = {(c.body, c.freedom) for c in conditions if c.kind == "moved" and c.step in (None, 1)}
         if gone and held.factor * curves[held.curve].at(first) and (held.body, held.freedom) not in later:
-            raise _prestrain_error(f"settles while the rigid body {held.body!r} goes elsewhere", growing[0])
+            raise _build_prestrain_error(
+                f"settles while the rigid body {held.body!r} goes elsewhere", growing[0]
+            )
     return first
 
 
@@ -181,18 +183,20 @@ def _compute_rest_start(
     """Return when a pre-strain has grown, s; it then rests until the first step ends."""
     points = curves[prestrain.curve].points
     if not len(points) or curves[prestrain.curve].corners is None:
-        raise _prestrain_error("grows along no line through points", prestrain, "use LINEAR points")
+        raise _build_prestrain_error("grows along no line through points", prestrain, "use LINEAR points")
     grown = float(points[np.flatnonzero(points[:, 1] != points[-1, 1]).max(initial=-1) + 1, 0])
     rest = step_end_s - grown
     if rest < 0.0:
-        raise _prestrain_error("goes on growing after the first step", prestrain)
+        raise _build_prestrain_error("goes on growing after the first step", prestrain)
     if rest < MIN_RELAXATION_TIMES * slowest:
         what = f"rests for {rest:.4g} s in the first step, in which tissue of {slowest:.4g} s does not relax"
-        raise _prestrain_error(what, prestrain, f"let it rest for {MIN_RELAXATION_TIMES * slowest:.4g} s")
+        raise _build_prestrain_error(
+            what, prestrain, f"let it rest for {MIN_RELAXATION_TIMES * slowest:.4g} s"
+        )
     return grown
 
 
-def _prestrain_error(what: str, prestrain: Prestrain, remedy: str | None = None) -> ProblemError:
+def _build_prestrain_error(what: str, prestrain: Prestrain, remedy: str | None = None) -> ProblemError:
     return ProblemError(f"a pre-strain {what}", place=f"line {prestrain.line}, <prestrain>", remedy=remedy)
 
 

@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 
 from ...arrays import Array
-from ...phases import boundaries, find_phases
+from ...phases import find_boundaries, find_phases
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse, check_responses
 from .leave_one_out import (
     MAX_ERROR_SHARE,
@@ -79,7 +79,7 @@ def _match_times(history: History, other_history: History) -> Array:
     """
     phases, other_phases = find_phases(*history), find_phases(*other_history)
     if [phase.kind for phase in phases] == [phase.kind for phase in other_phases]:
-        return np.asarray(np.interp(other_history[0], boundaries(other_phases), boundaries(phases)))
+        return np.asarray(np.interp(other_history[0], find_boundaries(other_phases), find_boundaries(phases)))
     return other_history[0] / other_history[0][-1] * history[0][-1]
 
 

@@ -22,7 +22,7 @@ from .objective import (
     compute_residuals,
     find_new_warnings,
 )
-from .parameters import Grouping, SearchSpace, Unknowns, build_space, stage_groupings
+from .parameters import Grouping, SearchSpace, Unknowns, build_space, build_stage_groupings
 from .prediction import compute_error_percent
 from .state import Calibration, CalibrationSettings, Iterate, SearchState, StageResult
 from .trust_region import FIRST_RADIUS, SearchPoint, SearchStep, minimise
@@ -71,7 +71,7 @@ def calibrate(
     ProblemError
         If priors are given together with the paper's objective.
     """
-    groupings = tuple(stages) or stage_groupings(unknowns.names)
+    groupings = tuple(stages) or build_stage_groupings(unknowns.names)
     if unknowns.priors and settings is not None and settings.objective == "paper":
         raise ProblemError("the paper's objective has no place for priors", remedy="use pointwise")
     run = _Search(simulate, tuple(measured), unknowns, settings or CalibrationSettings(), groupings)

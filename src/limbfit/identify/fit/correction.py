@@ -74,7 +74,7 @@ class MeshCorrection:
 def _correct_response(
     response: SiteResponse, coarse: SiteResponse, fine: SiteResponse, scale: float | None, reason: str
 ) -> SiteResponse:
-    reason = reason or ("" if response.completed else f"{COARSE_MESH}: {_failure_reason(response)}")
+    reason = reason or ("" if response.completed else f"{COARSE_MESH}: {_describe_failure(response)}")
     if scale is None or reason:
         nothing = np.full_like(response.force_N, np.nan), np.full_like(response.jacobian, np.nan)
         return SiteResponse(*nothing, False, reason, response.site)
@@ -90,13 +90,13 @@ def _correct_response(
 def _find_fault(response: SiteResponse, where: str) -> str:
     """Return why a response cannot be an anchor, or an empty text."""
     if not response.completed:
-        return f"{where}: {_failure_reason(response)}"
+        return f"{where}: {_describe_failure(response)}"
     if not (np.all(np.isfinite(response.force_N)) and np.all(np.isfinite(response.jacobian))):
         return f"{where}: the simulated force is not finite"
     return "" if np.any(response.force_N) else f"{where}: there is no force"
 
 
-def _failure_reason(response: SiteResponse) -> str:
+def _describe_failure(response: SiteResponse) -> str:
     return response.reason or "simulation failed"
 
 

@@ -15,7 +15,7 @@ from ...arrays import Array
 from .calibration import calibrate, evaluate_state
 from .correction import MeshCorrection
 from .objective import MeasuredCurve, Simulate, SiteResponse, check_responses, find_new_warnings
-from .parameters import Grouping, Unknowns, build_space, stage_groupings
+from .parameters import Grouping, Unknowns, build_space, build_stage_groupings
 from .state import Calibration, CalibrationSettings, Iterate, SearchState, StageResult
 from .trust_region import FIRST_RADIUS
 
@@ -131,7 +131,7 @@ def calibrate_with_correction(
         unknowns,
         settings or CalibrationSettings(),
         fidelity or CorrectionSettings(),
-        tuple(stages) or stage_groupings(unknowns.names),
+        tuple(stages) or build_stage_groupings(unknowns.names),
         on_iterate,
     )
     run.begin()

@@ -24,7 +24,7 @@ Objective = Literal["pointwise", "paper"]
 _MIN_ERROR_SHARE = 1e-4
 
 
-def largest_magnitude(values: Array) -> float:
+def find_largest_magnitude(values: Array) -> float:
     """Return the largest absolute value of values (n,)."""
     return float(np.abs(values).max())
 
@@ -54,7 +54,7 @@ class MeasuredCurve:
     @property
     def peak_N(self) -> float:
         """The largest force; the largest magnitude where lengths are compared."""
-        return largest_magnitude(self.force_N) if self.unit == "mm" else float(self.force_N.max())
+        return find_largest_magnitude(self.force_N) if self.unit == "mm" else float(self.force_N.max())
 
     @property
     def site_name(self) -> str:
@@ -156,19 +156,19 @@ def compute_residuals(
     objective: Objective, responses: Sequence[SiteResponse], measured: Sequence[MeasuredCurve]
 ) -> tuple[Array, Array]:
     """Return the residuals (N,) and their derivatives (N, p) with respect to the full parameters."""
-    rows = _pointwise_residuals if objective == "pointwise" else _mean_square_residuals
+    rows = _compute_pointwise_residuals if objective == "pointwise" else _compute_mean_square_residuals
     pairs = [rows(response, site) for response, site in zip(responses, measured, strict=True)]
     return np.concatenate([r for r, _ in pairs]), np.concatenate([j for _, j in pairs])
 
 
-def _pointwise_residuals(response: SiteResponse, site: MeasuredCurve) -> tuple[Array, Array]:
+def _compute_pointwise_residuals(response: SiteResponse, site: MeasuredCurve) -> tuple[Array, Array]:
     difference = response.force_N - site.force_N
     return site.discount_touch_down(difference) * site.scale, site.discount_touch_down(
         response.jacobian
     ) * site.scale
 
 
-def _mean_square_residuals(response: SiteResponse, site: MeasuredCurve) -> tuple[Array, Array]:
+def _compute_mean_square_residuals(response: SiteResponse, site: MeasuredCurve) -> tuple[Array, Array]:
     """Equation 8's entry R of a site, with rows that complete the second derivative of the objective.
 
     Least squares would take the slope g of R alone, as g g'. There is only one entry per site, fewer than

@@ -33,7 +33,7 @@ def group_separately(names: Sequence[str]) -> Grouping:
     return tuple(range(len(names)))
 
 
-def stage_groupings(names: Sequence[str]) -> tuple[Grouping, ...]:
+def build_stage_groupings(names: Sequence[str]) -> tuple[Grouping, ...]:
     """Return the groupings of the stages: one material, then one per tissue (paper, section 2.3).
 
     A single tissue has one stage, because the second would repeat the first.

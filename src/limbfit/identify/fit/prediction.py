@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from ...arrays import Array
-from .objective import SiteResponse, largest_magnitude
+from .objective import SiteResponse, find_largest_magnitude
 
 
 def compute_error_percent(simulated_N: Array, measured_N: Array) -> float:
@@ -18,7 +18,7 @@ def compute_error_percent(simulated_N: Array, measured_N: Array) -> float:
 
     Measured lengths may be negative; their largest magnitude is taken.
     """
-    return float(100 * np.mean(np.abs(simulated_N - measured_N)) / largest_magnitude(measured_N))
+    return float(100 * np.mean(np.abs(simulated_N - measured_N)) / find_largest_magnitude(measured_N))
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ class PredictionModel:
         standard deviation of the stiffness that is expected of a site that was not fitted.
         """
         noise_N, misfit = self.find_residual_sd(name, unit)
-        misfit_N = misfit * largest_magnitude(response.force_N)
+        misfit_N = misfit * find_largest_magnitude(response.force_N)
         own_N = np.hypot(np.hypot(noise_N, misfit_N), self.site_factor * np.abs(site_N))
         sd = compute_prediction_sd(response.jacobian, parameters, self.covariance_log, own_N)
         share = misfit_N**2 / np.maximum(sd, 1e-300) ** 2

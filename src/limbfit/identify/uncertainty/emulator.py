@@ -18,7 +18,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import CalibrationError
-from ..fit.objective import SiteResponse, largest_magnitude
+from ..fit.objective import SiteResponse, find_largest_magnitude
 from ..fit.prediction import compute_error_percent
 
 _LENGTHS = (1.0, 2.0, 4.0, 8.0)  # of the kernel, in half-widths of the points
@@ -85,7 +85,7 @@ class Emulator:
         forces = np.array([np.concatenate([r.force_N for r in run]) for run in runs])
         slopes = np.array([np.concatenate([r.jacobian for r in run]) for run in runs])
         sites = _build_slices([r.force_N.size for r in runs[0]])
-        peaks = np.array([[largest_magnitude(f[s]) for s in sites] for f in forces])
+        peaks = np.array([[find_largest_magnitude(f[s]) for s in sites] for f in forces])
         middle = softening * np.maximum(np.median(peaks, axis=0), 1e-9)
         soft = np.concatenate([np.full(s.stop - s.start, v) for s, v in zip(sites, middle)])
         centre, width = _find_box(np.log(points))
@@ -149,7 +149,7 @@ class Emulator:
         """Expected error of the emulator itself (sites,), in percent of the largest force: one sd."""
         force, doubt = (found[0] for found in self.predict_forces_and_sd(np.asarray(parameters)))
         return np.array(
-            [100 * sd / max(largest_magnitude(force[s]), 1e-12) for sd, s in zip(doubt, self._sites)]
+            [100 * sd / max(find_largest_magnitude(force[s]), 1e-12) for sd, s in zip(doubt, self._sites)]
         )
 
     def is_inside(self, parameters: Array, margin: float = 0.1) -> bool:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...arrays import Array, Indices
-from ...autoregressive import block_covariance, lag_one
+from ...autoregressive import compute_block_covariance, estimate_lag_one
 from ...phases import find_phases
 from ..fit.objective import MeasuredCurve, SiteResponse
 
@@ -77,7 +77,7 @@ def estimate_record_noise(
     """
     residual = residual_N - residual_N.mean()
     sd = float(residual.std())
-    lag = lag_one(residual)
+    lag = estimate_lag_one(residual)
     samples = _count_samples(times_s, residual.size)
     slope = touch_down_sd_mm * (
         np.ones(len(times_s))
@@ -86,7 +86,7 @@ def estimate_record_noise(
     )
     slope = slope if smoothing is None else smoothing @ slope
     floor = (_MIN_NOISE_SHARE * force_N.max()) ** 2
-    covariance = block_covariance(sd, lag, samples) + np.outer(slope, slope)
+    covariance = compute_block_covariance(sd, lag, samples) + np.outer(slope, slope)
     covariance += floor * np.eye(len(times_s))
     unit = "mm" if displacement_mm is None else "N"
     return SiteNoise(name, times_s, covariance, sd, lag, touch_down_sd_mm, unit)

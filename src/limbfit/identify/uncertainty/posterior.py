@@ -146,12 +146,12 @@ def sample_by_importance(
         mixture = logsumexp([proposal.log_density(drawn) for proposal in proposals], axis=0)
         logs = probability - mixture
         weights = _normalise(logs)
-        if _effective_size(weights) >= _TARGET_EFFECTIVE_SIZE:
+        if _compute_effective_size(weights) >= _TARGET_EFFECTIVE_SIZE:
             break
         tempered = _temper_weights(logs, 10.0 * (k + extra))
         mean = tempered @ drawn
         spread = np.cov(drawn.T, aweights=tempered).reshape(k + extra, k + extra)
-    worth = _effective_size(weights)
+    worth = _compute_effective_size(weights)
     places = (np.arange(_KEPT_SAMPLES) + random.uniform()) / _KEPT_SAMPLES
     kept = drawn[np.minimum(np.searchsorted(np.cumsum(weights), places), len(drawn) - 1)]
     return Posterior(
@@ -195,7 +195,7 @@ def _normalise(logs: Array) -> Array:
     return np.asarray(weights / weights.sum())
 
 
-def _effective_size(weights: Array) -> float:
+def _compute_effective_size(weights: Array) -> float:
     """Return the number of equal weights that tell as much (Kish's effective size)."""
     return float(1 / np.sum(weights**2))
 
@@ -204,7 +204,7 @@ def _temper_weights(logs: Array, least: float) -> Array:
     """Return weights evened out until they are worth at least ``least``: the first rounds may hit little."""
     for power in 0.5 ** np.arange(0, 12):
         weights = _normalise(power * logs)
-        if _effective_size(weights) >= least:
+        if _compute_effective_size(weights) >= least:
             break
     return weights
 

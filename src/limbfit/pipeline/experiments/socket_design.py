@@ -17,7 +17,7 @@ from ...anatomy.frame import Frame, build_limb_frame
 from ...anatomy.surfaces.surfaces import Anatomy, write_surface
 from ...anatomy.surfaces.triangles import Surface
 from ...arrays import Array
-from ...donning import outer_surface, press, pressed_problem
+from ...donning import build_pressed_problem, extract_outer_surface, press
 from ...donning.model import OUTER
 from ...donning.relief import Relief, Trial
 from ...errors import RunError, SurfaceError
@@ -195,7 +195,7 @@ class _Bench:
         table, faces = self.limb.study.socket, self.mesh.face_sets[OUTER]
         middles = self.mesh.points[faces[:, :3]].mean(axis=1)
         pressure = target.at(middles, self.limb.anatomy, self.limb.regions, self.plain)
-        problem = pressed_problem(self.mesh, self.laws, pressure, table.donning_s, table.hold_s)
+        problem = build_pressed_problem(self.mesh, self.laws, pressure, table.donning_s, table.hold_s)
         problem = replace(problem, fibres=build_fibre_field(self.limb.fibres, self.mesh))
         end = problem.history.times[-1]
 
@@ -215,7 +215,10 @@ class _Bench:
         _, fields = self.kept.get(compute_digest("pressed", *given), make)
         self.count += 1
         limb = compute_profile(self.limb.outer.skin, self.frame)
-        before, after = outer_surface(self.mesh), outer_surface(self.mesh, fields["displacement"])
+        before, after = (
+            extract_outer_surface(self.mesh),
+            extract_outer_surface(self.mesh, fields["displacement"]),
+        )
         return replace(self.recipe, offsets=compute_offsets(limb, before, after, self.frame))
 
     def made(self, name: str, recipe: Recipe, depths: Mapping[str, float] | None = None) -> _Made:

@@ -23,9 +23,9 @@ from ...donning import (
     Patch,
     SocketFit,
     SocketStep,
+    build_socket_problem,
     don,
     pack,
-    socket_problem,
     unpack,
 )
 from ...donning.model import OUTER
@@ -186,7 +186,7 @@ class SocketLimb:
             told(row.time, end, words)
 
         problem = replace(
-            socket_problem(mesh, laws, socket, fit), fibres=build_fibre_field(self.fibres, mesh)
+            build_socket_problem(mesh, laws, socket, fit), fibres=build_fibre_field(self.fibres, mesh)
         )
         before = None if begun is None else begun.latest()
         found = don(

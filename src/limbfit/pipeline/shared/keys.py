@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ...extensions import extensions_digest
+from ...extensions import compute_extensions_digest
 from ...study import Study
 from .artefacts import compute_digest, compute_file_digest
 from .provenance import list_input_files
@@ -61,7 +61,7 @@ class Keys:
     @cached_property
     def extensions(self) -> str:
         """Of the study's own Python files, which may change what any stage does."""
-        return extensions_digest(self.study.extensions)
+        return compute_extensions_digest(self.study.extensions)
 
     def of(
         self,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...arrays import Array
 from ...errors import ProblemError, TraceError
 from ...execution import Executor
-from ...extensions import extensions_digest
+from ...extensions import compute_extensions_digest
 from ...fe import SimulationWarning
 from ...indentation import (
     Direction,
@@ -146,7 +146,7 @@ def compute_job_digest(job: SimulationJob) -> str:
     model = {key: value for key, value in vars(job.model).items() if key not in ("mesh", "extensions")}
     indenter = job.model.indenter.model_dump(exclude={"file"})  # its digest is in the model
     clamps = None if job.model.clamps is None else job.model.clamps.model_dump()
-    model["extensions_digest"] = extensions_digest(job.model.extensions)
+    model["extensions_digest"] = compute_extensions_digest(job.model.extensions)
     model |= {"indenter": indenter, "steps": job.model.steps.model_dump(), "clamps": clamps}
     return compute_digest(
         code_digest(simulate),

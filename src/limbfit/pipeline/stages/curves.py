@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import TraceError
-from ...phases import MotionPhase, in_words
+from ...phases import MotionPhase, describe_phases
 from ...study import Record, Study
 from ...traces import (
     Creep,
@@ -75,7 +75,7 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, dict[
         "speed_load_mm_s": smooth.speed_load_mm_s,
         "speed_unload_mm_s": None if np.isnan(smooth.speed_unload_mm_s) else smooth.speed_unload_mm_s,
         "phases": _phases_to_rows(trace, smooth, touch),
-        "phases_in_words": in_words(smooth.phases),
+        "phases_in_words": describe_phases(smooth.phases),
         "knots_s": smooth.knots_s.tolist(),
         "knots_mm": smooth.knots_mm.tolist(),
         "knots_N": smooth.knots_N.tolist() if isinstance(smooth, Creep) else None,

@@ -19,7 +19,14 @@ from ...identify.fit.correction import MeshCorrection
 from ...identify.fit.multifidelity import CorrectionSettings, calibrate_with_correction
 from ...identify.fit.multistart import SearchResult, continue_from_bound
 from ...identify.fit.objective import MeasuredCurve, SiteResponse
-from ...identify.fit.parameters import Grouping, Prior, Unknowns, build_space, constrain, stage_groupings
+from ...identify.fit.parameters import (
+    Grouping,
+    Prior,
+    Unknowns,
+    build_space,
+    build_stage_groupings,
+    constrain,
+)
 from ...identify.fit.state import Calibration, CalibrationSettings, SearchState
 from ...identify.uncertainty.intervals import EvaluationStore, count_further_evaluations, sample_uncertainty
 from ...identify.uncertainty.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
@@ -376,7 +383,9 @@ def build_settings(study: Study) -> CalibrationSettings:
 def build_groupings(study: Study) -> tuple[Grouping, ...]:
     """Which parameters move together in each stage, as far as the study lets them move."""
     names = build_unknowns(study).names
-    made = [constrain(one, names, study.fixed, study.calibration.tied) for one in stage_groupings(names)]
+    made = [
+        constrain(one, names, study.fixed, study.calibration.tied) for one in build_stage_groupings(names)
+    ]
     return tuple(dict.fromkeys(made))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array
-from ...identify.fit.objective import largest_magnitude
+from ...identify.fit.objective import find_largest_magnitude
 from ...identify.uncertainty.noise import SiteNoise, compute_depth_slope, compute_skin_similarity
 from ...indentation import Simulation
 
@@ -65,7 +65,7 @@ class SecondaryValues:
         A force counts as one whose error is ``error_share`` of its largest. Where this is off by more than
         that share of the largest value, it counts by as much less.
         """
-        return min(1.0, (error_share * largest_magnitude(self.value) / self.noise_sd) ** 2)
+        return min(1.0, (error_share * find_largest_magnitude(self.value) / self.noise_sd) ** 2)
 
     def noise(
         self, name: str, simulated: Array, depth_mm: Array | None, touch_down_sd_mm: float

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...identify.fit.correction import MeshCorrection
-from ...identify.fit.objective import SiteResponse, largest_magnitude
+from ...identify.fit.objective import SiteResponse, find_largest_magnitude
 from ...identify.fit.prediction import PredictionModel, compute_error_percent, summarise_errors
 from ...indentation import (
     Simulation,
@@ -230,7 +230,7 @@ def _write_observed(
                 "what": seen.what,
                 "name": one.name,
                 "unit": seen.unit,
-                "largest": largest_magnitude(one.compared),
+                "largest": find_largest_magnitude(one.compared),
                 "noise": seen.noise_sd,
                 **seen.facts,
                 "error_percent": compute_error_percent(whole.force_N, one.compared)

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from ..formats import fixed, symbol, unit_of, with_value
+from ..formats import format_fixed, format_symbol, format_with_value, get_unit
 from ..page import Figure
 from ..store import Curves, Json, Results, find_compared_quantity
 from . import plots
@@ -52,7 +52,7 @@ def draw_force_figure(
         if (quantity := find_compared_quantity(curves)) != ("force", "N"):
             ax.set_ylabel(f"{quantity[0].capitalize()} ({quantity[1]})")
     plots.add_legend(drawing, max(axes, key=lambda ax: len(ax.get_legend_handles_labels()[1])))
-    sites = ", ".join(f"{row['record']} ({fixed(row.get('error_percent'))} %)" for row, _ in pairs)
+    sites = ", ".join(f"{row['record']} ({format_fixed(row.get('error_percent'))} %)" for row, _ in pairs)
     alt = f"Measured and simulated force against {words}; site and error: {sites}"
     kind = "fitted" if all(row.get("fitted") for row, _ in pairs) else "held-out"
     paper = "Figure 7 of the paper for this study: m" if name == "forces-fitted" else "M"
@@ -65,7 +65,7 @@ def _make_site_title(row: Json, columns: int) -> str:
     head = f"site {row['record']}" + (f", {region}" if region and columns < 3 else "")
     most = MAX_TITLE // (columns - 1 or 1)
     head = head if len(head) <= most else head[: most - 1] + "…"
-    return f"{head}: {fixed(row.get('error_percent'))} %"
+    return f"{head}: {format_fixed(row.get('error_percent'))} %"
 
 
 def _draw_forces(ax: Axes, curves: Curves, against: str, materials: str) -> None:
@@ -116,7 +116,7 @@ def draw_convergence_figure(store: Results) -> Figure | None:
     _finish_convergence(axes, store)
     count = sum(len(ax.get_legend_handles_labels()[0]) for ax in axes[:2])
     plots.add_legend(drawing, *axes[:2], columns=math.ceil(count / math.ceil(count / MAX_LEGEND_ROW)))
-    last = fixed(stages[-1]["iterations"][-1].get("error_percent"), 2)
+    last = format_fixed(stages[-1]["iterations"][-1].get("error_percent"), 2)
     alt = f"Error and parameters against iteration; the error ends at {last} %"
     caption = (
         "The paper's two steps (figure 5) as they went: the mean error at the fitted sites (thin lines: "
@@ -150,7 +150,7 @@ def _finish_convergence(axes: Sequence[Axes], store: Results) -> None:
     axes[0].set_yscale("log")
     plots.format_log_axis(axes[0].yaxis, minor=True)
     for ax, name in zip(axes[1:], store.law.keys, strict=True):
-        ax.set_title(f"{symbol(name)} ({unit_of(name)})")
+        ax.set_title(f"{format_symbol(name)} ({get_unit(name)})")
         for i, (tissue, values) in enumerate(store.truth.get("parameters", {}).items()):
             if name in values:
                 ax.axhline(values[name], lw=1, label=f"truth, {tissue}", **choose_truth_style(i))
@@ -169,10 +169,10 @@ def draw_error_figure(store: Results) -> Figure | None:
     for at, row in enumerate(rows):
         color, hatch = (FITTED, None) if row.get("fitted") else (HELD_OUT, "///")
         ax.barh(at, row["error_percent"], color=color, alpha=0.75, hatch=hatch, height=0.62)
-        ax.text(row["error_percent"], at, f" {fixed(row['error_percent'])}", va="center", fontsize=8)
+        ax.text(row["error_percent"], at, f" {format_fixed(row['error_percent'])}", va="center", fontsize=8)
     plots.set_rows(ax, [f"{row['record']} ({'fitted' if row.get('fitted') else 'held out'})" for row in rows])
     ax.set_xlabel("Mean absolute error over largest force (%)")
-    sites = ", ".join(f"{row['record']} {fixed(row['error_percent'])} %" for row in rows)
+    sites = ", ".join(f"{row['record']} {format_fixed(row['error_percent'])} %" for row in rows)
     caption = "Force error of each site. Plain bars: sites that were fitted; hatched: held out."
     return plots.make_figure(drawing, "errors", f"Error of each site: {sites}", caption)
 
@@ -187,7 +187,7 @@ def draw_interval_figure(store: Results) -> Figure | None:
     drawing, (ax,) = plots.make_panels(1, 1, 0.7 + 0.3 * len(names))
     for at, (tissue, name) in enumerate(names):
         _draw_ratios(ax, store, at, tissue, name)
-    plots.set_rows(ax, [f"{t} {with_value(n, last[t][n])}" for t, n in names])
+    plots.set_rows(ax, [f"{t} {format_with_value(n, last[t][n])}" for t, n in names])
     plots.set_log_scale(ax, minor=True)
     ax.set_xlabel("Ratio to the identified value (–)")
     ax.axvline(1, color=MUTED, lw=0.8)
@@ -258,7 +258,7 @@ def _draw_time_figure(
             ax.plot(x, curves[f"{what}_simulated_{unit}"], color=SIMULATED, label=store.materials)
         if f"{what}_low_{unit}" in curves:
             plots.plot_band(ax, x, curves[f"{what}_low_{unit}"], curves[f"{what}_high_{unit}"])
-        ax.set_title(f"{row['record']}, {layer['what']}: {fixed(layer['error_percent'])} %")
+        ax.set_title(f"{row['record']}, {layer['what']}: {format_fixed(layer['error_percent'])} %")
     plots.add_legend(drawing, axes[0])
     use = "fitted" if fitted else "held-out"
     records = ", ".join(f"{row['record']} {layer['what']}" for row, layer, _ in rows)
@@ -277,7 +277,7 @@ def draw_skin_figure(store: Results, fitted: bool) -> Figure | None:
     plots.label_outer(axes, 3, "Measured (mm)", "Predicted (mm)")
     for ax, (row, seen, curves) in zip(axes, rows, strict=True):
         _draw_pairs(ax, curves, seen["components"])
-        ax.set_title(f"{row['record']}: {fixed(seen['error_percent'])} %")
+        ax.set_title(f"{row['record']}: {format_fixed(seen['error_percent'])} %")
     plots.add_legend(drawing, axes[0])
     use = "fitted" if fitted else "held-out"
     records = ", ".join(str(row["record"]) for row, _, _ in rows)

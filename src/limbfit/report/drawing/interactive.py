@@ -19,7 +19,7 @@ from ...arrays import Array
 from ...mesh import read_vtu
 from ...web.arrays import pack
 from ...web.shapes import extract_interface, read_shell, to_shell, to_volume_shape
-from ..formats import symbol, unit_of
+from ..formats import format_symbol, get_unit
 from ..page import Interactive
 from ..store import Curves, Json, Results
 from .pictures import (
@@ -206,7 +206,7 @@ def record_curves(store: Results, sites: Sequence[str]) -> Interactive | None:
     return Interactive("records", "records", "Records of all sites.", caption, {"sites": choices})
 
 
-def convergence_curves(store: Results) -> Interactive | None:
+def draw_convergence_curves(store: Results) -> Interactive | None:
     """The error and each parameter over the accepted iterates of all stages."""
     steps = [step for stage in store.stages for step in stage.get("iterations") or ()]
     if not steps:
@@ -217,7 +217,9 @@ def convergence_curves(store: Results) -> Interactive | None:
             {"label": tissue, "y": [step["parameters"].get(tissue, {}).get(name) for step in steps]}
             for tissue in store.tissues
         ]
-        make_panels.append({"title": symbol(name), "unit": unit_of(name), "log": False, "series": series})
+        make_panels.append(
+            {"title": format_symbol(name), "unit": get_unit(name), "log": False, "series": series}
+        )
     caption = "The same, to read values from; iterates are counted through all stages."
     return Interactive(
         "iterates", "iterates", "Error and parameters over the iterates.", caption, {"panels": make_panels}

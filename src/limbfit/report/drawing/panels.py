@@ -79,7 +79,7 @@ def embed_png(data: bytes) -> str:
 _GAP, _TITLE = 14, 46
 
 
-def picture_row(shots: Sequence[Shot], titles: Sequence[str], alt: str) -> str:
+def build_picture_row(shots: Sequence[Shot], titles: Sequence[str], alt: str) -> str:
     """Pictures side by side in one SVG, with titles, labelled marks and a scale bar in each."""
     width = sum(view.size[0] for _, view, _ in shots) + _GAP * (len(shots) - 1)
     height = max(view.size[1] for _, view, _ in shots) + _TITLE
@@ -137,7 +137,7 @@ def _draw_scale_bar(view: View) -> str:
     return f'{line}<text class="scale-text" x="{right}" y="{bottom - 10}">{length} mm</text>'
 
 
-def legend(entries: Iterable[tuple[str, str]]) -> str:
+def build_legend(entries: Iterable[tuple[str, str]]) -> str:
     items = "".join(
         f'<span><i class="swatch" style="background:{color}"></i>{escape(text)}</span>'
         for text, color in entries
@@ -179,7 +179,7 @@ def make_key(text: str, color: str, dot: bool = False, filled: bool = True) -> P
     return Line2D([], [], ls="", marker="o", mfc=color if filled else "white", mec=color, ms=8, label=text)
 
 
-def figure_sheet(
+def build_figure_sheet(
     title: str, rows: Sequence[PictureRow], keys: Sequence[Patch | Line2D], spare_in: float = 0.0
 ) -> Drawing:
     """Rows of pictures on one sheet with a title and a legend; every picture has a scale and its sides.

@@ -19,7 +19,17 @@ from ...arrays import Array
 from ...web.shapes import build_patient_frame
 from ..page import Figure
 from ..store import Json, Results
-from .panels import FIELD_MAP, PAPER, Mark, Shot, View, embed_png, legend, make_colour_bar, picture_row
+from .panels import (
+    FIELD_MAP,
+    PAPER,
+    Mark,
+    Shot,
+    View,
+    build_legend,
+    build_picture_row,
+    embed_png,
+    make_colour_bar,
+)
 
 SKIN, MUSCLE, BONE = "#e3c878", "#c8717a", "#e9e6dc"
 BETWEEN = ("#7d6a2e", "#f7efce", "#4a6472")  # layers between the outermost and the core
@@ -36,7 +46,7 @@ FIELDS = (
 Grid = Any  # a pyvista data set; what its stubs promise differs between its releases
 
 
-def unit(values: Iterable[float]) -> Array:
+def normalise(values: Iterable[float]) -> Array:
     v = np.asarray(tuple(values), dtype=float)
     return v / np.linalg.norm(v)
 
@@ -47,7 +57,7 @@ def read_limb_frame(store: Results) -> Array:
 
 
 @contextmanager
-def without_display_warning() -> Iterator[None]:
+def silence_display_warning() -> Iterator[None]:
     """VTK warns on the terminal that there is no display before it draws without one, as it should."""
     before = vtkLogger.GetCurrentVerbosityCutoff()
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
@@ -113,7 +123,7 @@ def make_field_plotter(
     return plotter
 
 
-@without_display_warning()
+@silence_display_warning()
 def draw_surface_figure(store: Results) -> Figure | None:
     """The limb from four sides: skin translucent, bones and regions inside, sites named where they show."""
     if "skin" not in store.surface_files:
@@ -126,10 +136,10 @@ def draw_surface_figure(store: Results) -> Figure | None:
         "Skin (translucent), bones, and the indentation sites from four sides of the patient. "
         "Filled: sites that were fitted; open: held out."
     )
-    return Figure("model", picture_row(shots, SIDES, alt), caption)
+    return Figure("model", build_picture_row(shots, SIDES, alt), caption)
 
 
-@without_display_warning()
+@silence_display_warning()
 def draw_marker_figure(store: Results) -> Figure | None:
     """Figure 1: the skin of the image with markers, coloured by its distance from the skin without them."""
     marked_file, plain_file = store.folder / "segment" / "skin-markers.stl", store.surface_files.get("skin")
@@ -146,7 +156,7 @@ def draw_marker_figure(store: Results) -> Figure | None:
         "without: each site of the study was matched to one of the bumps."
     )
     bar = make_colour_bar(limits, "distance (mm)")
-    return Figure("markers", picture_row(shots, SIDES, alt) + bar, caption)
+    return Figure("markers", build_picture_row(shots, SIDES, alt) + bar, caption)
 
 
 def draw_slices_figure(store: Results) -> Figure | None:
@@ -175,17 +185,19 @@ def make_four_views(store: Results, skin: Any) -> list[View]:
 def _mark_facing_sites(store: Results, view: View) -> list[Mark]:
     """The sites whose skin faces the camera of a view."""
     return [
-        _mark_site(row) for row in store.placed_sites.values() if unit(row["axis"]) @ view.direction > 0.5
+        _mark_site(row)
+        for row in store.placed_sites.values()
+        if normalise(row["axis"]) @ view.direction > 0.5
     ]
 
 
 def _mark_site(row: Json, axis: bool = False) -> Mark:
     color = FITTED if row.get("fitted") else HELD_OUT
-    position, direction = np.array(row["position_mm"]), unit(row["axis"]) if axis else None
+    position, direction = np.array(row["position_mm"]), normalise(row["axis"]) if axis else None
     return Mark(str(row["site"]), position, color, bool(row.get("fitted")), direction)
 
 
-@without_display_warning()
+@silence_display_warning()
 def draw_mesh_figure(store: Results, sites: Sequence[str]) -> Figure | None:
     """Figures 4 and 6: whole meshes of some sites cut through the site, and the refinement near it."""
     whole: list[Shot] = []
@@ -206,18 +218,24 @@ def draw_mesh_figure(store: Results, sites: Sequence[str]) -> Figure | None:
     alt = "Meshes cut through the sites " + ", ".join(names) + f": {', '.join(colours)} and bone voids"
     paper = {"skin": "skin–adipose layer", "muscle": "muscle–soft tissue"}
     words = paper if tuple(colours) == tuple(paper) else {name: name for name in colours}
-    key = legend((*((words[name], colour) for name, colour in colours.items()), ("wall of a bone", BONE)))
+    key = build_legend(
+        (*((words[name], colour) for name, colour in colours.items()), ("wall of a bone", BONE))
+    )
     caption = (
         "Figures 4 and 6 of the paper for this study: the mesh of each fitted site, cut along the limb "
         "through the site (above), and near the indenter "
         "(below). Bones are voids with fixed surfaces; the arrow is the axis of the indenter."
     )
     titles = [f"site {name}" for name in names]
-    markup = picture_row(whole, titles, alt) + picture_row(near, [f"{t}, near" for t in titles], alt) + key
+    markup = (
+        build_picture_row(whole, titles, alt)
+        + build_picture_row(near, [f"{t}, near" for t in titles], alt)
+        + key
+    )
     return Figure("mesh-cut", markup, caption)
 
 
-@without_display_warning()
+@silence_display_warning()
 def draw_field_figure(store: Results, sites: Sequence[str], stage: str, name: str) -> Figure | None:
     """The deformed cut of some sites at the largest indentation, coloured by what is stored."""
     grids = [(row, file, read_linear(file)) for row, file in find_placed_meshes(store, sites, stage)]
@@ -232,7 +250,9 @@ def draw_field_figure(store: Results, sites: Sequence[str], stage: str, name: st
     names = [row["site"] for row, _, _ in grids]
     alt = f"Deformed cut at the peak, coloured by {field[1]}, sites " + ", ".join(names)
     caption = f"Deformed cut through each site at the largest indentation; colour: {field[1]}."
-    markup = picture_row(shots, [f"site {name}" for name in names], alt) + make_colour_bar(limits, field[1])
+    markup = build_picture_row(shots, [f"site {name}" for name in names], alt) + make_colour_bar(
+        limits, field[1]
+    )
     return Figure(name, markup, caption)
 
 
@@ -269,8 +289,8 @@ def read_linear(file: Path) -> Grid:
 def make_cut_views(store: Results, row: Json, file: Path) -> tuple[View, View]:
     """The whole limb and the neighbourhood of a site, seen at right angles to the cut through it."""
     up = read_limb_frame(store)[2]
-    axis = unit(row["axis"])
-    normal = unit(np.cross(axis, up)) if abs(axis @ up) < 0.98 else read_limb_frame(store)[0]
+    axis = normalise(row["axis"])
+    normal = normalise(np.cross(axis, up)) if abs(axis @ up) < 0.98 else read_limb_frame(store)[0]
     points = np.asarray(pv.read(file).points)
     height = points @ up
     middle = points.mean(axis=0)

@@ -12,19 +12,19 @@ from ...arrays import Array
 from ..page import Figure
 from ..store import Json, Results
 from .colours import MUTED, SIMULATED, THIRD
-from .panels import FIELD_MAP, Mark, Shot, View, make_colour_bar, picture_row
+from .panels import FIELD_MAP, Mark, Shot, View, build_picture_row, make_colour_bar
 from .pictures import (
     SIDES,
     Grid,
     cut_behind,
     make_field_plotter,
     make_four_views,
+    normalise,
     read_limb_frame,
     read_linear,
     render_field,
     render_views,
-    unit,
-    without_display_warning,
+    silence_display_warning,
 )
 from .plots import add_legend, make_figure, make_panels, styled
 
@@ -34,7 +34,7 @@ SHEAR, MARKED = "shear_strain", "#d62728"
 OFFSET, OFFSET_MAP = "offset_mm", "RdBu_r"
 
 
-@without_display_warning()
+@silence_display_warning()
 def draw_pressure_figures(store: Results, files: Mapping[str, Path], name: str) -> tuple[Figure, ...]:
     """Pressure and shear on four sides, one colour scale for all the stored fields, by their titles."""
     surfaces = {title: _read_surface(file) for title, file in files.items() if file.is_file()}
@@ -80,11 +80,11 @@ def _render_surfaces(
     for title, surface in surfaces.items():
         shots = render_views(make_field_plotter(surface, field, limits, colours), views)
         titles = [f"{title}, {side}" for side in SIDES]
-        markup += picture_row(shots, titles, f"{alt}, {title}, from four sides")
+        markup += build_picture_row(shots, titles, f"{alt}, {title}, from four sides")
     return markup + make_colour_bar(limits, words, colours)
 
 
-@without_display_warning()
+@silence_display_warning()
 def draw_offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | None:
     """Faces of sockets by their titles, coloured by how far outside the unloaded limb they are."""
     faces = {title: pv.read(file) for title, file in files.items() if file.is_file()}
@@ -101,7 +101,7 @@ def draw_offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | No
     return Figure("socket-design-offset", markup, caption)
 
 
-@without_display_warning()
+@silence_display_warning()
 def draw_inside_figure(store: Results, title: str, inside: Sequence[Json], file: Path) -> tuple[Figure, ...]:
     """Cuts along and across the limb through the place of the largest shear, coloured by it."""
     if not file.is_file():
@@ -121,7 +121,9 @@ def draw_inside_figure(store: Results, title: str, inside: Sequence[Json], file:
         f"Inside the limb, {title}: cuts along and across it through the largest shear "
         f"({worst['tissue']}{near}), deformed; colour: largest shear strain of each element."
     )
-    markup = picture_row(shots, ("along the limb", "across the limb"), f"Cuts coloured by {words}, {title}")
+    markup = build_picture_row(
+        shots, ("along the limb", "across the limb"), f"Cuts coloured by {words}, {title}"
+    )
     return (Figure("socket-inside", markup + make_colour_bar(limits, words), caption),)
 
 
@@ -131,7 +133,7 @@ def _make_cut_views(store: Results, grid: Grid, place: Array) -> tuple[View, Vie
     points = np.asarray(grid.points)
     middle = points.mean(axis=0)
     outwards = (place - middle) - (place - middle) @ up * up
-    normal = unit(np.cross(outwards if np.linalg.norm(outwards) > 1.0 else back, up))
+    normal = normalise(np.cross(outwards if np.linalg.norm(outwards) > 1.0 else back, up))
     half = float(np.ptp(points @ up)) / 2 * 1.05
     across = np.cross(normal, up)
     reach = float(np.abs((points - middle) @ across).max()) + 10

@@ -10,9 +10,9 @@ import pyvista as pv
 from scipy.spatial import KDTree
 
 from ...errors import InputError
-from ...mesh import dihedral_angles
+from ...mesh import compute_dihedral_angles
 from ..store import Json, Results, load_store
-from .panels import Drawing, Mark, PictureRow, Shot, View, figure_sheet, make_key, write_png
+from .panels import Drawing, Mark, PictureRow, Shot, View, build_figure_sheet, make_key, write_png
 from .pictures import (
     BONE,
     MATT,
@@ -28,10 +28,10 @@ from .pictures import (
     make_four_views,
     make_limb_plotter,
     make_plotter,
+    normalise,
     read_linear,
     render_views,
-    unit,
-    without_display_warning,
+    silence_display_warning,
 )
 
 CUT_PLANE = "#0072b2"
@@ -59,7 +59,7 @@ def draw_stage(results: Path, stage: str, file: Path) -> Path:
     store = load_store(results)
     if "skin" not in store.surface_files:
         raise InputError("no surfaces are stored", file=results, remedy="run the stage surfaces first")
-    with without_display_warning():
+    with silence_display_warning():
         write_png(_SHEETS[stage](store), file)
     return file
 
@@ -78,7 +78,7 @@ def draw_surfaces_sheet(store: Results) -> Drawing:
     regions = [name for name in store.surface_files if name.startswith("region-")]
     keys = [make_key("skin", SKIN_SURFACE), make_key("bone", BONE), make_key("proximal cut", CUT_PLANE)]
     keys += [make_key(name.removeprefix("region-"), choose_inner_colour(name)) for name in regions]
-    return figure_sheet("Surfaces", rows, keys)
+    return build_figure_sheet("Surfaces", rows, keys)
 
 
 def draw_sites_sheet(store: Results) -> Drawing:
@@ -88,14 +88,14 @@ def draw_sites_sheet(store: Results) -> Drawing:
     colours = {name: REGIONS[i % len(REGIONS)] for i, name in enumerate(regions)}
     plotter = make_limb_plotter(store, skin)
     for row in store.sites:
-        axis, place = unit(row["axis"]), np.array(row["position_mm"])
+        axis, place = normalise(row["axis"]), np.array(row["position_mm"])
         arrow = pv.Arrow(
             start=place - AXIS_MM * axis, direction=axis, scale=AXIS_MM, tip_length=0.4, tip_radius=0.14
         )
         plotter.add_mesh(arrow, color=colours[str(row.get("region") or "")], **MATT)
 
     def mark_facing(view: View) -> list[Mark]:
-        facing = [row for row in store.sites if unit(row["axis"]) @ view.direction > 0.35]
+        facing = [row for row in store.sites if normalise(row["axis"]) @ view.direction > 0.35]
         return [_mark_site(row, colours) for row in facing]
 
     shots = render_views(plotter, make_four_views(store, skin), mark_facing)
@@ -103,7 +103,7 @@ def draw_sites_sheet(store: Results) -> Drawing:
     used = {bool(row.get("fitted")) for row in store.sites}
     if len(used) == 2:
         keys += [make_key("fitted", "#555555", True), make_key("held out", "#555555", True, filled=False)]
-    return figure_sheet("Sites, with the axis of the indenter", [PictureRow(shots, SIDES)], keys)
+    return build_figure_sheet("Sites, with the axis of the indenter", [PictureRow(shots, SIDES)], keys)
 
 
 def draw_mesh_sheet(store: Results) -> Drawing:
@@ -118,15 +118,15 @@ def draw_mesh_sheet(store: Results) -> Drawing:
         colours |= choose_region_colours(grid)
         plotter = make_plotter()
         add_regions(plotter, cut_behind(grid, views[0]))
-        mark = Mark(str(row["site"]), np.array(row["position_mm"]), CUT_PLANE, True, unit(row["axis"]))
+        mark = Mark(str(row["site"]), np.array(row["position_mm"]), CUT_PLANE, True, normalise(row["axis"]))
         shots = [(picture, view, [mark]) for picture, view, _ in render_views(plotter, views)]
         whole.append(shots[0])
         near.append(shots[1])
         tets = grid.cell_connectivity.reshape(-1, 4)
-        angles[str(row["site"])] = dihedral_angles(np.asarray(grid.points, float), tets).min(axis=1)
+        angles[str(row["site"])] = compute_dihedral_angles(np.asarray(grid.points, float), tets).min(axis=1)
     titles = [f"site {name}" for name in angles]
     keys = [make_key(name, colour) for name, colour in (colours | {"wall of a bone": BONE}).items()]
-    drawing = figure_sheet(
+    drawing = build_figure_sheet(
         "Meshes, cut along the limb through the site",
         [PictureRow(whole, titles), PictureRow(near, [f"{title}, near the indenter" for title in titles])],
         keys,
@@ -150,7 +150,7 @@ def _draw_histogram(drawing: Drawing, angles: dict[str, Any]) -> None:
 
 
 def _make_cut_plane(store: Results, skin: Any) -> Any:
-    normal, point = unit(store.surfaces["cut_normal"]), np.array(store.surfaces["cut_point"])
+    normal, point = normalise(store.surfaces["cut_normal"]), np.array(store.surfaces["cut_point"])
     near = np.asarray(skin.points)[np.abs((skin.points - point) @ normal) < 3.0]
     centre = near.mean(axis=0) if len(near) else point
     reach = 1.12 * float(np.linalg.norm(near - centre, axis=1).max()) if len(near) else 60.0

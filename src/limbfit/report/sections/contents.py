@@ -23,7 +23,7 @@ from .sensitivity import SENSITIVITIES
 from .simulations import make_comparison_section, make_simulated_section, make_solver_section
 from .socket import make_socket_section
 from .socket_design import make_socket_design_section
-from .summary import list_key_numbers, summary
+from .summary import build_summary, list_key_numbers
 from .uncertainty import make_uncertainty_section
 
 Maker = Callable[[Results, Json], Section]
@@ -60,7 +60,7 @@ def make_page(store: Results) -> Page:
         make_record_check_section(store) if "flags" in store.predict else None,
         make_parameter_section(store),
         make_convergence_section(store),
-        *_experiment_sections(store),
+        *_list_experiment_sections(store),
         make_simulated_section(store) if store.simulated else None,
         make_comparison_section(store) if store.compared else None,
         make_solver_section(store),
@@ -74,13 +74,13 @@ def make_page(store: Results) -> Page:
         title=str(study.get("name") or "Unnamed study"),
         subtitle=str(study.get("description") or ""),
         key_numbers=list_key_numbers(store),
-        summary=summary(store),
+        summary=build_summary(store),
         sections=tuple(section for section in sections if section is not None),
         footer=f"Made by limbfit {version} from stored results. {PRIVACY}",
     )
 
 
-def _experiment_sections(store: Results) -> tuple[Section, ...]:
+def _list_experiment_sections(store: Results) -> tuple[Section, ...]:
     """A section for each finished experiment, then one that names those that are stale."""
     found = [
         SECTIONS[name](store, store.experiments[name]) for name in SECTIONS.names if name in store.experiments

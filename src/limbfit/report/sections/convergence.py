@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 
 from ..drawing.figures import draw_convergence_figure
-from ..drawing.interactive import convergence_curves
-from ..formats import NOTHING, fixed, number, with_unit
+from ..drawing.interactive import draw_convergence_curves
+from ..formats import NOTHING, format_fixed, format_with_unit, number
 from ..page import Bullets, Section, Table, make_bullets, make_section
 from ..store import Json, Results
-from ..tables import Column, make_table, numeric
+from ..tables import Column, make_table, to_numeric
 
 _KINDS = {
     "folded": "elements inside out",
@@ -36,7 +36,7 @@ def make_convergence_section(store: Results) -> Section:
         "Convergence of the identification",
         make_bullets(texts),
         draw_convergence_figure(store),
-        convergence_curves(store),
+        draw_convergence_curves(store),
         describe_search(store),
         (make_iteration_table(store, stage) for stage in stages if stage.get("iterations")),
         otherwise="No identification is stored yet.",
@@ -49,12 +49,14 @@ def make_iteration_table(store: Results, stage: Json) -> Table:
     tissues = known if stage.get("name") != "one material" else known[:1]
     columns: tuple[Column, ...] = (
         ("Iteration", "iteration"),
-        ("Objective", lambda step: numeric(number(step.get("cost"), 4))),
+        ("Objective", lambda step: to_numeric(number(step.get("cost"), 4))),
         ("Error (%)", "error_percent", 2),
         *(
             (
-                f"{tissue + ' ' if len(tissues) > 1 else ''}{with_unit(key)}",
-                lambda step, t=tissue, k=key: numeric(number(step.get("parameters", {}).get(t, {}).get(k))),
+                f"{tissue + ' ' if len(tissues) > 1 else ''}{format_with_unit(key)}",
+                lambda step, t=tissue, k=key: to_numeric(
+                    number(step.get("parameters", {}).get(t, {}).get(k))
+                ),
             )
             for tissue in tissues
             for key in store.law.keys
@@ -77,7 +79,8 @@ def describe_search(store: Results) -> tuple[Bullets | None, Table | None]:
     for site, one in (store.calibration.get("contact") or {}).items():
         if (off := one.get("from_rest_percent") or 0.0) > EQUAL_PERCENT:
             texts.append(
-                f"The answer's force from rest differs from the fitted one by {fixed(off, 2)} % at site "
+                f"The answer's force from rest differs from the fitted one by "
+                f"{format_fixed(off, 2)} % at site "
                 f"{site}: its tissue has more than one equilibrium, or steps were cut."
             )
     columns = (
@@ -85,7 +88,7 @@ def describe_search(store: Results) -> tuple[Bullets | None, Table | None]:
         ("Site", "site"),
         ("Doubt", lambda row: _KINDS[row["kind"]]),
         ("How many", "count", 0),
-        ("From (% of the depth)", lambda row: numeric(fixed(100 * row["share"], 0))),
+        ("From (% of the depth)", lambda row: to_numeric(format_fixed(100 * row["share"], 0))),
         ("Accepted iterate", lambda row: "no" if row["iterate"] is None else row["iterate"]),
     )
     caption = "Simulations of the search that completed but are doubtful."

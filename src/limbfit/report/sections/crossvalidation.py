@@ -6,10 +6,10 @@ import numpy as np
 
 from ..drawing.colours import HELD_OUT, INK, MUTED, ONE_MATERIAL, SIMULATED
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
-from ..formats import NOTHING, fixed
+from ..formats import NOTHING, format_fixed
 from ..page import Figure, Prose, Section, Table, make_section
 from ..store import Json, Results
-from ..tables import make_table, numeric
+from ..tables import make_table, to_numeric
 
 
 def make_crossvalidation_section(store: Results, content: Json) -> Section:
@@ -36,12 +36,15 @@ def _describe_choices(content: Json) -> str:
         )
     return (
         f"{drawn} of {content['fitted_sites']} sites was fitted, and the sites left were predicted. The mean "
-        f"held-out error is {fixed(own['median_percent'])} % in the middle, "
-        f"{fixed(own['low_percent'])} to {fixed(own['high_percent'])} % for nine choices in ten. The study's "
-        f"own choice ({', '.join(own['fitted'])}) has {fixed(own['mean_error_heldout_percent'])} %; "
+        f"held-out error is {format_fixed(own['median_percent'])} % in the middle, "
+        f"{format_fixed(own['low_percent'])} to {format_fixed(own['high_percent'])} % for nine "
+        "choices in ten. The study's "
+        f"own choice ({', '.join(own['fitted'])}) has {format_fixed(own['mean_error_heldout_percent'])} %; "
         f"{100 * own['share_better']:.0f} % of the choices do better. The fits run on an emulator of "
         f"{content['emulator']['runs']} simulations of all sites, which misses the solver by "
-        f"{fixed(content['emulator']['loo_percent'], 2)} % of the largest force (median, each left out)."
+        ""
+        f"{format_fixed(content['emulator']['loo_percent'], 2)} % of the largest force (median, "
+        "each left out)."
         f"{limits}"
     )
 
@@ -86,7 +89,7 @@ def _make_site_table(content: Json) -> Table:
         ("Site", "site"),
         ("Region", "region"),
         ("Choices without it", "left_out_of", 0),
-        ("Error without it (%)", lambda row: numeric(_format_spread(row))),
+        ("Error without it (%)", lambda row: to_numeric(_format_spread(row))),
         ("Error, the study's choice (%)", "own_percent", 2),
     )
     caption = (
@@ -99,14 +102,14 @@ def _make_site_table(content: Json) -> Table:
 def _format_spread(row: Json) -> str:
     if row["mean_percent"] is None:
         return NOTHING
-    sd = "" if row["sd_percent"] is None else f" ± {fixed(row['sd_percent'], 2)}"
-    return f"{fixed(row['mean_percent'], 2)}{sd}"
+    sd = "" if row["sd_percent"] is None else f" ± {format_fixed(row['sd_percent'], 2)}"
+    return f"{format_fixed(row['mean_percent'], 2)}{sd}"
 
 
 def _make_region_table(content: Json) -> Table:
     def errors(fold: Json) -> str:
         held = (site for site in fold["errors_percent"] if site not in fold["fitted"])
-        return ", ".join(f"{site}: {fixed(fold['errors_percent'][site])}" for site in held)
+        return ", ".join(f"{site}: {format_fixed(fold['errors_percent'][site])}" for site in held)
 
     columns = (
         ("Region left out", "label"),

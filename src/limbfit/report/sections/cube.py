@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 
 from ..drawing.colours import INK, MEASURED, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH
 from ..drawing.plots import make_figure, make_panels, make_standalone, styled
-from ..formats import fixed, number
+from ..formats import format_fixed, number
 from ..page import Figure, Prose, Section, Table, make_section
 from ..store import Json, Results
-from ..tables import make_table, numeric
+from ..tables import make_table, to_numeric
 
 KINDS = {"skin": "Figure 8. Skin, adipose tissue", "muscle": "Figure 9. Muscle, soft tissue below the skin"}
 _OWN = ((SIMULATED, "-"), (THIRD, "-"), (INK, "-"))
@@ -22,7 +22,7 @@ _OTHERS = ((ONE_MATERIAL, "--"), (TRUTH, "-."), (THIRD, (0, (6, 2))), (MUTED, ":
 def make_cube_section(store: Results, content: Json) -> Section:
     """What the experiment ``cube`` found."""
     softest = [
-        f"{row['tissue'].removesuffix(' (this study)')} {fixed(row['peak_kPa'], 2)} kPa"
+        f"{row['tissue'].removesuffix(' (this study)')} {format_fixed(row['peak_kPa'], 2)} kPa"
         for row in content["tissues"]
         if _is_own(row)
     ]
@@ -42,7 +42,7 @@ def _is_own(row: Json) -> bool:
     return bool(row["source"] == "this study")
 
 
-def cube_drawing(content: Json) -> str:
+def draw_cube(content: Json) -> str:
     """The figure as the text of an SVG file."""
     return make_standalone(draw_cube_figure(content).markup)
 
@@ -86,12 +86,12 @@ def _make_tissue_table(content: Json) -> Table:
     columns = (
         ("Tissue", "tissue"),
         ("Published or identified values", "values"),
-        ("Shear modulus, long-term (kPa)", lambda row: numeric(number(row["shear_modulus_kPa"]))),
-        ("Instantaneous (kPa)", lambda row: numeric(number(row["instantaneous_modulus_kPa"]))),
-        ("Largest stress (kPa)", lambda row: numeric(number(row["peak_kPa"]))),
-        ("Back at its height (kPa)", lambda row: numeric(number(row["back_kPa"]))),
-        ("After the hold (kPa)", lambda row: numeric(number(row["end_kPa"]))),
-        ("J", lambda row: numeric(f"{fixed(row['J_min'], 4)} to {fixed(row['J_max'], 4)}")),
+        ("Shear modulus, long-term (kPa)", lambda row: to_numeric(number(row["shear_modulus_kPa"]))),
+        ("Instantaneous (kPa)", lambda row: to_numeric(number(row["instantaneous_modulus_kPa"]))),
+        ("Largest stress (kPa)", lambda row: to_numeric(number(row["peak_kPa"]))),
+        ("Back at its height (kPa)", lambda row: to_numeric(number(row["back_kPa"]))),
+        ("After the hold (kPa)", lambda row: to_numeric(number(row["end_kPa"]))),
+        ("J", lambda row: to_numeric(f"{format_fixed(row['J_min'], 4)} to {format_fixed(row['J_max'], 4)}")),
         ("How it was put into the law", "conversion"),
         ("Source", "source"),
     )

@@ -8,10 +8,10 @@ import numpy as np
 
 from ..drawing.colours import INK, MUTED, ONE_MATERIAL, SIMULATED, THIRD
 from ..drawing.plots import add_legend, make_figure, make_panels, set_log_scale, set_rows, styled
-from ..formats import fixed, label, number
+from ..formats import format_fixed, label, number
 from ..page import Figure, Prose, Section, Table, make_bullets, make_section
 from ..store import Json, Results
-from ..tables import Column, make_table, numeric
+from ..tables import Column, make_table, to_numeric
 
 _STYLES = ((SIMULATED, "o"), (THIRD, "D"), (ONE_MATERIAL, "s"), (MUTED, "^"), (INK, "v"))
 MAX_FACTOR = 100.0  # factor that is drawn
@@ -32,7 +32,8 @@ def make_design_section(store: Results, content: Json) -> Section:
         f"Which {content['wanted']} of the candidate indentations would determine the parameters best, "
         "judged by the Fisher information of their forces, from exact derivatives at the parameters "
         f"({content['parameters_from']}); {searched}. The noise: a sensor of {number(noise['sensor_N'])} N, "
-        f"and an error of the model of {fixed(100 * noise['misfit'])} % of the largest force that drifts "
+        f"and an error of the model of {format_fixed(100 * noise['misfit'])} % of the largest force "
+        "that drifts "
         "along the trace. D-optimal is the smallest joint region of confidence, A-optimal the smallest sum "
         f"of variances. In short: {content['verdict']}."
     )
@@ -51,8 +52,8 @@ def _make_design_table(content: Json) -> Table:
     columns = (
         ("Design", "design"),
         ("Sites (depth in mm)", _list_depths),
-        ("D (%)", lambda row: numeric(fixed(100 * row["d_efficiency"], 0))),
-        ("A (%)", lambda row: numeric(fixed(100 * row["a_efficiency"], 0))),
+        ("D (%)", lambda row: to_numeric(format_fixed(100 * row["d_efficiency"], 0))),
+        ("A (%)", lambda row: to_numeric(format_fixed(100 * row["a_efficiency"], 0))),
         *make_factor_columns(content["designs"]),
     )
     caption = (
@@ -66,7 +67,7 @@ def _make_design_table(content: Json) -> Table:
 
 
 def _list_depths(row: Json) -> str:
-    return ", ".join(f"{one['site']} ({fixed(one['depth_mm'])})" for one in row["sites"])
+    return ", ".join(f"{one['site']} ({format_fixed(one['depth_mm'])})" for one in row["sites"])
 
 
 def make_factor_columns(designs: Sequence[Json]) -> list[Column]:
@@ -74,7 +75,7 @@ def make_factor_columns(designs: Sequence[Json]) -> list[Column]:
 
     def factor(row: Json, name: str) -> object:
         value = row["factor_95"][name]
-        return numeric("open" if value > MAX_FACTOR else f"×/÷ {number(value)}")
+        return to_numeric("open" if value > MAX_FACTOR else f"×/÷ {number(value)}")
 
     return [(label(name), lambda row, name=name: factor(row, name)) for name in designs[0]["factor_95"]]
 
@@ -111,7 +112,7 @@ def _make_candidate_table(content: Json) -> Table:
         ("Largest force (N)", "peak_force_N", 2),
         (
             "Information alone (bits)",
-            lambda row: numeric(fixed(row["bits"]), row["bits"] / most if most else None),
+            lambda row: to_numeric(format_fixed(row["bits"]), row["bits"] / most if most else None),
         ),
     )
     caption = "The candidates: how much each would tell by itself beyond the bounds."
@@ -126,7 +127,8 @@ def make_protocol_section(store: Results, content: Json) -> Section:
     if content.get("pressures"):
         wanted = "the logarithms of the mean pressures of the socket's regions"
     text = (
-        f"The records that fit into {fixed(content['minutes'], 0)} min and have, on average over {draws} "
+        f"The records that fit into {format_fixed(content['minutes'], 0)} min and have, on average "
+        f"over {draws} "
         f"tissues that the limb may have, {meaning[content['criterion']]} for "
         f"{wanted}. The first of the tissues is the "
         f"{content['parameters_from']}. Every site with another indenter takes {content['setup_s']:g} s to "
@@ -181,7 +183,9 @@ def _make_pressure_table(content: Json) -> Table:
     columns: list[Column] = [("Load, region", str)]
     for row in content["protocols"]:
         half = {name: 100.0 * (value - 1.0) for name, value in row["pressures_95"].items()}
-        columns.append((f"{row['design']} (± %)", lambda name, half=half: numeric(fixed(half[name]))))
+        columns.append(
+            (f"{row['design']} (± %)", lambda name, half=half: to_numeric(format_fixed(half[name])))
+        )
     caption = (
         "The 95 % interval to be expected of each mean pressure, by the tissue alone: to first order, with "
         "the derivatives that the socket's simulation stored."

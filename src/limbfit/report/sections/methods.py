@@ -13,7 +13,15 @@ from jinja2 import ChainableUndefined, Environment, PackageLoader
 
 from ...laws import ACTIVE, OGDEN, split_key
 from ...shapes import SHAPES
-from ..formats import NOTHING, fixed, friction, limits, number, symbol, with_value
+from ..formats import (
+    NOTHING,
+    format_fixed,
+    format_friction,
+    format_limits,
+    format_symbol,
+    format_with_value,
+    number,
+)
 from ..page import Prose, Section
 from ..store import Json, Results
 from .parameters import describe_residuals
@@ -74,7 +82,13 @@ def write_method_parts(store: Results) -> tuple[Part, ...]:
         experiments=_list_experiments(store),
         seconds=sum(stage.get("seconds") or 0.0 for stage in (store.run.get("stages") or {}).values()),
         **{"NOTHING": NOTHING, "OGDEN": OGDEN, "elements": ELEMENTS},
-        **{"fixed": fixed, "number": number, "friction": friction, "span": _span, "pairs": _pairs},
+        **{
+            "fixed": format_fixed,
+            "number": number,
+            "friction": format_friction,
+            "span": _format_span,
+            "pairs": _format_pairs,
+        },
         describe_indenter=lambda one: SHAPES[one["shape"]].said(one),
         describe_preload=describe_preload,
         describe_constraints=describe_constraints,
@@ -86,19 +100,23 @@ def write_method_parts(store: Results) -> tuple[Part, ...]:
     return tuple((head, " ".join(body.split())) for head, body in parts if body.strip())
 
 
-def _span(facts: Iterable[Json], key: str, digits: int, factor: int = 1) -> str:
+def _format_span(facts: Iterable[Json], key: str, digits: int, factor: int = 1) -> str:
     """From the least to the largest value of a key, where there is one."""
     values = [factor * fact[key] for fact in facts if isinstance(fact.get(key), int | float)]
-    return f"{fixed(min(values), digits)} to {fixed(max(values), digits)}" if values else NOTHING
+    return (
+        f"{format_fixed(min(values), digits)} to {format_fixed(max(values), digits)}" if values else NOTHING
+    )
 
 
-def _pairs(table: Json) -> str:
+def _format_pairs(table: Json) -> str:
     return ", ".join(f"{key} = {value}" for key, value in table.items() if value not in (None, [], ""))
 
 
 def _format_start(start: Json) -> str:
     tissues = (start or {}).items()
-    return _join_tissues({t: ", ".join(map(with_value, values, values.values())) for t, values in tissues})
+    return _join_tissues(
+        {t: ", ".join(map(format_with_value, values, values.values())) for t, values in tissues}
+    )
 
 
 def _format_bounds(bounds: Json) -> str:
@@ -106,7 +124,10 @@ def _format_bounds(bounds: Json) -> str:
     texts = {}
     for tissue, values in lower.items():
         ends = {key: (low, upper.get(tissue, {}).get(key)) for key, low in values.items()}
-        words = (f"{symbol(key)} {limits(both)} {split_key(key)[1]}".strip() for key, both in ends.items())
+        words = (
+            f"{format_symbol(key)} {format_limits(both)} {split_key(key)[1]}".strip()
+            for key, both in ends.items()
+        )
         texts[tissue] = ", ".join(words)
     return _join_tissues(texts)
 
@@ -141,7 +162,9 @@ def describe_constraints(table: Json | None) -> str:
     words = [f"{', '.join(held)} stayed at the start"] if held else []
     words += [f"{' and '.join(group)} were kept equal" for group in tied]
     if table.get("priors"):
-        words.append(f"lognormal priors of {symbol('c')} and {symbol('m')} were those of people")
+        words.append(
+            f"lognormal priors of {format_symbol('c')} and {format_symbol('m')} were those of people"
+        )
     if prior:
         known = (f"{name}: median {p['median']}, factor {p['factor']}" for name, p in dict(prior).items())
         words.append(f"lognormal priors were put on {'; '.join(known)}")
@@ -155,5 +178,5 @@ def _list_experiments(store: Results) -> list[str]:
     for name in store.experiments:
         options = store.run["experiments"][name].get("options") or {}
         plain = {key: value for key, value in options.items() if not isinstance(value, dict)}
-        done.append(name + (f" ({_pairs(plain)})" if plain else ""))
+        done.append(name + (f" ({_format_pairs(plain)})" if plain else ""))
     return done

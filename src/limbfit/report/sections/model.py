@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from ..drawing import pictures
 from ..drawing.interactive import make_explorer
-from ..formats import NOTHING, count, duration, fixed
+from ..formats import NOTHING, count, format_duration, format_fixed
 from ..page import Prose, Section, Table, make_bullets, make_section
 from ..store import Json, Results
-from ..tables import make_table, numeric
+from ..tables import make_table, to_numeric
 
 
 def make_model_section(store: Results) -> Section:
@@ -51,8 +51,8 @@ def make_place_table(store: Results) -> Table:
     columns = (
         ("Site", "site"),
         ("Region", "region"),
-        ("Position, LPS (mm)", lambda row: numeric(_format_vector(row.get("position_mm"), 1))),
-        ("Axis into the limb", lambda row: numeric(_format_vector(row.get("axis"), 3))),
+        ("Position, LPS (mm)", lambda row: to_numeric(_format_vector(row.get("position_mm"), 1))),
+        ("Axis into the limb", lambda row: to_numeric(_format_vector(row.get("axis"), 3))),
         ("Off the skin (mm)", "off_skin_mm", 2),
         ("Marker", _describe_evidence),
     )
@@ -61,14 +61,14 @@ def make_place_table(store: Results) -> Table:
 
 
 def _format_vector(values: list[float] | None, decimals: int) -> str:
-    return ", ".join(fixed(value, decimals) for value in values or ()) or NOTHING
+    return ", ".join(format_fixed(value, decimals) for value in values or ()) or NOTHING
 
 
 def _describe_evidence(row: Json) -> str:
     marker = row.get("marker")
     if not marker:
         return "position given in the study"
-    height, distance = fixed(marker.get("height_mm")), fixed(marker.get("distance_to_hint_mm"))
+    height, distance = format_fixed(marker.get("height_mm")), format_fixed(marker.get("distance_to_hint_mm"))
     return f"{height} mm high, {distance} mm from the hint"
 
 
@@ -94,12 +94,12 @@ def make_mesh_table(store: Results) -> Table:
     columns = (
         ("Site", "site"),
         ("Element", "element"),
-        ("Nodes", lambda facts: numeric(count(facts.get("nodes")))),
-        ("Elements", lambda facts: numeric(count(facts.get("cells")))),
+        ("Nodes", lambda facts: to_numeric(count(facts.get("nodes")))),
+        ("Elements", lambda facts: to_numeric(count(facts.get("cells")))),
         ("Smallest dihedral (°)", "min_dihedral_deg", 1),
-        ("Layers (mm)", lambda facts: numeric(_describe_layers(facts))),
+        ("Layers (mm)", lambda facts: to_numeric(_describe_layers(facts))),
         ("Bone trimmed (mm³)", _sum_trimmed_bone),
-        ("Time", lambda facts: numeric(duration(facts.get("seconds")))),
+        ("Time", lambda facts: to_numeric(format_duration(facts.get("seconds")))),
     )
     caption = "Meshes. Layers are the mean ± standard deviation of their thickness, outermost first."
     rows = [{**facts, "site": site} for site, facts in store.mesh.items()]
@@ -108,15 +108,15 @@ def make_mesh_table(store: Results) -> Table:
 
 def _sum_trimmed_bone(facts: Json) -> object:
     trimmed = (facts.get("trimmed_bone") or {}).values()
-    return numeric(fixed(sum((bone.get("volume_mm3", 0.0) for bone in trimmed), 0.0), 0))
+    return to_numeric(format_fixed(sum((bone.get("volume_mm3", 0.0) for bone in trimmed), 0.0), 0))
 
 
 def _describe_layers(facts: Json) -> str:
     """Thickness of the layer, or of each by its name."""
     each = facts.get("layer_thickness_mm") or {}
     if len(each) < 2:
-        return f"{fixed(facts.get('layer_mean_mm'), 2)} ± {fixed(facts.get('layer_std_mm'), 2)}"
+        return f"{format_fixed(facts.get('layer_mean_mm'), 2)} ± {format_fixed(facts.get('layer_std_mm'), 2)}"
     return ", ".join(
-        f"{name} {fixed(values.get('mean'), 2)} ± {fixed(values.get('std'), 2)}"
+        f"{name} {format_fixed(values.get('mean'), 2)} ± {format_fixed(values.get('std'), 2)}"
         for name, values in each.items()
     )

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from ..drawing.figures import draw_interval_figure
-from ..formats import NOTHING, fixed, label, limits, number, unit_of
+from ..formats import NOTHING, format_fixed, format_limits, get_unit, label, number
 from ..page import Block, Bullets, Cell, Note, Prose, Section, Table, make_section
 from ..store import Json, Results
-from ..tables import Column, make_row, make_table, numeric
+from ..tables import Column, make_row, make_table, to_numeric
 
 
 def make_parameter_section(store: Results) -> Section:
@@ -39,13 +39,13 @@ def make_parameter_columns(store: Results) -> tuple[Column, ...]:
     return (
         ("Tissue", lambda row: store.describe_tissue(row[0])),
         ("Parameter", lambda row: store.describe_parameter(row[1])),
-        ("Unit", lambda row: unit_of(row[1])),
+        ("Unit", lambda row: get_unit(row[1])),
     )
 
 
 def make_value_column(head: str, tissues: Json) -> Column:
     """The values of parameters by tissue and key."""
-    return head, lambda row: numeric(number(tissues.get(row[0], {}).get(row[1])))
+    return head, lambda row: to_numeric(number(tissues.get(row[0], {}).get(row[1])))
 
 
 def make_parameter_table(store: Results) -> Table:
@@ -54,7 +54,7 @@ def make_parameter_table(store: Results) -> Table:
         *make_parameter_columns(store),
         make_value_column("Start", store.stages[0].get("start", {})),
         *(make_value_column(one["name"].capitalize(), one.get("parameters", {})) for one in store.stages),
-        ("95 % interval", lambda row: numeric(limits(store.interval(*row)))),
+        ("95 % interval", lambda row: to_numeric(format_limits(store.interval(*row)))),
         ("Verdict", lambda row: _read_verdict(store, *row)),
         *((make_value_column("Truth", store.truth.get("parameters", {})),) if store.truth else ()),
     )
@@ -88,7 +88,9 @@ def make_correlation_table(store: Results) -> Table | None:
 
 def _shade_cell(value: Any) -> Cell:
     known = isinstance(value, int | float) and value == value
-    return Cell(fixed(value, 2), number=True, shade=max(-1.0, min(1.0, float(value))) if known else None)
+    return Cell(
+        format_fixed(value, 2), number=True, shade=max(-1.0, min(1.0, float(value))) if known else None
+    )
 
 
 def describe_priors(store: Results) -> tuple[Block, ...]:
@@ -107,14 +109,17 @@ def describe_priors(store: Results) -> tuple[Block, ...]:
 
     def share(row: tuple[str, str]) -> Cell:
         value = float(found["share"][".".join(row)])
-        return numeric(fixed(100 * value, 0), share=min(value, 1.0))
+        return to_numeric(format_fixed(100 * value, 0), share=min(value, 1.0))
 
     columns = (
         *make_parameter_columns(store),
-        ("Prior", lambda row: numeric(number(stated.get(".".join(row), nothing)["median"]))),
-        ("Factor", lambda row: numeric(fixed(stated.get(".".join(row), nothing)["factor"], 2))),
+        ("Prior", lambda row: to_numeric(number(stated.get(".".join(row), nothing)["median"]))),
+        ("Factor", lambda row: to_numeric(format_fixed(stated.get(".".join(row), nothing)["factor"], 2))),
         ("From priors (%)", share),
-        ("Wider without", lambda row: numeric(f"{fixed(found['wider_without']['.'.join(row)], 2)} times")),
+        (
+            "Wider without",
+            lambda row: to_numeric(f"{format_fixed(found['wider_without']['.'.join(row)], 2)} times"),
+        ),
     )
     table = make_table("priors", caption, columns, store.parameters)
     return Prose(f"Lognormal priors count beside the records. Source: {'; '.join(sources)}."), table
@@ -143,7 +148,7 @@ def _describe_residuals(store: Results) -> Prose | None:
         return None
     meshes, own = (
         ", ".join(
-            f"{name} {fixed(100 * site[share], 1)} %"
+            f"{name} {format_fixed(100 * site[share], 1)} %"
             for name, site in rows.items()
             if site.get(share) is not None
         )
@@ -152,7 +157,7 @@ def _describe_residuals(store: Results) -> Prose | None:
     text = (
         "The intervals rest on two kinds of residuals at the fitted sites, standard deviations of the noise "
         f"as recorded and of the smooth misfit of the model: {describe_residuals(rows)}. "
-        f"A misfit lasts about {fixed(100 * found['correlation'], 0)} % of a record. "
+        f"A misfit lasts about {format_fixed(100 * found['correlation'], 0)} % of a record. "
     )
     if meshes:
         text += f"The error of the meshes is added, in percent of the largest force: {meshes}."
@@ -161,7 +166,8 @@ def _describe_residuals(store: Results) -> Prose | None:
     if own:
         text += (
             " So is what tissue and surfaces make a site as a whole stiffer or softer, root mean square over "
-            f"the record: {own}; {fixed(found['site_factor'], 1)} times what its thickness lets expect."
+            f"the record: {own}; {format_fixed(found['site_factor'], 1)} times what its thickness "
+            "lets expect."
         )
     return Prose(text)
 
@@ -169,7 +175,7 @@ def _describe_residuals(store: Results) -> Prose | None:
 def describe_residuals(sites: Json) -> str:
     """Standard deviations of each fitted record's noise and of the model's misfit, in words."""
     return ", ".join(
-        f"{name} {fixed(one.get('noise_sd_N'), 3)} and {fixed(one.get('misfit_sd_N'), 3)} "
+        f"{name} {format_fixed(one.get('noise_sd_N'), 3)} and {format_fixed(one.get('misfit_sd_N'), 3)} "
         f"{one.get('unit', 'N')}"
         for name, one in sites.items()
     )

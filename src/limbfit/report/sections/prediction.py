@@ -6,10 +6,10 @@ from collections.abc import Iterable
 
 from ..drawing import figures
 from ..drawing.pictures import draw_field_figure
-from ..formats import NOTHING, fixed
+from ..formats import NOTHING, format_fixed
 from ..page import Note, Row, Section, Table, make_section
 from ..store import Json, Results
-from ..tables import make_row, make_table, numeric
+from ..tables import make_row, make_table, to_numeric
 
 
 def make_fit_section(store: Results) -> Section:
@@ -60,12 +60,15 @@ def make_site_table(store: Results) -> Table:
         ("Region", "region"),
         ("Use", _name_use),
         ("Largest force (N)", "peak_force_N", 2),
-        ("Depth (mm)", lambda row: numeric(fixed(store.traces.get(row["record"], {}).get("depth_mm"), 2))),
+        (
+            "Depth (mm)",
+            lambda row: to_numeric(format_fixed(store.traces.get(row["record"], {}).get("depth_mm"), 2)),
+        ),
         (
             "Error, one material (%)",
-            lambda row: _error(row, "error_one_material_percent", "one_material"),
+            lambda row: _format_error(row, "error_one_material_percent", "one_material"),
         ),
-        (f"Error, {store.materials} (%)", lambda row: _error(row, "error_percent", "force")),
+        (f"Error, {store.materials} (%)", lambda row: _format_error(row, "error_percent", "force")),
     )
     foot = _make_mean_rows(store)
     return make_table("sites", caption, columns, store.predicted, marked="fitted", foot=foot)
@@ -75,8 +78,8 @@ def _name_use(row: Json) -> str:
     return "fitted" if row.get("fitted") else "held out"
 
 
-def _error(row: Json, key: str, what: str) -> object:
-    return numeric("not predicted" if what in row.get("not_predicted", ()) else fixed(row.get(key)))
+def _format_error(row: Json, key: str, what: str) -> object:
+    return to_numeric("not predicted" if what in row.get("not_predicted", ()) else format_fixed(row.get(key)))
 
 
 def _make_mean_rows(store: Results) -> Iterable[Row]:
@@ -84,9 +87,9 @@ def _make_mean_rows(store: Results) -> Iterable[Row]:
         chosen = [row for row in store.predicted if _name_use(row) == use]
         one = _average_by_site(chosen, "error_one_material_percent")
         if chosen:
-            mean = numeric(fixed(sum(one) / len(one)) if one else NOTHING)
-            cells = (_count_sites(chosen), use, numeric(""), numeric(""), mean)
-            yield make_row(f"Mean, {use}", *cells, numeric(store.mean_error(key)))
+            mean = to_numeric(format_fixed(sum(one) / len(one)) if one else NOTHING)
+            cells = (_count_sites(chosen), use, to_numeric(""), to_numeric(""), mean)
+            yield make_row(f"Mean, {use}", *cells, to_numeric(store.mean_error(key)))
 
 
 def _average_by_site(rows: list[Json], key: str) -> list[float]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from ..formats import NOTHING, duration, fixed
+from ..formats import NOTHING, format_duration, format_fixed
 from ..page import Prose, Section, Table, make_section
 from ..store import Results
-from ..tables import make_row, make_table, numeric
+from ..tables import make_row, make_table, to_numeric
 
 
 def make_timing_section(store: Results) -> Section:
@@ -16,7 +16,7 @@ def make_timing_section(store: Results) -> Section:
     machine = store.run.get("machine") or {}
     words = (
         f"{machine['cores']} cores" if "cores" in machine else "",
-        f"{fixed(machine['memory_GB'])} GB of memory" if "memory_GB" in machine else "",
+        f"{format_fixed(machine['memory_GB'])} GB of memory" if "memory_GB" in machine else "",
         f"Python {machine['python']}" if "python" in machine else "",
     )
     known = ", ".join(word for word in words if word)
@@ -40,10 +40,10 @@ def make_timing_table(store: Results) -> Table:
     longest = max([*seconds, 1e-9])
     columns = (
         ("Stage", "stage"),
-        ("Time", lambda row: numeric(duration(row["seconds"]), share=row["seconds"] / longest)),
+        ("Time", lambda row: to_numeric(format_duration(row["seconds"]), share=row["seconds"] / longest)),
         ("Finished", lambda row: row["finished"][:16].replace("T", " ")),
     )
-    total = make_row("Total", numeric(duration(sum(seconds))), "")
+    total = make_row("Total", to_numeric(format_duration(sum(seconds))), "")
     return make_table("timing", "How long each stage took.", columns, rows, foot=(total,))
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from ..formats import fixed, number
+from ..formats import format_fixed, number
 from ..page import Note, Prose, Section, Table, make_bullets, make_section
 from ..store import Json, Results
-from ..tables import make_table, numeric
+from ..tables import make_table, to_numeric
 
 MARKED_ERROR = 4.0  # standardised errors from here on are marked
 
@@ -46,14 +46,14 @@ def _make_flag_table(flags: list[Json]) -> Table:
         ("Found", "found"),
         (
             "Evidence",
-            lambda flag: "; ".join(f"{_words(k)} {number(v)}" for k, v in flag["evidence"].items()),
+            lambda flag: "; ".join(f"{_format_words(k)} {number(v)}" for k, v in flag["evidence"].items()),
         ),
         ("Likely cause", "cause"),
     )
     return make_table("flags", "What looks wrong, and the numbers that say so.", columns, flags)
 
 
-def _words(name: str) -> str:
+def _format_words(name: str) -> str:
     for unit, shown in (("_percent", " (%)"), ("_kPa", " (kPa)"), ("_mm", " (mm)"), ("_deg", " (°)")):
         if name.endswith(unit):
             return name.removesuffix(unit).replace("_", " ") + shown
@@ -65,8 +65,8 @@ def _make_left_out_table(store: Results, left_out: list[Json]) -> Table:
     columns = (
         ("Site", "site"),
         ("Use", lambda row: "fitted" if row["site"] in fitted else "held out"),
-        ("Error without it (%)", lambda row: numeric(fixed(100 * row["error"]))),
-        ("Of others (%)", lambda row: numeric(fixed(100 * row["expected"]))),
+        ("Error without it (%)", lambda row: to_numeric(format_fixed(100 * row["error"]))),
+        ("Of others (%)", lambda row: to_numeric(format_fixed(100 * row["expected"]))),
         ("Standardised", "standardised", 1),
         ("Measured over predicted force", "ratio", 2),
         ("Cook's distance", "cook", 2),

@@ -10,7 +10,7 @@ from ..drawing.colours import GRID, INK, MUTED, SIMULATED
 from ..drawing.figures import thin_curves
 from ..drawing.interactive import record_curves
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
-from ..formats import fixed
+from ..formats import format_fixed
 from ..page import Figure, Section, Table, make_section
 from ..store import Curves, Json, Results
 from ..tables import make_table
@@ -44,7 +44,7 @@ def draw_record_figure(store: Results, site: str) -> Figure | None:
     for ax in axes[:2]:
         _mark_phases(ax, facts.get("phases") or [])
     add_legend(drawing, axes[0])
-    peak, depth = fixed(facts.get("peak_force_N"), 2), fixed(facts.get("depth_mm"), 2)
+    peak, depth = format_fixed(facts.get("peak_force_N"), 2), format_fixed(facts.get("depth_mm"), 2)
     words = facts.get("phases_in_words")
     phases = f"the indenter's phases are {words} (holds are shaded); " if words else ""
     alt = f"Record of site {site}: displacement and force against time, and force against displacement"

@@ -6,10 +6,10 @@ from matplotlib.axes import Axes
 
 from ..drawing.colours import HELD_OUT, SIMULATED, choose_tissue_style
 from ..drawing.plots import add_legend, make_figure, make_panels, set_log_scale, styled
-from ..formats import fixed, limits, number, with_unit
+from ..formats import format_fixed, format_limits, format_with_unit, number
 from ..page import Cell, Figure, Prose, Section, Table, make_bullets, make_section
 from ..store import Json, Results
-from ..tables import make_row, make_table, numeric
+from ..tables import make_row, make_table, to_numeric
 from .parameters import make_parameter_columns, make_value_column
 
 MAX_FACTOR = 1e3  # of an interval over its value, in the figure
@@ -27,8 +27,8 @@ def make_regions_section(store: Results, content: Json) -> Section:
     )
     words = Prose(
         f"Parameters of each region, started from those of the whole limb. {used} Mean error over the sites: "
-        f"{fixed(content['mean_own_error_percent'])} % with each region's own parameters, "
-        f"{fixed(content['mean_whole_error_percent'])} % with those of the whole limb. "
+        f"{format_fixed(content['mean_own_error_percent'])} % with each region's own parameters, "
+        f"{format_fixed(content['mean_whole_error_percent'])} % with those of the whole limb. "
         f"{_count_determined(content)}"
     )
     return make_section(
@@ -76,7 +76,7 @@ def _name_region(row: Json) -> str:
 
 def _format_value(row: Json, tissue: str, name: str) -> Cell:
     value, interval = row["parameters"][tissue][name], row["intervals_95"][tissue][name]
-    return numeric(f"{number(value)} ({'open' if None in interval else limits(interval)})")
+    return to_numeric(f"{number(value)} ({'open' if None in interval else format_limits(interval)})")
 
 
 def _make_error_table(content: Json) -> Table:
@@ -93,7 +93,7 @@ def _make_error_table(content: Json) -> Table:
         for site, own in region["own_error_percent_by_site"].items():
             row = {"region": region["region"], "site": site, "own": own, "whole": whole[site]}
             rows.append(row | {"fitted": site in region["fitted_sites"]})
-        means = (numeric(fixed(region[f"{which}_error_percent"], 2)) for which in ("own", "whole"))
+        means = (to_numeric(format_fixed(region[f"{which}_error_percent"], 2)) for which in ("own", "whole"))
         number_of_sites = f"{len(sites)} site{'s' if len(sites) > 1 else ''}"
         end = "" if region["converged"] else "not converged"
         foot.append(make_row(f"Mean, {region['region']}", number_of_sites, end, *means))
@@ -144,5 +144,5 @@ def _draw_parameter(ax: Axes, content: Json, name: str) -> None:
             label = tissue if at == 0 else None
             ax.plot(value, y, ls="", marker=style["marker"], color=style["color"], ms=5, label=label)
     set_log_scale(ax)
-    ax.set_title(with_unit(name))
+    ax.set_title(format_with_unit(name))
     ax.set_yticks([])

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from ..drawing.colours import GRID, INK, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH, choose_tissue_style
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
-from ..formats import fixed, friction, number
+from ..formats import format_fixed, format_friction, number
 from ..page import Block, Bullets, Figure, Prose, Section, Table, make_bullets, make_section
 from ..store import Json, Results
 from ..tables import Column, make_table
@@ -53,13 +53,14 @@ def make_stiffness_section(store: Results, content: Json) -> Section:
 
 def _describe_thickness(content: Json) -> str:
     return _join_clauses(
-        f"site {row['site']}{_role(row, ' ({})')}: {fixed(row['tissue_mm'])} mm of tissue to the nearest "
-        f"bone, indented by {fixed(row['indentation_mm'])} mm"
+        f"site {row['site']}{_format_role(row, ' ({})')}: {format_fixed(row['tissue_mm'])} mm of "
+        "tissue to the nearest "
+        f"bone, indented by {format_fixed(row['indentation_mm'])} mm"
         for row in content["sites"]
     )
 
 
-def _role(row: Json, form: str) -> str:
+def _format_role(row: Json, form: str) -> str:
     return form.format(row["role"]) if row["role"] else ""
 
 
@@ -80,7 +81,7 @@ def _find_leading_tissue(content: Json) -> str:
                 changes[row["tissue"]] = max(changes.get(row["tissue"], 0.0), spread)
         if len(changes) > 1:
             most = max(changes, key=lambda tissue: changes[tissue])
-            numbers = ", ".join(f"{tissue} {fixed(value)} %" for tissue, value in changes.items())
+            numbers = ", ".join(f"{tissue} {format_fixed(value)} %" for tissue, value in changes.items())
             words = f"at site {site['site']} the force follows the {most} most (largest change: {numbers})"
             found.append(words)
     return _join_clauses(found)
@@ -112,7 +113,9 @@ def _draw_curves(ax: Axes, store: Results, name: str, site: Json, content: Json)
     for i, (row, head) in enumerate(zip(rows, heads, strict=False)):
         color, line = (INK, "-") if row["base"] else _STYLES[i % len(_STYLES)]
         ax.plot(curves["time_s"], curves[head], color=color, ls=line, label=_name_model(row))
-    ax.set_title(f"site {site['site']}{_role(site, ', {}')}: {fixed(site['tissue_mm'])} mm of tissue")
+    ax.set_title(
+        f"site {site['site']}{_format_role(site, ', {}')}: {format_fixed(site['tissue_mm'])} mm of tissue"
+    )
     ax.set_xlabel("Time (s)")
     ax.margins(x=0.01)
 
@@ -169,8 +172,8 @@ def _describe_volume_ratio(content: Json) -> str:
     """How far J goes with the study's ratio."""
     rows = [row for row in content["runs"] if row["base"] and row["J_min"] is not None]
     parts = [
-        f"from {fixed(row['J_min'], 3)} to {fixed(row['J_max'], 3)} at site {row['site']}, "
-        f"{fixed(row['beyond_percent'], 0)} % of that volume beyond 1 %"
+        f"from {format_fixed(row['J_min'], 3)} to {format_fixed(row['J_max'], 3)} at site {row['site']}, "
+        f"{format_fixed(row['beyond_percent'], 0)} % of that volume beyond 1 %"
         for row in rows
     ]
     return f"Here it goes {'; '.join(parts)}." if parts else ""
@@ -185,7 +188,7 @@ def _draw_kappa_figure(content: Json) -> Figure:
         ratio = [row["kappa_ratio"] for row in rows]
         known = {key: [row[key] for row in rows] for key in ("peak_force_N", *_RANGE)}
         style: dict[str, Any] = {"color": color, "ls": line, "marker": "o", "ms": 4}
-        label = f"site {site['site']}{_role(site, ', {}')}"
+        label = f"site {site['site']}{_format_role(site, ', {}')}"
         axes[0].plot(ratio, known["peak_force_N"], label=label, **style)
         axes[1].fill_between(ratio, known["J_min"], known["J_max"], color=color, alpha=0.15, lw=0)
         axes[1].plot(ratio, known["J_low"], ratio, known["J_high"], **style)
@@ -213,7 +216,8 @@ def make_contact_section(store: Results, content: Json) -> Section:
         "to it where it has touched: the two ends of what friction can do. The paper found no significant "
         f"change of the largest force. {_describe_changes(content)}"
         if content["friction"] == "frictionless"
-        else f"Contact in this study's model is {friction(content['friction'])}. {_describe_changes(content)}"
+        else f"Contact in this study's model is {format_friction(content['friction'])}. "
+        f"{_describe_changes(content)}"
     )
     return _compare_models(store, "sensitivity-contact", "Sensitivity to friction", words, content, _EFFORT)
 
@@ -234,7 +238,7 @@ def make_indenter_section(store: Results, content: Json) -> Section:
 def _describe_changes(content: Json) -> str:
     return _join_clauses(
         f"{row['label']}: the largest force at site {row['site']} changes by "
-        f"{fixed(row['peak_change_percent'])} %"
+        f"{format_fixed(row['peak_change_percent'])} %"
         for row in content["runs"]
         if not row["base"] and row["peak_change_percent"] is not None
     )
@@ -266,7 +270,7 @@ def _describe_limits(content: Json) -> str:
 def _describe_limit(row: Json) -> str:
     if row["limit_N"] is None:
         return "the forces do not tend to a value yet: finer meshes are needed"
-    error, limit = fixed(row["error_percent"], 2), fixed(row["limit_N"], 3)
+    error, limit = format_fixed(row["error_percent"], 2), format_fixed(row["limit_N"], 3)
     if row["order"] is None:
         return (
             f"the study's mesh is {error} % off the finest, whose largest force is {limit} N; with this "

@@ -9,7 +9,7 @@ from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import count
 from ..page import Bullets, Figure, Note, Prose, Section, Table, make_bullets, make_section
 from ..store import Json, Results
-from ..tables import make_table, numeric
+from ..tables import make_table, to_numeric
 from .provenance import make_pair_table
 
 
@@ -94,7 +94,7 @@ def make_solver_section(store: Results) -> Section:
         "Objective": found.get("objective"),
         "Forward simulations of the identification": found.get("forward_runs"),
         "Of them with derivatives": found.get("forward_runs_with_sensitivities"),
-        "Corrections of the search by the whole meshes": _corrections(found.get("corrections") or []),
+        "Corrections of the search by the whole meshes": _build_corrections(found.get("corrections") or []),
         "Starts": (found.get("multistart") or {}).get("summary"),
         "Linear solver": found.get("linear_solver"),
         "Element": found.get("element"),
@@ -112,7 +112,7 @@ def make_solver_section(store: Results) -> Section:
     )
 
 
-def _corrections(rounds: list[Json]) -> str | None:
+def _build_corrections(rounds: list[Json]) -> str | None:
     """How many, and what the last one changed."""
     if not rounds:
         return None
@@ -128,7 +128,7 @@ def make_solver_table(store: Results) -> Table:
     columns = (
         ("Site", "record"),
         ("Element", "element"),
-        ("Steps", lambda row: numeric(count(row.get("steps")))),
+        ("Steps", lambda row: to_numeric(count(row.get("steps")))),
         ("Largest penetration (mm)", "penetration_mm", 3),
         ("Completed", _describe_end),
         ("Not predicted", _list_not_predicted),

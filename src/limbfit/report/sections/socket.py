@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..drawing.socket_pictures import draw_inside_figure, draw_pressure_figures, draw_settling_figure
-from ..formats import NOTHING, fixed, friction, label, symbol
+from ..formats import NOTHING, format_fixed, format_friction, format_symbol, label
 from ..page import Block, Note, Prose, Row, Section, Table, make_section
 from ..store import Json, Results
-from ..tables import Column, make_row, make_table, numeric
+from ..tables import Column, make_row, make_table, to_numeric
 
 # What counts as known, and how its change is headed.
 KNOWN = {
-    "liner.c_kPa": f"Change, liner {symbol('c')} 10 % larger",
+    "liner.c_kPa": f"Change, liner {format_symbol('c')} 10 % larger",
     "friction": "Change, friction 10 % larger",
 }
 PAPERS = (
@@ -76,7 +76,7 @@ def _describe_shape(content: Json) -> str:
     origin = ORIGINS.get(content["parameters_from"], content["parameters_from"])
     return (
         f"The socket is {made}{areas}: {shape['volume_cm3']:.0f} cm3, at most {shape['deepest_mm']:.1f} mm "
-        f"inside the limb's unloaded surface. Contact is {friction(content['friction'])}; {lined}. "
+        f"inside the limb's unloaded surface. Contact is {format_friction(content['friction'])}; {lined}. "
         f"Tissues: {origin}."
     )
 
@@ -99,8 +99,8 @@ def _make_region_table(names: list[str], held: list[Mapping[str, Any]], draws: i
     columns = (
         ("Region", "region"),
         ("Mean pressure (kPa)", "mean_kPa", 1),
-        ("95 % (kPa)", lambda row: numeric(_format_interval(row["interval_kPa"]))),
-        ("Mostly from", lambda row: numeric(_name_main_source(row["interval_from"]))),
+        ("95 % (kPa)", lambda row: to_numeric(_format_interval(row["interval_kPa"]))),
+        ("Mostly from", lambda row: to_numeric(_name_main_source(row["interval_from"]))),
         ("Peak (kPa)", "peak_kPa", 1),
         ("Mean shear (kPa)", "shear_kPa", 1),
         ("Peak shear (kPa)", "shear_peak_kPa", 1),
@@ -114,7 +114,7 @@ def _make_region_table(names: list[str], held: list[Mapping[str, Any]], draws: i
 
 
 def _format_interval(interval: list[float] | None) -> str:
-    return NOTHING if interval is None else f"{fixed(interval[0])} to {fixed(interval[1])}"
+    return NOTHING if interval is None else f"{format_fixed(interval[0])} to {format_fixed(interval[1])}"
 
 
 def _name_main_source(shares: Mapping[str, float] | None) -> str:
@@ -122,7 +122,7 @@ def _name_main_source(shares: Mapping[str, float] | None) -> str:
     if not shares:
         return NOTHING
     name, percent = next(iter(shares.items()))
-    return f"{label(name)} {fixed(percent, 0)} %"
+    return f"{label(name)} {format_fixed(percent, 0)} %"
 
 
 def _make_load_table(
@@ -131,7 +131,7 @@ def _make_load_table(
     """A table in which the rows of each load stand below a marked row with its name."""
     body: list[Row] = []
     for load, own in zip(loads, rows, strict=True):
-        body.append(make_row(load, *(numeric("") for _ in columns[1:]), marked=True))
+        body.append(make_row(load, *(to_numeric("") for _ in columns[1:]), marked=True))
         body += make_table(name, caption, columns, own).rows
     return Table(name, caption, tuple(column[0] for column in columns), tuple(body))
 
@@ -145,7 +145,7 @@ def _make_strain_table(names: list[str], held: list[Mapping[str, Any]]) -> Table
         ("Compression: largest", "compression", 2),
         ("exceeded in 1 %", "compression_rare", 2),
         *((f"Sheared over {level} (cm3)", ("sheared_cm3", level), 2) for level in levels),
-        ("Largest shear near", lambda row: numeric(row["near"] or NOTHING)),
+        ("Largest shear near", lambda row: to_numeric(row["near"] or NOTHING)),
     )
     rows = [[row | {"sheared_cm3": _to_cm3(row["sheared_mm3"])} for row in one["inside"]] for one in held]
     caption = (
@@ -174,11 +174,11 @@ def make_interval_table(held: Mapping[str, Any], title: str) -> Table | None:
     lines = []
     for name, unit, begin, value, row in rows:
         low, high = row[f"{begin}interval_{unit}"]
-        cells = [f"{fixed(value)} {unit}", f"{fixed(max(value - low, high - value), 2)} {unit}"]
-        cells += [fixed(row[f"{begin}interval_from"][one], 0) for one in names]
+        cells = [f"{format_fixed(value)} {unit}", f"{format_fixed(max(value - low, high - value), 2)} {unit}"]
+        cells += [format_fixed(row[f"{begin}interval_from"][one], 0) for one in names]
         changes = row[f"{begin}change_{unit}"]
-        cells += [f"{fixed(changes[one], 2 if unit == 'mm' else 1)} {unit}" for one in known]
-        lines.append(make_row(name, *map(numeric, cells)))
+        cells += [f"{format_fixed(changes[one], 2 if unit == 'mm' else 1)} {unit}" for one in known]
+        lines.append(make_row(name, *map(to_numeric, cells)))
     caption = (
         f"What the intervals of means and settling come from, {title}: the share of the variance that would "
         "go if a parameter were known, to first order. Parameters are correlated, so that shares do not add "

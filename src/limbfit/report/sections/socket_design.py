@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from ..drawing.socket_pictures import draw_offset_figure, draw_pressure_figures
-from ..formats import fixed
+from ..formats import format_fixed
 from ..page import Note, Prose, Section, Table, make_section
 from ..store import Json, Results
 from ..tables import Column, make_table
@@ -49,7 +49,8 @@ def _describe_design(content: Json) -> str:
         f"The design is the shape that the limb takes under a pressure of {target['pressure_kPa']:g} kPa "
         f"({target['pressure']}{'; ' + own if own else ''}), which follows its surface. The control has the "
         f"same volume, {control['volume_cm3']:.0f} cm3, by a uniform reduction of every circumference by "
-        f"{fixed(control['reduction_percent'], 2)} %. Brim, distal end, liner, friction and loads are alike. "
+        f"{format_fixed(control['reduction_percent'], 2)} %. Brim, distal end, liner, friction and "
+        "loads are alike. "
         f"Tissues: {origin}."
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 
-from ..formats import fixed, label, limits, number, symbol
+from ..formats import format_fixed, format_limits, format_symbol, label, number
 from ..page import Block, KeyNumber, Prose, make_bullets
 from ..store import Results
 
@@ -32,11 +32,11 @@ def list_key_numbers(store: Results) -> tuple[KeyNumber, ...]:
 def _label_modulus(store: Results, tissue: str) -> str:
     first = next(p for p in store.law.parameters if p.key == store.law.moduli[0])
     interval = store.interval(tissue, first.key)
-    text = f"{tissue}, {first.words} {symbol(first.key)}"
-    return f"{text} ({limits(interval)} kPa)" if interval else text
+    text = f"{tissue}, {first.words} {format_symbol(first.key)}"
+    return f"{text} ({format_limits(interval)} kPa)" if interval else text
 
 
-def summary(store: Results) -> tuple[Block, ...]:
+def build_summary(store: Results) -> tuple[Block, ...]:
     """One paragraph in plain words, then the verdict."""
     sentences = [_describe_study(store), _describe_errors(store), _compare_materials(store)]
     prose = Prose(" ".join(sentence for sentence in sentences if sentence))
@@ -73,7 +73,7 @@ def _describe_errors(store: Results) -> str:
     sites = len({row["site"] for row in held})
     places = "the one site that was" if sites == 1 else f"the {sites} sites that were"
     errors = [row["error_percent"] for row in held if row.get("error_percent") is not None]
-    worst = f" (largest {fixed(max(errors))} %)" if errors else ""
+    worst = f" (largest {format_fixed(max(errors))} %)" if errors else ""
     return (
         f"At {places} not used, the model predicts the force with a mean error of "
         f"{store.mean_error('heldout')} % of the largest force{worst}; at the fitted "
@@ -88,7 +88,7 @@ def _compare_materials(store: Results) -> str:
     if not known:
         return ""
     first, second = (statistics.fmean(column) for column in zip(*known, strict=True))
-    start = f"With one material for all soft tissue the held-out error is {fixed(first)} %: "
+    start = f"With one material for all soft tissue the held-out error is {format_fixed(first)} %: "
     if abs(first - second) < 0.1 * max(first, second):
         return start + f"here {store.materials} predict no better than one."
     return start + f"{store.materials} predict {'better' if second < first else 'worse'}."

@@ -12,10 +12,10 @@ from matplotlib.ticker import MaxNLocator
 
 from ..drawing import plots
 from ..drawing.colours import INK, MEASURED, MUTED, SIMULATED, choose_truth_style
-from ..formats import NOTHING, fixed, label, limits, number
+from ..formats import NOTHING, format_fixed, format_limits, label, number
 from ..page import Block, Bullets, Cell, Figure, Note, Prose, Section, Table, make_section
 from ..store import Curves, Json, Results, find_compared_quantity, get_record_name
-from ..tables import Column, make_table, numeric
+from ..tables import Column, make_table, to_numeric
 
 TrueValues = dict[str, tuple[float, dict[str, Any]]]  # by name: a true parameter and its line
 MAX_DRAWS, MAX_SITES = 300, 18
@@ -46,8 +46,9 @@ def _describe_method(content: Json) -> Prose:
         "Residuals are noise of the record, estimated from what smoothing took away (its autocorrelation and "
         "the doubt about touch-down included), plus a smooth misfit of the model at each site, a Gaussian "
         "process whose size and duration are found by restricted maximum likelihood: a misfit of "
-        f"{fixed(100 * residuals['misfit_elsewhere'], 2)} % of the largest force that lasts "
-        f"{fixed(100 * residuals['correlation'], 0)} % of a record. Posterior and profiles use an emulator "
+        f"{format_fixed(100 * residuals['misfit_elsewhere'], 2)} % of the largest force that lasts "
+        f"{format_fixed(100 * residuals['correlation'], 0)} % of a record. Posterior and profiles "
+        "use an emulator "
         "of the solver; the further sources are simulations of their own, carried to the parameters by the "
         "linearised fit."
     )
@@ -56,12 +57,12 @@ def _describe_method(content: Json) -> Prose:
 def _make_parameter_table(content: Json) -> Table:
     columns = (
         ("Parameter", lambda row: label(row["name"])),
-        ("Identified", lambda row: numeric(number(row["calibrated"]))),
-        ("Linearised", lambda row: numeric(limits(row["linearised_95"]))),
-        ("Posterior", lambda row: numeric(limits(row["posterior_95"]))),
-        ("Profile", lambda row: numeric(limits(row["profile_95"]))),
+        ("Identified", lambda row: to_numeric(number(row["calibrated"]))),
+        ("Linearised", lambda row: to_numeric(format_limits(row["linearised_95"]))),
+        ("Posterior", lambda row: to_numeric(format_limits(row["posterior_95"]))),
+        ("Profile", lambda row: to_numeric(format_limits(row["profile_95"]))),
         ("Profile says", _describe_profile),
-        ("With all sources", lambda row: numeric(limits(row["with_sources_95"]))),
+        ("With all sources", lambda row: to_numeric(format_limits(row["with_sources_95"]))),
         ("Verdict", "verdict"),
     )
     caption = (
@@ -97,7 +98,7 @@ def _make_combination_table(content: Json) -> Table:
 
 
 def _format_factor(value: float) -> Cell:
-    return numeric(f"×÷ {number(value, 4)}" if value < 100 else "×÷ > 100")
+    return to_numeric(f"×÷ {number(value, 4)}" if value < 100 else "×÷ > 100")
 
 
 @plots.styled
@@ -146,7 +147,7 @@ def _describe_check(check: Json) -> str:
     pairs = zip(check["emulated"], check["solved"], strict=True)
     off = [abs(a - b) for a, b in pairs if b is not None]
     failed = "" if len(off) == len(check["solved"]) else ", not simulated at each end"
-    return f"{label(check['name'])} {fixed(max(off, default=None), 2)} (the {check['why']}{failed})"
+    return f"{label(check['name'])} {format_fixed(max(off, default=None), 2)} (the {check['why']}{failed})"
 
 
 def _make_evidence_table(content: Json) -> Table | None:
@@ -166,7 +167,7 @@ def _make_evidence_table(content: Json) -> Table | None:
     rows = [
         found[which] | {"heldout_percent": heldout.get(f"{which}_percent")} for which in ("first", "second")
     ]
-    samples = fixed(found["first"]["effective_samples"], 0)
+    samples = format_fixed(found["first"]["effective_samples"], 0)
     caption = (
         f"One material or several: {found['verdict']}. Criteria count {samples} effective samples (residuals "
         "are correlated) and the size of the misfit as a parameter; AIC is corrected for few samples."
@@ -181,12 +182,15 @@ def _make_source_table(content: Json) -> Table:
     def shift(row: Json, name: str) -> Cell:
         value, shifts = row["parameters_percent"][name], row["parameters_percent"].values()
         share = min(abs(value) / (max(map(abs, shifts)) or 1.0), 1.0)
-        return numeric(f"{'' if row['shared'] else '±'}{fixed(value)}", share)
+        return to_numeric(f"{'' if row['shared'] else '±'}{format_fixed(value)}", share)
 
     columns: tuple[Column, ...] = (
         ("Source", "source"),
         ("Change", _describe_change),
-        ("Force (%)", lambda row: numeric(fixed(float(np.mean(list(row["force_percent"].values()))), 2))),
+        (
+            "Force (%)",
+            lambda row: to_numeric(format_fixed(float(np.mean(list(row["force_percent"].values()))), 2)),
+        ),
         *((f"{label(name)} (%)", lambda row, name=name: shift(row, name)) for name in names),
         ("Counted", lambda row: "yes" if row["counted"] else "told only"),
     )
@@ -214,7 +218,7 @@ def _make_prediction_table(content: Json) -> Table:
         ("Misfit", "misfit_sd_percent", 2),
     )
     found = content["predictions"]
-    fitted, heldout = (fixed(found[f"coverage_{use}_percent"], 0) for use in ("fitted", "heldout"))
+    fitted, heldout = (format_fixed(found[f"coverage_{use}_percent"], 0) for use in ("fitted", "heldout"))
     caption = (
         "Prediction intervals of 95 %: how much of each record lies inside, and standard deviations by cause "
         f"in percent of the largest force. Fitted sites: {fitted} % inside; held-out sites: {heldout} %."
@@ -224,19 +228,23 @@ def _make_prediction_table(content: Json) -> Table:
 
 def _format_inside(row: Json) -> Cell:
     reason = row.get("reason")
-    return numeric(f"not predicted: {reason}" if reason else fixed(row["inside_percent"], 0))
+    return to_numeric(f"not predicted: {reason}" if reason else format_fixed(row["inside_percent"], 0))
 
 
 def _describe_emulator(content: Json) -> Block:
     found, chain = content["emulator"], content["posterior"]
     last = found["rounds"][-1]
     text = (
-        f"Emulator: {found['runs']} simulations of all fitted sites with derivatives; its stated error over "
-        f"nine tenths of the posterior is at most {fixed(max(last['error_percent']), 2)} % of the largest "
-        f"force (needed: {fixed(min(found['needed_percent']), 2)} %), left-out runs are met to "
-        f"{fixed(max(last['loo_percent']), 2)} % (median); {fixed(100 * last['outside'], 0)} % of the "
-        f"posterior lies beyond its simulations. Chain: {fixed(chain['independent_draws'], 0)} independent "
-        f"draws, acceptance {fixed(100 * chain['acceptance'], 0)} %."
+        f"Emulator: {found['runs']} simulations of all fitted sites with derivatives; its stated "
+        "error over "
+        f"nine tenths of the posterior is at most {format_fixed(max(last['error_percent']), 2)} % "
+        "of the largest "
+        f"force (needed: {format_fixed(min(found['needed_percent']), 2)} %), left-out runs are met to "
+        f"{format_fixed(max(last['loo_percent']), 2)} % (median); "
+        f"{format_fixed(100 * last['outside'], 0)} % of the "
+        f"posterior lies beyond its simulations. Chain: "
+        f"{format_fixed(chain['independent_draws'], 0)} independent "
+        f"draws, acceptance {format_fixed(100 * chain['acceptance'], 0)} %."
     )
     return Prose(text) if found["good_enough"] else Note(text)
 
@@ -323,7 +331,9 @@ def draw_prediction_figure(store: Results, content: Json) -> Figure | None:
         ax.plot(time, measured, color=MEASURED, lw=2.2, alpha=0.55, label="measured")
         ax.plot(time, predicted, color=SIMULATED, lw=1.1, label="predicted")
         kind = "fitted" if row["fitted"] else "held out"
-        ax.set_title(f"site {get_record_name(row)}, {kind}: {fixed(row['inside_percent'], 0)} % inside")
+        ax.set_title(
+            f"site {get_record_name(row)}, {kind}: {format_fixed(row['inside_percent'], 0)} % inside"
+        )
         ax.margins(x=0.01)
         if quantity != "force":
             ax.set_ylabel(f"{quantity.capitalize()} ({unit})")
