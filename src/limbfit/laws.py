@@ -161,7 +161,7 @@ _POWER_RELAXATION = (
 )
 
 
-def _power() -> TissueLaw:
+def _build_power() -> TissueLaw:
     """The paper's law with relaxation as a power of time."""
     energy = _describe_energy("γ Σ (τᵢ/1 s)^(−slope) exp(−t/τᵢ)")
     words = f"{OGDEN_WORDS} with relaxation as a power of time"
@@ -195,7 +195,10 @@ def _build_active() -> TissueLaw:
 
 FIBRE_KEYS = tuple(parameter.key for parameter in (*_FIBRES, _TENSION))
 _OWN = {law.name: law for law in map(_build_ogden, range(1, MOST_RELAXATIONS + 1))}
-LAWS = Registry("tissue law", _OWN | {POWER: _power(), FIBRED: _build_fibred(), ACTIVE: _build_active()})
+LAWS = Registry(
+    "tissue law",
+    _OWN | {POWER: _build_power(), FIBRED: _build_fibred(), ACTIVE: _build_active()},
+)
 
 
 def is_ogden(name: str) -> bool:

@@ -50,13 +50,13 @@ def check_packed(path: Path, header: Mapping[str, Any]) -> None:
         elsewhere = header.get("data file", header.get("datafile"))
         unpacker = zlib.decompressobj(47) if encoding.startswith("g") else bz2.BZ2Decompressor()
         place = path if elsewhere is None else path.parent / str(elsewhere)
-        if _exceeds_when_unpacked(place, elsewhere is None, unpacker, _LARGEST_TYPE * voxels):
+        if _is_larger_unpacked(place, elsewhere is None, unpacker, _LARGEST_TYPE * voxels):
             raise LabelError(
                 "its data unpack to more than its header states", file=path, remedy="save it again"
             )
 
 
-def _exceeds_when_unpacked(path: Path, after_header: bool, unpacker: Any, most: int) -> bool:
+def _is_larger_unpacked(path: Path, after_header: bool, unpacker: Any, most: int) -> bool:
     """Whether compressed data come to more than ``most`` bytes; they are not kept."""
     total, waiting = 0, b""
     with path.open("rb") as stream:

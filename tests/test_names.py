@@ -1,0 +1,90 @@
+"""Names tell what comes back: a function of a module begins with a verb, or converts one thing to another."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import limbfit
+
+PACKAGE = Path(limbfit.__file__).parent
+VERBS = frozenset(
+    """
+acquire adapt add advance allow amputate announce answer append apply approach approximate ask assemble
+assess assign average balance batch begin bench bisect build bump calibrate call cap chain change check
+choose clamp classify clean clear clip close coarsen code collect colour combine compare compile
+compress compute connect constrain continue copy correct count couple create crop cross curve cut decode
+deform delay demo derive describe design diagnose die difference differentiate dilate divide do don draw
+drive drop edit embed end ensure equilibrate erode estimate evaluate exchange exclude expand explain
+explore export extend extract extrapolate extrude factor fail fill find finish fit flag flatten follow
+format from gather generate get grade group grow guess halve has head hide hold identify ignore import
+impose improve insert integrate interpolate interpret interrupt intersect invert is iterate join judge
+keep kill label lead level limit list listen load locate lock log lump main make mark mask match measure
+mend merge mesh minimise move multiply mute name normalise number observe offset open optimise order
+orient outline own pack page paint pair parse place plan plot pool position post predict prefetch
+prepare prepend press preview print prioritise project prolong promote prompt pull put rank rasterise
+read rebuild record recover rectify redact reduce refactor refine refuse register regularise release
+remesh remove render renew repair replace report reproduce resample rescale resolve respond restate
+restrict resume rotate round run sample save scale schedule search segment select send serve set shade
+share shorten show silence simulate size slice smooth snap solve sort split spread stack start state
+step stop store sum summarise symmetrise take tell temper thicken thin tilt to touch transfer translate
+triangulate trim try turn unpack untangle update vary voxelise walk warm warn weigh widen work wrap
+write zip
+    """.split()  # noqa: SIM905
+)
+PREDICATES = frozenset({"is", "has", "can", "are", "prefers"})
+# Functions that are named by what they are, and why.
+EXCEPTIONS = {
+    "cli/": "a command's function has the command's name",
+    "fe/kernel/": "compiled formulas have the name of what they compute, as in a textbook",
+    "fe/contact/": "compiled formulas",
+    "fe/lanes.py": "compiled arithmetic",
+    "fe/materials/": "laws and their formulas",
+    "fe/solution/multigrid.py": "compiled sweeps",
+    "fe/solution/products.py": "compiled loops",
+    "fe/solution/sensitivity.py": "compiled formulas",
+    "shapes/": "compiled distances, and names that users import",
+    "mesh/cells.py": "shape functions",
+    "mesh/volume.py": "names that users import",
+    "notebook/": "names that users import",
+    "fields.py": "names that users import",
+    "pipeline/verbs/acquire.py": "names that users import",
+    "pipeline/verbs/run.py": "names that users import",
+    "priors/people.py": "a constructor",
+    "anatomy/meshing/_netgen_worker.py": "a script",
+}
+
+
+def functions() -> list[tuple[str, str]]:
+    """File below the package and name of each function that stands at the top of a module."""
+    found = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        file = path.relative_to(PACKAGE).as_posix()
+        for node in ast.parse(path.read_text("utf-8")).body:
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not node.name.startswith("__"):
+                found.append((file, node.name))
+    return found
+
+
+def begins_with_a_verb(name: str) -> bool:
+    first = name.lstrip("_").split("_")[0]
+    return first in VERBS | PREDICATES or first == "with" or "_to_" in name
+
+
+def test_functions_begin_with_a_verb():
+    wrong = [
+        f"{file}: {name}"
+        for file, name in functions()
+        if not begins_with_a_verb(name) and not any(file.startswith(place) for place in EXCEPTIONS)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_exception_is_needed():
+    odd = {file for file, name in functions() if not begins_with_a_verb(name)}
+    assert [place for place in EXCEPTIONS if not any(file.startswith(place) for file in odd)] == []
+
+
+def test_the_list_of_verbs_holds_no_spare_word():
+    first = {name.lstrip("_").split("_")[0] for _, name in functions()}
+    assert sorted(VERBS - first) == []
