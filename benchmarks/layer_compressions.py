@@ -41,6 +41,10 @@ class Footprint:
         across = j0(np.multiply.outer(k, np.sin(angle)) * self.width_mm / 2)
         return np.asarray((along * across).mean(axis=-1) * np.exp(-((_ROUNDING_MM * k) ** 2) / 2))
 
+    def under(self, thickness_mm: Array, force_N: Array) -> Layers:
+        """Layers (n, l) under it: the same at every force."""
+        return Layers.under(self, thickness_mm)
+
 
 @dataclass(frozen=True)
 class Layers:

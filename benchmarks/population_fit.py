@@ -15,11 +15,11 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
-from layer_compressions import Footprint, Layers
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
@@ -30,11 +30,25 @@ SITES = ("LL_A", "LL_P", "UL_A", "UL_P")
 FORCE_N = 9.0  # F_0, the median
 STEP = 1e-4  # of central differences, in logarithms
 ROUNDS, STILL = 150, 0.01  # of linearisation, and when they end: change of logarithms
-DAMPED = 0.5  # of a whole step, which overshoots where a layer's compression is hardly more than its reading
+DAMPED, SETTLING = 0.5, 15  # of a whole step, which overshoots; rounds after which it is half of that
 WEAK_MPA, WEAK = 0.005, 2.0  # prior of beta: its middle, and the standard deviation of the logarithm
 LEAST, MOST = 0.02, 3.0  # bounds of standard deviations
 READING_MM = 0.8  # nothing is read worse: what is more is a difference of places
 TYPICAL, SPREAD = 0.3, 1.0  # lognormal prior of the deviations of logarithms
+
+
+class PressedLayers(Protocol):
+    """Layers at n places under a probe."""
+
+    def compressions(self, shear_moduli: Array) -> Array:
+        """Compression of each layer in mm per N, (n, l), for moduli (n, l) in MPa."""
+
+
+class Probe(Protocol):
+    """What presses: `layer_compressions.Footprint`, linear theory, or `solved_layers.SolvedFootprint`."""
+
+    def under(self, thickness_mm: Array, force_N: Array) -> PressedLayers:
+        """Layers of these thicknesses (n, l) under it, pressed by forces (n,)."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +98,8 @@ def read_legs(file: Path, layers: Sequence[Sequence[str]]) -> Legs:
 class Fit:
     """``effects`` (l, 5): beta of each site and alpha, of log MPa, with ``covariance`` (5 l, 5 l).
 
-    ``between``, ``within`` (l,) are standard deviations of log mu, ``reading_mm`` (l,) those of e.
+    ``between``, ``within`` (l,) are standard deviations of log mu, ``reading_mm`` (l,) those of e; ``logs``
+    (n, l) are the likeliest log mu of every place that was fitted.
     """
 
     effects: Array
@@ -92,6 +107,7 @@ class Fit:
     between: Array
     within: Array
     reading_mm: Array
+    logs: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -104,10 +120,15 @@ class _Linear:
     gap: NDArray[np.bool_]  # (p, 4)
 
 
-def fit(legs: Legs, footprint: Footprint, known: Sequence[Known] = ()) -> Fit:
-    """The model of these legs."""
+def fit(
+    legs: Legs, probe: Probe, known: Sequence[Known] = (), still: float = STILL, start: Fit | None = None
+) -> Fit:
+    """The model of these legs, searched from that of much the same legs where one is given.
+
+    ``still``: root mean square step of the likeliest log mu of all places at which it ends.
+    """
     count = legs.thickness_mm.shape[1]
-    under = Layers.under(footprint, legs.thickness_mm)
+    under = probe.under(legs.thickness_mm, legs.force_N)
     people, row = np.unique(legs.person, return_inverse=True)
     shape = (len(people), len(SITES))
     design = np.zeros((len(row), count, 5 * count))
@@ -122,26 +143,28 @@ def fit(legs: Legs, footprint: Footprint, known: Sequence[Known] = ()) -> Fit:
 
     model = _Mixed(count, tuple(known))
     gap = placed(np.ones(len(row))) == 0
-    logs = design @ model.middle
-    theta = model.start
-    for _ in range(ROUNDS):
+    logs, theta = design @ model.middle, model.start
+    if start is not None and start.logs is not None:
+        logs = start.logs
+        theta = np.log(np.concatenate([start.between, start.within, start.reading_mm]))
+    for number in range(ROUNDS):
         expected, slope = _pressed(under, legs.force_N, logs)
         seen = legs.compression_mm - expected + np.einsum("nij,nj->ni", slope, logs)
         linear = _Linear(placed(seen), placed(slope), placed(design), gap)
         found = minimize(model.cost, theta, args=(linear,), method="L-BFGS-B", bounds=model.bounds)
         step = model.likeliest(found.x, linear)[row, legs.site] - logs
         moved = max(np.abs(found.x - theta).max(), float(np.sqrt(np.mean(step**2))))
-        theta, logs = found.x, logs + np.clip(DAMPED * step, -0.5, 0.5)
-        if moved < STILL:
+        theta, logs = found.x, logs + np.clip(DAMPED / (1 + number / SETTLING) * step, -0.5, 0.5)
+        if moved < still:
             break
     else:
         raise RuntimeError(f"the logarithms still move by {moved:.1e} after {ROUNDS} rounds")
     between, within, reading = model.deviations(theta)
     effects, covariance = model.effects(theta, linear)
-    return Fit(effects.reshape(count, 5), covariance, between, within, reading)
+    return Fit(effects.reshape(count, 5), covariance, between, within, reading, logs)
 
 
-def _pressed(under: Layers, force_N: Array, logs: Array) -> tuple[Array, Array]:
+def _pressed(under: PressedLayers, force_N: Array, logs: Array) -> tuple[Array, Array]:
     """Compressions (n, l) and their derivatives (n, l, l) with respect to log mu."""
     columns = []
     for layer in range(logs.shape[1]):
@@ -234,10 +257,10 @@ class Coverage:
     all: float
 
 
-def predict(found: Fit, legs: Legs, footprint: Footprint, draws: int, seed: int = 0) -> Array:
+def predict(found: Fit, legs: Legs, probe: Probe, draws: int, seed: int = 0) -> Array:
     """Drawn compressions (draws, n, l) of the layers of other persons' legs, readings and all."""
     random = np.random.default_rng(seed)
-    under, count = Layers.under(footprint, legs.thickness_mm), legs.thickness_mm.shape[1]
+    under, count = probe.under(legs.thickness_mm, legs.force_N), legs.thickness_mm.shape[1]
     people, row = np.unique(legs.person, return_inverse=True)
     force = np.log(legs.force_N / FORCE_N)[:, None]
     told = np.empty((draws, *legs.thickness_mm.shape))
@@ -252,21 +275,38 @@ def predict(found: Fit, legs: Legs, footprint: Footprint, draws: int, seed: int 
     return told
 
 
-def coverage(
-    legs: Legs, footprint: Footprint, known: Sequence[Known] = (), folds: int = 10, draws: int = 400
-) -> Coverage:
-    """Every person is left out once, with a tenth of all others."""
+def predict_held_out(
+    legs: Legs,
+    probe: Probe,
+    known: Sequence[Known] = (),
+    folds: int = 10,
+    draws: int = 400,
+    still: float = STILL,
+) -> Array:
+    """Compressions (draws, n, l) of every person, drawn from the model of the others.
+
+    Every person is left out once, with as many of the others as ``folds`` ask for: alone with one fold each.
+    """
     fold = np.random.default_rng(0).permutation(legs.person.max() + 1)[legs.person] % folds
-    inside = np.zeros(legs.compression_mm.shape, dtype=bool)
-    whole = np.zeros(len(fold), dtype=bool)
-    for number in range(folds):
+    drawn, every = np.empty((draws, *legs.compression_mm.shape)), fit(legs, probe, known, still)
+    for number in np.unique(fold):
         out = fold == number
-        told = predict(fit(legs.of(~out), footprint, known), legs.of(out), footprint, draws, number)
-        inside[out] = _within(told, legs.compression_mm[out])
-        whole[out] = _within(told.sum(axis=2), legs.compression_mm[out].sum(axis=1))
+        others = fit(legs.of(~out), probe, known, still, replace(every, logs=every.logs[~out]))
+        drawn[:, out] = predict(others, legs.of(out), probe, draws, int(number))
+    return drawn
+
+
+def coverage(
+    legs: Legs, probe: Probe, known: Sequence[Known] = (), folds: int = 10, draws: int = 400
+) -> Coverage:
+    """Of the intervals of `predict_held_out`."""
+    drawn = predict_held_out(legs, probe, known, folds, draws)
+    inside = within(drawn, legs.compression_mm)
+    whole = within(drawn.sum(axis=2), legs.compression_mm.sum(axis=1))
     return Coverage(tuple(map(float, inside.mean(axis=0))), float(whole.mean()), float(inside.mean()))
 
 
-def _within(drawn: Array, seen: Array) -> NDArray[np.bool_]:
+def within(drawn: Array, seen: Array) -> NDArray[np.bool_]:
+    """Whether what was seen lies in the middle 90 % of what was drawn (draws, ...)."""
     low, high = np.quantile(drawn, [0.05, 0.95], axis=0)
     return np.asarray((low <= seen) & (seen <= high))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from blocks import parameter_slope, punch
 
-from limbfit.fe import Indenter, StepControl, solve
+from limbfit.fe import Indenter, Ogden, StepControl, solve
 from limbfit.fe.solution import sensitivity, simulation
 
 TIGHT = StepControl(load_steps=4, unload_steps=4, tolerance=1e-10)
@@ -35,3 +35,14 @@ def test_an_edge_taken_as_flat_on_the_way_changes_no_answer(monkeypatch):
     assert np.abs(flat.force - usual.force).max() <= 1e-8 * usual.peak_force
     error = np.abs(flat.force_sensitivity - usual.force_sensitivity).max(axis=0)
     assert (error <= 1e-5 * np.abs(usual.force_sensitivity).max(axis=0)).all()
+
+
+def test_tissue_without_relaxation_has_sensitivities():
+    """Force is proportional to all moduli together (Euler's theorem of homogeneous functions)."""
+    problem = punch("hex8", 2, 1)
+    tissues = {name: Ogden(((0.006, 4.0),), ()) for name in problem.mesh.region_names}
+    result = solve(problem.with_materials(tissues), TIGHT, sensitivities=True)
+    moduli = [number for number, (_, name) in enumerate(result.parameter_names) if name == "c1"]
+    assert len(moduli) == len(tissues)
+    slopes = result.force_sensitivity[:, moduli].sum(axis=1) * 0.006
+    assert slopes == pytest.approx(result.force, abs=1e-6 * result.peak_force)

@@ -79,7 +79,7 @@ class MemoryDerivative:
         slopes = np.empty((*stress.shape, 9))
         d_past = self.elastic if self.before is None else self.before
         d_elastic, d_past, d_prony = (
-            a.reshape(*a.shape[:-2], -1) for a in (self.elastic, d_past, self.prony)
+            a.reshape(*a.shape[:-2], 6 * laws.count) for a in (self.elastic, d_past, self.prony)
         )
 
         def part(cells: slice) -> Array:
