@@ -71,10 +71,19 @@ def apparent(found: Fit, other: Fit, layer: int, force_log_sd: float) -> dict[st
 
 
 def exponent() -> dict[str, Any]:
-    """The prior of m: of the studies of people with Ogden's law, each one draw of a lognormal."""
-    logs = np.log([one["m"] for one in LITERATURE if "m" in one.get("used", ())])
-    spread = float(np.std(logs, ddof=1)) * np.sqrt(1 + 1 / len(logs))
-    return {"median": round(float(np.exp(logs.mean())), 2), "factor": round(float(np.exp(spread)), 2)}
+    """The prior of m: its median of the studies of people with Ogden's law.
+
+    These are two, too few to tell how far studies differ, so the spread is that of all four studies, animals
+    included: each is one draw of a lognormal.
+    """
+    exponents: dict[str, list[float]] = {}
+    people = []
+    for one in LITERATURE:
+        if "m" in one:
+            exponents.setdefault(one["citation"], []).append(np.log(one.get("m_of_pair", one["m"])))
+            people += exponents[one["citation"]][-1:] if "m" in one.get("used", ()) else []
+    spread = np.std([np.mean(logs) for logs in exponents.values()], ddof=1) * np.sqrt(1 + 1 / len(people))
+    return {"median": round(float(np.exp(np.mean(people))), 2), "factor": round(float(np.exp(spread)), 2)}
 
 
 def viscosity() -> tuple[float, float]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.priors import POPULATION
+from limbfit.priors import LITERATURE, POPULATION
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from layer_compressions import Footprint, Layers
@@ -90,6 +90,24 @@ def test_the_prior_of_c_is_made_of_what_is_stored() -> None:
     for name in ("skin_fat", "fat", "muscle"):
         assert STORED["prior"][name]["c_kPa"] == constant(STORED["apparent"][name], STORED["step"][name])
     assert all(prior["m"] == exponent() for prior in STORED["prior"].values())
+
+
+def test_the_exponent_of_one_term_is_twice_that_of_the_pair_under_compression() -> None:
+    """The slope of log stress over log stretch, which is what an exponent is."""
+    stretch = np.array([0.5, 0.501])
+
+    def slope(stress: np.ndarray) -> float:
+        return float(np.diff(np.log(-stress))[0] / np.diff(np.log(stretch))[0])
+
+    def pair(m: float) -> np.ndarray:
+        return stretch**m - stretch**-m - stretch ** (-m / 2) + stretch ** (m / 2)
+
+    one_term = [one for one in LITERATURE if "m_of_pair" in one]
+    assert len(one_term) == 2
+    for one in one_term:
+        of_one = slope(stretch ** one["m"] - stretch ** (-one["m"] / 2))
+        assert slope(pair(one["m_of_pair"])) == pytest.approx(of_one, rel=0.1)
+        assert slope(pair(one["m"])) < 1.8 * of_one  # both are negative: too steep by far
 
 
 @pytest.mark.slow

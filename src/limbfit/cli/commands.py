@@ -306,6 +306,8 @@ def show_sites(summary: dict[str, Any]) -> None:
     for kind, key in (("fitted", "mean_error_fitted_percent"), ("held-out", "mean_error_heldout_percent")):
         if summary.get(key) is not None:
             STDOUT.print(f"mean error at the {kind} sites: {summary[key]:.2f} %")
+    if summary.get("fit_quality"):
+        STDOUT.print(f"fit: {summary['fit_quality']}")
 
 
 VERBS = (demo, phantom, series, check, run, status, simulate, report)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import make_lsq_spline
+from scipy.interpolate import BSpline
+from scipy.optimize import minimize_scalar
 
-from ..autoregressive import clip_lag, estimate_lag_one
+from ..autoregressive import clip_lag
 from .numerics import Array
 
 _PIECES = 10  # of a cubic spline along the way in: follows any onset, and no noise faster than a tenth of it
@@ -32,25 +33,42 @@ class Scatter:
 def estimate_scatter(*parts: Array) -> Scatter:
     """The noise of forces on a smooth curve, in parts (n,) that are smooth each, evenly sampled.
 
-    A curve takes some of the noise with it, the slow part above all: as many degrees of freedom as it has
-    are given back, for the correlation as well (Bartlett's bias of an estimated autocorrelation).
+    A spline through each part takes slow noise with it. Restricted maximum likelihood (Patterson and Thompson
+    1971) of first-order autoregressive noise on such splines gives it back.
     """
-    residuals = [_compute_residual(part) for part in parts if len(part) > 2 * _LEAST_PER_PIECE]
-    if not residuals:
-        residuals = [(np.diff(np.concatenate(parts), 2) / np.sqrt(6.0), 0)]
-    left, taken = np.concatenate([r for r, _ in residuals]), sum(k for _, k in residuals)
-    n = len(left)
-    lag = estimate_lag_one(left)
-    lag = clip_lag(lag + (taken * (1.0 + lag) + 2.0 * lag) / n) if lag > 2.0 / np.sqrt(n) else 0.0
-    new = left[1:] - lag * left[:-1]
-    innovation = float(new @ new) / max(n - taken, 1)
+    long = [part for part in parts if len(part) > 2 * _LEAST_PER_PIECE]
+    if not long:
+        return Scatter(float(np.sqrt(np.mean(np.diff(np.concatenate(parts), 2) ** 2) / 6.0)), 0.0)
+    rows = [np.column_stack([_spline_basis(len(part)), part]) for part in long]
+    n = sum(map(len, rows))
+    found = minimize_scalar(
+        lambda log: _restricted_likelihood(rows, 1.0 - np.exp(log))[0],
+        bounds=(np.log(1.0 - clip_lag(1.0)), 0.0),
+        method="bounded",
+        options={"xatol": 0.02},
+    )
+    lag = float(1.0 - np.exp(found.x))
+    lag = lag if lag > 2.0 / np.sqrt(n) else 0.0
+    innovation = _restricted_likelihood(rows, lag)[1]
     return Scatter(float(np.sqrt(innovation / (1.0 - lag**2))), lag)
 
 
-def _compute_residual(force: Array) -> tuple[Array, int]:
-    """What a cubic spline leaves of a force (n,), and how many coefficients it has."""
-    n = len(force)
+def _restricted_likelihood(rows: list[Array], lag: float) -> tuple[float, float]:
+    """Minus twice the log of the restricted likelihood at its best size of the noise, and the variance of the
+    innovations; ``rows`` (n, k + 1) of each part are its basis and its force."""
+    squares = determinant = 0.0
+    for part in rows:
+        white = np.vstack([np.sqrt(1.0 - lag**2) * part[:1], part[1:] - lag * part[:-1]])
+        corner = np.diag(np.linalg.qr(white, mode="r"))
+        squares += float(corner[-1] ** 2)
+        determinant += float(2 * np.log(np.abs(corner[:-1])).sum() - np.log(1.0 - lag**2))
+    free = sum(len(part) - part.shape[1] + 1 for part in rows)
+    variance = squares / free
+    return free * float(np.log(max(variance, 1e-300))) + determinant, variance
+
+
+def _spline_basis(n: int) -> Array:
+    """A cubic spline's basis (n, k) along n samples."""
     pieces = int(np.clip(n // _LEAST_PER_PIECE, 1, _PIECES))
-    at = np.linspace(0.0, 1.0, n)
     knots = np.r_[[0.0] * 4, np.linspace(0, 1, pieces + 1)[1:-1] ** _CLOSER, [1.0] * 4]
-    return force - make_lsq_spline(at, force, knots)(at), pieces + 3
+    return np.asarray(BSpline.design_matrix(np.linspace(0.0, 1.0, n), knots, 3).toarray())

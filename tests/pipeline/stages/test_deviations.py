@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
+from scipy.signal import lfilter
 
 from layered import block_context, block_study
 from limbfit.identify.fit.objective import SiteResponse
 from limbfit.mesh import read_vtu, write_vtu
 from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.stages.curves import read_record
 from limbfit.pipeline.stages.deviations import (
     GIVEN_MM,
     LEAST_SHARE,
@@ -20,6 +22,7 @@ from limbfit.pipeline.stages.deviations import (
     compute_expected_share,
     compute_thickness_slope,
     estimate_site_deviation,
+    estimate_site_noise,
     estimate_surface_error_mm,
     measure_bone_distance_mm,
 )
@@ -107,3 +110,23 @@ def test_thinner_tissue_under_an_indenter_has_faster_waves(tmp_path: Path) -> No
     thickness = measure_bone_distance_mm(record.model)
     assert thickness is not None
     assert off == pytest.approx(0.5 * LEAST_SHARE * speeds + (speeds - 4.0) * GIVEN_MM / thickness)
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.98])
+def test_slow_noise_of_a_record_is_not_taken_for_the_force(tmp_path: Path, lag: float) -> None:
+    """At 0.98 the smoothing removes a fifth of it only."""
+    found = context(tmp_path)
+    record = load_site_record(found, found.study.recorded[0])
+    file = found.study.path(record.record.trace)
+    table = np.loadtxt(file, delimiter=",", skiprows=1)
+    _, smooth, facts = read_record(found.study, record.record)
+    since = table[:, 0] - facts["touch_down_s"]
+    force = np.interp(since, smooth.time_s, smooth.force_N, right=0.0)
+    sd, stated = 0.005 * smooth.peak_force_N, []
+    for seed in range(4):
+        new = np.random.default_rng(seed).standard_normal(len(table) + 1000)
+        noise = lfilter([np.sqrt(1 - lag**2)], [1.0, -lag], new)[1000:]
+        rows = np.stack([*table.T[:2], force + sd * noise], axis=1)
+        np.savetxt(file, rows, delimiter=",", header=file.read_text().splitlines()[0], comments="")
+        stated.append(estimate_site_noise(found.study, record, record.force_N).sd_N)
+    assert np.mean(stated) == pytest.approx(sd, rel=0.2 if lag else 0.03)

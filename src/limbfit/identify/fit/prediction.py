@@ -98,6 +98,12 @@ class PredictionModel:
         noise = [found["compared_noise_sd_N"] for found in alike]
         return float(np.median(noise)) if noise else 0.0, self.misfit_elsewhere
 
+    def find_mesh_share(self, site: str) -> float:
+        """Return the error of a record's mesh over its largest force: elsewhere the median of the fitted."""
+        shares = [one.get("mesh_share") or 0.0 for one in self.sites.values()]
+        own = self.sites.get(site, {"mesh_share": np.median(shares) if shares else 0.0})
+        return float(own.get("mesh_share") or 0.0)
+
     def compute_interval_95(
         self,
         response: SiteResponse,

@@ -194,9 +194,12 @@ class Likelihood:
         found = [self.find_optimum(self.space.reduce(np.log(start))) for start in starts]
         return min(found, key=lambda one: one.minus_2_log)
 
-    def compute_covariance(self, z: Array) -> Array:
-        """Return the linearised covariance (k, k) at z (k,); the bounds keep it finite."""
-        point = self.linearise(z)
+    def compute_covariance(self, z: Array, factor: float = 1.0) -> Array:
+        """Return the linearised covariance (k, k) at z (k,), the misfit ``factor`` times as large.
+
+        The bounds keep it finite.
+        """
+        point = self.linearise(z, factor)
         assert point is not None
         bounds = np.diag(12.0 / (self.space.upper - self.space.lower) ** 2)
         return np.asarray(np.linalg.inv(point.jacobian.T @ point.jacobian + bounds), dtype=np.float64)

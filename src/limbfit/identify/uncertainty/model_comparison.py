@@ -1,4 +1,9 @@
-"""One material or several: information criteria on one likelihood, and errors at held-out sites."""
+"""One material or several: the evidence of each on one likelihood, and errors at held-out sites.
+
+The residuals are so alike that ten or so independent ones are left, too few for criteria that count samples
+(AIC, corrected or not; BIC). The evidence counts none: it is the likelihood's mean over the bounds, by
+Laplace's method (MacKay 2003, section 28). A parameter that the records do not tell costs nothing there.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +18,7 @@ from scipy.special import stdtr
 from ...arrays import Array
 from .likelihood import MISFIT_FACTOR_BOUNDS, Likelihood, Optimum
 
-# Differences of criteria (Burnham and Anderson 2002; Kass and Raftery 1995)
+# Differences of minus twice the log of the evidence (Kass and Raftery 1995)
 _CLEAR_DIFFERENCE, _STRONG_DIFFERENCE = 2.0, 10.0
 
 
@@ -21,8 +26,8 @@ _CLEAR_DIFFERENCE, _STRONG_DIFFERENCE = 2.0, 10.0
 class AlternativeModel:
     """A model's fit: ``parameters`` counts the free ones and the size of the misfit.
 
-    ``aic`` is corrected for few samples (Hurvich and Tsai 1989); both criteria use the effective number of
-    samples.
+    ``minus_2_log_evidence`` depends on the bounds: of twice the width in logarithms, a parameter that the
+    records tell costs 1.4 more.
     """
 
     name: str
@@ -30,8 +35,7 @@ class AlternativeModel:
     minus_2_log: float
     effective_samples: float
     misfit_factor: float
-    aic: float
-    bic: float
+    minus_2_log_evidence: float
 
 
 @dataclass(frozen=True)
@@ -65,12 +69,17 @@ def fit_alternative(name: str, likelihood: Likelihood, start: Array) -> tuple[Al
         )
         factor = float(np.exp(found.x))
         at = likelihood.find_optimum(at.z, factor=factor)
-    k = len(start) + int(likelihood.has_misfit)
-    n = likelihood.model.effective_samples()
-    correction = 2 * k * (k + 1) / max(n - k - 1, 1.0)
-    value = at.minus_2_log
+    width = likelihood.space.upper - likelihood.space.lower
+    spread = np.linalg.slogdet(2 * np.pi * likelihood.compute_covariance(at.z, factor))[1]
     return (
-        AlternativeModel(name, k, value, n, factor, value + 2 * k + correction, value + k * float(np.log(n))),
+        AlternativeModel(
+            name,
+            len(start) + int(likelihood.has_misfit),
+            at.minus_2_log,
+            likelihood.model.effective_samples(),
+            factor,
+            at.minus_2_log - float(spread) + 2 * float(np.log(width).sum()),
+        ),
         at,
     )
 
@@ -83,13 +92,12 @@ def compare_models(
 ) -> ModelComparison:
     """Compare two models by the records; the errors in percent are those at the same held-out sites."""
     heldout = _compare_held_out(np.asarray(errors_first, float), np.asarray(errors_second, float))
-    by_fit = min(first.aic - second.aic, first.bic - second.bic, key=abs)
-    agree = (first.aic - second.aic) * (first.bic - second.bic) > 0
-    better_fitted = 0 if not agree or abs(by_fit) < _CLEAR_DIFFERENCE else (1 if by_fit > 0 else -1)
+    by_fit = first.minus_2_log_evidence - second.minus_2_log_evidence
+    better_fitted = 0 if abs(by_fit) < _CLEAR_DIFFERENCE else (1 if by_fit > 0 else -1)
     better_unseen = 0
     if heldout.get("p_value", 1.0) < 0.05:
         better_unseen = 1 if heldout["difference_percent"] > 0 else -1
-    better, verdict = _describe_comparison(first, second, better_fitted, better_unseen, abs(by_fit), heldout)
+    better, verdict = _describe_comparison(first, second, better_fitted, better_unseen, by_fit, heldout)
     return ModelComparison(first, second, heldout, better, verdict)
 
 
@@ -115,12 +123,12 @@ def _describe_comparison(
     second: AlternativeModel,
     better_fitted: int,
     better_unseen: int,
-    size: float,
+    by_evidence: float,
     heldout: dict[str, float],
 ) -> tuple[str, str]:
     names = {1: second.name, -1: first.name}
     if better_fitted:
-        strength = "strongly" if size > _STRONG_DIFFERENCE else "moderately"
+        strength = "strongly" if abs(by_evidence) > _STRONG_DIFFERENCE else "moderately"
         by_fit = f"the fitted records support {names[better_fitted]} {strength}"
     else:
         by_fit = f"the fitted records do not distinguish {first.name} from {second.name}"
@@ -137,5 +145,5 @@ def _describe_comparison(
     else:
         better = ""
     end = f"better supported: {better}" if better else "neither is better supported"
-    numbers = f"AIC {first.aic - second.aic:+.1f}, BIC {first.bic - second.bic:+.1f} against {first.name}"
+    numbers = f"twice the log of the evidence {by_evidence:+.1f} against {first.name}"
     return better, f"{by_fit} ({numbers}); {by_test}; {end}"

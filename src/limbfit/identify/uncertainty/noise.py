@@ -2,7 +2,7 @@
 
 The forces compared are a smoothed record at a few points. Slow noise passes the smoothing unchanged, fast
 noise does not. Therefore the compared points have the covariance that means of their share of the samples
-have. It keeps what the smoothing keeps, and claims no knowledge of what the smoothing removed.
+have.
 """
 
 from __future__ import annotations
@@ -65,6 +65,7 @@ def estimate_record_noise(
     displacement_mm: Array | None,
     touch_down_sd_mm: float = 0.0,
     smoothing: Array | None = None,
+    sd_and_lag: tuple[float, float] | None = None,
 ) -> SiteNoise:
     """Estimate the noise of a record from ``residual_N`` (samples,), raw minus smoothed force.
 
@@ -74,10 +75,11 @@ def estimate_record_noise(
         itself, in place of the force: a wrong touch-down then shifts it everywhere by the same.
     touch_down_sd_mm : an error of the touch-down moves the whole curve along its own slope.
     smoothing : (n, n) of the curve, which that slope passes too; by default none.
+    sd_and_lag : standard deviation of the samples and correlation of neighbours, where they are known better
+        than by the residual, from which smoothing has taken slow noise; by default those of the residual.
     """
     residual = residual_N - residual_N.mean()
-    sd = float(residual.std())
-    lag = estimate_lag_one(residual)
+    sd, lag = sd_and_lag or (float(residual.std()), estimate_lag_one(residual))
     samples = _count_samples(times_s, residual.size)
     slope = touch_down_sd_mm * (
         np.ones(len(times_s))

@@ -22,6 +22,7 @@ from ...identify.uncertainty.noise import SiteNoise, estimate_record_noise
 from ...indentation import SiteModel, compute_contact_radius
 from ...mesh import read_vtu
 from ...study import Study
+from ...traces.scatter import estimate_scatter
 from ..shared.context import Context
 from .curves import read_record
 from .records import SiteRecord
@@ -32,6 +33,7 @@ OF_A_VOXEL = 0.17
 GIVEN_MM = 0.3  # of surfaces that come as files
 LEAST_SHARE = 0.01  # of the force: what is left on the true surfaces of those patients
 _STEP = 1.1
+_PRESSED_SHARE = 0.03  # of the peak: below it the force has a corner, where the skin lets go
 
 
 def estimate_site_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
@@ -49,14 +51,23 @@ def estimate_site_noise(study: Study, record: SiteRecord, force_N: Array) -> Sit
 
 
 def _estimate_curve_noise(study: Study, record: SiteRecord, force_N: Array) -> SiteNoise:
-    """Of a record, by what regularising took away from it."""
+    """Of a record, by its scatter about smooth curves of its phases, while the indenter presses.
+
+    A stated force has corners of its own: there it is by what regularising took away.
+    """
     trace, smooth, facts = read_record(study, record.record)
     since = trace.time_s - facts["touch_down_s"]
     inside = (since >= 0) & (since <= smooth.time_s[-1])
-    residual = trace.force_N[inside] - np.interp(since[inside], smooth.time_s, smooth.force_N)
+    force = np.interp(since, smooth.time_s, smooth.force_N)
+    residual, scatter = (trace.force_N - force)[inside], None
     if record.record.forced:
         moved = trace.displacement_mm[inside] - facts["touch_down_mm"]
         residual = moved - np.interp(since[inside], smooth.time_s, smooth.displacement_mm)
+    else:
+        pressed = inside & (force > _PRESSED_SHARE * smooth.peak_force_N)
+        parts = [pressed & (since >= phase.start_s) & (since <= phase.end_s) for phase in smooth.phases]
+        found = estimate_scatter(*(trace.force_N[part] for part in parts))
+        scatter = found.sd_N, found.lag
     return estimate_record_noise(
         record.name,
         record.times_s,
@@ -65,6 +76,7 @@ def _estimate_curve_noise(study: Study, record: SiteRecord, force_N: Array) -> S
         None if record.record.forced else record.displacement_mm,
         record.touch_down_sd_mm,
         record.smoothing,
+        scatter,
     )
 
 

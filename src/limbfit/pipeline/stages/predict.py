@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
+from ...identify.checks.fit_quality import FitQuality, assess_fit, refit_residuals, summarise_fit
 from ...identify.fit.correction import MeshCorrection
 from ...identify.fit.objective import SiteResponse, find_largest_magnitude
 from ...identify.fit.prediction import PredictionModel, compute_error_percent, summarise_errors
@@ -23,7 +24,7 @@ from ...study import Study
 from ..shared.artefacts import write_curves, write_json
 from ..shared.context import Context
 from ..shared.simulations import SimulationCache
-from .deviations import estimate_site_deviation
+from .deviations import estimate_site_deviation, estimate_site_noise
 from .outliers import outliers_to_dict
 from .records import SiteRecord, coarsen_records, load_site_record, select_compared_records, to_response
 
@@ -75,7 +76,9 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
             context, folder, site, None if near is None else near[i], best, known
         )
     doubts = outliers_to_dict(context, cache, records, ours, best, one, searched, correction)
-    write_json(folder / "predict.json", {"sites": rows, **_compute_means(rows), **doubts})
+    quality = _assess_fits(context, [site for site in sites if site.ours.completed], best, known)
+    fit = {"verdict": summarise_fit(quality), "records": [one.to_dict() for one in quality]}
+    write_json(folder / "predict.json", {"sites": rows, **_compute_means(rows), **doubts, "fit_quality": fit})
     return {}
 
 
@@ -195,6 +198,44 @@ def _write_curves(
         low, high = known.compute_interval_95(ours, best, record.name, unit, own)
         columns |= {f"{name}_low_{unit}": np.maximum(low, 0.0), f"{name}_high_{unit}": high}
     write_curves(folder / f"{record.name}.csv", **columns)
+
+
+def _assess_fits(
+    context: Context, sites: Sequence[SitePrediction], best: Array, known: PredictionModel
+) -> list[FitQuality]:
+    """How well the model follows each record, beside its noise and the errors of its mesh and site."""
+    stiffer = [estimate_site_deviation(context, site.record, site.ours, best) for site in sites]
+    allowed, residuals = [], [site.ours.force_N - site.record.compared for site in sites]
+    for site, stiff in zip(sites, stiffer, strict=True):
+        mesh = known.find_mesh_share(site.record.name) * site.ours.force_N
+        noise = estimate_site_noise(context.study, site.record, site.ours.force_N).covariance
+        allowed.append(noise + np.outer(stiff, stiff) + np.outer(mesh, mesh))
+    fitted = [i for i, site in enumerate(sites) if site.record.site.fitted]
+    refitted = refit_residuals(
+        [residuals[i] for i in fitted],
+        [sites[i].ours.jacobian * best for i in fitted],
+        [allowed[i] for i in fitted],
+    )
+    left = dict(zip(fitted, refitted, strict=True))
+    found = []
+    for i, (site, stiff) in enumerate(zip(sites, stiffer, strict=True)):
+        record = site.record
+        of_site = 0.0 if record.site.fitted else stiff
+        low, high = known.compute_interval_95(site.ours, best, record.name, record.record.unit, of_site)
+        found.append(
+            assess_fit(
+                record.name,
+                record.site.fitted,
+                record.times_s,
+                record.force_N if record.record.forced else record.displacement_mm,
+                residuals[i],
+                find_largest_magnitude(record.compared),
+                allowed[i],
+                (record.compared >= np.maximum(low, 0.0)) & (record.compared <= high),
+                left.get(i),
+            )
+        )
+    return found
 
 
 def _write_observed(

@@ -377,6 +377,7 @@ def summarise(study: Study) -> dict[str, Any]:
         for key in ("mean_error_fitted_percent", "mean_error_heldout_percent"):
             summary[key] = predicted[key]
         summary["flags"] = predicted.get("flags", [])
+        summary["fit_quality"] = predicted.get("fit_quality", {}).get("verdict", "")
     report = store["report"] / "report.html"
     if report.is_file():
         summary["report"] = str(report)

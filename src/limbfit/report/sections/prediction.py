@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from ..drawing import figures
 from ..drawing.pictures import draw_field_figure
 from ..formats import NOTHING, format_fixed
-from ..page import Note, Row, Section, Table, make_section
+from ..page import Cell, Note, Row, Section, Table, make_section
 from ..store import Json, Results
-from ..tables import make_row, make_table, to_numeric
+from ..tables import Column, make_row, make_table, to_numeric
 
 
 def make_fit_section(store: Results) -> Section:
@@ -35,6 +35,7 @@ def make_prediction_section(store: Results) -> Section:
         "prediction",
         "All sites, held-out sites",
         make_site_table(store) if store.predicted else None,
+        make_quality_table(store),
         figures.draw_error_figure(store),
         figures.draw_force_figure(store, rows, "time_s", "forces-held-out", 3),
         figures.draw_force_figure(store, rows, "displacement_mm", "loops-held-out", 3),
@@ -72,6 +73,38 @@ def make_site_table(store: Results) -> Table:
     )
     foot = _make_mean_rows(store)
     return make_table("sites", caption, columns, store.predicted, marked="fitted", foot=foot)
+
+
+def make_quality_table(store: Results) -> Table | None:
+    """How well the model follows each record, by phase; None where it is not stored."""
+    found = store.predict.get("fit_quality") or {}
+    if not found.get("records"):
+        return None
+    caption = (
+        f"Goodness of fit: {found['verdict']}. Error: root mean square over the largest force, by phase, and "
+        "how many times what noise, touch-down, mesh and site explain (about one where the model is right)."
+    )
+
+    def phase(name: str) -> Column:
+        def cell(row: Json) -> Cell:
+            here = next((one for one in row["phases"] if one["phase"] == name), None)
+            text = (
+                f"{format_fixed(here['error_percent'], 2)} ({format_fixed(here['times_noise'], 1)})"
+                if here
+                else NOTHING
+            )
+            return to_numeric(text)
+
+        return f"{name.capitalize()} (% (times))", cell
+
+    columns: tuple[Column, ...] = (
+        ("Record", "record"),
+        ("Use", _name_use),
+        *map(phase, ("loading", "hold", "unloading")),
+        ("In the 95 % band (%)", lambda row: to_numeric(format_fixed(100 * row["inside_95"], 0))),
+        ("Verdict", lambda row: row["verdict"] or "follows"),
+    )
+    return make_table("fit-quality", caption, columns, found["records"], marked="fitted")
 
 
 def _name_use(row: Json) -> str:

@@ -160,8 +160,7 @@ def _make_evidence_table(content: Json) -> Table | None:
         ("Model", "name"),
         ("Free parameters", "parameters", 0),
         ("−2 ln L", "minus_2_log", 1),
-        ("AIC", "aic", 1),
-        ("BIC", "bic", 1),
+        ("−2 ln evidence", "minus_2_log_evidence", 1),
         ("Held-out error (%)", "heldout_percent", 2),
     )
     rows = [
@@ -169,8 +168,8 @@ def _make_evidence_table(content: Json) -> Table | None:
     ]
     samples = format_fixed(found["first"]["effective_samples"], 0)
     caption = (
-        f"One material or several: {found['verdict']}. Criteria count {samples} effective samples (residuals "
-        "are correlated) and the size of the misfit as a parameter; AIC is corrected for few samples."
+        f"One material or several: {found['verdict']}. Evidence: the likelihood's mean over the bounds. "
+        f"Residuals are correlated: {samples} count, too few for criteria that count samples."
     )
     return make_table("evidence", caption, columns, rows, marked=lambda row: row["name"] == found["better"])
 

@@ -1,0 +1,189 @@
+"""How well a model follows the records: by phase, beside what may be off without the model being wrong.
+
+The residuals r of a record that the model obeys have a known covariance C: noise, touch-down, mesh, and the
+stiffness of the site as a whole. ``sqrt(r' C^-1 r / n)`` is then about one in every phase. A model that
+cannot follow leaves smooth residuals, many times as large by this measure even where they are small beside
+the force. Their autocorrelation is tested on residuals whitened by C (Ljung and Box 1978). What other
+parameters would explain is taken out first: it is the model that is judged, not where the search stopped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+from scipy.special import chdtrc
+
+from ...arrays import Array
+from ...phases import find_phases
+
+_MIN_TIMES_NOISE, _MIN_SHARE = 2.0, 0.003  # of the largest force: less is of no use to say
+_MIN_POINTS = 4
+_LAGS = 10  # of the test for autocorrelation
+_CLEAR_P = 1e-3
+_FEW_INSIDE = 0.5  # of the points of a held-out record
+_WORDS = {"load": "loading", "hold": "hold", "unload": "unloading"}
+
+
+@dataclass(frozen=True)
+class PhaseError:
+    """Root mean square error of one kind of phase, in N (mm if depths are compared).
+
+    In percent it is over the record's largest value, ``times_noise`` over what noise, touch-down, mesh and
+    site explain; ``bias_percent`` is its mean.
+    """
+
+    phase: str
+    error_N: float
+    error_percent: float
+    bias_percent: float
+    times_noise: float
+
+    @property
+    def is_clear(self) -> bool:
+        """True if the model does not follow the record there."""
+        return self.times_noise >= _MIN_TIMES_NOISE and self.error_percent >= 100 * _MIN_SHARE
+
+
+@dataclass(frozen=True)
+class FitQuality:
+    """A record beside the model: ``times_noise`` of all of it, ``autocorrelation`` of neighbouring residuals,
+    ``ljung_box_p`` the probability of so much of it by chance, ``inside_95`` the share of points in the 95 %
+    band, and the ``verdict``, empty where the model follows."""
+
+    record: str
+    fitted: bool
+    times_noise: float
+    autocorrelation: float
+    ljung_box_p: float
+    inside_95: float | None
+    phases: tuple[PhaseError, ...]
+    verdict: str
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def refit_residuals(
+    residuals_N: Sequence[Array], jacobians_log: Sequence[Array], covariances: Sequence[Array]
+) -> list[Array]:
+    """Return the residuals (n,) of fitted records at the parameters that explain them best under C.
+
+    That is one generalised least-squares step of the logarithms of the parameters, by about one at most;
+    ``jacobians_log`` (n, p) are the derivatives with respect to these.
+    """
+    rows = [_whiten(J, C) for J, C in zip(jacobians_log, covariances, strict=True)]
+    left = [_whiten(r, C) for r, C in zip(residuals_N, covariances, strict=True)]
+    A = np.eye(rows[0].shape[1]) + sum(J.T @ J for J in rows)
+    step = np.linalg.solve(A, sum(J.T @ r for J, r in zip(rows, left, strict=True)))
+    return [r - J @ step for r, J in zip(residuals_N, jacobians_log, strict=True)]
+
+
+def assess_fit(
+    record: str,
+    fitted: bool,
+    times_s: Array,
+    depth_mm: Array,
+    residual_N: Array,
+    peak_N: float,
+    covariance: Array,
+    inside: Array | None = None,
+    refitted_N: Array | None = None,
+) -> FitQuality:
+    """Assess ``residual_N`` (n,), simulated minus measured, with ``covariance`` (n, n) of what may be off.
+
+    ``depth_mm`` (n,) tells the phases, ``peak_N`` is the largest measured force, ``inside`` (n,) whether each
+    point lies in its 95 % band. ``refitted_N`` (n,) are the residuals of `refit_residuals`, which are beside
+    the covariance; by default those of the answer. A held-out record is judged by the band, which counts how
+    well the parameters are known.
+    """
+    refitted = residual_N if refitted_N is None else refitted_N
+    white = _whiten(refitted, covariance)
+    centred = residual_N - residual_N.mean()
+    alike = float(centred[1:] @ centred[:-1] / max(centred @ centred, 1e-300))
+    phases = _assess_phases(times_s, depth_mm, residual_N, refitted, peak_N, covariance)
+    share = None if inside is None else float(np.mean(inside))
+    times_noise, p = float(np.sqrt(np.mean(white**2))), _test_autocorrelation(white)
+    found = FitQuality(record, fitted, times_noise, alike, p, share, phases, "")
+    text = _describe_fitted(found) if fitted else _describe_held_out(found)
+    return FitQuality(record, fitted, times_noise, alike, p, share, phases, text)
+
+
+def summarise_fit(records: Sequence[FitQuality]) -> str:
+    """Say in one line how the model fits the study's records."""
+    fitted = [one for one in records if one.fitted]
+    off = [one for one in fitted if one.verdict]
+    if not fitted:
+        return ""
+    if not off:
+        what = "the model follows every fitted record within what noise, touch-down, mesh and site explain"
+        return what + _count_held_out(records)
+    worst = max(off, key=lambda one: max(p.times_noise for p in one.phases if p.is_clear))
+    also = f"; and {len(off) - 1} more of {len(fitted)} fitted records" if len(off) > 1 else ""
+    return worst.verdict + also + _count_held_out(records)
+
+
+def _count_held_out(records: Sequence[FitQuality]) -> str:
+    held = [one for one in records if not one.fitted and one.inside_95 is not None]
+    off = [one for one in held if one.verdict]
+    return f"; {len(off)} of {len(held)} held-out records lie mostly outside their 95 % band" if off else ""
+
+
+def _whiten(rows: Array, covariance: Array) -> Array:
+    return np.asarray(solve_triangular(cholesky(covariance, lower=True), rows, lower=True))
+
+
+def _test_autocorrelation(white: Array) -> float:
+    """Probability of so much autocorrelation of white noise (n,) by chance (Ljung and Box 1978)."""
+    n, squares = len(white), max(float(white @ white), 1e-300)
+    lags = np.arange(1, min(_LAGS, n - 2) + 1)
+    alike = np.array([float(white[k:] @ white[:-k]) / squares for k in lags])
+    return float(chdtrc(len(lags), n * (n + 2) * np.sum(alike**2 / (n - lags))))
+
+
+def _assess_phases(
+    times_s: Array,
+    depth_mm: Array,
+    residual_N: Array,
+    refitted_N: Array,
+    peak_N: float,
+    covariance: Array,
+) -> tuple[PhaseError, ...]:
+    kinds = np.full(len(times_s), "", dtype=object)
+    for phase in find_phases(times_s, depth_mm):
+        kinds[(times_s > phase.start_s) & (times_s <= phase.end_s)] = _WORDS.get(phase.kind, phase.kind)
+    found = []
+    for kind in dict.fromkeys(kinds[kinds != ""]):
+        at = np.flatnonzero(kinds == kind)
+        if len(at) < _MIN_POINTS:
+            continue
+        error = residual_N[at]
+        rms = float(np.sqrt(np.mean(error**2)))
+        white = _whiten(refitted_N[at], covariance[np.ix_(at, at)])
+        times = float(np.sqrt(np.mean(white**2)))
+        found.append(PhaseError(kind, rms, 100 * rms / peak_N, 100 * float(error.mean()) / peak_N, times))
+    return tuple(found)
+
+
+def _describe_fitted(found: FitQuality) -> str:
+    clear = [phase for phase in found.phases if phase.is_clear]
+    if not clear or found.ljung_box_p > _CLEAR_P:
+        return ""
+    worst = max(clear, key=lambda phase: phase.error_percent)
+    return (
+        f"the model cannot follow the {worst.phase} at {found.record}: {worst.error_percent:.2g} % of the "
+        f"largest force, {worst.times_noise:.2g} times what noise, touch-down, mesh and site explain"
+    )
+
+
+def _describe_held_out(found: FitQuality) -> str:
+    if found.inside_95 is None or found.inside_95 >= _FEW_INSIDE or not any(p.is_clear for p in found.phases):
+        return ""
+    worst = max(found.phases, key=lambda phase: phase.error_percent)
+    return (
+        f"{found.record} is not predicted: {100 * found.inside_95:.0f} % of its points lie in the 95 % band, "
+        f"and the {worst.phase} is off by {worst.error_percent:.2g} % of the largest force"
+    )

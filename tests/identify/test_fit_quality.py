@@ -1,0 +1,86 @@
+"""The verdict on a fit: silent where the model is right, and plain where it cannot follow."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from limbfit.identify.checks.fit_quality import FitQuality, assess_fit, refit_residuals, summarise_fit
+from limbfit.identify.uncertainty.discrepancy import compute_matern
+
+TIMES = np.linspace(0.0, 12.0, 81)
+DEPTH = np.interp(TIMES, [0.0, 4.0, 8.0, 12.0], [0.0, 4.0, 4.0, 0.0])
+FORCE = DEPTH**1.5
+SD, PEAK = 0.02, 8.0
+# White noise, and a site as a whole that may be 1 % stiffer.
+COVARIANCE = SD**2 * np.eye(81) + 1e-4 * np.outer(FORCE, FORCE)
+SHAPE = np.stack([FORCE, DEPTH, DEPTH**2], axis=1)  # what three parameters would add, per logarithm
+
+
+def assess(residual: np.ndarray, fitted: bool = True, inside: np.ndarray | None = None) -> FitQuality:
+    return assess_fit("05", fitted, TIMES, DEPTH, residual, PEAK, COVARIANCE, inside)
+
+
+def noise(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).multivariate_normal(np.zeros(81), COVARIANCE)
+
+
+def test_a_model_that_is_right_is_not_accused() -> None:
+    found = [assess(noise(seed)) for seed in range(300)]
+    assert not any(one.verdict for one in found)
+    assert np.mean([one.times_noise for one in found]) == pytest.approx(1.0, abs=0.02)
+    assert np.mean([one.ljung_box_p < 0.05 for one in found]) == pytest.approx(0.05, abs=0.035)
+    assert summarise_fit(found[:4]).startswith("the model follows every fitted record")
+
+
+def test_an_unloading_that_the_model_cannot_follow_is_named() -> None:
+    bump = 0.48 * np.clip(np.sin(np.pi * (TIMES - 8.0) / 4.0), 0.0, None) * (TIMES > 8.0)
+    found = assess(noise(1) + bump)
+    unload = found.phases[-1]
+    assert [phase.phase for phase in found.phases] == ["loading", "hold", "unloading"]
+    assert unload.error_percent == pytest.approx(100 * 0.48 / np.sqrt(2) / PEAK, rel=0.15)
+    assert 8 < unload.times_noise < 0.48 / SD  # part of it might be a stiffer site
+    assert max(phase.times_noise for phase in found.phases[:2]) < 1.5
+    assert found.verdict.startswith("the model cannot follow the unloading at 05: 4.")
+    assert "of the largest force" in found.verdict
+    others = [assess(noise(seed)) for seed in (2, 3)]
+    assert summarise_fit([*others, found]) == found.verdict
+
+
+def test_an_error_of_no_size_or_of_no_memory_is_not_said() -> None:
+    """A tenth of a percent is nothing, however well seen; noise that is larger than stated is no model."""
+    small = assess_fit("05", True, TIMES, DEPTH, 0.008 * np.sin(TIMES), PEAK, 1e-6 * np.eye(81))
+    assert small.times_noise > 3
+    assert not small.verdict
+    loud = assess(5 * SD * np.random.default_rng(4).standard_normal(81))
+    assert loud.times_noise > 3
+    assert not loud.verdict
+
+
+def test_other_parameters_are_tried_before_the_model_is_blamed() -> None:
+    """Two records share the parameters; what these explain goes, what is a record's own stays."""
+    step = np.array([0.1, -0.25, 0.05])
+    shared = [noise(1) + SHAPE @ step, noise(2) + 2 * SHAPE @ step]
+    own = [shared[0], shared[1] + 0.3 * np.sin(TIMES) * (TIMES > 8.0)]
+    shapes, covariances = [SHAPE, 2 * SHAPE], [COVARIANCE, COVARIANCE]
+
+    def judge(residual: np.ndarray, refitted: np.ndarray) -> FitQuality:
+        return assess_fit("06", True, TIMES, DEPTH, residual, PEAK, COVARIANCE, None, refitted)
+
+    right = [judge(*pair) for pair in zip(shared, refit_residuals(shared, shapes, covariances), strict=True)]
+    wrong = [judge(*pair) for pair in zip(own, refit_residuals(own, shapes, covariances), strict=True)]
+    assert assess(shared[0]).times_noise > 3
+    assert max(one.times_noise for one in right) < 1.3
+    assert right[0].phases[0].error_percent == assess(shared[0]).phases[0].error_percent
+    assert not any(one.verdict for one in right)
+    assert wrong[1].verdict.startswith("the model cannot follow the unloading at 06")
+
+
+def test_a_held_out_record_is_judged_by_its_band() -> None:
+    drift = compute_matern(TIMES, 0.3)[0] * 0.8
+    off = assess(noise(5) + drift, fitted=False, inside=np.arange(81) < 20)
+    assert off.inside_95 == pytest.approx(20 / 81)
+    assert off.verdict.startswith("05 is not predicted: 25 % of its points lie in the 95 % band")
+    assert not assess(noise(5) + drift, fitted=False, inside=np.ones(81, dtype=bool)).verdict
+    fitted = assess(noise(1))
+    assert summarise_fit([fitted, off]).endswith("1 of 1 held-out records lie mostly outside their 95 % band")
