@@ -88,6 +88,44 @@ def test_check_as_json(limbfit, study):
     assert found["sites"]["1"]["touch_down_mm"] == pytest.approx(0.4, abs=0.15)
 
 
+PLANNED = """
+[[sites]]
+name = "3"
+position = [40.0, 0.0, 55.0]
+depth_mm = 12.0
+speed_mm_s = 24.0
+[socket]
+[[socket.loads]]
+name = "an hour"
+force_N = [0.0, 0.0, 100.0]
+hold_s = 3600.0
+"""
+
+
+def test_check_says_what_goes_beyond_the_fitted_records(limbfit, study):
+    """A site a quarter around the limb, one that is planned deep and fast, and a load of an hour."""
+    file = study / "study.toml"
+    file.write_text(file.read_text() + PLANNED)
+    code, out, _ = limbfit("check", study, "--json")
+    found = json.loads(out)
+    assert code == 0
+    rows = {name: {row["quantity"]: row for row in own} for name, own in found["outside_records"].items()}
+    assert set(rows["site 2"]) == {"angle to the nearest fitted site"}
+    assert rows["site 2"]["angle to the nearest fitted site"]["prediction"][1] == pytest.approx(90.0, abs=3.0)
+    assert set(rows["site 3"]) == {"time", "depth over thickness"}
+    fast, deep = rows["site 3"]["time"], rows["site 3"]["depth over thickness"]
+    assert fast["prediction"] == [0.5, 1.0]
+    assert fast["records"] == pytest.approx([5.0 / 0.96, 10.0 / 0.96], rel=0.03)
+    assert deep["prediction"][1] / deep["records"][1] == pytest.approx(12.0 / 5.0, rel=0.1)
+    assert rows["the load 'an hour'"]["time"]["prediction"] == [1.0, 2.0 + 10.0 + 1.0 + 3600.0]
+    times, others = found["outside_text"]
+    assert "the load 'an hour' comes on in 1 s (the records' shortest ramp takes 5.2" in times
+    assert "lasts 3610 s" in times
+    assert others.startswith("site 3 goes beyond the records: depth over thickness")
+    _, _, told = limbfit("check", study)
+    assert f"warning: {times}\nwarning: {others}" in told
+
+
 def test_status_of_a_fresh_study(limbfit, study):
     code, out, _ = limbfit("status", study, "--json")
     states = {row["stage"]: row["state"] for row in json.loads(out)["stages"]}

@@ -65,10 +65,13 @@ def test_the_command_says_what_most_of_an_interval_comes_from(capsys):
             "socket": {"notes": ["its triangles looked away from the tissue and were turned"]},
             "parameters_from": "identified",
             "balance_percent": 0.01,
+            "outside_text": ["the load 'stance' lasts 3600 s; the records last 13 s"],
             "samples": {"simulated": 5, "failed": ["the load could not be carried"]},
         }
     )
-    out = " ".join(capsys.readouterr().out.split())
+    printed = capsys.readouterr()
+    assert "warning: the load 'stance' lasts 3600 s; the records last 13 s" in printed.err
+    out = " ".join(printed.out.split())
     assert "socket: its triangles looked away from the tissue and were turned" in out
     assert "settled by 9.0 mm (95 %: 8.0 to 10.0, mostly from skin c 80 %)" in out
     assert "28.0 to 32.0 skin c 80 %" in out

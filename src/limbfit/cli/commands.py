@@ -131,6 +131,7 @@ def check(study: StudyPath, as_json: AsJson = False) -> None:
     for line in findings["facts"]:
         STDOUT.print(line)
     show_flags(findings["flags"])
+    show_outside(findings["outside_text"])
     STDOUT.print("the study can be run" + (", but see the warnings" if findings["flags"] else ""))
 
 
@@ -224,6 +225,7 @@ def simulate(
             f"curve: {found['curve']}\nfields: {found['fields']}"
         )
     show_warnings([found])
+    show_outside(found["outside_text"])
     if not found["completed"]:
         STDERR.print(f"error: site {site}: the simulation is partial: {found['reason']}")
         raise typer.Exit(1)
@@ -266,6 +268,7 @@ def show_summary(summary: dict[str, Any], as_json: bool) -> None:
     if "sites" in summary:  # as the report, not before its stage
         show_sites(summary)
         show_warnings(summary["sites"])
+        show_outside(summary["outside_text"])
     show_flags(summary.get("flags", ()))
     if "report" in summary:
         STDOUT.print(f"report: {summary['report']}")
@@ -276,6 +279,12 @@ def show_warnings(sites: Sequence[Mapping[str, Any]]) -> None:
     for site in sites:
         for text in site["warnings"]:
             STDERR.print(f"warning: site {site.get('record', site['site'])}: {text}", soft_wrap=True)
+
+
+def show_outside(texts: Sequence[str]) -> None:
+    """What predictions do to the tissue that no fitted record did."""
+    for text in texts:
+        STDERR.print(f"warning: {text}", soft_wrap=True)
 
 
 def show_flags(flags: Sequence[Mapping[str, Any]]) -> None:

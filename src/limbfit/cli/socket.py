@@ -12,7 +12,7 @@ import limbfit
 
 from ..errors import InputError
 from ..laws import split_key
-from .commands import StudyPath, parse_parameters
+from .commands import StudyPath, parse_parameters, show_outside
 from .console import STDOUT, AsJson, listen_on_console, tell_stored
 from .groups import WithDefault
 from .runs import add_execution_options
@@ -92,6 +92,7 @@ def show_socket(found: dict[str, Any]) -> None:
         f"{found['balance_percent']:.2g} %; not a medical device",
         soft_wrap=True,
     )
+    show_outside(found["outside_text"])
 
 
 def _format_main_cause(shares: Mapping[str, float] | None) -> str:

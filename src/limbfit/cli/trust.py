@@ -71,7 +71,12 @@ def design(
         str | None,
         typer.Option(help="with --protocol: speeds in mm/s; default: the study's and five times it"),
     ] = None,
-    holds: Annotated[str, typer.Option(help="with --protocol: holds in s, 0 for none")] = "0,30",
+    holds: Annotated[
+        str | None,
+        typer.Option(
+            help="with --protocol: holds in s, 0 for none; default: 0,30, for a socket as long as its loads"
+        ),
+    ] = None,
     determine: Annotated[
         str | None,
         typer.Option(

@@ -30,7 +30,9 @@ _COLUMNS = (
 
 
 def collect_outcome(folder: StudyFolder, kept: str | None = None) -> dict[str, Any]:
-    """Parameters with intervals and verdicts, errors by site and their means; empty where nothing is stored.
+    """Parameters with intervals and verdicts, errors by site and their means, what is outside the records.
+
+    Empty where nothing is stored.
 
     Parameters
     ----------
@@ -51,6 +53,7 @@ def collect_outcome(folder: StudyFolder, kept: str | None = None) -> dict[str, A
             {key: row.get(key) for key in ("site", "record", "region", "fitted", *_COLUMNS)}
             for row in predicted.get("sites", [])
         ],
+        "outside": predicted.get("outside_text", []),
         "means": {key: value for key, value in predicted.items() if key.endswith("_percent")},
     }
 

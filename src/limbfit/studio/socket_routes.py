@@ -63,7 +63,10 @@ class WantedRun(StrictModel):
 
 
 def list_runs(folder: StudyFolder) -> list[dict[str, Any]]:
-    """Stored runs: ``run``, ``steps`` (name, regions, settling_mm), ``mark``, which other fields change."""
+    """Stored runs: ``run``, ``steps`` (name, regions, settling_mm), ``mark``, which other fields change.
+
+    ``outside``: what it does to the tissue that no fitted record did, in words.
+    """
     single = read_stored(folder.results / "socket" / "socket.json")
     found = {SOCKET: single} if single else {}
     designed = read_stored(folder.results / "socket_design" / "socket_design.json")
@@ -72,7 +75,15 @@ def list_runs(folder: StudyFolder) -> list[dict[str, Any]]:
     for name, content in found.items():
         steps = [{"name": "donning"} | content["donning"], *content["loads"]]
         files = [_find_file(folder, name, i) for i in range(len(steps))]
-        rows.append({"run": name, "steps": [_step(one) for one in steps], "mark": compute_fingerprint(files)})
+        outside = content.get("outside_text", [])
+        rows.append(
+            {
+                "run": name,
+                "steps": [*map(_step, steps)],
+                "outside": outside,
+                "mark": compute_fingerprint(files),
+            }
+        )
     return rows
 
 

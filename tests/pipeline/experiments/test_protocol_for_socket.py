@@ -52,6 +52,9 @@ def test_the_records_for_a_socket_tell_its_pressures_best(study) -> None:
     for row in found["protocols"]:
         assert own["cost"] <= row["cost"] + 1e-12 or row["minutes"] > own["minutes"]
     assert "as far as tissue decides" in found["verdict"]
+    # Ramps of 0.3 s are quicker than the socket's, and a record of 10 s and more lasts as long as its loads.
+    assert not any("does not determine all" in text for text in found["left_out"])
+    assert {row["speed_mm_s"] for row in found["candidates"]} == {0.96, 4.8}
     text = Path(limbfit.report_study(study)["report"]).read_text()
     assert "stance, " in text
     with pytest.raises(InputError, match="are not determined with other parameters"):

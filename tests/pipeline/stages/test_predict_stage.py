@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyvista as pv
 
 from layered import layered_block, store_blocks
 from limbfit.execution import SerialExecutor
@@ -160,6 +161,40 @@ def test_nothing_is_missing_where_nothing_fails(whole):
         curves = columns(folder, name)
         assert np.mean(curves["force_high_N"] - curves["force_low_N"]) > 0.02
         assert (folder / f"{name}.vtu").is_file()
+
+
+@pytest.mark.slow
+def test_a_held_out_site_is_compared_with_what_the_fitted_record_did(whole):
+    """One that is pressed in for longer; strain by tissue, near the indenter at its deepest point."""
+    rows, folder = whole
+    known = {name: {(r["quantity"], r["tissue"]): r for r in row["loading"]} for name, row in rows.items()}
+    for name in BLOCKS:
+        sheared = compute_rare_shear(folder / f"{name}.vtu", region=1)
+        assert known[name]["shear strain", "muscle"]["high"] == pytest.approx(sheared, rel=0.02)
+    assert rows["near"]["outside_records"] == []
+    outside = {(r["quantity"], r["tissue"]): r for r in rows["aside"]["outside_records"]}
+    assert set(outside) == {
+        *(("shear strain", "muscle"), ("compressive strain", "muscle"), ("depth over thickness", None))
+    }
+    for key, row in outside.items():
+        assert row["records"][1] == known["near"][key]["high"]
+        assert row["prediction"][1] == known["aside"][key]["high"] > 1.1 * row["records"][1]
+    assert 0.01 < outside["shear strain", "muscle"]["share"] < 0.1
+    (text,) = json.loads((folder / "predict.json").read_text())["outside_text"]
+    assert text.startswith("site aside goes beyond the records: depth over thickness 0.11 (records: 0.078)")
+
+
+def compute_rare_shear(file: Path, region: int) -> float:
+    """What 1 % of a tissue's volume within 20 mm of the pressed skin exceeds, from the stored fields."""
+    grid = pv.read(file)
+    pressed = grid.points[grid["contact_pressure_kPa"] > 0]
+    middles = grid.points[grid.cells_dict[24][:, :4]].mean(axis=1)
+    far = np.linalg.norm(middles[:, None] - pressed, axis=2).min(axis=1)
+    cells = np.flatnonzero((grid["region"] == region) & (far <= 20.0))
+    shear = (grid["largest_stretch"][cells] ** 2 - grid["smallest_stretch"][cells] ** 2) / 4
+    volume = grid.compute_cell_sizes()["Volume"][cells]
+    order = np.argsort(shear)[::-1]
+    return float(shear[order][np.searchsorted(np.cumsum(volume[order]), 0.01 * volume.sum())])
 
 
 @pytest.mark.slow

@@ -131,7 +131,7 @@ _OWN: tuple[Experiment, ...] = (
         options={
             **{"minutes": 25.0, "setup_s": 60.0, "rest_s": 30.0, "speeds_mm_s": [], "holds_s": []},
             **{"depths_mm": [], "determine": [], "criterion": "D", "draws": 3, "seed": 0},
-            **{"seen": dict.fromkeys(SEEN), "pressures": {}},
+            **{"seen": dict.fromkeys(SEEN), "pressures": {}, "socket_times": {}},
             **{"parameters": {}, "parameters_from": "", "noise": {}},
         },
         check=check_protocol,
@@ -143,7 +143,7 @@ _OWN: tuple[Experiment, ...] = (
         tables=("socket", "geometry", "mesh", "material"),
         apart=("socket.design",),
         options={"parameters": {}, "parameters_from": "", "covariance_log": None}
-        | {"most_probable": None, "samples": 0},
+        | {"most_probable": None, "recorded_range": None, "samples": 0},
         check=check_socket,
     ),
     Experiment(

@@ -40,6 +40,7 @@ from ...study import Site, Study
 from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.limb import LimbGeometry
+from ..shared.loading import LoadHistory, describe_untested_times
 from ..shared.planned import PlannedRecord, press, write_records
 from ..shared.simulations import build_curve_job, build_model, build_site_model, open_experiment_cache
 from ..stages.deviations import compute_expected_share, estimate_surface_error_mm, is_modulus
@@ -94,11 +95,13 @@ def run_protocol(
     noise: dict[str, float],
     seen: Mapping[str, float | None],
     pressures: Mapping[str, Sequence[float]],
+    socket_times: Mapping[str, tuple[float, float]],
 ) -> dict[str, Any]:
     """Simulate every possible record at every draw, with derivatives, and choose within the time.
 
     ``seen``: how well what is read (`SEEN`); None: there is none. ``pressures``: derivatives (p,) of their
-    logarithms by those of the parameters; none: parameters count.
+    logarithms by those of the parameters; none: parameters count. ``socket_times``: ramp and end, s, of
+    donning and each load that they are of.
     """
     study = context.study
     known = build_unknowns(study)
@@ -123,6 +126,9 @@ def run_protocol(
         _to_row(name, chosen, told_by[name], budget, wanted, (known.names, which), pressures, len(tissues))
         for name, chosen in plans.items()
     ]
+    chosen = (found[i].model for i in plans[DESIGNED])
+    histories = [LoadHistory.from_knots(model.knots_s, model.knots_mm) for model in chosen]
+    left_out += describe_untested_times(histories, socket_times)
     content = {
         "minutes": minutes,
         "setup_s": setup_s,

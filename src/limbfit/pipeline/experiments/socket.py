@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from ...anatomy.surfaces.surfaces import write_surface
 from ...donning import Donned
+from ...donning.model import OUTER
+from ...identify.checks.domain import Extent, RecordedRange, describe_outside
 from ...indentation import Parameters
 from ...mesh import Mesh, write_vtu
 from ...socket import Socket
@@ -22,11 +24,16 @@ from ..shared.artefacts import write_json, write_table
 from ..shared.context import Context
 from ..shared.kept import Begun, ResultFiles
 from ..shared.limb import LimbGeometry
+from ..shared.loading import NEAR_MM, LimbAxis, describe_socket_load, name_load, time_socket_loads
 from ..shared.socket_shape import build_loadable_socket, check_at_rest
 from .socket_intervals import CHANGE_PERCENT, FRICTION, draw_step, store_change, widen_intervals
 from .socket_limb import SocketLimb, SocketRun, run_sockets, simulate_socket
 
 NAME = "socket"
+NOT_COMPARED = (
+    "what the fitted records did to the tissue is not stored, and the socket is not compared with it: "
+    "limbfit run, then limbfit socket again"
+)
 
 
 def check_socket(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
@@ -49,6 +56,7 @@ def run_socket(
     parameters_from: str,
     covariance_log: Sequence[Sequence[float]] | None,
     most_probable: Parameters | None,
+    recorded_range: Mapping[str, Any] | None,
     samples: int,
 ) -> dict[str, Any]:
     """Pressure, shear and settling in the study's socket at the ``parameters`` of the tissues.
@@ -57,6 +65,7 @@ def run_socket(
     ----------
     covariance_log : (p, p) that of the parameters' logarithms, where they were identified.
     most_probable : parameters that intervals cover too; none: those that are simulated.
+    recorded_range : what the fitted records did to the tissue, from ``predict.json``; None: not known.
     samples : draws from it that are simulated too, and more friction; the intervals then count what
         derivatives miss.
     """
@@ -86,6 +95,10 @@ def run_socket(
         else [],
         "samples": None,
     }
+    compared = _compare_with_records(limb, mesh, found, recorded_range)
+    for held in (content["donning"], *content["loads"]):
+        held |= compared[held.get("name", "donning")]
+    content["outside_text"] = [] if covariance is None else _describe_outside(content, recorded_range)
     if covariance is not None and samples:
         steps = [draw_step(covariance, number) for number in range(samples)]
         content["samples"] = _simulate_samples(context, folder, (limb, mesh, socket), content, steps)
@@ -94,6 +107,38 @@ def run_socket(
     _write_tables(folder, content)
     begun.drop()
     return {}
+
+
+def _compare_with_records(
+    limb: SocketLimb, mesh: Mesh, found: Donned, stored: Mapping[str, Any] | None
+) -> dict[str, dict[str, Any]]:
+    """What donning and each load do to the tissue, and what of it no fitted record did, by name.
+
+    None where what the records did is not known.
+    """
+    if stored is None:
+        return {name: {"loading": None, "outside_records": None} for name in found.held}
+    tested, axis, before = RecordedRange.from_dict(stored), LimbAxis(limb.anatomy), list[Extent]()
+    near_mm = NEAR_MM + limb.study.socket.liner.thickness_mm
+    compared, histories = {}, time_socket_loads(limb.study.socket)
+    for name, held in found.held.items():
+        before = describe_socket_load(
+            mesh, mesh.face_sets[OUTER], held, before, histories[name], limb.study.tissues, near_mm, axis,
+            tested,
+        )  # fmt: skip
+        compared[name] = {
+            "loading": [one.to_dict() for one in before],
+            "outside_records": tested.find_outside(before),
+        }
+    return compared
+
+
+def _describe_outside(content: Mapping[str, Any], tested: Mapping[str, Any] | None) -> list[str]:
+    """In words what donning and loads do that no fitted record did."""
+    if tested is None:
+        return [NOT_COMPARED]
+    loads = {name_load(load["name"]): load["outside_records"] for load in content["loads"]}
+    return describe_outside({"donning": content["donning"]["outside_records"], **loads})
 
 
 def _simulate_samples(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
+from ...identify.checks.domain import Extent, RecordedRange, describe_outside
 from ...identify.checks.fit_quality import FitQuality, assess_fit, refit_residuals, summarise_fit
 from ...identify.fit.correction import MeshCorrection
 from ...identify.fit.objective import SiteResponse, find_largest_magnitude
@@ -23,6 +24,8 @@ from ...indentation import (
 from ...study import Study
 from ..shared.artefacts import write_curves, write_json
 from ..shared.context import Context
+from ..shared.limb import LimbGeometry
+from ..shared.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
 from ..shared.simulations import SimulationCache
 from .deviations import estimate_site_deviation, estimate_site_noise
 from .outliers import outliers_to_dict
@@ -67,7 +70,7 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
         others = [as_is if r.site.fitted else held for r, as_is, held in zip(records, others, fine)]
     sites = [SitePrediction(*parts) for parts in zip_longest(records, simulations[:n], ours, others)]
     whole = [job for site, job in zip(sites, jobs) if site.own.completed]
-    _write_fields(context, folder, whole, len(jobs))
+    strains = _write_fields(context, folder, whole, len(jobs))
     for site in sites:
         _write_curves(context, folder, site, best, known)
     rows = [_to_row(site) for site in sites]
@@ -75,10 +78,12 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
         rows[i]["observed"] = _write_observed(
             context, folder, site, None if near is None else near[i], best, known
         )
+    tested = _compare_with_records(context, sites, strains, rows)
     doubts = outliers_to_dict(context, cache, records, ours, best, one, searched, correction)
     quality = _assess_fits(context, [site for site in sites if site.ours.completed], best, known)
     fit = {"verdict": summarise_fit(quality), "records": [one.to_dict() for one in quality]}
-    write_json(folder / "predict.json", {"sites": rows, **_compute_means(rows), **doubts, "fit_quality": fit})
+    content = {"sites": rows, **_compute_means(rows), **tested, **doubts, "fit_quality": fit}
+    write_json(folder / "predict.json", content)
     return {}
 
 
@@ -164,18 +169,62 @@ class FieldJob:
     file: Path
 
 
-def store_fields(wanted: FieldJob) -> str:
-    store_job_fields(wanted.job, wanted.file)
-    return wanted.job.model.name
+def store_fields(wanted: FieldJob) -> tuple[str, list[Extent]]:
+    """Store them where they are not yet; return the record's name and the strains near the indenter."""
+    if not wanted.file.is_file():
+        store_job_fields(wanted.job, wanted.file)
+    return wanted.job.model.name, read_strain_extents(wanted.file) if wanted.file.is_file() else []
 
 
-def _write_fields(context: Context, folder: Path, jobs: Sequence[SimulationJob], before: int) -> None:
+def _write_fields(
+    context: Context, folder: Path, jobs: Sequence[SimulationJob], before: int
+) -> dict[str, list[Extent]]:
+    """Store the fields of the jobs; return the strains near the indenter of each record."""
     wanted = [FieldJob(job, folder / f"{job.model.name}.vtu") for job in jobs]
-    missing = [one for one in wanted if not one.file.is_file()]
-    names = [one.job.model.name for one in missing]
-    for i, name in enumerate(context.executor.map(store_fields, missing, keys=names)):
-        total = before + len(missing)
-        context.tell("predict", before + i + 1, total, f"fields of site {name}")
+    names, found = [one.job.model.name for one in wanted], {}
+    for i, (name, strains) in enumerate(context.executor.map(store_fields, wanted, keys=names)):
+        found[name] = strains
+        context.tell("predict", before + i + 1, before + len(wanted), f"fields of site {name}")
+    return found
+
+
+def _compare_with_records(
+    context: Context,
+    sites: Sequence[SitePrediction],
+    strains: Mapping[str, Sequence[Extent]],
+    rows: Sequence[dict[str, Any]],
+) -> dict[str, Any]:
+    """Add to the ``rows`` of the sites what they do to the tissue, and what of it no fitted record did.
+
+    Returns what the fitted records did together, and what is outside in words.
+    """
+    limb = LimbGeometry.stored(context.store)
+    axis = LimbAxis(limb.anatomy)
+
+    def describe(site: SitePrediction, tested: RecordedRange | None = None) -> list[Extent]:
+        record, model = site.record.record, site.record.model
+        return describe_indentation(
+            LoadHistory.from_knots(model.knots_s, model.knots_N or model.knots_mm),
+            max(model.knots_mm),
+            model.indenter,
+            limb.place(record.site),
+            axis,
+            force_N=float(site.record.force_N.max()),
+            strains=strains.get(record.name, ()),
+            tested=tested,
+        )
+
+    fitted = [site for site in sites if site.record.site.fitted]
+    loading = {site.record.name: describe(site) for site in fitted}
+    places = np.array([limb.place(site.record.site)[0] for site in fitted]).reshape(-1, 3)
+    tested = RecordedRange.from_records(loading.values(), map(float, axis.measure_angle(places)))
+    for site, row in zip(sites, rows, strict=True):
+        name = site.record.name
+        own = loading.get(name) or describe(site, tested)
+        row["loading"] = [one.to_dict() for one in own]
+        row["outside_records"] = [] if name in loading else tested.find_outside(own)
+    outside = {f"site {row['record']}": row["outside_records"] for row in rows if not row["fitted"]}
+    return {"recorded_range": tested.to_dict(), "outside_text": describe_outside(outside)}
 
 
 def _write_curves(

@@ -9,11 +9,13 @@ import numpy as np
 
 from ...anatomy.imaging import Volume
 from ...anatomy.surfaces.surfaces import Anatomy
+from ...identify.checks.domain import Extent, RecordedRange, describe_outside
 from ...indentation import read_indenter
-from ...study import ClampsTable, Record, Study
+from ...study import ClampsTable, Record, Site, Study
 from ...traces import Regularised, SurfaceMotion, Trace
 from ..shared.context import Listener, Progress, ignore_progress
 from ..shared.limb import LimbGeometry
+from ..shared.loading import LimbAxis, LoadHistory, describe_indentation, name_load, time_socket_loads
 from ..shared.socket_shape import build_loadable_socket, build_regions, check_load, check_regions
 from ..shared.store import Store
 from ..stages.curves import SecondaryMeasurement, read_observed, read_record
@@ -34,7 +36,8 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
     dict
         ``study``, ``facts`` (sentences), ``sites`` (peak force, depth, touch-down of each record),
         ``flags`` (what looks wrong about records and places, with the evidence), ``refused`` (``commands``
-        that this study cannot have with their defaults, and ``why``).
+        that this study cannot have with their defaults, and ``why``), ``outside_records`` (by name of a site
+        or load what it does that no fitted record does) and ``outside_text``, the same in words.
 
     Raises
     ------
@@ -89,6 +92,7 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
     refused = list_refused_commands(study, limb)
     facts += [f"cannot run: limbfit {', '.join(row['commands'])}: {row['why']}" for row in refused]
     flags = record_flags(study, records, steps, placed, anatomy)
+    outside = _outside_records(study, records, limb)
     listener(Progress("check", 2, 2))
     return {
         "study": study.study.name,
@@ -96,7 +100,55 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
         "sites": records,
         "flags": [flag.to_dict() for flag in flags],
         "refused": refused,
+        "outside_records": outside,
+        "outside_text": describe_outside(outside),
     }
+
+
+def _outside_records(
+    study: Study, records: Mapping[str, Mapping[str, Any]], limb: LimbGeometry | None
+) -> dict[str, list[dict[str, Any]]]:
+    """What other records, planned indentations and the socket do that no fitted record does, by name.
+
+    Only what is known before a simulation: times, pressure, depth, and places where the limb is known.
+    """
+    axis = None if limb is None else LimbAxis(limb.anatomy)
+
+    def describe(one: Record | Site, tested: RecordedRange | None = None) -> list[Extent]:
+        site = one.site if isinstance(one, Record) else one
+        facts = records.get(one.name) or _plan(site)
+        return describe_indentation(
+            LoadHistory.from_knots(facts["knots_s"], facts["knots_N"] or facts["knots_mm"]),
+            facts["depth_mm"],
+            study.indenter_of(one),
+            None if limb is None else limb.place(site),
+            axis,
+            force_N=facts["peak_force_N"],
+            tested=tested,
+        )
+
+    fitted = study.records_at(*study.fitted)
+    if not fitted:
+        return {}
+    places = [limb.place(site)[0] for site in study.fitted] if limb is not None else []
+    angles = axis.measure_angle(np.array(places)).tolist() if axis is not None else ()
+    tested = RecordedRange.from_records(map(describe, fitted), angles)
+    held = [record for record in study.recorded if not record.site.fitted]
+    planned = [site for site in study.sites if site.depth_mm is not None and not study.records_at(site)]
+    others: list[Record | Site] = [*held, *planned]
+    found = {f"site {one.name}": tested.find_outside(describe(one, tested)) for one in others}
+    if "socket" in study.model_fields_set:
+        for name, history in time_socket_loads(study.socket).items():
+            found[name_load(name)] = tested.find_outside([history.time])
+    return found
+
+
+def _plan(site: Site) -> dict[str, Any]:
+    """What is known of an indentation that a site plans, in and out."""
+    assert site.depth_mm is not None
+    ramp = site.depth_mm / site.speed_mm_s
+    knots = {"knots_s": (0.0, ramp, 2 * ramp), "knots_mm": (0.0, site.depth_mm, 0.0), "knots_N": None}
+    return {**knots, "depth_mm": site.depth_mm, "peak_force_N": None}
 
 
 def _read_secondary(

@@ -12,7 +12,7 @@ from ...study import Study
 from ..shared.context import Listener, ignore_progress
 from ..shared.store import Store
 from .run import run_experiment
-from .simulate import IDENTIFIED, choose_parameters
+from .simulate import IDENTIFIED, choose_parameters, read_recorded_range
 
 LITERATURE = "literature"
 SIMULATIONS = 6
@@ -55,6 +55,7 @@ def fit_socket(
     if origin == IDENTIFIED:
         calibration = Store(study.results).read("calibrate", "calibration.json")
         known = {key: calibration["uncertainty"][key] for key in ("covariance_log", "most_probable")}
+        known["recorded_range"] = read_recorded_range(study)
     elif samples:
         what = f"there is nothing to draw {samples} samples from: the parameters were not identified"
         raise InputError(what, place="--samples", remedy="identify them (limbfit run)")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,12 +14,14 @@ from ...study import Study
 from ..experiments.socket import NAME as SOCKET
 from ..experiments.socket_intervals import CHANGE_PERCENT
 from ..shared.context import Listener, ignore_progress
+from ..shared.loading import LoadHistory, time_socket_loads
 from ..shared.planned import SEEN
 from ..shared.store import Store
 from .run import run_experiment, study_status
 from .simulate import IDENTIFIED, choose_parameters
 
 _SENSOR_N, _MISFIT = 0.05, 0.02  # where no calibration tells: noise, and the model's error over the peak
+_HOLD_S = 30.0
 _FASTER = 5.0  # the second speed that a protocol may have, over the first
 _CORRELATION = 0.95  # of the model's error between neighbouring points of comparison
 
@@ -70,7 +72,7 @@ def plan_protocol(
     setup_s: float = 60.0,
     rest_s: float = 30.0,
     speeds_mm_s: Sequence[float] = (),
-    holds_s: Sequence[float] = (0.0, 30.0),
+    holds_s: Sequence[float] = (),
     depths_mm: Sequence[float] = (),
     determine: Sequence[str] = (),
     criterion: Criterion | None = None,
@@ -88,8 +90,10 @@ def plan_protocol(
     ----------
     minutes : of the whole session.
     setup_s, rest_s : for each site with an indenter, and for the tissue to come back after each record.
-    speeds_mm_s : to choose from; none: ``acquire.ramp_speed_mm_s`` and five times as fast, within its limit.
-    holds_s : at the deepest point, to choose from; 0: none.
+    speeds_mm_s : to choose from; none: ``acquire.ramp_speed_mm_s`` and five times as fast, or as fast as a
+        socket's loads come on, within its limit.
+    holds_s : at the deepest point, to choose from; 0: none. By default 0 and 30, or for a socket as long as
+        its loads last, within half of the session.
     depths_mm : to choose from; none: as deep as each site was recorded or is planned. No record goes deeper
         than half of the tissue's thickness.
     determine : parameters such as ``muscle.c_kPa``; by default all. ``socket``: the mean pressures of the
@@ -124,7 +128,10 @@ def plan_protocol(
             remedy="state socket alone, and A or no criterion",
         )
     used, origin = (parameters, "given") if parameters else choose_parameters(study, Store(study.results))
-    slow = study.acquire.ramp_speed_mm_s
+    times = time_socket_loads(study.socket) if pressures else {}
+    if not holds_s:
+        longest = max((one.end_s for one in times.values()), default=0.0)
+        holds_s = (0.0, max(_HOLD_S, min(longest, 30.0 * minutes - setup_s - rest_s)))
     return run_experiment(
         study,
         "protocol",
@@ -132,13 +139,13 @@ def plan_protocol(
         minutes=float(minutes),
         setup_s=float(setup_s),
         rest_s=float(rest_s),
-        speeds_mm_s=[float(v) for v in speeds_mm_s]
-        or [slow, min(_FASTER * slow, study.acquire.speed_limit_mm_s)],
+        speeds_mm_s=[float(v) for v in speeds_mm_s] or _speeds(study, times.values(), depths_mm),
         holds_s=[float(hold) for hold in holds_s],
         depths_mm=[float(depth) for depth in depths_mm],
         determine=[] if pressures else list(determine),
         criterion=criterion or ("A" if pressures else "D"),
         pressures=pressures,
+        socket_times={name: [one.ramp_s, one.end_s] for name, one in times.items()},
         draws=draws,
         seed=seed,
         parameters=used,
@@ -146,6 +153,21 @@ def plan_protocol(
         noise=_find_noise(study, origin),
         seen=dict(zip(SEEN, (ultrasound_sd_mm, surface_sd_mm, shear_waves_sd_m_s), strict=True)),
     )
+
+
+def _speeds(study: Study, loads: Iterable[LoadHistory], depths_mm: Sequence[float]) -> list[float]:
+    """The study's speed, and five times that or as fast as the ``loads`` of a socket come on, mm/s.
+
+    The deepest record then takes as long as the load that comes on fastest.
+    """
+    slow, limit = study.acquire.ramp_speed_mm_s, study.acquire.speed_limit_mm_s
+    stated = [site.depth_mm for site in study.sites if site.depth_mm is not None]
+    store = Store(study.results)
+    if store.stamp("traces") is not None:
+        stated += [facts["depth_mm"] for facts in store.read("traces", "traces.json")["sites"].values()]
+    deepest = max(depths_mm or stated, default=0.0)
+    fast = max((deepest / one.ramp_s for one in loads), default=0.0)
+    return [slow, min(max(_FASTER * slow, fast), limit)]
 
 
 def _read_socket_pressures(study: Study) -> dict[str, list[float]]:

@@ -371,9 +371,13 @@ def summarise(study: Study) -> dict[str, Any]:
         predicted = store.read("predict", "predict.json")
         columns = ("site", "record", "region", "fitted", "peak_force_N", "error_percent")
         summary["sites"] = [
-            {**{key: row[key] for key in columns}, "warnings": row.get("warnings", [])}
+            {
+                **{key: row[key] for key in columns},
+                **{key: row.get(key, []) for key in ("warnings", "outside_records")},
+            }
             for row in predicted["sites"]
         ]
+        summary["outside_text"] = predicted.get("outside_text", [])
         for key in ("mean_error_fitted_percent", "mean_error_heldout_percent"):
             summary[key] = predicted[key]
         summary["flags"] = predicted.get("flags", [])

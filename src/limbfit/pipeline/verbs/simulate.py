@@ -10,12 +10,15 @@ from ...errors import InputError
 from ...execution import SerialExecutor
 from ...fe import Problem, Result
 from ...febio import FebSettings, build_result, compute_end_time, find_febio, run_febio, write_feb
+from ...identify.checks.domain import RecordedRange, describe_outside
 from ...indentation import Parameters, SiteModel, build_first_steps, build_problem, simulate_fields
 from ...mesh import read_vtu
 from ...study import Indentation as Planned
-from ...study import Study
+from ...study import Record, Study
 from ..shared.artefacts import write_curves, write_json
 from ..shared.context import Context, Listener, ignore_progress
+from ..shared.limb import LimbGeometry
+from ..shared.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
 from ..shared.simulations import CURVE_POINTS, build_model
 from ..shared.store import Store
 from .run import compute_keys, run_study
@@ -115,6 +118,7 @@ def simulate_site(
         force_N=result.force_at(times + model.waits_s),
     )
     summary = _summarise(found, result, "limbfit" if program is None else result.statistics["linear_solver"])
+    summary |= _compare_with_records(found, result, None if program else fields)
     files = {
         "curve": curve,
         "fields": fields if fields.is_file() and (by_febio or result.states) else None,
@@ -124,6 +128,32 @@ def simulate_site(
     beside = {kind: file and file.relative_to(folder).as_posix() for kind, file in files.items()}
     write_json(folder / f"{name}.json", summary | beside)
     return summary | {kind: file and str(file) for kind, file in files.items()}
+
+
+def _compare_with_records(found: Indentation, result: Result, fields: Path | None) -> dict[str, Any]:
+    """What of an indentation no fitted record did, and in words; None where that is not known.
+
+    ``fields`` at its deepest point; without them strains are not compared.
+    """
+    study, model = found.context.study, found.model
+    stored = read_recorded_range(study) if found.origin == IDENTIFIED else None
+    if stored is None:
+        return {"outside_records": None, "outside_text": []}
+    tested, limb = RecordedRange.from_dict(stored), LimbGeometry.stored(found.context.store)
+    site = found.stated.site if isinstance(found.stated, Record) else found.stated
+    rows = tested.find_outside(
+        describe_indentation(
+            LoadHistory.from_knots(model.knots_s, model.knots_N or model.knots_mm),
+            float(result.displacement.max()) if model.forced else max(model.knots_mm),
+            model.indenter,
+            limb.place(site),
+            LimbAxis(limb.anatomy),
+            force_N=result.peak_force,
+            strains=read_strain_extents(fields) if fields is not None and fields.is_file() else (),
+            tested=tested,
+        )
+    )
+    return {"outside_records": rows, "outside_text": describe_outside({f"site {found.name}": rows})}
 
 
 def _summarise(found: Indentation, result: Result, solver: str) -> dict[str, Any]:
@@ -165,6 +195,15 @@ def run_febio_site(found: Indentation, program: Path, folder: Path) -> tuple[Res
     end = compute_end_time(problem)
     run = run_febio(program, folder, end, FORCES, threads=options.threads, time_limit_s=options.time_limit_s)
     return build_result(problem, run.log, run.verdict, run.seconds), folder / "model.xplt"
+
+
+def read_recorded_range(study: Study) -> dict[str, Any] | None:
+    """What the fitted records did to the tissue; None where the prediction, which stores it, is not done."""
+    store = Store(study.results)
+    if store.state("predict", compute_keys(study)["predict"]).state != "done":
+        return None
+    tested: dict[str, Any] = store.read("predict", "predict.json")["recorded_range"]
+    return tested
 
 
 def choose_parameters(study: Study, store: Store) -> tuple[Parameters, str]:

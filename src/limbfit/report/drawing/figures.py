@@ -21,6 +21,7 @@ from .colours import (
     MUTED,
     ONE_MATERIAL,
     SIMULATED,
+    THIRD,
     TRUTH,
     choose_tissue_style,
     choose_truth_style,
@@ -81,6 +82,49 @@ def _draw_forces(ax: Axes, curves: Curves, against: str, materials: str) -> None
     if simulated is not None:
         ax.plot(x, simulated, color=SIMULATED, label=materials)
     ax.margins(x=0.01)
+
+
+@plots.styled
+def draw_domain_figure(store: Results) -> Figure | None:
+    """Times and shear of each tissue: those of the records, and those of predictions and of the socket."""
+    tested = _read_extents(store.predict.get("recorded_range", {}).get("extents"))
+    tissues = [tissue for quantity, tissue in tested if quantity == "shear strain" and tissue]
+    if not tissues:
+        return None
+    socket = store.experiments.get("socket") or {"donning": {}, "loads": []}
+    rows = [
+        *((row["loading"], "fitted record", FITTED, "") for row in store.predicted if row["fitted"]),
+        *((row["loading"], "held-out record", HELD_OUT, "") for row in store.predicted if not row["fitted"]),
+        *((one.get("loading"), "socket", THIRD, str(one["name"])) for one in socket["loads"]),
+    ]
+    drawing, axes = plots.make_panels(len(tissues), 3, 2.4)
+    plots.label_outer(axes, 3, "Time (s)", "Shear strain")
+    for ax, tissue in zip(axes, tissues, strict=True):
+        time, shear = tested["time", None], tested["shear strain", tissue]
+        ax.fill_between(time, 0.0, shear[1], color=FITTED, alpha=0.15, lw=0, label="what the records tell")
+        for loading, label, color, name in rows:
+            own = _read_extents(loading)
+            if ("shear strain", tissue) in own:
+                own_time, (_, high) = own["time", None], own["shear strain", tissue]
+                ax.plot(own_time, (high, high), color=color, marker="|", label=label)
+                ax.annotate(name, (own_time[1], high), xytext=(0, 3), textcoords="offset points", ha="right")
+        plots.set_log_scale(ax, minor=not socket["loads"])
+        ax.set_ylim(bottom=0.0)
+        ax.set_title(tissue)
+    handles = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
+    drawing.legend(list(handles.values()), list(handles), loc="outside upper left", ncols=4, labelcolor=INK)
+    caption = (
+        "Where the answer ends: each line is a record, or a load of the socket, from its shortest ramp to "
+        "its end (from the first touch), at the shear strain that 1 % of the tissue near the load exceeds. "
+        "The identified parameters are tested inside the shaded area alone."
+    )
+    alt = "Time and shear strain of records, predictions and socket loads, by tissue"
+    return plots.make_figure(drawing, "domain", alt, caption)
+
+
+def _read_extents(loading: Iterable[Json] | None) -> dict[tuple[str, str | None], tuple[float, float]]:
+    """The stored range of each quantity, by its name and tissue."""
+    return {(one["quantity"], one["tissue"]): (one["low"], one["high"]) for one in loading or ()}
 
 
 @plots.styled

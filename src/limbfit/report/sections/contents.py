@@ -14,7 +14,7 @@ from .design import make_design_section, make_protocol_section
 from .methods import make_method_section
 from .model import make_mesh_section, make_model_section
 from .parameters import make_parameter_section
-from .prediction import make_fit_section, make_prediction_section
+from .prediction import make_domain_section, make_fit_section, make_prediction_section
 from .provenance import make_provenance_section, make_settings_section, make_timing_section
 from .record_checks import make_record_check_section
 from .records import make_record_section
@@ -57,6 +57,7 @@ def make_page(store: Results) -> Page:
         make_record_section(store),
         make_fit_section(store),
         make_prediction_section(store),
+        make_domain_section(store) if "recorded_range" in store.predict else None,
         make_record_check_section(store) if "flags" in store.predict else None,
         make_parameter_section(store),
         make_convergence_section(store),

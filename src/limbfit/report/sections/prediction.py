@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from ..drawing import figures
 from ..drawing.pictures import draw_field_figure
-from ..formats import NOTHING, format_fixed
-from ..page import Cell, Note, Row, Section, Table, make_section
+from ..formats import NOTHING, format_fixed, number
+from ..page import Cell, Note, Prose, Row, Section, Table, make_section
 from ..store import Json, Results
 from ..tables import Column, make_row, make_table, to_numeric
 
@@ -46,6 +46,53 @@ def make_prediction_section(store: Results) -> Section:
         Note(unseen) if store.predicted and not rows else None,
         otherwise="No predictions are stored yet.",
     )
+
+
+def make_domain_section(store: Results) -> Section:
+    """What predictions and the socket do to the tissue that no fitted record did."""
+    socket = store.experiments.get("socket") or {"loads": []}
+    held = [{"record": "socket, donning", **socket["donning"]}] if "donning" in socket else []
+    held += [{**load, "record": f"socket, {load['name']}"} for load in socket["loads"]]
+    rows = [
+        {"record": one["record"], **row}
+        for one in (*store.predicted, *held)
+        for row in one.get("outside_records") or ()
+    ]
+    within = "Every prediction lies within what the fitted records did to the tissue."
+    return make_section(
+        "domain",
+        "Where the answer ends",
+        Prose(
+            "Parameters are tested by what the records did to the tissue: how far they strained it, how "
+            "fast, for how long, and where. A small error at held-out sites says nothing beyond that."
+        ),
+        map(Note, [*store.predict.get("outside_text", ()), *socket.get("outside_text", ())]),
+        figures.draw_domain_figure(store),
+        make_outside_table(rows) if rows else Note(within),
+    )
+
+
+def make_outside_table(rows: Iterable[Json]) -> Table:
+    """Each quantity of a prediction that goes beyond the records, with both ranges."""
+    caption = (
+        "What goes beyond the fitted records. Strain and pressure: what 1 % of the volume near the load, or "
+        "of the area, exceeds. Outside: the share of it, or else of the range, that is beyond the records."
+    )
+    columns = (
+        ("Prediction", "record"),
+        ("Quantity", "quantity"),
+        ("Tissue", "tissue"),
+        ("Unit", "unit"),
+        ("Records", lambda row: to_numeric(_format_range(row["records"]))),
+        ("Prediction", lambda row: to_numeric(_format_range(row["prediction"]))),
+        ("Outside (%)", lambda row: to_numeric(format_fixed(100.0 * row["share"], 0))),
+    )
+    return make_table("outside-records", caption, columns, rows)
+
+
+def _format_range(limits: Sequence[float]) -> str:
+    low, high = (number(value, 2) for value in limits)
+    return f"to {high}" if limits[0] == 0.0 else f"{low} to {high}"
 
 
 def make_site_table(store: Results) -> Table:

@@ -60,7 +60,7 @@ def make_socket_section(store: Results, content: Json) -> Section:
             "largest mean over one face of the mesh, which grows as faces get smaller. The limb is at most "
             f"{content['penetration_mm']:.2f} mm in the wall."
         ),
-        map(Note, content["warnings"]),
+        map(Note, [*content["warnings"], *content.get("outside_text", ())]),
     )
 
 

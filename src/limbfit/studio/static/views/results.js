@@ -189,7 +189,8 @@ class ResultsView {
       ...kept.map((run) => el("option", { value: run.name }, `${run.name} (${run.since.slice(0, 16).replace("T", " ")})`)));
     this.compareWith.value = this.other;
     this.drop.hidden = !this.other;
-    replace(this.compared, this.siteTable(), this.parameterTable());
+    const outside = this.outcome.outside.map((text) => el("p", { class: "hint doubt" }, `⚠ ${text}`));
+    replace(this.compared, this.siteTable(), ...outside, this.parameterTable());
   }
 
   async compare(name) {

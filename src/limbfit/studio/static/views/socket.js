@@ -207,7 +207,8 @@ class SocketView {
     if (told.includes(null)) return;
     this.words.textContent = told.length > 1 ? told.map((text, i) => `${this.panes[i].run.run}: ${text}`).join(" | ") : told[0];
     this.slider.setAttribute("aria-valuetext", name);
-    replace(this.table, told.length > 1 ? compared(this.panes) : single(this.panes[0].step));
+    const outside = this.panes[0].run.outside.map((text) => el("p", { class: "hint doubt" }, `⚠ ${text}`));
+    replace(this.table, told.length > 1 ? compared(this.panes) : single(this.panes[0].step), ...outside);
   }
 }
 
