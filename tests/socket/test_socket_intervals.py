@@ -8,7 +8,7 @@ import pytest
 from limbfit.fe import SimulationWarning
 from limbfit.identify.uncertainty.uncertainty import NORMAL_95
 from limbfit.pipeline.experiments.socket_intervals import (
-    ParameterSpread,
+    SimulationSpread,
     draw_step,
     spread_to_facts,
     widen_intervals,
@@ -21,7 +21,7 @@ COVARIANCE = np.array([[0.04, -0.015], [-0.015, 0.09]])
 
 
 def test_interval_and_shares_are_those_of_drawn_parameters():
-    spread = ParameterSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
+    spread = SimulationSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
     interval, shares, changes = spread.told(50.0, SLOPES)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(2), COVARIANCE, 200_000)
     values = 50.0 + draws @ SLOPES[:2]
@@ -34,16 +34,16 @@ def test_interval_and_shares_are_those_of_drawn_parameters():
 
 
 def test_an_interval_covers_the_most_probable_parameters_too():
-    plain, _, _ = ParameterSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2)).told(50.0, SLOPES)
+    plain, _, _ = SimulationSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2)).told(50.0, SLOPES)
     for step in (0.3, -0.3):  # of the skin's c, whose slope is 3 kPa
-        (low, high), _, _ = ParameterSpread(NAMES, (0, 1), COVARIANCE, np.array([step, 0.0])).told(
+        (low, high), _, _ = SimulationSpread(NAMES, (0, 1), COVARIANCE, np.array([step, 0.0])).told(
             50.0, SLOPES
         )
         assert (low, high) == pytest.approx((plain[0] + min(3 * step, 0.0), plain[1] + max(3 * step, 0.0)))
 
 
 def test_what_is_stored_has_the_same_keys_with_and_without_intervals():
-    spread = ParameterSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
+    spread = SimulationSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
     known = spread_to_facts(spread, "settling_", "mm", 5.0, SLOPES)
     assert known.keys() == spread_to_facts(None, "settling_", "mm", 5.0, None).keys()
     assert known["settling_interval_mm"][0] >= 0.0
@@ -59,7 +59,7 @@ def facts(value: float, **known) -> dict:
 
 def test_what_derivatives_miss_of_simulated_draws_widens_the_intervals():
     """A value that bends by as much as it slopes: its 95 % interval holds 83 % of other draws, then 91 %."""
-    spread = ParameterSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
+    spread = SimulationSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
 
     def value(step) -> float:
         return 50.0 + step @ SLOPES[:2] + 8.0 * step[1] ** 2

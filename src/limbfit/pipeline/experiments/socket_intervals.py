@@ -28,7 +28,7 @@ _CHANGE = float(np.log1p(CHANGE_PERCENT / 100.0))
 
 
 @dataclass(frozen=True, eq=False)
-class ParameterSpread:
+class SimulationSpread:
     """How well a simulation's parameters are known.
 
     Attributes
@@ -47,7 +47,7 @@ class ParameterSpread:
     @classmethod
     def of(
         cls, study: Study, names: Sequence[tuple[str, str]], covariance: Array, off: Array
-    ) -> ParameterSpread:
+    ) -> SimulationSpread:
         """For a simulation whose parameters have ``names``, tissue and name, of `Problem.parameter_names`.
 
         ``covariance`` and ``off`` are those of all of the study's parameters, tissue by tissue.
@@ -86,7 +86,7 @@ def _find_key(law: TissueLaw, name: str) -> str:
 
 
 def spread_to_facts(
-    spread: ParameterSpread | None, name: str, unit: str, value: float, slopes: Array | None
+    spread: SimulationSpread | None, name: str, unit: str, value: float, slopes: Array | None
 ) -> dict[str, Any]:
     """As it is stored: interval, shares and changes of a value, by keys with its name and unit; or none."""
     keys = (f"{name}interval_{unit}", f"{name}interval_from", f"{name}change_{unit}")

@@ -46,7 +46,7 @@ from ..shared.simulations import find_fibre_directions
 from ..shared.socket_shape import build_regions, find_covered_regions, load_of, mesh_edge_mm
 from ..shared.sources import code_digest
 from ..stages.mesh import is_meshed, keep_mesh, mesh_settings, read_stored_depth
-from .socket_intervals import ParameterSpread, spread_to_facts
+from .socket_intervals import SimulationSpread, spread_to_facts
 
 Mask = NDArray[np.bool_]
 
@@ -209,7 +209,7 @@ class SocketLimb:
         """What is stored of a simulation, with intervals where covariance (p, p) and ``off`` (p,) are."""
         fit = self.fit(socket)
         spread = (
-            None if known is None else ParameterSpread.of(self.study, found.result.parameter_names, *known)
+            None if known is None else SimulationSpread.of(self.study, found.result.parameter_names, *known)
         )
         mesh = found.result.problem.mesh
         faces = self.faces(mesh, socket)
@@ -344,7 +344,7 @@ def _describe_stop(found: Donned, fit: SocketFit) -> str:
     )
 
 
-def _loaded_to_dict(one: Held, spread: ParameterSpread | None) -> dict[str, Any]:
+def _loaded_to_dict(one: Held, spread: SimulationSpread | None) -> dict[str, Any]:
     def of(name: str, patch: Patch) -> dict[str, Any]:
         known = spread_to_facts(spread, "", "kPa", patch.mean_kPa, one.slopes.get(name))
         return {"region": name, **asdict(patch), **known}
