@@ -32,7 +32,7 @@ from limbfit.identify.uncertainty.uncertainty import NORMAL_95
 from limbfit.indentation import list_flat_names, to_parameters, to_vector
 from limbfit.mesh import Mesh
 from limbfit.phantom.build import draw_true_parameters
-from limbfit.pipeline.experiments.socket_intervals import draw_step, predict_change
+from limbfit.pipeline.experiments.socket_intervals import ParameterSpread, draw_step, predict_change
 from limbfit.pipeline.experiments.socket_limb import SocketLimb
 from limbfit.pipeline.shared.context import Context, ignore_progress
 from limbfit.pipeline.shared.socket_shape import build_socket
@@ -67,7 +67,7 @@ class Bench:
         limb, started = replace(self.limb, study=study), time.process_time()
         laws = limb.materials(to_parameters(parameters, study.tissues))
         found = limb.don(self.mesh, laws, self.socket, lambda *_: None, known)
-        around = (self.covariance, np.zeros_like(self.centre)) if known else None
+        around = ParameterSpread(self.covariance, np.zeros_like(self.centre)) if known else None
         load = limb.facts(found, self.socket, around)["loads"][-1]
         row = {"values": {one["region"]: one["mean_kPa"] for one in load["regions"]}}
         row["values"][SETTLING] = load["settling_mm"]

@@ -37,6 +37,12 @@ class Bars:
     depth: float
     points: int = 60
 
+    @staticmethod
+    def elastic(section: float, stretch: np.ndarray, c: float, m: float) -> np.ndarray:
+        """Elastic force of a bar, N."""
+        powers = stretch ** (m - 1) - stretch ** (-m - 1) - stretch ** (-m / 2 - 1) + stretch ** (m / 2 - 1)
+        return -section * c * 1e-3 / m * powers
+
     def force(self, p: np.ndarray) -> np.ndarray:
         """Force (points,) N at evenly spread times of loading and unloading."""
         n = self.points
@@ -44,11 +50,7 @@ class Bars:
         travel = 0.96 * np.minimum(time, time[-1] - time)
         total = np.zeros(n, dtype=p.dtype)
         for section, length, (c, m, gamma, tau) in zip(self.sections, self.lengths, p.reshape(-1, 4)):
-            stretch = 1 - travel / length
-            powers = (
-                stretch ** (m - 1) - stretch ** (-m - 1) - stretch ** (-m / 2 - 1) + stretch ** (m / 2 - 1)
-            )
-            elastic = -section * c * 1e-3 / m * powers
+            elastic = self.elastic(section, 1 - travel / length, c, m)
             dt = time[1] - time[0]
             decay, history = np.exp(-dt / tau), np.zeros(n, dtype=p.dtype)
             rise = (1 - decay) / (dt / tau)

@@ -11,7 +11,7 @@ from stored_results import NAMES, write_results
 from limbfit.priors import SOURCE
 from limbfit.report.page import Prose, Table
 from limbfit.report.sections.methods import describe_constraints
-from limbfit.report.sections.parameters import describe_priors, make_parameter_section
+from limbfit.report.sections.parameters import describe_priors, describe_relaxation, make_parameter_section
 from limbfit.report.store import load_store
 
 
@@ -68,3 +68,25 @@ def test_the_methods_say_that_people_were_asked() -> None:
         "Lognormal priors of c and m were those of people; "
         "lognormal priors were put on muscle.m: median 3.0, factor 1.25."
     )
+
+
+def test_moduli_at_several_times_are_shown_with_what_the_records_prefer(results: Path) -> None:
+    assert describe_relaxation(load_store(results)) == ()
+    file = results / "calibrate" / "calibration.json"
+    content = json.loads(file.read_text())
+    content["uncertainty"]["relaxation"] = {
+        "words": ["the records cannot tell the relaxation of the model from a power law of time"],
+        "moduli": [
+            {"tissue": "muscle", "time_s": time, "modulus_kPa": 5.0, "interval_95": [low, 5.5]}
+            for time, low in ((1.0, 4.6), (3600.0, 1.0))
+        ],
+        "prior": {"slope": [0.0, 0.3], "source": "published tissue"},
+        "beyond": {"longest_s": 12.6},
+    }
+    file.write_text(json.dumps(content))
+    words, table = describe_relaxation(load_store(results))
+    assert words.text.startswith("The records cannot tell")
+    assert "after 13 s" in words.text
+    assert "published tissue" in words.text
+    rows = [[cell.text for cell in row.cells] for row in table.rows]
+    assert [row[2:] for row in rows] == [["5.00", "4.60 to 5.50"], ["5.00", "1.00 to 5.50"]]

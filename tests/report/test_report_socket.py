@@ -67,6 +67,7 @@ def test_the_command_says_what_most_of_an_interval_comes_from(capsys):
             "balance_percent": 0.01,
             "outside_text": ["the load 'stance' lasts 3600 s; the records last 13 s"],
             "samples": {"simulated": 5, "failed": ["the load could not be carried"]},
+            "worn_s": 3600.0,
         }
     )
     printed = capsys.readouterr()

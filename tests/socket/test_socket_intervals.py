@@ -8,6 +8,7 @@ import pytest
 from limbfit.fe import SimulationWarning
 from limbfit.identify.uncertainty.uncertainty import NORMAL_95
 from limbfit.pipeline.experiments.socket_intervals import (
+    ParameterSpread,
     SimulationSpread,
     draw_step,
     spread_to_facts,
@@ -20,9 +21,14 @@ SLOPES = np.array([3.0, -1.0, 2.0])
 COVARIANCE = np.array([[0.04, -0.015], [-0.015, 0.09]])
 
 
+def spread_of(off=(0.0, 0.0), shift=(0.0, 0.0), relaxation=((0.0, 0.0), (0.0, 0.0))) -> SimulationSpread:
+    known = ParameterSpread(COVARIANCE, np.array(off))
+    return SimulationSpread(NAMES, (0, 1), known.relax(1.0, np.array(shift), np.array(relaxation)))
+
+
 def test_interval_and_shares_are_those_of_drawn_parameters():
-    spread = SimulationSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
-    interval, shares, changes = spread.told(50.0, SLOPES)
+    spread = spread_of()
+    interval, shares, changes, _ = spread.told(50.0, SLOPES)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(2), COVARIANCE, 200_000)
     values = 50.0 + draws @ SLOPES[:2]
     assert (interval[1] - interval[0]) / 2 == pytest.approx(NORMAL_95 * values.std(), rel=0.01)
@@ -34,16 +40,28 @@ def test_interval_and_shares_are_those_of_drawn_parameters():
 
 
 def test_an_interval_covers_the_most_probable_parameters_too():
-    plain, _, _ = SimulationSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2)).told(50.0, SLOPES)
+    plain, *_ = spread_of().told(50.0, SLOPES)
     for step in (0.3, -0.3):  # of the skin's c, whose slope is 3 kPa
-        (low, high), _, _ = SimulationSpread(NAMES, (0, 1), COVARIANCE, np.array([step, 0.0])).told(
-            50.0, SLOPES
-        )
+        (low, high), *_ = spread_of([step, 0.0]).told(50.0, SLOPES)
         assert (low, high) == pytest.approx((plain[0] + min(3 * step, 0.0), plain[1] + max(3 * step, 0.0)))
 
 
+def test_an_interval_counts_relaxation_beyond_the_records_and_holds_the_value():
+    """Moduli fall by 40 % on average, with a deviation of 20 %; the simulated value stays inside."""
+    further = np.array([[0.04, 0.0], [0.0, 0.0]])
+    interval, _, _, (moved, sd) = spread_of(shift=[-0.4, 0.0], relaxation=further).told(50.0, SLOPES)
+    draws = np.random.default_rng(0).multivariate_normal([-0.4, 0.0], COVARIANCE + further, 200_000)
+    values = 50.0 + draws @ SLOPES[:2]
+    assert (moved, sd) == pytest.approx((3.0 * -0.4, 3.0 * 0.2))
+    half = NORMAL_95 * values.std()
+    assert interval == pytest.approx([values.mean() - half, values.mean() + half], abs=0.05)
+    (low, high), *_ = spread_of(shift=[-4.0, 0.0]).told(50.0, SLOPES)
+    assert low < 50.0 - 12.0
+    assert high == 50.0
+
+
 def test_what_is_stored_has_the_same_keys_with_and_without_intervals():
-    spread = SimulationSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
+    spread = spread_of()
     known = spread_to_facts(spread, "settling_", "mm", 5.0, SLOPES)
     assert known.keys() == spread_to_facts(None, "settling_", "mm", 5.0, None).keys()
     assert known["settling_interval_mm"][0] >= 0.0
@@ -59,7 +77,7 @@ def facts(value: float, **known) -> dict:
 
 def test_what_derivatives_miss_of_simulated_draws_widens_the_intervals():
     """A value that bends by as much as it slopes: its 95 % interval holds 83 % of other draws, then 91 %."""
-    spread = SimulationSpread(NAMES, (0, 1), COVARIANCE, np.zeros(2))
+    spread = spread_of()
 
     def value(step) -> float:
         return 50.0 + step @ SLOPES[:2] + 8.0 * step[1] ** 2

@@ -303,6 +303,8 @@ def show_parameters(summary: dict[str, Any]) -> None:
         for tissue, known in values.items():
             table.add_row(f"{tissue}, {kind}", *(f"{known[name]:.3g}" for name in names))
     STDOUT.print(table)
+    for text in summary.get("relaxation", {}).get("words", ()):
+        STDOUT.print(f"relaxation: {text}", soft_wrap=True)
 
 
 def show_sites(summary: dict[str, Any]) -> None:

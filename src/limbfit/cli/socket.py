@@ -87,6 +87,11 @@ def show_socket(found: dict[str, Any]) -> None:
         drawn, failed = found["samples"]["simulated"], found["samples"]["failed"]
         words = "".join(f"; another failed: {reason}" for reason in failed)
         STDOUT.print(f"95 %: by derivatives and {drawn} simulated draws{words}", soft_wrap=True)
+    if found["worn_s"]:
+        STDOUT.print(
+            f"95 %: with what relaxation may do until the socket has been worn for {found['worn_s']:g} s",
+            soft_wrap=True,
+        )
     STDOUT.print(
         f"tissues: {found['parameters_from']}; contact balances the loads within "
         f"{found['balance_percent']:.2g} %; not a medical device",

@@ -112,6 +112,7 @@ class SocketTable(TomlTable):
     donning_s: Positive = 2.0
     travel_mm: Positive | None = None
     hold_s: Length = 10.0
+    worn_s: Positive = 3600.0
     body_weight_N: Annotated[float, Field(ge=50, le=3000)] = 800.0
     loads: tuple[SocketLoadTable, ...] = (SocketLoadTable(name="single stance", preset="single stance"),)
     regions: tuple[SocketRegionTable, ...] = ()

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 from scipy.special import chdtrc
 
@@ -90,7 +91,7 @@ def assess_fit(
     residual_N: Array,
     peak_N: float,
     covariance: Array,
-    inside: Array | None = None,
+    inside: NDArray[np.bool_] | None = None,
     refitted_N: Array | None = None,
 ) -> FitQuality:
     """Assess ``residual_N`` (n,), simulated minus measured, with ``covariance`` (n, n) of what may be off.

@@ -57,13 +57,62 @@ def compute_prediction_sd(
 
 
 @dataclass(frozen=True)
+class RelaxationSpread:
+    """What other relaxations that fit the records say of the parameters ``durations_s`` (d,) after a step.
+
+    Forces then follow from the moduli at that time, with the logarithms' mean ``shift_log`` (d, p) over those
+    of the answer and the covariance ``own_weight`` times that of the answer plus ``covariance_log``
+    (d, p, p). ``longest_s`` is the longest load in the records.
+    """
+
+    longest_s: float
+    own_weight: float
+    durations_s: Array
+    shift_log: Array
+    covariance_log: Array
+
+    def interpolate(self, duration_s: float) -> tuple[Array, Array]:
+        """Return shift (p,) and covariance (p, p) at a duration, from its logarithm."""
+        at = float(np.interp(np.log(duration_s), np.log(self.durations_s), np.arange(len(self.durations_s))))
+        i = min(int(at), len(self.durations_s) - 2)
+        weights = np.array([i + 1 - at, at - i])
+        return weights @ self.shift_log[i : i + 2], np.tensordot(weights, self.covariance_log[i : i + 2], 1)
+
+    def compute_beyond_N(self, slopes: Array, times_s: Array) -> tuple[Array, Array]:
+        """Return shift and standard deviation (n,) of forces at times beyond the records' longest load.
+
+        ``slopes`` (n, p) are by the logarithms of the parameters. Both are zero within the records' times.
+        """
+        shift, sd = np.zeros(len(times_s)), np.zeros(len(times_s))
+        for i in np.flatnonzero(times_s > self.longest_s):
+            by_log, covariance = self.interpolate(float(times_s[i]))
+            shift[i], sd[i] = slopes[i] @ by_log, np.sqrt(slopes[i] @ covariance @ slopes[i])
+        return shift, sd
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-like values."""
+        return {
+            "longest_s": self.longest_s,
+            "own_weight": self.own_weight,
+            "durations_s": self.durations_s.tolist(),
+            "shift_log": self.shift_log.tolist(),
+            "covariance_log": self.covariance_log.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, stored: dict[str, Any]) -> RelaxationSpread:
+        arrays = [np.array(stored[key]) for key in ("durations_s", "shift_log", "covariance_log")]
+        return cls(float(stored["longest_s"]), float(stored["own_weight"]), *arrays)
+
+
+@dataclass(frozen=True)
 class PredictionModel:
     """What a prediction interval needs of a stored uncertainty (``Uncertainty``, ``ResidualModel.to_dict``).
 
     ``sites`` holds noise and misfit of the fitted records, and ``known_scale`` the number of independent
     residuals from which the size of the misfit is known. ``site_factor`` is the deviation of whole sites over
     the expected one. ``most_probable`` (p,) are the most probable parameters, which may differ from those of
-    least error.
+    least error. ``relaxation`` is what is added beyond the longest load in the records.
     """
 
     covariance_log: Array
@@ -72,18 +121,21 @@ class PredictionModel:
     misfit_elsewhere: float
     known_scale: float
     site_factor: float = 1.0
+    relaxation: RelaxationSpread | None = None
 
     @classmethod
     def from_stored(cls, uncertainty: dict[str, Any]) -> PredictionModel:
         """Build the model from the part ``uncertainty`` of ``calibration.json``."""
-        residuals = uncertainty["residuals"]
+        residuals, probable = uncertainty["residuals"], uncertainty["most_probable"]
+        relaxation = (uncertainty.get("relaxation") or {}).get("beyond")
         return cls(
             np.array(uncertainty["covariance_log"]),
-            np.array([value for one in uncertainty["most_probable"].values() for value in one.values()]),
+            np.array([value for one in probable.values() for value in one.values()]),
             residuals["sites"],
             float(residuals["misfit_elsewhere"]),
             float(residuals["known_scale"]),
             float(residuals.get("site_factor") or 1.0),
+            None if relaxation is None else RelaxationSpread.from_dict(relaxation),
         )
 
     def find_residual_sd(self, site: str, unit: str = "N") -> tuple[float, float]:
@@ -111,6 +163,7 @@ class PredictionModel:
         name: str,
         unit: str = "N",
         site_N: Array | float = 0.0,
+        times_s: Array | None = None,
     ) -> tuple[Array, Array]:
         """Return the 95 % interval of a new record, two arrays (n,) in N.
 
@@ -118,14 +171,21 @@ class PredictionModel:
         simulated at the ``parameters`` (p,), and its linearised value at the most probable parameters. It is
         in mm for a record that compares depths (``unit``). The misfit is known from few residuals only, so
         the interval takes Student's quantile with Satterthwaite's degrees of freedom. ``site_N`` (n,) is one
-        standard deviation of the stiffness that is expected of a site that was not fitted.
+        standard deviation of the stiffness that is expected of a site that was not fitted. Beyond the longest
+        load in the records, by ``times_s`` (n,), the interval counts what relaxation may do there.
         """
         noise_N, misfit = self.find_residual_sd(name, unit)
         misfit_N = misfit * find_largest_magnitude(response.force_N)
         own_N = np.hypot(np.hypot(noise_N, misfit_N), self.site_factor * np.abs(site_N))
+        shift_N: Array | float = 0.0
+        if self.relaxation is not None and times_s is not None:
+            slopes = response.jacobian * parameters
+            shift_N, relaxation_N = self.relaxation.compute_beyond_N(slopes, times_s)
+            own_N = np.hypot(own_N, relaxation_N)
         sd = compute_prediction_sd(response.jacobian, parameters, self.covariance_log, own_N)
         share = misfit_N**2 / np.maximum(sd, 1e-300) ** 2
         freedom = np.clip(self.known_scale / np.maximum(share, 1e-3) ** 2, 3.0, 1e6)
         half, off = stdtrit(freedom, 0.975) * sd, np.log(self.most_probable / parameters)
         other = response.force_N + response.jacobian @ (parameters * off)
-        return np.minimum(response.force_N, other) - half, np.maximum(response.force_N, other) + half
+        low, high = np.minimum(response.force_N, other), np.maximum(response.force_N, other)
+        return low + np.minimum(shift_N, 0.0) - half, high + np.maximum(shift_N, 0.0) + half

@@ -143,7 +143,7 @@ _OWN: tuple[Experiment, ...] = (
         tables=("socket", "geometry", "mesh", "material"),
         apart=("socket.design",),
         options={"parameters": {}, "parameters_from": "", "covariance_log": None}
-        | {"most_probable": None, "recorded_range": None, "samples": 0},
+        | {"most_probable": None, "recorded_range": None, "relaxation": None, "samples": 0},
         check=check_socket,
     ),
     Experiment(

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...anatomy.surfaces.surfaces import write_surface
+from ...arrays import Array
 from ...donning import Donned
 from ...donning.model import OUTER
 from ...identify.checks.domain import Extent, RecordedRange, describe_outside
+from ...identify.fit.prediction import RelaxationSpread
 from ...indentation import Parameters
 from ...mesh import Mesh, write_vtu
 from ...socket import Socket
@@ -26,7 +27,14 @@ from ..shared.kept import Begun, ResultFiles
 from ..shared.limb import LimbGeometry
 from ..shared.loading import NEAR_MM, LimbAxis, describe_socket_load, name_load, time_socket_loads
 from ..shared.socket_shape import build_loadable_socket, check_at_rest
-from .socket_intervals import CHANGE_PERCENT, FRICTION, draw_step, store_change, widen_intervals
+from .socket_intervals import (
+    CHANGE_PERCENT,
+    FRICTION,
+    ParameterSpread,
+    draw_step,
+    store_change,
+    widen_intervals,
+)
 from .socket_limb import SocketLimb, SocketRun, run_sockets, simulate_socket
 
 NAME = "socket"
@@ -57,6 +65,7 @@ def run_socket(
     covariance_log: Sequence[Sequence[float]] | None,
     most_probable: Parameters | None,
     recorded_range: Mapping[str, Any] | None,
+    relaxation: dict[str, Any] | None,
     samples: int,
 ) -> dict[str, Any]:
     """Pressure, shear and settling in the study's socket at the ``parameters`` of the tissues.
@@ -66,6 +75,8 @@ def run_socket(
     covariance_log : (p, p) that of the parameters' logarithms, where they were identified.
     most_probable : parameters that intervals cover too; none: those that are simulated.
     recorded_range : what the fitted records did to the tissue, from ``predict.json``; None: not known.
+    relaxation : of `RelaxationSpread.to_dict`; intervals cover what it leaves of the moduli when the socket
+        has been worn for ``socket.worn_s``.
     samples : draws from it that are simulated too, and more friction; the intervals then count what
         derivatives miss.
     """
@@ -83,7 +94,10 @@ def run_socket(
     known = None
     if covariance is not None:
         at, probable = (context.study.vector(one) for one in (parameters, most_probable or parameters))
-        known = covariance, np.log(probable / at)
+        known = ParameterSpread(covariance, np.log(probable / at))
+        if relaxation is not None:
+            spread = RelaxationSpread.from_dict(relaxation)
+            known = known.relax(spread.own_weight, *spread.interpolate(context.study.socket.worn_s))
     content = limb.facts(found, socket, known) | {
         "parameters": parameters,
         "parameters_from": parameters_from,
@@ -94,6 +108,7 @@ def run_socket(
         if find_bone(limb.anatomy, "tibia")
         else [],
         "samples": None,
+        "worn_s": None if relaxation is None else context.study.socket.worn_s,
     }
     compared = _compare_with_records(limb, mesh, found, recorded_range)
     for held in (content["donning"], *content["loads"]):
@@ -146,7 +161,7 @@ def _simulate_samples(
     folder: Path,
     donned: tuple[SocketLimb, Mesh, Socket],
     content: dict[str, Any],
-    steps: Sequence[NDArray[np.float64]],
+    steps: Sequence[Array],
 ) -> dict[str, Any]:
     """Simulate parameters whose logarithms differ by ``steps (k,)``, and widen the intervals by the misses.
 

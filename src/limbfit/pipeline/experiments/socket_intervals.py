@@ -5,6 +5,9 @@ variance g'Cg.  The share of a parameter i is what of it would go if that one we
 the squared correlation of the two.  Parameters are correlated, so that shares do not add up to one.  The
 simulated parameters fit best, others are most probable: intervals cover both, as those of parameters do.
 
+A socket is worn for longer than any record lasts, and how far tissue relaxes by then is known less well
+(`limbfit.identify.uncertainty.relaxation`). That moves the value and adds to its variance.
+
 Contact and large strain are not of first order.  Where parameters drawn from C were simulated too, the mean
 of what g misses of them is added to the value, and its variance to that of the value.
 """
@@ -28,6 +31,33 @@ _CHANGE = float(np.log1p(CHANGE_PERCENT / 100.0))
 
 
 @dataclass(frozen=True, eq=False)
+class ParameterSpread:
+    """How well the study's parameters are known, tissue by tissue; all of their logarithms.
+
+    Attributes
+    ----------
+    covariance : (p, p).
+    off : (p,) how far the most probable ones are from those that are simulated.
+    shift, relaxation : (p,) and (p, p) what relaxation beyond the records moves them by, and adds; or 0.
+    """
+
+    covariance: Array
+    off: Array
+    shift: Array | float = 0.0
+    relaxation: Array | float = 0.0
+
+    def relax(self, own_weight: float, shift: Array, relaxation: Array) -> ParameterSpread:
+        """The same when a socket has been worn for long, of what `RelaxationSpread` says."""
+        return ParameterSpread(own_weight * self.covariance, own_weight * self.off, shift, relaxation)
+
+    def select(self, chosen: Array) -> ParameterSpread:
+        """Those of which ``chosen`` (p,) is True."""
+        both, shape = np.ix_(chosen, chosen), self.covariance.shape
+        shift, relaxation = np.broadcast_to(self.shift, shape[:1]), np.broadcast_to(self.relaxation, shape)
+        return ParameterSpread(self.covariance[both], self.off[chosen], shift[chosen], relaxation[both])
+
+
+@dataclass(frozen=True, eq=False)
 class SimulationSpread:
     """How well a simulation's parameters are known.
 
@@ -35,50 +65,51 @@ class SimulationSpread:
     ----------
     names : of its parameters by tissue and key, such as ``skin.c_kPa``; a liner's too.
     identified : (k,) numbers of those that were identified.
-    covariance : (k, k) of their logarithms.
-    off : (k,) how far the logarithms of the most probable ones are from those that are simulated.
+    known : how well these k are known.
     """
 
     names: Sequence[str]
     identified: Sequence[int]
-    covariance: Array
-    off: Array
+    known: ParameterSpread
 
     @classmethod
-    def of(
-        cls, study: Study, names: Sequence[tuple[str, str]], covariance: Array, off: Array
-    ) -> SimulationSpread:
+    def of(cls, study: Study, names: Sequence[tuple[str, str]], known: ParameterSpread) -> SimulationSpread:
         """For a simulation whose parameters have ``names``, tissue and name, of `Problem.parameter_names`.
 
-        ``covariance`` and ``off`` are those of all of the study's parameters, tissue by tissue.
+        ``known`` is of all of the study's parameters, tissue by tissue.
         """
         laws = dict.fromkeys(study.tissues, study.law)
         own = [(tissue, parameter.name) for tissue in study.tissues for parameter in study.law.parameters]
-        known = np.array([name in names for name in own])  # fibres that a tissue has not change nothing
+        simulated = np.array([name in names for name in own])  # fibres that a tissue has not change nothing
         order = [list(names).index(name) for name in own if name in names]
         keyed = [f"{region}.{_find_key(laws.get(region, LAWS[OGDEN]), name)}" for region, name in names]
-        return cls(keyed, order, covariance[np.ix_(known, known)], off[known])
+        return cls(keyed, order, known.select(simulated))
 
-    def told(self, value: float, slopes: Array) -> tuple[list[float], dict[str, float], dict[str, float]]:
+    def told(
+        self, value: float, slopes: Array
+    ) -> tuple[list[float], dict[str, float], dict[str, float], list[float]]:
         """What is known of a positive value by its slopes (p,) by the logarithms of all parameters.
 
         Returns
         -------
-        interval : 95 %.
-        shares : of its variance, percent, that would go if a parameter were known, largest first.
+        interval : 95 %, the value itself included.
+        shares : of its variance by the parameters, percent, that would go if one were known, largest first.
         changes : of the value where each parameter of the simulation is ``CHANGE_PERCENT`` larger.
+        relaxation : by which relaxation beyond the records moves the value, and its standard deviation.
         """
-        own = slopes[list(self.identified)]
-        along = self.covariance @ own
+        known, own = self.known, slopes[list(self.identified)]
+        along = known.covariance @ own
         variance = float(own @ along)
-        half = NORMAL_95 * np.sqrt(max(variance, 0.0))
-        scale = np.maximum(np.diag(self.covariance) * variance, np.finfo(float).tiny)
+        moved, further = float(own @ known.shift), max(float(own @ known.relaxation @ own), 0.0)
+        half = NORMAL_95 * np.sqrt(max(variance, 0.0) + further)
+        scale = np.maximum(np.diag(known.covariance) * variance, np.finfo(float).tiny)
         shares = 100.0 * along**2 / scale
         found = {self.names[self.identified[i]]: float(shares[i]) for i in np.argsort(-shares)}
         by = _CHANGE * slopes
         changes = dict(zip(self.names, map(float, by), strict=True))
-        ends = sorted((value, value + float(own @ self.off)))
-        return [max(ends[0] - half, 0.0), ends[1] + half], found, changes
+        low, high = sorted((value, value + float(own @ known.off)))
+        interval = [max(min(low + moved - half, value), 0.0), max(high + moved + half, value)]
+        return interval, found, changes, [moved, float(np.sqrt(further))]
 
 
 def _find_key(law: TissueLaw, name: str) -> str:
@@ -88,8 +119,9 @@ def _find_key(law: TissueLaw, name: str) -> str:
 def spread_to_facts(
     spread: SimulationSpread | None, name: str, unit: str, value: float, slopes: Array | None
 ) -> dict[str, Any]:
-    """As it is stored: interval, shares and changes of a value, by keys with its name and unit; or none."""
-    keys = (f"{name}interval_{unit}", f"{name}interval_from", f"{name}change_{unit}")
+    """As it is stored: interval, shares, changes and relaxation, by keys with its name and unit; or none."""
+    keys = tuple(f"{name}{key}" for key in (f"interval_{unit}", "interval_from", f"change_{unit}"))
+    keys += (f"{name}relaxation_{unit}",)
     found = (None,) * len(keys) if spread is None or slopes is None else spread.told(value, slopes)
     return dict(zip(keys, found, strict=True))
 

@@ -46,7 +46,7 @@ from ..shared.simulations import find_fibre_directions
 from ..shared.socket_shape import build_regions, find_covered_regions, load_of, mesh_edge_mm
 from ..shared.sources import code_digest
 from ..stages.mesh import is_meshed, keep_mesh, mesh_settings, read_stored_depth
-from .socket_intervals import SimulationSpread, spread_to_facts
+from .socket_intervals import ParameterSpread, SimulationSpread, spread_to_facts
 
 Mask = NDArray[np.bool_]
 
@@ -147,7 +147,7 @@ class SocketLimb:
 
     def key(self, folder: Path, parameters: Parameters, socket: Socket, sensitivities: bool = False) -> str:
         """Of all that decides what a socket does to this limb, whose `mesh` is kept in the folder."""
-        table = self.study.socket.model_dump(mode="json", exclude={"design"})
+        table = self.study.socket.model_dump(mode="json", exclude={"design", "worn_s"})
         return compute_digest(
             *(table, self.study.material.model_dump(mode="json"), parameters, sensitivities),
             *(compute_file_digest(folder / MESH), code_digest(SocketLimb.of), code_digest(don)),
@@ -203,13 +203,11 @@ class SocketLimb:
             raise RunError(_describe_stop(found, fit))
         return found
 
-    def facts(
-        self, found: Donned, socket: Socket, known: tuple[Array, Array] | None = None
-    ) -> dict[str, Any]:
-        """What is stored of a simulation, with intervals where covariance (p, p) and ``off`` (p,) are."""
+    def facts(self, found: Donned, socket: Socket, known: ParameterSpread | None = None) -> dict[str, Any]:
+        """What is stored of a simulation, with intervals where parameters are ``known`` so well."""
         fit = self.fit(socket)
         spread = (
-            None if known is None else SimulationSpread.of(self.study, found.result.parameter_names, *known)
+            None if known is None else SimulationSpread.of(self.study, found.result.parameter_names, known)
         )
         mesh = found.result.problem.mesh
         faces = self.faces(mesh, socket)

@@ -11,10 +11,12 @@ import numpy as np
 from ...errors import StudyError
 from ...identify.fit.multifidelity import CorrectionRound
 from ...identify.fit.multistart import MultistartResult, describe_starts, run_multistart
-from ...identify.fit.parameters import Unknowns
+from ...identify.fit.parameters import Unknowns, build_space
 from ...identify.fit.state import Calibration
+from ...identify.uncertainty.relaxation import assess_relaxation
 from ...identify.uncertainty.uncertainty import Uncertainty
 from ...indentation import Parameters
+from ...laws import FIBRED, is_ogden
 from ...priors import SOURCE
 from ...study import Study
 from ..shared.artefacts import write_json
@@ -63,6 +65,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     for site, texts in laboratory.warnings.items():
         context.tell("calibrate", 0, 0, f"warning: site {site}, at the answer: {'; '.join(texts)}")
     content = _calibration_to_dict(context, found, known, laboratory)
+    content["uncertainty"] |= _relaxation_record(study, found, known, laboratory)
     content |= {
         "corrections": [_round_record(one, found.sites, study) for one in rounds],
         "multistart": _multistart_to_dict(tried, study) if table.starts > 1 else None,
@@ -189,6 +192,22 @@ def _uncertainty_to_dict(known: Uncertainty, study: Study) -> dict[str, Any]:
         "priors": _priors_to_dict(known, study),
         "residuals": known.residual_model.to_dict(),
     }
+
+
+def _relaxation_record(
+    study: Study, found: Calibration, known: Uncertainty, laboratory: RecordSimulator
+) -> dict[str, Any]:
+    """What is known of relaxation beyond the records, and the verdicts with that; none of other laws."""
+    if not is_ogden(study.law.name) and study.law.name != FIBRED:
+        return {"relaxation": None}
+    bounds = build_unknowns(study)
+    space = build_space(bounds, build_groupings(study)[-1])
+    of_records = found.responses, laboratory.measured, known.residual_model
+    relaxation = assess_relaxation(found.parameters, *of_records, bounds, space)
+    if relaxation is None:
+        return {"relaxation": None}
+    verdicts = dict(zip(known.names, relaxation.qualify_verdicts(known), strict=True))
+    return {"verdict": verdicts, "relaxation": relaxation.to_dict(known)}
 
 
 def _priors_to_dict(known: Uncertainty, study: Study) -> dict[str, Any] | None:

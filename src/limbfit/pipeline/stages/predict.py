@@ -244,7 +244,7 @@ def _write_curves(
         columns[f"{name}_one_material_{unit}"] = site.one.force_N
     if ours.completed:
         own = 0.0 if record.site.fitted else estimate_site_deviation(context, record, ours, best)
-        low, high = known.compute_interval_95(ours, best, record.name, unit, own)
+        low, high = known.compute_interval_95(ours, best, record.name, unit, own, record.times_s)
         columns |= {f"{name}_low_{unit}": np.maximum(low, 0.0), f"{name}_high_{unit}": high}
     write_curves(folder / f"{record.name}.csv", **columns)
 

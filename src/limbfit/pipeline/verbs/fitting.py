@@ -55,6 +55,7 @@ def fit_socket(
     if origin == IDENTIFIED:
         calibration = Store(study.results).read("calibrate", "calibration.json")
         known = {key: calibration["uncertainty"][key] for key in ("covariance_log", "most_probable")}
+        known["relaxation"] = (calibration["uncertainty"].get("relaxation") or {}).get("beyond")
         known["recorded_range"] = read_recorded_range(study)
     elif samples:
         what = f"there is nothing to draw {samples} samples from: the parameters were not identified"

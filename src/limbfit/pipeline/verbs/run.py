@@ -367,6 +367,8 @@ def summarise(study: Study) -> dict[str, Any]:
         calibration = store.read("calibrate", "calibration.json")
         summary["parameters"] = calibration["stages"][-1]["parameters"]
         summary["intervals_95"] = calibration["uncertainty"]["intervals_95"]
+        if relaxation := calibration["uncertainty"].get("relaxation"):
+            summary["relaxation"] = {key: relaxation[key] for key in ("prefers", "words", "moduli")}
     if (store["predict"] / "predict.json").is_file():
         predicted = store.read("predict", "predict.json")
         columns = ("site", "record", "region", "fitted", "peak_force_N", "error_percent")

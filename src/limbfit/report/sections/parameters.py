@@ -28,6 +28,7 @@ def make_parameter_section(store: Results) -> Section:
         section.title,
         section.blocks,
         none if found and not store.uncertainty else None,
+        describe_relaxation(store),
         describe_priors(store),
         _describe_combinations(store),
         _describe_residuals(store),
@@ -91,6 +92,28 @@ def _shade_cell(value: Any) -> Cell:
     return Cell(
         format_fixed(value, 2), number=True, shade=max(-1.0, min(1.0, float(value))) if known else None
     )
+
+
+def describe_relaxation(store: Results) -> tuple[Block, ...]:
+    """What the records tell of relaxation, and the modulus of each tissue at several times after a step."""
+    found = store.uncertainty.get("relaxation")
+    if not found:
+        return ()
+    first = str(found["words"][0])
+    longest, (low, high) = found["beyond"]["longest_s"], found["prior"]["slope"]
+    lead = (
+        f"{first[0].upper()}{first[1:]}. No record shows the modulus that longer loads see: after "
+        f"{longest:.0f} s it falls as a power of time, whose slope is between {low:g} and {high:g} "
+        f"({found['prior']['source']})."
+    )
+    columns: tuple[Column, ...] = (
+        ("Tissue", lambda row: store.describe_tissue(row["tissue"])),
+        ("After a step (s)", lambda row: to_numeric(number(row["time_s"]))),
+        ("Modulus (kPa)", lambda row: to_numeric(number(row["modulus_kPa"]))),
+        ("95 % interval", lambda row: to_numeric(format_limits(row["interval_95"]))),
+    )
+    caption = "Modulus of each tissue after a step of strain: of the model, and what the records leave open."
+    return Prose(lead), make_table("moduli", caption, columns, found["moduli"])
 
 
 def describe_priors(store: Results) -> tuple[Block, ...]:

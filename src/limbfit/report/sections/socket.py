@@ -50,6 +50,7 @@ def make_socket_section(store: Results, content: Json) -> Section:
         draw_settling_figure(content),
         _make_region_table(names, held, (content.get("samples") or {}).get("simulated", 0)),
         make_interval_table(held[-1], names[-1]),
+        _describe_wear(content.get("worn_s")),
         make_published_blocks(content, held[-1], names[-1]),
         draw_inside_figure(store, names[-1], held[-1]["inside"], folder / f"held-{len(held) - 1}.vtu"),
         _make_strain_table(names, held),
@@ -159,6 +160,16 @@ def _make_strain_table(names: list[str], held: list[Mapping[str, Any]]) -> Table
 
 def _to_cm3(volumes_mm3: Mapping[str, float]) -> dict[str, float]:
     return {level: volume / 1000.0 for level, volume in volumes_mm3.items()}
+
+
+def _describe_wear(worn_s: float | None) -> Prose | None:
+    """For how long a load the intervals hold."""
+    if worn_s is None:
+        return None
+    return Prose(
+        f"Intervals count what relaxation may do until the socket has been worn for {worn_s:g} s, which no "
+        "record shows (see Parameters); they hold the simulated values, too."
+    )
 
 
 def make_interval_table(held: Mapping[str, Any], title: str) -> Table | None:

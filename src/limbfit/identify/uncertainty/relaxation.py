@@ -1,0 +1,372 @@
+"""What is known of relaxation beyond the records: fits with other relaxations, without a simulation.
+
+Fitted to the records of force are the model's own terms alone, the same with a modulus that goes on to fall
+as ``(1 + t/T)^-s``, T being the longest load in the records, and a spectrum of fixed times whose amplitudes
+are a power of time (`superposition`). They are weighed by their restricted likelihoods, each with a misfit
+of its own. Up to T these fits say how far the modulus is known. Beyond T it falls as ``(t/T)^-s``: no record
+shows that part, and s lies, each value as likely, between 0 and what tissues have at most (`MAX_SLOPE`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import nnls
+from scipy.special import logsumexp
+
+from ...arrays import Array
+from ..fit.objective import MeasuredCurve, SiteResponse
+from ..fit.parameters import SearchSpace, Unknowns
+from ..fit.prediction import RelaxationSpread
+from .discrepancy import ResidualModel, estimate_discrepancy
+from .estimator import PriorPrecision
+from .superposition import RelaxationModel, Superposition, TissueParameters, find_tissue_parameters
+from .uncertainty import DETERMINED, NORMAL_95, UNDETERMINED, WEAK, Uncertainty, choose_verdict
+
+# Slopes of log G over log t. Muscle: 0.25 in vivo (Klatt et al. 2010); six pieces ex vivo (Iaquinta 2023,
+# perineal_indentation): 0.13 to 0.16 before 1 s, 0.18 to 0.22 from 3 to 10 s.
+MAX_SLOPE = 0.3
+SOURCE = (
+    "muscle has a slope of 0.25 in vivo (Klatt et al. 2010, doi 10.1088/0031-9155/55/21/007) and of 0.13 to "
+    "0.22 between 0.3 and 10 s ex vivo (Iaquinta, perineal_indentation)"
+)
+_TAIL_SLOPES = (0.1, 0.2, 0.3)
+_SPECTRUM_SLOPES = (0.0, 0.1, 0.2, 0.3)
+_SHORTEST, _LONGEST, _SPECTRUM_TIMES = 0.02, 30.0, 12  # of the shortest ramp; of the longest load
+OWN, POWER_LAW, UNDECIDED = "the model's terms", "a power law", "undecided"
+NOT_LONG_TERM = "determined at {}; its long-term value not"
+NOT_ALONE = "not determined: another relaxation fits as well"
+MIN_OWN_WEIGHT = 0.1  # of the answer: no other relaxation is quite that of the tissue
+LONG_TERM_S = 3600.0  # after which a modulus is long-term: a socket worn for an hour
+STATED_S = (1.0, 10.0)  # at which moduli are stated
+_DURATIONS_S = np.geomspace(1.0, 10 * LONG_TERM_S, 19)
+_STRONG_EVIDENCE = 6.0  # of twice the log of the ratio of two evidences (Kass and Raftery 1995)
+_MAX_FIT_STEPS, _FURTHER_FIT_STEPS, _FIT_TOLERANCE, _MAX_STEP_LOG = 12, 3, 1e-3, 1.0
+_ALIKE = 0.01  # of the largest force: with which a fit begins
+_DIFFERENCE = 1e-3
+_IN_CONTACT = 0.01  # of the largest force
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A world fitted to the records: z (k,), covariance (k, k), and minus twice the log evidence."""
+
+    world: RelaxationModel
+    z: Array
+    covariance: Array
+    criterion: float
+
+
+@dataclass(frozen=True)
+class RelaxationAssessment:
+    """Which relaxations fit the records at ``parameters`` (p,), and what they leave open.
+
+    ``weights`` (w,) of the fitted worlds, the model's own terms first. ``evidence`` is twice the logarithm of
+    how much more probable the records are with a power law than with the model's own terms. ``spread`` is
+    what they leave open of each tissue's modulus at any time.
+    """
+
+    tissues: tuple[TissueParameters, ...]
+    parameters: Array
+    weights: Array
+    evidence: float
+    spread: RelaxationSpread
+
+    @property
+    def preferred(self) -> str:
+        """Which relaxation the records prefer, if they tell."""
+        if abs(self.evidence) < _STRONG_EVIDENCE:
+            return UNDECIDED
+        return POWER_LAW if self.evidence > 0 else OWN
+
+    def state_modulus(self, known: Uncertainty, number: int, duration_s: float) -> tuple[float, Array]:
+        """Return the model's modulus so long after a step, and the 95 % interval (2,) that holds it; kPa."""
+        tissue, p = self.tissues[number], self.parameters
+        at = tissue.modulus_log(p, duration_s)
+        steps = np.exp(_DIFFERENCE * np.eye(len(p)))
+        slopes = np.array([tissue.modulus_log(p * step, duration_s) - at for step in steps]) / _DIFFERENCE
+        shift, covariance = self.spread.interpolate(duration_s)
+        i, weight = tissue.moduli[0], self.spread.own_weight
+        half = NORMAL_95 * np.sqrt(weight * slopes @ known.covariance @ slopes + covariance[i, i])
+        off = weight * float(slopes @ np.log(known.centre / p))
+        ends = at + shift[i] + np.array([min(off, 0.0) - half, max(off, 0.0) + half])
+        return float(np.exp(at)), np.exp([min(ends[0], at), max(ends[1], at)])
+
+    def describe(self, known: Uncertainty) -> list[str]:
+        """Return what the records tell of relaxation, in sentences."""
+        longest = f"the records, whose longest load lasts {self.spread.longest_s:.0f} s,"
+        preferred = {
+            OWN: f"{longest} prefer the relaxation of the model to a power law of time",
+            POWER_LAW: f"{longest} prefer relaxation as a power of time to that of the model",
+            UNDECIDED: f"{longest} cannot tell the relaxation of the model from a power law of time",
+        }
+        found = [f"{preferred[self.preferred]} (2 ln B = {abs(self.evidence):.0f})"]
+        for number, tissue in enumerate(self.tissues):
+            modulus, (low, high) = self.state_modulus(known, number, LONG_TERM_S)
+            found.append(
+                f"{tissue.name}: an hour after a step the modulus is {low:.3g} to {high:.3g} kPa (95 %); "
+                f"the model has {modulus:.3g} kPa"
+            )
+        return found
+
+    def qualify_verdicts(self, known: Uncertainty) -> tuple[str, ...]:
+        """Return the verdicts (p,) on parameters for what relaxation beyond the records leaves of them.
+
+        A modulus is determined if it is so `LONG_TERM_S` after a step, amplitudes and times if the records
+        prefer the model's terms to other relaxations.
+        """
+        verdicts = list(known.verdicts)
+        for number, tissue in enumerate(self.tissues):
+            for i in (*tissue.amplitudes, *tissue.times):
+                if verdicts[i] in (DETERMINED, WEAK) and self.preferred != OWN:
+                    verdicts[i] = NOT_ALONE
+            modulus = tissue.moduli[0]
+            if verdicts[modulus] in (DETERMINED, WEAK):
+                verdicts[modulus] = self._judge_modulus(known, number, verdicts[modulus])
+        return tuple(verdicts)
+
+    def to_dict(self, known: Uncertainty) -> dict[str, Any]:
+        """Return JSON-like values, with moduli at `STATED_S` and `LONG_TERM_S` in kPa."""
+        moduli = []
+        for number, tissue in enumerate(self.tissues):
+            for time in (*STATED_S, LONG_TERM_S):
+                value, interval = self.state_modulus(known, number, time)
+                row = {"tissue": tissue.name, "time_s": time, "modulus_kPa": value}
+                moduli.append(row | {"interval_95": interval.tolist()})
+        return {
+            "prefers": self.preferred,
+            "evidence": self.evidence,
+            "words": self.describe(known),
+            "moduli": moduli,
+            "prior": {"slope": [0.0, MAX_SLOPE], "source": SOURCE},
+            "beyond": self.spread.to_dict(),
+        }
+
+    def _judge_modulus(self, known: Uncertainty, number: int, verdict: str) -> str:
+        """The verdict on a long-term modulus whose ``verdict`` would hold if the model's terms were true."""
+
+        def judge(duration_s: float) -> str:
+            low, high = self.state_modulus(known, number, duration_s)[1]
+            return choose_verdict(float(np.sqrt(high / low)), 0.0)
+
+        if judge(LONG_TERM_S) == DETERMINED:
+            return verdict
+        times = [f"{time:g} s" for time in STATED_S if judge(time) == DETERMINED]
+        return NOT_LONG_TERM.format(" and ".join(times)) if times else UNDETERMINED
+
+
+def assess_relaxation(
+    parameters: Array,
+    responses: Sequence[SiteResponse],
+    measured: Sequence[MeasuredCurve],
+    model: ResidualModel,
+    unknowns: Unknowns,
+    space: SearchSpace,
+) -> RelaxationAssessment | None:
+    """Fit other relaxations to the records of force, and weigh them; nothing is simulated.
+
+    Parameters
+    ----------
+    parameters : (p,) of the answer, with its ``responses``.
+    model : the covariance of the residuals there.
+    space : of the calibration's last stage.
+
+    Returns
+    -------
+    None where no record is of force under a stated displacement, or no tissue relaxes.
+    """
+    tissues = find_tissue_parameters(unknowns.names, space)
+    chosen = [i for i, noise in enumerate(model.noise) if noise.unit == "N"]
+    if not chosen or not all(tissue.amplitudes for tissue in tissues):
+        return None
+    records = _Records.select(chosen, parameters, responses, measured, model, unknowns, space, tissues)
+    longest = records.longest_s
+    times = np.geomspace(_SHORTEST * records.shortest_ramp_s, _LONGEST * longest, _SPECTRUM_TIMES)
+    worlds = [RelaxationModel(), *(RelaxationModel(slope, longest) for slope in _TAIL_SLOPES)]
+    worlds += [RelaxationModel(slope, longest, times) for slope in _SPECTRUM_SLOPES]
+    fits = [records.fit(world) for world in worlds]
+    weights, evidence = _weigh(fits)
+    shifts, covariances = zip(*(records.spread(fits, weights, t) for t in _DURATIONS_S), strict=True)
+    spread = RelaxationSpread(
+        longest, float(weights[0]), _DURATIONS_S, np.array(shifts), np.array(covariances)
+    )
+    return RelaxationAssessment(tissues, parameters, weights, evidence, spread)
+
+
+def _weigh(fits: Sequence[_Fit]) -> tuple[Array, float]:
+    """Return the weight (w,) of each world and the evidence for a power law."""
+    half = -0.5 * np.array([fit.criterion for fit in fits])
+    likely = np.exp(half - half.max())
+    is_own = np.array([fit.world.is_own for fit in fits])
+    evidence = 2 * (logsumexp(half[~is_own]) - np.log((~is_own).sum()) - half[is_own][0])
+    weights = np.where(is_own, 1.0, 1.0 / (~is_own).sum()) * likely
+    own = max(float(weights[is_own][0] / weights.sum()), MIN_OWN_WEIGHT)
+    others = np.where(is_own, 0.0, weights)
+    return np.where(is_own, own, (1 - own) * others / max(others.sum(), np.finfo(float).tiny)), float(
+        evidence
+    )
+
+
+@dataclass(frozen=True)
+class _Records:
+    """The records of force, and how well their residuals are known."""
+
+    superpositions: tuple[Superposition, ...]
+    measured: tuple[MeasuredCurve, ...]
+    model: ResidualModel
+    prior: PriorPrecision
+    space: SearchSpace
+    tissues: tuple[TissueParameters, ...]
+    parameters: Array
+    shortest_ramp_s: float
+    longest_s: float
+
+    @classmethod
+    def select(
+        cls,
+        chosen: Sequence[int],
+        parameters: Array,
+        responses: Sequence[SiteResponse],
+        measured: Sequence[MeasuredCurve],
+        model: ResidualModel,
+        unknowns: Unknowns,
+        space: SearchSpace,
+        tissues: tuple[TissueParameters, ...],
+    ) -> _Records:
+        """Take those of ``chosen`` numbers."""
+        noise = tuple(model.noise[i] for i in chosen)
+        forces = [responses[i] for i in chosen]
+        own = replace(
+            model,
+            noise=noise,
+            peaks_N=model.peaks_N[chosen],
+            misfit=model.misfit[chosen],
+            mesh_N=tuple(model.mesh_N[i] for i in chosen) if model.mesh_N else (),
+            site_N=tuple(model.site_N[i] for i in chosen) if model.site_N else (),
+        )
+        pairs = list(zip(noise, forces, strict=True))
+        return cls(
+            tuple(Superposition(one.times_s, r, parameters, tissues) for one, r in pairs),
+            tuple(measured[i] for i in chosen),
+            own,
+            PriorPrecision.from_unknowns(unknowns, space),
+            space,
+            tissues,
+            parameters,
+            min(float(one.times_s[int(np.argmax(r.force_N))] - one.times_s[0]) for one, r in pairs),
+            max(_find_longest_load(one.times_s, r.force_N) for one, r in pairs),
+        )
+
+    def fit(self, world: RelaxationModel) -> _Fit:
+        """Fit a world, first with alike weights, then by what its own residuals say of its misfit."""
+        prior, model = self.prior, self.model
+        start = self.space.reduce(np.log(self.parameters)) if world.spectrum_s is None else self._guess(world)
+        z, _ = self._solve(world, start, self._alike(), _MAX_FIT_STEPS)
+        found = estimate_discrepancy(
+            *self._linearise(world, z),
+            model.noise,
+            model.peaks_N,
+            prior.precision,
+            model.mesh_N,
+            model.site_N,
+        )
+        stated = prior.rows @ z - prior.target
+        z, covariance = self._solve(world, z, found, _FURTHER_FIT_STEPS)
+        return _Fit(world, z, covariance, found.criterion + float(stated @ stated))
+
+    def _alike(self) -> ResidualModel:
+        """The residuals' covariance if the model were off by as much of the largest force everywhere."""
+        noise = [
+            replace(one, covariance=(_ALIKE * peak) ** 2 * np.eye(len(one.times_s)))
+            for one, peak in zip(self.model.noise, self.model.peaks_N, strict=True)
+        ]
+        off = np.zeros(len(noise))
+        return replace(self.model, noise=tuple(noise), misfit=off, correlation=1.0, mesh_N=(), site_N=())
+
+    def _solve(
+        self, world: RelaxationModel, z: Array, model: ResidualModel, steps: int
+    ) -> tuple[Array, Array]:
+        """Generalised least squares from z (k,) on; the answer and its covariance (k, k)."""
+        prior, answer = self.prior, self.space.reduce(np.log(self.parameters))
+        A = prior.precision
+        for _ in range(steps):
+            residuals, scaled = self._linearise(world, z)
+            weighted = model.solve(scaled)
+            A = prior.precision + sum(J.T @ W for J, W in zip(scaled, weighted))
+            g = prior.bound_precision @ (z - answer) + prior.rows.T @ (prior.rows @ z - prior.target)
+            g = g + sum(W.T @ r for r, W in zip(residuals, weighted))
+            step = np.clip(-np.linalg.solve(A, g), -_MAX_STEP_LOG, _MAX_STEP_LOG)
+            z = np.clip(z + step, self.space.lower, self.space.upper)
+            if np.abs(step).max() < _FIT_TOLERANCE:
+                break
+        return z, np.asarray(np.linalg.inv(A))
+
+    def _guess(self, world: RelaxationModel) -> Array:
+        """Start of a spectrum's fit: forces are linear in a modulus, and in that times an amplitude."""
+        p = self.parameters.copy()
+        relaxing = [tissue for tissue in self.tissues if not tissue.is_given]
+        p[[i for tissue in relaxing for i in (tissue.amplitudes[0], tissue.times[0])]] = 1.0
+        rows = []
+        for one, curve in zip(self.superpositions, self.measured, strict=True):
+            rows.append(np.column_stack([*one.split(world, p), curve.force_N]) / curve.peak_N)
+        table = np.vstack(rows)
+        shares = np.maximum(nnls(table[:, :-1], table[:, -1])[0].reshape(-1, 2), _DIFFERENCE)
+        for tissue, (modulus, amplitude) in zip(self.tissues, shares, strict=True):
+            p[list(tissue.moduli)] *= modulus
+            if not tissue.is_given:
+                p[tissue.amplitudes[0]] = amplitude / modulus
+        return self.space.reduce(np.log(p))
+
+    def _linearise(self, world: RelaxationModel, z: Array) -> tuple[list[Array], list[Array]]:
+        """Residuals (n,) and derivatives (n, k) of each record."""
+        p = self.space.expand(z)
+        found = [one.respond(world, p) for one in self.superpositions]
+        residuals = [r.force_N - one.force_N for r, one in zip(found, self.measured, strict=True)]
+        return residuals, [self.space.pull_back(r.jacobian, p) for r in found]
+
+    def spread(self, fits: Sequence[_Fit], weights: Array, duration_s: float) -> tuple[Array, Array]:
+        """Mean (p,) and covariance (p, p) of elastic parameters at a time, over those of the answer.
+
+        The model's own terms keep the answer, whose covariance is not counted here.
+        """
+        within, answer = min(duration_s, self.longest_s), np.log(self.parameters)
+        changes, inner = [], []
+        for fit in fits:
+            z = self.space.reduce(answer) if fit.world.is_own else fit.z
+            at = self._elastic_log(fit.world, z, within)
+            # Uniform from nothing to this.
+            further = self._is_modulus * MAX_SLOPE * np.log(duration_s / within)
+            steps = _DIFFERENCE * np.eye(len(z))
+            D = np.array([self._elastic_log(fit.world, z + s, within) - at for s in steps]) / _DIFFERENCE
+            changes.append(at - further / 2)
+            inner.append((not fit.world.is_own) * D.T @ fit.covariance @ D + np.outer(further, further) / 12)
+        own = self._elastic_log(RelaxationModel(), self.space.reduce(answer), duration_s)
+        change = np.array(changes) - own
+        mean = weights @ change
+        apart = change - mean
+        return mean, np.einsum("w,wi,wj->ij", weights, apart, apart) + np.tensordot(weights, inner, 1)
+
+    def _elastic_log(self, world: RelaxationModel, z: Array, duration_s: float) -> Array:
+        """Logarithms (p,) of moduli so long after a step and of other elastic parameters; 0 of the rest."""
+        p = self.space.expand(z)
+        found = np.zeros(len(p))
+        for tissue in self.tissues:
+            elastic = [*tissue.moduli, *tissue.others]
+            found[elastic] = np.log(p[elastic])
+            found[list(tissue.moduli)] += np.log(world.terms(tissue, p).at(duration_s))
+        return found
+
+    @property
+    def _is_modulus(self) -> Array:
+        moduli = [i for tissue in self.tissues for i in tissue.moduli]
+        return np.isin(np.arange(len(self.parameters)), moduli).astype(float)
+
+
+def _find_longest_load(times_s: Array, force_N: Array) -> float:
+    """Return the longest time without losing contact, s."""
+    loaded = np.flatnonzero(force_N > _IN_CONTACT * force_N.max())
+    runs = np.split(loaded, np.flatnonzero(np.diff(loaded) > 1) + 1)
+    return max(float(times_s[run[-1]] - times_s[run[0]]) for run in runs)

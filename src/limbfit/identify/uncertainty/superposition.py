@@ -1,0 +1,192 @@
+"""Forces of a record for any relaxation, from one simulation with derivatives.
+
+The force of a test that drives the indenter is the sum over tissues of their relaxation convolved with the
+rate of an elastic share (correspondence principle; Christensen 1982, section 2.1). Forces are homogeneous of
+degree one in the moduli, so a tissue's share of a simulated force is ``c dF/dc`` (Euler), and its elastic
+share follows by taking the simulated relaxation out again. Then a convolution gives the force, and its
+derivatives, for any other relaxation. The strains of that test are not exactly those of the simulated one;
+docs/uncertainty.md states the error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammainc
+
+from ...arrays import Array
+from ...relaxation import compute_power_law_terms
+from ..fit.objective import SiteResponse
+from ..fit.parameters import SearchSpace
+
+_TAIL_BINS = np.geomspace(2.0**-14, 8.0, 18)  # edges, of T over the times of a tail
+_DIFFERENCE = 1e-3
+
+
+@dataclass(frozen=True)
+class RelaxationTerms:
+    """``G(t) = constant + sum amplitudes exp(-t / times)``."""
+
+    constant: float
+    amplitudes: Array
+    times_s: Array
+
+    def at(self, time_s: float) -> float:
+        return self.constant + float(self.amplitudes @ np.exp(-time_s / self.times_s))
+
+
+@dataclass(frozen=True)
+class TissueParameters:
+    """Numbers of a tissue's parameters in the flat vector; ``is_given`` if its relaxation does not move."""
+
+    name: str
+    moduli: tuple[int, ...]
+    others: tuple[int, ...]
+    amplitudes: tuple[int, ...]
+    times: tuple[int, ...]
+    is_given: bool
+
+    def own_terms(self, p: Array) -> RelaxationTerms:
+        """The model's relaxation at parameters p."""
+        return RelaxationTerms(1.0, p[list(self.amplitudes)], p[list(self.times)])
+
+    def modulus_log(self, p: Array, time_s: float) -> float:
+        """Logarithm of the model's modulus so long after a step."""
+        return float(np.log(p[self.moduli[0]] * self.own_terms(p).at(time_s)))
+
+
+def find_tissue_parameters(names: Sequence[str], space: SearchSpace) -> tuple[TissueParameters, ...]:
+    """Group parameters ``<tissue>.<key>`` by what they do."""
+    found = []
+    for tissue in dict.fromkeys(name.rpartition(".")[0] for name in names):
+        groups: dict[str, list[int]] = {"modulus": [], "other": [], "gamma": [], "tau": []}
+        for i, name in enumerate(names):
+            own, _, key = name.rpartition(".")
+            kind = "modulus" if key.endswith("_kPa") else key.removesuffix("_s").rstrip("0123456789")
+            if own == tissue:
+                groups[kind if kind in groups else "other"].append(i)
+        moduli, others, amplitudes, times = (tuple(group) for group in groups.values())
+        is_given = not space.tie[list(amplitudes)].any()
+        found.append(TissueParameters(tissue, moduli, others, amplitudes, times, is_given))
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class RelaxationModel:
+    """A relaxation that the records are fitted with: the model's terms, with a tail, or a spectrum.
+
+    A spectrum's amplitudes are ``gamma tau_i^-slope exp(-tau_i / end)``, Fung's (1993) where the slope is 0.
+    Its end takes the place of a tissue's first relaxation time and is in units of ``longest_s``.
+    """
+
+    slope: float = 0.0
+    longest_s: float = 1.0
+    spectrum_s: Array | None = None
+
+    @property
+    def is_own(self) -> bool:
+        return self.spectrum_s is None and self.slope == 0.0
+
+    def has_spectrum(self, tissue: TissueParameters) -> bool:
+        return self.spectrum_s is not None and not tissue.is_given
+
+    def terms(self, tissue: TissueParameters, p: Array) -> RelaxationTerms:
+        """The relaxation of a tissue; the model's terms come first."""
+        own = tissue.own_terms(p)
+        if self.spectrum_s is not None and self.has_spectrum(tissue):
+            power = compute_power_law_terms(own.amplitudes[0], self.slope, self.spectrum_s)
+            ends = np.exp(-self.spectrum_s / (self.longest_s * own.times_s[0]))
+            return RelaxationTerms(1.0, power * ends, self.spectrum_s)
+        if self.spectrum_s is not None or self.slope == 0.0:
+            return own
+        # (1 + t/T)^-s is a mixture of exponentials whose rates times T have a gamma distribution.
+        share, middle = gammainc(self.slope, _TAIL_BINS), np.sqrt(_TAIL_BINS[1:] * _TAIL_BINS[:-1])
+        amplitudes = np.r_[own.amplitudes, np.diff(share)]
+        return RelaxationTerms(float(share[0]), amplitudes, np.r_[own.times_s, self.longest_s / middle])
+
+
+def _convolve(elastic: Array, times_s: Array, taus: Array) -> Array:
+    """Return the histories (terms, n, q) of elastic columns (n, q), linear between the times (n,)."""
+    x = np.diff(times_s)[:, None] / taus
+    decay, ramp = np.exp(-x)[..., None], (-np.expm1(-x) / x)[..., None]
+    found = np.empty((len(taus), *elastic.shape))
+    found[:, 0] = elastic[0]
+    for i, step in enumerate(np.diff(elastic, axis=0)):
+        found[:, i + 1] = decay[i] * found[:, i] + ramp[i] * step
+    return found
+
+
+def _deconvolve(relaxed: Array, times_s: Array, terms: RelaxationTerms) -> Array:
+    """Return the elastic columns (n, q) whose relaxation gives ``relaxed`` (n, q)."""
+    x = np.diff(times_s)[:, None] / terms.times_s
+    decay, ramp = np.exp(-x), -np.expm1(-x) / x
+    found = np.empty_like(relaxed)
+    found[0] = relaxed[0] / terms.at(0.0)
+    history = np.repeat(found[None, 0], len(terms.times_s), axis=0)
+    for i, value in enumerate(relaxed[1:]):
+        before = terms.amplitudes @ (decay[i][:, None] * history - ramp[i][:, None] * found[i])
+        found[i + 1] = (value - before) / (terms.constant + float(terms.amplitudes @ ramp[i]))
+        history = decay[i][:, None] * history + ramp[i][:, None] * (found[i + 1] - found[i])
+    return found
+
+
+class Superposition:
+    """Forces of a record for any relaxation, from its simulation at ``parameters`` (p,)."""
+
+    def __init__(
+        self, times_s: Array, response: SiteResponse, parameters: Array, tissues: Sequence[TissueParameters]
+    ) -> None:
+        self.times_s, self.parameters, self.tissues = times_s, parameters, tissues
+        self.in_contact = (response.force_N > 0)[:, None]
+        scaled = response.jacobian * parameters
+        self.elastic = [
+            _deconvolve(scaled[:, [*one.moduli, *one.others]], times_s, one.own_terms(parameters))
+            for one in tissues
+        ]
+        self._spectra: dict[int, Array] = {}
+
+    def respond(self, world: RelaxationModel, p: Array) -> SiteResponse:
+        """Force (n,) and derivatives (n, p) in a world at parameters p."""
+        change = np.log(p / self.parameters)
+        total, slopes = np.zeros(len(self.times_s)), np.zeros((len(self.times_s), len(p)))
+        for number, tissue in enumerate(self.tissues):
+            elastic, terms, n = self.elastic[number], world.terms(tissue, p), len(tissue.moduli)
+            histories = self._histories(world, number, terms)
+            relaxed = terms.constant * elastic + np.tensordot(terms.amplitudes, histories, 1)
+            factors = np.r_[np.exp(change[list(tissue.moduli)]), change[list(tissue.others)]]
+            factors[n:] *= factors[0]
+            total += relaxed @ factors
+            slopes[:, tissue.moduli] = relaxed[:, :n] * factors[:n]
+            slopes[:, tissue.moduli[0]] += relaxed[:, n:] @ factors[n:]
+            slopes[:, tissue.others] = relaxed[:, n:] * factors[0]
+            if world.has_spectrum(tissue):
+                slopes[:, tissue.amplitudes[0]] = (relaxed - elastic) @ factors
+                over_end = terms.amplitudes * terms.times_s / (world.longest_s * p[tissue.times[0]])
+                slopes[:, tissue.times[0]] = np.tensordot(over_end, histories, 1) @ factors
+                continue
+            for k, (amplitude, time) in enumerate(zip(tissue.amplitudes, tissue.times, strict=True)):
+                slopes[:, amplitude] = terms.amplitudes[k] * (histories[k] @ factors)
+                around = p[time] * np.exp([-_DIFFERENCE, _DIFFERENCE])
+                low, high = _convolve(elastic, self.times_s, around) @ factors
+                slopes[:, time] = terms.amplitudes[k] * (high - low) / (2 * _DIFFERENCE)
+        return SiteResponse(total * self.in_contact[:, 0], slopes * self.in_contact / p)
+
+    def split(self, world: RelaxationModel, p: Array) -> list[Array]:
+        """Force (n,) of each tissue's lasting part and of what relaxes, with the moduli as simulated."""
+        found = []
+        for number, tissue in enumerate(self.tissues):
+            terms, own = world.terms(tissue, p), slice(len(tissue.moduli))
+            relaxing = np.tensordot(terms.amplitudes, self._histories(world, number, terms), 1)
+            parts = terms.constant * self.elastic[number], relaxing
+            found += [(part[:, own] * self.in_contact).sum(axis=1) for part in parts]
+        return found
+
+    def _histories(self, world: RelaxationModel, number: int, terms: RelaxationTerms) -> Array:
+        """Convolutions of a tissue; those of the spectrum's fixed times are made once."""
+        if not world.has_spectrum(self.tissues[number]):
+            return _convolve(self.elastic[number], self.times_s, terms.times_s)
+        if number not in self._spectra:
+            self._spectra[number] = _convolve(self.elastic[number], self.times_s, terms.times_s)
+        return self._spectra[number]
