@@ -64,3 +64,20 @@ def test_what_benchmarks_and_examples_import_exists(script):
             for name in node.names:
                 known = hasattr(module, name.name) or find_spec(f"{node.module}.{name.name}")
                 assert known, f"{script.name}:{node.lineno}: {node.module} has no {name.name}"
+
+
+@pytest.mark.parametrize(
+    ("module", "old", "new"),
+    [
+        ("limbfit.execution", "placed", "place_jobs"),
+        ("limbfit.execution", "sharing", "share_executor"),
+        ("limbfit.indentation", "clamped", "clamp_problem"),
+        ("limbfit.fe.tractions", "tractions", "compute_tractions"),
+    ],
+)
+def test_documented_names_that_became_others_keep_working(module, old, new):
+    room = import_module(module)
+    with pytest.warns(FutureWarning, match=f"{old} is now called {new}"):
+        assert getattr(room, old) is getattr(room, new)
+    with pytest.raises(AttributeError, match="nothing"):
+        room.nothing  # noqa: B018

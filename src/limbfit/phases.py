@@ -71,7 +71,7 @@ def find_phases(
     Parameters
     ----------
     times, displacement : (n,) s, growing, and mm, with n > 1.
-    tolerance : mm that count as nothing; ``tolerance_mm`` by default.
+    tolerance : mm that count as nothing; ``choose_tolerance_mm`` by default.
     contact_s : when the skin is met: all before is one ``approach``.
     """
     times, displacement = np.asarray(times, dtype=float), np.asarray(displacement, dtype=float)

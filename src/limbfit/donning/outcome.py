@@ -133,7 +133,7 @@ def don(
 
     Parameters
     ----------
-    problem : of `socket_problem`.
+    problem : of `build_socket_problem`.
     regions : masks (f,) of the faces of the socket's body.
     sensitivities : also derivatives with respect to every material parameter.
     on_row : called after every step.

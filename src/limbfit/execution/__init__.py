@@ -4,6 +4,9 @@ A job is anything that can be pickled, and the function that does it is importab
 order of the jobs whatever runs them, so a caller cannot tell one executor from another except by the time.
 """
 
+from typing import Any
+
+from ..renamed import find_renamed
 from .base import (
     SAFE_PATH,
     THREAD_VARIABLES,
@@ -35,3 +38,7 @@ __all__ = [
     "run_in_background",
     "share_executor",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    return find_renamed(__name__, name, {"placed": "place_jobs", "sharing": "share_executor"})

@@ -1,8 +1,8 @@
 """The mechanics: viscoelastic indentation of soft tissue by a rigid body, with exact sensitivities.
 
->>> from limbfit.bench.blocks import layered_block
+>>> from limbfit.bench.blocks import build_layered_block
 >>> from limbfit.fe import History, Indenter, OgdenQLV, Problem, StepControl, solve
->>> mesh = layered_block("tet10", 2)                                         # skin over muscle, mm
+>>> mesh = build_layered_block("tet10", 2)                                         # skin over muscle, mm
 >>> skin = OgdenQLV(c=0.009, m=6.0, gamma=2.0, tau=0.5)                      # MPa, -, -, s
 >>> muscle = OgdenQLV(c=0.005, m=5.0, gamma=1.0, tau=0.5)
 >>> punch = Indenter("square", width=20.0, centre=(0, 0, 0), axis=(0, 0, -1))
@@ -43,7 +43,7 @@ from .materials import (
 )
 from .motion import Motion, RigidBody
 from .pressure import Pressure
-from .prestretch import build_isochoric_stretch
+from .prestretch import isochoric_stretch
 from .problem import History, Problem, Support
 from .result import Result, State, Step
 from .snapshot import Checkpoints, Snapshot
@@ -88,11 +88,11 @@ __all__ = [
     "System",
     "Tractions",
     "are_compiled",
-    "build_isochoric_stretch",
     "build_linear_solver",
     "compile_kernels",
     "compute_tangent_at_rest",
     "compute_tractions",
+    "isochoric_stretch",
     "iterate",
     "list_texts",
     "solve",

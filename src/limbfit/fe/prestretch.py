@@ -16,7 +16,7 @@ from ..errors import ProblemError
 Array = NDArray[np.float64]
 
 
-def build_isochoric_stretch(directions: ArrayLike, stretches: ArrayLike) -> Array:
+def isochoric_stretch(directions: ArrayLike, stretches: ArrayLike) -> Array:
     """Pre-stretches (m, 3, 3) along ``directions`` at constant volume.
 
     ``directions (m, 3)``, or one (3,), of any length; ``stretches``, one or (m,), along them: what is across

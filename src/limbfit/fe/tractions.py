@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..renamed import find_renamed
 from .contact.contact import ContactSurface
 from .kernel.laws import Laws
 from .result import State
@@ -105,3 +107,7 @@ def compute_tractions(system: System, laws: Laws, state: State, body: int = 0) -
         one.surface.faces, one.surface.N, found.tools[body].places, now.areas, normals.reshape(shape),
         forces.reshape(shape),
     )  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    return find_renamed(__name__, name, {"tractions": "compute_tractions"})

@@ -1,6 +1,9 @@
 """A study's site as a mechanical problem, and what is observed in it."""
 
+from typing import Any
+
 from ..laws import Parameters, list_flat_names, to_parameters, to_vector
+from ..renamed import find_renamed
 from .clamps import build_clamping_pins, clamp_problem
 from .fibres import Direction, build_fibre_field
 from .neighbourhood import Extension, cut_neighbourhood
@@ -69,3 +72,7 @@ __all__ = [
     "to_vector",
     "to_vector3",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    return find_renamed(__name__, name, {"clamped": "clamp_problem"})

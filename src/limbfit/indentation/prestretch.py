@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..arrays import Array
-from ..fe import build_isochoric_stretch
+from ..fe import isochoric_stretch
 from ..mesh import Mesh
 
 
@@ -31,9 +31,9 @@ def build_prestretch_field(
         found = np.tile(np.eye(3), (len(mesh.cells), 1, 1)) if found is None else found
         own = np.flatnonzero(mesh.regions == mesh.region_names.index(tissue))
         if fibres is not None and tissue in fibred:
-            found[own] = build_isochoric_stretch(fibres[own], stretch)
+            found[own] = isochoric_stretch(fibres[own], stretch)
         else:
-            found[own] = build_isochoric_stretch(_find_normals(mesh, own), stretch**-2.0)
+            found[own] = isochoric_stretch(_find_normals(mesh, own), stretch**-2.0)
     return found
 
 

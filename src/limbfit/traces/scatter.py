@@ -39,21 +39,21 @@ def estimate_scatter(*parts: Array) -> Scatter:
     long = [part for part in parts if len(part) > 2 * _LEAST_PER_PIECE]
     if not long:
         return Scatter(float(np.sqrt(np.mean(np.diff(np.concatenate(parts), 2) ** 2) / 6.0)), 0.0)
-    rows = [np.column_stack([_spline_basis(len(part)), part]) for part in long]
+    rows = [np.column_stack([_build_spline_basis(len(part)), part]) for part in long]
     n = sum(map(len, rows))
     found = minimize_scalar(
-        lambda log: _restricted_likelihood(rows, 1.0 - np.exp(log))[0],
+        lambda log: _compute_restricted_likelihood(rows, 1.0 - np.exp(log))[0],
         bounds=(np.log(1.0 - clip_lag(1.0)), 0.0),
         method="bounded",
         options={"xatol": 0.02},
     )
     lag = float(1.0 - np.exp(found.x))
     lag = lag if lag > 2.0 / np.sqrt(n) else 0.0
-    innovation = _restricted_likelihood(rows, lag)[1]
+    innovation = _compute_restricted_likelihood(rows, lag)[1]
     return Scatter(float(np.sqrt(innovation / (1.0 - lag**2))), lag)
 
 
-def _restricted_likelihood(rows: list[Array], lag: float) -> tuple[float, float]:
+def _compute_restricted_likelihood(rows: list[Array], lag: float) -> tuple[float, float]:
     """Minus twice the log of the restricted likelihood at its best size of the noise, and the variance of the
     innovations; ``rows`` (n, k + 1) of each part are its basis and its force."""
     squares = determinant = 0.0
@@ -67,7 +67,7 @@ def _restricted_likelihood(rows: list[Array], lag: float) -> tuple[float, float]
     return free * float(np.log(max(variance, 1e-300))) + determinant, variance
 
 
-def _spline_basis(n: int) -> Array:
+def _build_spline_basis(n: int) -> Array:
     """A cubic spline's basis (n, k) along n samples."""
     pieces = int(np.clip(n // _LEAST_PER_PIECE, 1, _PIECES))
     knots = np.r_[[0.0] * 4, np.linspace(0, 1, pieces + 1)[1:-1] ** _CLOSER, [1.0] * 4]

@@ -26,7 +26,7 @@ DOUBT = FOLD.text
 
 def test_a_kept_simulation_keeps_its_warnings(tmp_path, monkeypatch):
     made = Simulation("tibia", np.arange(3.0), None, True, "", 0.02, {"steps": 2}, (FOLD,))
-    monkeypatch.setattr(simulations, "job_digest", lambda job: "one")
+    monkeypatch.setattr(simulations, "compute_job_digest", lambda job: "one")
     simulations.SimulationCache(tmp_path)._keep(None, made)
     again = next(simulations.SimulationCache(tmp_path).run([None], SerialExecutor()))
     assert again.doubts == (FOLD,)

@@ -155,7 +155,8 @@ def contact(  # type: ignore[no-untyped-def]
     ``near``: the arrays of `Distances`, whatever the body; ``frame``: the axes (3, 3) of the body.
     ``weights, areas (c,)``: penalty times area (N/mm) and area of every point.  ``flat_from``: penetration
     from which a point's tangent leaves the body's curvature out (mm).  ``grip``: the held points, their
-    anchors, normals, bounds and pulls (`Grip`), by ``hardness`` times the weights.  ``forces (c, 3)`` receive
+    anchors, normals, bounds and pulls (`StickyContact`), by ``hardness`` times the weights.
+    ``forces (c, 3)`` receive
     the derivative of the energy with respect to the points, N; ``gaps (c,)``, ``normals (c, 3)`` and ``blocks
     (c, 3, 3)`` distance, its gradient and the tangent of each point, ``stick (c, 3, 3)`` the part of the
     tangent that holds it along the body.

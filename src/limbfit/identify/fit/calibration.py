@@ -58,7 +58,7 @@ def calibrate(
         in which elements fold that did not fold before.
     measured : the measured curves, at the times at which ``simulate`` gives the force.
     unknowns : names, start and bounds of the full parameters.
-    stages : groupings (see ``build_space``), by default ``stage_groupings``. Each stage starts from
+    stages : groupings (see ``build_space``), by default ``build_stage_groupings``. Each stage starts from
         the end of the one before. If tissues have different starts, which a stage with one material cannot
         represent, the next stage begins with the same ratios between the tissues.
     on_iterate : called after every accepted iterate with the state from which the search can continue.

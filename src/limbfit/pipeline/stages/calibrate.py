@@ -65,7 +65,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     for site, texts in laboratory.warnings.items():
         context.tell("calibrate", 0, 0, f"warning: site {site}, at the answer: {'; '.join(texts)}")
     content = _calibration_to_dict(context, found, known, laboratory)
-    content["uncertainty"] |= _relaxation_record(study, found, known, laboratory)
+    content["uncertainty"] |= _assess_relaxation(study, found, known, laboratory)
     content |= {
         "corrections": [_round_record(one, found.sites, study) for one in rounds],
         "multistart": _multistart_to_dict(tried, study) if table.starts > 1 else None,
@@ -194,7 +194,7 @@ def _uncertainty_to_dict(known: Uncertainty, study: Study) -> dict[str, Any]:
     }
 
 
-def _relaxation_record(
+def _assess_relaxation(
     study: Study, found: Calibration, known: Uncertainty, laboratory: RecordSimulator
 ) -> dict[str, Any]:
     """What is known of relaxation beyond the records, and the verdicts with that; none of other laws."""

@@ -86,7 +86,7 @@ def estimate_site_deviation(
     """One standard deviation (n,) of what a record would be off by, as its site's tissue were stiffer.
 
     In N, or mm where the record compares depths, from the derivatives at ``parameters`` (p,). What thinner
-    tissue is strained more by shows in what is seen of it (`Observed.by_strain`), not in its moduli.
+    tissue is strained more by shows in what is seen of it (`SecondaryValues.by_strain`), not in its moduli.
     """
     stiffer = np.asarray(response.jacobian @ (parameters * is_modulus(context.study)))
     surface_mm, thickness_mm = estimate_surface_error_mm(context), measure_bone_distance_mm(record.model)

@@ -165,7 +165,7 @@ def select_compared_records(context: Context, records: Sequence[SiteRecord]) -> 
 
 
 def coarsen_records(context: Context, records: Sequence[SiteRecord]) -> Sequence[SiteRecord]:
-    """The records as parameters are searched (`site_model`); ``records`` itself where that is the same."""
+    """The records as parameters are searched (`build_site_model`); ``records`` where that is the same."""
     if not context.study.is_searched_apart:
         return records
     return [replace(one, model=build_recorded_model(context, one.record, searched=True)) for one in records]

@@ -92,7 +92,7 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
     refused = list_refused_commands(study, limb)
     facts += [f"cannot run: limbfit {', '.join(row['commands'])}: {row['why']}" for row in refused]
     flags = record_flags(study, records, steps, placed, anatomy)
-    outside = _outside_records(study, records, limb)
+    outside = _describe_outside(study, records, limb)
     listener(Progress("check", 2, 2))
     return {
         "study": study.study.name,
@@ -105,7 +105,7 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
     }
 
 
-def _outside_records(
+def _describe_outside(
     study: Study, records: Mapping[str, Mapping[str, Any]], limb: LimbGeometry | None
 ) -> dict[str, list[dict[str, Any]]]:
     """What other records, planned indentations and the socket do that no fitted record does, by name.

@@ -139,7 +139,7 @@ def plan_protocol(
         minutes=float(minutes),
         setup_s=float(setup_s),
         rest_s=float(rest_s),
-        speeds_mm_s=[float(v) for v in speeds_mm_s] or _speeds(study, times.values(), depths_mm),
+        speeds_mm_s=[float(v) for v in speeds_mm_s] or _choose_speeds(study, times.values(), depths_mm),
         holds_s=[float(hold) for hold in holds_s],
         depths_mm=[float(depth) for depth in depths_mm],
         determine=[] if pressures else list(determine),
@@ -155,7 +155,7 @@ def plan_protocol(
     )
 
 
-def _speeds(study: Study, loads: Iterable[LoadHistory], depths_mm: Sequence[float]) -> list[float]:
+def _choose_speeds(study: Study, loads: Iterable[LoadHistory], depths_mm: Sequence[float]) -> list[float]:
     """The study's speed, and five times that or as fast as the ``loads`` of a socket come on, mm/s.
 
     The deepest record then takes as long as the load that comes on fastest.
