@@ -69,7 +69,8 @@ def test_priors_of_people_narrow_what_records_leave_open_and_let_stand_what_they
     skin = [NAMES.index("skin.c_kPa"), NAMES.index("skin.m")]
     share = with_people.prior_share[skin]
     assert share.min() > 0.2
-    assert with_people.wider_without[skin] == pytest.approx((1 - share) ** -0.5, rel=0.05)
+    # Exact for one parameter with a prior; c and m of the skin are correlated.
+    assert with_people.wider_without[skin] == pytest.approx((1 - share) ** -0.5, rel=0.1)
     low, high = with_people.intervals_95.T
     assert np.all((low < TRUTH) & (high > TRUTH))
     # The width of an open parameter hangs on the noise: 0.5 to 1.2 times that without, one draw by another.

@@ -342,7 +342,7 @@ def test_errors_hold_no_traceback(page, study, monkeypatch):
     answer = page.get("/api/study")
     assert answer.status_code == 422
     assert "sites" in answer.json()["error"]
-    monkeypatch.setattr("limbfit.studio.study_routes.running", lambda folder: 1 / 0)
+    monkeypatch.setattr("limbfit.studio.study_routes.find_running", lambda folder: 1 / 0)
     answer = page.get("/api/changes")
     assert answer.status_code == 500
     assert "ZeroDivisionError" in answer.json()["error"]

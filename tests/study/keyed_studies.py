@@ -222,6 +222,7 @@ READ: dict[str, str] = {
         ),
         "pipeline/experiments/socket_limb.py",
     ),
+    "socket.worn_s": "pipeline/experiments/socket.py",
     **{key: "pipeline/experiments/socket_design.py" for key in KEYS if key.startswith("socket.design.")},
     **{
         f"socket.design.{key}": "pipeline/shared/socket_shape.py"
