@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
+from limbfit.relaxation import compute_power_law_terms
+
 Array = NDArray[np.float64]
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "relaxation"
@@ -105,7 +107,7 @@ def power_law() -> Law:
     """Fixed times with amplitudes gamma (tau / 1 s)^-slope."""
     return Law(
         "power of time",
-        lambda p: (np.exp(p[0]) * POWER_TIMES_S ** -p[1], POWER_TIMES_S),
+        lambda p: (compute_power_law_terms(float(np.exp(p[0])), p[1], POWER_TIMES_S), POWER_TIMES_S),
         np.array([np.log(AMPLITUDES), (-0.5, 2.0)]),
         np.array([[0.0, slope] for slope in (0.0, 0.2, 0.5)]),
     )
