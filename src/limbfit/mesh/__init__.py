@@ -12,7 +12,7 @@ from .volume import (
     node_jacobians,
     to_tet10,
 )
-from .vtu import read_grid, read_vtu, silence_vtk, write_pvd, write_vtu
+from .vtu import grid_to_mesh, read_grid, read_vtu, silence_vtk, write_pvd, write_vtu
 
 __all__ = [
     "CELLS",
@@ -29,6 +29,7 @@ __all__ = [
     "check",
     "compute_dihedral_angles",
     "find_gauges_along",
+    "grid_to_mesh",
     "locate",
     "measure_quality",
     "node_jacobians",

@@ -98,7 +98,11 @@ def read_vtu(path: str | Path) -> Mesh:
 
     A foreign file without regions becomes one region named ``all``.
     """
-    grid = read_grid(Path(path))
+    return grid_to_mesh(read_grid(Path(path)), path)
+
+
+def grid_to_mesh(grid: vtkUnstructuredGrid, path: str | Path) -> Mesh:
+    """Return the mesh of a grid that `read_grid` has read; ``path`` is for errors."""
     kinds = np.unique(vtk_to_numpy(grid.GetCellTypesArray()))
     named = {cell.vtk: cell.name for cell in CELLS.values()}
     if len(kinds) != 1 or int(kinds[0]) not in named:

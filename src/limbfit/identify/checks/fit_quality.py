@@ -10,7 +10,7 @@ parameters would explain is taken out first: it is the model that is judged, not
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -109,8 +109,7 @@ def assess_fit(
     share = None if inside is None else float(np.mean(inside))
     times_noise, p = float(np.sqrt(np.mean(white**2))), _test_autocorrelation(white)
     found = FitQuality(record, fitted, times_noise, alike, p, share, phases, "")
-    text = _describe_fitted(found) if fitted else _describe_held_out(found)
-    return FitQuality(record, fitted, times_noise, alike, p, share, phases, text)
+    return replace(found, verdict=_describe_fitted(found) if fitted else _describe_held_out(found))
 
 
 def summarise_fit(records: Sequence[FitQuality]) -> str:

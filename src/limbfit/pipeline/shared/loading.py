@@ -31,7 +31,7 @@ from ...identify.checks.domain import (
     describe_outside,
 )
 from ...indentation import compute_contact_radius
-from ...mesh import Mesh, cell_volumes, read_grid, read_vtu
+from ...mesh import Mesh, cell_volumes, grid_to_mesh, read_grid
 from ...phases import find_phases
 from ...study import IndenterTable, Vector
 from ...study.socket import SocketTable
@@ -129,7 +129,8 @@ def compute_strain_extents(
 
 def read_strain_extents(file: Path) -> list[Extent]:
     """Return the strains near the indenter of a simulation whose fields were stored (see `fields`)."""
-    mesh, grid = read_vtu(file), read_grid(file)
+    grid = read_grid(file)
+    mesh = grid_to_mesh(grid, file)
     most, least = (
         vtk_to_numpy(grid.GetCellData().GetArray(f"{which}_stretch")) ** 2
         for which in ("largest", "smallest")

@@ -71,8 +71,9 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     sites = [SitePrediction(*parts) for parts in zip_longest(records, simulations[:n], ours, others)]
     whole = [job for site, job in zip(sites, jobs) if site.own.completed]
     strains = _write_fields(context, folder, whole, len(jobs))
-    for site in sites:
-        _write_curves(context, folder, site, best, known)
+    bands = [_Band.compute(context, site, best, known) if site.ours.completed else None for site in sites]
+    for site, band in zip(sites, bands, strict=True):
+        _write_curves(folder, site, band)
     rows = [_to_row(site) for site in sites]
     for i, site in enumerate(sites):
         rows[i]["observed"] = _write_observed(
@@ -80,7 +81,8 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
         )
     tested = _compare_with_records(context, sites, strains, rows)
     doubts = outliers_to_dict(context, cache, records, ours, best, one, searched, correction)
-    quality = _assess_fits(context, [site for site in sites if site.ours.completed], best, known)
+    judged = [(site, band) for site, band in zip(sites, bands, strict=True) if band is not None]
+    quality = _assess_fits(context, judged, best, known)
     fit = {"verdict": summarise_fit(quality), "records": [one.to_dict() for one in quality]}
     content = {"sites": rows, **_compute_means(rows), **tested, **doubts, "fit_quality": fit}
     write_json(folder / "predict.json", content)
@@ -227,11 +229,27 @@ def _compare_with_records(
     return {"recorded_range": tested.to_dict(), "outside_text": describe_outside(outside)}
 
 
-def _write_curves(
-    context: Context, folder: Path, site: SitePrediction, best: Array, known: PredictionModel
-) -> None:
+@dataclass(frozen=True)
+class _Band:
+    """The 95 % band of a record (n,), and one standard deviation (n,) of what its site may be off by."""
+
+    deviation: Array
+    low: Array
+    high: Array
+
+    @classmethod
+    def compute(cls, context: Context, site: SitePrediction, best: Array, known: PredictionModel) -> _Band:
+        record, ours = site.record, site.ours
+        deviation = estimate_site_deviation(context, record, ours, best)
+        of_site = 0.0 if record.site.fitted else deviation
+        unit = record.record.unit
+        low, high = known.compute_interval_95(ours, best, record.name, unit, of_site, record.times_s)
+        return cls(deviation, np.maximum(low, 0.0), high)
+
+
+def _write_curves(folder: Path, site: SitePrediction, band: _Band | None) -> None:
     """The record beside its prediction; a column that is not predicted is not there."""
-    record, ours, missing = site.record, site.ours, site.missing
+    record, missing = site.record, site.missing
     name, unit = ("displacement" if record.record.forced else "force"), record.record.unit
     columns = {"time_s": record.times_s}
     columns |= (
@@ -242,23 +260,21 @@ def _write_curves(
         columns[f"{name}_simulated_{unit}"] = site.own.force_N
     if site.one is not None and "one_material" not in missing:
         columns[f"{name}_one_material_{unit}"] = site.one.force_N
-    if ours.completed:
-        own = 0.0 if record.site.fitted else estimate_site_deviation(context, record, ours, best)
-        low, high = known.compute_interval_95(ours, best, record.name, unit, own, record.times_s)
-        columns |= {f"{name}_low_{unit}": np.maximum(low, 0.0), f"{name}_high_{unit}": high}
+    if band is not None:
+        columns |= {f"{name}_low_{unit}": band.low, f"{name}_high_{unit}": band.high}
     write_curves(folder / f"{record.name}.csv", **columns)
 
 
 def _assess_fits(
-    context: Context, sites: Sequence[SitePrediction], best: Array, known: PredictionModel
+    context: Context, judged: Sequence[tuple[SitePrediction, _Band]], best: Array, known: PredictionModel
 ) -> list[FitQuality]:
     """How well the model follows each record, beside its noise and the errors of its mesh and site."""
-    stiffer = [estimate_site_deviation(context, site.record, site.ours, best) for site in sites]
+    sites = [site for site, _ in judged]
     allowed, residuals = [], [site.ours.force_N - site.record.compared for site in sites]
-    for site, stiff in zip(sites, stiffer, strict=True):
+    for site, band in judged:
         mesh = known.find_mesh_share(site.record.name) * site.ours.force_N
         noise = estimate_site_noise(context.study, site.record, site.ours.force_N).covariance
-        allowed.append(noise + np.outer(stiff, stiff) + np.outer(mesh, mesh))
+        allowed.append(noise + np.outer(band.deviation, band.deviation) + np.outer(mesh, mesh))
     fitted = [i for i, site in enumerate(sites) if site.record.site.fitted]
     refitted = refit_residuals(
         [residuals[i] for i in fitted],
@@ -267,10 +283,8 @@ def _assess_fits(
     )
     left = dict(zip(fitted, refitted, strict=True))
     found = []
-    for i, (site, stiff) in enumerate(zip(sites, stiffer, strict=True)):
+    for i, (site, band) in enumerate(judged):
         record = site.record
-        of_site = 0.0 if record.site.fitted else stiff
-        low, high = known.compute_interval_95(site.ours, best, record.name, record.record.unit, of_site)
         found.append(
             assess_fit(
                 record.name,
@@ -280,7 +294,7 @@ def _assess_fits(
                 residuals[i],
                 find_largest_magnitude(record.compared),
                 allowed[i],
-                (record.compared >= np.maximum(low, 0.0)) & (record.compared <= high),
+                (record.compared >= band.low) & (record.compared <= band.high),
                 left.get(i),
             )
         )

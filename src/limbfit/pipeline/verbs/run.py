@@ -304,10 +304,8 @@ def run_experiment(
     ):
         known = Keys(study)
         chain = _chain_keys(known)
-        key, parts = (
-            compute_experiment_key(experiment, known, chain, chosen),
-            _collect_parts(known, experiment, chain),
-        )
+        key = compute_experiment_key(experiment, known, chain, chosen)
+        parts = _collect_parts(known, experiment, chain)
         context = Context(study, store, executor, listener)
         found = do_experiment(context, experiment, key, chosen, parts)
     return found | {"folder": str(store[name])}
