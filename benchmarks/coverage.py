@@ -42,12 +42,12 @@ from limbfit.identify.fit.parameters import Unknowns
 from limbfit.identify.uncertainty.emulator import Emulator
 from limbfit.identify.uncertainty.noise import SiteNoise, compute_depth_slope, estimate_record_noise
 from limbfit.phantom.record import DISPLACEMENT_NOISE_MM, RATE_HZ
-from limbfit.pipeline.experiments.emulator_file import EMULATOR, read_emulator
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.deviations import estimate_site_deviation
-from limbfit.pipeline.stages.laboratory import build_unknowns
-from limbfit.pipeline.stages.records import SiteRecord, load_site_record
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.identification.record_simulator import build_unknowns
+from limbfit.pipeline.records.deviations import estimate_site_deviation
+from limbfit.pipeline.records.records import SiteRecord, load_site_record
+from limbfit.pipeline.uncertainty.result import EMULATOR, read_emulator
 from limbfit.traces import Regularised, TouchDown, Trace, find_touch_down, regularise
 
 Array = NDArray[np.float64]

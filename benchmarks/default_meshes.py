@@ -18,13 +18,13 @@ import numpy as np
 from limbfit import load_study, run_study
 from limbfit.execution import SerialExecutor
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import SimulationCache
-from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.laboratory import build_unknowns
-from limbfit.pipeline.stages.mesh import mesh_settings
-from limbfit.pipeline.stages.records import load_site_record
-from limbfit.pipeline.stages.remesh import mesh_models
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.identification.record_simulator import build_unknowns
+from limbfit.pipeline.limb.mesh import mesh_settings
+from limbfit.pipeline.limb.remesh import mesh_models
+from limbfit.pipeline.records.records import load_site_record
+from limbfit.pipeline.simulation.simulations import SimulationCache
 
 FINER, FARTHER, FAR_MM, GROWTH, FLATNESS = 0.6, 1.5, 12.0, 0.4, 1.2
 

@@ -50,7 +50,7 @@ from limbfit.errors import LimbfitError
 from limbfit.fe import solve
 from limbfit.indentation import SiteModel, build_problem, build_steps
 from limbfit.mesh import Mesh, boundary_faces, measure_quality
-from limbfit.pipeline.stages.mesh import build_coarse_settings, mesh_settings
+from limbfit.pipeline.limb.mesh import build_coarse_settings, mesh_settings
 from limbfit.study import Study
 
 Array = NDArray[np.float64]

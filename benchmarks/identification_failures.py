@@ -19,9 +19,9 @@ from limbfit.execution import SerialExecutor, share_executor
 from limbfit.fe import solve
 from limbfit.indentation import Simulation, SimulationJob, build_problem, build_steps, to_parameters
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.shared.artefacts import compute_digest, read_curves
-from limbfit.pipeline.shared.simulations import compute_job_digest
-from limbfit.pipeline.shared.store import RUNS
+from limbfit.pipeline.engine.storage import compute_digest, read_curves
+from limbfit.pipeline.engine.store import RUNS
+from limbfit.pipeline.simulation.simulations import compute_job_digest
 
 # Newton iterations of a step, none of which may be halved: the largest with which a simulation stops early.
 LIMITS = (5, 4, 3, 2, 1)

@@ -24,9 +24,9 @@ from limbfit.execution import SerialExecutor
 from limbfit.identify.fit.correction import MeshCorrection
 from limbfit.indentation import SimulationJob, build_problem, simulate, to_parameters, to_vector
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.records import load_site_record, to_response
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.records.records import load_site_record, to_response
 
 MOVED = np.array(
     [0.15, -0.15, 0.1, 0.1]

@@ -40,11 +40,11 @@ from limbfit.identify.checks.protocol import (
 from limbfit.identify.fit.objective import SiteResponse
 from limbfit.indentation import to_vector
 from limbfit.phantom.record import NOTHING, ULTRASOUND_NOISE_MM, WAVES_NOISE_M_S, SecondaryMeasurements
-from limbfit.pipeline.experiments.protocol import DETERMINED
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import SimulationCache, build_curve_job, build_site_model
-from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.laboratory import build_unknowns
+from limbfit.pipeline.design.protocol import DETERMINED
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.identification.record_simulator import build_unknowns
+from limbfit.pipeline.simulation.simulations import SimulationCache, build_curve_job, build_site_model
 from limbfit.study import Study
 
 FAST, HOLD_S = 4.8, 30.0

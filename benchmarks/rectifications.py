@@ -34,11 +34,11 @@ from limbfit.execution import SerialExecutor
 from limbfit.mesh import Mesh
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.surfaces import build_true_anatomy
-from limbfit.pipeline.experiments.socket_limb import SocketLimb
-from limbfit.pipeline.shared.context import Context, ignore_progress
-from limbfit.pipeline.shared.socket_shape import build_socket
-from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.verbs.fitting import choose_tissues
+from limbfit.pipeline.commands.fitting import choose_tissues
+from limbfit.pipeline.engine.context import Context, ignore_progress
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.socket.limb import SocketLimb
+from limbfit.pipeline.socket.shape import build_socket
 from limbfit.socket import Socket
 from limbfit.study.socket import SocketAreaTable
 

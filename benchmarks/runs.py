@@ -30,7 +30,7 @@ from runs_jobs import TISSUES, answer, bind, measured, nothing, stored_fields
 from limbfit.bench.blocks import DEPTH, INDENTATION, build_block_site, build_layered_block
 from limbfit.execution import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
 from limbfit.indentation import SimulationJob, SiteModel, simulate
-from limbfit.pipeline.shared.simulations import CURVE_POINTS, SimulationCache
+from limbfit.pipeline.simulation.simulations import CURVE_POINTS, SimulationCache
 from limbfit.study.meshing import MeshTable
 
 SOFT, STIFF = (6.0, 5.0, 1.5, 0.6, 4.0, 4.0, 1.5, 0.6), (9.0, 6.0, 2.0, 0.5, 4.0, 4.0, 3.0, 0.3)

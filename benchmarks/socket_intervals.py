@@ -32,11 +32,11 @@ from limbfit.identify.uncertainty.uncertainty import NORMAL_95
 from limbfit.indentation import list_flat_names, to_parameters, to_vector
 from limbfit.mesh import Mesh
 from limbfit.phantom.build import draw_true_parameters
-from limbfit.pipeline.experiments.socket_intervals import ParameterSpread, draw_step, predict_change
-from limbfit.pipeline.experiments.socket_limb import SocketLimb
-from limbfit.pipeline.shared.context import Context, ignore_progress
-from limbfit.pipeline.shared.socket_shape import build_socket
-from limbfit.pipeline.shared.store import Store
+from limbfit.pipeline.engine.context import Context, ignore_progress
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.socket.intervals import ParameterSpread, draw_step, predict_change
+from limbfit.pipeline.socket.limb import SocketLimb
+from limbfit.pipeline.socket.shape import build_socket
 from limbfit.socket import Socket
 
 SETTLING = "settling (mm)"

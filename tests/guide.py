@@ -13,8 +13,8 @@ import pytest
 from layered import store_blocks
 from limbfit import load_study
 from limbfit.execution import Limits, make_executor
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.stages.calibrate import run_calibrate
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.identification.calibrate import run_calibrate
 
 GUIDE = Path(__file__).parents[1] / "docs" / "extending.md"
 BLOCKS = {"a": ((3.0, 5.0), 2.2, True), "b": ((3.0, 21.0), 6.0, True)}  # thicknesses, depth

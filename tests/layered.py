@@ -17,11 +17,11 @@ from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
 from limbfit.mesh.boxes import SIX_TETS, build_boxes, turn_upright
 from limbfit.phantom.record import Ramp, record
-from limbfit.pipeline.shared.artefacts import write_json
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import COARSE, find_fibre_directions
-from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.curves import run_traces
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.engine.storage import write_json
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.records.traces import run_traces
+from limbfit.pipeline.simulation.simulations import COARSE, find_fibre_directions
 from limbfit.study import Study, load_study
 
 TISSUES = ("skin", "fat", "muscle")

@@ -32,7 +32,16 @@ INNER_FLOORS = {
     "anatomy": ["imaging", "meshing", "sites", "segmentation", "surfaces", "labels", "images", ""],
     "fe": ["__init__", "solution", "", "contact", "kernel", "materials", "lanes threads"],
     "identify": ["__init__", "checks", "uncertainty", "fit"],
-    "pipeline": ["__init__", "verbs", "experiments", "stages", "shared"],
+    "pipeline": [
+        "__init__",
+        "commands",
+        "socket design uncertainty variants",
+        "identification",
+        "records",
+        "simulation",
+        "limb",
+        "engine",
+    ],
     "report": ["__init__ build", "sections", "drawing", "page store tables formats"],
 }
 # ``report`` reads stored results only; ``phantom`` makes inputs: neither may know the other.

@@ -49,8 +49,8 @@ EXCEPTIONS = {
     "notebook/": "names that users import",
     "fe/prestretch.py": "a name that users import",
     "fields.py": "names that users import",
-    "pipeline/verbs/acquire.py": "names that users import",
-    "pipeline/verbs/run.py": "names that users import",
+    "pipeline/commands/acquire.py": "names that users import",
+    "pipeline/commands/run.py": "names that users import",
     "priors/people.py": "a constructor",
     "anatomy/meshing/_netgen_worker.py": "a script",
 }

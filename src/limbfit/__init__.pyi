@@ -46,13 +46,13 @@ from .notebook import (
     calibrate as calibrate,
     solve as solve,
 )
-from .pipeline.experiments.catalogue import (
+from .pipeline.commands.experiments import (
     Experiment as Experiment,
     register_experiment as register_experiment,
 )
-from .pipeline.experiments.cube import compress_cube as compress_cube
-from .pipeline.shared.context import Progress as Progress
-from .pipeline.verbs.acquire import (
+from .pipeline.variants.cube import compress_cube as compress_cube
+from .pipeline.engine.context import Progress as Progress
+from .pipeline.commands.acquire import (
     acquire_site as acquire_site,
     check_recording as check_recording,
     judge_recording as judge_recording,
@@ -60,35 +60,35 @@ from .pipeline.verbs.acquire import (
     virtual_fitsocket as virtual_fitsocket,
     waiting as waiting,
 )
-from .pipeline.verbs.batch import run_batch as run_batch
-from .pipeline.verbs.calibration_bench import bench_calibrate as bench_calibrate
-from .pipeline.verbs.check import check_study as check_study
-from .pipeline.verbs.compare import compare_site as compare_site
-from .pipeline.verbs.demo import (
+from .pipeline.commands.batch import run_batch as run_batch
+from .pipeline.commands.calibration_bench import bench_calibrate as bench_calibrate
+from .pipeline.commands.check import check_study as check_study
+from .pipeline.commands.compare import compare_site as compare_site
+from .pipeline.commands.demo import (
     make_phantom_study as make_phantom_study,
     run_demo as run_demo,
 )
-from .pipeline.verbs.doctor import diagnose as diagnose
-from .pipeline.verbs.export import export_study as export_study
-from .pipeline.verbs.febfile import simulate_feb as simulate_feb
-from .pipeline.verbs.fitting import (
+from .pipeline.commands.doctor import diagnose as diagnose
+from .pipeline.commands.export import export_study as export_study
+from .pipeline.commands.febfile import simulate_feb as simulate_feb
+from .pipeline.commands.fitting import (
     design_socket as design_socket,
     fit_socket as fit_socket,
 )
-from .pipeline.verbs.planning import (
+from .pipeline.commands.planning import (
     design_study as design_study,
     plan_protocol as plan_protocol,
 )
-from .pipeline.verbs.reproduce import reproduce_study as reproduce_study
-from .pipeline.verbs.run import (
+from .pipeline.commands.reproduce import reproduce_study as reproduce_study
+from .pipeline.commands.run import (
     STAGE_NAMES as STAGE_NAMES,
     report_study as report_study,
     run_experiment as run_experiment,
     run_study as run_study,
     study_status as study_status,
 )
-from .pipeline.verbs.show import show_stage as show_stage
-from .pipeline.verbs.simulate import simulate_site as simulate_site
+from .pipeline.commands.show import show_stage as show_stage
+from .pipeline.commands.simulate import simulate_site as simulate_site
 from .shapes import (
     Measure as Measure,
     Shape as Shape,

@@ -13,7 +13,7 @@ from limbfit.acquire import LineDevice, connect
 from limbfit.acquire.virtual import Serving
 from limbfit.cli import app
 from limbfit.errors import InputError, RunError
-from limbfit.pipeline.verbs.acquire import acquire_site
+from limbfit.pipeline.commands.acquire import acquire_site
 from limbfit.study import load_study
 
 ADDRESSES = {

@@ -28,7 +28,7 @@ from limbfit.acquire.messages import SetLimits
 from limbfit.acquire.phases import Phase
 from limbfit.acquire.wire import Encoder
 from limbfit.errors import RunError
-from limbfit.pipeline.stages.curves import read_record
+from limbfit.pipeline.records.traces import read_record
 from limbfit.study import load_study
 
 

@@ -16,8 +16,8 @@ from limbs import leg_image, rotation, write_dicom
 from conftest import COARSE
 from limbfit import load_study
 from limbfit.cli import main
-from limbfit.pipeline.shared.artefacts import write_json
-from limbfit.pipeline.verbs.run import run_record
+from limbfit.pipeline.commands.run import run_record
+from limbfit.pipeline.engine.storage import write_json
 
 IN_TAGS = {
     "PatientName": "QUIXOTE^ALONSO^MARKERX1",

@@ -14,8 +14,8 @@ from limbfit.anatomy.images.formats import register_image_format
 from limbfit.anatomy.imaging import Volume, read_labels, read_volume, write_volume
 from limbfit.errors import ImageError, InputError
 from limbfit.extensions import load_extensions
-from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, Experiment, register_experiment
-from limbfit.pipeline.verbs.run import compute_keys, study_status
+from limbfit.pipeline.commands.experiments import EXPERIMENTS, Experiment, register_experiment
+from limbfit.pipeline.commands.run import compute_keys, study_status
 
 GEOMETRY = {"spacing_mm": np.array([1.0, 1.5, 2.0]), "origin_mm": np.array([3.0, -4.0, 50.0])}
 

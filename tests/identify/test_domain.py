@@ -15,7 +15,7 @@ from limbfit.identify.checks.domain import (
     RecordedRange,
     describe_outside,
 )
-from limbfit.pipeline.shared.loading import LoadHistory, describe_untested_times, time_socket_loads
+from limbfit.pipeline.simulation.loading import LoadHistory, describe_untested_times, time_socket_loads
 from limbfit.study.socket import SocketLoadTable, SocketTable
 
 RECORDS = (

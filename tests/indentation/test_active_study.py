@@ -13,10 +13,10 @@ from limbfit.errors import InputError, StudyError
 from limbfit.fe import Contractile, OgdenQLV
 from limbfit.indentation import SimulationJob, build_materials, build_problem, simulate
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.experiments.socket import check_socket
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import build_recorded_model
-from limbfit.pipeline.verbs.run import compute_keys
+from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.simulation.simulations import build_recorded_model
+from limbfit.pipeline.socket.socket import check_socket
 from limbfit.study import Study
 
 ALONG = "fibres = { muscle = [1.0, 0.0, 0.0] }\n"

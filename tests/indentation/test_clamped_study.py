@@ -12,13 +12,13 @@ from limbfit.errors import ProblemError, StudyError
 from limbfit.execution import SerialExecutor
 from limbfit.febio import read_feb, to_problem
 from limbfit.indentation import SimulationJob, simulate
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import build_planned_model, compute_job_digest
-from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.mesh import build_coarse_settings, mesh_settings
-from limbfit.pipeline.verbs.check import check_study
-from limbfit.pipeline.verbs.export import export_study
-from limbfit.pipeline.verbs.run import compute_keys, run_study
+from limbfit.pipeline.commands.check import check_study
+from limbfit.pipeline.commands.export import export_study
+from limbfit.pipeline.commands.run import compute_keys, run_study
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.limb.mesh import build_coarse_settings, mesh_settings
+from limbfit.pipeline.simulation.simulations import build_planned_model, compute_job_digest
 from limbfit.study import Study, load_study
 from small_limb import small_limb
 

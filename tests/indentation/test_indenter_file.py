@@ -10,8 +10,8 @@ import pyvista as pv
 
 from limbfit.errors import InputError, StudyError
 from limbfit.indentation import SiteModel, read_indenter
-from limbfit.pipeline.shared.simulations import SimulationJob, compute_job_digest
-from limbfit.pipeline.verbs.run import compute_keys
+from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.simulation.simulations import SimulationJob, compute_job_digest
 from limbfit.study import IndenterTable, Study, load_study
 
 TEXT = """

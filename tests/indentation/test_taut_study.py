@@ -11,10 +11,10 @@ from layered import block_context, block_study
 from limbfit.errors import InputError, StudyError
 from limbfit.indentation import SimulationJob, build_problem, simulate
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.experiments.socket import check_socket
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import build_recorded_model, compute_job_digest
-from limbfit.pipeline.verbs.run import compute_keys
+from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.simulation.simulations import build_recorded_model, compute_job_digest
+from limbfit.pipeline.socket.socket import check_socket
 
 TAUT = "prestretch = { skin = 1.1 }\n"
 VALUES = {"c_kPa": 6.0, "m": 5.0, "gamma": 1.2, "tau_s": 0.5}

@@ -18,7 +18,7 @@ from limbfit.fe import StepControl, System, solve
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.system import Increment
 from limbfit.laws import LAWS, Parameter, TissueLaw, register_law
-from limbfit.pipeline.verbs.run import compute_keys
+from limbfit.pipeline.commands.run import compute_keys
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "fe"))
 from blocks import block, check_tangent, punch

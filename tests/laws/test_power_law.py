@@ -26,10 +26,10 @@ from limbfit.febio import (
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.indentation.sites import build_site_materials
 from limbfit.laws import LAWS, POWER, TissueLaw
-from limbfit.pipeline.shared.artefacts import write_json
-from limbfit.pipeline.shared.simulations import build_recorded_model, compute_job_digest
-from limbfit.pipeline.verbs.export import check_export
-from limbfit.pipeline.verbs.run import compute_keys
+from limbfit.pipeline.commands.export import check_export
+from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.engine.storage import write_json
+from limbfit.pipeline.simulation.simulations import build_recorded_model, compute_job_digest
 from limbfit.relaxation import DEFAULT_SPAN_S, choose_relaxation_times, compute_power_law_terms
 from limbfit.report.sections.methods import write_method_parts
 from limbfit.report.store import load_store

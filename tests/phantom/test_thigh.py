@@ -20,8 +20,8 @@ from limbfit.phantom.mri import build_image, make_grid
 from limbfit.phantom.sites import DETAIL_SITES, SAFE_SHARE
 from limbfit.phantom.socket import LINER_MM, make_socket
 from limbfit.phantom.surfaces import build_outer_surface, build_true_anatomy
-from limbfit.pipeline.shared.socket_shape import build_regions, load_of
-from limbfit.pipeline.verbs.check import check_study
+from limbfit.pipeline.commands.check import check_study
+from limbfit.pipeline.socket.shape import build_regions, load_of
 from limbfit.study import load_study
 
 THIGH = "transfemoral"

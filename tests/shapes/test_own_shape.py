@@ -18,9 +18,9 @@ from limbfit.extensions import load_extensions
 from limbfit.fe import StepControl, solve
 from limbfit.febio import FebSettings, read_feb, to_problem, write_feb, write_inp
 from limbfit.indentation import SiteModel
-from limbfit.pipeline.experiments.sensitivity import list_other_indenters
-from limbfit.pipeline.shared.simulations import SimulationJob, compute_job_digest
-from limbfit.pipeline.verbs.run import compute_keys
+from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.simulation.simulations import SimulationJob, compute_job_digest
+from limbfit.pipeline.variants.sensitivity import list_other_indenters
 from limbfit.shapes import SHAPES, TAKEN, Shape
 from limbfit.study import IndenterTable
 

@@ -21,7 +21,7 @@ from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.donning import Load, SocketFit, build_socket_problem, don, pack, unpack
 from limbfit.errors import ProblemError
 from limbfit.fe import Checkpoints, OgdenQLV, StepControl, solve
-from limbfit.pipeline.shared.kept import Begun, ResultFiles
+from limbfit.pipeline.engine.partial_results import Begun, ResultFiles
 from limbfit.socket import Recipe, rectify_limb
 from limbfit.socket.trim import Trim
 

@@ -7,14 +7,14 @@ import pytest
 
 from limbfit.fe import SimulationWarning
 from limbfit.identify.uncertainty.uncertainty import NORMAL_95
-from limbfit.pipeline.experiments.socket_intervals import (
+from limbfit.pipeline.socket.intervals import (
     ParameterSpread,
     SimulationSpread,
     draw_step,
     spread_to_facts,
     widen_intervals,
 )
-from limbfit.pipeline.experiments.socket_limb import format_warning
+from limbfit.pipeline.socket.limb import format_warning
 
 NAMES = ("skin.c_kPa", "skin.tau_s", "liner.c_kPa")
 SLOPES = np.array([3.0, -1.0, 2.0])

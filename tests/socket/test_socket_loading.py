@@ -15,7 +15,7 @@ from limbfit.donning import Held, Strains
 from limbfit.identify.checks.domain import ANGLE, LEVEL, PRESSURE, RATE, SHEAR, TIME, Extent, RecordedRange
 from limbfit.mesh import Mesh, boundary_faces, cell_volumes
 from limbfit.mesh.boxes import SIX_TETS, build_boxes, turn_upright
-from limbfit.pipeline.shared.loading import LimbAxis, LoadHistory, describe_socket_load
+from limbfit.pipeline.simulation.loading import LimbAxis, LoadHistory, describe_socket_load
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ import pytest
 from socket_limbs import CUT_NORMAL, round_limb
 
 from limbfit.anatomy.frame import build_limb_frame
-from limbfit.pipeline.shared.socket_shape import mesh_edge_mm
-from limbfit.pipeline.verbs.check import check_study
+from limbfit.pipeline.commands.check import check_study
+from limbfit.pipeline.socket.shape import mesh_edge_mm
 from limbfit.socket import Recipe, Socket, rectify_limb
 from limbfit.socket.trim import Trim
 from limbfit.study import Study, load_study

@@ -13,8 +13,8 @@ from socket_limbs import round_limb
 from limbfit.anatomy.surfaces.surfacefiles import write_surface
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import StudyError
-from limbfit.pipeline.shared.socket_shape import build_regions, build_socket, load_of
-from limbfit.pipeline.verbs.check import check_study
+from limbfit.pipeline.commands.check import check_study
+from limbfit.pipeline.socket.shape import build_regions, build_socket, load_of
 from limbfit.socket import Socket
 from limbfit.socket.landmarks import find_knee_centre
 from limbfit.study import Study, load_study

@@ -15,7 +15,7 @@ from limb_image import make_segmented
 
 from limbfit.anatomy.imaging import read_labels
 from limbfit.pipeline import run_study, study_status
-from limbfit.pipeline.shared.store import lock
+from limbfit.pipeline.engine.store import lock
 from limbfit.studio.app import create_app
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import Door

@@ -12,9 +12,9 @@ from typing import Any
 from test_study_docs import KEYS
 
 from limbfit.extensions import load_extensions
-from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, compute_experiment_key
-from limbfit.pipeline.shared.keys import Keys
-from limbfit.pipeline.verbs.run import compute_keys
+from limbfit.pipeline.commands.experiments import EXPERIMENTS, compute_experiment_key
+from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.engine.keys import Keys
 from limbfit.study import Study, load_study
 
 SEEN = {"ultrasound": "3.csv", "surface": "3.csv", "shear_waves": "3.csv"}
@@ -204,15 +204,15 @@ ACTS_ON_SURFACES: dict[str, tuple[str, Any]] = {
 }
 # Of no stage: what reads them instead.
 READ: dict[str, str] = {
-    **dict.fromkeys(("solver.solver", "febio.program", "febio.penalty"), "pipeline/verbs/simulate.py"),
-    **dict.fromkeys(("febio.threads", "febio.time_limit_s"), "pipeline/verbs/simulate.py"),
-    **{key: "pipeline/shared/context.py" for key in KEYS if key.startswith("execution.")},
+    **dict.fromkeys(("solver.solver", "febio.program", "febio.penalty"), "pipeline/commands/simulate.py"),
+    **dict.fromkeys(("febio.threads", "febio.time_limit_s"), "pipeline/commands/simulate.py"),
+    **{key: "pipeline/engine/context.py" for key in KEYS if key.startswith("execution.")},
     **{key: "acquire/" for key in KEYS if key.startswith("acquire.")},
     "acquire.key_gap_ms": "cli/acquire.py",
     **dict.fromkeys(
-        ("records.depth_mm", "records.speed_mm_s", "records.hold_s"), "pipeline/verbs/acquire.py"
+        ("records.depth_mm", "records.speed_mm_s", "records.hold_s"), "pipeline/commands/acquire.py"
     ),
-    **{key: "pipeline/shared/socket_shape.py" for key in KEYS if key.startswith("socket.")},
+    **{key: "pipeline/socket/shape.py" for key in KEYS if key.startswith("socket.")},
     **{key: "study/socket.py" for key in KEYS if key.startswith("socket.liner.")},
     **dict.fromkeys(
         (
@@ -220,14 +220,11 @@ READ: dict[str, str] = {
             *("socket.donning_s", "socket.hold_s", "socket.loads.duration_s", "socket.loads.hold_s"),
             "socket.liner.thickness_mm",
         ),
-        "pipeline/experiments/socket_limb.py",
+        "pipeline/socket/limb.py",
     ),
-    "socket.worn_s": "pipeline/experiments/socket.py",
-    **{key: "pipeline/experiments/socket_design.py" for key in KEYS if key.startswith("socket.design.")},
-    **{
-        f"socket.design.{key}": "pipeline/shared/socket_shape.py"
-        for key in ("adapter_diameter_mm", "adapter_mm")
-    },
+    "socket.worn_s": "pipeline/socket/socket.py",
+    **{key: "pipeline/socket/design.py" for key in KEYS if key.startswith("socket.design.")},
+    **{f"socket.design.{key}": "pipeline/socket/shape.py" for key in ("adapter_diameter_mm", "adapter_mm")},
     **{f"markups.{key}": "study/loading.py" for key in ("file", "gives")},
 }
 # How else the tables above name them.

@@ -25,9 +25,9 @@ from test_study_docs import KEYS
 
 import limbfit
 from limbfit.acquire import Settings
-from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, compute_experiment_key
-from limbfit.pipeline.shared.keys import Keys
-from limbfit.pipeline.verbs.run import compute_keys
+from limbfit.pipeline.commands.experiments import EXPERIMENTS, compute_experiment_key
+from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.engine.keys import Keys
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from tomlkit.items import AoT
 
 from ..anatomy.imaging import LabelMap, read_labels, write_labels
 from ..errors import StudyError
-from ..pipeline.shared.artefacts import compute_file_digest
+from ..pipeline.engine.storage import compute_file_digest
 from ..study import Record, Study, load_study
 from .folder import StudyFolder
 

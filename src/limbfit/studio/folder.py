@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..pipeline.shared.artefacts import read_json
-from ..pipeline.shared.store import Store
-from ..pipeline.verbs.acquire import FOLDER as ACQUIRED
+from ..pipeline.commands.acquire import FOLDER as ACQUIRED
+from ..pipeline.engine.storage import read_json
+from ..pipeline.engine.store import Store
 from ..study import Study, load_study
 
 

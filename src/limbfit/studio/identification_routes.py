@@ -10,8 +10,8 @@ from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict
 
 from ..pipeline import STAGE_NAMES
-from ..pipeline.shared.artefacts import read_curves
-from ..pipeline.shared.simulations import find_newest_simulations
+from ..pipeline.engine.storage import read_curves
+from ..pipeline.simulation.simulations import find_newest_simulations
 from ..study import Record
 from .folder import StudyFolder
 from .processes import find_running, find_starting, start_run, stop_run

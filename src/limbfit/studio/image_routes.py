@@ -15,7 +15,7 @@ from ..anatomy.imaging import LabelMap, Volume
 from ..anatomy.labels.labelfiles import colour_of
 from ..anatomy.surfaces.surfaces import read_surface
 from ..errors import InputError, RunError
-from ..pipeline.stages.inputs import read_plain_image
+from ..pipeline.limb.inputs import read_plain_image
 from ..study import Study
 from .editing import LABELS, find_shown_labels, read_shown_labels, save_labels
 from .processes import find_running

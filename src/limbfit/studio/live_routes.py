@@ -16,8 +16,8 @@ from ..acquire import Recording, follow_recording
 from ..acquire.events import PINS
 from ..acquire.phases import FINAL
 from ..errors import TraceError
-from ..pipeline.verbs.acquire import FOLDER as ACQUIRED
-from ..pipeline.verbs.acquire import RECORD, VERDICT
+from ..pipeline.commands.acquire import FOLDER as ACQUIRED
+from ..pipeline.commands.acquire import RECORD, VERDICT
 from .folder import StudyFolder, resolve_inside
 from .study_routes import Folder
 

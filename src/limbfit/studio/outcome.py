@@ -11,7 +11,7 @@ from typing import Any
 
 from ..errors import InputError, RunError
 from ..pipeline import export_study
-from ..pipeline.shared.artefacts import read_curves, write_json
+from ..pipeline.engine.storage import read_curves, write_json
 from ..study import Record
 from .folder import StudyFolder, read_stored
 from .study_routes import list_stages

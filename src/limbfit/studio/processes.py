@@ -15,7 +15,7 @@ import psutil
 
 from ..errors import InputError, RunError
 from ..pipeline import STAGE_NAMES
-from ..pipeline.shared.store import find_holder, is_held
+from ..pipeline.engine.store import find_holder, is_held
 from ..study import load_study
 from .commands import PROGRAM, find_command, interrupt_process, start_command
 from .folder import StudyFolder

@@ -14,9 +14,9 @@ from ..anatomy.sites.sites import project_to_skin
 from ..anatomy.surfaces.surfaces import Anatomy, Surface, load_anatomy, read_surface
 from ..errors import InputError, SiteError
 from ..mesh import read_vtu
-from ..pipeline.shared.artefacts import compute_digest
-from ..pipeline.stages.sites import place_site
-from ..pipeline.stages.surfaces import read_given_anatomy
+from ..pipeline.engine.storage import compute_digest
+from ..pipeline.limb.sites import place_site
+from ..pipeline.limb.surfaces import read_given_anatomy
 from ..study import Site, Study
 from ..web.arrays import pack
 from ..web.shapes import Shell, build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape

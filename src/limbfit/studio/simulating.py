@@ -13,7 +13,7 @@ from typing import Any
 import psutil
 
 from ..errors import RunError
-from ..pipeline.verbs.journal import redact_paths
+from ..pipeline.engine.journal import redact_paths
 from .commands import PROGRAM, find_command, interrupt_process, start_command
 from .folder import StudyFolder
 from .processes import find_running

@@ -15,8 +15,8 @@ from pydantic import Field
 from ..anatomy.frame import build_limb_frame
 from ..errors import InputError, SurfaceError
 from ..mesh import read_vtu
-from ..pipeline.shared.artefacts import compute_digest
-from ..pipeline.shared.socket_shape import build_regions, build_socket, place_errors, trim_of
+from ..pipeline.engine.storage import compute_digest
+from ..pipeline.socket.shape import build_regions, build_socket, place_errors, trim_of
 from ..socket import Socket
 from ..socket.rays import LimbProfile, compute_profile
 from ..socket.trim import Trim, find_brim, trim_limb, wrap_trimline

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Request
 from fastapi.responses import FileResponse
 
 from ..pipeline import study_status
-from ..pipeline.shared.provenance import list_input_files
+from ..pipeline.engine.provenance import list_input_files
 from ..study import Study
 from .folder import StudyFolder, compute_fingerprint
 from .processes import find_running

@@ -11,8 +11,8 @@ from pydantic import BaseModel, ConfigDict
 
 from ..anatomy.surfaces.surfaces import load_anatomy
 from ..errors import InputError
-from ..pipeline.stages.curves import read_record
-from ..pipeline.stages.plausible import record_flags
+from ..pipeline.records.record_checks import record_flags
+from ..pipeline.records.traces import read_record
 from ..study import Record, Study
 from ..traces.numerics import average_in_bins
 from .editing import set_record

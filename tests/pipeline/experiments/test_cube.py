@@ -10,8 +10,7 @@ from scipy.integrate import quad
 
 from limbfit import compress_cube
 from limbfit.errors import InputError
-from limbfit.pipeline.experiments.cube import _build_times, compress
-from limbfit.pipeline.experiments.published import KPA, PUBLISHED
+from limbfit.pipeline.variants.cube import KPA, PUBLISHED, _build_times, compress
 
 SKIN = {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.5}
 MUSCLE = {"c_kPa": 4.0, "m": 4.0, "gamma": 3.0, "tau_s": 0.3}

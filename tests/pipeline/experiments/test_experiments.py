@@ -10,9 +10,9 @@ import pytest
 from limbfit import run_experiment
 from limbfit.errors import InputError
 from limbfit.pipeline import Progress, study_status
-from limbfit.pipeline.experiments.catalogue import EXPERIMENTS, Experiment, register_experiment
-from limbfit.pipeline.shared.artefacts import write_json
-from limbfit.pipeline.verbs.run import compute_keys
+from limbfit.pipeline.commands.experiments import EXPERIMENTS, Experiment, register_experiment
+from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.engine.storage import write_json
 from limbfit.study import load_study
 
 

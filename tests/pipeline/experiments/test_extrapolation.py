@@ -7,8 +7,12 @@ import pytest
 
 from limbfit.fe import ELEMENTS, ORDER_IN_TIME
 from limbfit.fe.materials import compute_prony_factors
-from limbfit.pipeline.experiments.uncertainty_sources import FINER, mesh_share
-from limbfit.pipeline.shared.extrapolation import MESH_ORDERS, estimate_coarse_error, extrapolate_richardson
+from limbfit.pipeline.simulation.extrapolation import (
+    MESH_ORDERS,
+    estimate_coarse_error,
+    extrapolate_richardson,
+)
+from limbfit.pipeline.uncertainty.sources import FINER, mesh_share
 from limbfit.study import load_study
 
 COARSE = "[mesh.coarse]\nedge_near_mm = 5.0\n"

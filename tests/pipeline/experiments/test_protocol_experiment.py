@@ -12,8 +12,8 @@ import limbfit
 from conftest import COARSE
 from limbfit.errors import InputError
 from limbfit.identify.checks.protocol import sample_tissues
-from limbfit.pipeline.experiments.protocol import DESIGNED, PLAIN, UNSEEN
-from limbfit.pipeline.stages.laboratory import build_unknowns
+from limbfit.pipeline.design.protocol import DESIGNED, PLAIN, UNSEEN
+from limbfit.pipeline.identification.record_simulator import build_unknowns
 
 BALL = '[indenters.ball]\nshape = "sphere"\nwidth_mm = 12.0\n[acquire]\nforce_limit_N = 45.0\n'
 

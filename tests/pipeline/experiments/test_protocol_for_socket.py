@@ -10,7 +10,7 @@ import pytest
 import limbfit
 from conftest import COARSE, write_trace
 from limbfit.errors import InputError
-from limbfit.pipeline.experiments.protocol import DESIGNED
+from limbfit.pipeline.design.protocol import DESIGNED
 from small_limb import LIMB, small_limb
 
 LOAD = """hold_s = 1.0

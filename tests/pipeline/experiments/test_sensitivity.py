@@ -9,19 +9,19 @@ from conftest import coarse_mesh
 from limbfit.errors import InputError
 from limbfit.execution import SerialExecutor
 from limbfit.pipeline import run_study
-from limbfit.pipeline.experiments.sensitivity import (
+from limbfit.pipeline.engine.context import Context, Progress
+from limbfit.pipeline.engine.storage import read_json, write_json
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.simulation.extrapolation import extrapolate_richardson
+from limbfit.pipeline.variants.sensitivity import (
     list_other_indenters,
     run_contact,
     run_indenter,
     run_kappa,
     run_stiffness,
+    summarise_volumes,
 )
-from limbfit.pipeline.experiments.variants import choose_sites
-from limbfit.pipeline.experiments.volumes import summarise_volumes
-from limbfit.pipeline.shared.artefacts import read_json, write_json
-from limbfit.pipeline.shared.context import Context, Progress
-from limbfit.pipeline.shared.extrapolation import extrapolate_richardson
-from limbfit.pipeline.shared.store import Store
+from limbfit.pipeline.variants.variants import choose_sites
 from limbfit.study import IndenterTable, load_study
 
 SETTINGS = coarse_mesh("tet10", 9.0) + "[indenter]\nedge_radius_mm = 2.0\n"

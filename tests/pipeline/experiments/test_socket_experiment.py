@@ -26,8 +26,8 @@ from limbfit.fe import OgdenQLV
 from limbfit.fe.kernel.laws import Laws
 from limbfit.identify.uncertainty.uncertainty import NORMAL_95
 from limbfit.indentation import to_parameters
-from limbfit.pipeline.shared.socket_shape import build_socket
-from limbfit.pipeline.verbs.run import run_experiment
+from limbfit.pipeline.commands.run import run_experiment
+from limbfit.pipeline.socket.shape import build_socket
 from small_limb import limb, small_limb
 
 SOCKET = """hold_s = 1.0

@@ -9,7 +9,7 @@ import pytest
 
 from conftest import COARSE
 from limbfit import report_study, run_experiment
-from limbfit.pipeline.experiments.emulator_file import EMULATOR, read_emulator
+from limbfit.pipeline.uncertainty.result import EMULATOR, read_emulator
 from limbfit.study import load_study
 
 QUICK = (

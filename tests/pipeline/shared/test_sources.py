@@ -14,9 +14,9 @@ from types import ModuleType
 import pytest
 
 from limbfit.indentation import simulate
-from limbfit.pipeline.experiments.catalogue import EXPERIMENTS
-from limbfit.pipeline.shared.sources import PACKAGE, find_sources, format_source
-from limbfit.pipeline.verbs.run import STAGES
+from limbfit.pipeline.commands.experiments import EXPERIMENTS
+from limbfit.pipeline.commands.run import STAGES
+from limbfit.pipeline.engine.sources import PACKAGE, find_sources, format_source
 
 RUNS = {stage.name: stage.run for stage in (*STAGES, *EXPERIMENTS)} | {"simulation": simulate}
 
@@ -77,9 +77,9 @@ def test_it_holds_what_lists_by_hand_forgot():
 
 DIGESTS = """
 import json
-from limbfit.pipeline.experiments.catalogue import EXPERIMENTS
-from limbfit.pipeline.verbs.run import STAGES
-from limbfit.pipeline.shared.sources import code_digest
+from limbfit.pipeline.commands.experiments import EXPERIMENTS
+from limbfit.pipeline.commands.run import STAGES
+from limbfit.pipeline.engine.sources import code_digest
 print(json.dumps({stage.name: code_digest(stage.run) for stage in (*STAGES, *EXPERIMENTS)}))
 """
 

@@ -10,8 +10,8 @@ import sys
 import pytest
 
 from limbfit.errors import RunError
-from limbfit.pipeline.shared.artefacts import compute_file_digest, read_json, write_json
-from limbfit.pipeline.shared.store import EARLIER, Store, lock, translate_disk_errors
+from limbfit.pipeline.engine.storage import compute_file_digest, read_json, write_json
+from limbfit.pipeline.engine.store import EARLIER, Store, lock, translate_disk_errors
 
 
 def test_stage_is_done_only_for_its_key(tmp_path):
@@ -120,7 +120,7 @@ def test_file_digest_sees_names_and_contents(tmp_path):
 
 def test_second_run_is_refused_while_the_first_lives(tmp_path):
     program = (
-        "import sys; from pathlib import Path; from limbfit.pipeline.shared.store import lock\n"
+        "import sys; from pathlib import Path; from limbfit.pipeline.engine.store import lock\n"
         "with lock(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
     )
     holder = subprocess.Popen(

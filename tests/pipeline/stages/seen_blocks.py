@@ -15,7 +15,7 @@ from limbfit.execution import SerialExecutor
 from limbfit.indentation import Parameters, Simulation, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, write_vtu
 from limbfit.phantom.record import Ramp, RobotRecord, record
-from limbfit.pipeline.shared.context import Context
+from limbfit.pipeline.engine.context import Context
 from limbfit.study import Study, load_study
 
 TRUTH = {

@@ -13,9 +13,9 @@ from limbfit.bench.blocks import SPEED, build_block_site
 from limbfit.errors import StudyError
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.indentation.sites import ROUGHLY
-from limbfit.pipeline.shared.provenance import record_settings
-from limbfit.pipeline.stages.mesh import build_coarse_settings, mesh_settings
-from limbfit.pipeline.stages.records import is_moved
+from limbfit.pipeline.engine.provenance import record_settings
+from limbfit.pipeline.limb.mesh import build_coarse_settings, mesh_settings
+from limbfit.pipeline.records.records import is_moved
 from limbfit.study import Study, load_study
 from limbfit.study.meshing import ACCURACIES, estimate_cells
 from limbfit.study.tables import SolverTable

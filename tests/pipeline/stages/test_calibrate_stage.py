@@ -14,11 +14,11 @@ from layered import store_blocks
 from limbfit.errors import StudyError
 from limbfit.execution import Limits, SerialExecutor, make_executor
 from limbfit.indentation import to_vector
-from limbfit.pipeline.shared.context import Context, Progress
-from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.calibrate import run_calibrate
-from limbfit.pipeline.stages.laboratory import build_groupings
-from limbfit.pipeline.stages.predict import run_predict
+from limbfit.pipeline.engine.context import Context, Progress
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.identification.calibrate import run_calibrate
+from limbfit.pipeline.identification.predict import run_predict
+from limbfit.pipeline.identification.record_simulator import build_groupings
 from limbfit.priors import SOURCE
 from limbfit.study import Study, load_study
 

@@ -13,9 +13,8 @@ from scipy.signal import lfilter
 from layered import block_context, block_study
 from limbfit.identify.fit.objective import SiteResponse
 from limbfit.mesh import read_vtu, write_vtu
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.stages.curves import read_record
-from limbfit.pipeline.stages.deviations import (
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.records.deviations import (
     GIVEN_MM,
     LEAST_SHARE,
     OF_A_VOXEL,
@@ -26,8 +25,9 @@ from limbfit.pipeline.stages.deviations import (
     estimate_surface_error_mm,
     measure_bone_distance_mm,
 )
-from limbfit.pipeline.stages.observed import WaveMeasurement
-from limbfit.pipeline.stages.records import SiteRecord, load_site_record
+from limbfit.pipeline.records.records import SiteRecord, load_site_record
+from limbfit.pipeline.records.secondary_measurements import WaveMeasurement
+from limbfit.pipeline.records.traces import read_record
 
 TRUTH = {"skin": {"c_kPa": 8.0, "m": 5.0, "gamma": 2.0, "tau_s": 0.5}}
 TRUTH["muscle"] = TRUTH["skin"] | {"c_kPa": 4.0}

@@ -13,11 +13,11 @@ from limbfit.errors import InputError, StudyError
 from limbfit.fe import Fibred, OgdenQLV
 from limbfit.indentation import SimulationJob, build_materials, build_problem, simulate
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.experiments.cube import check_cube
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import build_recorded_model, find_fibre_directions
-from limbfit.pipeline.stages.laboratory import build_groupings, build_unknowns
-from limbfit.pipeline.verbs.run import compute_keys
+from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.identification.record_simulator import build_groupings, build_unknowns
+from limbfit.pipeline.simulation.simulations import build_recorded_model, find_fibre_directions
+from limbfit.pipeline.variants.cube import check_cube
 from limbfit.study import Study
 
 VALUES = {"c_kPa": 6.0, "m": 5.0, "gamma": 1.2, "tau_s": 0.5, "k1_kPa": 30.0, "k2": 3.0}

@@ -14,7 +14,7 @@ from limbfit.errors import StudyError
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.mri import build_image, make_grid
 from limbfit.pipeline import run_study
-from limbfit.pipeline.verbs.run import study_status
+from limbfit.pipeline.commands.run import study_status
 from limbfit.study import Study, load_study
 
 TEXT = """

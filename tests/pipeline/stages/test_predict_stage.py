@@ -16,11 +16,11 @@ from limbfit.execution import SerialExecutor
 from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_parameters, to_vector
 from limbfit.indentation import simulating as indentation
 from limbfit.mesh import write_vtu
-from limbfit.pipeline.shared.artefacts import read_curves, write_json
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import COARSE, compute_job_digest
-from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.predict import run_predict
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.engine.storage import read_curves, write_json
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.identification.predict import run_predict
+from limbfit.pipeline.simulation.simulations import COARSE, compute_job_digest
 from limbfit.study import Study, load_study
 
 TISSUES = ("skin", "muscle")

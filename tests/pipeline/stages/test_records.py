@@ -16,11 +16,11 @@ from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.prediction import PredictionModel
 from limbfit.identify.uncertainty.estimator import FitSensitivity
 from limbfit.identify.uncertainty.noise import estimate_record_noise
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.curves import read_record
-from limbfit.pipeline.stages.mesh import mesh_job, mesh_settings
-from limbfit.pipeline.verbs.run import compute_keys
+from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.limb.mesh import mesh_job, mesh_settings
+from limbfit.pipeline.records.traces import read_record
 from limbfit.report.sections.prediction import make_site_table
 from limbfit.report.store import load_store
 from limbfit.study import Record, Study, load_study

@@ -15,10 +15,10 @@ from limbfit.bench.blocks import build_block_site
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import SimulationJob, SiteModel, simulate
 from limbfit.mesh import write_vtu
-from limbfit.pipeline.shared.context import Context, Progress
-from limbfit.pipeline.shared.simulations import COARSE, SimulationCache
-from limbfit.pipeline.stages.laboratory import RecordSimulator, estimate_linearised
-from limbfit.pipeline.stages.records import load_site_record, to_response
+from limbfit.pipeline.engine.context import Context, Progress
+from limbfit.pipeline.identification.record_simulator import RecordSimulator, estimate_linearised
+from limbfit.pipeline.records.records import load_site_record, to_response
+from limbfit.pipeline.simulation.simulations import COARSE, SimulationCache
 from limbfit.study import Record, Study, load_study
 
 TRUTH = {

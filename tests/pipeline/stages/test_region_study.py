@@ -22,8 +22,8 @@ from limbfit.febio import write_feb
 from limbfit.indentation import SimulationJob, SiteModel, build_problem, simulate, to_parameters
 from limbfit.mesh import read_vtu, write_vtu
 from limbfit.phantom.record import Ramp, record
-from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.verbs.run import compute_keys
+from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.engine.store import Store
 from limbfit.study import IndenterTable, SolverTable, Study
 
 CUT = np.array([12.0, -80.0, 300.0])  # the middle of the limb's proximal cut, LPS mm

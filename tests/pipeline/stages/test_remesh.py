@@ -7,11 +7,11 @@ from dataclasses import replace
 from conftest import COARSE
 from limbfit import load_study, run_study
 from limbfit.execution import SerialExecutor
-from limbfit.pipeline.shared.context import Context, Progress
-from limbfit.pipeline.shared.store import Store
-from limbfit.pipeline.stages.mesh import mesh_settings
-from limbfit.pipeline.stages.records import load_site_record
-from limbfit.pipeline.stages.remesh import mesh_models, mesh_where_possible, scale_edges
+from limbfit.pipeline.engine.context import Context, Progress
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.limb.mesh import mesh_settings
+from limbfit.pipeline.limb.remesh import mesh_models, mesh_where_possible, scale_edges
+from limbfit.pipeline.records.records import load_site_record
 
 
 def test_a_site_without_such_a_mesh_is_left_out_and_named(study):

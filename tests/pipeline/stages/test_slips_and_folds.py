@@ -12,7 +12,7 @@ from limbfit.identify.fit.objective import MeasuredCurve
 from limbfit.identify.fit.parameters import FIXED, Unknowns
 from limbfit.identify.fit.state import CalibrationSettings
 from limbfit.indentation import SimulationJob, simulate
-from limbfit.pipeline.stages.records import to_response
+from limbfit.pipeline.records.records import to_response
 from limbfit.study import SolverTable
 
 TISSUES = ("skin", "muscle")

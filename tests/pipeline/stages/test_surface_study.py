@@ -19,12 +19,12 @@ from limbfit.indentation import (
 )
 from limbfit.mesh import Mesh
 from limbfit.phantom.record import write_surface
-from limbfit.pipeline.shared.simulations import SimulationCache
-from limbfit.pipeline.shared.surface_points import MAX_POINTS, ChosenPoints, choose_points
-from limbfit.pipeline.stages.calibrate import run_calibrate
-from limbfit.pipeline.stages.curves import run_traces
-from limbfit.pipeline.stages.laboratory import RecordSimulator, estimate_linearised
-from limbfit.pipeline.stages.predict import run_predict
+from limbfit.pipeline.identification.calibrate import run_calibrate
+from limbfit.pipeline.identification.predict import run_predict
+from limbfit.pipeline.identification.record_simulator import RecordSimulator, estimate_linearised
+from limbfit.pipeline.records.traces import run_traces
+from limbfit.pipeline.simulation.simulations import SimulationCache
+from limbfit.pipeline.simulation.surface_points import MAX_POINTS, ChosenPoints, choose_points
 from limbfit.report.drawing.figures import draw_skin_figure
 from limbfit.report.sections.prediction import make_observed_table
 from limbfit.report.store import load_store

@@ -15,11 +15,11 @@ from limbfit.execution import SerialExecutor
 from limbfit.identify.fit.parameters import Unknowns, build_stage_groupings, group_by_kind, group_separately
 from limbfit.indentation import SimulationJob, list_flat_names, simulate, to_parameters, to_vector
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.shared.context import Context, Progress
-from limbfit.pipeline.stages.calibrate import run_calibrate
-from limbfit.pipeline.stages.laboratory import build_unknowns
-from limbfit.pipeline.stages.predict import run_predict
-from limbfit.pipeline.verbs.run import compute_keys
+from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.engine.context import Context, Progress
+from limbfit.pipeline.identification.calibrate import run_calibrate
+from limbfit.pipeline.identification.predict import run_predict
+from limbfit.pipeline.identification.record_simulator import build_unknowns
 from limbfit.report import build_report
 from limbfit.study import SolverTable, Study, load_study
 

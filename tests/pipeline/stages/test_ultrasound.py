@@ -17,10 +17,10 @@ from limbfit.errors import ProblemError, TraceError
 from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_vector
 from limbfit.mesh import find_gauges_along
 from limbfit.phantom.record import write_ultrasound
-from limbfit.pipeline.shared.simulations import SimulationCache
-from limbfit.pipeline.stages.calibrate import run_calibrate
-from limbfit.pipeline.stages.laboratory import RecordSimulator, estimate_linearised
-from limbfit.pipeline.stages.predict import run_predict
+from limbfit.pipeline.identification.calibrate import run_calibrate
+from limbfit.pipeline.identification.predict import run_predict
+from limbfit.pipeline.identification.record_simulator import RecordSimulator, estimate_linearised
+from limbfit.pipeline.simulation.simulations import SimulationCache
 from limbfit.report.drawing.figures import draw_layer_figure
 from limbfit.report.store import load_store
 from limbfit.study import SolverTable, Study

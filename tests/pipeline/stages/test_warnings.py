@@ -13,8 +13,8 @@ from limbfit.cli.commands import show_warnings
 from limbfit.execution import SerialExecutor
 from limbfit.fe import SimulationWarning
 from limbfit.indentation import Simulation
-from limbfit.pipeline.shared import simulations
-from limbfit.pipeline.stages.doubted import SearchWarning, warnings_to_dict
+from limbfit.pipeline.identification.simulation_warnings import SearchWarning, warnings_to_dict
+from limbfit.pipeline.simulation import simulations
 from limbfit.report import build_report
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "report"))

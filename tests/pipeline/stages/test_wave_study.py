@@ -12,12 +12,12 @@ from seen_blocks import PUNCH, TRUTH, Made, SeenBlock
 from limbfit.errors import TraceError
 from limbfit.indentation import Simulation, SiteModel, place_waves_under
 from limbfit.phantom.record import write_waves
-from limbfit.pipeline.shared.context import Context
-from limbfit.pipeline.shared.simulations import SimulationCache, build_recorded_model
-from limbfit.pipeline.stages.calibrate import run_calibrate
-from limbfit.pipeline.stages.curves import run_traces
-from limbfit.pipeline.stages.laboratory import RecordSimulator, estimate_linearised
-from limbfit.pipeline.stages.predict import run_predict
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.identification.calibrate import run_calibrate
+from limbfit.pipeline.identification.predict import run_predict
+from limbfit.pipeline.identification.record_simulator import RecordSimulator, estimate_linearised
+from limbfit.pipeline.records.traces import run_traces
+from limbfit.pipeline.simulation.simulations import SimulationCache, build_recorded_model
 from limbfit.report.drawing.figures import draw_wave_figure
 from limbfit.report.sections.prediction import make_observed_table
 from limbfit.report.store import load_store

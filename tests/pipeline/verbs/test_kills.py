@@ -18,7 +18,7 @@ import pytest
 
 from conftest import COARSE
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.verbs.run import STAGE_NAMES
+from limbfit.pipeline.commands.run import STAGE_NAMES
 
 READERS = {
     ".json": lambda file: json.loads(file.read_text()),

@@ -17,8 +17,8 @@ import pytest
 from limbfit.errors import InputError, RunError
 from limbfit.execution import Limits, SerialExecutor, make_executor, share_executor
 from limbfit.pipeline import Progress, diagnose, run_batch, run_study, study_status
-from limbfit.pipeline.verbs.doctor import compress_test_cube, judge_self_test
-from limbfit.pipeline.verbs.journal import redact_paths
+from limbfit.pipeline.commands.doctor import compress_test_cube, judge_self_test
+from limbfit.pipeline.engine.journal import redact_paths
 from limbfit.study import load_study
 
 

@@ -1,0 +1,376 @@
+"""Indentations recorded into a study, and a virtual device whose limb is the study's own simulations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from datetime import UTC, datetime
+from itertools import product
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from ..._version import __version__
+from ...acquire import (
+    Event,
+    LineDevice,
+    Listener,
+    NoOperator,
+    RecordedRamp,
+    Recorder,
+    Session,
+    Settings,
+    Update,
+    check_record,
+    connect,
+    find_ramps,
+    prioritise,
+    read_recording,
+    run_session,
+)
+from ...acquire.virtual import Fault, Serving, Surrogate, VirtualFitSocket, VirtualLimb, fit_surrogate, serve
+from ...errors import InputError, TraceError
+from ...study import AcquireTable, Indentation, Record, Site, Study
+from ..engine.storage import read_curves, write_curves, write_json
+from ..engine.store import Store, translate_disk_errors
+
+FOLDER = "acquired"  # beside the study file: measured data, no result
+RECORD, VERDICT = "record.csv", "verdict.json"
+
+
+def waiting(study: Study) -> list[Indentation]:
+    """Sites and records that are yet to be made, site by site."""
+    return [one for one in study.indentations if not _is_made(study, one)]
+
+
+def _is_made(study: Study, one: Indentation) -> bool:
+    return one.trace is not None and study.path(one.trace).is_file()
+
+
+def acquire_site(
+    study: Study,
+    name: str,
+    *,
+    address: str,
+    operator: SimpleQueue[Event] | None = None,
+    stops: SimpleQueue[Event] | None = None,
+    depth_mm: float | None = None,
+    replace_record: bool = False,
+    listener: Listener | None = None,
+) -> dict[str, Any]:
+    """Record a site, or one of its records, on a device, judge it, and put it where the study names it.
+
+    Parameters
+    ----------
+    address : of the device: ``tcp://HOST[:PORT]`` or ``serial:PATH[@BAUD]``.
+    operator : where events of the operator come from (`limbfit.acquire.Keyboard`).  None: unattended - the
+        limb counts as in place, and the key as held until the search is ``depth_mm`` deep.
+    stops : unattended, where events that end the session come from (`limbfit.acquire.events.Abort`).
+    depth_mm : where the search ends; by default the record's own, where unattended the site's ``depth_mm`` or
+        the depth of its last record, else ``acquire.search_depth_mm``.
+    replace_record : also where the study has this record; that one is kept beside the new one.
+    listener : is told of phases and samples; see `limbfit.acquire.Told`.
+
+    Returns
+    -------
+    dict
+        ``name``, ``site``, ``completed``, ``phase``, ``reason``, ``verdict``, ``samples``, ``lost``,
+        ``refused``, ``unreachable``, ``depth_mm`` and the files by kind.
+
+    Raises
+    ------
+    InputError
+        For a site that the study does not have or has a record of, or an address of no device.
+    RunError
+        Where the device does not answer, or the record cannot be written.
+    """
+    one = study.indentation(name)
+    site = one.site if isinstance(one, Record) else one
+    settings = check_recording(
+        study, name, depth_mm=depth_mm, unattended=operator is None, replace_record=replace_record
+    )
+    device = LineDevice(connect(address))
+    try:
+        with translate_disk_errors(study.folder):
+            folder = _make_folder(study, one)
+            recorder = Recorder(folder / RECORD, _head(one, site, settings, device, operator is None))
+    except BaseException:
+        device.close()
+        raise
+    events = operator if operator is not None else stops if stops is not None else SimpleQueue()
+    told = _join_listeners(NoOperator(events), listener) if operator is None else listener
+    try:
+        session = Session(settings, device, site=site.name, recorder=recorder, listener=told)
+        ending = run_session(session, events)
+    finally:
+        recorder.close()
+    found = {
+        "name": one.name,
+        "site": site.name,
+        "completed": ending.completed,
+        "phase": str(ending.phase),
+        "reason": ending.reason,
+        "unreachable": list(ending.unreachable),
+        "samples": ending.samples,
+        "lost": session.counts.lost,
+        "refused": asdict(device.refused),
+        "depth_mm": (ending.depth_um - ending.touch_um) / 1000 if ending.completed else None,
+    }
+    return found | _keep(study, one, folder, ending.completed)
+
+
+def check_recording(
+    study: Study,
+    name: str,
+    *,
+    depth_mm: float | None = None,
+    unattended: bool = False,
+    replace_record: bool = False,
+) -> Settings:
+    """The device's settings for a site, or one of its records; see `acquire_site`.
+
+    Raises
+    ------
+    InputError
+        For what can be known to be wrong before the device is asked.
+    """
+    one = study.indentation(name)
+    if _is_made(study, one) and not replace_record:
+        remedy = "give --again to record it once more; the old record is kept"
+        raise InputError(f"{one.trace} exists", file=study.file, place=_place(one), remedy=remedy)
+    if isinstance(one, Record) and one.forced:
+        raise InputError(
+            "the device drives by displacement, and this record is made under force",
+            file=study.file,
+            place=_place(one),
+            remedy='leave out control = "force", or record it elsewhere',
+        )
+    _check_inside(study, one)
+    return build_device_settings(study, one, depth_mm, unattended)
+
+
+def judge_recording(file: Path) -> dict[str, Any]:
+    """What a record holds, whole or cut short by a crash, and the verdict on its ramps.
+
+    Raises
+    ------
+    TraceError
+        Where it is no record.
+    """
+    recording = read_recording(file)
+    try:
+        verdict, count = check_record(recording).to_dict(), len(find_ramps(recording))
+    except (KeyError, TypeError, ValueError):
+        raise TraceError("its head or its events lack what a verdict needs", file=file) from None
+    seconds = float(np.ptp(recording.device_us)) / 1e6 if recording.device_us.size else 0.0
+    return {
+        "site": recording.head.get("site"),
+        "samples": len(recording.device_us),
+        "seconds": seconds,
+        "lost_bytes": recording.lost_bytes,
+        "ramps": count,
+        "phases": [phase for phase, _, _ in recording.phases()],
+        "verdict": verdict,
+    }
+
+
+def _place(one: Indentation) -> str:
+    """Where the study names the record's file."""
+    return f"{one.key if isinstance(one, Record) else f'sites.{one.name}'}.trace"
+
+
+def _check_inside(study: Study, one: Indentation) -> None:
+    """Nothing outside the study's folder is written."""
+    root = study.folder.resolve()
+    targets = [study.folder / FOLDER / one.name]
+    targets += [study.path(one.trace)] if one.trace is not None else []
+    if (study.folder / FOLDER).exists() and not (study.folder / FOLDER).is_dir():
+        raise InputError(
+            "is a file, where records are kept", file=study.folder / FOLDER, remedy="move it away"
+        )
+    for target in targets:
+        if not target.resolve().is_relative_to(root):
+            raise InputError(
+                f"{target.relative_to(study.folder)} lies outside the study's folder",
+                file=study.file,
+                place=_place(one),
+                remedy="nothing is recorded there; name a place inside",
+            )
+
+
+def build_device_settings(
+    study: Study, one: Indentation, depth_mm: float | None, unattended: bool
+) -> Settings:
+    """Those of ``[acquire]``, with what the record states of its own."""
+    own = {"ramp_speed_mm_s": one.speed_mm_s, "hold_s": one.hold_s} if isinstance(one, Record) else {}
+    stated = {key: value for key, value in own.items() if value is not None}
+    try:
+        table = AcquireTable(**(study.acquire.model_dump() | stated))
+    except ValidationError as error:
+        what = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
+        raise InputError(what, file=study.file, place=_place(one).removesuffix(".trace")) from None
+    settings = Settings(**table.model_dump())
+    if depth_mm is None and isinstance(one, Record):
+        depth_mm = one.depth_mm
+    if depth_mm is None and unattended:
+        depth_mm = one.depth_mm or _find_recorded_depth(study, one)
+        if depth_mm is None:
+            remedy = "give --depth, or state its depth_mm"
+            raise InputError(
+                "the depth is not known",
+                file=study.file,
+                place=_place(one).removesuffix(".trace"),
+                remedy=remedy,
+            )
+    if depth_mm is None:
+        return settings
+    if not settings.min_depth_mm < depth_mm < settings.depth_limit_mm:
+        raise InputError(
+            f"{depth_mm:g} mm is not between acquire.min_depth_mm ({settings.min_depth_mm:g}) and "
+            f"acquire.depth_limit_mm ({settings.depth_limit_mm:g})",
+            place="--depth, or depth_mm",
+        )
+    return replace(settings, search_depth_mm=depth_mm)
+
+
+def _find_recorded_depth(study: Study, one: Indentation) -> float | None:
+    file = Store(study.results)["traces"] / "traces.json"
+    if not file.is_file():
+        return None
+    facts = Store(study.results).read("traces", "traces.json")["sites"].get(one.name)
+    return None if facts is None else float(facts["depth_mm"])
+
+
+def _make_folder(study: Study, one: Indentation) -> Path:
+    stamp = f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"[:-3]
+    folder = study.folder / FOLDER / one.name / stamp
+    folder.mkdir(parents=True)
+    return folder
+
+
+def _head(
+    one: Indentation, site: Site, settings: Settings, device: LineDevice, unattended: bool
+) -> dict[str, Any]:
+    identity = asdict(device.identity)
+    del identity["nonce"]
+    return {
+        "site": site.name,
+        "record": one.name,
+        "indenter": one.indenter,
+        "begun": datetime.now(UTC).isoformat(timespec="milliseconds"),
+        "limbfit": __version__,
+        "unattended": unattended,
+        "priority": prioritise(),
+        "device": identity,
+        "settings": asdict(settings),
+    }
+
+
+def _join_listeners(first: Listener, second: Listener | None) -> Listener:
+    def tell(told: Update) -> None:
+        first(told)
+        if second is not None:
+            second(told)
+
+    return tell
+
+
+def _keep(study: Study, one: Indentation, folder: Path, completed: bool) -> dict[str, Any]:
+    """Verdict and ramps beside the record; the first ramp that counts into the study."""
+    files: dict[str, Any] = {"record": str(folder / RECORD), "trace": None}
+    if not completed:
+        return {"verdict": None, "files": files}
+    recording = read_recording(folder / RECORD)
+    verdict = check_record(recording).to_dict()
+    found = find_ramps(recording)
+    with translate_disk_errors(study.folder):
+        for ramp in found:
+            _write_ramp(study, folder / f"ramp-{ramp.cycle}.csv", ramp)
+        counted = [ramp for ramp in found if ramp.cycle > study.acquire.precondition]
+        if counted and one.trace is not None:
+            files["trace"] = str(_place_trace(study, one.trace, counted[0]))
+        # Last: who waits for the verdict finds the trace in its place.
+        write_json(folder / VERDICT, verdict | {"trace": str(one.trace) if files["trace"] else None})
+    return {"verdict": verdict, "files": files}
+
+
+def _place_trace(study: Study, trace: Path, ramp: RecordedRamp) -> Path:
+    """The record where the study names it; a former one stays beside it, with the time in its name."""
+    file = study.path(trace)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if file.exists():
+        file.rename(file.with_name(f"{file.stem}.until-{datetime.now(UTC):%Y%m%dT%H%M%S}{file.suffix}"))
+    _write_ramp(study, file, ramp)
+    return file
+
+
+def _write_ramp(study: Study, file: Path, ramp: RecordedRamp) -> None:
+    names, trace = study.traces, ramp.trace
+    columns = zip(
+        (names.time_s, names.displacement_mm, names.force_N),
+        (trace.time_s, trace.displacement_mm, trace.force_N),
+        strict=True,
+    )
+    work = file.with_name(f".{file.name}.work")
+    write_curves(work, **dict(columns))
+    work.replace(file)
+
+
+# -- the device that is a program
+
+
+def virtual_fitsocket(
+    study: Study, *, seed: int = 0, faults: tuple[Fault, ...] = (), paced: bool = False
+) -> VirtualFitSocket:
+    """A virtual FitSocket with the study's limb in it, as stored simulations describe it.
+
+    Parameters
+    ----------
+    seed : of the limb's place in the ring, and of the sensors' noise.
+    paced : the device's clock waits for limbfit, and may go faster than the wall's.
+
+    Raises
+    ------
+    InputError
+        Where no site has a stored simulation.
+    """
+    sites = read_surrogates(study)
+    limb = VirtualLimb(sites, np.random.default_rng(seed))
+    return VirtualFitSocket(limb, seed=seed, faults=faults, clock="paced" if paced else "real")
+
+
+def read_surrogates(study: Study) -> dict[str, Surrogate]:
+    """Each site that has a stored simulation: of the prediction, else of `limbfit simulate`."""
+    found: dict[str, Surrogate] = {}
+    columns = (("predict", "force_simulated_N"), ("simulate", "force_N"))
+    for one in study.indentations:
+        site = one.site.name if isinstance(one, Record) else one.name
+        for (folder, column), name in product(columns, dict.fromkeys((one.name, site))):
+            file = study.results / folder / f"{name}.csv"
+            if site not in found and file.is_file() and (folder == "simulate" or column in read_curves(file)):
+                found[site] = _read_surrogate(file, column)
+    if not found:
+        remedy = "run it first (limbfit run), or simulate sites (limbfit simulate)"
+        raise InputError("the study has no stored simulation", file=study.results, remedy=remedy)
+    return found
+
+
+def _read_surrogate(file: Path, column: str) -> Surrogate:
+    try:
+        curves = read_curves(file)
+        return fit_surrogate(curves["time_s"], curves["displacement_mm"], curves[column])
+    except (KeyError, ValueError):
+        raise TraceError("not a simulated curve", file=file, remedy="run the stage again") from None
+    except TraceError as error:
+        raise TraceError(error.what, file=file) from None
+
+
+def serve_fitsocket(
+    device: VirtualFitSocket, serving: Serving, *, speed: float = 1.0, tell: Callable[[str], None]
+) -> None:
+    """Serve a virtual device until `Serving.stop`; its thread asks for real-time priority."""
+    tell(f"priority: {prioritise()}")
+    serve(device, serving, speed=speed, tell=tell)

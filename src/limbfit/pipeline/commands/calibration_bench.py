@@ -1,0 +1,91 @@
+"""How long an identification takes, beside the loop it replaces: FEBio with finite differences."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from ...bench.forward import FEBIO_SECONDS
+from ...study import Study, load_study
+from ..engine.context import Listener, ignore_progress
+from ..engine.store import Store
+from ..simulation.simulations import SimulationCache
+from .demo import make_phantom_study
+from .run import run_study
+
+FEBIO_CASE, FEBIO_ITERATIONS = "residuum/posterior_tet10", 10
+_AFRESH = ("calibrate", "predict", "report")
+
+
+def bench_calibrate(folder: Path | None = None, *, listener: Listener = ignore_progress) -> dict[str, Any]:
+    """Identify a study afresh, in a copy of it, and time the stages after meshing.
+
+    Parameters
+    ----------
+    folder : of the study, or its file; None makes the coarse phantom of seed 0. What its chain has stored up
+        to the meshes is used, what stands on them is not.
+
+    Returns
+    -------
+    dict
+        ``seconds`` of calibration and prediction together, ``forward_runs`` of both (and how many of the
+        calibration's have sensitivities), ``mean_error_fitted_percent``, ``mean_error_heldout_percent``;
+        ``febio_loop_seconds``, what FEBio would take for (parameters + 1) simulations per iteration and
+        fitted site, ten iterations, at its time on a site of 20,922 nodes; and ``ratio`` of the two.
+
+    Raises
+    ------
+    InputError
+        Where the study cannot be used.
+    """
+    with tempfile.TemporaryDirectory(prefix="limbfit-bench-") as scratch:
+        place = Path(scratch) / "study"
+        if folder is None:
+            make_phantom_study(place, detail="coarse", seed=0, listener=listener)
+        else:
+            source = load_study(folder)
+            assert source.file is not None
+            shutil.copytree(source.file.parent, place, ignore=_select_left_out)
+            if source.file.name != "study.toml":
+                (place / source.file.name).rename(place / "study.toml")
+        study = load_study(place)
+        run_study(study, until="predict", listener=listener)
+        return _collect_facts(study)
+
+
+def _select_left_out(folder: str, names: list[str]) -> set[str]:
+    """Results that stand on the meshes, locks and unfinished work."""
+    if Path(folder).name != "results":
+        return set()
+    return {name for name in names if name in _AFRESH or name.startswith(".")}
+
+
+def _collect_facts(study: Study) -> dict[str, Any]:
+    store = Store(study.results)
+    predicted = store.read("predict", "predict.json")
+    seconds = {stage: (store.stamp(stage) or {})["seconds"] for stage in ("calibrate", "predict")}
+    runs = {stage: SimulationCache(store[stage] / "runs") for stage in seconds}
+    names = {file.name for cache in runs.values() for file in cache.folder.glob("*.npz")}
+    parameters, sites = len(study.parameters), len(study.fitted)
+    febio = FEBIO_SECONDS[FEBIO_CASE] * FEBIO_ITERATIONS * sites * (parameters + 1)
+    total = seconds["calibrate"] + seconds["predict"]
+    mesh = store.read("mesh", "mesh.json")
+    return {
+        "study": study.study.name,
+        "seconds": total,
+        "seconds_calibrate": seconds["calibrate"],
+        "seconds_predict": seconds["predict"],
+        "forward_runs": len(names),
+        "forward_runs_calibrate": len(runs["calibrate"]),
+        "forward_runs_calibrate_with_sensitivities": runs["calibrate"].with_sensitivities(),
+        "sites_fitted": sites,
+        "sites_predicted": len(predicted["sites"]),
+        "nodes_per_site": max(site["nodes"] for site in mesh["sites"].values()),
+        "mean_error_fitted_percent": predicted["mean_error_fitted_percent"],
+        "mean_error_heldout_percent": predicted["mean_error_heldout_percent"],
+        "febio_loop_seconds": febio,
+        "ratio": febio / total,
+        "ratio_calibrate": febio / seconds["calibrate"],
+    }

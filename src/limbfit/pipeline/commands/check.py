@@ -1,0 +1,275 @@
+"""Read every input of a study and say what is wrong with it, before anything runs."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from ...anatomy.imaging import Volume
+from ...anatomy.surfaces.surfaces import Anatomy
+from ...identify.checks.domain import Extent, RecordedRange, describe_outside
+from ...indentation import read_indenter
+from ...study import ClampsTable, Record, Site, Study
+from ...traces import Regularised, SurfaceMotion, Trace
+from ..engine.context import Listener, Progress, ignore_progress
+from ..engine.store import Store
+from ..limb.inputs import check_labels, read_marked_image, read_study_image, read_study_labels
+from ..limb.sites import place_site
+from ..limb.surfaces import read_given_anatomy
+from ..records.record_checks import record_flags
+from ..records.traces import SecondaryMeasurement, read_observed, read_record
+from ..simulation.limb_geometry import LimbGeometry
+from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, name_load, time_socket_loads
+from ..socket.shape import build_loadable_socket, build_regions, check_load, check_regions
+from .refusals import list_refused_commands
+from .run import compute_keys
+
+
+def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[str, Any]:
+    """Facts about a study's inputs; raises at the first that cannot be used.
+
+    Returns
+    -------
+    dict
+        ``study``, ``facts`` (sentences), ``sites`` (peak force, depth, touch-down of each record),
+        ``flags`` (what looks wrong about records and places, with the evidence), ``refused`` (``commands``
+        that this study cannot have with their defaults, and ``why``), ``outside_records`` (by name of a site
+        or load what it does that no fitted record does) and ``outside_text``, the same in words.
+
+    Raises
+    ------
+    InputError
+        For an image, label map, surface, site or record that cannot be used.
+    """
+    facts = list(study.notes)
+    listener(Progress("check", 0, 2, "geometry"))
+    given, notes = read_given_anatomy(study) if study.surfaces is not None else (None, ())
+    told, bones = (
+        _describe_image(study) if given is None else ([*notes, *_describe_surfaces(study, given)], None)
+    )
+    facts += told
+    for name, table in study.used_indenters.items():
+        if table.file is not None:
+            here = table.model_copy(update={"file": study.path(table.file)})
+            width = read_indenter(here, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
+            facts.append(f"indenter{'' if name is None else ' ' + name}: {table.file}, {width:.1f} mm wide")
+    listener(Progress("check", 1, 2, "records"))
+    read = {record.name: read_record(study, record) for record in study.recorded}
+    records = {name: record for name, (_, _, record) in read.items()}
+    seen = {record.name: _read_secondary(study, record, read[record.name]) for record in study.recorded}
+    for name, record in records.items():
+        facts.append(
+            f"site {name}: peak force {record['peak_force_N']:.2f} N at {record['depth_mm']:.2f} mm, "
+            f"touch-down after {record['touch_down_mm']:.2f} +- {record['touch_down_uncertainty_mm']:.2f} "
+            f"mm; {record['phases_in_words']}"
+            + ("" if record["speed_unload_mm_s"] is not None else "; loading only, no unloading")
+        )
+    number = len(study.records_at(*study.fitted))
+    facts.append(
+        f"{len(study.fitted)} of {len(study.sites)} sites are fitted"
+        + (f", with {number} records" if number > len(study.fitted) else "")
+    )
+    if study.priors:
+        known = (f"{name} {p.median:g}, factor {p.factor:g}" for name, p in study.priors.items())
+        facts.append(f"lognormal priors (median, one standard deviation): {'; '.join(known)}")
+    steps = {name: float(np.median(np.diff(trace.time_s))) for name, (trace, _, _) in read.items()}
+    limb = _read_limb(study, given)
+    placed, anatomy = (limb.places, limb.anatomy) if limb is not None else ({}, None)
+    facts += _describe_surface_motion(study, {name: one.motion for name, one in seen.items()}, limb)
+    facts += [told for name, one in seen.items() for told in _describe_waves(name, one)]
+    if records and not placed:
+        facts.append(
+            "the sites are not placed yet: stiffness is compared without the thickness of the tissue "
+            "(limbfit run --until sites, then check again)"
+        )
+    if "socket" in study.model_fields_set:
+        facts += _describe_socket(study, anatomy, bones)
+    if study.clamps is not None:
+        facts.append(_describe_clamps(study, study.clamps, limb))
+    refused = list_refused_commands(study, limb)
+    facts += [f"cannot run: limbfit {', '.join(row['commands'])}: {row['why']}" for row in refused]
+    flags = record_flags(study, records, steps, placed, anatomy)
+    outside = _describe_outside(study, records, limb)
+    listener(Progress("check", 2, 2))
+    return {
+        "study": study.study.name,
+        "facts": facts,
+        "sites": records,
+        "flags": [flag.to_dict() for flag in flags],
+        "refused": refused,
+        "outside_records": outside,
+        "outside_text": describe_outside(outside),
+    }
+
+
+def _describe_outside(
+    study: Study, records: Mapping[str, Mapping[str, Any]], limb: LimbGeometry | None
+) -> dict[str, list[dict[str, Any]]]:
+    """What other records, planned indentations and the socket do that no fitted record does, by name.
+
+    Only what is known before a simulation: times, pressure, depth, and places where the limb is known.
+    """
+    axis = None if limb is None else LimbAxis(limb.anatomy)
+
+    def describe(one: Record | Site, tested: RecordedRange | None = None) -> list[Extent]:
+        site = one.site if isinstance(one, Record) else one
+        facts = records.get(one.name) or _plan(site)
+        return describe_indentation(
+            LoadHistory.from_knots(facts["knots_s"], facts["knots_N"] or facts["knots_mm"]),
+            facts["depth_mm"],
+            study.indenter_of(one),
+            None if limb is None else limb.place(site),
+            axis,
+            force_N=facts["peak_force_N"],
+            tested=tested,
+        )
+
+    fitted = study.records_at(*study.fitted)
+    if not fitted:
+        return {}
+    places = [limb.place(site)[0] for site in study.fitted] if limb is not None else []
+    angles = axis.measure_angle(np.array(places)).tolist() if axis is not None else ()
+    tested = RecordedRange.from_records(map(describe, fitted), angles)
+    held = [record for record in study.recorded if not record.site.fitted]
+    planned = [site for site in study.sites if site.depth_mm is not None and not study.records_at(site)]
+    others: list[Record | Site] = [*held, *planned]
+    found = {f"site {one.name}": tested.find_outside(describe(one, tested)) for one in others}
+    if "socket" in study.model_fields_set:
+        for name, history in time_socket_loads(study.socket).items():
+            found[name_load(name)] = tested.find_outside([history.time])
+    return found
+
+
+def _plan(site: Site) -> dict[str, Any]:
+    """What is known of an indentation that a site plans, in and out."""
+    assert site.depth_mm is not None
+    ramp = site.depth_mm / site.speed_mm_s
+    knots = {"knots_s": (0.0, ramp, 2 * ramp), "knots_mm": (0.0, site.depth_mm, 0.0), "knots_N": None}
+    return {**knots, "depth_mm": site.depth_mm, "peak_force_N": None}
+
+
+def _read_secondary(
+    study: Study, record: Record, read: tuple[Trace, Regularised, dict[str, Any]]
+) -> SecondaryMeasurement:
+    """What was seen beside a record."""
+    trace, smooth, facts = read
+    return read_observed(study, record, trace, facts["touch_down_s"], smooth)
+
+
+def _describe_waves(name: str, seen: SecondaryMeasurement) -> Iterator[str]:
+    """How fast shear waves are."""
+    for place, means in seen.waves:
+        speeds = f"{means.speed_m_s.min():.2f} to {means.speed_m_s.max():.2f} m/s"
+        readings = int(means.samples.sum())
+        yield f"site {name}: shear waves at {place.name}, {speeds} in {readings} readings"
+
+
+def _describe_surface_motion(
+    study: Study,
+    motions: Mapping[str, SurfaceMotion | None],
+    limb: LimbGeometry | None,
+) -> Iterator[str]:
+    """How the skin around the indenter moves, and which of its points are compared where sites are known."""
+    chosen = {} if limb is None else limb.surface_points(study, motions)
+    for record in study.recorded:
+        motion = motions[record.name]
+        if motion is None:
+            continue
+        said = (
+            f"site {record.name}: surface of {len(motion.points)} points at {len(motion.time_s)} times in "
+            f"contact, up to {motion.largest_mm:.2f} mm"
+        )
+        if record.name in chosen:
+            said += f"; {chosen[record.name].words}"
+        yield said
+
+
+def _read_limb(study: Study, given: Anatomy | None) -> LimbGeometry | None:
+    """The limb of given surfaces or of stages that are done; else None."""
+    if given is not None:
+        return LimbGeometry(given, {site.name: place_site(site, study, given, None) for site in study.sites})
+    store = Store(study.results)
+    if store.stamp("sites") is None or store.state("sites", compute_keys(study)["sites"]).state != "done":
+        return None
+    return LimbGeometry.stored(store)
+
+
+def _describe_image(study: Study) -> tuple[list[str], tuple[str, ...] | None]:
+    """Facts, and the names of the bones where a label map is given."""
+    volume = read_study_image(study)
+    facts = [_describe_sampling("image", volume), *(f"warning: image: {note}" for note in volume.notes)]
+    marked = read_marked_image(study)
+    if marked is not None:
+        facts.append(_describe_sampling("image with markers", marked))
+        facts += [f"warning: image with markers: {note}" for note in marked.notes]
+    given, bones = read_study_labels(study, volume), None
+    if given is not None:
+        labels, notes = given
+        check_labels(study, labels)
+        bones = labels.bone_names
+        facts.append("corrected labels: " + ", ".join(labels.names.values()))
+        facts += [f"label map: {note}" for note in notes]
+    return facts, bones
+
+
+def _describe_clamps(study: Study, clamps: ClampsTable, limb: LimbGeometry | None) -> str:
+    """What ``[clamps]`` says; where the limb is known, how many of the pins hold it at each site."""
+    said = (
+        f"clamps: {len(clamps.angles)} pins of {clamps.force_N:g} N, {clamps.begun_s:g} s before touch-down"
+    )
+    if limb is None:
+        return f"{said}; they are placed after limbfit run --until sites"
+    held = [f"{count} at site {name}" for name, count in limb.clamping_pins(study).items()]
+    return f"{said}; {', '.join(held)} meet the skin"
+
+
+def _describe_socket(study: Study, anatomy: Anatomy | None, bones: Collection[str] | None) -> list[str]:
+    """What ``[socket]`` says; where the limb is known, the socket around its bare skin.
+
+    Loads are checked where at least the names of the ``bones`` are known.
+    """
+    table = study.socket
+    liner = f"a liner of {table.liner.thickness_mm:g} mm" if table.liner.thickness_mm else "no liner"
+    travel = f" over {table.travel_mm:g} mm" if table.travel_mm else ""
+    meshed = f"; limb meshed at {table.edge_mm:g} mm" if table.edge_mm else ""
+    facts = [
+        f"socket: {liner}, friction {table.friction}, donning by {table.donning}{travel}; "
+        f"{', '.join(load.name for load in table.loads) or 'no load'}{meshed}"
+    ]
+    if anatomy is None:
+        if bones is not None:
+            for load in table.loads:
+                check_load(study, load, bones)
+        return [
+            *facts,
+            "the socket's shape is checked after limbfit run --until sites",
+        ]
+    socket = build_loadable_socket(study, anatomy, anatomy.skin)
+    named = [one.region for one in table.design.regions]
+    check_regions(study, named, "socket.design.regions", build_regions(study, anatomy))
+    depth = socket.offset(anatomy.skin)
+    return [
+        *facts,
+        *(f"socket: {note}" for note in socket.notes),
+        f"socket: {socket.volume_mm3 / 1000:.0f} cm3, from {-depth.min():.1f} mm outside the skin to "
+        f"{depth.max():.1f} mm inside it",
+    ]
+
+
+def _describe_sampling(name: str, volume: Volume) -> str:
+    size = " x ".join(str(n) for n in volume.size)
+    spacing = " x ".join(f"{s:.3g}" for s in volume.spacing)
+    return f"{name}: {size} voxels of {spacing} mm"
+
+
+def _describe_surfaces(study: Study, anatomy: Anatomy) -> list[str]:
+    facts = [
+        f"{name}: {surface.volume / 1000:.1f} cm3, {len(surface.faces)} triangles"
+        for name, surface in {"skin": anatomy.skin, **anatomy.bones, **anatomy.regions}.items()
+    ]
+    for site in study.sites:
+        place_site(site, study, anatomy, None)
+    largest = np.ptp(anatomy.skin.points, axis=0)
+    return [*facts, "extent of the skin: " + " x ".join(f"{x:.0f}" for x in largest) + " mm"]

@@ -1,0 +1,203 @@
+"""One indentation by limbfit and by FEBio: same mesh, same history, both curves and their difference."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from ...arrays import Array
+from ...errors import ProblemError
+from ...fe import Problem, Result, System, solve
+from ...fe.solution.control import schedule_steps
+from ...febio import (
+    TIME_TOLERANCE,
+    FacePenalties,
+    FebioLog,
+    RunVerdict,
+    build_contact,
+    build_result,
+    compute_end_time,
+    compute_mean_penalty,
+    find_febio,
+    read_log,
+)
+from ...indentation import Parameters, build_first_steps
+from ...study import Study
+from ..engine.context import Listener, ignore_progress
+from ..engine.storage import write_curves, write_json
+from .simulate import Indentation, build_feb_settings, build_site_problem, prepare_site, run_febio_site
+
+FREE = 1.0  # penetration over the depth: FEBio's punch sinks in as far as its penalty lets it
+
+
+def compare_site(
+    study: Study,
+    name: str,
+    *,
+    parameters: Parameters | None = None,
+    febio_log: str | Path | None = None,
+    listener: Listener = ignore_progress,
+) -> dict[str, Any]:
+    """Solve a site by limbfit and by FEBio; JSON, CSV and a picture go to ``results/compare``.
+
+    limbfit solves it twice: as ``limbfit simulate`` does, and with the mean contact penalty of FEBio, which
+    shows how much of the difference is how far the indenter sinks in.
+
+    Parameters
+    ----------
+    parameters : per tissue; by default the identified ones, or the study's start where none were identified.
+    febio_log : the table of the indenter's force that FEBio wrote elsewhere, for the exported input; FEBio
+        itself is then not needed.
+
+    Raises
+    ------
+    InputError
+        Where FEBio is absent and no table is given, where the table is not one of this indentation, and as
+        `prepare_site`.
+    """
+    program = find_febio(study.febio.program) if febio_log is None else None
+    log = None if febio_log is None else read_log(febio_log)
+    found = prepare_site(study, name, parameters=parameters, listener=listener)
+    folder, name = found.context.store["compare"], found.name
+    folder.mkdir(parents=True, exist_ok=True)
+    problem = build_site_problem(found)
+    found.context.tell("compare", 0, 3, f"site {name}: FEBio")
+    if program is not None:
+        other, _ = run_febio_site(found, program, folder / f"{name}.febio")
+    else:
+        assert log is not None
+        other = _build_log_result(problem, log, Path(str(febio_log)))
+    runs = {"limbfit": solve_as_simulated(found, problem, 1)}
+    runs["limbfit_matched"] = _solve_matched(found, problem, other)
+    found.context.tell("compare", 3, 3, f"site {name}")
+    summary = _summarise(found, other, runs) | {"febio_log": None if febio_log is None else str(febio_log)}
+    _write(folder, name, found, other, runs, summary)
+    return summary
+
+
+def solve_as_simulated(found: Indentation, problem: Problem, part: int) -> Result:
+    """limbfit's own result, as ``limbfit simulate`` gets it."""
+    found.context.tell("compare", part, 3, f"site {found.name}: limbfit")
+    return solve(problem, build_first_steps(found.model, found.context.study.tissues), store="none")
+
+
+def _solve_matched(found: Indentation, problem: Problem, other: Result) -> Result:
+    """limbfit with FEBio's steps, its course of the stress in them and its contact penalty."""
+    found.context.tell("compare", 2, 3, f"site {found.name}: limbfit with FEBio's contact and steps")
+    settings = build_feb_settings(found, "")
+    end = float(problem.history.times[-1])
+    times = np.minimum(other.times[1:], end)  # a table has nine digits
+    if not len(times):  # FEBio got nowhere: all the way then
+        times = schedule_steps(problem.history, settings.steps)
+    contact = build_contact(problem, settings)
+    penalty = compute_mean_penalty(contact, problem, float(times[0]))
+    steps = replace(settings.steps, times=tuple(times), penalty=penalty, penetration=FREE, stress="linear")
+    system = System(problem)
+    weights = FacePenalties(system, (contact,) * len(problem.rigid_bodies), times)
+    return solve(problem, steps, store="none", on_step=weights.update_after, system=system)
+
+
+def _build_log_result(problem: Problem, log: FebioLog, file: Path) -> Result:
+    """A table from elsewhere, complete where it reaches the end of the history."""
+    reached, end = float(log.times[-1]), compute_end_time(problem)
+    reason = (
+        "" if reached > end * (1.0 - TIME_TOLERANCE) else f"the table ends at {reached:.4g} s of {end:.4g} s"
+    )
+    verdict = RunVerdict("partial" if reason else "normal", reason, reached, "")
+    try:
+        return build_result(problem, log, verdict)
+    except ProblemError as error:
+        raise ProblemError(error.what, file=file, remedy=error.remedy) from None
+
+
+def _select_common_times(other: Result, mine: Result) -> Array:
+    """FEBio's own times, as far as both went."""
+    return other.times[other.times <= mine.times[-1] * (1.0 + 1e-9)]
+
+
+def difference(other: Result, mine: Result) -> dict[str, float | None]:
+    """limbfit less FEBio at FEBio's own times, in percent of FEBio's largest force."""
+    times = _select_common_times(other, mine)
+    peak = float(other.force[: len(times)].max(initial=0.0))
+    if peak <= 0.0:
+        return dict.fromkeys(("max_percent", "mean_percent", "peak_percent"))
+    gap = mine.force_at(times) - other.force[: len(times)]
+    return {
+        "max_percent": 100.0 * float(np.abs(gap).max()) / peak,
+        "mean_percent": 100.0 * float(np.abs(gap).mean()) / peak,
+        "peak_percent": 100.0 * (float(mine.force_at(times).max()) - peak) / peak,
+    }
+
+
+def _summarise(found: Indentation, other: Result, runs: dict[str, Result]) -> dict[str, Any]:
+    return {
+        "site": found.name,
+        "parameters": found.parameters,
+        "parameters_from": found.origin,
+        "element": other.statistics["element"],
+        "unknowns": runs["limbfit"].statistics["unknowns"],
+        "febio": {
+            "version": other.statistics["linear_solver"],
+            "completed": other.completed,
+            "reason": other.reason,
+            "peak_force_N": other.peak_force,
+            "steps": other.statistics["steps"],
+            "seconds": other.statistics["seconds"]["total"] or None,
+            "penalty": found.context.study.febio.penalty,  # times the automatic one; None: explicit
+        },
+        **{
+            key: {
+                "completed": mine.completed,
+                "reason": mine.reason,
+                "peak_force_N": mine.peak_force,
+                "penetration_mm": float(mine.penetration.max(initial=0.0)),
+                "steps": mine.statistics["steps"],
+                "seconds": mine.statistics["seconds"]["total"],
+                "difference": difference(other, mine),
+            }
+            for key, mine in runs.items()
+        },
+    }
+
+
+def _write(
+    folder: Path,
+    name: str,
+    found: Indentation,
+    other: Result,
+    runs: dict[str, Result],
+    summary: dict[str, Any],
+) -> None:
+    times = _select_common_times(other, min(runs.values(), key=lambda run: run.times[-1]))
+    curves = {key: run.force_at(times) for key, run in runs.items()}
+    write_curves(
+        folder / f"{name}.csv",
+        time_s=times,
+        displacement_mm=other.displacement[: len(times)],
+        febio_N=other.force[: len(times)],
+        **{f"{key}_N": force for key, force in curves.items()},
+    )
+    _draw(folder / f"{name}.png", name, times, other.force[: len(times)], curves)
+    files = {kind: str(folder / f"{name}.{kind}") for kind in ("csv", "png")}
+    summary["files"] = files
+    write_json(folder / f"{name}.json", summary)
+
+
+def _draw(file: Path, name: str, times: Array, febio: Array, curves: dict[str, Array]) -> None:
+    words = {"limbfit": "limbfit", "limbfit_matched": "limbfit, FEBio's contact penalty"}
+    with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+        drawing = Figure(figsize=(9.6, 3.2), layout="constrained", dpi=150)
+        left, right = drawing.subplots(1, 2)
+        left.plot(times, febio, "o", ms=3.5, mfc="none", color="0.3", label="FEBio")
+        for (key, force), style in zip(curves.items(), ("-", "--")):
+            left.plot(times, force, style, label=words[key])
+            right.plot(times, 100.0 * (force - febio) / max(febio.max(initial=0.0), 1e-12), style)
+        left.set(xlabel="Time (s)", ylabel="Force (N)", title=f"Site {name}")
+        right.set(xlabel="Time (s)", ylabel="Difference (% of FEBio's peak)")
+        left.legend(frameon=False)
+        drawing.savefig(file)

@@ -1,0 +1,83 @@
+"""The synthetic patient as a study, and the demo that identifies it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from ...errors import InputError
+from ...execution import make_executor
+from ...phantom.build import make_phantom
+from ...phantom.forces import simulate_true_force
+from ...study import load_study
+from ..engine.context import Listener, Progress, compile_in_background, ignore_progress
+from ..engine.storage import read_json
+from .run import run_study
+
+
+def make_phantom_study(
+    folder: str | Path,
+    *,
+    detail: str = "coarse",
+    seed: int = 0,
+    fat: bool = False,
+    socket: bool = False,
+    ultrasound: bool = False,
+    surface: bool = False,
+    shear_waves: bool = False,
+    tendon: bool = False,
+    limb: str = "transtibial",
+    listener: Listener = ignore_progress,
+    workers: int = 0,
+) -> dict[str, Any]:
+    """Make a synthetic patient in ``folder``; returns its truth (see ``make_phantom``)."""
+    with compile_in_background() as compiled, make_executor(workers) as executor:
+
+        def mapping(function: Callable, jobs: Iterable) -> Iterable:
+            if function is simulate_true_force:
+                compiled()
+            return executor.map(function, jobs)
+
+        return make_phantom(
+            Path(folder),
+            detail=detail,
+            seed=seed,
+            fat=fat,
+            socket=socket,
+            ultrasound=ultrasound,
+            surface=surface,
+            shear_waves=shear_waves,
+            tendon=tendon,
+            limb=limb,
+            mapping=mapping,
+            progress=lambda text, done, total: listener(Progress(f"phantom {text}", done, total)),
+        )
+
+
+def run_demo(folder: str | Path, *, seed: int = 0, listener: Listener = ignore_progress) -> dict[str, Any]:
+    """A coarse synthetic patient identified from its DICOM images and records; goes on where it was stopped.
+
+    Returns
+    -------
+    dict
+        The summary of :func:`run_study` with the ``truth`` beside it.
+
+    Raises
+    ------
+    InputError
+        When ``folder`` holds something else, or the demo of another seed.
+    """
+    folder = Path(folder)
+    truth_file = folder / "truth.json"
+    if not truth_file.is_file():
+        make_phantom_study(folder, detail="coarse", seed=seed, listener=listener)
+    truth = read_json(truth_file)
+    if truth["seed"] != seed or truth["detail"] != "coarse":
+        raise InputError(
+            f"holds the phantom of seed {truth['seed']}, {truth['detail']}",
+            file=folder,
+            remedy="give another folder, or the same seed",
+        )
+    summary = run_study(load_study(folder), listener=listener)
+    return {**summary, "truth": truth["parameters"]}

@@ -1,0 +1,218 @@
+"""Indentations of a study as inputs of other solvers, with the same numbers as ``limbfit simulate``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from ...arrays import Array
+from ...bench.blocks import build_block_model, build_layered_block
+from ...errors import InputError
+from ...execution import SerialExecutor
+from ...fe import ELEMENTS, Problem
+from ...febio import (
+    ParameterRange,
+    check_optimisable,
+    describe_differences,
+    turn_to_indenter_frame,
+    write_feb,
+    write_inp,
+    write_optimisation,
+)
+from ...indentation import Parameters, SiteModel, build_problem
+from ...laws import POWER
+from ...mesh import Mesh, write_vtu
+from ...study import Indentation as Planned
+from ...study import Record, Study
+from ..engine.context import Context, Listener, ignore_progress
+from ..engine.store import Store
+from ..records.records import load_site_record
+from .simulate import Indentation, build_feb_settings, build_site_problem, choose_parameters, prepare_site
+
+FITTED = "febio-optimize"
+FORMATS = ("feb", FITTED, "inp", "calculix")
+_DIVISIONS = 4  # of the block on which an export is tried
+_NO_CURVE = np.array([0.0, 1.0]), np.zeros(2)
+
+
+def export_study(
+    study: Study,
+    to: str,
+    *,
+    site: str | None = None,
+    output: str | Path | None = None,
+    parameters: Parameters | None = None,
+    listener: Listener = ignore_progress,
+) -> dict[str, Any]:
+    """Write one indentation, or all of them, for another solver; meshes are made where missing.
+
+    Parameters
+    ----------
+    to : ``feb`` (FEBio 4), ``febio-optimize`` (FEBio's parameter optimisation: control file and model, for
+        each fitted site; FEBio fits one model at a time), ``inp`` (Abaqus) or ``calculix``.
+    output : a folder; by default ``results/export``.
+    parameters : per tissue; by default the identified ones, or the study's start where none were identified.
+
+    Raises
+    ------
+    InputError
+        For an unknown site or format, and where the other solver has no such material, element or contact.
+    RunError
+        Where a file cannot be written.
+    """
+    chosen = check_export(study, to, site=site, parameters=parameters)
+    folder = study.results / "export" if output is None else Path(output)
+    rows = []
+    for one in chosen:
+        found = prepare_site(study, one.name, parameters=parameters, listener=listener)
+        folder.mkdir(parents=True, exist_ok=True)
+        curve = _build_curve(found) if to == FITTED else _NO_CURVE
+        files, notes = _write(found, build_site_problem(found), to, folder, curve)
+        rows.append(
+            {
+                "site": one.name,
+                "parameters": found.parameters,
+                "parameters_from": found.origin,
+                "files": [str(file) for file in files],
+                "notes": list(notes),
+            }
+        )
+    return {"format": to, "sites": rows}
+
+
+def check_export(
+    study: Study, to: str, *, site: str | None = None, parameters: Parameters | None = None
+) -> Sequence[Planned]:
+    """The indentations to be written, each of which has been written on a small block in the limb's place.
+
+    Raises
+    ------
+    InputError
+        As `export_study`, before anything is meshed.
+    """
+    if to not in FORMATS:
+        raise InputError(f"{to!r} is no format", place="--to", remedy=f"give one of {', '.join(FORMATS)}")
+    chosen, store = _select_chosen(study, to, site), Store(study.results)
+    used, origin = (parameters, "given") if parameters else choose_parameters(study, store)
+    context = Context(study, store, SerialExecutor(), ignore_progress)
+    kinds = {(one.indenter, _is_forced(one)): one for one in chosen}
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "block.vtu"
+        block = _build_block(study)
+        write_vtu(block, file)
+        for one in kinds.values():
+            model = _build_block_model(study, one, file)
+            problem = build_problem(model, block, used)
+            if study.clamps is not None:
+                later = problem.history.later(study.clamps.begun_s)
+                problem = replace(problem, history=later, touch_down_s=study.clamps.begun_s)
+            found = Indentation(context, one, model, used, origin)
+            _write(found, problem, to, Path(folder), _NO_CURVE)
+    return chosen
+
+
+def _is_forced(one: Planned) -> bool:
+    return isinstance(one, Record) and one.forced
+
+
+def _build_block(study: Study) -> Mesh:
+    """A block in layers of the study's tissues, under a skin, held below."""
+    mesh = build_layered_block(ELEMENTS[study.mesh.element].cell_type, _DIVISIONS)
+    middles = mesh.points[mesh.corners].mean(axis=1)[:, 2]
+    ranks = np.argsort(np.argsort(-middles, kind="stable"), kind="stable")
+    count = len(study.tissues)
+    held = {"fixed_bottom": mesh.node_sets["bottom"]}
+    return replace(mesh, regions=ranks * count // len(ranks), region_names=study.tissues, node_sets=held)
+
+
+def _build_block_model(study: Study, one: Planned, file: Path) -> SiteModel:
+    """An indentation in the middle of that block's top, without pins."""
+    model = build_block_model(one.name, file, study.solver, study.mesh.element)
+    along = (0.0, 0.0, 1.0)
+    return replace(
+        model,
+        knots_N=(0.0, 1.0, 0.0) if _is_forced(one) else (),
+        indenter=study.indenter_of(one),
+        kappa_ratio=study.material.kappa_ratio,
+        law=study.material.law,
+        relaxation_span_s=study.material.relaxation_span_s,
+        fibres=tuple((tissue, along) for tissue in study.fibres),
+        extensions=study.extensions,
+        course=study.material.course,
+        prestretch=tuple(sorted(study.material.prestretch.items())),
+    )
+
+
+def _build_curve(found: Indentation) -> tuple[Array, Array]:
+    """Times, s, from touch-down and forces, N, of an indentation's record."""
+    assert isinstance(found.stated, Record)
+    record = load_site_record(found.context, found.stated)
+    inside = (record.times_s >= 0.0) & (record.times_s <= found.model.knots_s[-1])
+    return record.times_s[inside], record.force_N[inside]
+
+
+def _select_chosen(study: Study, to: str, site: str | None) -> Sequence[Planned]:
+    if site is not None:
+        one = study.indentation(site)
+        if to == FITTED and not isinstance(one, Record):
+            raise InputError("has no record to fit", file=study.file, place=f"sites.{site}")
+        return (one,)
+    if to == FITTED:
+        if not study.fitted:
+            raise InputError("no site is fitted", file=study.file, remedy="give --site")
+        return study.records_at(*study.fitted)
+    return study.indentations
+
+
+def _write(
+    found: Indentation, problem: Problem, to: str, folder: Path, curve: tuple[Array, Array]
+) -> tuple[tuple[Path, ...], tuple[str, ...]]:
+    """The files of a site, and what the other solver does otherwise; ``curve``: what its fit compares."""
+    name = found.name
+    settings = build_feb_settings(found, f"{name}-forces.txt")
+    if to == "feb":
+        write_feb(problem, folder / f"{name}.feb", settings)
+        return (folder / f"{name}.feb",), describe_differences(problem, settings)
+    if to == FITTED:
+        if problem.fibres is not None:
+            raise InputError("FEBio's fit is written for tissues without fibres", place="--to")
+        if found.context.study.material.law == POWER:
+            what = f'FEBio\'s fit cannot tie the relaxation terms that make the power of time of "{POWER}"'
+            raise InputError(what, place="--to", remedy="identify with limbfit")
+        check_optimisable(problem)
+        control, model = folder / f"{name}-optimize.feb", folder / f"{name}-model.feb"
+        # FEBio's fit takes its automatic penalty of a step of no time: another one than in a plain run.
+        settings = replace(settings, penalty=None)
+        turned = turn_to_indenter_frame(problem)
+        write_feb(turned, model, settings)
+        ranges = _build_ranges(found, problem.mesh.region_names)
+        iterations = found.context.study.calibration.max_iterations
+        write_optimisation(control, ranges, *curve, iterations=iterations)
+        return (control, model), describe_differences(turned, settings)
+    program = "abaqus" if to == "inp" else to
+    write_inp(problem, folder / f"{name}.inp", program, settings)
+    return (folder / f"{name}.inp",), ()
+
+
+def _build_ranges(found: Indentation, tissues: Sequence[str]) -> dict[str, ParameterRange]:
+    """Start and bounds of the tissues, in the solver's units."""
+    study = found.context.study
+    ranges = {}
+    for tissue in tissues:
+        start, lower, upper = (
+            found.parameters[tissue],
+            study.material.of(tissue, "lower"),
+            study.material.of(tissue, "upper"),
+        )
+        for key, value in start.items():
+            if not lower[key] <= value <= upper[key]:
+                what = f"{tissue}.{key} = {value:g} lies outside its bounds, {lower[key]:g} to {upper[key]:g}"
+                raise InputError(what, file=study.file, place="material")
+        start, lower, upper = map(study.law.in_solver_units, (start, lower, upper))
+        ranges[tissue] = ParameterRange(start, lower, upper, study.material.kappa_ratio)
+    return ranges

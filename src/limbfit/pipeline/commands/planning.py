@@ -1,0 +1,208 @@
+"""Planning an experiment on a limb, sites or a whole session: ``limbfit design``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ...errors import InputError
+from ...identify.checks.design import Criterion
+from ...indentation import Parameters
+from ...study import Study
+from ..engine.context import Listener, ignore_progress
+from ..engine.store import Store
+from ..records.planned_records import SEEN
+from ..simulation.loading import LoadHistory, time_socket_loads
+from ..socket.intervals import CHANGE_PERCENT
+from ..socket.socket import NAME as SOCKET
+from .run import run_experiment, study_status
+from .simulate import IDENTIFIED, choose_parameters
+
+_SENSOR_N, _MISFIT = 0.05, 0.02  # where no calibration tells: noise, and the model's error over the peak
+_HOLD_S = 30.0
+_FASTER = 5.0  # the second speed that a protocol may have, over the first
+_CORRELATION = 0.95  # of the model's error between neighbouring points of comparison
+
+
+def design_study(
+    study: Study,
+    *,
+    sites: int = 0,
+    depths_mm: Sequence[float] = (),
+    parameters: Parameters | None = None,
+    listener: Listener = ignore_progress,
+) -> dict[str, Any]:
+    """The best choice of sites and depths at known parameters, beside the study's own choice.
+
+    Parameters
+    ----------
+    sites : how many to choose; 0: as many as the study fits, or four.
+    depths_mm : depths to choose from at every site; none: as recorded or planned.
+    parameters : per tissue; by default the identified ones, or the study's start.
+
+    Returns
+    -------
+    dict
+        What ``results/design/design.json`` holds, and ``folder``.
+
+    Raises
+    ------
+    InputError
+        For more sites than there are, or identified parameters that are stale.
+    """
+    used, origin = (parameters, "given") if parameters else choose_parameters(study, Store(study.results))
+    return run_experiment(
+        study,
+        "design",
+        listener=listener,
+        sites=sites,
+        depths_mm=[float(depth) for depth in depths_mm],
+        parameters=used,
+        parameters_from=origin,
+        noise=_find_noise(study, origin),
+    )
+
+
+def plan_protocol(
+    study: Study,
+    *,
+    minutes: float = 25.0,
+    setup_s: float = 60.0,
+    rest_s: float = 30.0,
+    speeds_mm_s: Sequence[float] = (),
+    holds_s: Sequence[float] = (),
+    depths_mm: Sequence[float] = (),
+    determine: Sequence[str] = (),
+    criterion: Criterion | None = None,
+    draws: int = 3,
+    seed: int = 0,
+    ultrasound_sd_mm: float | None = None,
+    surface_sd_mm: float | None = None,
+    shear_waves_sd_m_s: float | None = None,
+    parameters: Parameters | None = None,
+    listener: Listener = ignore_progress,
+) -> dict[str, Any]:
+    """The records that determine the parameters best in a patient's time, at several draws of the tissues.
+
+    Parameters
+    ----------
+    minutes : of the whole session.
+    setup_s, rest_s : for each site with an indenter, and for the tissue to come back after each record.
+    speeds_mm_s : to choose from; none: ``acquire.ramp_speed_mm_s`` and five times as fast, or as fast as a
+        socket's loads come on, within its limit.
+    holds_s : at the deepest point, to choose from; 0: none. By default 0 and 30, or for a socket as long as
+        its loads last, within half of the session.
+    depths_mm : to choose from; none: as deep as each site was recorded or is planned. No record goes deeper
+        than half of the tissue's thickness.
+    determine : parameters such as ``muscle.c_kPa``; by default all. ``socket``: the mean pressures of the
+        regions under every load of ``results/socket``, which needs identified parameters.
+    criterion : ``D``, the smallest joint region of confidence, or ``A``, the least sum of variances; by
+        default D, and A for pressures.
+    draws : tissues that the protocol is judged at, the first those of ``parameters``.
+    ultrasound_sd_mm : how well ultrasound through the indenter reads the thickness of a tissue; None: there
+        is none.
+    surface_sd_mm : how well cameras read the displacement of the skin around the indenter; None: likewise.
+    shear_waves_sd_m_s : how well elastography reads the speed of shear waves in each tissue under the
+        indenter, once a second; as much all speeds of a tissue may be off together. None: likewise.
+    parameters : per tissue; by default the identified ones, or the study's start.
+
+    Returns
+    -------
+    dict
+        What ``results/protocol/protocol.json`` holds, and ``folder``, where ``records.toml`` is, too.
+
+    Raises
+    ------
+    InputError
+        For unknown parameters, a time too short for any record, identified parameters that are stale, or
+        pressures that are not stored with their derivatives.
+    """
+    pressures = _read_socket_pressures(study) if SOCKET in determine else {}
+    if pressures and (len(determine) > 1 or criterion == "D"):
+        what = "with other parameters" if len(determine) > 1 else 'by the criterion "D"'
+        raise InputError(
+            f"pressures of a socket are not determined {what}: they are more than the parameters",
+            place="--determine",
+            remedy="state socket alone, and A or no criterion",
+        )
+    used, origin = (parameters, "given") if parameters else choose_parameters(study, Store(study.results))
+    times = time_socket_loads(study.socket) if pressures else {}
+    if not holds_s:
+        longest = max((one.end_s for one in times.values()), default=0.0)
+        holds_s = (0.0, max(_HOLD_S, min(longest, 30.0 * minutes - setup_s - rest_s)))
+    return run_experiment(
+        study,
+        "protocol",
+        listener=listener,
+        minutes=float(minutes),
+        setup_s=float(setup_s),
+        rest_s=float(rest_s),
+        speeds_mm_s=[float(v) for v in speeds_mm_s] or _choose_speeds(study, times.values(), depths_mm),
+        holds_s=[float(hold) for hold in holds_s],
+        depths_mm=[float(depth) for depth in depths_mm],
+        determine=[] if pressures else list(determine),
+        criterion=criterion or ("A" if pressures else "D"),
+        pressures=pressures,
+        socket_times={name: [one.ramp_s, one.end_s] for name, one in times.items()},
+        draws=draws,
+        seed=seed,
+        parameters=used,
+        parameters_from=origin,
+        noise=_find_noise(study, origin),
+        seen=dict(zip(SEEN, (ultrasound_sd_mm, surface_sd_mm, shear_waves_sd_m_s), strict=True)),
+    )
+
+
+def _choose_speeds(study: Study, loads: Iterable[LoadHistory], depths_mm: Sequence[float]) -> list[float]:
+    """The study's speed, and five times that or as fast as the ``loads`` of a socket come on, mm/s.
+
+    The deepest record then takes as long as the load that comes on fastest.
+    """
+    slow, limit = study.acquire.ramp_speed_mm_s, study.acquire.speed_limit_mm_s
+    stated = [site.depth_mm for site in study.sites if site.depth_mm is not None]
+    store = Store(study.results)
+    if store.stamp("traces") is not None:
+        stated += [facts["depth_mm"] for facts in store.read("traces", "traces.json")["sites"].values()]
+    deepest = max(depths_mm or stated, default=0.0)
+    fast = max((deepest / one.ramp_s for one in loads), default=0.0)
+    return [slow, min(max(_FASTER * slow, fast), limit)]
+
+
+def _read_socket_pressures(study: Study) -> dict[str, list[float]]:
+    """Derivatives (p,) of the logarithm of every mean pressure by those of the parameters.
+
+    Raises
+    ------
+    InputError
+        Where the study has no current socket, or one without derivatives.
+    """
+    store, remedy = Store(study.results), "run limbfit socket on it, with identified parameters, first"
+    place = "--determine socket"
+    if "done" not in [row["state"] for row in study_status(study) if row["stage"] == SOCKET]:
+        raise InputError("the study has no current socket", file=study.file, place=place, remedy=remedy)
+    found = {}
+    for load in store.read(SOCKET, "socket.json")["loads"]:
+        for region in load["regions"]:
+            if region["change_kPa"] is None:
+                what = "its socket's pressures have no derivatives"
+                raise InputError(what, file=study.file, place=place, remedy=remedy)
+            by = [region["change_kPa"].get(f"{tissue}.{name}", 0.0) for tissue, name in study.parameters]
+            slopes = np.array(by) / np.log1p(CHANGE_PERCENT / 100.0)
+            if region["mean_kPa"] > 0:
+                found[f"{load['name']}, {region['region']}"] = (slopes / region["mean_kPa"]).tolist()
+    return found
+
+
+def _find_noise(study: Study, origin: str) -> dict[str, float]:
+    """Sensor noise and the model's own error, from the calibration's residuals where there is one."""
+    if origin != IDENTIFIED:
+        return {"sensor_N": _SENSOR_N, "misfit": _MISFIT, "correlation": _CORRELATION}
+    residuals = Store(study.results).read("calibrate", "calibration.json")["uncertainty"]["residuals"]
+    noise = [row["compared_noise_sd_N"] for row in residuals["sites"].values() if row["unit"] == "N"]
+    return {
+        "sensor_N": float(max(np.median(noise), 1e-3)) if noise else _SENSOR_N,
+        "misfit": float(residuals["misfit_elsewhere"]),
+        "correlation": _CORRELATION,
+    }

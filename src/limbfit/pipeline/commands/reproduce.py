@@ -1,0 +1,160 @@
+"""A study run again from its record, in a new folder, and compared with what it gave then."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..._version import __version__
+from ...errors import InputError
+from ...study import Study, load_study
+from ..engine.context import Listener, ignore_progress
+from ..engine.hand_labels import find_hand_labels
+from ..engine.provenance import collect_versions, compute_input_digests, record_settings
+from ..engine.storage import read_curves, read_json
+from ..engine.store import Store
+from .run import run_study
+
+TOLERANCE = 1e-6  # of a parameter, and of the largest force of a site, relative
+RECORD = "run.json"
+
+
+def reproduce_study(
+    record: str | Path,
+    folder: str | Path,
+    *,
+    tolerance: float = TOLERANCE,
+    listener: Listener = ignore_progress,
+) -> dict[str, Any]:
+    """Copy the inputs of a study to a new folder, run it there, and compare.
+
+    Parameters
+    ----------
+    record : ``results/run.json`` of a study, or the study.
+    folder : the new one; must not exist, unless an earlier attempt at the same record is to go on.
+    tolerance : how far parameters, and forces over a site's largest, may be apart, relative.
+    listener : is told of progress.
+
+    Returns
+    -------
+    dict
+        ``same``, ``tolerance``, ``parameters`` and ``forces`` (largest relative difference by name), and
+        ``versions`` that differ, each as (then, now).
+
+    Raises
+    ------
+    InputError
+        Where the record is not one, or the study's inputs or settings are no longer those of the record.
+    """
+    record, folder = Path(record), Path(folder)
+    file = record if record.name == RECORD else load_study(record).results / RECORD
+    known = _read(file)
+    study = load_study(file.parent.parent)
+    _check_unchanged(study, known, file)
+    _copy_inputs(study, folder)
+    summary = run_study(load_study(folder), listener=listener)
+    then = Store(study.results).read("calibrate", "calibration.json")["stages"][-1]["parameters"]
+    parameters = dict(_compute_relative(then, summary["parameters"]))
+    forces = dict(_compare_forces(study.results / "predict", folder / "results" / "predict"))
+    return {
+        "same": bool(max([*parameters.values(), *forces.values()]) <= tolerance),
+        "tolerance": tolerance,
+        "parameters": parameters,
+        "forces": forces,
+        "versions": _list_version_changes(known),
+        "folder": str(folder),
+    }
+
+
+def _read(file: Path) -> dict[str, Any]:
+    if not file.is_file():
+        raise InputError("no such record", file=file, remedy="run the study first: limbfit run")
+    try:
+        known = read_json(file)
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        known = None
+    if not isinstance(known, dict) or not {"settings", "inputs", "versions", "stages"} <= set(known):
+        raise InputError("is not the record of a run", file=file, remedy="give results/run.json of a study")
+    if not {"calibrate", "predict"} <= set(known["stages"]):
+        raise InputError(
+            "that run did not reach its predictions", file=file, remedy="run the study to its end"
+        )
+    return known
+
+
+def _check_unchanged(study: Study, known: Mapping[str, Any], file: Path) -> None:
+    """The inputs and settings must be those that the record tells of: else nothing is to be compared."""
+    found = compute_input_digests(study)
+    changed = [key for key in {**known["inputs"], **found} if known["inputs"].get(key) != found.get(key)]
+    if not changed:
+        now = json.loads(json.dumps(record_settings(study, found), default=str))
+        changed = [
+            table
+            for table in {**known["settings"], **now}
+            if table not in ("execution", "acquire") and known["settings"].get(table) != now.get(table)
+        ]
+    if changed:
+        raise InputError(
+            f"the study has changed since: {', '.join(changed[:4])}",
+            file=file,
+            remedy="bring back what it was made from, or run the study again for a new record",
+        )
+
+
+def _copy_inputs(study: Study, folder: Path) -> None:
+    """The study file and what it names below its folder; what lies elsewhere is read where it is."""
+    if folder.exists() and not (folder / "study.toml").is_file() and any(folder.iterdir()):
+        raise InputError("holds something else", file=folder, remedy="give a folder that does not exist")
+    folder.mkdir(parents=True, exist_ok=True)
+    if study.file is None:
+        raise InputError("the study has no file")
+    root = study.folder.resolve()
+    edited = find_hand_labels(study)
+    for path in {*study.inputs.values(), Path(study.file.name), *([edited] if edited else [])}:
+        source = study.path(path)
+        if path.is_absolute():
+            continue
+        if not source.resolve().is_relative_to(root) or ".." in path.parts:
+            raise InputError(
+                f"{path} lies outside the study's folder", file=study.file, remedy="name it by its full path"
+            )
+        target = folder / ("study.toml" if path == Path(study.file.name) else path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source.is_dir():
+            shutil.copytree(source, target, dirs_exist_ok=True)
+        else:
+            for one in source.parent.glob(f"{source.name}*"):  # a label map's names lie beside it
+                shutil.copyfile(one, target.with_name(target.name + one.name[len(source.name) :]))
+
+
+def _compute_relative(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+    for tissue, values in then.items():
+        for name, value in values.items():
+            yield f"{tissue}.{name}", abs(now[tissue][name] - value) / max(abs(value), 1e-300)
+
+
+def _select_simulated(curves: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    """What is compared of a prediction, simulated: force, or displacement under a stated force."""
+    return curves.get("force_simulated_N", curves.get("displacement_simulated_mm"))
+
+
+def _compare_forces(then: Path, now: Path) -> Iterator[tuple[str, float]]:
+    for file in sorted(then.glob("*.csv")):
+        a, b = (_select_simulated(read_curves(folder / file.name)) for folder in (then, now))
+        if a is not None and b is not None:
+            yield file.stem, float(np.abs(a - b).max() / max(np.abs(a).max(), 1e-300))
+        elif a is not b:  # one of them could not be predicted: all of the force is missing
+            yield file.stem, 1.0
+
+
+def _list_version_changes(known: Mapping[str, Any]) -> dict[str, list[str | None]]:
+    then = {"limbfit": known.get("limbfit"), **known["versions"]}
+    now: dict[str, str] = {"limbfit": __version__, **collect_versions()}
+    return {
+        name: [then.get(name), now.get(name)] for name in {**then, **now} if then.get(name) != now.get(name)
+    }

@@ -1,0 +1,410 @@
+"""Which stages there are, what each depends on, and the run that does what is missing."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ... import report
+from ..._version import __version__
+from ...errors import InputError
+from ...extensions import load_extensions
+from ...study import Study
+from ..engine.context import Context, Listener, build_executor, compile_in_background, ignore_progress
+from ..engine.hand_labels import keep_hand_labels
+from ..engine.journal import write_journal
+from ..engine.keys import Keys, Stage
+from ..engine.provenance import collect_versions, compute_input_digests, describe_machine, record_settings
+from ..engine.stale_reasons import collect_parts, describe_causes
+from ..engine.storage import write_json
+from ..engine.store import Store, lock
+from ..identification.calibrate import check_fitted, run_calibrate
+from ..identification.predict import run_predict
+from ..limb.mesh import run_mesh
+from ..limb.segment import run_segment
+from ..limb.sites import run_sites
+from ..limb.surfaces import run_surfaces
+from ..records.record_checks import tell_flags
+from ..records.traces import run_traces
+from ..simulation.limb_geometry import LimbGeometry
+from ..simulation.surface_points import read_motion
+from .experiments import (
+    EXPERIMENTS,
+    check_experiment,
+    compute_experiment_key,
+    do_experiment,
+    list_experiment_rows,
+    merge_options,
+)
+
+
+def run_report(context: Context, folder: Path) -> dict[str, Any]:
+    """``report.html``; a phantom's ``truth.json`` beside the study is shown in it.
+
+    It is drawn on the executor: graphics libraries can crash, and a worker that dies is an error in words.
+    """
+    context.tell("report", 0, 1, "drawing figures")
+    truth = context.study.folder / "truth.json"
+    if truth.is_file():
+        shutil.copyfile(truth, context.store.folder / "truth.json")
+    list(context.executor.map(_draw, [(context.store.folder, folder, context.study.extensions)]))
+    return {}
+
+
+def _draw(job: tuple[Path, Path, tuple[Path, ...]]) -> None:
+    results, out, extensions = job
+    load_extensions(extensions)  # they may have sections and words of their own
+    report.build_report(results, out)
+
+
+_PLACE = ("name", "position", "near", "axis", "region", "fitted", "indenter")
+_WAVES = ("shear_waves", "shear_waves_sd_m_s", "shear_waves_bias_m_s")
+_SEEN = ("ultrasound", "ultrasound_sd_mm", "surface", "surface_sd_mm", "surface_frame", *_WAVES)
+_RECORD = ("trace", "touch_down_s", "peak_s", "control", *_SEEN)
+_UNSEEN: dict[str, Any] = {
+    **dict.fromkeys(("trace", "touch_down_s", "peak_s", "axis", "edge", "indenter", "ultrasound", "surface")),
+    "shear_waves": None,
+    "region": "",
+    "control": "displacement",
+    "ultrasound_sd_mm": 0.1,
+    "surface_sd_mm": 0.05,
+    "surface_frame": "limb",
+    "shear_waves_sd_m_s": 0.1,
+    "shear_waves_bias_m_s": 0.1,
+}
+_NAMED = ("site", "name")
+# How pins press; the mesh depends on how wide they are alone.
+_PRESSING = tuple(
+    f"clamps.{key}" for key in ("force_N", "angles_degrees", "levels_mm", "clamping_s", "settling_s")
+)
+
+STAGES = (
+    Stage("segment", run_segment, (), ("image", "segmentation")),
+    Stage("surfaces", run_surfaces, ("segment",), ("geometry", "surfaces")),
+    Stage("sites", run_sites, ("surfaces",), ("indenter", "indenters"), _PLACE, (*_NAMED, "indenter")),
+    Stage("traces", run_traces, (), ("traces",), ("name", *_RECORD), (*_NAMED, *_RECORD)),
+    Stage(
+        "mesh", run_mesh, ("surfaces", "sites"), ("geometry", "mesh", "clamps"), ("name",), apart=_PRESSING
+    ),
+    Stage(
+        "calibrate",
+        run_calibrate,
+        ("sites", "traces", "mesh"),
+        ("material", "calibration", "solver", "indenter", "indenters", "clamps"),
+        ("name", "fitted", "weight", "edge", "indenter"),
+        (*_NAMED, "indenter"),
+    ),
+    Stage("predict", run_predict, ("sites", "traces", "mesh", "calibrate"), (), ("name", "edge"), _NAMED),
+    Stage("report", run_report, ("predict",), ("study",), ("name", "region")),
+)
+_FOLDERS = frozenset(("compare", "export", "simulate", *(stage.name for stage in STAGES)))  # of results
+STAGE_NAMES = tuple(stage.name for stage in STAGES)
+
+
+def list_stages(study: Study) -> tuple[Stage, ...]:
+    """The stages that a study has: without an image there is nothing to segment."""
+    return tuple(stage for stage in STAGES if stage.name != "segment" or study.image is not None)
+
+
+def compute_keys(study: Study) -> dict[str, str]:
+    """The key of every stage: a digest of its settings, input files, code and of the stages it stands on.
+
+    The calibration's is the one that it has in the study of its fitted sites alone: whatever is held out can
+    change, come and go without it. The report's covers the experiments that it shows.
+    """
+    return _chain_keys(Keys(study))
+
+
+def _chain_keys(known: Keys) -> dict[str, str]:
+    study = known.study
+    stages = list_stages(study)
+    calibrate = known.of(stages, study=_select_calibration_inputs(study))["calibrate"]
+    found = known.of(stages[:-1], {"calibrate": calibrate})
+    shown = [row["key"] for row in list_experiment_rows(study, known, found) if row["state"] == "done"]
+    return found | known.of(stages[-1:], found, options={"report": {"experiments": shown} if shown else {}})
+
+
+def _select_calibration_inputs(study: Study) -> Study:
+    """The study's fitted sites; with markers the others' places too, since each marker goes to one site."""
+    sites = [site.model_copy(update={"region": ""}) for site in study.fitted]
+    if any(site.near is not None for site in sites):
+        others = [site for site in study.sites if not site.fitted and site.near is not None]
+        sites += [site.model_copy(update=_UNSEEN) for site in others]
+    fitted = {site.name for site in study.fitted}
+    records = tuple(record for record in study.records if record.site in fitted)
+    return study.model_copy(update={"sites": tuple(sites), "records": records})
+
+
+def study_status(study: Study) -> list[dict[str, Any]]:
+    """State of every stage: done, begun, stale (made from other inputs, settings or code) or missing.
+
+    ``why`` names what changed since a stale one was made. Below the stages: the experiments that were begun
+    or done.
+    """
+    store, known = Store(study.results), Keys(study)
+    wanted, rows = _chain_keys(known), []
+    for stage in list_stages(study):
+        state = store.state(stage.name, wanted[stage.name])
+        rows.append(
+            {
+                "stage": stage.name,
+                "state": state.state,
+                "seconds": state.seconds,
+                "finished": state.finished,
+                "why": _describe_why(known, stage, wanted) if state.state == "stale" else [],
+            }
+        )
+    columns = ("state", "seconds", "finished")
+    for row in list_experiment_rows(study, known, wanted):
+        if row["state"] != "missing":
+            why = (
+                _describe_why(known, EXPERIMENTS[row["experiment"]], wanted)
+                if row["state"] == "stale"
+                else []
+            )
+            rows.append({"stage": row["experiment"], **{key: row[key] for key in columns}, "why": why})
+    return rows
+
+
+def _collect_parts(known: Keys, stage: Stage, chain: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """What the key of a stage is made of, for a later status to say what changed."""
+    seen = _select_calibration_inputs(known.study) if stage.name == "calibrate" else known.study
+    return collect_parts(stage, known, seen, chain)
+
+
+def _describe_why(known: Keys, stage: Stage, chain: Mapping[str, str]) -> list[str]:
+    stamp = Store(known.study.results).stamp(stage.name) or {}
+    return describe_causes(stamp.get("parts"), _collect_parts(known, stage, chain))
+
+
+def run_study(
+    study: Study,
+    *,
+    until: str | None = None,
+    start: str | None = None,
+    force: Sequence[str] = (),
+    listener: Listener = ignore_progress,
+) -> dict[str, Any]:
+    """Do every stage that is not done, in order; return the summary of the study.
+
+    Parameters
+    ----------
+    study : a checked study.
+    until : name of the last stage to do; default all.
+    start : name of a stage that is done anew, and all after it.
+    force : names of stages that are done anew. Kept simulations count: the same ones would come out.
+    listener : is told of progress; ``results/log`` too.
+
+    Raises
+    ------
+    InputError
+        When an input cannot be used.
+    RunError
+        When another run holds the study, or the disk is full.
+    """
+    return _run_stages(study, until, start, force, listener)
+
+
+def _run_stages(
+    study: Study,
+    until: str | None,
+    start: str | None,
+    force: Sequence[str],
+    listener: Listener,
+    check: Callable[[LimbGeometry], None] | None = None,
+) -> dict[str, Any]:
+    """See `run_study`; ``check`` is given the limb before anything is meshed."""
+    anew = _select_stages_to_redo(study, until, start, force)
+    store = Store(study.results)
+    with (
+        lock(study.results),
+        write_journal(study, "run", listener) as listener,
+        build_executor(study) as executor,
+    ):
+        context = Context(study, store, executor, listener)
+        kept = keep_hand_labels(study)
+        if kept is not None:
+            context.tell("segment", 0, 1, f"label map corrected by hand: kept as {kept}")
+        known = Keys(study)
+        chain = _chain_keys(known)
+        wanted = list(chain) if until is None else list(chain)[: list(chain).index(until) + 1]
+        missing = {name for name in wanted if name in anew or store.state(name, chain[name]).state != "done"}
+        if "calibrate" in missing:
+            check_fitted(study)
+        wanted.sort(key=lambda name: name != "traces")  # records need no limb: what is wrong is said at once
+        with compile_in_background("calibrate" in missing) as compiled:
+            for name in wanted:
+                if name == "mesh":
+                    _check_limb(context, check, name in missing)
+                if name == "calibrate":
+                    compiled()
+                if name in missing:
+                    if name == "calibrate":
+                        tell_flags(context)
+                    _do(context, name, known, chain)
+                else:
+                    context.tell(name, 1, 1, "is up to date")
+        summary = summarise(study)
+    if until is not None:
+        summary["until"] = until
+    return summary
+
+
+def _check_limb(context: Context, check: Callable[[LimbGeometry], None] | None, meshing: bool) -> None:
+    """Refuse what surfaces, sites and records rule out, before anything is meshed."""
+    study, store = context.study, context.store
+    if not (meshing or check):
+        return
+    limb = LimbGeometry.stored(store)
+    if meshing:
+        facts = store.read("traces", "traces.json")["sites"]
+        moving = [one for one in study.recorded if facts[one.name].get("surface", {}).get("compared")]
+        limb.clamping_pins(study)
+        limb.surface_points(study, {one.name: read_motion(store["traces"], one) for one in moving})
+    if check is not None:
+        check(limb)
+
+
+def _select_stages_to_redo(
+    study: Study, until: str | None, start: str | None, force: Sequence[str]
+) -> set[str]:
+    """Stages that are done whether they are up to date or not."""
+    names = [stage.name for stage in list_stages(study)]
+    for name in (until, start, *force):
+        if name is not None and name not in names:
+            raise InputError(f"no stage is named {name!r}", remedy="stages are " + ", ".join(names))
+    if until is not None and start is not None and names.index(start) > names.index(until):
+        raise InputError(f"{start} comes after {until}", remedy="leave out one of the two")
+    return {*force, *(names[names.index(start) :] if start is not None else ())}
+
+
+def run_experiment(
+    study: Study, name: str, *, listener: Listener = ignore_progress, **options: Any
+) -> dict[str, Any]:
+    """Do an experiment of a study, and before it every stage that it needs and that is not done.
+
+    Its results lie in ``results/<name>``; ``limbfit report`` shows them.
+
+    Parameters
+    ----------
+    study : a checked study.
+    name : of the experiment.
+    listener : is told of progress.
+    options : as the experiment takes them; left out: its defaults.
+
+    Returns
+    -------
+    dict
+        What ``results/<name>/<name>.json`` holds, and ``folder``, where that is.
+
+    Raises
+    ------
+    InputError
+        For an experiment or option that there is not, or an input that cannot be used.
+    RunError
+        When another run holds the study, or the disk is full.
+    """
+    experiment = EXPERIMENTS[name]
+    if name in _FOLDERS:
+        raise InputError(f"results/{name} is not for an experiment", remedy="give it another name")
+    chosen = merge_options(experiment, options)
+    check_experiment(experiment, study, None, chosen)
+    last = [stage.name for stage in STAGES if stage.name in experiment.needs][-1:]
+    if last:
+
+        def check(limb: LimbGeometry) -> None:
+            check_experiment(experiment, study, limb, chosen)
+
+        _run_stages(study, last[0], None, (), listener, check)
+    store = Store(study.results)
+    with (
+        lock(study.results),
+        write_journal(study, name, listener) as listener,
+        build_executor(study) as executor,
+    ):
+        known = Keys(study)
+        chain = _chain_keys(known)
+        key = compute_experiment_key(experiment, known, chain, chosen)
+        parts = _collect_parts(known, experiment, chain)
+        context = Context(study, store, executor, listener)
+        found = do_experiment(context, experiment, key, chosen, parts)
+    return found | {"folder": str(store[name])}
+
+
+def _do(context: Context, name: str, known: Keys, chain: Mapping[str, str]) -> None:
+    stage = next(stage for stage in STAGES if stage.name == name)
+    if name == "report":
+        write_json(context.store.folder / "run.json", run_record(context.study))
+    parts = _collect_parts(known, stage, chain)
+    stamp = context.store.make(
+        name, chain[name], lambda folder: {**stage.run(context, folder), "parts": parts}
+    )
+    context.tell(name, 1, 1, f"done in {stamp['seconds']:.1f} s")
+
+
+def run_record(study: Study) -> dict[str, Any]:
+    """``run.json``: versions, settings, digests of the inputs, how long each stage took."""
+    store = Store(study.results)
+    stamps = {stage.name: store.stamp(stage.name) for stage in list_stages(study)}
+    inputs, known = compute_input_digests(study), Keys(study)
+    return {
+        "limbfit": __version__,
+        "study": study.study.model_dump(mode="json"),
+        "settings": record_settings(study, inputs),
+        "versions": collect_versions(),
+        "machine": describe_machine(),
+        "inputs": inputs,
+        "stages": {
+            name: {"seconds": stamp["seconds"], "finished": stamp["finished"], "key": stamp["key"]}
+            for name, stamp in stamps.items()
+            if stamp
+        },
+        "experiments": {
+            row["experiment"]: {key: row[key] for key in ("state", "seconds", "finished", "options", "key")}
+            for row in list_experiment_rows(study, known, _chain_keys(known))
+            if row["state"] in ("done", "stale")
+        },
+    }
+
+
+def report_study(study: Study, *, listener: Listener = ignore_progress) -> dict[str, Any]:
+    """Make the report anew from what is stored, stale or not; nothing is solved."""
+    store = Store(study.results)
+    with lock(study.results), build_executor(study) as executor:
+        context = Context(study, store, executor, listener)
+        known = Keys(study)
+        _do(context, "report", known, _chain_keys(known))
+        return summarise(study)
+
+
+def summarise(study: Study) -> dict[str, Any]:
+    """The figures of a study from what is stored: parameters, sites with errors, where the report is."""
+    store = Store(study.results)
+    summary: dict[str, Any] = {"study": study.study.name, "results": str(study.results)}
+    if (store["calibrate"] / "calibration.json").is_file():
+        calibration = store.read("calibrate", "calibration.json")
+        summary["parameters"] = calibration["stages"][-1]["parameters"]
+        summary["intervals_95"] = calibration["uncertainty"]["intervals_95"]
+        if relaxation := calibration["uncertainty"].get("relaxation"):
+            summary["relaxation"] = {key: relaxation[key] for key in ("prefers", "words", "moduli")}
+    if (store["predict"] / "predict.json").is_file():
+        predicted = store.read("predict", "predict.json")
+        columns = ("site", "record", "region", "fitted", "peak_force_N", "error_percent")
+        summary["sites"] = [
+            {
+                **{key: row[key] for key in columns},
+                **{key: row.get(key, []) for key in ("warnings", "outside_records")},
+            }
+            for row in predicted["sites"]
+        ]
+        summary["outside_text"] = predicted.get("outside_text", [])
+        for key in ("mean_error_fitted_percent", "mean_error_heldout_percent"):
+            summary[key] = predicted[key]
+        summary["flags"] = predicted.get("flags", [])
+        summary["fit_quality"] = predicted.get("fit_quality", {}).get("verdict", "")
+    report = store["report"] / "report.html"
+    if report.is_file():
+        summary["report"] = str(report)
+    return summary

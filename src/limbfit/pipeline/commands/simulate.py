@@ -1,0 +1,224 @@
+"""One indentation of a study, simulated and stored for ParaView."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...errors import InputError
+from ...execution import SerialExecutor
+from ...fe import Problem, Result
+from ...febio import FebSettings, build_result, compute_end_time, find_febio, run_febio, write_feb
+from ...identify.checks.domain import RecordedRange, describe_outside
+from ...indentation import Parameters, SiteModel, build_first_steps, build_problem, simulate_fields
+from ...mesh import read_vtu
+from ...study import Indentation as Planned
+from ...study import Record, Study
+from ..engine.context import Context, Listener, ignore_progress
+from ..engine.storage import write_curves, write_json
+from ..engine.store import Store
+from ..simulation.limb_geometry import LimbGeometry
+from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
+from ..simulation.simulations import CURVE_POINTS, build_model
+from .run import compute_keys, run_study
+
+IDENTIFIED = "identified"
+FEB_NAME, FORCES = "model.feb", "forces.txt"
+
+
+@dataclass(frozen=True)
+class Indentation:
+    """An indentation of a study, ready to be simulated: ``origin`` says where the parameters are from."""
+
+    context: Context
+    stated: Planned
+    model: SiteModel
+    parameters: Parameters
+    origin: str
+
+    @property
+    def name(self) -> str:
+        """That of the record, or of the site that plans it."""
+        return self.model.name
+
+
+def prepare_site(
+    study: Study, name: str, *, parameters: Parameters | None = None, listener: Listener = ignore_progress
+) -> Indentation:
+    """A site as recorded, or as the study plans it; meshes are made where missing.
+
+    Parameters
+    ----------
+    name : of a site with one record at most, or of a record.
+    parameters : per tissue; by default the identified ones, or the study's start where none were identified.
+
+    Raises
+    ------
+    InputError
+        For a site that the study does not have, identified parameters that are stale, or any input of the
+        stages before.
+    """
+    stated = study.indentation(name)
+    store = Store(study.results)
+    used, origin = (parameters, "given") if parameters else choose_parameters(study, store)
+    run_study(study, until="mesh", listener=listener)
+    context = Context(study, store, SerialExecutor(), listener)
+    return Indentation(context, stated, build_model(context, stated), used, origin)
+
+
+def simulate_site(
+    study: Study,
+    name: str,
+    *,
+    parameters: Parameters | None = None,
+    animation: bool = False,
+    solver: str | None = None,
+    listener: Listener = ignore_progress,
+) -> dict[str, Any]:
+    """Simulate one indentation (see `prepare_site`).
+
+    Curve and fields at the deepest point go to ``results/simulate``.
+
+    Parameters
+    ----------
+    parameters : as `prepare_site`.
+    animation : also the fields of every step, as a PVD collection.
+    solver : ``limbfit`` or ``febio``; by default what the study says.  FEBio's fields stay in its own file.
+
+    Raises
+    ------
+    InputError
+        For a site that the study does not have, identified parameters that are stale, or any input of the
+        stages before.
+    """
+    by_febio = (solver or study.solver.solver) == "febio"
+    program = find_febio(study.febio.program) if by_febio else None
+    if program is not None and animation:
+        raise InputError("FEBio's fields are in its plot file", place="--animation", remedy="leave it out")
+    found = prepare_site(study, name, parameters=parameters, listener=listener)
+    context, model, name = found.context, found.model, found.name
+    folder = context.store["simulate"]
+    folder.mkdir(exist_ok=True)
+    context.tell("simulate", 0, 1, f"site {name}")
+    played = folder / f"{name}.pvd" if animation else None
+    if program is not None:
+        (folder / f"{name}.vtu").unlink(missing_ok=True)  # that of another simulation
+        result, fields = run_febio_site(found, program, folder / f"{name}.febio")
+    else:
+        fields = folder / f"{name}.vtu"
+        result = simulate_fields(model, found.parameters, fields, played)
+    context.tell("simulate", 1, 1, f"site {name}")
+    times = model.curve_times(CURVE_POINTS)
+    curve = folder / f"{name}.csv"
+    write_curves(
+        curve,
+        time_s=times,
+        displacement_mm=result.displacement_at(times) if model.forced else model.history.at(times),
+        force_N=result.force_at(times + model.waits_s),
+    )
+    summary = _summarise(found, result, "limbfit" if program is None else result.statistics["linear_solver"])
+    summary |= _compare_with_records(found, result, None if program else fields)
+    files = {
+        "curve": curve,
+        "fields": fields if fields.is_file() and (by_febio or result.states) else None,
+        "animation": played,
+    }
+    # A path may tell who the patient is: what is stored names the files as they lie beside it.
+    beside = {kind: file and file.relative_to(folder).as_posix() for kind, file in files.items()}
+    write_json(folder / f"{name}.json", summary | beside)
+    return summary | {kind: file and str(file) for kind, file in files.items()}
+
+
+def _compare_with_records(found: Indentation, result: Result, fields: Path | None) -> dict[str, Any]:
+    """What of an indentation no fitted record did, and in words; None where that is not known.
+
+    ``fields`` at its deepest point; without them strains are not compared.
+    """
+    study, model = found.context.study, found.model
+    stored = read_recorded_range(study) if found.origin == IDENTIFIED else None
+    if stored is None:
+        return {"outside_records": None, "outside_text": []}
+    tested, limb = RecordedRange.from_dict(stored), LimbGeometry.stored(found.context.store)
+    site = found.stated.site if isinstance(found.stated, Record) else found.stated
+    rows = tested.find_outside(
+        describe_indentation(
+            LoadHistory.from_knots(model.knots_s, model.knots_N or model.knots_mm),
+            float(result.displacement.max()) if model.forced else max(model.knots_mm),
+            model.indenter,
+            limb.place(site),
+            LimbAxis(limb.anatomy),
+            force_N=result.peak_force,
+            strains=read_strain_extents(fields) if fields is not None and fields.is_file() else (),
+            tested=tested,
+        )
+    )
+    return {"outside_records": rows, "outside_text": describe_outside({f"site {found.name}": rows})}
+
+
+def _summarise(found: Indentation, result: Result, solver: str) -> dict[str, Any]:
+    """What is told of a simulation; FEBio says nothing of its penetration."""
+    own = solver == "limbfit"
+    return {
+        "site": found.name,
+        "solver": solver,
+        "parameters": found.parameters,
+        "parameters_from": found.origin,
+        "peak_force_N": result.peak_force,
+        "depth_mm": float(result.displacement.max()) if found.model.forced else max(found.model.knots_mm),
+        "penetration_mm": float(result.penetration.max(initial=0.0)) if own else None,
+        "completed": result.completed,
+        "reason": result.reason,
+        "warnings": list(result.warnings),
+        "element": result.statistics["element"],
+        "unknowns": result.statistics["unknowns"],
+    }
+
+
+def build_site_problem(found: Indentation) -> Problem:
+    """The site's problem, as `simulate_site` solves it."""
+    return build_problem(found.model, read_vtu(found.model.mesh), found.parameters)
+
+
+def build_feb_settings(found: Indentation, force_file: str) -> FebSettings:
+    """What is written for FEBio beside the problem."""
+    study = found.context.study
+    title = f"{study.study.name}, site {found.name}, parameters: {found.origin}"
+    return FebSettings(study.febio.penalty, build_first_steps(found.model, study.tissues), force_file, title)
+
+
+def run_febio_site(found: Indentation, program: Path, folder: Path) -> tuple[Result, Path]:
+    """The site solved by FEBio in ``folder``, and its plot file; a failure is a result with its reason."""
+    problem, options = build_site_problem(found), found.context.study.febio
+    folder.mkdir(parents=True, exist_ok=True)
+    write_feb(problem, folder / FEB_NAME, build_feb_settings(found, FORCES))
+    end = compute_end_time(problem)
+    run = run_febio(program, folder, end, FORCES, threads=options.threads, time_limit_s=options.time_limit_s)
+    return build_result(problem, run.log, run.verdict, run.seconds), folder / "model.xplt"
+
+
+def read_recorded_range(study: Study) -> dict[str, Any] | None:
+    """What the fitted records did to the tissue; None where the prediction, which stores it, is not done."""
+    store = Store(study.results)
+    if store.state("predict", compute_keys(study)["predict"]).state != "done":
+        return None
+    tested: dict[str, Any] = store.read("predict", "predict.json")["recorded_range"]
+    return tested
+
+
+def choose_parameters(study: Study, store: Store) -> tuple[Parameters, str]:
+    """The identified parameters, else the study's start, and which they are.
+
+    Neither will do where the calibration is stale: it is not this study's, and who has identified a model
+    does not expect the start.
+    """
+    if store.stamp("calibrate") is None:
+        start = {tissue: study.material.of(tissue, "start") for tissue in study.tissues}
+        return start, "start of the study"
+    if store.state("calibrate", compute_keys(study)["calibrate"]).state != "done":
+        raise InputError(
+            "the identified parameters are stale: made from other inputs, settings or code",
+            file=store["calibrate"] / "calibration.json",
+            remedy="identify again (limbfit run), or give --parameters",
+        )
+    return store.read("calibrate", "calibration.json")["stages"][-1]["parameters"], IDENTIFIED

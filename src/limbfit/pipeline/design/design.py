@@ -1,0 +1,251 @@
+"""The experiment ``design``: which sites to test, and how deep, to determine the parameters best."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...anatomy.sites.under import measure_tissue_under
+from ...anatomy.surfaces.surfaces import load_anatomy
+from ...arrays import Array
+from ...errors import InputError, RunError, StudyError
+from ...identify.checks.design import (
+    Candidate,
+    Design,
+    NoiseModel,
+    build_candidate,
+    choose_design,
+    compute_bounds_information,
+    compute_efficiency,
+    evaluate_design,
+)
+from ...identify.fit.objective import SiteResponse
+from ...indentation import Parameters, SiteModel
+from ...study import Site, Study
+from ..engine.context import Context
+from ..engine.storage import write_json, write_table
+from ..identification.record_simulator import build_unknowns
+from ..simulation.limb_geometry import LimbGeometry
+from ..simulation.simulations import build_curve_job, build_model, open_experiment_cache
+
+DEFAULT_SITES = 4
+DEEPEST_SHARE = 0.5  # of the tissue's thickness that a candidate may go
+
+
+def check_design(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
+    """Refuse more sites than there are, sites with several records, and depths that fit at too few of them.
+
+    Raises
+    ------
+    InputError
+    """
+    sites, depths = count_wanted_sites(study, options["sites"]), options["depths_mm"]
+    if not 0 < sites <= len(study.sites):
+        raise InputError(f"{sites} sites are wanted of {len(study.sites)}", place="--sites")
+    for site in study.sites:
+        records = study.records_at(site)
+        if len(records) > 1 or any(record.forced for record in records):
+            raise InputError(
+                "a design chooses one indentation per site, under a stated displacement; a site has others",
+                file=study.file,
+                place=f"sites.{site.name}",
+                remedy="leave one of that kind in a study for the design",
+            )
+    if limb is None or not depths:
+        return
+    fitting = [site for site in study.sites if min(depths) <= _find_deepest_mm(study, limb, site)]
+    if len(fitting) < sites:
+        what = f"{min(depths):g} mm is no deeper than half of the tissue at {len(fitting)} of {sites} sites"
+        raise StudyError(
+            what, file=study.file, place="--depths", remedy="give smaller depths, or fewer sites"
+        )
+
+
+def count_wanted_sites(study: Study, sites: int) -> int:
+    """How many sites to choose: of 0 as many as the study fits, else four, or all where it has fewer."""
+    return sites or len(study.fitted) or min(DEFAULT_SITES, len(study.sites))
+
+
+def _find_deepest_mm(study: Study, limb: LimbGeometry, site: Site) -> float:
+    """How deep a candidate at a site may go."""
+    width = study.indenter_of((study.records_at(site) or (site,))[0]).width_mm
+    return DEEPEST_SHARE * measure_tissue_under(limb.anatomy, *limb.place(site), width)
+
+
+def run_design(
+    context: Context,
+    folder: Path,
+    *,
+    sites: int,
+    depths_mm: Sequence[float],
+    parameters: Parameters,
+    parameters_from: str,
+    noise: dict[str, float],
+) -> dict[str, Any]:
+    """Simulate every candidate once, with derivatives, and choose."""
+    study = context.study
+    vector = study.vector(parameters)
+    models, left_out = _build_candidate_models(context, depths_mm)
+    cache = open_experiment_cache(context, folder)
+    jobs = [build_curve_job(model, study.tissues, vector) for model in models]
+    model_noise, found = NoiseModel(**noise), []
+    for i, (model, simulation) in enumerate(zip(models, cache.run(jobs, context.executor))):
+        depth = float(max(model.knots_mm))
+        context.tell("design", i + 1, len(models), f"site {model.name}, {depth:.1f} mm")
+        assert simulation.jacobian is not None
+        if not simulation.completed:
+            left_out.append(f"site {model.name} at {depth:.1f} mm: {simulation.reason}")
+            continue
+        response = SiteResponse(simulation.force_N, simulation.jacobian)
+        found.append(
+            (build_candidate(model.site, depth, response, vector, model_noise), simulation.force_N.max())
+        )
+    content = _to_content(context, found, count_wanted_sites(study, sites), vector, left_out)
+    content |= {"parameters": parameters, "parameters_from": parameters_from, "noise": noise}
+    write_json(folder / "design.json", content)
+    _write_tables(folder, content)
+    return {}
+
+
+def _build_candidate_models(
+    context: Context, depths_mm: Sequence[float]
+) -> tuple[list[SiteModel], list[str]]:
+    """Each site as recorded or planned, or at each depth that its tissue allows; and what was left out."""
+    study, models, left_out = context.study, [], []
+    anatomy = load_anatomy(context.store["surfaces"]) if depths_mm else None
+    for one in study.indentations:
+        own = build_model(context, one)
+        if anatomy is None:
+            models.append(own)
+            continue
+        thickness = measure_tissue_under(anatomy, own.position, own.axis, own.indenter.width_mm)
+        for depth in depths_mm:
+            if depth > DEEPEST_SHARE * thickness:
+                left_out.append(f"site {own.site} at {depth:g} mm: the tissue is {thickness:.1f} mm thick")
+            else:
+                models.append(_scale_to_depth(own, depth))
+    return models, left_out
+
+
+def _scale_to_depth(own: SiteModel, depth: float) -> SiteModel:
+    """The phases of the record, or of the plan, to another depth: at the same rates, held for as long."""
+    phases, share = own.history.phases, depth / max(own.knots_mm)
+    seconds = [phase.duration_s * (1.0 if phase.kind == "hold" else share) for phase in phases]
+    knots_mm = share * np.array([phases[0].start_mm, *(phase.end_mm for phase in phases)])
+    knots_s = np.r_[0.0, np.cumsum(seconds)]
+    return replace(own, knots_s=tuple(knots_s.tolist()), knots_mm=tuple(knots_mm.tolist()))
+
+
+def _to_content(
+    context: Context,
+    found: Sequence[tuple[Candidate, float]],
+    sites: int,
+    vector: Array,
+    left_out: list[str],
+) -> dict[str, Any]:
+    """What ``design.json`` holds: the best choices, the study's own, all sites, and the candidates."""
+    study = context.study
+    every = [one for one, _ in found]
+    if len({one.site for one in every}) < sites:
+        raise RunError(f"only {len(every)} candidates could be simulated: {'; '.join(left_out)}")
+    bounds = build_unknowns(study)
+    prior = compute_bounds_information(bounds)
+    designs = {
+        "D-optimal": choose_design(every, sites, prior, "D"),
+        "A-optimal": choose_design(every, sites, prior, "A"),
+    }
+    own = _own_choice(study, every)
+    if own:
+        designs["the study's own"] = evaluate_design(every, own, prior)
+    designs["all sites"] = evaluate_design(every, _select_deepest(every), prior)
+    best_d, best_a = designs["D-optimal"], designs["A-optimal"]
+    rows = []
+    for name, design in designs.items():
+        chosen = [every[i] for i in design.chosen]
+        rows.append(
+            {
+                "design": name,
+                "sites": [{"site": one.site, "depth_mm": one.depth_mm} for one in chosen],
+                "d_efficiency": compute_efficiency(design, best_d, "D"),
+                "a_efficiency": compute_efficiency(design, best_a, "A"),
+                "factor_95": dict(zip(bounds.names, design.factors_95.tolist(), strict=True)),
+                "exhaustive": design.exhaustive,
+            }
+        )
+    return {
+        "wanted": sites,
+        "designs": rows,
+        "verdict": _describe_verdict(designs, bounds.names),
+        "candidates": [_to_row(one, peak, prior) for one, peak in found],
+        "left_out": left_out,
+    }
+
+
+def _to_row(one: Candidate, peak: float, prior: Array) -> dict[str, Any]:
+    """A candidate, and what it tells alone: bits of information over the bounds."""
+    gain = np.linalg.slogdet(prior + one.information)[1] - np.linalg.slogdet(prior)[1]
+    return {
+        "site": one.site,
+        "depth_mm": one.depth_mm,
+        "peak_force_N": float(peak),
+        "bits": float(gain / (2 * np.log(2))),
+    }
+
+
+def _own_choice(study: Study, every: Sequence[Candidate]) -> tuple[int, ...]:
+    """The study's fitted sites at the depth nearest to the recorded one; its deepest candidate otherwise."""
+    fitted = {site.name for site in study.fitted}
+    return tuple(i for i in _select_deepest(every) if every[i].site in fitted)
+
+
+def _select_deepest(every: Sequence[Candidate]) -> tuple[int, ...]:
+    """The deepest candidate of each site."""
+    best: dict[str, int] = {}
+    for i, one in enumerate(every):
+        if one.site not in best or one.depth_mm > every[best[one.site]].depth_mm:
+            best[one.site] = i
+    return tuple(best.values())
+
+
+def _describe_verdict(designs: dict[str, Design], names: Sequence[str]) -> str:
+    """In words: what the study's own choice gives away, and what no choice determines."""
+    best, every = designs["D-optimal"], designs["all sites"]
+    words = []
+    own = designs.get("the study's own")
+    if own is not None and len(own.chosen) == len(best.chosen):
+        share = compute_efficiency(own, best, "D")
+        told = "the study's own choice is as good as the best" if share > 0.95 else (
+            f"the study's own choice is worth {100 * share:.0f} % of the data of the best"
+        )  # fmt: skip
+        words.append(told)
+    wide = [name for name, factor in zip(names, best.factors_95) if factor > 2]
+    open_too = [name for name, factor in zip(names, every.factors_95) if factor > 2]
+    if wide:
+        words.append(f"even the best choice does not determine within a factor of two: {', '.join(wide)}")
+    if open_too:
+        words.append(f"nor do all sites together: {', '.join(open_too)}")
+    return "; ".join(words) or "the best choice determines every parameter within a factor of two"
+
+
+def _write_tables(folder: Path, content: dict[str, Any]) -> None:
+    names = list(content["designs"][0]["factor_95"])
+    rows = [
+        [
+            row["design"],
+            " ".join(f"{one['site']}@{one['depth_mm']:.2f}mm" for one in row["sites"]),
+            row["d_efficiency"],
+            row["a_efficiency"],
+            *(row["factor_95"][name] for name in names),
+        ]
+        for row in content["designs"]
+    ]
+    heads = ["design", "sites", "d_efficiency", "a_efficiency", *(f"factor_95_{name}" for name in names)]
+    write_table(folder / "designs.csv", heads, rows)
+    keys = ("site", "depth_mm", "peak_force_N", "bits")
+    write_table(
+        folder / "candidates.csv", keys, [[row[key] for key in keys] for row in content["candidates"]]
+    )

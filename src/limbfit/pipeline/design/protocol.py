@@ -1,0 +1,401 @@
+"""The experiment ``protocol``: which records a session of stated length should make, and what they tell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...anatomy.sites.under import measure_tissue_under
+from ...anatomy.surfaces.surfaces import load_anatomy
+from ...arrays import Array
+from ...errors import InputError, RunError
+from ...identify.checks.design import NoiseModel, compute_bounds_information
+from ...identify.checks.protocol import (
+    Budget,
+    DesignTarget,
+    RecordNoise,
+    RecordOption,
+    compute_duration_s,
+    compute_factors_95,
+    plan_records,
+    sample_tissues,
+)
+from ...identify.fit.objective import SiteResponse
+from ...identify.fit.parameters import Unknowns
+from ...indentation import (
+    Parameters,
+    Simulation,
+    SimulationJob,
+    find_layers_under,
+    find_nearby_skin_points,
+    place_waves_under,
+)
+from ...mesh import read_vtu
+from ...study import Site, Study
+from ..engine.context import Context
+from ..engine.storage import write_json, write_table
+from ..identification.record_simulator import build_unknowns
+from ..records.deviations import compute_expected_share, estimate_surface_error_mm, is_modulus
+from ..records.planned_records import PlannedRecord, press, write_records
+from ..simulation.limb_geometry import LimbGeometry
+from ..simulation.loading import LoadHistory, describe_untested_times
+from ..simulation.simulations import build_curve_job, build_model, build_site_model, open_experiment_cache
+from .design import DEEPEST_SHARE
+
+DETERMINED = 1.25  # largest factor of a 95 % interval that counts as determined
+READING_S = 1.0
+DESIGNED, PLAIN, UNSEEN = "designed", "one ramp at each site", "by force alone"
+
+
+def check_protocol(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
+    """Refuse unknown parameters, and a session too short for set-up, rest and hold alone.
+
+    Raises
+    ------
+    InputError
+    """
+    _select_named(build_unknowns(study), options["determine"])
+    budget = Budget(60.0 * options["minutes"], options["setup_s"])
+    _check_minutes([options["rest_s"] + min(options["holds_s"], default=0.0)], budget)
+
+
+def _check_minutes(seconds: Sequence[float], budget: Budget) -> None:
+    """Refuse a session into which no record of so many ``seconds``, or more, fits."""
+    least = budget.setup_s + min(seconds)
+    if least > budget.seconds:
+        raise InputError(
+            f"no record fits into {budget.seconds / 60:g} min: the shortest takes {least / 60:.1f} min or "
+            "more, set-up included",
+            place="--minutes",
+            remedy="allow more time",
+        )
+
+
+def run_protocol(
+    context: Context,
+    folder: Path,
+    *,
+    minutes: float,
+    setup_s: float,
+    rest_s: float,
+    speeds_mm_s: Sequence[float],
+    holds_s: Sequence[float],
+    depths_mm: Sequence[float],
+    determine: Sequence[str],
+    criterion: str,
+    draws: int,
+    seed: int,
+    parameters: Parameters,
+    parameters_from: str,
+    noise: dict[str, float],
+    seen: Mapping[str, float | None],
+    pressures: Mapping[str, Sequence[float]],
+    socket_times: Mapping[str, tuple[float, float]],
+) -> dict[str, Any]:
+    """Simulate every possible record at every draw, with derivatives, and choose within the time.
+
+    ``seen``: how well what is read (`SEEN`); None: there is none. ``pressures``: derivatives (p,) of their
+    logarithms by those of the parameters; none: parameters count. ``socket_times``: ramp and end, s, of
+    donning and each load that they are of.
+    """
+    study = context.study
+    known = build_unknowns(study)
+    which = _select_named(known, determine)
+    rows = np.array(list(pressures.values())) if pressures else np.eye(len(known.names))[list(which)]
+    tissues = sample_tissues(known, study.vector(parameters), draws, seed)
+    noises = RecordNoise.from_sds(NoiseModel(**noise), **seen)
+    planned, left_out = _plan_records(context, speeds_mm_s, holds_s, depths_mm, noises)
+    budget = Budget(60.0 * minutes, setup_s)
+    _check_minutes([one.seconds + rest_s for one in planned], budget)
+    found, options, blind, peaks = _build_options(context, folder, planned, tissues, noises, rest_s, left_out)
+    if not found:
+        raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
+    stiffness = is_modulus(study).astype(np.float64)
+    wanted = DesignTarget(
+        compute_bounds_information(known), rows, "A" if criterion == "A" else "D", stiffness
+    )
+    plans, told_by = _build_and_report_plans(
+        found, options, blind if noises.has_secondary else None, budget, wanted
+    )
+    told = [
+        _to_row(name, chosen, told_by[name], budget, wanted, (known.names, which), pressures, len(tissues))
+        for name, chosen in plans.items()
+    ]
+    chosen = (found[i].model for i in plans[DESIGNED])
+    histories = [LoadHistory.from_knots(model.knots_s, model.knots_mm) for model in chosen]
+    left_out += describe_untested_times(histories, socket_times)
+    content = {
+        "minutes": minutes,
+        "setup_s": setup_s,
+        "rest_s": rest_s,
+        "criterion": wanted.criterion,
+        "determine": [known.names[i] for i in which],
+        "draws": tissues.tolist(),
+        "records": [_record(found[i], options[i], peaks[i]) for i in plans[DESIGNED]],
+        "pressures": list(pressures),
+        "protocols": told,
+        "verdict": _describe_verdict(told[0], [known.names[i] for i in which]),
+        "candidates": [_record(one, option, peak) for one, option, peak in zip(found, options, peaks)],
+        "left_out": left_out,
+        "parameters": parameters,
+        "parameters_from": parameters_from,
+        "noise": noise,
+        **seen,
+    }
+    write_json(folder / "protocol.json", content)
+    _write_tables(folder, content)
+    write_records(folder / "records.toml", content["records"], seen)
+    return {}
+
+
+def _select_named(known: Unknowns, determine: Sequence[str]) -> tuple[int, ...]:
+    """Numbers of the parameters to be determined: all where none is named."""
+    strange = [name for name in determine if name not in known.names]
+    if strange:
+        raise InputError(
+            f"no parameter is named {strange[0]!r}",
+            place="--determine",
+            remedy=f"use {', '.join(known.names)}",
+        )
+    return tuple(i for i, name in enumerate(known.names) if not determine or name in determine)
+
+
+def _build_and_report_plans(
+    found: Sequence[PlannedRecord],
+    options: Sequence[RecordOption],
+    blind: Sequence[RecordOption] | None,
+    budget: Budget,
+    wanted: DesignTarget,
+) -> tuple[dict[str, tuple[int, ...]], dict[str, Sequence[RecordOption]]]:
+    """The plans by name, and what their records tell; ``blind``: by force alone, if more is seen."""
+    plans = _build_plans(found, options, budget, wanted)
+    if DESIGNED not in plans:
+        raise RunError(f"no record that could be simulated fits into {budget.seconds / 60:g} min")
+    told_by: dict[str, Sequence[RecordOption]] = dict.fromkeys(plans, options)
+    if blind is not None:
+        plans[UNSEEN] = _build_plans(found, blind, budget, wanted)[DESIGNED]
+        told_by |= dict.fromkeys((UNSEEN, PLAIN), blind)
+    return plans, told_by
+
+
+def _plan_records(
+    context: Context,
+    speeds_mm_s: Sequence[float],
+    holds_s: Sequence[float],
+    depths_mm: Sequence[float],
+    noises: RecordNoise,
+) -> tuple[list[PlannedRecord], list[str]]:
+    """Every site with every indenter, speed and hold, as deep as asked for, else as recorded or planned.
+
+    Nowhere deeper than its tissue allows.
+    """
+    study, found, left_out = context.study, [], []
+    anatomy = load_anatomy(context.store["surfaces"])
+    deepest: dict[str, float] = {}
+    for one in study.indentations:
+        own = build_model(context, one)
+        deepest[own.site] = max(deepest.get(own.site, 0.0), max(own.knots_mm))
+    for site in study.sites:
+        usual = deepest[site.name]
+        wanted = depths_mm or (usual,)
+        for name in study.all_indenters:
+            model = build_site_model(
+                context, _replace_indenter(site, name), (0.0, 1.0), (0.0, max(wanted)), searched=True
+            )
+            if noises.layers is not None:
+                model = replace(model, layers=find_layers_under(model))
+            if noises.skin is not None:
+                model = replace(model, skin_points=find_nearby_skin_points(model))
+            if noises.waves is not None:
+                model = replace(model, waves=place_waves_under(model, read_vtu(model.mesh)))
+            thickness = measure_tissue_under(anatomy, model.position, model.axis, model.indenter.width_mm)
+            most = DEEPEST_SHARE * thickness
+            if most < max(wanted):
+                half = f"half of the tissue's {thickness:.1f} mm"
+                left_out.append(f"site {site.name}: no deeper than {most:.1f} mm, {half}")
+            depths = dict.fromkeys(min(depth, most) for depth in wanted)
+            nearest = min(depths, key=lambda depth: abs(depth - usual))
+            for depth, speed, hold in product(depths, speeds_mm_s, holds_s):
+                planned = press(model, depth, speed, hold)
+                found.append(PlannedRecord(site.name, name, depth, speed, hold, planned, depth == nearest))
+    return found, list(dict.fromkeys(left_out))
+
+
+def _replace_indenter(site: Site, name: str | None) -> Site:
+    return site.model_copy(update={"indenter": name})
+
+
+def _build_options(
+    context: Context,
+    folder: Path,
+    planned: Sequence[PlannedRecord],
+    tissues: Array,
+    noise: RecordNoise,
+    rest_s: float,
+    left_out: list[str],
+) -> tuple[list[PlannedRecord], list[RecordOption], list[RecordOption], list[float]]:
+    """What each record would tell at each draw, and its force alone: nothing where its simulation does not
+    come to its end.
+
+    Records that press harder than the device may at the first draw are left out.
+    """
+    study, cache = context.study, open_experiment_cache(context, folder)
+    limit = study.acquire.force_limit_N
+    jobs = [build_curve_job(one.model, study.tissues, tissue) for one in planned for tissue in tissues]
+    infos = np.zeros((2, len(planned), *tissues.shape, tissues.shape[1]))
+    peaks, failed = np.zeros(len(planned)), [0] * len(planned)
+    for i, (job, simulation) in enumerate(zip(jobs, cache.run(jobs, context.executor))):
+        k, draw = divmod(i, len(tissues))
+        context.tell("protocol", i + 1, len(jobs), planned[k].told)
+        assert simulation.jacobian is not None
+        if draw == 0:
+            peaks[k] = simulation.force_N.max()
+        if simulation.completed:
+            infos[:, k, draw] = _compute_information(job, simulation, noise)
+        else:
+            failed[k] += 1
+    kept = []
+    for k, one in enumerate(planned):
+        if peaks[k] > limit:
+            left_out.append(f"{one.told}: {peaks[k]:.1f} N, over acquire.force_limit_N ({limit:g} N)")
+        elif failed[k] == len(tissues):
+            left_out.append(f"{one.told}: not simulated to the end")
+        else:
+            kept.append(k)
+            if failed[k]:
+                where = f"at {failed[k]} of {len(tissues)} draws"
+                left_out.append(f"{one.told}: not simulated to the end {where}, and is not counted there")
+    places = [(planned[k].site, planned[k].tool) for k in kept]
+    seconds = [planned[k].seconds + rest_s for k in kept]
+    off_mm = estimate_surface_error_mm(context)
+    shares = [compute_expected_share(planned[k].model, off_mm) for k in kept]
+    seeing, blind = (list(map(RecordOption, places, seconds, info[kept], shares)) for info in infos)
+    return [planned[k] for k in kept], seeing, blind, [float(peaks[k]) for k in kept]
+
+
+def _compute_information(
+    job: SimulationJob, simulation: Simulation, noises: RecordNoise
+) -> tuple[Array, Array]:
+    """The information (p, p) of a record with what is seen beside its force, and of its force alone."""
+    assert simulation.jacobian is not None
+    parameters, points = np.array(job.parameters), np.array(job.model.skin_points).reshape(-1, 3)
+    force = SiteResponse(simulation.force_N, simulation.jacobian)
+    if not noises.has_secondary:
+        return (alone := noises.compute_force_information(force, parameters)), alone
+    assert simulation.observed_jacobian is not None
+    beside = simulation.observed, simulation.observed_jacobian
+    parts = len(job.model.layers), points, job.model.knots_s[-1] / READING_S
+    return noises.compute_information(force, *beside, parts, parameters), noises.compute_force_information(
+        force, parameters
+    )
+
+
+def _build_plans(
+    found: Sequence[PlannedRecord], options: Sequence[RecordOption], budget: Budget, wanted: DesignTarget
+) -> dict[str, tuple[int, ...]]:
+    """The designed protocol, one slow ramp at every site, as deep as usual, and the best without each
+    ingredient."""
+    slow, tool = min(one.speed_mm_s for one in found), found[0].indenter
+    places = [(one.site, one.indenter) for one in found]
+    most = {
+        place: max(one.depth_mm for one in found if (one.site, one.indenter) == place) for place in places
+    }
+    deep = [one.depth_mm == most[place] for one, place in zip(found, places, strict=True)]
+    plain = [
+        one.speed_mm_s == slow and not one.hold_s and one.indenter == tool and one.usual for one in found
+    ]
+    kinds: Mapping[str, Sequence[bool]] = {
+        DESIGNED: [True] * len(found),
+        "without holds": [not one.hold_s for one in found],
+        "at one speed": [one.speed_mm_s == slow for one in found],
+        "with one indenter": [one.indenter == tool for one in found],
+        "at one depth": deep,
+    }
+    plans: dict[str, tuple[int, ...]] = {}
+    for name, allowed in kinds.items():
+        chosen = [i for i, ok in enumerate(allowed) if ok]
+        fits = any(compute_duration_s(options, [i], budget) <= budget.seconds for i in chosen)
+        if fits and (name == DESIGNED or len(chosen) < len(found)):
+            best = plan_records([options[i] for i in chosen], budget, wanted)
+            plans[name] = tuple(chosen[i] for i in best)
+    if any(plain):
+        plans[PLAIN] = tuple(i for i, ok in enumerate(plain) if ok)
+    return plans
+
+
+def _to_row(
+    name: str,
+    chosen: Sequence[int],
+    options: Sequence[RecordOption],
+    budget: Budget,
+    wanted: DesignTarget,
+    parameters: tuple[Sequence[str], Sequence[int]],
+    pressures: Iterable[str],
+    draws: int,
+) -> dict[str, Any]:
+    """A protocol, and what to expect of it: the middle of the draws and the worst.
+
+    ``parameters``: all of their names, and which are to be determined.
+    """
+    names, which = parameters
+    covariances = wanted.compute_covariances(options, chosen, draws)
+    factors = compute_factors_95(covariances)
+    middle, worst = np.median(factors, axis=0), factors.max(axis=0)
+    of_pressures = np.median(compute_factors_95(wanted.project(covariances)), axis=0)
+    return {
+        "design": name,
+        "records": len(chosen),
+        "minutes": compute_duration_s(options, chosen, budget) / 60.0,
+        "factor_95": dict(zip(names, middle.tolist(), strict=True)),
+        "worst_95": dict(zip(names, worst.tolist(), strict=True)),
+        "pressures_95": dict(zip(pressures, of_pressures.tolist())),
+        "determined": int(np.sum(middle[list(which)] <= DETERMINED)),
+        "cost": wanted.compute_cost(covariances),
+    }
+
+
+def _record(one: PlannedRecord, option: RecordOption, peak: float) -> dict[str, Any]:
+    return {
+        "site": one.site,
+        "indenter": one.tool,
+        "depth_mm": one.depth_mm,
+        "speed_mm_s": one.speed_mm_s,
+        "hold_s": one.hold_s,
+        "seconds": option.seconds,
+        "peak_force_N": peak,
+    }
+
+
+def _describe_verdict(best: Mapping[str, Any], wanted: Sequence[str]) -> str:
+    """In words: how much of what is wanted the protocol determines."""
+    if best["pressures_95"]:
+        worst = max(best["pressures_95"], key=best["pressures_95"].__getitem__)
+        return (
+            f"{best['records']} records in {best['minutes']:.0f} min tell the mean pressures of the socket's "
+            f"regions within {100 * (best['pressures_95'][worst] - 1):.1f} % (95 %) as far as tissue decides "
+            f"them, the worst at {worst}; {best['determined']} of {len(wanted)} parameters within 25 %"
+        )
+    open_ones = [name for name in wanted if best["factor_95"][name] > DETERMINED]
+    head = (
+        f"{best['records']} records in {best['minutes']:.0f} min determine {best['determined']} of "
+        f"{len(wanted)} parameters within 25 %"
+    )
+    return f"{head}; not {', '.join(open_ones)}" if open_ones else head
+
+
+def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:
+    keys = ("site", "indenter", "depth_mm", "speed_mm_s", "hold_s", "seconds", "peak_force_N")
+    for name in ("records", "candidates"):
+        write_table(folder / f"{name}.csv", keys, [[row[key] for key in keys] for row in content[name]])
+    names = list(content["protocols"][0]["factor_95"])
+    heads = ["protocol", "records", "minutes", "determined", *(f"factor_95_{name}" for name in names)]
+    rows = [
+        [row["design"], row["records"], row["minutes"], row["determined"], *row["factor_95"].values()]
+        for row in content["protocols"]
+    ]
+    write_table(folder / "protocols.csv", heads, rows)

@@ -1,0 +1,159 @@
+"""Which source decides an answer: a function's module, what that imports, and the files beside them.
+
+A name imported from a package is followed to the module that defines it: a package's ``__init__`` that only
+hands names on is no reason for all of the package to count.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from ..._version import __version__
+from .storage import compute_digest, compute_file_digest
+
+PACKAGE = Path(__file__).parents[2]
+_LAZY = "_HOME"  # name of the table of an ``__init__`` that loads its names when they are first used
+
+
+def find_sources(function: Callable[..., Any]) -> tuple[Path, ...]:
+    """Every file that decides what a function does, sorted: modules, templates, scripts, styles.
+
+    Other packages are left out: their versions are stored beside each result.
+    """
+    return _find_closure(Path(inspect.getfile(function)))
+
+
+@cache
+def code_digest(function: Callable[..., Any]) -> str:
+    """Digest of `find_sources` a function: what it made is stale when any of them has changed."""
+    return compute_digest(__version__, code_parts(function))
+
+
+def code_parts(function: Callable[..., Any]) -> dict[str, str]:
+    """Digest of each of `find_sources` a function, by its path in the package."""
+    return {format_source(file): _digest(file) for file in find_sources(function)}
+
+
+def format_source(file: Path) -> str:
+    """A source file's path in the package; the name alone of one that is outside."""
+    return file.relative_to(PACKAGE).as_posix() if file.is_relative_to(PACKAGE) else file.name
+
+
+_digest = cache(compute_file_digest)
+
+
+@cache
+def _find_closure(file: Path) -> tuple[Path, ...]:
+    found: set[Path] = set()
+    waiting = [file]
+    while waiting:
+        here = waiting.pop()
+        if here not in found:
+            found.add(here)
+            waiting += _read(here).reached if here.suffix == ".py" else []
+    return tuple(sorted(found))
+
+
+@dataclass(frozen=True)
+class _Module:
+    """What the text of a module says: its imports (place without suffix, name), strings, lazy names."""
+
+    file: Path
+    imports: tuple[tuple[Path, str], ...]
+    strings: frozenset[str]
+    lazy: dict[str, Path]
+
+    @property
+    def reached(self) -> list[Path]:
+        """The files that this one needs."""
+        return [home for place, name in self.imports for home in _find_homes(place, name)] + self._beside()
+
+    def _beside(self) -> list[Path]:
+        """Files beside the module that it names in a string, and those in a folder that is no package."""
+        found = []
+        for name in self.strings & _list_names(self.file.parent):
+            place = self.file.parent / name
+            if place.is_file():
+                found.append(place)
+            elif not (place / "__init__.py").exists():
+                found += [path for path in place.rglob("*") if path.is_file()]
+        return found
+
+
+@cache
+def _list_names(folder: Path) -> frozenset[str]:
+    own = ("__init__.py", "__pycache__")
+    return frozenset(path.name for path in folder.iterdir() if path.name not in own)
+
+
+@cache
+def _read(file: Path) -> _Module:
+    imports: list[tuple[Path, str]] = []
+    strings: set[str] = set()
+    lazy: dict[str, Path] = {}
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            strings.add(node.value)
+        elif isinstance(node, ast.Import):
+            paths = [alias.name.split(".") for alias in node.names]
+            imports += [(_place(path[:-1]), path[-1]) for path in paths if path[0] == PACKAGE.name]
+        elif isinstance(node, ast.ImportFrom):
+            place = _find_base(file, node)
+            imports += [] if place is None else [(place, alias.name) for alias in node.names]
+        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == _LAZY:
+            homes = ast.literal_eval(node.value) if isinstance(node.value, ast.Dict) else _read_stub(file)
+            lazy = {name: file.parent.joinpath(*home.split(".")) for name, home in homes.items()}
+    return _Module(file, tuple(imports), frozenset(strings), lazy)
+
+
+def _read_stub(file: Path) -> dict[str, str]:
+    """The homes of the names in the stub beside an ``__init__`` that loads them by it."""
+    stub = ast.parse(file.with_suffix(".pyi").read_text(encoding="utf-8"))
+    imports = [node for node in stub.body if isinstance(node, ast.ImportFrom) and node.module]
+    return {alias.name: str(node.module) for node in imports for alias in node.names}
+
+
+def _find_base(file: Path, node: ast.ImportFrom) -> Path | None:
+    """The module, without its suffix, that names are imported from; None for other packages."""
+    path = node.module.split(".") if node.module else []
+    if node.level:
+        return file.parents[node.level - 1].joinpath(*path)
+    return _place(path) if path[0] == PACKAGE.name else None
+
+
+def _place(path: list[str]) -> Path:
+    return PACKAGE.parent.joinpath(*path)
+
+
+def _find_homes(place: Path, name: str) -> list[Path]:
+    """The file that holds a name imported from ``place``: a module in it, or the one that defines the name.
+
+    A lazy package that is imported as a whole may load any of its names.
+    """
+    inside = _find_file(place / name)
+    if inside is not None:
+        names = _read(inside).lazy if inside.name == "__init__.py" else {}
+        return [inside, *(home for each, its in names.items() for home in _find_homes(its, each))]
+    file = _find_file(place)
+    if file is None:
+        raise FileNotFoundError(f"no module {place}")
+    if file.name == "__init__.py":
+        known = _read(file)
+        if name in known.lazy:
+            return _find_homes(known.lazy[name], name)
+        for home, handed_on in known.imports:
+            if handed_on == name:
+                return _find_homes(home, name)
+    return [file]
+
+
+@cache
+def _find_file(place: Path) -> Path | None:
+    files = place.with_name(f"{place.name}.py"), place / "__init__.py"
+    return next((file for file in files if file.is_file()), None)

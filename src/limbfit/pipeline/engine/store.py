@@ -1,0 +1,224 @@
+"""Stage folders on disk: what is done, what is stale, who holds them.
+
+A stage works in ``results/.work-<stage>-<key>`` and is renamed to ``results/<stage>`` when complete. The key
+is a digest of everything the stage depends on, so a run that was killed finds its own unfinished folder again
+and goes on in it. Of an unfinished folder of other inputs the simulations are kept, since some may serve.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from ...errors import RunError
+from .storage import DRAFT, read_json, write_json
+
+STAMP = "stage.json"
+LOCK, HOLDER = ".lock", ".holder"
+_PATIENCE_S = 0.5  # for one who only asks whether a study is held
+RUNS = "runs"  # a stage's kept simulations
+COARSE = "coarse"  # folder of the coarse meshes, in that of the mesh stage
+EARLIER = ".earlier"  # those of attempts with other inputs, while the stage is not complete
+_OLD = ".old-"
+
+
+@dataclass(frozen=True)
+class StageState:
+    """What the disk says of a stage: ``done``, ``stale`` (of other inputs), ``begun`` or ``missing``."""
+
+    stage: str
+    state: str
+    seconds: float | None = None
+    finished: str | None = None
+
+
+class Store:
+    """The results folder of one study."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __getitem__(self, stage: str) -> Path:
+        return self.folder / stage
+
+    def read(self, stage: str, name: str) -> Any:
+        """A JSON artefact of a finished stage."""
+        return read_json(self[stage] / name)
+
+    def stamp(self, stage: str) -> dict[str, Any] | None:
+        file = self[stage] / STAMP
+        return read_json(file) if file.is_file() else None
+
+    def work_folder(self, stage: str, key: str) -> Path:
+        return self.folder / f".work-{stage}-{key}"
+
+    def state(self, stage: str, key: str) -> StageState:
+        stamp = self.stamp(stage)
+        if stamp and stamp["key"] == key:
+            return StageState(stage, "done", stamp["seconds"], stamp["finished"])
+        if self.work_folder(stage, key).is_dir():
+            return StageState(stage, "begun")
+        return StageState(stage, "stale" if stamp else "missing")
+
+    def make(self, stage: str, key: str, produce: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
+        """Run ``produce(folder)`` in the stage's work folder and put the folder in its place.
+
+        ``produce`` returns facts for the stamp. Seconds add up over interrupted attempts. A folder that was
+        complete when a run was killed is only put in its place.
+        """
+        work = self.work_folder(stage, key)
+        with translate_disk_errors(self.folder):
+            work.mkdir(parents=True, exist_ok=True)
+            if not (work / STAMP).is_file():
+                self._take_over_others(stage, work)
+                self._complete(stage, key, work, produce)
+            self._put_in_place(work, self[stage])
+        return read_json(self[stage] / STAMP)
+
+    def _complete(self, stage: str, key: str, work: Path, produce: Callable[[Path], dict[str, Any]]) -> None:
+        clock = _Clock(work / ".seconds")
+        try:
+            facts = produce(work)
+        finally:
+            seconds = clock.stop()
+        clock.file.unlink(missing_ok=True)
+        shutil.rmtree(work / EARLIER, ignore_errors=True)
+        for draft in work.rglob(f".*{DRAFT}"):  # of attempts that were killed while writing
+            draft.unlink()
+        stamp = {
+            "stage": stage,
+            "key": key,
+            "seconds": round(seconds, 3),
+            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+            **facts,
+        }
+        write_json(work / STAMP, stamp)
+
+    def _take_over_others(self, stage: str, work: Path) -> None:
+        """Drop unfinished folders of other inputs, but for their simulations."""
+        earlier = work / EARLIER
+        for folder in self.folder.glob(f".work-{stage}-*"):
+            if folder != work:
+                for file in (*folder.glob(f"{EARLIER}/*.npz"), *folder.glob(f"{RUNS}/*.npz")):
+                    earlier.mkdir(exist_ok=True)
+                    file.rename(earlier / file.name)
+                shutil.rmtree(folder, ignore_errors=True)
+
+    def mend(self) -> None:
+        """Put right what a run that was killed while it wrote or renamed has left."""
+        for draft in self.folder.glob(f".*{DRAFT}"):
+            draft.unlink()
+        for old in self.folder.glob(f"{_OLD}*"):
+            place = self.folder / old.name.removeprefix(_OLD)
+            if place.exists():
+                shutil.rmtree(old, ignore_errors=True)
+            else:
+                old.rename(place)
+
+    def _put_in_place(self, work: Path, place: Path) -> None:
+        """Renames only: at each moment the old folder, none, or the new one stands there, never a mixture."""
+        old = self.folder / f"{_OLD}{place.name}"
+        shutil.rmtree(old, ignore_errors=True)
+        if place.exists():
+            place.rename(old)
+        work.rename(place)
+        shutil.rmtree(old, ignore_errors=True)
+
+
+class _Clock:
+    """Seconds spent on a stage, kept on disk so that they add up over attempts."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.before = float(read_json(file)) if file.is_file() else 0.0
+        self.start = perf_counter()
+
+    def stop(self) -> float:
+        total = self.before + perf_counter() - self.start
+        if self.file.parent.is_dir():
+            write_json(self.file, round(total, 3))
+        return total
+
+
+@contextmanager
+def translate_disk_errors(folder: Path) -> Iterator[None]:
+    """Turn a full or read-only disk into one clear line."""
+    remedies = {
+        errno.ENOSPC: "the disk is full; free some space and run again: finished work is kept",
+        errno.EROFS: "the file system is read-only; copy the study to a folder that can be written",
+        errno.EACCES: "no permission to write; check the folder's owner and mode",
+        errno.EDQUOT: "the disk quota is used up; free some space and run again: finished work is kept",
+        errno.EFBIG: "a file is larger than may be written here (ulimit -f); raise the limit and run again",
+        errno.EPERM: "writing is not permitted; check the folder's owner and mode",
+    }
+    try:
+        yield
+    except OSError as error:
+        if error.errno in remedies:
+            raise RunError(f"{folder}: {remedies[error.errno]}") from error
+        if error.errno is None and "failed to write" in str(error):  # VTK does not say why
+            raise RunError(
+                f"{folder}: a file could not be written; see whether the disk is full and run again: "
+                "finished work is kept"
+            ) from error
+        raise
+
+
+@contextmanager
+def lock(folder: Path) -> Iterator[None]:
+    """Hold a study for one run; a second run is refused while the first lives.
+
+    The lock is the operating system's, on ``results/.lock``, so it goes with the process however that ends;
+    ``results/.holder`` says whose it is.
+    """
+    if folder.is_symlink():
+        raise RunError(f"{folder}: is a link, and nothing outside the study is written; make it a folder")
+    own = FileLock(folder / LOCK, timeout=_PATIENCE_S)
+    with translate_disk_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            own.acquire()
+        except Timeout:
+            holder = find_holder(folder) or "another process"
+            raise RunError(
+                f"{folder}: {holder} is running this study; wait for it or end it (kill PID): its lock "
+                "ends with it, and the next run continues where it stopped"
+            ) from None
+    try:
+        with translate_disk_errors(folder):
+            since = f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+            (folder / HOLDER).write_text(f"process {os.getpid()} (since {since})", encoding="utf-8")
+            Store(folder).mend()
+        yield
+    finally:
+        (folder / HOLDER).unlink(missing_ok=True)
+        own.release()
+
+
+def find_holder(folder: Path) -> str:
+    """Which process says that it holds a study, and since when; empty where none does."""
+    try:
+        return (folder / HOLDER).read_text(encoding="utf-8").strip()
+    except OSError:
+        return ""
+
+
+def is_held(folder: Path) -> bool:
+    """Whether a run holds a study now."""
+    if not (folder / LOCK).is_file():
+        return False
+    try:
+        with FileLock(folder / LOCK, timeout=0):
+            return False
+    except Timeout:
+        return True

@@ -1,0 +1,225 @@
+"""From records and meshes to identified parameters: the stage ``calibrate``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import StudyError
+from ...identify.fit.multifidelity import CorrectionRound
+from ...identify.fit.multistart import MultistartResult, describe_starts, run_multistart
+from ...identify.fit.parameters import Unknowns, build_space
+from ...identify.fit.state import Calibration
+from ...identify.uncertainty.relaxation import assess_relaxation
+from ...identify.uncertainty.uncertainty import Uncertainty
+from ...indentation import Parameters
+from ...laws import FIBRED, is_ogden
+from ...priors import SOURCE
+from ...study import Study
+from ..engine.context import Context
+from ..engine.storage import write_json
+from ..simulation.simulations import SimulationCache
+from .record_simulator import Array, RecordSimulator, build_groupings, build_unknowns, list_stage_titles
+from .simulation_warnings import contact_to_dict, warnings_to_dict
+
+
+def check_fitted(study: Study) -> None:
+    """Refuse a study that has nothing to identify parameters from.
+
+    Raises
+    ------
+    StudyError
+        With the remedy.
+    """
+    if not study.fitted:
+        remedy = "set fitted = true where there is a record, or stop before it: limbfit run --until mesh"
+        raise StudyError("no site is fitted", file=study.file, place="sites", remedy=remedy)
+
+
+def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
+    """One material, then each tissue its own, on the fitted sites; simulations are kept.
+
+    A run taken up again repeats the interrupted one from its kept simulations.
+    """
+    study, table = context.study, context.study.calibration
+    cache = SimulationCache(folder / "runs", also=[context.store["calibrate"] / "runs"])
+    laboratory = RecordSimulator(context, cache, study.records_at(*study.fitted))
+    stages = build_groupings(study)
+    rounds_of: dict[int, tuple[CorrectionRound, ...]] = {}
+
+    def run(number: int, start: Unknowns) -> Calibration:
+        if number:
+            context.tell("calibrate", 0, 0, f"start {number + 1} of {table.starts}")
+        found, rounds_of[number] = laboratory.identify(start, stages)
+        return found
+
+    with laboratory.meshing(folder / "coarser") as meshed:
+        tried = run_multistart(run, build_unknowns(study), table.starts, table.seed, stages[0])
+        meshed()
+    found, known = laboratory.uncertainty(tried.best, stages[-1], folder / "coarser")
+    rounds = rounds_of[tried.number]
+    answers = laboratory.answer(found.parameters)
+    for site, texts in laboratory.warnings.items():
+        context.tell("calibrate", 0, 0, f"warning: site {site}, at the answer: {'; '.join(texts)}")
+    content = _calibration_to_dict(context, found, known, laboratory)
+    content["uncertainty"] |= _assess_relaxation(study, found, known, laboratory)
+    content |= {
+        "corrections": [_round_record(one, found.sites, study) for one in rounds],
+        "multistart": _multistart_to_dict(tried, study) if table.starts > 1 else None,
+        "warnings": laboratory.warnings,
+        "contact": contact_to_dict(
+            laboratory.latest,
+            laboratory.penalties,
+            laboratory.of_records(answers),
+            laboratory.of_records(found.responses),
+        ),
+        "doubts": warnings_to_dict(
+            laboratory.doubts, laboratory.latest, laboratory.evaluations * laboratory.simulated, found
+        ),
+    }
+    write_json(folder / "calibration.json", content)
+    return {}
+
+
+def _calibration_to_dict(
+    context: Context, found: Calibration, known: Uncertainty, laboratory: RecordSimulator
+) -> dict[str, Any]:
+    """What ``calibration.json`` holds."""
+    study, cache = context.study, laboratory.cache
+    bounds = build_unknowns(study)
+    example = cache.example()
+    return {
+        "stages": [
+            _stage_to_dict(found, i, bounds.start, study, laboratory) for i in range(len(found.stages))
+        ],
+        "bounds": {
+            "lower": study.by_tissue(bounds.lower),
+            "upper": study.by_tissue(bounds.upper),
+        },
+        "law": study.law.record(),
+        "objective": study.calibration.objective,
+        "uncertainty": _uncertainty_to_dict(known, study),
+        "forward_runs": len(cache),
+        "forward_runs_with_sensitivities": cache.with_sensitivities(),
+        "linear_solver": example.facts["linear_solver"] if example else None,
+        "element": example.facts["element"] if example else None,
+    }
+
+
+def _stage_to_dict(
+    found: Calibration, number: int, start: Array, study: Study, laboratory: RecordSimulator
+) -> dict[str, Any]:
+    """One stage: from ``start`` (the first) or the end of the stage before to its own end."""
+    stage = found.stages[number]
+    before = np.array(found.stages[number - 1].parameters) if number else start
+    iterates = [iterate for iterate in found.history if iterate.stage == number]
+
+    def starts(parameters: Sequence[float]) -> list[Parameters]:
+        return [study.by_tissue(one) for one in laboratory.starts(np.array(parameters))]
+
+    return {
+        "name": list_stage_titles(study.tissues)[number],
+        "start": study.by_tissue(before),
+        "parameters": study.by_tissue(np.array(stage.parameters)),
+        "cost": stage.cost,
+        "evaluations": stage.evaluations,
+        "converged": stage.converged,
+        "reason": stage.reason,
+        "iterations": [
+            {
+                "iteration": i,
+                "parameters": study.by_tissue(np.array(iterate.parameters)),
+                "starts": starts(iterate.parameters),
+                "cost": iterate.cost,
+                "error_percent": float(np.mean(iterate.errors_percent)),
+                "error_percent_by_site": dict(zip(found.sites, iterate.errors_percent, strict=True)),
+            }
+            for i, iterate in enumerate(iterates)
+        ],
+    }
+
+
+def _round_record(one: CorrectionRound, sites: Sequence[str], study: Study) -> dict[str, Any]:
+    """One correction of the search by the whole meshes; percentages are of each site's largest force."""
+    return {
+        "stage": list_stage_titles(study.tissues)[one.stage] if one.stage >= 0 else "start",
+        "parameters": study.by_tissue(np.array(one.parameters)),
+        "scale_by_site": dict(zip(sites, one.scales, strict=True)),
+        "difference_percent_by_site": dict(zip(sites, one.difference_percent, strict=True)),
+        "change_percent_by_site": dict(zip(sites, one.expected_percent, strict=True)),
+        "reason": one.reason,
+    }
+
+
+def _multistart_to_dict(tried: MultistartResult, study: Study) -> dict[str, Any]:
+    """What came of every start."""
+    names = [f"{tissue}.{name}" for tissue, name in study.parameters]
+    return {
+        "summary": describe_starts(tried, names),
+        "reached": tried.reached,
+        "starts": [
+            {
+                "start": study.by_tissue(np.array(one.start)),
+                "parameters": None if one.parameters is None else study.by_tissue(np.array(one.parameters)),
+                **{
+                    key: getattr(one, key)
+                    for key in ("cost", "evaluations", "converged", "reason", "same", "apart")
+                },
+            }
+            for one in tried.starts
+        ],
+    }
+
+
+def _uncertainty_to_dict(known: Uncertainty, study: Study) -> dict[str, Any]:
+    """What is stored of the uncertainty; intervals by tissue and name, like the parameters."""
+    intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in study.tissues}
+    for (tissue, name), interval in zip(study.parameters, known.intervals_95.tolist(), strict=True):
+        intervals[tissue][name] = interval
+    return {
+        "method": known.method,
+        "intervals_95": intervals,
+        "correlation": {"names": list(known.names), "matrix": known.correlation.tolist()},
+        "covariance_log": known.covariance.tolist(),
+        "sampling_covariance_log": known.sampling_covariance.tolist(),
+        "verdict": dict(zip(known.names, known.verdicts, strict=True)),
+        "at_bound": dict(zip(known.names, map(bool, known.at_bound), strict=True)),
+        "combinations": [f"{c.text}: {c.verdict}" for c in known.combinations],
+        "most_probable": study.by_tissue(known.centre),
+        "priors": _priors_to_dict(known, study),
+        "residuals": known.residual_model.to_dict(),
+    }
+
+
+def _assess_relaxation(
+    study: Study, found: Calibration, known: Uncertainty, laboratory: RecordSimulator
+) -> dict[str, Any]:
+    """What is known of relaxation beyond the records, and the verdicts with that; none of other laws."""
+    if not is_ogden(study.law.name) and study.law.name != FIBRED:
+        return {"relaxation": None}
+    bounds = build_unknowns(study)
+    space = build_space(bounds, build_groupings(study)[-1])
+    of_records = found.responses, laboratory.measured, known.residual_model
+    relaxation = assess_relaxation(found.parameters, *of_records, bounds, space)
+    if relaxation is None:
+        return {"relaxation": None}
+    verdicts = dict(zip(known.names, relaxation.qualify_verdicts(known), strict=True))
+    return {"verdict": verdicts, "relaxation": relaxation.to_dict(known)}
+
+
+def _priors_to_dict(known: Uncertainty, study: Study) -> dict[str, Any] | None:
+    """The priors that counted, and how much of each interval comes from them; none where none were stated."""
+    if not study.priors:
+        return None
+    stated = study.calibration.prior
+    return {
+        "stated": {
+            name: {**prior.model_dump(), "source": "the study" if name in stated else SOURCE}
+            for name, prior in study.priors.items()
+        },
+        "share": dict(zip(known.names, known.prior_share.tolist(), strict=True)),
+        "wider_without": dict(zip(known.names, known.wider_without.tolist(), strict=True)),
+    }

@@ -1,0 +1,393 @@
+"""Forces at every recorded site from the identified parameters: the stage ``predict``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...arrays import Array
+from ...identify.checks.domain import Extent, RecordedRange, describe_outside
+from ...identify.checks.fit_quality import FitQuality, assess_fit, refit_residuals, summarise_fit
+from ...identify.fit.correction import MeshCorrection
+from ...identify.fit.objective import SiteResponse, find_largest_magnitude
+from ...identify.fit.prediction import PredictionModel, compute_error_percent, summarise_errors
+from ...indentation import Simulation, SimulationJob, store_job_fields
+from ...study import Study
+from ..engine.context import Context
+from ..engine.storage import write_curves, write_json
+from ..records.deviations import estimate_site_deviation, estimate_site_noise
+from ..records.outliers import outliers_to_dict
+from ..records.records import (
+    SiteRecord,
+    coarsen_records,
+    load_site_record,
+    select_compared_records,
+    to_response,
+)
+from ..simulation.limb_geometry import LimbGeometry
+from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
+from ..simulation.simulations import SimulationCache
+
+_MISSING = {
+    "force": "no force is predicted",
+    "interval": "no 95 % interval and no check against the other sites",
+    "one_material": "no force with one material",
+}
+
+
+def run_predict(context: Context, folder: Path) -> dict[str, Any]:
+    """Force at every recorded site with all materials and with one, intervals, and the fields at the peak."""
+    study = context.study
+    calibration = context.stored("calibrate", "calibration.json")
+    answers = [Answer.of(stage, study) for stage in calibration["stages"]]
+    one, best = answers[0].parameters, answers[-1].parameters
+    known = PredictionModel.from_stored(calibration["uncertainty"])
+    records = [load_site_record(context, record) for record in study.recorded]
+    cache = SimulationCache(
+        folder / "runs", also=[context.store[stage] / "runs" for stage in ("calibrate", "predict")]
+    )
+    searched = coarsen_records(context, records)
+    jobs = build_answer_jobs(records, searched, answers[-1])
+    if len(answers) > 1:
+        jobs += _build_one_material_jobs(records, searched, answers[0], best)
+    simulations = []
+    for simulation in cache.run(jobs, context.executor):
+        simulations.append(simulation)
+        context.tell("predict", len(simulations), len(jobs) + len(records), f"site {simulation.site}")
+    n = len(records)
+    near = simulations[n : 2 * n] if searched is not records else None
+    ours = own = [to_response(simulation) for simulation in simulations[:n]]
+    others = [to_response(simulation) for simulation in simulations[n:]]
+    correction = None
+    if searched is not records:
+        coarse, others = others[:n], others[n:]
+        correction = MeshCorrection(coarse, own)
+        ours = correction(coarse)
+        fine = correction(others) if others else []
+        others = [as_is if r.site.fitted else held for r, as_is, held in zip(records, others, fine)]
+    sites = [SitePrediction(*parts) for parts in zip_longest(records, simulations[:n], ours, others)]
+    whole = [job for site, job in zip(sites, jobs) if site.own.completed]
+    strains = _write_fields(context, folder, whole, len(jobs))
+    bands = [_Band.compute(context, site, best, known) if site.ours.completed else None for site in sites]
+    for site, band in zip(sites, bands, strict=True):
+        _write_curves(folder, site, band)
+    rows = [_to_row(site) for site in sites]
+    for i, site in enumerate(sites):
+        rows[i]["observed"] = _write_observed(
+            context, folder, site, None if near is None else near[i], best, known
+        )
+    tested = _compare_with_records(context, sites, strains, rows)
+    doubts = outliers_to_dict(context, cache, records, ours, best, one, searched, correction)
+    judged = [(site, band) for site, band in zip(sites, bands, strict=True) if band is not None]
+    quality = _assess_fits(context, judged, best, known)
+    fit = {"verdict": summarise_fit(quality), "records": [one.to_dict() for one in quality]}
+    content = {"sites": rows, **_compute_means(rows), **tested, **doubts, "fit_quality": fit}
+    write_json(folder / "predict.json", content)
+    return {}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Identified ``parameters`` (p,), and those from which its simulation in the calibration ``starts``."""
+
+    parameters: Array
+    starts: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, stage: dict[str, Any], study: Study) -> Answer:
+        """The answer of a stage as ``calibration.json`` holds it."""
+        starts = stage["iterations"][-1]["starts"]
+        return cls(study.vector(stage["parameters"]), tuple(study.vector(one) for one in starts))
+
+
+def build_answer_jobs(
+    records: Sequence[SiteRecord], searched: Sequence[SiteRecord], answer: Answer
+) -> list[SimulationJob]:
+    """Every record at the answer, then so with derivatives as it is ``searched``, if that is another model.
+
+    At the fitted sites the calibration has simulated all of them already; elsewhere they start from rest.
+    """
+    best = answer.parameters
+    if searched is records:
+        return [record.job(best) for record in records]
+    starts = [answer.starts if record.site.fitted else () for record in records]
+    own = [record.own_job(best, before) for record, before in zip(records, starts)]
+    return own + [record.job(best, starts=before) for record, before in zip(searched, starts)]
+
+
+def _build_one_material_jobs(
+    records: Sequence[SiteRecord], searched: Sequence[SiteRecord], one: Answer, best: Array
+) -> list[SimulationJob]:
+    """Every record with one material: at the fitted sites as the calibration has simulated it already.
+
+    Elsewhere it is of where parameters are searched, and starts from that with all materials and derivatives,
+    which has just been done.
+    """
+
+    def job(record: SiteRecord, near: SiteRecord) -> SimulationJob:
+        if not record.site.fitted:
+            return near.job(one.parameters, sensitivities=False, starts=[best])
+        simulated = record.job if near is record else record.own_job
+        return simulated(one.parameters, starts=one.starts)
+
+    return [job(*pair) for pair in zip(records, searched)]
+
+
+@dataclass(frozen=True)
+class SitePrediction:
+    """A record at the answer: its own mesh's simulation, the same with derivatives, and with one
+    material (None where that is the answer). Force and derivatives at the times of the record."""
+
+    record: SiteRecord
+    own: Simulation
+    ours: SiteResponse
+    one: SiteResponse | None
+
+    @property
+    def missing(self) -> dict[str, str]:
+        """What is not predicted, and why."""
+        found = {} if self.ours.completed else {"interval": self.ours.reason}
+        if not self.own.completed:
+            found = {"force": self.own.reason}
+        if self.one is not None and not self.one.completed:
+            found["one_material"] = self.one.reason
+        return found
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is doubtful or missing."""
+        doubts = self.ours.warnings if self.ours.completed else self.own.warnings
+        return [*doubts, *(f"{_MISSING[what]}: {reason}" for what, reason in self.missing.items())]
+
+
+@dataclass(frozen=True)
+class FieldJob:
+    """Fields at the deepest point of a site, to be stored by the worker that has just simulated it."""
+
+    job: SimulationJob
+    file: Path
+
+
+def store_fields(wanted: FieldJob) -> tuple[str, list[Extent]]:
+    """Store them where they are not yet; return the record's name and the strains near the indenter."""
+    if not wanted.file.is_file():
+        store_job_fields(wanted.job, wanted.file)
+    return wanted.job.model.name, read_strain_extents(wanted.file) if wanted.file.is_file() else []
+
+
+def _write_fields(
+    context: Context, folder: Path, jobs: Sequence[SimulationJob], before: int
+) -> dict[str, list[Extent]]:
+    """Store the fields of the jobs; return the strains near the indenter of each record."""
+    wanted = [FieldJob(job, folder / f"{job.model.name}.vtu") for job in jobs]
+    names, found = [one.job.model.name for one in wanted], {}
+    for i, (name, strains) in enumerate(context.executor.map(store_fields, wanted, keys=names)):
+        found[name] = strains
+        context.tell("predict", before + i + 1, before + len(wanted), f"fields of site {name}")
+    return found
+
+
+def _compare_with_records(
+    context: Context,
+    sites: Sequence[SitePrediction],
+    strains: Mapping[str, Sequence[Extent]],
+    rows: Sequence[dict[str, Any]],
+) -> dict[str, Any]:
+    """Add to the ``rows`` of the sites what they do to the tissue, and what of it no fitted record did.
+
+    Returns what the fitted records did together, and what is outside in words.
+    """
+    limb = LimbGeometry.stored(context.store)
+    axis = LimbAxis(limb.anatomy)
+
+    def describe(site: SitePrediction, tested: RecordedRange | None = None) -> list[Extent]:
+        record, model = site.record.record, site.record.model
+        return describe_indentation(
+            LoadHistory.from_knots(model.knots_s, model.knots_N or model.knots_mm),
+            max(model.knots_mm),
+            model.indenter,
+            limb.place(record.site),
+            axis,
+            force_N=float(site.record.force_N.max()),
+            strains=strains.get(record.name, ()),
+            tested=tested,
+        )
+
+    fitted = [site for site in sites if site.record.site.fitted]
+    loading = {site.record.name: describe(site) for site in fitted}
+    places = np.array([limb.place(site.record.site)[0] for site in fitted]).reshape(-1, 3)
+    tested = RecordedRange.from_records(loading.values(), map(float, axis.measure_angle(places)))
+    for site, row in zip(sites, rows, strict=True):
+        name = site.record.name
+        own = loading.get(name) or describe(site, tested)
+        row["loading"] = [one.to_dict() for one in own]
+        row["outside_records"] = [] if name in loading else tested.find_outside(own)
+    outside = {f"site {row['record']}": row["outside_records"] for row in rows if not row["fitted"]}
+    return {"recorded_range": tested.to_dict(), "outside_text": describe_outside(outside)}
+
+
+@dataclass(frozen=True)
+class _Band:
+    """The 95 % band of a record (n,), and one standard deviation (n,) of what its site may be off by."""
+
+    deviation: Array
+    low: Array
+    high: Array
+
+    @classmethod
+    def compute(cls, context: Context, site: SitePrediction, best: Array, known: PredictionModel) -> _Band:
+        record, ours = site.record, site.ours
+        deviation = estimate_site_deviation(context, record, ours, best)
+        of_site = 0.0 if record.site.fitted else deviation
+        unit = record.record.unit
+        low, high = known.compute_interval_95(ours, best, record.name, unit, of_site, record.times_s)
+        return cls(deviation, np.maximum(low, 0.0), high)
+
+
+def _write_curves(folder: Path, site: SitePrediction, band: _Band | None) -> None:
+    """The record beside its prediction; a column that is not predicted is not there."""
+    record, missing = site.record, site.missing
+    name, unit = ("displacement" if record.record.forced else "force"), record.record.unit
+    columns = {"time_s": record.times_s}
+    columns |= (
+        {"force_N": record.force_N} if record.record.forced else {"displacement_mm": record.displacement_mm}
+    )
+    columns[f"{name}_measured_{unit}"] = record.compared
+    if "force" not in missing:
+        columns[f"{name}_simulated_{unit}"] = site.own.force_N
+    if site.one is not None and "one_material" not in missing:
+        columns[f"{name}_one_material_{unit}"] = site.one.force_N
+    if band is not None:
+        columns |= {f"{name}_low_{unit}": band.low, f"{name}_high_{unit}": band.high}
+    write_curves(folder / f"{record.name}.csv", **columns)
+
+
+def _assess_fits(
+    context: Context, judged: Sequence[tuple[SitePrediction, _Band]], best: Array, known: PredictionModel
+) -> list[FitQuality]:
+    """How well the model follows each record, beside its noise and the errors of its mesh and site."""
+    sites = [site for site, _ in judged]
+    allowed, residuals = [], [site.ours.force_N - site.record.compared for site in sites]
+    for site, band in judged:
+        mesh = known.find_mesh_share(site.record.name) * site.ours.force_N
+        noise = estimate_site_noise(context.study, site.record, site.ours.force_N).covariance
+        allowed.append(noise + np.outer(band.deviation, band.deviation) + np.outer(mesh, mesh))
+    fitted = [i for i, site in enumerate(sites) if site.record.site.fitted]
+    refitted = refit_residuals(
+        [residuals[i] for i in fitted],
+        [sites[i].ours.jacobian * best for i in fitted],
+        [allowed[i] for i in fitted],
+    )
+    left = dict(zip(fitted, refitted, strict=True))
+    found = []
+    for i, (site, band) in enumerate(judged):
+        record = site.record
+        found.append(
+            assess_fit(
+                record.name,
+                record.site.fitted,
+                record.times_s,
+                record.force_N if record.record.forced else record.displacement_mm,
+                residuals[i],
+                find_largest_magnitude(record.compared),
+                allowed[i],
+                (record.compared >= band.low) & (record.compared <= band.high),
+                left.get(i),
+            )
+        )
+    return found
+
+
+def _write_observed(
+    context: Context,
+    folder: Path,
+    site: SitePrediction,
+    near: Simulation | None,
+    best: Array,
+    known: PredictionModel,
+) -> list[dict[str, Any]]:
+    """Everything that was seen beside a record's force with its prediction, as files and rows.
+
+    ``near`` is the simulation with derivatives where that is another than the site's own.
+    """
+    rows = []
+    for one in select_compared_records(context, [site.record])[1:]:
+        assert one.seen is not None
+        ours = whole = one.respond(site.own)
+        if near is not None:
+            searched = one.respond(near)
+            ours = MeshCorrection([searched], [whole])([searched])[0]
+        seen, what, unit = one.seen, one.seen.quantity, one.seen.ending
+        columns = seen.columns | {f"{what}_measured_{unit}": one.compared}
+        if whole.completed:
+            columns[f"{what}_simulated_{unit}"] = whole.force_N
+        if ours.completed:
+            low, high = known.compute_interval_95(ours, best, one.name, one.unit)
+            columns |= {f"{what}_low_{unit}": low, f"{what}_high_{unit}": high}
+        write_curves(folder / f"{one.name}.csv", **columns)
+        rows.append(
+            {
+                "kind": seen.kind,
+                "what": seen.what,
+                "name": one.name,
+                "unit": seen.unit,
+                "largest": find_largest_magnitude(one.compared),
+                "noise": seen.noise_sd,
+                **seen.facts,
+                "error_percent": compute_error_percent(whole.force_N, one.compared)
+                if whole.completed
+                else None,
+            }
+        )
+    return rows
+
+
+def _to_row(site: SitePrediction) -> dict[str, Any]:
+    record, own = site.record, site.own
+
+    def error(found: Simulation | SiteResponse | None) -> float | None:
+        if found is None or not found.completed:
+            return None
+        return compute_error_percent(found.force_N, record.compared)
+
+    return {
+        "site": record.site.name,
+        "record": record.name,
+        "control": record.record.control,
+        "region": record.site.region,
+        "fitted": record.site.fitted,
+        "peak_force_N": float(record.force_N.max()),
+        "error_percent": error(own),
+        "error_one_material_percent": error(site.one),
+        "penetration_mm": own.penetration_mm,
+        "completed": own.completed,
+        "reason": own.reason,
+        "not_predicted": site.missing,
+        "warnings": site.warnings,
+        "doubts": [asdict(doubt) for doubt in own.doubts],
+        "steps": own.facts["steps"],
+        "element": own.facts["element"],
+    }
+
+
+def _compute_means(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Mean and standard deviation of the errors of fitted and held-out sites; None where there are none.
+
+    A site's is the mean of its records'.
+    """
+    found: dict[str, Any] = {}
+    for kind, fitted in (("fitted", True), ("heldout", False)):
+        errors: dict[str, list[float]] = {}
+        for row in rows:
+            if row["fitted"] == fitted and row["error_percent"] is not None:
+                errors.setdefault(row["site"], []).append(row["error_percent"])
+        summary = asdict(summarise_errors([float(np.mean(of_site)) for of_site in errors.values()]))
+        for key in ("mean_percent", "sd_percent"):
+            name = f"{key.removesuffix('_percent')}_error_{kind}_percent"
+            found[name] = None if np.isnan(summary[key]) else summary[key]
+    return found

@@ -1,0 +1,170 @@
+"""The stage ``mesh``: one graded mesh for each site."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...anatomy.meshing.layers import LayerSpec
+from ...anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
+from ...anatomy.meshing.meshreport import MeshReport
+from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
+from ...anatomy.surfaces.thickness import read_thickness
+from ...arrays import Array
+from ...mesh import Mesh, write_vtu
+from ...study import Study
+from ..engine.context import Context
+from ..engine.storage import read_json, write_json
+from ..engine.store import COARSE
+from .files import THICKNESS
+
+
+@dataclass(frozen=True)
+class MeshJob:
+    """A site mesh to be made by a worker."""
+
+    site: str
+    surfaces: Path
+    surfaces_key: str
+    position: tuple[float, ...]
+    axis: tuple[float, ...]
+    settings: MeshSettings
+    file: Path
+
+
+def mesh_job(
+    context: Context,
+    site: str,
+    position: Sequence[float],
+    axis: Sequence[float],
+    settings: MeshSettings,
+    file: Path,
+) -> MeshJob:
+    """The mesh of a site of the study's surfaces, with any settings; wider where a wider indenter touches.
+
+    ``near_radius_mm`` is that of ``[indenter]``: it grows by as much as the site's widest one is wider.
+    """
+    study = context.study
+    wider = max(study.width_at(study.site(site)) - study.indenter.width_mm, 0.0)
+    settings = replace(settings, near_radius_mm=settings.near_radius_mm + wider / 2)
+    key = str((context.store.stamp("surfaces") or {})["key"])
+    surfaces = context.store["surfaces"]
+    return MeshJob(site, surfaces, key, tuple(position), tuple(axis), settings, file)
+
+
+def make_mesh(job: MeshJob) -> dict[str, Any]:
+    """Mesh one site and store it; returns the facts that ``mesh.json`` holds."""
+    shared = replace(job.settings, near_radius_mm=0.0)
+    anatomy, base = _build_base(job.surfaces, job.surfaces_key, shared)
+    mesh, report = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.settings, base)
+    return keep_mesh(mesh, report, job.settings, job.file)
+
+
+def keep_mesh(mesh: Mesh, report: MeshReport, settings: MeshSettings, file: Path) -> dict[str, Any]:
+    """Write a mesh, and beside it the facts that are returned."""
+    write_vtu(mesh, file)
+    facts = {**asdict(report), "element": settings.element}
+    facts["repairs"] = [repair.text for repair in report.repairs]
+    write_json(file.with_suffix(".json"), facts)
+    return facts
+
+
+@lru_cache(maxsize=1)
+def _build_base(surfaces: Path, key: str, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
+    """What all sites of a study share, whatever their ``near_radius_mm``; a worker makes it once."""
+    anatomy = load_anatomy(surfaces)
+    return anatomy, build_base_mesh(anatomy, settings, read_stored_depth(surfaces, anatomy, settings))
+
+
+def read_stored_depth(surfaces: Path, anatomy: Anatomy, settings: MeshSettings) -> Array | None:
+    """Thickness of the mapped layer at the skin's points, mm; none where every layer's is stated."""
+    mapped = any(layer.thickness_mm is None for layer in settings.layers)
+    return read_thickness(surfaces / THICKNESS, anatomy.skin) if mapped else None
+
+
+def mesh_settings(study: Study) -> MeshSettings:
+    """How the site meshes of a study are made."""
+    table, geometry = study.mesh, study.geometry
+    return MeshSettings(
+        element=table.cell_type,
+        edge_near_mm=table.edge_near_mm,
+        edge_far_mm=_choose_far_mm(study, table.edge_far_mm),
+        near_radius_mm=table.near_radius_mm,
+        growth=table.growth,
+        flatness=table.flatness,
+        engine=table.engine,
+        time_limit_s=table.time_limit_s,
+        layers=tuple(
+            LayerSpec(layer.name, layer.thickness_mm, layer.min_thickness_mm)
+            for layer in geometry.model_layers
+        ),
+        core=geometry.core,
+        bone_policy=geometry.bone_policy,
+        bone_clearance_mm=geometry.bone_clearance_mm,
+    )
+
+
+def build_coarse_settings(study: Study) -> MeshSettings | None:
+    """How the second, coarse meshes are made; None where the study wants none."""
+    table = study.mesh.coarse
+    if table is None:
+        return None
+    coarse = replace(mesh_settings(study), **table.model_dump())
+    return replace(coarse, edge_far_mm=_choose_far_mm(study, table.edge_far_mm))
+
+
+def _choose_far_mm(study: Study, stated: float) -> float:
+    """Edge length far from the site: no longer than pins that press there are wide."""
+    return stated if study.clamps is None else min(stated, study.clamps.width_mm)
+
+
+def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
+    """One graded mesh per site, and a coarse one where the study wants it; side by side.
+
+    Meshes of an interrupted run are kept.
+    """
+    study = context.study
+    content = _make_meshes(context, folder, mesh_settings(study), "")
+    coarse = build_coarse_settings(study)
+    if coarse is not None:
+        (folder / COARSE).mkdir(exist_ok=True)
+        content["coarse"] = _make_meshes(context, folder / COARSE, coarse, "coarse, ")
+    write_json(folder / "mesh.json", content)
+    for facts in (*folder.glob("*.vtu"), *folder.glob(f"{COARSE}/*.vtu")):
+        facts.with_suffix(".json").unlink()
+    return {}
+
+
+def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: str) -> dict[str, Any]:
+    """The meshes of all sites that are not there yet; returns what ``mesh.json`` holds of all."""
+    sites = context.stored("sites", "sites.json")["sites"]
+    jobs = [
+        mesh_job(
+            context,
+            site["site"],
+            site["position_mm"],
+            site["axis"],
+            settings,
+            folder / f"{site['site']}.vtu",
+        )
+        for site in sites
+    ]
+    facts = {job.site: read_json(job.file.with_suffix(".json")) for job in jobs if is_meshed(job.file)}
+    missing = [job for job in jobs if job.site not in facts]
+    context.tell("mesh", len(facts), len(jobs), word.removesuffix(", "))
+    for job, made in zip(missing, context.executor.map(make_mesh, missing), strict=True):
+        facts[job.site] = made
+        context.tell("mesh", len(facts), len(jobs), f"{word}site {job.site}: {made['nodes']} nodes")
+        for repair in made["repairs"]:
+            context.tell("mesh", len(facts), len(jobs), f"{word}site {job.site}: {repair}")
+    return {"settings": asdict(settings), "sites": {job.site: facts[job.site] for job in jobs}}
+
+
+def is_meshed(file: Path) -> bool:
+    """Whether a mesh was kept whole (see `keep_mesh`)."""
+    return file.is_file() and file.with_suffix(".json").is_file()

@@ -1,0 +1,91 @@
+"""The stage ``segment``: image to label map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...anatomy.imaging import LabelMap, Volume, write_labels
+from ...anatomy.labels.contours import write_contours
+from ...anatomy.labels.quality import assess_labels
+from ...anatomy.sites.marked import extract_marked_skin, remove_markers
+from ...anatomy.sites.registration import register_limb
+from ...anatomy.surfaces.surfaces import write_surface
+from ...report.drawing.sheet import draw_sheet
+from ...study import Study
+from ..engine.context import Context
+from ..engine.hand_labels import DIGEST, LABELS
+from ..engine.storage import compute_file_digest, write_json
+from .files import MARKED_SKIN, name_file_in_errors
+from .inputs import read_marked_image, read_study_image, read_study_labels, segment_automatically
+
+
+def run_segment(context: Context, folder: Path) -> dict[str, Any]:
+    """Image to label map; a corrected label map of the study wins over the automatic one."""
+    study = context.study
+    assert study.image is not None
+    context.tell("segment", 0, 3, "reading the image")
+    volume, removed = remove_own_markers(study, read_study_image(study), folder)
+    for note in volume.notes:
+        context.tell("segment", 0, 3, f"warning: image: {note}")
+    context.tell("segment", 1, 3, "labelling tissues")
+    given = read_study_labels(study, volume)
+    if given is not None:
+        (labels, notes), method = given, "corrected by hand"
+        for note in notes:
+            context.tell("segment", 1, 3, f"label map: {note}")
+    else:
+        labels, notes, method = segment_automatically(study, volume), [], "automatic"
+    write_labels(folder / LABELS, labels)
+    write_contours(folder / "contours.csv", labels)
+    quality = assess_labels(labels)
+    write_json(folder / "quality.json", quality.as_json())
+    draw_sheet(folder / "quality.png", volume, labels, quality)
+    context.tell("segment", 2, 3, "outlining the skin with markers")
+    facts = {"method": method, "volumes_cm3": label_volumes(labels), "repairs": notes}
+    facts["warnings"] = [f"image: {note}" for note in volume.notes]
+    facts[DIGEST] = compute_file_digest(folder / LABELS)
+    write_json(folder / "segment.json", facts | removed | store_second_skin(study, volume, labels, folder))
+    return {}
+
+
+def label_volumes(labels: LabelMap) -> dict[str, float]:
+    """Volume of each label in cubic centimetres."""
+    voxel_cm3 = float(np.prod(labels.spacing)) / 1000
+    return {
+        name: round(float((labels.array == value).sum()) * voxel_cm3, 2)
+        for value, name in labels.names.items()
+    }
+
+
+def remove_own_markers(study: Study, volume: Volume, folder: Path) -> tuple[Volume, dict[str, Any]]:
+    """The image without the markers on its skin, if the study says that there are some; else as it is.
+
+    The skin with them on is stored in ``folder``. The facts say how many were taken off.
+    """
+    assert study.image is not None
+    if study.image.markers != "same":
+        return volume, {}
+    with name_file_in_errors(study.path(study.image.path)):
+        skin, _ = extract_marked_skin(volume)
+        plain, count = remove_markers(volume, skin)
+    write_surface(folder / MARKED_SKIN, skin)
+    return plain, {"markers_removed": count}
+
+
+def store_second_skin(study: Study, volume: Volume, labels: LabelMap, folder: Path) -> dict[str, Any]:
+    """Store the skin of the second image, moved to where the limb lies in the first; how it was moved."""
+    marked = read_marked_image(study)
+    if marked is None:
+        return {}
+    assert study.image is not None
+    assert study.image.marked is not None
+    with name_file_in_errors(study.path(study.image.marked)):
+        skin, _ = extract_marked_skin(marked)
+        motion = register_limb(volume, marked, labels.limb)
+    write_surface(folder / MARKED_SKIN, replace(skin, points=motion.apply(skin.points)))
+    measures = {"shift_mm": motion.shift_mm, "turn_deg": motion.turn_deg, "correlation": motion.correlation}
+    return {"motion": {name: round(value, 3) for name, value in measures.items()}}

@@ -1,0 +1,71 @@
+"""The stage ``sites``: where each indentation is on the skin, and its axis."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...anatomy.sites.markers import find_markers, match_markers
+from ...anatomy.sites.sites import compute_indenter_axis, project_to_skin
+from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy, read_surface
+from ...errors import SiteError
+from ...study import Site, Study
+from ..engine.context import Context
+from ..engine.storage import write_json
+from .files import MARKED_SKIN
+
+
+def run_sites(context: Context, folder: Path) -> dict[str, Any]:
+    """Where each indentation is: on the skin, with the indenter's axis; markers matched to names."""
+    study = context.study
+    anatomy = load_anatomy(context.store["surfaces"])
+    for note in study.notes:
+        context.tell("sites", 0, 1, note)
+    context.tell("sites", 0, 1, "placing sites")
+    markers = _match_markers(context, anatomy)
+    placed = [place_site(site, study, anatomy, markers.get(site.name)) for site in study.sites]
+    write_json(folder / "sites.json", {"sites": placed})
+    return {}
+
+
+def _match_markers(context: Context, anatomy: Anatomy) -> dict[str, Any]:
+    hints = {site.name: np.array(site.near) for site in context.study.sites if site.near is not None}
+    if not hints:
+        return {}
+    marked = read_surface(context.store["segment"] / MARKED_SKIN)
+    return dict(match_markers(find_markers(marked, anatomy.skin), hints))
+
+
+def place_site(site: Site, study: Study, anatomy: Anatomy, marker: Any) -> dict[str, Any]:
+    """A site on the skin with its axis; ``marker`` is what was matched to it, or None.
+
+    Raises
+    ------
+    SiteError
+        When the site is too far off the skin.
+    """
+    wanted = np.array(site.position) if marker is None else marker.position
+    try:
+        point, off = project_to_skin(anatomy, wanted)
+        axis = site.axis or compute_indenter_axis(anatomy.skin, point, study.width_at(site))
+    except SiteError as error:
+        raise SiteError(
+            error.what, file=study.file, place=f"sites.{site.name}", remedy=error.remedy
+        ) from None
+    evidence = None
+    if marker is not None:
+        assert site.near is not None
+        distance = float(np.linalg.norm(marker.position - np.array(site.near)))
+        evidence = {"height_mm": round(float(marker.height), 3), "distance_to_hint_mm": round(distance, 3)}
+    unit = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    return {
+        "site": site.name,
+        "region": site.region,
+        "fitted": site.fitted,
+        "position_mm": [float(x) for x in point],
+        "axis": [float(x) for x in unit],
+        "off_skin_mm": round(float(off), 3),
+        "marker": evidence,
+    }

@@ -1,0 +1,109 @@
+"""The stage ``surfaces``: label map, or surfaces of the study, to a checked anatomy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...anatomy.imaging import LabelMap, read_labels
+from ...anatomy.segmentation.amputation import amputate_limb
+from ...anatomy.segmentation.voxels import amputate_anatomy
+from ...anatomy.surfaces.mending import build_closed_anatomy, orient_outward
+from ...anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface, save_anatomy
+from ...anatomy.surfaces.thickness import measure_fat_depth, write_thickness
+from ...study import Study
+from ..engine.context import Context
+from .files import THICKNESS, find_labelled_file, name_file_in_errors
+from .inputs import has_mapped_fat, list_labelled_regions
+
+
+def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
+    """Label map or the study's own surfaces to a checked anatomy: closed skin, closed bones, proximal cut."""
+    study = context.study
+    context.tell("surfaces", 0, 2, "building surfaces")
+    if study.surfaces is not None:
+        anatomy, notes = read_given_anatomy(study)
+    else:
+        labels = _read_limb_labels(context)
+        anatomy, notes = _build_imaged_anatomy(study, labels)
+        if has_mapped_fat(study):
+            depth = measure_fat_depth(labels, anatomy, study.geometry.surface_edge_mm)
+            write_thickness(folder / THICKNESS, anatomy.skin, depth)
+    for note in notes:
+        context.tell("surfaces", 1, 2, note)
+    save_anatomy(folder, anatomy, notes)
+    return {}
+
+
+def _read_limb_labels(context: Context) -> LabelMap:
+    """The label map of the segment stage, after the virtual amputation where there is one."""
+    geometry = context.study.geometry
+    named = list_labelled_regions(context.study)
+    with name_file_in_errors(find_labelled_file(context.study)):
+        labels = read_labels(context.store["segment"] / "labels.seg.nrrd").with_regions(named)
+    if geometry.amputation is None:
+        return labels
+    plane = geometry.amputation
+    return amputate_limb(labels, plane.point, plane.normal, pad_mm=geometry.amputation_pad_mm)
+
+
+def _build_imaged_anatomy(study: Study, labels: LabelMap) -> tuple[Anatomy, tuple[str, ...]]:
+    geometry = study.geometry
+    cut = geometry.proximal_cut
+    with name_file_in_errors(find_labelled_file(study)):
+        anatomy = build_anatomy(
+            labels,
+            edge_mm=geometry.surface_edge_mm,
+            proximal_cut=None if cut is None else (np.array(cut.point), np.array(cut.normal)),
+        )
+    anatomy, files, notes = _add_given_regions(study, anatomy)
+    with name_file_in_errors(find_labelled_file(study)):
+        check_anatomy(anatomy, files)
+    return anatomy, notes
+
+
+def _add_given_regions(study: Study, anatomy: Anatomy) -> tuple[Anatomy, dict[str, Path], tuple[str, ...]]:
+    """The anatomy with the regions that come as surfaces, in the study's order, their files by name, and
+    what was mended in them."""
+    files = {one.name: study.path(one.surface) for one in study.geometry.regions if one.surface is not None}
+    tables = study.surfaces
+    coordinates, unit = (None, "mm") if tables is None else (tables.coordinates, tables.unit)
+    mended = {
+        name: orient_outward(read_surface(file, coordinates, unit), name) for name, file in files.items()
+    }
+    found = {name: surface for name, (surface, _) in mended.items()} | dict(anatomy.regions)
+    order = [one.name for one in study.geometry.regions]
+    notes = tuple(note for _, told in mended.values() for note in told)
+    return replace(anatomy, regions={name: found[name] for name in order}), files, notes
+
+
+def read_given_anatomy(study: Study) -> tuple[Anatomy, tuple[str, ...]]:
+    """The checked anatomy of given surfaces, after the virtual amputation where there is one.
+
+    Returns
+    -------
+    anatomy : without a stated cut it ends just inside the skin's open end, or at the highest (z) of the skin.
+    notes : what was mended to close the surfaces.
+    """
+    assert study.surfaces is not None
+    tables, geometry = study.surfaces, study.geometry
+    files = {name: study.path(path) for name, path in {"skin": tables.skin, **tables.bones}.items()}
+    surfaces = {name: read_surface(path, tables.coordinates, tables.unit) for name, path in files.items()}
+    skin, cut = surfaces.pop("skin"), geometry.proximal_cut
+    anatomy, notes = build_closed_anatomy(
+        skin, surfaces, None if cut is None else (cut.point, cut.normal), files
+    )
+    if geometry.regions:
+        anatomy, region_files, told = _add_given_regions(study, anatomy)
+        notes += told
+        check_anatomy(anatomy, files | region_files)
+    if geometry.amputation is None:
+        return anatomy, notes
+    plane, pad = geometry.amputation, geometry.amputation_pad_mm
+    with name_file_in_errors(files["skin"]):
+        stump = amputate_anatomy(anatomy, plane.point, plane.normal, pad, geometry.surface_edge_mm)
+        check_anatomy(stump)
+    return stump, notes

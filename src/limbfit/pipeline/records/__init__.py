@@ -1,0 +1,1 @@
+"""The records of a study: read, checked, and compared with what a simulation gives."""

@@ -1,0 +1,109 @@
+"""The records of a study judged before anything is simulated (see `identify.plausibility`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ...anatomy.sites.sites import compute_indenter_axis
+from ...anatomy.sites.under import measure_tissue_under
+from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
+from ...identify.checks.plausibility import RecordFacts, RecordWarning, check_plausibility
+from ...indentation import compute_contact_radius
+from ...study import Record, Study
+from ..engine.context import Context
+from ..engine.storage import read_curves
+
+Placed = Mapping[str, Mapping[str, Any]]
+
+
+def read_record_warnings(context: Context) -> tuple[RecordWarning, ...]:
+    """Flags on all records from the stages ``surfaces``, ``sites`` and ``traces``."""
+    study = context.study
+    traces = context.stored("traces", "traces.json")["sites"]
+    rows = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}
+    steps = {
+        name: _step(read_curves(context.store["traces"] / f"{name}-raw.csv")["time_s"]) for name in traces
+    }
+    return record_flags(study, traces, steps, rows, load_anatomy(context.store["surfaces"]))
+
+
+def tell_flags(context: Context) -> None:
+    """Warn of what is wrong with records before parameters are identified from them."""
+    for flag in read_record_warnings(context):
+        context.tell("calibrate", 0, 0, f"warning: {flag.text}")
+
+
+def record_flags(
+    study: Study,
+    records: Mapping[str, Mapping[str, Any]],
+    steps_s: Mapping[str, float],
+    placed: Placed,
+    anatomy: Anatomy | None,
+) -> tuple[RecordWarning, ...]:
+    """Flags on the records.
+
+    Parameters
+    ----------
+    records : what ``traces.json`` says of each.
+    steps_s : time between samples of each.
+    placed : what ``sites.json`` says of the sites whose place is known (yet).
+    anatomy : None while the surfaces are not known.
+    """
+    recorded = [record for record in study.recorded if record.name in records]
+    facts = [
+        _collect_facts(
+            one,
+            records[one.name],
+            steps_s[one.name],
+            compute_contact_radius(study.indenter_of(one)),
+            placed.get(one.site.name),
+            anatomy,
+        )
+        for one in recorded
+    ]
+    remarks = tuple(_flag(one.name, r) for one in recorded for r in records[one.name].get("remarks", ()))
+    return (*remarks, *check_plausibility(facts))
+
+
+def _flag(site: str, remark: Mapping[str, Any]) -> RecordWarning:
+    """What reading a record had to say about it."""
+    return RecordWarning((site,), **remark)
+
+
+def _collect_facts(
+    stated: Record,
+    record: Mapping[str, Any],
+    step_s: float,
+    radius: float,
+    row: Mapping[str, Any] | None,
+    anatomy: Anatomy | None,
+) -> RecordFacts:
+    facts: dict[str, Any] = {}
+    if row is not None and anatomy is not None:
+        width = radius * np.sqrt(np.pi)
+        axis = np.array(row["axis"])
+        normal = compute_indenter_axis(anatomy.skin, row["position_mm"], width)
+        facts = {
+            "position_mm": tuple(row["position_mm"]),
+            "thickness_mm": measure_tissue_under(anatomy, row["position_mm"], normal, width),
+            "axis_deg": float(np.degrees(np.arccos(np.clip(axis @ normal, -1, 1)))),
+            "off_skin_mm": row["off_skin_mm"] if row["marker"] is None else None,
+            "hint_mm": None if row["marker"] is None else row["marker"]["distance_to_hint_mm"],
+        }
+    return RecordFacts(
+        site=stated.name,
+        place=stated.site.name,
+        peak_N=record["peak_force_N"],
+        depth_mm=record["depth_mm"],
+        speed_mm_s=abs(record["speed_load_mm_s"]),
+        step_s=step_s,
+        radius_mm=radius,
+        **facts,
+    )
+
+
+def _step(times_s: Sequence[float] | np.ndarray) -> float:
+    return float(np.median(np.diff(times_s)))

@@ -1,0 +1,260 @@
+"""Records to regularised curves, and what was seen beside them: the stage ``traces``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...errors import TraceError
+from ...phases import MotionPhase, describe_phases
+from ...study import Record, Study
+from ...traces import (
+    Creep,
+    Regularised,
+    Remark,
+    SurfaceMotion,
+    Thinning,
+    TouchDown,
+    Trace,
+    WaveMeans,
+    WaveSpeeds,
+    compute_thinnings,
+    interpret_record,
+    read_layers,
+    read_surface_motion,
+    read_trace,
+    read_wave_speeds,
+    regularise,
+    regularise_creep,
+    select_frames_in_contact,
+)
+from ..engine.context import Context
+from ..engine.storage import write_curves, write_json
+from ..limb.files import LAYERS, SMOOTHING, WAVES
+from ..simulation.simulations import CURVE_POINTS
+from ..simulation.surface_points import write_motion
+
+END_SHARE = 0.05  # of the largest force: an indenter that hardly pushes does not hold the tissue
+SEEN = 3.0  # standard deviations that the skin must move by to be compared
+
+
+class SecondaryMeasurement(NamedTuple):
+    """What was seen beside a record's force: layers, the skin, shear waves at places under the indenter."""
+
+    layers: tuple[Thinning, ...] = ()
+    motion: SurfaceMotion | None = None
+    waves: tuple[tuple[WaveSpeeds, WaveMeans], ...] = ()
+
+
+def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, dict[str, Any]]:
+    """A record as it is used, its regularised curves and the facts that ``traces.json`` holds."""
+    table = study.traces
+    file = study.path(record.trace)
+    trace = read_trace(file, (table.time_s, table.displacement_mm, table.force_N))
+    try:
+        known = interpret_record(trace, record.touch_down_s, forced=record.forced)
+        trace, touch = known.trace, known.touch_down
+        made = regularise_creep if record.forced else regularise
+        smooth = made(trace, touch, table.smoothing, record.peak_s)
+    except TraceError as error:
+        raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
+    facts = {
+        "site": record.site.name,
+        "control": record.control,
+        "touch_down_s": touch.time_s,
+        "touch_down_mm": touch.displacement_mm,
+        "touch_down_uncertainty_mm": touch.uncertainty_mm,
+        "peak_s": touch.time_s + smooth.peak_s,
+        "peak_force_N": smooth.peak_force_N,
+        "depth_mm": smooth.depth_mm,
+        "noise_N": smooth.noise_N,
+        "speed_load_mm_s": smooth.speed_load_mm_s,
+        "speed_unload_mm_s": None if np.isnan(smooth.speed_unload_mm_s) else smooth.speed_unload_mm_s,
+        "phases": _phases_to_rows(trace, smooth, touch),
+        "phases_in_words": describe_phases(smooth.phases),
+        "knots_s": smooth.knots_s.tolist(),
+        "knots_mm": smooth.knots_mm.tolist(),
+        "knots_N": smooth.knots_N.tolist() if isinstance(smooth, Creep) else None,
+        "remarks": [asdict(remark) for remark in (*_list_reading_remarks(trace), *known.remarks)],
+    }
+    return trace, smooth, facts
+
+
+def _list_reading_remarks(trace: Trace) -> tuple[Remark, ...]:
+    """What was done to read a file that is no plain table in s, mm and N."""
+    if not trace.notes:
+        return ()
+    cause, remedy = "the format of the rig's export", "compare the phases with what the rig did"
+    return (Remark("reading", "; ".join(trace.notes), cause, remedy, {}),)
+
+
+def _phases_to_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[dict[str, Any]]:
+    """What the indenter does, in times of the record and in mm from touch-down."""
+    first_s, first_mm = float(trace.time_s[0]), float(trace.displacement_mm[0]) - touch.displacement_mm
+    phases = [phase.later(touch.time_s) for phase in smooth.phases]
+    if touch.time_s > first_s:
+        phases.insert(0, MotionPhase("approach", first_s, touch.time_s, first_mm, 0.0))
+    return [{**asdict(phase), "rate_mm_s": phase.rate_mm_s} for phase in phases]
+
+
+def run_traces(context: Context, folder: Path) -> dict[str, Any]:
+    """Records to regularised curves, counted from touch-down."""
+    recorded = context.study.recorded
+    facts = {}
+    for i, record in enumerate(recorded):
+        context.tell("traces", i, len(recorded), f"site {record.name}")
+        trace, smooth, told = read_record(context.study, record)
+        facts[record.name] = told
+        write_curves(
+            folder / f"{record.name}-raw.csv",
+            time_s=trace.time_s,
+            displacement_mm=trace.displacement_mm,
+            force_N=trace.force_N,
+        )
+        even = smooth.resample(CURVE_POINTS)
+        write_curves(
+            folder / f"{record.name}.csv",
+            time_s=even.time_s,
+            displacement_mm=even.displacement_mm,
+            force_N=even.force_N,
+        )
+        np.save(folder / SMOOTHING.format(record.name), smooth.curve.response(even.time_s))
+        seen = read_observed(context.study, record, trace, told["touch_down_s"], smooth)
+        told |= observed_to_facts(record, seen)
+        store_observed(folder, record, seen)
+        for what in describe_still_values(told):
+            words = f"site {record.name}, {what} hardly gives way, and is not compared"
+            context.tell("traces", i, len(recorded), words)
+    write_json(folder / "traces.json", {"sites": facts})
+    return {}
+
+
+def read_observed(
+    study: Study, record: Record, trace: Trace, touch_down_s: float, smooth: Regularised
+) -> SecondaryMeasurement:
+    """What was seen while the record's force is 5 % of its largest or more.
+
+    Raises
+    ------
+    TraceError
+        For a file that cannot be that, with the file, the place and the remedy.
+    """
+    pressed = smooth.time_s[smooth.force_N >= END_SHARE * smooth.force_N.max()]
+    end_s = touch_down_s + float(pressed[-1])
+    found = SecondaryMeasurement()
+    if record.ultrasound is not None:
+        found = found._replace(layers=_read_thinnings(study, record, touch_down_s, end_s))
+    if record.shear_waves is not None:
+        found = found._replace(waves=_read_waves(study, record, touch_down_s, end_s))
+    if record.surface is not None:
+        file = study.path(record.surface)
+        whole = read_surface_motion(file, study.traces.time_s)
+        times = float(trace.time_s[0]), float(trace.time_s[-1])
+        try:
+            found = found._replace(motion=select_frames_in_contact(whole, times, touch_down_s, end_s))
+        except TraceError as error:
+            raise TraceError(error.what, file=file, place=study.traces.time_s, remedy=error.remedy) from None
+    return found
+
+
+def _read_waves(
+    study: Study, record: Record, touch_down_s: float, end_s: float
+) -> tuple[tuple[WaveSpeeds, WaveMeans], ...]:
+    assert record.shear_waves is not None
+    file = study.path(record.shear_waves)
+    found = read_wave_speeds(file, study.traces.time_s)
+    _check_tissues(study, file, "m_s", [one.tissue for one in found])
+    try:
+        return tuple((one, one.means(touch_down_s, end_s)) for one in found)
+    except TraceError as error:
+        raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
+
+
+def _check_tissues(study: Study, file: Path, unit: str, named: Sequence[str]) -> None:
+    """Whether the model has the tissues that the columns of a file name."""
+    for tissue in named:
+        if tissue not in study.tissues:
+            known = ", ".join(f"{one}_{unit}" for one in study.tissues)
+            raise TraceError(
+                f"the model has no tissue {tissue!r}",
+                file=file,
+                place="header",
+                remedy=f"name columns among {known}",
+            )
+
+
+def _read_thinnings(study: Study, record: Record, touch_down_s: float, end_s: float) -> tuple[Thinning, ...]:
+    assert record.ultrasound is not None
+    file = study.path(record.ultrasound)
+    try:
+        layers = read_layers(file, study.traces.time_s)
+        found = compute_thinnings(layers, touch_down_s, end_s, record.ultrasound_sd_mm)
+    except TraceError as error:
+        raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
+    _check_tissues(study, file, "mm", [one.tissue for one in found])
+    return found
+
+
+def observed_to_facts(record: Record, seen: SecondaryMeasurement) -> dict[str, Any]:
+    """What ``traces.json`` says of it."""
+    facts: dict[str, Any] = {}
+    if seen.layers:
+        facts["layers"] = {
+            one.tissue: {
+                "thickness_mm": one.thickness_mm,
+                "compression_mm": float(one.compression_mm.max()),
+                "before": one.before,
+                "sd_mm": one.sd_mm,
+                "compared": one.is_seen,
+            }
+            for one in seen.layers
+        }
+    if (motion := seen.motion) is not None:
+        frames, points, _ = motion.moved_mm.shape
+        facts["surface"] = {
+            "points": points,
+            "frames": frames,
+            "displacement_mm": motion.largest_mm,
+            "sd_mm": record.surface_sd_mm,
+            "compared": motion.largest_mm > SEEN * record.surface_sd_mm,
+        }
+    if seen.waves:
+        facts["waves"] = [
+            {
+                "name": place.name,
+                "tissue": place.tissue,
+                "depth_mm": place.depth_mm,
+                "readings": int(means.samples.sum()),
+                "from_m_s": float(means.speed_m_s.min()),
+                "to_m_s": float(means.speed_m_s.max()),
+            }
+            for place, means in seen.waves
+        ]
+    return facts
+
+
+def describe_still_values(facts: dict[str, Any]) -> tuple[str, ...]:
+    """What of the facts hardly moves, in words."""
+    layers = [f"ultrasound: {name}" for name, one in facts.get("layers", {}).items() if not one["compared"]]
+    still = "surface" in facts and not facts["surface"]["compared"]
+    return (*layers, *(["surface: the skin"] if still else []))
+
+
+def store_observed(folder: Path, record: Record, seen: SecondaryMeasurement) -> None:
+    """Write the curves of a record's tissues, the moves of its surface and the speeds of its shear waves."""
+    if layers := seen.layers:
+        columns = {f"{one.tissue}_mm": one.compression_mm for one in layers}
+        file = folder / LAYERS.format(record.name)
+        write_curves(file, time_s=layers[0].time_s, samples=layers[0].samples, **columns)
+    if seen.motion is not None:
+        write_motion(folder, record, seen.motion)
+    if seen.waves:
+        means = [one for _, one in seen.waves]
+        number = np.repeat(np.arange(len(means)), [len(one.time_s) for one in means])
+        keys = ("time_s", "speed_m_s", "samples")
+        columns = {key: np.concatenate([getattr(one, key) for one in means]) for key in keys}
+        write_curves(folder / WAVES.format(record.name), place=number.astype(np.float64), **columns)

@@ -1,1 +1,0 @@
-"""What verbs, experiments and stages share: the store and its keys, simulations kept, provenance."""

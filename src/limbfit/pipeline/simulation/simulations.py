@@ -1,0 +1,362 @@
+"""Simulations of a study, never done twice: kept on disk as they finish, keyed by what decides them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import Array
+from ...errors import ProblemError, TraceError
+from ...execution import Executor
+from ...extensions import compute_extensions_digest
+from ...fe import SimulationWarning
+from ...indentation import (
+    Direction,
+    Simulation,
+    SimulationJob,
+    SiteModel,
+    WavePlace,
+    build_clamping_pins,
+    place_waves_under,
+    read_indenter,
+    simulate,
+)
+from ...mesh import read_vtu
+from ...study import Indentation, Record, Site, Study, Vector
+from ..engine.context import Context
+from ..engine.sources import code_digest
+from ..engine.storage import compute_digest, compute_file_digest, write_atomically
+from ..engine.store import COARSE, EARLIER, RUNS
+from .surface_points import ChosenPoints, choose_points, read_motion
+
+CURVE_POINTS = 81  # times, about, at which measured and simulated force are compared
+
+
+class SimulationCache:
+    """Finished simulations in ``folder``, one file each.
+
+    ``also`` are folders of earlier runs, beside those of interrupted attempts: what is found there is copied,
+    since they may be replaced.
+    ``work`` does a job; what it tells beyond `simulate` is in the simulation's facts.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        also: Sequence[Path] = (),
+        work: Callable[[SimulationJob], Simulation] = simulate,
+    ) -> None:
+        self.folder, self.work = folder, work
+        self.places = (folder, folder.parent / EARLIER, *also)
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def run(
+        self, jobs: Sequence[SimulationJob], executor: Executor, again: bool = False
+    ) -> Iterator[Simulation]:
+        """The jobs' simulations, in order; those not found are done on the executor, once each, and kept.
+
+        ``again``: those that failed are tried once more.
+        """
+        found = {job: kept for job in dict.fromkeys(jobs) if (kept := self._find(job)) is not None}
+        if again:
+            found = {job: kept for job, kept in found.items() if kept.completed}
+        missing = [job for job in dict.fromkeys(jobs) if job not in found]
+        made = executor.map(self.work, missing, keys=[job.model.name for job in missing], on_lost=_build_lost)
+        for job in jobs:
+            if job not in found:
+                simulation = found[job] = next(made)
+                if not simulation.facts.get("lost"):  # the machine's fault: another run tries it again
+                    self._keep(job, simulation)
+            yield found[job]
+
+    def example(self) -> Simulation | None:
+        """Any kept simulation, for what they all have in common; None where there is none."""
+        file = next(self.folder.glob("*.npz"), None)
+        return None if file is None else _load(file)
+
+    def __len__(self) -> int:
+        return len(list(self.folder.glob("*.npz")))
+
+    def with_sensitivities(self) -> int:
+        """How many of the kept simulations have derivatives."""
+        return sum(_load(file).jacobian is not None for file in self.folder.glob("*.npz"))
+
+    def _find(self, job: SimulationJob) -> Simulation | None:
+        name = f"{compute_job_digest(job)}.npz"
+        for place in self.places:
+            if (place / name).is_file():
+                if place != self.folder:
+                    with write_atomically(self.folder / name) as stream:
+                        stream.write((place / name).read_bytes())
+                return _load(self.folder / name)
+        return None
+
+    def _keep(self, job: SimulationJob, simulation: Simulation) -> None:
+        with write_atomically(self.folder / f"{compute_job_digest(job)}.npz") as stream:
+            arrays = {"force_N": simulation.force_N}
+            if simulation.jacobian is not None:
+                arrays["jacobian"] = simulation.jacobian
+            if simulation.observed.size:
+                arrays["observed"] = simulation.observed
+            if simulation.observed_jacobian is not None:
+                arrays["observed_jacobian"] = simulation.observed_jacobian
+            facts = {
+                "site": simulation.site,
+                "completed": simulation.completed,
+                "reason": simulation.reason,
+                "penetration_mm": simulation.penetration_mm,
+                "facts": simulation.facts,
+                "doubts": [asdict(doubt) for doubt in simulation.doubts],
+            }
+            np.savez(stream, facts=json.dumps(facts), **arrays)  # type: ignore[arg-type]
+
+
+def _build_lost(job: SimulationJob, reason: str) -> Simulation:
+    """A failed simulation in place of one whose worker died or went over its limits."""
+    n, site = len(job.times_s), job.model.name
+    slopes = np.zeros((n, len(job.parameters))) if job.sensitivities else None
+    facts = {"lost": True, "element": "", "steps": 0, "newton_iterations": 0, "cuts": 0}
+    nothing = np.zeros((job.model.gauges, n))
+    return Simulation(site, np.zeros(n), slopes, False, reason, 0.0, facts, observed=nothing)
+
+
+def _load(file: Path) -> Simulation:
+    with np.load(file, allow_pickle=False) as stored:
+        facts: dict[str, Any] = json.loads(str(stored["facts"]))
+        jacobian = stored.get("jacobian")
+        doubts = tuple(SimulationWarning(**one) for one in facts.pop("doubts"))
+        return Simulation(
+            force_N=stored["force_N"],
+            jacobian=jacobian,
+            doubts=doubts,
+            observed=stored.get("observed", np.zeros((0, 0))),
+            observed_jacobian=stored.get("observed_jacobian"),
+            **facts,
+        )
+
+
+def compute_job_digest(job: SimulationJob) -> str:
+    """What decides a simulation, code included, wherever its mesh file happens to lie."""
+    model = {key: value for key, value in vars(job.model).items() if key not in ("mesh", "extensions")}
+    indenter = job.model.indenter.model_dump(exclude={"file"})  # its digest is in the model
+    clamps = None if job.model.clamps is None else job.model.clamps.model_dump()
+    model["extensions_digest"] = compute_extensions_digest(job.model.extensions)
+    model |= {"indenter": indenter, "steps": job.model.steps.model_dump(), "clamps": clamps}
+    return compute_digest(
+        code_digest(simulate),
+        model,
+        job.tissues,
+        job.parameters,
+        job.times_s,
+        job.sensitivities,
+        job.starts,
+        job.nested_mm,
+    )
+
+
+def find_fibre_directions(context: Context) -> tuple[tuple[str, Direction], ...]:
+    """The direction of the fibres in each tissue that has some, of length one, or that of a flow."""
+    found: list[tuple[str, Direction]] = []
+    for tissue, stated in context.study.fibres.items():
+        if stated == "flow":
+            found.append((tissue, "flow"))
+        else:
+            found.append((tissue, read_limb_axis(context) if stated == "axis" else _normalise(stated)))
+    return tuple(found)
+
+
+def read_limb_axis(context: Context) -> Vector:
+    """The limb's axis, proximally: the unit normal of its proximal cut."""
+    return _normalise(context.stored("surfaces", "surfaces.json")["cut_normal"])
+
+
+def _normalise(along: Sequence[float]) -> Vector:
+    x, y, z = (float(value) for value in np.array(along) / np.linalg.norm(along))
+    return x, y, z
+
+
+def build_site_model(
+    context: Context,
+    one: Indentation,
+    knots_s: Sequence[float],
+    knots_mm: Sequence[float],
+    searched: bool = False,
+    knots_N: Sequence[float] = (),
+    layers: Sequence[str] = (),
+) -> SiteModel:
+    """The stored mesh and place of an indentation's site with a history of displacement, or of force.
+
+    ``searched``: as parameters are searched: on its coarse mesh where the study has one, and no more of it
+    than ``calibration.search_radius_mm``. ``layers``: tissues whose compression is wanted, too.
+
+    Raises
+    ------
+    ProblemError
+        Where the study's clamps do not meet the limb there.
+    """
+    study: Study = context.study
+    site = one.site if isinstance(one, Record) else one
+    placed = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}[site.name]
+    folder = COARSE if searched and study.mesh.coarse is not None else ""
+    mesh = context.store["mesh"] / folder / f"{site.name}.vtu"
+    indenter = study.indenter_of(one)
+    place = tuple(placed["position_mm"]), tuple(placed["axis"])
+    clamped: dict[str, Any] = {}
+    if study.clamps is not None:  # said here, with the study's file, before workers build the site
+        whole, along = read_vtu(mesh), read_limb_axis(context)
+        count_pins_met(study, one, place, (whole.points, whole.face_sets["skin"]), along)
+        clamped = {"clamps": study.clamps, "along": along}
+    return SiteModel(
+        name=one.name,
+        site=site.name,
+        mesh=mesh,
+        mesh_digest=compute_file_digest(mesh),
+        position=place[0],
+        axis=place[1],
+        knots_s=tuple(knots_s),
+        knots_mm=tuple(knots_mm),
+        knots_N=tuple(knots_N),
+        edge=site.edge,
+        indenter=indenter,
+        indenter_digest="" if indenter.file is None else compute_file_digest(indenter.file),
+        kappa_ratio=study.material.kappa_ratio,
+        steps=study.solver,
+        element=study.mesh.element,
+        within_mm=study.within_mm if searched else None,
+        law=study.material.law,
+        relaxation_span_s=study.material.relaxation_span_s,
+        fibres=find_fibre_directions(context),
+        extensions=study.extensions,
+        layers=tuple(layers),
+        course=study.material.course,
+        prestretch=tuple(sorted(study.material.prestretch.items())),
+        **clamped,
+    )
+
+
+def count_pins_met(
+    study: Study,
+    one: Indentation,
+    place: tuple[Vector, Vector],
+    skin: tuple[Array, NDArray[np.int64]],
+    along: Vector,
+) -> int:
+    """How many pins hold the limb in an indentation; 0 where the study has none.
+
+    Parameters
+    ----------
+    place : position and axis of the indenter.
+    skin : points (n, 3) mm and faces (f, 3 or more).
+    along : the limb's axis, proximally.
+
+    Raises
+    ------
+    ProblemError
+        Where the pins cannot be placed, with the study's file.
+    """
+    if study.clamps is None:
+        return 0
+    indenter = read_indenter(study.indenter_of(one), *place, None)
+    try:
+        return len(build_clamping_pins(*skin, indenter, np.array(along), study.clamps))
+    except ProblemError as error:
+        what = f"site {one.name}: {error.what}"
+        raise ProblemError(what, file=study.file, place="clamps", remedy=error.remedy) from None
+
+
+def build_recorded_model(context: Context, record: Record, searched: bool = False) -> SiteModel:
+    """A site driven by one of its records, from touch-down; ``searched``: see `build_site_model`."""
+    facts = context.stored("traces", "traces.json")["sites"][record.name]
+    force = facts["knots_N"] if record.forced else ()
+    layers = [tissue for tissue, one in facts.get("layers", {}).items() if one["compared"]]
+    model = build_site_model(context, record, facts["knots_s"], facts["knots_mm"], searched, force, layers)
+    points = find_surface_points(context, record)
+    if points is not None:
+        model = replace(model, skin_points=points.points, skin_axes=points.axes)
+    waves = facts.get("waves", [])
+    return replace(model, waves=_place_waves(context, record, model, waves)) if waves else model
+
+
+def _place_waves(
+    context: Context, record: Record, model: SiteModel, waves: Sequence[Mapping[str, Any]]
+) -> tuple[WavePlace, ...]:
+    """Where the shear waves of a record are, in the site's own mesh.
+
+    Raises
+    ------
+    TraceError
+        Where the limb has no such place, with the record's file.
+    """
+    assert record.shear_waves is not None
+    mesh = read_vtu(context.store["mesh"] / f"{record.site.name}.vtu")
+    try:
+        return place_waves_under(model, mesh, [(one["tissue"], one["depth_mm"]) for one in waves])
+    except ProblemError as error:
+        file = context.study.path(record.shear_waves)
+        what = f"site {record.site.name}: {error.what}"
+        raise TraceError(what, file=file, place="header", remedy=error.remedy) from None
+
+
+def find_surface_points(context: Context, record: Record) -> ChosenPoints | None:
+    """The points of a record's surface that are compared, on the skin of the site's own mesh; None: nothing.
+
+    Raises
+    ------
+    TraceError
+        Where no point can be compared.
+    """
+    facts = context.stored("traces", "traces.json")["sites"][record.name].get("surface")
+    if facts is None or not facts["compared"]:
+        return None
+    (placed,) = (
+        row for row in context.stored("sites", "sites.json")["sites"] if row["site"] == record.site.name
+    )
+    mesh = read_vtu(context.store["mesh"] / f"{record.site.name}.vtu")
+    place = tuple(placed["position_mm"]), tuple(placed["axis"])
+    motion = read_motion(context.store["traces"], record)
+    return choose_points(context.study, record, place, (mesh.points, mesh.face_sets["skin"]), motion)
+
+
+def build_planned_model(context: Context, site: Site) -> SiteModel:
+    """The site driven by the depth and speed that the study plans for it, in and out."""
+    assert site.depth_mm is not None
+    ramp = site.depth_mm / site.speed_mm_s
+    return build_site_model(context, site, (0.0, ramp, 2 * ramp), (0.0, site.depth_mm, 0.0))
+
+
+def build_model(context: Context, one: Indentation) -> SiteModel:
+    """An indentation as it was recorded, or as the study plans it."""
+    return (
+        build_recorded_model(context, one) if isinstance(one, Record) else build_planned_model(context, one)
+    )
+
+
+def build_curve_job(model: SiteModel, tissues: tuple[str, ...], parameters: Iterable[float]) -> SimulationJob:
+    """An indentation at flat ``parameters``, with derivatives, at the times of a curve."""
+    times = model.curve_times(CURVE_POINTS)
+    return SimulationJob(model, tissues, tuple(map(float, parameters)), tuple(map(float, times)))
+
+
+def open_experiment_cache(context: Context, folder: Path) -> SimulationCache:
+    """Simulations of the experiment in ``folder``; all others of the study count as done."""
+    others = sorted(place for place in context.store.folder.glob(f"*/{RUNS}") if place.parent != folder)
+    return SimulationCache(folder / RUNS, also=others)
+
+
+def find_newest_simulations(folder: Path, sites: Sequence[str]) -> dict[str, Simulation]:
+    """The last kept simulation of each of the sites, of those that have one, while a stage goes on."""
+    found: dict[str, Simulation] = {}
+    files = [(file.stat().st_mtime_ns, file) for file in folder.glob("*.npz")]
+    for _, file in sorted(files, reverse=True):
+        if len(found) == len(sites):
+            break
+        simulation = _load(file)
+        if simulation.site in sites:
+            found.setdefault(simulation.site, simulation)
+    return found

@@ -1,0 +1,1 @@
+"""The experiment ``uncertainty``: where its intervals come from, and what it stores."""

@@ -1,0 +1,408 @@
+"""What the experiment ``uncertainty`` stores: one JSON, and its tables and curves as CSV."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.special import stdtrit
+
+from ...arrays import Array
+from ...errors import InputError
+from ...identify.fit.objective import SiteResponse
+from ...identify.fit.parameters import Unknowns
+from ...identify.uncertainty.emulator import Emulator
+from ...identify.uncertainty.estimator import FitSensitivity
+from ...identify.uncertainty.exploration import Exploration
+from ...identify.uncertainty.model_comparison import ModelComparison
+from ...identify.uncertainty.noise import SiteNoise
+from ...identify.uncertainty.posterior import compute_principal_axes
+from ...identify.uncertainty.uncertainty import (
+    DETERMINED,
+    GIVEN,
+    NORMAL_95,
+    UNDETERMINED,
+    Uncertainty,
+    choose_verdict,
+    format_product,
+)
+from ..engine.storage import write_atomically, write_curves, write_json, write_table
+from ..records.records import SiteRecord
+from .sources import Change
+
+EMULATOR = "emulator.npz"
+
+
+def write_runs(
+    file: Path, names: Sequence[str], points: Array, responses: Sequence[Sequence[SiteResponse]]
+) -> None:
+    """Parameters (k, p), forces (k, N) and derivatives (k, N, p) of all sites, one after the other."""
+    with write_atomically(file) as stream:
+        np.savez(
+            stream,
+            names=np.array(names),
+            points=np.asarray(points),
+            sizes=np.array([response.force_N.size for response in responses[0]]),
+            forces=np.array([np.concatenate([r.force_N for r in run]) for run in responses]),
+            jacobians=np.array([np.concatenate([r.jacobian for r in run]) for run in responses]),
+        )
+
+
+def read_emulator(file: Path) -> Emulator:
+    """The emulator of stored runs.
+
+    Raises
+    ------
+    InputError
+        Where there are none.
+    """
+    if not file.is_file():
+        raise InputError("no emulator is stored", file=file, remedy="run limbfit uncertainty first")
+    with np.load(file, allow_pickle=False) as stored:
+        ends = np.cumsum(stored["sizes"])[:-1]
+        runs = [
+            [SiteResponse(f, j) for f, j in zip(np.split(force, ends), np.split(jacobian, ends))]
+            for force, jacobian in zip(stored["forces"], stored["jacobians"])
+        ]
+        return Emulator.fit(tuple(map(str, stored["names"])), stored["points"], runs)
+
+
+_DRAWS = 1500  # written
+_SHARES = {name: f"{name}_sd_percent" for name in ("parameters", "sources", "noise", "misfit")}
+_MOST_OFF = 0.5  # of the rise that ends an interval: differences beyond it are told
+
+
+@dataclass(frozen=True)
+class Found:
+    """All that the experiment found; see the parts for what they are."""
+
+    known: Uncertainty
+    explored: Exploration
+    evidence: ModelComparison | None
+    gain: FitSensitivity
+    changes: tuple[Change, ...]
+    unknowns: Unknowns
+
+    @property
+    def source_covariance(self) -> Array:
+        """Of the logarithms (p, p), by all counted sources."""
+        counted = [change for change in self.changes if change.variant.counted]
+        parts = [self.gain.compute_covariance(c.force_N, c.variant.shared, c.variant.sites) for c in counted]
+        return np.sum([np.zeros_like(self.known.covariance), *parts], axis=0)
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """A recorded site as predicted at the identified parameters, beside its record and the record's noise
+    (None where the prediction failed)."""
+
+    record: SiteRecord
+    response: SiteResponse
+    noise: SiteNoise | None
+
+
+def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) -> None:
+    """``uncertainty.json``, and CSV: parameters, draws, profiles, sources, predictions."""
+    (folder / "predictions").mkdir(exist_ok=True)
+    parameters, combinations = _parameters_to_rows(found), _combinations_to_rows(found)
+    rows = [_write_prediction(folder, found, one) for one in predicted]
+    explored, posterior = found.explored, found.explored.posterior
+    content = {
+        "parameters": parameters,
+        "combinations": combinations,
+        "correlation": {
+            "names": list(found.known.names),
+            "matrix": _compute_correlation(posterior.covariance).tolist(),
+        },
+        "covariance_log": posterior.covariance.tolist(),
+        "covariance_sources_log": found.source_covariance.tolist(),
+        "residuals": found.known.residual_model.to_dict(),
+        "emulator": _emulator_to_dict(found),
+        "posterior": posterior.to_dict(),
+        "profiles": {one.name: one.to_dict() for one in explored.profiles},
+        "checks": [asdict(check) for check in explored.checks],
+        "evidence": None if found.evidence is None else found.evidence.to_dict(),
+        "sources": [_source_to_row(found, change) for change in found.changes],
+        "predictions": {"sites": rows, **_compute_coverage(rows)},
+        "verdict": _describe_verdict(found, parameters, combinations, rows),
+    }
+    write_json(folder / "uncertainty.json", content)
+    _write_table(folder / "parameters.csv", [_flatten_row(row) for row in parameters])
+    _write_table(folder / "sources.csv", [_flatten_row(row) for row in content["sources"]])
+    _write_table(folder / "predictions.csv", rows)
+    write_runs(folder / EMULATOR, found.known.names, explored.emulator.points, explored.runs)
+    draws = posterior.samples[:: max(len(posterior.samples) // _DRAWS, 1)]
+    write_curves(folder / "draws.csv", **dict(zip(found.known.names, draws.T)))
+    _write_table(
+        folder / "profiles.csv",
+        [
+            {"parameter": one.name, "value": value, "rise": rise, "extrapolated": bool(beyond)}
+            for one in explored.profiles
+            for value, rise, beyond in zip(one.values, one.rise, one.extrapolated, strict=True)
+        ],
+    )
+
+
+def _parameters_to_rows(found: Found) -> list[dict[str, Any]]:
+    """One row for every parameter: calibrated, its interval by every method, the verdict on all sources."""
+    known, explored = found.known, found.explored
+    posterior = explored.posterior
+    profiles = {one.name: one for one in explored.profiles}
+    more = np.sqrt(np.diag(posterior.covariance) + np.diag(found.source_covariance))
+    ours = np.sqrt(np.diag(posterior.covariance))
+    rows = []
+    for i, name in enumerate(known.names):
+        median, (low, high) = posterior.median[i], posterior.intervals_95[i]
+        wider = more[i] / max(ours[i], 1e-300)
+        bounds = found.unknowns.lower[i], found.unknowns.upper[i]
+        with_sources = (
+            max(median * (low / median) ** wider, bounds[0]),
+            min(median * (high / median) ** wider, bounds[1]),
+        )
+        profile = profiles.get(name)
+        prior_sd = np.log(bounds[1] / bounds[0]) / np.sqrt(12.0)
+        given = known.verdicts[i] == GIVEN
+        factor = np.sqrt(with_sources[1] / with_sources[0])
+        rows.append(
+            {
+                "name": name,
+                "calibrated": float(known.parameters[i]),
+                "median": float(median),
+                "linearised_95": known.intervals_95[i].tolist(),
+                "posterior_95": [float(low), float(high)],
+                "profile_95": None if profile is None else list(profile.interval_95),
+                "profile_verdict": None if profile is None else profile.verdict,
+                "profile_extrapolated": None if profile is None else list(profile.ends_extrapolated),
+                "with_sources_95": list(map(float, with_sources)),
+                "verdict": GIVEN if given else choose_verdict(float(factor), more[i] / prior_sd),
+            }
+        )
+    return rows
+
+
+def _combinations_to_rows(found: Found) -> list[dict[str, Any]]:
+    """The principal axes of the posterior, as its draws, the linearisation and the sources see them."""
+    known, explored = found.known, found.explored
+    logs = np.log(explored.posterior.samples)
+    prior_sd = np.log(found.unknowns.upper / found.unknowns.lower) / np.sqrt(12.0)
+    rows = []
+    for weights in compute_principal_axes(explored.posterior, explored.likelihood.space):
+        drawn = logs @ weights
+        low, high = np.quantile(drawn, [0.025, 0.975])
+        sd = float(drawn.std(ddof=1))
+        linear = float(np.sqrt(weights @ known.covariance @ weights))
+        sources = float(np.sqrt(weights @ found.source_covariance @ weights))
+        factor = float(np.exp((high - low) / 2))
+        total = float(np.hypot(sd, sources))
+        wider = float(factor ** (total / max(sd, 1e-300)))
+        rows.append(
+            {
+                "text": format_product(weights, known.names),
+                "weights": weights.tolist(),
+                "linearised_factor_95": float(np.exp(min(NORMAL_95 * linear, 50.0))),
+                "posterior_factor_95": factor,
+                "with_sources_factor_95": wider,
+                "verdict": choose_verdict(wider, total / float(np.linalg.norm(weights * prior_sd))),
+            }
+        )
+    return rows
+
+
+def _emulator_to_dict(found: Found) -> dict[str, Any]:
+    explored = found.explored
+    emulator = explored.emulator
+    return {
+        "runs": len(emulator.points),
+        "needed_percent": list(explored.needed_percent),
+        "good_enough": explored.good_enough,
+        "rounds": explored.rounds_to_dicts(),
+        "lower": emulator.lower.tolist(),
+        "upper": emulator.upper.tolist(),
+        "kernel_length": emulator.length,
+        "nugget": emulator.nugget,
+    }
+
+
+def _source_to_row(found: Found, change: Change) -> dict[str, Any]:
+    """One line of the table: change of force in percent of the largest, change of parameters in percent.
+
+    A source of each site's own changes parameters by the root of the sum of squares over sites.
+    """
+    variant, model = change.variant, found.known.residual_model
+    names = [noise.name for noise in model.noise]
+    forces = [100 * float(np.mean(np.abs(d))) / peak for d, peak in zip(change.force_N, model.peaks_N)]
+    if variant.shared:
+        shift = found.gain.compute_shift(change.force_N)
+    else:
+        shift = np.sqrt(np.diag(found.gain.compute_covariance(change.force_N, False, variant.sites)))
+    return {
+        "source": variant.source,
+        "change": variant.change,
+        "shared": variant.shared,
+        "counted": variant.counted,
+        "failed": list(change.failed),
+        "force_percent": dict(zip(names, forces)),
+        "parameters_percent": dict(zip(found.known.names, (100 * np.expm1(shift)).tolist())),
+    }
+
+
+def _write_prediction(folder: Path, found: Found, one: Predicted) -> dict[str, Any]:
+    """A site's interval as CSV, and its row: how wide, why, and how much of the record lies inside.
+
+    Of a site whose prediction failed there is the reason only.
+    """
+    model, record = found.known.residual_model, one.record
+    facts = {
+        "site": record.site.name,
+        "record": record.name,
+        "fitted": record.site.fitted,
+        "reason": one.response.reason,
+    }
+    if one.noise is None:
+        return facts | dict.fromkeys(("inside_percent", "half_width_percent", *_SHARES.values()))
+    parameters = found.known.parameters
+    force, measured = one.response.force_N, record.compared
+    what, unit = ("displacement" if record.record.forced else "force"), record.record.unit
+    peak = float(force.max())
+    names = [noise.name for noise in model.noise]
+    share = model.misfit[names.index(record.name)] if record.name in names else model.misfit_elsewhere
+    scaled = one.response.jacobian * parameters
+    variances = {
+        "parameters": np.einsum("ni,ij,nj->n", scaled, found.explored.posterior.covariance, scaled),
+        "sources": np.einsum("ni,ij,nj->n", scaled, found.source_covariance, scaled),
+        "noise": np.diag(one.noise.covariance),
+        "misfit": np.full(len(force), (share * peak) ** 2),
+    }
+    total = np.sum(list(variances.values()), axis=0)
+    part = variances["misfit"] / np.maximum(total, 1e-300)
+    freedom = np.clip(model.known_scale / np.maximum(part, 1e-3) ** 2, 3.0, 1e6)
+    half = stdtrit(freedom, 0.975) * np.sqrt(total)
+    low, high = np.maximum(force - half, 0.0), force + half
+    write_curves(
+        folder / "predictions" / f"{record.name}.csv",
+        time_s=record.times_s,
+        **{
+            f"{what}_{which}_{unit}": curve
+            for which, curve in (("measured", measured), ("predicted", force), ("low", low), ("high", high))
+        },
+    )
+    inside = (measured >= low) & (measured <= high)
+    return facts | {
+        "inside_percent": 100 * float(inside.mean()),
+        "half_width_percent": 100 * float(half.mean()) / peak,
+        **{_SHARES[k]: 100 * float(np.sqrt(v.mean())) / peak for k, v in variances.items()},
+    }
+
+
+def _compute_coverage(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """Mean share of the records inside their intervals, in percent."""
+    found: dict[str, float | None] = {}
+    for kind, fitted in (("fitted", True), ("heldout", False)):
+        shares = [row["inside_percent"] for row in rows if row["fitted"] == fitted and not row["reason"]]
+        found[f"coverage_{kind}_percent"] = float(np.mean(shares)) if shares else None
+    return found
+
+
+def _describe_verdict(
+    found: Found,
+    parameters: Sequence[dict[str, Any]],
+    combinations: Sequence[dict[str, Any]],
+    rows: Sequence[dict[str, Any]],
+) -> list[str]:
+    """The answer in sentences."""
+    words = []
+    for word in (DETERMINED, "weakly determined", UNDETERMINED):
+        names = [row["name"] for row in parameters if row["verdict"] == word]
+        if names:
+            words.append(f"{word.capitalize()}: {', '.join(names)}.")
+    told = [row for row in combinations if row["verdict"] == DETERMINED]
+    words.append(
+        f"{len(told)} of {len(combinations)} independent combinations are determined to within "
+        "-20 to +25 %" + (f"; the best is {told[0]['text']}." if told else ".")
+    )
+    beyond = [
+        row["name"]
+        for row in parameters
+        if not row["posterior_95"][0] <= row["calibrated"] <= row["posterior_95"][1]
+    ]
+    if beyond:
+        words.append(
+            f"The calibrated value lies outside its sampled interval: {', '.join(beyond)}; the calibration "
+            "weighs all points of a record alike, the sampled interval by noise and misfit."
+        )
+    if found.evidence is not None:
+        words.append(found.evidence.verdict[0].upper() + found.evidence.verdict[1:] + ".")
+    counted = [change for change in found.changes if change.variant.counted]
+    if counted:
+        largest = max(
+            counted,
+            key=lambda c: float(
+                np.trace(found.gain.compute_covariance(c.force_N, c.variant.shared, c.variant.sites))
+            ),
+        )
+        words.append(
+            f"Beyond the records, {largest.variant.source} ({largest.variant.change}) would change the "
+            "parameters most."
+        )
+    coverage = _compute_coverage(rows)["coverage_heldout_percent"]
+    if coverage is not None:
+        words.append(f"{coverage:.0f} % of the held-out records lies inside the 95 % prediction intervals.")
+    words += [f"Site {row['record']} is not predicted: {row['reason']}." for row in rows if row["reason"]]
+    words += _describe_profiles(found.explored)
+    if not found.explored.good_enough:
+        words.append("The emulator is less accurate than the records: raise uncertainty.runs.")
+    if not found.explored.posterior.long_enough:
+        words.append("The sampler's chain is short for its autocorrelation: intervals are rough.")
+    return words
+
+
+def _describe_profiles(explored: Exploration) -> list[str]:
+    """Where profiles rest on an emulator beyond its runs, and what the solver said there."""
+    beyond = [one.name for one in explored.profiles if any(one.ends_extrapolated)]
+    words = []
+    if beyond:
+        words.append(
+            "Profiles end beyond the emulator's simulations, where they are extrapolated: "
+            f"{', '.join(beyond)}."
+        )
+    thresholds = {one.name: one.threshold for one in explored.profiles}
+    for check in explored.checks:
+        if None in check.solved:
+            words.append(f"An end of the profile of {check.name} could not be simulated.")
+        off = check.largest_difference
+        if off is not None and off > _MOST_OFF * thresholds[check.name]:
+            words.append(
+                f"At an end of the profile of {check.name} solver and emulator differ by {off:.1f} in "
+                f"-2 ln L, where a rise of {thresholds[check.name]:.1f} ends an interval: it rests there on "
+                "the emulator alone."
+            )
+    return words
+
+
+def _compute_correlation(covariance: Array) -> Array:
+    sd = np.sqrt(np.diag(covariance))
+    sd = np.where(sd > 0, sd, 1.0)
+    return covariance / np.outer(sd, sd)
+
+
+def _flatten_row(row: dict[str, Any]) -> dict[str, Any]:
+    """Lists and dictionaries of a row as columns."""
+    flat: dict[str, Any] = {}
+    for key, value in row.items():
+        if isinstance(value, dict):
+            flat |= {f"{key}.{name}": number for name, number in value.items()}
+        elif isinstance(value, list) and len(value) == 2 and not isinstance(value[0], str):
+            flat |= {f"{key}_low": value[0], f"{key}_high": value[1]}
+        elif isinstance(value, list):
+            flat[key] = " ".join(map(str, value))
+        else:
+            flat[key] = value
+    return flat
+
+
+def _write_table(file: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Rows with the same columns as CSV."""
+    write_table(file, list(rows[0]) if rows else [], [list(row.values()) for row in rows])

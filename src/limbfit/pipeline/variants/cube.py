@@ -1,0 +1,343 @@
+"""The cube of the paper's figures 8 and 9: tissues compared by their stress in uniaxial compression.
+
+A cube of 10 mm between frictionless plates that hold on to it: compressed over 0.5 s, brought back over
+0.5 s, held for 1 s, its sides free. The paper does not say how far it was compressed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ... import report
+from ...arrays import Array
+from ...errors import InputError, RunError
+from ...fe import History, Material, Ogden, Problem, StepControl, Support, System, iterate
+from ...fe.kernel.laws import Laws
+from ...fe.materials import PronyTerms
+from ...fe.observables import compute_element_fields
+from ...indentation import build_materials
+from ...laws import KPA, LAWS, OGDEN
+from ...mesh import Mesh
+from ...mesh.boxes import HEX, build_boxes
+from ...relaxation import DEFAULT_SPAN_S
+from ...study import Study
+from ..engine.context import Context
+from ..engine.storage import read_json, write_json
+from ..simulation.limb_geometry import LimbGeometry
+
+
+@dataclass(frozen=True)
+class PublishedTissue:
+    """A tissue of the literature.
+
+    Parameters
+    ----------
+    kind : ``skin`` or ``muscle``: beside which of a study's tissues it is shown.
+    values : the numbers as printed.
+    terms : (c_k in kPa, m_k) of the Ogden terms that they were put into.
+    bulk_kPa : bulk modulus: 100 times ``c``, as in the paper, or times the shear modulus.
+    relaxation : (gamma, tau in s) of ``G = 1 + gamma exp(-t/tau)``; None: not published; () : elastic.
+    conversion : what was done to the numbers, in words.
+    source : the citation, and where the numbers were taken from.
+    """
+
+    name: str
+    kind: str
+    values: str
+    terms: tuple[tuple[float, float], ...]
+    bulk_kPa: float
+    relaxation: tuple[float, float] | tuple[()] | None
+    conversion: str
+    source: str
+
+    def material(self, relaxation: PronyTerms) -> Ogden:
+        """The tissue for the solver, MPa; ``relaxation`` is taken where none was published."""
+        published = (self.relaxation,) if self.relaxation else ()
+        used = relaxation if self.relaxation is None else published
+        shear = 0.5 * sum(c for c, _ in self.terms)
+        return Ogden(
+            tuple((c * KPA, m) for c, m in self.terms),
+            used,
+            kappa_ratio=self.bulk_kPa / shear,
+        )
+
+
+_FIRST_ORDER = (
+    "c and m of FEBio's first-order Ogden, c/m² Σ(λᵐ − 1), the law that the paper names: the shear modulus "
+    "of small strains is c/2"
+)
+_SECOND_ORDER = "the law of limbfit, c/m² Σ(λᵐ + λ⁻ᵐ − 2); γ read without the unit that the paper prints"
+_PAPER = "Sengeh, Moerman, Petron and Herr, J. Mech. Behav. Biomed. Mater. 59 (2016) 379"
+_LIM = (
+    "Lim, Hong, Chen and Weerasooriya 2011, pig skin in tension, as quoted by Sengeh et al. 2016 [their 44]"
+)
+_AFFAGARD = (
+    "Affagard et al., human thigh muscles in vivo, as quoted by Dao and Ho Ba Tho, Appl. Bionics Biomech. "
+    "2018, 7631818, table 2"
+)
+_NEO_HOOKEAN = "neo-Hookean C10 (I1 − 3): one Ogden term, m = 2 and c = 4 C10; shear modulus 2 C10"
+_NO_RELAXATION = "; no relaxation published: that of the study's own tissue"
+
+PUBLISHED = (
+    PublishedTissue(
+        "residuum, skin–adipose (Sengeh 2016)", "skin", "c = 5.22 kPa, m = 4.79, γ = 3.57, τ = 0.32 s",
+        ((5.22, 4.79), (5.22, -4.79)), 522.0, (3.57, 0.32), _SECOND_ORDER, f"{_PAPER}, table 1",
+    ),
+    PublishedTissue(
+        "pig skin, along the spine (Lim 2011)", "skin", "c = 20 kPa, m = 11",
+        ((20.0, 11.0),), 2000.0, None, _FIRST_ORDER + _NO_RELAXATION, _LIM,
+    ),
+    PublishedTissue(
+        "pig skin, across the spine (Lim 2011)", "skin", "c = 8 kPa, m = 7",
+        ((8.0, 7.0),), 800.0, None, _FIRST_ORDER + _NO_RELAXATION, _LIM,
+    ),
+    PublishedTissue(
+        "pig subdermal fat (Sims 2010)", "skin", "μ = 0.53 kPa, Prony α = 0.39, τ = 700 s",
+        ((1.06, 2.0),), 53.0, (),
+        "neo-Hookean: one Ogden term, m = 2 and c = 2 μ; left elastic, since within 2 s of τ = 700 s the "
+        "stress relaxes by less than 0.2 %",
+        "Sims et al., Biomech. Model. Mechanobiol. 9 (2010) 703, abstract",
+    ),
+    PublishedTissue(
+        "residuum, muscle complex (Sengeh 2016)", "muscle", "c = 5.20 kPa, m = 4.78, γ = 3.47, τ = 0.34 s",
+        ((5.20, 4.78), (5.20, -4.78)), 520.0, (3.47, 0.34), _SECOND_ORDER, f"{_PAPER}, table 1",
+    ),
+    PublishedTissue(
+        "rat tibialis anterior (Bosboom 2001)", "muscle", "c = 15.6 kPa, m = 21.4, γ = 0.549, τ = 6.01 s",
+        ((15.6, 21.4),), 1560.0, (0.549, 6.01),
+        _FIRST_ORDER + "; its δ = 0.549 read as γ, as in the paper",
+        "Bosboom et al., J. Biomech. 34 (2001) 1365, abstract, and as quoted by Sengeh et al. 2016 [their 9]",
+    ),
+    PublishedTissue(
+        "human thigh, softest (Affagard)", "muscle", "C10 = 1.75 kPa",
+        ((7.0, 2.0),), 350.0, None, _NEO_HOOKEAN + _NO_RELAXATION, _AFFAGARD,
+    ),
+    PublishedTissue(
+        "human thigh, stiffest (Affagard)", "muscle", "C10 = 3.75 kPa",
+        ((15.0, 2.0),), 750.0, None, _NEO_HOOKEAN + _NO_RELAXATION, _AFFAGARD,
+    ),
+)  # fmt: skip
+
+
+SIDE_MM, RAMP_S, HOLD_S = 10.0, 0.5, 1.0
+STEPS = 40  # in each ramp, and in the time held
+COMPRESSION_PERCENT = 20.0
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """A tissue to be compressed; ``row`` is what is told of it beside its stress."""
+
+    name: str
+    kind: str
+    material: Material
+    row: dict[str, Any]
+
+
+def compress_cube(
+    output: Path | None = None,
+    *,
+    parameters: dict[str, dict[str, float]] | None = None,
+    kappa_ratio: float = 100.0,
+    law: str = OGDEN,
+    relaxation_span_s: tuple[float, float] = DEFAULT_SPAN_S,
+    compression_percent: float = COMPRESSION_PERCENT,
+) -> dict[str, Any]:
+    """Compress a cube of each given tissue, of the paper's and of the published ones.
+
+    Parameters
+    ----------
+    output : folder for ``cube.json``, ``cube.csv`` and ``cube.svg``; None: nothing is written.
+    parameters : ``{tissue: {name: value}}``, outermost first; the last one stands beside published
+        muscle, all others beside published skin. None: published tissues only.
+    kappa_ratio : bulk modulus over the shear modulus of the given tissues.
+    law : name of their law.
+    relaxation_span_s : first and last time of relaxation as a power of time.
+    compression_percent : of the side of the cube.
+
+    Returns
+    -------
+    dict
+        ``tissues``: for each its name, kind, law, peak stress, what is left of it and its change of volume;
+        ``time_s``, and ``stress_kPa`` for each tissue (Cauchy stress along the compression, positive when
+        pushing).
+
+    Raises
+    ------
+    InputError
+        For a compression that is no compression.
+    """
+    check_compression(compression_percent)
+    times = _build_times()
+    rows, stresses = [], {}
+    own = build_materials(parameters or {}, kappa_ratio, law, relaxation_span_s=relaxation_span_s)
+    for specimen in _build_specimens(parameters or {}, own, law):
+        stress, least, most = compress(specimen.material, times, compression_percent)
+        stresses[specimen.name] = stress
+        rows.append(specimen.row | _summarise(times, stress) | {"J_min": least, "J_max": most})
+    content = {
+        "side_mm": SIDE_MM,
+        "compression_percent": compression_percent,
+        "ramp_s": RAMP_S,
+        "hold_s": HOLD_S,
+        "element": "hex8",
+        "tissues": rows,
+        "time_s": times.tolist(),
+        "stress_kPa": {name: stress.tolist() for name, stress in stresses.items()},
+    }
+    if output is not None:
+        _write(output, content)
+    return content
+
+
+def check_compression(percent: float) -> None:
+    """Raise `InputError` for a compression that is none, or too large."""
+    if not 0.0 < percent <= 60.0:
+        raise InputError(
+            f"a compression of {percent:g} % is not possible here",
+            place="compression",
+            remedy="give one above 0 and up to 60 %",
+        )
+
+
+def check_cube(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
+    """Refuse tissues with fibres, and what is no compression.
+
+    Raises
+    ------
+    InputError
+    """
+    check_compression(options["compression_percent"])
+    if study.fibres:
+        what = "the cube compares isotropic tissues, and this study has fibres"
+        raise InputError(what, file=study.file, place="material.law")
+
+
+def run_cube(context: Context, folder: Path, *, compression_percent: float) -> dict[str, Any]:
+    """The experiment: this study's identified tissues beside the published ones."""
+    context.tell("cube", 0, 1, "compressing")
+    stages = context.stored("calibrate", "calibration.json")["stages"]
+    compress_cube(
+        folder,
+        parameters=stages[-1]["parameters"],
+        kappa_ratio=context.study.material.kappa_ratio,
+        law=context.study.material.law,
+        relaxation_span_s=context.study.material.relaxation_span_s,
+        compression_percent=compression_percent,
+    )
+    return {}
+
+
+def _build_specimens(
+    parameters: dict[str, dict[str, float]], own: dict[str, Material], law: str
+) -> list[Specimen]:
+    found = []
+    for i, (tissue, values) in enumerate(parameters.items()):
+        words = ", ".join(f"{p.key} = {values[p.key]:.4g} {p.unit}".rstrip() for p in LAWS[law].parameters)
+        kind = "muscle" if i == len(parameters) - 1 else "skin"
+        row = {"values": words, "conversion": "none", "source": "this study"}
+        found.append(_build_specimen(f"{tissue} (this study)", kind, own[tissue], LAWS[law].words, row))
+    # The paper's, where no study gives its own.
+    relaxation: dict[str, PronyTerms] = {"skin": ((3.57, 0.32),), "muscle": ((3.47, 0.34),)}
+    if parameters:
+        first, last = (tuple(map(tuple, list(own.values())[i].table().prony)) for i in (0, -1))
+        relaxation = {"skin": first, "muscle": last}
+    for known in PUBLISHED:
+        row = {"values": known.values, "conversion": known.conversion, "source": known.source}
+        found.append(
+            _build_specimen(
+                known.name, known.kind, known.material(relaxation[known.kind]), "sum of Ogden terms", row
+            )
+        )
+    return found
+
+
+def _build_specimen(name: str, kind: str, material: Material, law: str, row: dict[str, Any]) -> Specimen:
+    table = material.table()
+    relaxation = 1.0 + float(table.prony[:, 0].sum())
+    terms = table.terms.tolist() if table.has_terms else []
+    facts = {
+        "tissue": name,
+        "kind": kind,
+        "shear_modulus_kPa": material.instantaneous_modulus / relaxation / KPA,
+        "instantaneous_modulus_kPa": material.instantaneous_modulus / KPA,
+        "bulk_modulus_kPa": table.kappa / KPA,
+        "prony": table.prony.tolist(),
+        "law": law,
+        "terms": [[c / KPA, m] for c, m in terms],
+    }
+    return Specimen(name, kind, material, facts | row)
+
+
+def _build_times() -> Array:
+    """Steps (k,) in s: even in each ramp, dense at first while the cube is held."""
+    ramp = np.arange(1, STEPS + 1) / STEPS
+    return np.concatenate([RAMP_S * ramp, RAMP_S * (1 + ramp), 2 * RAMP_S + HOLD_S * ramp**1.5])
+
+
+def build_cube_mesh(cells: int = 1) -> Mesh:
+    """The cube of ``cells`` hexahedra along a side, from the origin, mm."""
+    lines = np.linspace(0.0, SIDE_MM, cells + 1)
+    points, corners = build_boxes(lines, lines, lines)
+    return Mesh(points, corners[:, HEX], "hex8", np.zeros(len(corners), dtype=int), ("cube",), {}, {})
+
+
+def compress(material: Material, times: Array, compression_percent: float) -> tuple[Array, float, float]:
+    """Stress (k,) in kPa at ``times`` s, and the least and largest ratio of volumes."""
+    depth = SIDE_MM * compression_percent / 100.0
+    ramp = np.array([0.0, RAMP_S, 2 * RAMP_S, 2 * RAMP_S + HOLD_S])
+    mesh = build_cube_mesh()
+    planes = [Support(np.flatnonzero(mesh.points[:, i] == 0.0), i) for i in range(3)]
+    top = Support(np.flatnonzero(mesh.points[:, 2] == SIDE_MM), 2, -1.0)
+    problem = Problem(
+        mesh=mesh,
+        materials={"cube": material},
+        fixed=np.zeros(0, dtype=int),
+        contact_faces=np.zeros((0, 4), dtype=int),
+        indenter=None,
+        history=History(ramp, np.array([0.0, depth, 0.0, 0.0])),
+        supports=(*planes, top),
+    )
+    system, laws = System(problem), Laws.build([material])
+    found: dict[float, tuple[float, float]] = {}
+    for step in iterate(problem, StepControl(times=tuple(times), tolerance=1e-7)):
+        fields = compute_element_fields(system, laws, step.state)
+        found[step.time] = (-float(fields.cauchy[0, 2]), float(fields.J[0]))
+    missing = [t for t in times if t not in found]
+    if missing:
+        raise RunError(f"the cube could not be solved beyond {missing[0]:.3g} s; compress it less far")
+    stress, volume = np.array([found[t] for t in times]).T
+    return stress / KPA, float(volume.min()), float(volume.max())
+
+
+def _summarise(times: Array, stress: Array) -> dict[str, float]:
+    """Peak, and the tension that stays when the cube is back at its height, at once and at the end."""
+    back = int(np.argmin(np.abs(times - 2 * RAMP_S)))
+    return {
+        "peak_kPa": float(stress.max()),
+        "back_kPa": float(stress[back]),
+        "end_kPa": float(stress[-1]),
+    }
+
+
+def _write(folder: Path, content: dict[str, Any]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "cube.json", content)
+    stored = read_json(folder / "cube.json")
+    columns = [np.array([0.0, *content["time_s"]])]
+    columns += [np.array([0.0, *values]) for values in content["stress_kPa"].values()]
+    heads = ["time_s", *(_format_column(name) for name in content["stress_kPa"])]
+    table = np.column_stack(columns)
+    np.savetxt(folder / "cube.csv", table, fmt="%.9g", delimiter=",", header=",".join(heads), comments="")
+    (folder / "cube.svg").write_text(report.draw_cube(stored), encoding="utf-8")
+
+
+def _format_column(name: str) -> str:
+    """A tissue's name as the head of a CSV column, with the unit."""
+    plain = "".join(c if c.isalnum() and c.isascii() else " " for c in name)
+    return "_".join(plain.split()) + "_kPa"

@@ -1,0 +1,184 @@
+"""The experiment ``regions``: parameters of each region of the limb beside those of the whole (table 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ...arrays import Array
+from ...errors import InputError, StudyError
+from ...identify.checks.crossvalidation import RegionFit, RegionRecords, average_errors, fit_regions
+from ...identify.fit.objective import SiteResponse
+from ...identify.fit.parameters import Unknowns
+from ...identify.fit.state import Calibration
+from ...study import Site, Study
+from ..engine.context import Context
+from ..engine.storage import write_json, write_table
+from ..identification.record_simulator import RecordSimulator, build_groupings, build_unknowns
+from ..records.records import SiteRecord, load_site_record, to_response
+from ..simulation.limb_geometry import LimbGeometry
+from ..simulation.simulations import SimulationCache, open_experiment_cache
+
+CHOICES = ("all", "fitted")
+
+
+def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]:
+    """Each region's own parameters, started from the whole limb's, and the errors of both.
+
+    ``sites``: ``all`` fits every recorded site of a region, as table 3 lists them; ``fitted`` those that the
+    study fits, and the others of the region are predicted.
+    """
+    study = context.study
+    members = _group_by_region(context, sites)
+    stages = context.stored("calibrate", "calibration.json")["stages"]
+    whole = study.vector(stages[-1]["parameters"])
+    cache = open_experiment_cache(context, folder)
+    benches = {
+        name: RecordSimulator(context, cache, study.records_at(*fitted), "regions")
+        for name, (fitted, _) in members.items()
+    }
+    made = {name: _build_region(context, cache, benches[name], mine) for name, (_, mine) in members.items()}
+    found = fit_regions(made, build_unknowns(study), whole)
+    rows = [_to_row(context, name, benches[name], members[name], fit, folder) for name, fit in found.items()]
+    content = {
+        "sites_used": sites,
+        "left_out": _describe_left_out(context, members),
+        "whole": {
+            "name": stages[-1]["name"],
+            "start": stages[0]["start"],
+            "parameters": stages[-1]["parameters"],
+            "fitted_sites": [site.name for site in study.fitted],
+        },
+        "regions": rows,
+        **_compute_means(rows),
+    }
+    write_json(folder / "regions.json", content)
+    _write_tables(folder, content)
+    return {}
+
+
+def check_regions(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
+    """Refuse a study whose recorded sites have no region, and an unknown choice of sites.
+
+    Raises
+    ------
+    InputError
+    """
+    if (sites := options["sites"]) not in CHOICES:
+        raise InputError(f"{sites!r} is not a choice of sites", place="sites", remedy="use all or fitted")
+    if not any(record.site.region for record in study.recorded):
+        raise StudyError(
+            "no site has a region",
+            file=study.file,
+            place="sites",
+            remedy='give each a region, such as region = "tibia"',
+        )
+
+
+def _group_by_region(context: Context, sites: str) -> dict[str, tuple[list[Site], list[Site]]]:
+    """By region: the sites that it is fitted on, and all that have a record."""
+    study = context.study
+    recorded = [site for site in study.sites if study.records_at(site)]
+    names = list(dict.fromkeys(site.region for site in recorded if site.region))
+    found = {}
+    for name in names:
+        mine = [site for site in recorded if site.region == name]
+        used = mine if sites == "all" else [site for site in mine if site.fitted]
+        if used:
+            found[name] = (used, mine)
+    return found
+
+
+def _describe_left_out(context: Context, members: dict[str, Any]) -> list[str]:
+    """What no region's model is judged on, in words."""
+    recorded = [site for site in context.study.sites if context.study.records_at(site)]
+    without = [site.name for site in recorded if not site.region]
+    regions = dict.fromkeys(site.region for site in recorded if site.region and site.region not in members)
+    words = [f"region {name}: none of its sites is fitted" for name in regions]
+    return words + ([f"sites without a region: {', '.join(without)}"] if without else [])
+
+
+def _build_region(
+    context: Context, cache: SimulationCache, laboratory: RecordSimulator, mine: Sequence[Site]
+) -> RegionRecords:
+    records = [load_site_record(context, record) for record in context.study.records_at(*mine)]
+    stage = build_groupings(context.study)[-1:]
+
+    def identify(start: Unknowns) -> Calibration:
+        return laboratory.identify(start, stage)[0]
+
+    def simulate(parameters: Array) -> list[SiteResponse]:
+        return _simulate_forces(context, cache, records, parameters)
+
+    return RegionRecords(identify, simulate, tuple(record.measured for record in records))
+
+
+def _simulate_forces(
+    context: Context, cache: SimulationCache, records: Sequence[SiteRecord], parameters: Array
+) -> list[SiteResponse]:
+    """Forces on the study's own meshes; with derivatives where the study's prediction has made them so."""
+    apart = context.study.is_searched_apart
+    jobs = [record.own_job(parameters) if apart else record.job(parameters) for record in records]
+    return [to_response(one) for one in cache.run(jobs, context.executor)]
+
+
+def _to_row(
+    context: Context,
+    name: str,
+    laboratory: RecordSimulator,
+    chosen: tuple[list[Site], list[Site]],
+    fit: RegionFit,
+    folder: Path,
+) -> dict[str, Any]:
+    """What ``regions.json`` holds of a region."""
+    study, found = context.study, fit.calibration
+    fitted, mine = chosen
+    _, known = laboratory.uncertainty(found, build_groupings(study)[-1], folder / "coarser", moves=False)
+    intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in study.tissues}
+    for (tissue, key), limits in zip(study.parameters, known.intervals_95.tolist(), strict=True):
+        intervals[tissue][key] = limits
+    return {
+        "region": name,
+        "sites": [site.name for site in mine],
+        "fitted_sites": [site.name for site in fitted],
+        "parameters": study.by_tissue(found.parameters),
+        "intervals_95": intervals,
+        "verdict": dict(zip(known.names, known.verdicts, strict=True)),
+        "evaluations": found.evaluations,
+        "converged": found.converged,
+        "reason": found.reason,
+        "own_error_percent": average_errors(fit.own_percent),
+        "whole_error_percent": average_errors(fit.whole_percent),
+        "own_error_percent_by_site": fit.own_percent,
+        "whole_error_percent_by_site": fit.whole_percent,
+    }
+
+
+def _compute_means(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """Mean error over all sites, each with its own region's model and with the whole limb's."""
+    return {
+        f"mean_{which}_error_percent": average_errors(
+            {site: error for row in rows for site, error in row[f"{which}_error_percent_by_site"].items()}
+        )
+        for which in ("own", "whole")
+    }
+
+
+def _write_tables(folder: Path, content: dict[str, Any]) -> None:
+    """Table 3 as CSV: parameters by region, and errors by site."""
+    whole, rows = content["whole"], content["regions"]
+    heads = ["tissue", "parameter", "start", "whole_limb"]
+    lines = []
+    for tissue, values in whole["parameters"].items():
+        for key, value in values.items():
+            cells = [tissue, key, whole["start"][tissue][key], value]
+            lines.append([*cells, *(row["parameters"][tissue][key] for row in rows)])
+    write_table(folder / "parameters.csv", [*heads, *(row["region"] for row in rows)], lines)
+    errors = [
+        [row["region"], site, site in row["fitted_sites"], own, row["whole_error_percent_by_site"][site]]
+        for row in rows
+        for site, own in row["own_error_percent_by_site"].items()
+    ]
+    heads = ["region", "site", "fitted", "own_error_percent", "whole_limb_error_percent"]
+    write_table(folder / "errors.csv", heads, errors)

@@ -1,0 +1,292 @@
+"""Experiments of sensitivity: how force depends on what a study cannot measure or has to choose.
+
+Each takes the identified parameters, changes one thing, and simulates the chosen sites again: by default the
+one with the thinnest and the one with the thickest tissue over bone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...arrays import Array
+from ...fe import Result, solve
+from ...fe.kernel.laws import Laws
+from ...fe.observables import compute_element_fields
+from ...indentation import (
+    Parameters,
+    Simulation,
+    SimulationJob,
+    SiteModel,
+    build_problem,
+    build_steps,
+    to_parameters,
+)
+from ...mesh import read_vtu
+from ...shapes import OWN, SHAPES
+from ...study import IndenterTable
+from ..engine.context import Context
+from ..engine.storage import write_json, write_table
+from ..records.records import coarsen_records, load_site_record
+from ..simulation.simulations import SimulationCache, open_experiment_cache
+from .variants import (
+    ChosenSite,
+    Variant,
+    choose_sites,
+    compare_variants,
+    measure_tissue_over_bone,
+    run_variants,
+    write_variants,
+)
+
+NO_VOLUME = dict.fromkeys(("J_min", "J_low", "J_high", "J_max", "beyond_percent"))
+ALLOWED = 0.01  # departure of J from one that the paper's bulk modulus is to keep to
+
+
+def open_volume_cache(folder: Path) -> SimulationCache:
+    """Kept apart from simulations without volumes, which have the same key."""
+    return SimulationCache(folder / "volumes", work=simulate_with_volumes)
+
+
+def simulate_with_volumes(job: SimulationJob) -> Simulation:
+    """As `indentation.simulate`, without derivatives; ``facts["volume"]`` says what became of the volumes.
+
+    Of the elements within one width of the indenter from the site: ``J_min`` and ``J_max`` are means of
+    single elements, ``J_low`` and ``J_high`` bound the middle 98 % of the volume, ``beyond_percent`` is the
+    share of the volume whose J is more than 1 % from one.
+    """
+    model = job.model
+    parameters = to_parameters(job.parameters, job.tissues, job.model.law)
+    problem = build_problem(model, read_vtu(model.mesh), parameters)
+    result = solve(problem, steps=build_steps(model), store="peak")
+    return Simulation(
+        site=model.name,
+        force_N=result.force_at(np.array(job.times_s) + model.waits_s),
+        jacobian=None,
+        completed=result.completed,
+        reason=result.reason,
+        penetration_mm=float(result.penetration.max(initial=0.0)),
+        facts=dict(result.statistics) | {"volume": _compute_volume_ratio(result, model)},
+        doubts=result.doubts,
+    )
+
+
+def _compute_volume_ratio(result: Result, model: SiteModel) -> dict[str, Any]:
+    if not result.states:
+        return dict(NO_VOLUME)
+    problem = result.problem
+    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+    J = compute_element_fields(result.system, laws, result.states[-1]).J
+    centres = problem.mesh.points[problem.mesh.corners].mean(axis=1)
+    near = np.linalg.norm(centres - np.array(model.position), axis=1) < model.indenter.width_mm
+    return summarise_volumes(J[near], result.system.weights.sum(axis=1)[near])
+
+
+def summarise_volumes(J: Array, volumes: Array) -> dict[str, float]:
+    """What is told of ratios of volumes J (m,) of elements of ``volumes`` (m,)."""
+    order = np.argsort(J)
+    share = np.cumsum(volumes[order]) / volumes.sum()
+    low, high = np.interp([0.01, 0.99], share, J[order]).tolist()
+    beyond = float(volumes[np.abs(J - 1.0) > ALLOWED].sum() / volumes.sum())
+    return {
+        "J_min": float(J.min()),
+        "J_low": low,
+        "J_high": high,
+        "J_max": float(J.max()),
+        "beyond_percent": 100.0 * beyond,
+    }
+
+
+FACTORS = (0.5, 2.0)
+KAPPA_RATIOS = (10.0, 25.0, 50.0, 100.0, 200.0, 400.0)
+
+
+def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str]) -> dict[str, Any]:
+    """Force against the moduli of each tissue, all with the same ``m`` (the geometric mean of theirs).
+
+    Beside it the exact derivatives at all recorded sites, with the identified ``m``.
+    """
+    identified, law = read_identified_parameters(context), context.study.law
+    m, equal = None, identified
+    if "m" in law.keys:
+        m = float(np.exp(np.mean([np.log(values["m"]) for values in identified.values()])))
+        equal = {tissue: values | {"m": m} for tissue, values in identified.items()}
+    chosen = choose_sites(context, sites)
+    variants = [variant for one in chosen for variant in _build_stiffer(one, equal, law.moduli)]
+    content = _run(context, folder, "sensitivity-c", chosen, variants)
+    content |= {"parameters": identified, "equal_m": m, "factors": list(FACTORS)}
+    content["local"] = _collect_derivatives(context, folder, identified)
+    store_runs(folder, "sensitivity-c", content)
+    heads = ["site", "region", "tissue_mm", *(f"{tissue}_c" for tissue in identified)]
+    rows = [
+        [row["site"], row["region"], row["tissue_mm"], *row["peak_percent_per_percent"].values()]
+        for row in content["local"]
+    ]
+    write_table(folder / "derivatives.csv", heads, rows)
+    return {}
+
+
+def _build_stiffer(chosen: ChosenSite, equal: Parameters, moduli: Sequence[str]) -> list[Variant]:
+    base = Variant(chosen, chosen.model, equal, "as identified", {"tissue": None, "factor": 1.0}, base=True)
+    changed = [
+        Variant(
+            chosen,
+            chosen.model,
+            equal | {tissue: values | {key: factor * values[key] for key in moduli}},
+            f"{tissue} c x {factor:g}",
+            {"tissue": tissue, "factor": factor},
+        )
+        for tissue, values in equal.items()
+        for factor in FACTORS
+    ]
+    return [base, *changed]
+
+
+def _collect_derivatives(context: Context, folder: Path, identified: Parameters) -> list[dict[str, Any]]:
+    """Of every record of a force: change of the largest one in percent for one percent more of a modulus.
+
+    It is each tissue's first.  They are of where parameters are searched, as those of the prediction.
+    """
+    study = context.study
+    own = [load_site_record(context, record) for record in study.recorded if not record.forced]
+    records, best = coarsen_records(context, own), study.vector(identified)
+    cache = open_experiment_cache(context, folder)
+    rows: list[dict[str, Any]] = []
+    for record, found in zip(
+        records, cache.run([record.job(best) for record in records], context.executor), strict=True
+    ):
+        context.tell("sensitivity-c", len(rows), len(records), f"derivatives, site {found.site}")
+        assert found.jacobian is not None
+        peak = int(np.argmax(found.force_N))
+        relative = found.jacobian[peak] * best / found.force_N[peak]
+        rows.append(
+            {
+                "site": record.name,
+                "region": record.site.region,
+                "tissue_mm": measure_tissue_over_bone(record.model),
+                "completed": found.completed,
+                "peak_percent_per_percent": {
+                    tissue: float(value) if found.completed else None
+                    for (tissue, name), value in zip(study.parameters, relative, strict=True)
+                    if name == study.law.moduli[0]
+                },
+            }
+        )
+    return rows
+
+
+def run_kappa(
+    context: Context, folder: Path, *, sites: Sequence[str], ratios: Sequence[float]
+) -> dict[str, Any]:
+    """Force and change of volume against the ratio of bulk modulus and ``c``."""
+    identified, own = read_identified_parameters(context), context.study.material.kappa_ratio
+    chosen = choose_sites(context, sites)
+    variants = [
+        Variant(
+            one,
+            replace(one.model, kappa_ratio=ratio),
+            identified,
+            f"kappa = {ratio:g} c",
+            {"kappa_ratio": ratio},
+            base=ratio == own,
+        )
+        for one in chosen
+        for ratio in sorted({own, *map(float, ratios)})
+    ]
+    content = _run(context, folder, "sensitivity-kappa", chosen, variants, volumes=True)
+    content |= {"parameters": identified, "kappa_ratio": own}
+    store_runs(folder, "sensitivity-kappa", content)
+    return {}
+
+
+def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> dict[str, Any]:
+    """Force where the skin slips freely under the indenter, and where it sticks to it."""
+    identified, chosen = read_identified_parameters(context), choose_sites(context, sites)
+    variants = [
+        Variant(
+            one,
+            replace(one.model, indenter=one.model.indenter.model_copy(update={"friction": friction})),
+            identified,
+            friction if isinstance(friction, str) else f"coefficient {friction:g}",
+            {"friction": friction},
+            base=friction == one.model.indenter.friction,
+        )
+        for one in chosen
+        for friction in dict.fromkeys((one.model.indenter.friction, "frictionless", "sticky"))
+    ]
+    content = _run(context, folder, "sensitivity-contact", chosen, variants)
+    store_runs(
+        folder,
+        "sensitivity-contact",
+        content | {"parameters": identified, "friction": chosen[0].model.indenter.friction},
+    )
+    return {}
+
+
+def run_indenter(context: Context, folder: Path, *, sites: Sequence[str]) -> dict[str, Any]:
+    """Force and effort with the indenter as it is, and with others of its width: a sphere before all."""
+    identified, chosen = read_identified_parameters(context), choose_sites(context, sites)
+    variants = [
+        Variant(
+            one,
+            replace(one.model, indenter=table, indenter_digest=one.model.indenter_digest if base else ""),
+            identified,
+            label,
+            {"shape": table.shape, "width_mm": table.width_mm, "edge_radius_mm": table.edge_radius_mm},
+            base=base,
+        )
+        for one in chosen
+        for label, table, base in list_other_indenters(one.model.indenter)
+    ]
+    content = _run(context, folder, "sensitivity-indenter", chosen, variants)
+    store_runs(folder, "sensitivity-indenter", content | {"parameters": identified})
+    return {}
+
+
+def list_other_indenters(own: IndenterTable) -> list[tuple[str, IndenterTable, bool]]:
+    """(label, indenter, is the study's): its own, and those of its width that it is not."""
+    width = own.width_mm
+    found = [(f"{own.shape} of the study", own, True)]
+    for shape in dict.fromkeys((*OWN, SHAPES[own.shape])):
+        for label, rounding in shape.variants.items():
+            table = IndenterTable(
+                shape=shape.name, width_mm=width, edge_radius_mm=rounding * width, friction=own.friction
+            )
+            if table != own:
+                found.append((label, table, False))
+    return found
+
+
+def read_identified_parameters(context: Context) -> Parameters:
+    """The last stage of the calibration."""
+    return context.stored("calibrate", "calibration.json")["stages"][-1]["parameters"]
+
+
+def _run(
+    context: Context,
+    folder: Path,
+    name: str,
+    chosen: Sequence[ChosenSite],
+    variants: Sequence[Variant],
+    volumes: bool = False,
+) -> dict[str, Any]:
+    """Simulate the variants, write their curves, and what all experiments of sensitivity store."""
+    cache = open_volume_cache(folder) if volumes else open_experiment_cache(context, folder)
+    simulations = run_variants(context, name, cache, variants)
+    write_variants(folder, variants, simulations)
+    rows = compare_variants(variants, simulations)
+    if volumes:
+        for row, simulation in zip(rows, simulations, strict=True):
+            row |= simulation.facts.get("volume", NO_VOLUME)
+    return {"sites": [one.facts for one in chosen], "runs": rows}
+
+
+def store_runs(folder: Path, name: str, content: dict[str, Any]) -> None:
+    """``<name>.json``, and its runs as ``runs.csv``."""
+    write_json(folder / f"{name}.json", content)
+    keys = [key for key in content["runs"][0] if key not in ("warnings", "label", "base")]
+    write_table(folder / "runs.csv", keys, [[row[key] for key in keys] for row in content["runs"]])
