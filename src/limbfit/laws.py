@@ -23,6 +23,7 @@ OGDEN, OGDEN_WORDS = "ogden", "second-order Ogden"  # the law of a study that na
 FIBRED = "ogden-fibres"  # the law whose tissues may have fibres
 ACTIVE = "ogden-active"  # the law whose fibres may pull by themselves
 POWER = "ogden-power"  # the law that relaxes as a power of time
+FUNG = "fung"  # the law that stiffens exponentially
 MOST_RELAXATIONS = 6  # terms, as FEBio
 
 
@@ -69,7 +70,8 @@ class TissueLaw:
     material : the class that the solver takes (`fe.Material`); its fields are the parameters' names and
         ``kappa_ratio``, the bulk modulus over the long-term shear modulus.  None: limbfit's own, `OgdenQLV`,
         with as many relaxation terms as there are pairs of parameters after the first two, fibres where
-        there are k1 and k2, and their contraction where there is active; `OgdenPower` where there is slope.
+        there are k1 and k2, and their contraction where there is active; `OgdenPower` where there is slope,
+        `FungQLV` where there is b.
     relaxation_times_s : those of relaxation as a power of time, which are the study's.
     """
 
@@ -168,6 +170,19 @@ def _build_power() -> TissueLaw:
     return TissueLaw(POWER, words, energy, (_MODULUS, _EXPONENT, *_POWER_RELAXATION))
 
 
+# Forces of a deep indentation grow by some 40 % from b = 0 to 1; under 0.02 the law is neo-Hookean.
+_STIFFENING = Parameter("b", 1.0, 0.02, 20.0, "", "exponential stiffening")
+
+
+def _build_fung() -> TissueLaw:
+    """The exponential law with one relaxation term."""
+    energy = (
+        "the strain energy Ψ = c/(2b) (exp(b (Ĩ₁ − 3)) − 1) + κ/2 (ln J)² with quasi-linear viscoelasticity, "
+        "G(t) = 1 + γ exp(−t/τ) acting on the deviatoric stress"
+    )
+    return TissueLaw(FUNG, "exponential law of Fung", energy, (_MODULUS, _STIFFENING, _AMPLITUDE, _TIME))
+
+
 # Bounds are wide, for nobody has identified fibres so: passive muscle is near its ground along them or some
 # ten times as stiff; the fibres' modulus of small stretch is 4 k1.
 _FIBRES = (
@@ -197,7 +212,7 @@ FIBRE_KEYS = tuple(parameter.key for parameter in (*_FIBRES, _TENSION))
 _OWN = {law.name: law for law in map(_build_ogden, range(1, MOST_RELAXATIONS + 1))}
 LAWS = Registry(
     "tissue law",
-    _OWN | {POWER: _build_power(), FIBRED: _build_fibred(), ACTIVE: _build_active()},
+    _OWN | {POWER: _build_power(), FUNG: _build_fung(), FIBRED: _build_fibred(), ACTIVE: _build_active()},
 )
 
 

@@ -22,6 +22,7 @@ from ..fe import (
     Activation,
     Contractile,
     Fibred,
+    FungQLV,
     History,
     Indenter,
     Material,
@@ -31,7 +32,7 @@ from ..fe import (
     RigidSurface,
     StepControl,
 )
-from ..laws import LAWS, OGDEN, POWER, Parameters
+from ..laws import FUNG, LAWS, OGDEN, POWER, Parameters
 from ..mesh import Mesh
 from ..phases import spread
 from ..relaxation import DEFAULT_SPAN_S, choose_relaxation_times
@@ -164,6 +165,9 @@ def build_materials(
         if law == POWER:
             times = tuple(choose_relaxation_times(*relaxation_span_s).tolist())
             found[tissue] = OgdenPower(**own, times_s=times, kappa_ratio=kappa_ratio)
+            continue
+        if law == FUNG:
+            found[tissue] = FungQLV(**own, kappa_ratio=kappa_ratio)
             continue
         fibre = {name: own.pop(name) for name in ("k1", "k2") if name in own}
         active = own.pop("active", None)

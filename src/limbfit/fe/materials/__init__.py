@@ -5,6 +5,7 @@ from __future__ import annotations
 from .contractile import Contractile
 from .elastic import ElasticLaw, lane_function, mean_exponential
 from .fibred import Fibred
+from .fung import FungQLV
 from .hyperelastic import MooneyRivlin, NeoHookean, Ogden, OgdenPower, OgdenQLV
 from .material import LawTable, Material, PronyTerms, Uncoupled
 from .viscoelastic import ORDER_IN_TIME, compute_prony_factors
@@ -16,6 +17,7 @@ __all__ = [
     "Contractile",
     "ElasticLaw",
     "Fibred",
+    "FungQLV",
     "LawTable",
     "Material",
     "MooneyRivlin",

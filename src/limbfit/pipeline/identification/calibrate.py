@@ -16,7 +16,7 @@ from ...identify.fit.state import Calibration
 from ...identify.uncertainty.relaxation import assess_relaxation
 from ...identify.uncertainty.uncertainty import Uncertainty
 from ...indentation import Parameters
-from ...laws import FIBRED, is_ogden
+from ...laws import FIBRED, FUNG, is_ogden
 from ...priors import SOURCE
 from ...study import Study
 from ..engine.context import Context
@@ -198,7 +198,7 @@ def _assess_relaxation(
     study: Study, found: Calibration, known: Uncertainty, laboratory: RecordSimulator
 ) -> dict[str, Any]:
     """What is known of relaxation beyond the records, and the verdicts with that; none of other laws."""
-    if not is_ogden(study.law.name) and study.law.name != FIBRED:
+    if not is_ogden(study.law.name) and study.law.name not in (FIBRED, FUNG):
         return {"relaxation": None}
     bounds = build_unknowns(study)
     space = build_space(bounds, build_groupings(study)[-1])
