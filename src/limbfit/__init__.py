@@ -22,6 +22,7 @@ Everything the command line does is one call away:
 ``limbfit febio``         ``simulate_feb(file, output=None, listener=print)``
 ``limbfit design``        ``design_study(load_study(path), sites=4, depths_mm=(), listener=print)``
 ``limbfit design --protocol``  ``plan_protocol(load_study(path), minutes=25, listener=print)``
+``limbfit uncertainty --models``  ``compare_models(load_study(path), ["all"], listener=print)``
 ``limbfit socket``        ``fit_socket(load_study(path), listener=print)``
 ``limbfit socket design``  ``design_socket(load_study(path), optimise=(), simulations=6, listener=print)``
 ``limbfit cube``          ``compress_cube(folder)``, without a study

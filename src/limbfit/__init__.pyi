@@ -75,6 +75,10 @@ from .pipeline.commands.fitting import (
     design_socket as design_socket,
     fit_socket as fit_socket,
 )
+from .pipeline.commands.models import (
+    compare_models as compare_models,
+    fit_socket_of_models as fit_socket_of_models,
+)
 from .pipeline.commands.planning import (
     design_study as design_study,
     plan_protocol as plan_protocol,

@@ -105,9 +105,46 @@ def show_regions(found: dict[str, Any]) -> None:
         STDOUT.print(f"left out: {text}", soft_wrap=True)
 
 
-def uncertainty(study: StudyPath, as_json: AsJson = False) -> None:
+def uncertainty(
+    study: StudyPath,
+    models: Annotated[
+        str | None,
+        typer.Option(
+            help="instead, calibrate other models on the same records and weigh them: all, or some of "
+            "two-terms, power, fung, fibres, thinner, thicker, friction, separated by commas; each takes as "
+            "long as limbfit run",
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
     """Find what the records determine, what else changes the answer, and how far to trust predictions."""
-    run_verb(study, "uncertainty", show_uncertainty, as_json=as_json)
+    if models is None:
+        run_verb(study, "uncertainty", show_uncertainty, as_json=as_json)
+        return
+    names = [name.strip() for name in models.split(",") if name.strip()]
+    with listen_on_console() as listener:
+        found = limbfit.compare_models(limbfit.load_study(study), names, listener=listener)
+    tell_stored(found, show_models, as_json)
+
+
+def show_models(found: dict[str, Any]) -> None:
+    """The weight of each model, and the interval of each record's peak with all of them."""
+    columns = ("model", "fitted (%)", "held out (%)", "2 ln B against the study's", "weight (%)")
+    table = Table(*columns, box=None)
+    for row in found["models"]:
+        errors = (row["error_fitted_percent"], row["error_heldout_percent"])
+        words = ["" if error is None else f"{error:.2f}" for error in errors]
+        table.add_row(row["words"], *words, f"{row['evidence']:+.1f}", f"{100 * row['weight']:.0f}")
+    STDOUT.print(table)
+    table = Table("record", "", "measured peak", "95 % by the study's model", "95 % by all models", box=None)
+    for row in found["records"]:
+        ends = (row["own_interval_95"], row["interval_95"])
+        words = [f"{low:.3g} to {high:.3g} {row['unit']}" for low, high in ends]
+        kind = "fitted" if row["fitted"] else "held out"
+        table.add_row(row["record"], kind, f"{row['peak']:.3g} {row['unit']}", *words)
+    STDOUT.print(table)
+    for text in found["left_out"].values():
+        STDOUT.print(f"left out: {text}", soft_wrap=True)
 
 
 def show_uncertainty(found: dict[str, Any]) -> None:

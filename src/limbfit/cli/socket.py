@@ -41,11 +41,26 @@ def fit(
             help="draws of the identified parameters to simulate too, for intervals beyond first order", min=2
         ),
     ] = None,
+    models: Annotated[
+        bool,
+        typer.Option("--models", help="also with every model that limbfit uncertainty --models found likely"),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Put a socket on the limb and load it: pressure and shear by region, settling, the report."""
     _check(parameters, literature)
     checked = limbfit.load_study(study)
+    if models:
+        if parameters is not None or literature or samples:
+            raise InputError(
+                "models have parameters of their own",
+                place="--models",
+                remedy="leave out --parameters, --literature and --samples",
+            )
+        with listen_on_console() as listener:
+            mixed = limbfit.fit_socket_of_models(checked, listener=listener)
+        tell_stored(mixed, show_socket_models, as_json)
+        return
     with listen_on_console() as listener:
         found = limbfit.fit_socket(
             checked,
@@ -56,6 +71,20 @@ def fit(
         )
         found["report"] = limbfit.report_study(checked, listener=listener)["report"]
     tell_stored(found, show_socket, as_json)
+
+
+def show_socket_models(found: dict[str, Any]) -> None:
+    """The mean pressure of each region by every model, and the interval of all, for donning and each load."""
+    for held in found["loads"]:
+        STDOUT.print(f"{held['name']}:")
+        heads = (f"{row['words']}, {100 * row['weight']:.0f} %" for row in found["models"])
+        table = Table("region, mean (kPa)", *heads, "95 % by all models", box=None)
+        for row in held["regions"]:
+            low, high = row["interval_kPa"]
+            table.add_row(
+                row["region"], *(f"{value:.1f}" for value in row["mean_kPa"]), f"{low:.1f} to {high:.1f}"
+            )
+        STDOUT.print(table)
 
 
 def show_socket(found: dict[str, Any]) -> None:

@@ -25,6 +25,7 @@ class Results:
     """A results folder; every dictionary is empty where its file is not there (yet).
 
     ``experiments``: what each finished experiment stored, by its name; ``outdated``: those that are stale.
+    ``models``: other models of the same records.
     """
 
     folder: Path
@@ -41,6 +42,7 @@ class Results:
     truth: Json
     experiments: dict[str, Json] = field(default_factory=dict)
     outdated: tuple[str, ...] = ()
+    models: Json = field(default_factory=dict)
 
     @property
     def site_names(self) -> tuple[str, ...]:
@@ -198,6 +200,7 @@ def load_store(results: Path) -> Results:
         truth=_read_json(results / "truth.json"),
         experiments={name: _read_json(results / name / f"{name}.json") for name in done},
         outdated=tuple(name for name, state in states.items() if state == "stale"),
+        models=_read_json(results / "models" / "models.json"),
     )
 
 

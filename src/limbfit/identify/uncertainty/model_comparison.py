@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.special import stdtr
+from scipy.special import ndtr, softmax, stdtr
 
 from ...arrays import Array
 from .likelihood import MISFIT_FACTOR_BOUNDS, Likelihood, Optimum
@@ -82,6 +82,33 @@ def fit_alternative(name: str, likelihood: Likelihood, start: Array) -> tuple[Al
         ),
         at,
     )
+
+
+def weigh_models(minus_2_log_evidence: Sequence[float]) -> Array:
+    """Return the probability (m,) of each model, alike before the records were seen."""
+    return np.asarray(softmax(-0.5 * np.asarray(minus_2_log_evidence, dtype=float)))
+
+
+def compute_mixture_interval(means: Array, sds: Array, weights: Array) -> tuple[Array, Array]:
+    """Return both ends (n,) of the 95 % interval of a mixture of normal distributions.
+
+    Parameters
+    ----------
+    means, sds : (m, n) of each model at n points.
+    weights : (m,) of the models; their sum is 1.
+    """
+    kept = weights > 0
+    means, sds, weights = means[kept], np.maximum(sds[kept], np.finfo(float).tiny), weights[kept]
+
+    def find_quantile(share: float) -> Array:
+        low, high = (means - 10 * sds).min(axis=0), (means + 10 * sds).max(axis=0)
+        for _ in range(60):  # bisection
+            middle = (low + high) / 2
+            below = weights @ ndtr((middle - means) / sds) < share
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        return np.asarray((low + high) / 2)
+
+    return find_quantile(0.025), find_quantile(0.975)
 
 
 def compare_models(

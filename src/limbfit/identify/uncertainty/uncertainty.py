@@ -14,7 +14,7 @@ itself estimated from few independent residuals, so intervals take Student's qua
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import stdtrit  # Student quantiles; scipy.stats would take half a second to load
@@ -64,7 +64,9 @@ class Uncertainty:
     with the same priors. ``correlation`` (p, p) is of the logarithms. ``intervals_95`` (p, 2) are of the
     parameters and lie between the bounds; ``degrees_of_freedom`` (p,) belong to the linearised ones.
     ``combinations`` are the principal axes, the best known first. ``prior_share`` and ``wider_without`` (p,):
-    see `PriorPrecision.compute_shares`.
+    see `PriorPrecision.compute_shares`. ``minus_2_log_evidence`` compares models of the same records:
+    Laplace's approximation, with the priors and with a misfit that each model estimates from its own
+    residuals.
     """
 
     names: tuple[str, ...]
@@ -82,6 +84,7 @@ class Uncertainty:
     degrees_of_freedom: Array
     prior_share: Array
     wider_without: Array
+    minus_2_log_evidence: float = float("nan")
     method: str = LINEARISED
 
     @property
@@ -125,7 +128,10 @@ def estimate_uncertainty(
     ]
     estimator = Estimator.linearise(scaled, weights, prior.rows, (chosen.force_error_percent / 100) ** 2)
     estimate = _LinearisedEstimate.linearise(residuals, scaled, estimator, model, prior, space, z)
-    return _build_uncertainty(np.asarray(parameters), estimate, model, unknowns, space, prior)
+    found = _build_uncertainty(np.asarray(parameters), estimate, model, unknowns, space, prior)
+    stated = prior.rows @ z - prior.target
+    evidence = model.criterion + float(stated @ stated) - float(np.linalg.slogdet(prior.precision)[1])
+    return replace(found, minus_2_log_evidence=evidence)
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,9 @@ STAGES = (
     Stage("predict", run_predict, ("sites", "traces", "mesh", "calibrate"), (), ("name", "edge"), _NAMED),
     Stage("report", run_report, ("predict",), ("study",), ("name", "region")),
 )
-_FOLDERS = frozenset(("compare", "export", "simulate", *(stage.name for stage in STAGES)))  # of results
+_FOLDERS = frozenset(
+    ("compare", "export", "models", "simulate", *(stage.name for stage in STAGES))
+)  # of results
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
 
 

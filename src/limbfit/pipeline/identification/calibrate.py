@@ -191,6 +191,7 @@ def _uncertainty_to_dict(known: Uncertainty, study: Study) -> dict[str, Any]:
         "most_probable": study.by_tissue(known.centre),
         "priors": _priors_to_dict(known, study),
         "residuals": known.residual_model.to_dict(),
+        "minus_2_log_evidence": known.minus_2_log_evidence,
     }
 
 

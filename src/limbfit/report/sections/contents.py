@@ -13,6 +13,7 @@ from .cube import make_cube_section
 from .design import make_design_section, make_protocol_section
 from .methods import make_method_section
 from .model import make_mesh_section, make_model_section
+from .models import make_models_section
 from .parameters import make_parameter_section
 from .prediction import make_domain_section, make_fit_section, make_prediction_section
 from .provenance import make_provenance_section, make_settings_section, make_timing_section
@@ -61,6 +62,7 @@ def make_page(store: Results) -> Page:
         make_record_check_section(store) if "flags" in store.predict else None,
         make_parameter_section(store),
         make_convergence_section(store),
+        make_models_section(store) if store.models else None,
         *_list_experiment_sections(store),
         make_simulated_section(store) if store.simulated else None,
         make_comparison_section(store) if store.compared else None,

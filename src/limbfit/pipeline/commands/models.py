@@ -1,0 +1,395 @@
+"""Other models of the same limb and records: what an answer owes to the choice of its model.
+
+Each model is the study with one thing changed: its relaxation, its hyperelastic law, fibres, the thickness
+of the outermost layer, or friction. It is an ordinary study in ``results/models/<name>``, which is calibrated
+and predicts every record like the study itself. Models are weighed by how probable they make the fitted
+records (the Laplace evidence of their calibrations), and a prediction is the mixture of theirs.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+
+from ...errors import InputError
+from ...identify.uncertainty.model_comparison import compute_mixture_interval, weigh_models
+from ...identify.uncertainty.uncertainty import NORMAL_95
+from ...laws import FIBRED, FUNG, LAWS, OGDEN, POWER
+from ...study import Study, load_study
+from ..engine.context import Listener, Progress, ignore_progress
+from ..engine.hand_labels import find_hand_labels
+from ..engine.storage import read_curves, write_curves, write_json
+from ..engine.store import Store, lock
+from .fitting import fit_socket
+from .run import run_study
+
+FOLDER = "models"
+OWN = "the study's own"
+TWO_TERMS = "ogden-prony2"
+_LAYER_MM, _MIN_LAYER_MM, _FRICTION = 1.0, 0.5, 0.4
+_SHARED_STAGES = ("segment", "surfaces", "sites", "traces", "mesh", "by-hand")
+MIN_SOCKET_WEIGHT = 0.01  # of a model whose socket is simulated
+
+Document = tomlkit.TOMLDocument
+
+
+@dataclass(frozen=True)
+class ModelChange:
+    """A model that may stand for the study's: what is changed, in ``words``, and how.
+
+    ``change`` alters the study's file; it raises `InputError` if the study cannot be changed so.
+    """
+
+    words: str
+    change: Callable[[Study, Document], None]
+
+
+def _set_law(name: str, fibred: bool = False) -> Callable[[Study, Document], None]:
+    """Give all tissues another law; starts, bounds and priors of parameters that it lacks are left out."""
+
+    def change(study: Study, document: Document) -> None:
+        if study.material.law != OGDEN:
+            raise InputError(
+                f'the study\'s law is "{study.material.law}"', remedy=f'only "{OGDEN}" has this alternative'
+            )
+        material = document.setdefault("material", tomlkit.table())
+        material["law"] = name
+        keys = set(LAWS[name].keys)
+        for table in (material, *material.get("tissues", {}).values()):
+            for which in ("start", "lower", "upper"):
+                for key in [key for key in table.get(which, {}) if key not in keys]:
+                    del table[which][key]
+        if fibred:
+            material["fibres"] = {study.tissues[-1]: "axis"}
+        calibration = document.get("calibration", {})
+        if name in (POWER, FUNG):  # no people are described by these
+            calibration.pop("priors", None)
+        for key in ("prior", "fixed", "tied"):
+            stated = calibration.get(key)
+            if stated:
+                _drop_unknown(stated, keys)
+
+    return change
+
+
+def _drop_unknown(stated: Any, keys: Iterable[str]) -> None:
+    """Remove names of parameters, such as ``skin.tau_s``, that a law with these keys does not have."""
+    known = set(keys)
+    for name in [name for name in stated if str(name).rpartition(".")[2] not in known]:
+        if isinstance(stated, list):
+            stated.remove(name)
+        else:
+            del stated[name]
+
+
+def _change_layer(change_mm: float) -> Callable[[Study, Document], None]:
+    """Make the outermost layer of stated thickness so much thicker."""
+
+    def change(study: Study, document: Document) -> None:
+        layers = study.geometry.model_layers
+        number = next((i for i, one in enumerate(layers) if one.thickness_mm is not None), None)
+        if number is None:
+            raise InputError("no layer has a stated thickness", remedy="the label map decides it")
+        stated = layers[number].thickness_mm or 0.0
+        if stated + change_mm < _MIN_LAYER_MM:
+            raise InputError(f"the layer is only {stated:g} mm thick", remedy="leave this model out")
+        geometry: Any = document.setdefault("geometry", tomlkit.table())
+        if "layers" in geometry:
+            geometry["layers"][number]["thickness_mm"] = stated + change_mm
+        else:
+            geometry["skin_layer_mm"] = stated + change_mm
+
+    return change
+
+
+def _set_friction(study: Study, document: Document) -> None:
+    """Give every indenter a coefficient of friction; frictionless ones slide less, sticky ones more."""
+    if study.indenter.friction == _FRICTION:
+        raise InputError(f"friction is {_FRICTION:g} already", remedy="leave this model out")
+    document.setdefault("indenter", tomlkit.table())["friction"] = _FRICTION
+    for table in document.get("indenters", {}).values():
+        table["friction"] = _FRICTION
+
+
+MODELS: dict[str, ModelChange] = {
+    "two-terms": ModelChange("two relaxation terms", _set_law(TWO_TERMS)),
+    "power": ModelChange("relaxation as a power of time", _set_law(POWER)),
+    "fung": ModelChange("Fung's exponential law", _set_law(FUNG)),
+    "fibres": ModelChange("fibres along the limb", _set_law(FIBRED, fibred=True)),
+    "thinner": ModelChange(f"outer layer {_LAYER_MM:g} mm thinner", _change_layer(-_LAYER_MM)),
+    "thicker": ModelChange(f"outer layer {_LAYER_MM:g} mm thicker", _change_layer(_LAYER_MM)),
+    "friction": ModelChange(f"friction of {_FRICTION:g} under the indenter", _set_friction),
+}
+
+
+def select_models(names: Sequence[str]) -> tuple[str, ...]:
+    """The models of these names, each once; "all" stands for every one.
+
+    Raises
+    ------
+    InputError
+        For a name that no model has.
+    """
+    chosen = tuple(dict.fromkeys(MODELS if "all" in names else names))
+    for name in chosen:
+        if name not in MODELS:
+            raise InputError(
+                f"no model is named {name!r}",
+                place="--models",
+                remedy="use all, or some of " + ", ".join(MODELS),
+            )
+    if not chosen:
+        raise InputError(
+            "no model is named", place="--models", remedy="use all, or some of " + ", ".join(MODELS)
+        )
+    return chosen
+
+
+def derive_study(study: Study, name: str) -> Study:
+    """Write the study of a model beside its inputs, and give it what is stored and stays as it was.
+
+    Raises
+    ------
+    InputError
+        If the study cannot be changed so.
+    """
+    if study.file is None:
+        raise InputError("the study has no file")
+    folder = study.results / FOLDER / name
+    document = tomlkit.parse(study.file.read_text(encoding="utf-8"))
+    try:
+        MODELS[name].change(study, document)
+        folder.mkdir(parents=True, exist_ok=True)
+        _link_inputs(study, folder, document)
+        (folder / "study.toml").write_text(tomlkit.dumps(document), encoding="utf-8")
+        derived = load_study(folder)
+    except InputError as error:
+        raise InputError(f"model {name}: {error.what}", place=error.place, remedy=error.remedy) from None
+    for stage in _SHARED_STAGES:
+        stored, own = study.results / stage, derived.results / stage
+        if stored.is_dir() and not own.exists():
+            shutil.copytree(stored, own, copy_function=_link_or_copy)
+    return derived
+
+
+def _link_inputs(study: Study, folder: Path, document: Document) -> None:
+    """Make every input of the study appear at the same relative path below ``folder``."""
+    root = study.folder.resolve()
+    for path in sorted({*study.inputs.values(), *filter(None, [find_hand_labels(study)])}):
+        if path.is_absolute() or ".." in path.parts:
+            if not path.is_absolute():
+                _replace_path(document, str(path), os.path.relpath(root / path, folder.resolve()))
+            continue
+        top = Path(path.parts[0])
+        if top.name == study.results.name:
+            continue
+        place = folder / top
+        if not place.exists():
+            try:
+                place.symlink_to(os.path.relpath(root / top, folder.resolve()))
+            except OSError:  # no right to make links
+                (shutil.copytree if (root / top).is_dir() else shutil.copyfile)(root / top, place)
+
+
+def _replace_path(table: Any, old: str, new: str) -> None:
+    for key, value in table.items() if isinstance(table, Mapping) else enumerate(table):
+        if isinstance(value, Mapping | list):
+            _replace_path(value, old, new)
+        elif isinstance(value, str) and value == old:
+            table[key] = new
+
+
+def _link_or_copy(source: str, target: str) -> None:
+    """A second name of a file that is never written in place, or a copy where there are no links."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+
+
+def compare_models(
+    study: Study, models: Sequence[str], *, listener: Listener = ignore_progress
+) -> dict[str, Any]:
+    """Calibrate other models of the study on the same records, weigh them, and mix their predictions.
+
+    A model takes about as long as the study's own calibration; what is stored already is not done again.
+
+    Parameters
+    ----------
+    models : names in `MODELS`, or "all".
+    listener : is told of progress.
+
+    Returns
+    -------
+    dict
+        What ``results/models/models.json`` holds, and ``folder``.
+
+    Raises
+    ------
+    InputError
+        For a model that there is not, or that the study cannot have.
+    """
+    chosen = select_models(models)
+    derived, left_out = {}, {}
+    for name in chosen:
+        try:
+            derived[name] = derive_study(study, name)
+        except InputError as error:
+            if "all" not in models:
+                raise
+            left_out[name] = str(error)
+    run_study(study, until="predict", listener=listener)
+    for number, name in enumerate(derived, 1):
+        words = f"model {number} of {len(derived)}, {MODELS[name].words}"
+        derived[name] = derive_study(study, name)  # with what the run has stored since
+        run_study(derived[name], until="predict", listener=_name_model(listener, words))
+    with lock(study.results):
+        content = _mix_predictions(study, derived) | {"left_out": left_out}
+        write_json(study.results / FOLDER / "models.json", content)
+    return content | {"folder": str(study.results / FOLDER)}
+
+
+def _name_model(listener: Listener, words: str) -> Listener:
+    def tell(event: Progress) -> None:
+        listener(replace(event, text=f"{words}: {event.text}"))
+
+    return tell
+
+
+def _mix_predictions(study: Study, derived: Mapping[str, Study]) -> dict[str, Any]:
+    """Weights of the models, and for each record the interval of each and of all."""
+    stores = {OWN: Store(study.results), **{name: Store(one.results) for name, one in derived.items()}}
+    calibrations = {name: store.read("calibrate", "calibration.json") for name, store in stores.items()}
+    evidence = [one["uncertainty"]["minus_2_log_evidence"] for one in calibrations.values()]
+    weights = weigh_models(evidence)
+    predicted = {name: store.read("predict", "predict.json") for name, store in stores.items()}
+    rows = [
+        {
+            "model": name,
+            "words": MODELS[name].words if name in MODELS else "as the study states it",
+            "weight": float(weight),
+            "evidence": float(evidence[0] - value),
+            "error_fitted_percent": predicted[name]["mean_error_fitted_percent"],
+            "error_heldout_percent": predicted[name]["mean_error_heldout_percent"],
+            "parameters": calibrations[name]["stages"][-1]["parameters"],
+        }
+        for name, weight, value in zip(stores, weights, evidence, strict=True)
+    ]
+    records = []
+    for row in predicted[OWN]["sites"]:
+        found = _mix_record(stores, weights, row["record"], study.results / FOLDER)
+        if found is not None:
+            records.append({key: row[key] for key in ("site", "record", "fitted")} | found)
+    return {"models": rows, "records": records}
+
+
+def _mix_record(
+    stores: Mapping[str, Store], weights: np.ndarray, record: str, folder: Path
+) -> dict[str, Any] | None:
+    """The largest value of a record and its intervals, N or mm; None if a model does not predict it."""
+    curves = [read_curves(store["predict"] / f"{record}.csv") for store in stores.values()]
+    ends = [_find_band(one) for one in curves]
+    if any(band is None for band in ends):
+        return None
+    low, high = (np.array([band[k] for band in ends if band is not None]) for k in (0, 1))
+    means, sds = (low + high) / 2, (high - low) / (2 * NORMAL_95)
+    mixed = compute_mixture_interval(means, sds, weights)
+    mean = weights @ means
+    between = np.sqrt(weights @ (means - mean) ** 2)
+    name, unit = next((key.split("_measured_") for key in curves[0] if "_measured_" in key), ("force", "N"))
+    write_curves(
+        folder / f"{record}.csv",
+        **{"time_s": curves[0]["time_s"], f"{name}_measured_{unit}": curves[0][f"{name}_measured_{unit}"]},
+        **{f"{name}_{word}_{unit}": value for word, value in zip(("low", "high"), mixed, strict=True)},
+        **{
+            f"{name}_{model.replace(OWN, 'own')}_{unit}": value
+            for model, value in zip(stores, means, strict=True)
+        },
+    )
+    measured = curves[0][f"{name}_measured_{unit}"]
+    peak = int(np.argmax(np.abs(measured)))
+    return {
+        "unit": unit,
+        "peak": float(measured[peak]),
+        "own_interval_95": [float(low[0][peak]), float(high[0][peak])],
+        "interval_95": [float(mixed[0][peak]), float(mixed[1][peak])],
+        "sd_between_models": float(between[peak]),
+        "inside_percent": 100 * float(np.mean((measured >= mixed[0]) & (measured <= mixed[1]))),
+    }
+
+
+def _find_band(curves: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
+    """The columns of the 95 % band of a stored prediction."""
+    low = next((values for key, values in curves.items() if "_low_" in key), None)
+    high = next((values for key, values in curves.items() if "_high_" in key), None)
+    return None if low is None or high is None else (low, high)
+
+
+def fit_socket_of_models(study: Study, *, listener: Listener = ignore_progress) -> dict[str, Any]:
+    """Put the socket on the limb with every model that counts, and mix the mean pressures of its regions.
+
+    The models are those that `compare_models` has weighed last, of at least `MIN_SOCKET_WEIGHT`.
+
+    Returns
+    -------
+    dict
+        What ``results/models/socket.json`` holds, and ``folder``.
+
+    Raises
+    ------
+    InputError
+        If no models were compared, or the study's own socket cannot be simulated.
+    """
+    file = study.results / FOLDER / "models.json"
+    if not file.is_file():
+        raise InputError(
+            "no other models were compared", file=study.file, remedy="limbfit uncertainty --models all"
+        )
+    known = [row["model"] for row in Store(study.results).read(FOLDER, "models.json")["models"]]
+    compared = compare_models(study, known[1:], listener=listener)["models"]  # anew where the study changed
+    chosen = [row for row in compared if row["weight"] >= MIN_SOCKET_WEIGHT]
+    found = []
+    for row in chosen:
+        of_model = study if row["model"] == OWN else load_study(study.results / FOLDER / row["model"])
+        found.append(fit_socket(of_model, listener=_name_model(listener, f"socket, {row['words']}")))
+    weights = np.array([row["weight"] for row in chosen])
+    content = {
+        "models": [{key: row[key] for key in ("model", "words", "weight")} for row in chosen],
+        "loads": _mix_pressures(found, weights / weights.sum()),
+    }
+    with lock(study.results):
+        write_json(study.results / FOLDER / "socket.json", content)
+    return content | {"folder": str(study.results / FOLDER)}
+
+
+def _mix_pressures(sockets: Sequence[Mapping[str, Any]], weights: np.ndarray) -> list[dict[str, Any]]:
+    """For donning and each load, the mean pressure of each region by every model, and of all; kPa."""
+
+    def list_held(one: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+        return [one["donning"] | {"name": "donning"}, *one["loads"]]
+
+    rows = []
+    for held in zip(*map(list_held, sockets), strict=True):
+        regions = []
+        for same in zip(*(one["regions"] for one in held), strict=True):
+            means = np.array([region["mean_kPa"] for region in same])
+            ends = np.array([region["interval_kPa"] or 2 * [region["mean_kPa"]] for region in same])
+            low, high = compute_mixture_interval(
+                ends.mean(axis=1)[:, None], (ends @ [-1.0, 1.0])[:, None] / (2 * NORMAL_95), weights
+            )
+            regions.append(
+                {
+                    "region": same[0]["region"],
+                    "mean_kPa": means.tolist(),
+                    "interval_kPa": [max(float(low[0]), 0.0), float(high[0])],
+                }
+            )
+        rows.append({"name": held[0]["name"], "regions": regions})
+    return rows
