@@ -65,6 +65,27 @@ def test_the_main_types_live_where_the_table_says(name: str, home: str) -> None:
     assert getattr(import_module(f"limbfit.{home}"), name).__module__ == f"limbfit.{home}"
 
 
+READING = (ROOT / "docs" / "reading.md").read_text(encoding="utf-8")
+CHAPTERS = re.findall(r"^\| \d+ \| \[[\w ]+\]\(\S+\) \| `(\S+)` \| `(\w+)` \|", READING, re.MULTILINE)
+
+
+@pytest.mark.parametrize(("file", "name"), CHAPTERS)
+def test_a_chapter_of_the_reading_list_has_its_main_function(file: str, name: str) -> None:
+    assert re.search(rf"^(def|class) {name}\b", (PACKAGE / file).read_text(encoding="utf-8"), re.MULTILINE)
+
+
+def test_the_reading_list_is_short() -> None:
+    assert len(CHAPTERS) == 12
+    assert sum(len((PACKAGE / file).read_text(encoding="utf-8").splitlines()) for file, _ in CHAPTERS) < 3000
+
+
+def test_the_first_changes_name_files_that_are_there() -> None:
+    """Every path between backticks, below the package or the repository."""
+    paths = re.findall(r"`([\w./]+(?:/|\.py|\.md)|tests/\w+)`", READING)
+    assert len(paths) > 30
+    assert [path for path in paths if not (PACKAGE / path).exists() and not (ROOT / path).exists()] == []
+
+
 def test_pages_agree_on_where_a_corrected_segmentation_is_saved() -> None:
     for page in ("README.md", "docs/segmentation.md", "docs/getting-started.md"):
         text = " ".join((ROOT / page).read_text(encoding="utf-8").split())
