@@ -18,6 +18,7 @@ from .fe import (
     Motion as Motion,
     NeoHookean as NeoHookean,
     Ogden as Ogden,
+    FungQLV as FungQLV,
     OgdenPower as OgdenPower,
     OgdenQLV as OgdenQLV,
     OpenSurface as OpenSurface,
