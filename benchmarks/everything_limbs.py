@@ -25,7 +25,7 @@ from foreign_meshes import named_bodies
 from numpy.typing import NDArray
 
 from limbfit.anatomy.imaging import LabelMap, write_labels
-from limbfit.anatomy.sites.under import measure_tissue_under
+from limbfit.anatomy.sites.sites import measure_tissue_under
 from limbfit.anatomy.surfaces.mending import build_closed_anatomy
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, write_surface
 from limbfit.bench.limbs import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, draw_random_sites, make_amputated_calf

@@ -39,7 +39,7 @@ from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
 from limbfit.anatomy.segmentation.amputation import amputate_limb
 from limbfit.anatomy.segmentation.segmentation import segment
-from limbfit.anatomy.sites.under import measure_tissue_under
+from limbfit.anatomy.sites.sites import measure_tissue_under
 from limbfit.anatomy.surfaces.mending import build_closed_anatomy, open_loops
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, build_anatomy, find_bodies, read_surface
 from limbfit.anatomy.surfaces.thickness import measure_fat_depth

@@ -27,7 +27,7 @@ import SimpleITK as sitk  # noqa: N813
 
 from limbfit.anatomy.grid import BONES, FAT, LabelMap
 from limbfit.anatomy.labels.quality import assess_labels
-from limbfit.anatomy.segmentation.one_limb import check_one_limb
+from limbfit.anatomy.segmentation.body import check_one_limb
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy, compute_signed_distance
 from limbfit.phantom.geometry import Limb, compute_gradient, make_limb

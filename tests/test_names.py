@@ -29,7 +29,7 @@ respond restate restrict resume rotate round run sample save scale schedule sear
 serve set shade share shorten show silence simulate size slice smooth snap solve sort split spread stack
 start state step stop store sum summarise symmetrise take tell temper test thicken thin tilt time to
 touch transfer translate triangulate trim try turn unpack untangle update vary voxelise walk warm warn
-weigh whiten widen work wrap write zip
+weigh whiten widen wrap write zip
     """.split()  # noqa: SIM905
 )
 PREDICATES = frozenset({"is", "has", "can", "are", "prefers"})
@@ -52,7 +52,6 @@ EXCEPTIONS = {
     "pipeline/commands/acquire.py": "names that users import",
     "pipeline/commands/run.py": "names that users import",
     "priors/people.py": "a constructor",
-    "anatomy/meshing/_netgen_worker.py": "a script",
 }
 
 

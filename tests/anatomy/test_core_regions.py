@@ -14,8 +14,7 @@ from limbfit.anatomy.meshing.engines import VolumeTask, run_netgen
 from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, compute_signed_distance
 from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_limb, mesh_site
 from limbfit.anatomy.meshing.regions import build_region_level, find_interfaces
-from limbfit.anatomy.segmentation.amputation import amputate_limb
-from limbfit.anatomy.segmentation.voxels import voxelise_anatomy
+from limbfit.anatomy.segmentation.amputation import amputate_limb, voxelise_anatomy
 from limbfit.anatomy.surfaces.mending import build_closed_anatomy
 from limbfit.anatomy.surfaces.surfaces import (
     Anatomy,

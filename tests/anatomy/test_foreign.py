@@ -14,7 +14,7 @@ from limbs import SHARED, rotation
 from limbfit.anatomy.meshing import meshing, untangling
 from limbfit.anatomy.meshing.background import compute_volumes
 from limbfit.anatomy.meshing.engines import VolumeMesh
-from limbfit.anatomy.meshing.layered import extrude_layers
+from limbfit.anatomy.meshing.extrusion import extrude_layers
 from limbfit.anatomy.meshing.layers import LimbFields
 from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
 from limbfit.anatomy.meshing.smoothing import find_constraints

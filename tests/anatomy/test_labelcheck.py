@@ -10,7 +10,7 @@ import pytest
 from limbs import CALF, leg_image
 
 from limbfit.anatomy.imaging import LabelMap, Volume, check_image, clean_labels, read_volume
-from limbfit.anatomy.segmentation.one_limb import check_one_limb
+from limbfit.anatomy.segmentation.body import check_one_limb
 from limbfit.errors import ImageError, LabelError
 
 PATH = Path("labels.nrrd")

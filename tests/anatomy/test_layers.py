@@ -11,7 +11,7 @@ from test_meshing import COARSE, conforms, limb, site_of
 
 from limbfit.anatomy.grid import LabelMap
 from limbfit.anatomy.meshing.background import compute_volumes
-from limbfit.anatomy.meshing.columns import build_columns, choose_even_steps
+from limbfit.anatomy.meshing.extrusion import build_columns, choose_even_steps
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import build_base_mesh, mesh_site
 from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy

@@ -15,8 +15,8 @@ from limbs import SHARED, rotation
 
 from limbfit.anatomy.meshing import engines
 from limbfit.anatomy.meshing.background import LAYER, build_box_grid, compute_in_band, compute_volumes, cut
-from limbfit.anatomy.meshing.columns import build_columns
 from limbfit.anatomy.meshing.curving import curve_diagonals
+from limbfit.anatomy.meshing.extrusion import build_columns
 from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, compute_signed_distance
 from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
 from limbfit.anatomy.meshing.meshreport import mesh_warnings

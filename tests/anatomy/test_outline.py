@@ -12,11 +12,10 @@ from limbs import write_dicom
 from limbfit.anatomy.grid import BONES, FAT, Volume
 from limbfit.anatomy.imaging import read_volume
 from limbfit.anatomy.morphology import compute_depth
-from limbfit.anatomy.segmentation.body import find_limb_mask, smooth_image
-from limbfit.anatomy.segmentation.contrast import is_ct
+from limbfit.anatomy.segmentation.body import find_limb_mask, remove_supports, smooth_image
+from limbfit.anatomy.segmentation.ct import is_ct
 from limbfit.anatomy.segmentation.fat import find_bright_fat, select_subcutaneous
 from limbfit.anatomy.segmentation.segmentation import segment
-from limbfit.anatomy.segmentation.supports import remove_supports
 from limbfit.errors import ImageError
 from limbfit.phantom.geometry import SKIN_AND_FAT, Limb, make_limb
 from limbfit.phantom.mri import CONTRASTS, build_image, make_grid

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bodies import limb, revolved
 
-from limbfit.anatomy.meshing import thinbones
+from limbfit.anatomy.meshing import meshing
 from limbfit.anatomy.meshing.background import compute_volumes
 from limbfit.anatomy.meshing.layers import build_limb_fields
 from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
@@ -39,16 +39,16 @@ def test_the_base_keeps_a_bone_half_as_thick_as_its_grid_is_wide(thin: Anatomy) 
 
 def test_only_thin_bone_is_found_thin(thin: Anatomy) -> None:
     fields = build_limb_fields(thin, COARSE.layers, COARSE.bone_clearance_mm)
-    places = fields.frame.to_patient(thinbones.thin_places(fields, COARSE.base_spacing_mm))
+    places = fields.frame.to_patient(meshing.find_thin_bone(fields, COARSE.base_spacing_mm))
     assert len(places) > 50
     assert (places[:, 0] < thin.cut_point[0] - 8.0).all()  # none of the bone of 9 mm radius at x = 8 mm
-    assert (thinbones.thin_places(fields, 2.0)[:, 2] < -58.0).all()  # its tip at most
+    assert (meshing.find_thin_bone(fields, 2.0)[:, 2] < -58.0).all()  # its tip at most
 
 
 def test_a_mesh_that_lost_a_bone_says_so(thin: Anatomy, monkeypatch: pytest.MonkeyPatch) -> None:
     position, axis = thin.cut_point + np.array([-31.0, 0.0, -30.0]), np.array([1.0, 0.0, 0.0])
     _, report = mesh_site(thin, position, axis, COARSE)
     assert "loses" not in " ".join(report.warnings)
-    monkeypatch.setattr(thinbones, "HALVINGS", 0)
+    monkeypatch.setattr(meshing, "MAX_HALVINGS", 0)
     _, report = mesh_site(thin, position, axis, COARSE)
     assert any("the mesh loses part of the fibula" in line for line in report.warnings)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from limbfit.anatomy.sites.under import DEEPEST_MM, measure_tissue_under
+from limbfit.anatomy.sites.sites import DEEPEST_MM, measure_tissue_under
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface
 
 

@@ -7,7 +7,7 @@ import pytest
 from bodies import limb
 from limbs import rotation
 
-from limbfit.anatomy.segmentation.voxels import amputate_anatomy, voxelise_anatomy
+from limbfit.anatomy.segmentation.amputation import amputate_anatomy, voxelise_anatomy
 from limbfit.anatomy.surfaces.surfaces import check_anatomy
 from limbfit.errors import LabelError
 

@@ -1,12 +1,18 @@
-"""The limb frame: the proximal cut is the plane z = 0 and the limb lies at z <= 0; millimetres."""
+"""Where a limb lies: its proximal end on an image's grid, and the limb frame.
+
+In the limb frame the proximal cut is the plane z = 0 and the limb lies at z <= 0; millimetres.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Mask
+from ..errors import LabelError
+from .grid import Grid
 
 
 @dataclass(frozen=True)
@@ -32,3 +38,62 @@ def build_limb_frame(cut_point: Array, cut_normal: Array) -> Frame:
     x = np.cross(helper, z)
     x /= np.linalg.norm(x)
     return Frame(np.array([x, np.cross(z, x), z]), np.asarray(cut_point, dtype=float))
+
+
+@dataclass(frozen=True)
+class ProximalEnd:
+    """The proximal end of a limb on its grid.
+
+    ``axis`` is 0, 1, 2 for i, j, k; ``side`` -1 or 1, the sense of that axis that is proximal; ``layer`` the
+    last index that holds limb.
+    """
+
+    axis: int
+    side: int
+    layer: int
+
+    def direction(self, grid: Grid) -> Array:
+        """(3,) unit vector, proximal, LPS."""
+        return self.side * grid.direction[:, self.axis]
+
+    def along(self, array: NDArray) -> NDArray:
+        """A view of ``[k, j, i]`` whose first axis runs along the limb from distal to proximal."""
+        view = np.moveaxis(array, 2 - self.axis, 0)
+        return view[::-1] if self.side < 0 else view
+
+
+def find_longest_axis(limb: Mask, grid: Grid) -> int:
+    """The grid axis (0, 1, 2 for i, j, k) along which a mask is longest."""
+    extents = [_find_extent(limb, axis) for axis in range(3)]
+    return int(np.argmax([(b - a + 1) * grid.spacing[axis] for axis, (a, b) in enumerate(extents)]))
+
+
+def find_proximal_end(limb: Mask, grid: Grid, axis: int | None = None) -> ProximalEnd:
+    """Where the limb was cut: at the border of the image that it reaches, else at its thicker end.
+
+    The limb's axis is the grid axis along which it is longest, if it is not given. Of two ends at the
+    border, as of an intact leg, the superior one is proximal.
+    """
+    if not limb.any():
+        raise LabelError("the label map is empty", remedy="give one with the limb labelled")
+    axis = find_longest_axis(limb, grid) if axis is None else axis
+    low, high = _find_extent(limb, axis)
+    ends = [ProximalEnd(axis, -1, low), ProximalEnd(axis, 1, high)]
+    border = [end for end in ends if end.layer in (0, grid.size[axis] - 1)]
+    if len(border) == 1:
+        return border[0]
+    if len(border) == 2:
+        return max(border, key=lambda end: end.direction(grid)[2])
+    depth = min(3, high - low)
+    return max(ends, key=lambda end: int(select_layer(limb, axis, end.layer - depth * end.side).sum()))
+
+
+def select_layer(mask: Mask, axis: int, index: int) -> Mask:
+    """One layer of ``[k, j, i]`` across grid axis 0, 1, 2 (i, j, k)."""
+    return np.take(mask, index, axis=2 - axis)
+
+
+def _find_extent(mask: Mask, axis: int) -> tuple[int, int]:
+    others = tuple(n for n in range(3) if n != 2 - axis)
+    filled = np.flatnonzero(mask.any(axis=others))
+    return int(filled[0]), int(filled[-1])

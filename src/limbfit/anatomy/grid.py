@@ -19,7 +19,7 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Mask
 from ..errors import ImageError, LabelError
 
 SOFT_TISSUE = "soft tissue"
@@ -216,7 +216,7 @@ class LabelMap(Grid):
         return cls(array, *read_geometry(image), names=dict(names or DEFAULT_NAMES))
 
     @property
-    def limb(self) -> NDArray[np.bool_]:
+    def limb(self) -> Mask:
         """Everything inside the skin, bones included."""
         return self.array > 0
 
@@ -265,7 +265,7 @@ class LabelMap(Grid):
             raise LabelError("the label map names no soft tissue", remedy=f"name one label {SOFT_TISSUE!r}")
         return soft[0]
 
-    def mask(self, name: str) -> NDArray[np.bool_]:
+    def mask(self, name: str) -> Mask:
         """Voxels of one name."""
         return self.array == self.value(name)
 

@@ -15,10 +15,9 @@ import SimpleITK as sitk  # noqa: N813
 from ..errors import ImageError, LabelError
 from .grid import BONES, DEFAULT_NAMES, SOFT_TISSUE, LabelMap, Volume
 from .images.dicom import Series, describe_series, list_series, read_series
-from .images.formats import format_of, read_image
-from .images.nifti import describe_forms
+from .images.formats import describe_forms, format_of, read_image
 from .labels.dicom_labels import find_dicom_labels, read_dicom_labels
-from .labels.labelcheck import clean_labels
+from .labels.labelcheck import clean_labels, place_on_grid
 from .labels.labelfiles import (
     is_seg_nrrd,
     read_label_image,
@@ -27,7 +26,6 @@ from .labels.labelfiles import (
     write_seg_nrrd,
     write_sidecar,
 )
-from .labels.placement import place_on_grid
 
 __all__ = [
     "BONES",

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 from scipy.ndimage import label as connected
 
-Mask = NDArray[np.bool_]
+from ..arrays import Array, Indices, Mask
+
 Field = NDArray[np.float32]
-Spacing = NDArray[np.float64]
 Box = tuple[slice, ...]
 
 _ROUNDING = 1e-5  # of a radius: distances are float32
 
 
-def compute_distance(mask: Mask, spacing: Spacing) -> Field:
+def compute_distance(mask: Mask, spacing: Array) -> Field:
     """Distance of each voxel's centre to that of the nearest voxel of the mask, mm; infinite without any."""
     if not mask.any():
         return np.full(mask.shape, np.inf, dtype=np.float32)
@@ -33,24 +33,24 @@ def compute_distance(mask: Mask, spacing: Spacing) -> Field:
     return np.maximum(distance, 0, out=distance)
 
 
-def compute_depth(mask: Mask, spacing: Spacing) -> Field:
+def compute_depth(mask: Mask, spacing: Array) -> Field:
     """Distance to the nearest voxel outside the mask, mm; it goes on beyond its first and last slice."""
     padded = np.pad(mask, 1)
     padded[0], padded[-1] = padded[1], padded[-2]
     return compute_distance(~padded, spacing)[1:-1, 1:-1, 1:-1]
 
 
-def dilate_mask(mask: Mask, radius_mm: float, spacing: Spacing) -> Mask:
+def dilate_mask(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
     """The voxels within a radius of the mask."""
     return compute_distance(mask, spacing) <= radius_mm * (1 + _ROUNDING)
 
 
-def erode_mask(mask: Mask, radius_mm: float, spacing: Spacing) -> Mask:
+def erode_mask(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
     """The voxels of the mask that are farther than a radius from what is outside it, within the array."""
     return compute_distance(~mask, spacing) > radius_mm * (1 + _ROUNDING)
 
 
-def close_mask(mask: Mask, radius_mm: float, spacing: Spacing) -> Mask:
+def close_mask(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
     """Closed over gaps that a ball does not fit into; beyond the array the mask goes on as at its border."""
     room, inner, box = _make_room(mask, radius_mm, spacing)
     closed = erode_mask(dilate_mask(room, radius_mm, spacing), radius_mm, spacing)
@@ -59,7 +59,7 @@ def close_mask(mask: Mask, radius_mm: float, spacing: Spacing) -> Mask:
     return found
 
 
-def open_mask(mask: Mask, radius_mm: float, spacing: Spacing) -> Mask:
+def open_mask(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
     """Without what is too thin for a ball; beyond the array the mask goes on as at its border."""
     room, inner, box = _make_room(mask, 2 * radius_mm, spacing)
     opened = dilate_mask(erode_mask(room, radius_mm, spacing), radius_mm, spacing)
@@ -68,7 +68,7 @@ def open_mask(mask: Mask, radius_mm: float, spacing: Spacing) -> Mask:
     return found
 
 
-def _make_room(mask: Mask, reach_mm: float, spacing: Spacing) -> tuple[Mask, Box, Box]:
+def _make_room(mask: Mask, reach_mm: float, spacing: Array) -> tuple[Mask, Box, Box]:
     """The mask in its box with room around it; its box there, and its box in the array."""
     reach = np.ceil(reach_mm / spacing[: mask.ndim]).astype(int)[::-1] + 1
     box = find_box(mask)
@@ -80,7 +80,7 @@ def _make_room(mask: Mask, reach_mm: float, spacing: Spacing) -> tuple[Mask, Box
     return np.pad(mask[wide], pads, mode="edge"), inner, box
 
 
-def find_box(mask: Mask, margin: NDArray[np.int64] | int = 0) -> Box:
+def find_box(mask: Mask, margin: Indices | int = 0) -> Box:
     """The smallest box of indices that holds a mask, wider by a margin (voxels along each array axis)."""
     box = []
     for axis, more in enumerate(np.broadcast_to(margin, mask.ndim)):

@@ -9,9 +9,8 @@ import numpy as np
 
 from ..anatomy.grid import Grid
 from ..anatomy.imaging import read_volume
-from ..anatomy.segmentation.amputation import amputate_limb
+from ..anatomy.segmentation.amputation import amputate_limb, label_map
 from ..anatomy.segmentation.segmentation import segment
-from ..anatomy.segmentation.voxels import label_map
 from ..anatomy.sites.sites import compute_indenter_axis
 from ..anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface
 from ..arrays import Array

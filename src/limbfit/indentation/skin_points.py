@@ -11,7 +11,7 @@ from ..arrays import Array
 from ..errors import ProblemError
 from ..mesh import Gauge, Mesh
 from ..mesh.cells import linear_simplex, quadratic_simplex
-from ..shapes.closest_point import build_tree, closest_point
+from ..shapes.triangles import build_tree, closest_point
 
 Ints = NDArray[np.int64]
 

@@ -1,14 +1,15 @@
 """Volume meshes: points, cells, named sets; their quality; VTU on disk."""
 
 from .cells import CELLS, TET10_EDGES, TET_FACES, TRI6_EDGES, CellType
-from .gauges import Gauge, LayerGauge, find_gauges_along
-from .locating import locate
-from .measures import MeshQuality, compute_dihedral_angles, measure_quality
+from .locating import Gauge, LayerGauge, find_gauges_along, locate
 from .volume import (
     Mesh,
+    MeshQuality,
     boundary_faces,
     cell_volumes,
     check,
+    compute_dihedral_angles,
+    measure_quality,
     node_jacobians,
     to_tet10,
 )

@@ -10,15 +10,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Indices
 
 ShapeFunctions = Callable[[Array], tuple[Array, Array]]
 
 TET10_EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
 TET_FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])  # outward for positive volume
 TRI6_EDGES = np.array([[0, 1], [1, 2], [2, 0]])
+QUAD_CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=float)
+HEX_CORNERS = np.vstack([np.column_stack([QUAD_CORNERS, np.full(4, z)]) for z in (-1.0, 1.0)])
+_TET_NODES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+_TET10_FACES = np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [0, 3, 2, 7, 9, 6]])
+_HEX_FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
+# Keast's five points; the Jacobian of a quadratic tetrahedron is cubic.
+_KEAST = np.vstack([np.full(3, 0.25), np.full((3, 3), 1 / 6) + np.eye(3) / 3, np.full(3, 1 / 6)])
 
 
 @dataclass(frozen=True)
@@ -43,7 +49,7 @@ class CellType:
     nodes: Array
     corners: int
     face_corners: int
-    faces: NDArray[np.int64]
+    faces: Indices
     turned: tuple[int, ...]
     shape: ShapeFunctions
     points: Array
@@ -90,10 +96,6 @@ def _evaluate_tensor_linear(x: Array, corners: Array) -> tuple[Array, Array]:
     return factors.prod(axis=2), gradients
 
 
-QUAD_CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=float)
-HEX_CORNERS = np.vstack([np.column_stack([QUAD_CORNERS, np.full(4, z)]) for z in (-1.0, 1.0)])
-
-
 def linear_quadrilateral(x: Array) -> tuple[Array, Array]:
     """Bilinear quadrilateral, 4 nodes."""
     return _evaluate_tensor_linear(x, QUAD_CORNERS)
@@ -103,12 +105,6 @@ def linear_hexahedron(x: Array) -> tuple[Array, Array]:
     """Trilinear hexahedron, 8 nodes."""
     return _evaluate_tensor_linear(x, HEX_CORNERS)
 
-
-_TET_NODES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-_TET10_FACES = np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [0, 3, 2, 7, 9, 6]])
-_HEX_FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
-# Keast's five points; the Jacobian of a quadratic tetrahedron is cubic.
-_KEAST = np.vstack([np.full(3, 0.25), np.full((3, 3), 1 / 6) + np.eye(3) / 3, np.full(3, 1 / 6)])
 
 CELLS: dict[str, CellType] = {
     cell.name: cell

@@ -1,4 +1,4 @@
-"""Volume meshes: points, cells, regions and named sets; made of arrays, or of other libraries' meshes.
+"""Volume meshes and their quality; a mesh is made of arrays, or of another library's mesh.
 
 Vocabulary
 ----------
@@ -18,21 +18,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Array, Indices, Mask
 from ..errors import ProblemError
-from .cells import CELLS, TET10_EDGES, TRI6_EDGES, CellType
+from .cells import CELLS, TET10_EDGES, TET_FACES, TRI6_EDGES, CellType
+
+_VTK_NAMES = {cell.vtk: cell.name for cell in CELLS.values()} | {
+    1: "", 2: "", 3: "", 4: "", 5: "", 6: "", 7: "", 8: "", 9: "", 21: "", 22: "", 23: "", 28: "",
+    11: "voxels", 13: "wedges", 14: "pyramids", 25: "quadratic hexahedra", 29: "quadratic hexahedra",
+}  # fmt: skip
+_MESHIO_NAMES = {cell.meshio: cell.name for cell in CELLS.values()} | dict.fromkeys(
+    ("vertex", "line", "line3", "triangle", "triangle6", "quad", "quad8", "quad9"), ""
+)
+_MESHIO_REGIONS = ("gmsh:physical", "medit:ref", "region")
 
 
 @dataclass(frozen=True, repr=False)
 class Mesh:
     """An immutable volume mesh; see the module docstring for the arrays."""
 
-    points: NDArray[np.float64]
-    cells: NDArray[np.int64]
+    points: Array
+    cells: Indices
     cell_type: str
-    regions: NDArray[np.int64]
+    regions: Indices
     region_names: tuple[str, ...]
-    node_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
-    face_sets: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    node_sets: Mapping[str, Indices] = field(default_factory=dict)
+    face_sets: Mapping[str, Indices] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.cell_type not in CELLS:
@@ -57,17 +67,17 @@ class Mesh:
         return CELLS[self.cell_type]
 
     @property
-    def corners(self) -> NDArray[np.int64]:
+    def corners(self) -> Indices:
         """Corner nodes of each cell: (m, 4) for tetrahedra, (m, 8) for hexahedra."""
         return self.cells[:, : self.kind.corners]
 
     @property
-    def held(self) -> NDArray[np.int64]:
+    def held(self) -> Indices:
         """Nodes (k,) that do not move: those of all sets whose names begin with ``fixed_``."""
         sets = [nodes for name, nodes in self.node_sets.items() if name.startswith("fixed_")]
         return np.unique(np.concatenate(sets)) if sets else np.empty(0, dtype=np.int64)
 
-    def with_points(self, points: NDArray[np.float64]) -> Mesh:
+    def with_points(self, points: Array) -> Mesh:
         return replace(self, points=points)
 
     @classmethod
@@ -129,14 +139,14 @@ class Mesh:
         names = {int(number): name for name, (number, dim) in mesh.field_data.items() if dim == 3}
         return cls.from_arrays(mesh.points, cells, tissues, names)
 
-    def nodes_where(self, where: Callable[[NDArray[np.float64]], NDArray[np.bool_]]) -> NDArray[np.int64]:
+    def nodes_where(self, where: Callable[[Array], Mask]) -> Indices:
         """Numbers (k,) of the nodes at which ``where(points)`` holds: ``lambda p: p[:, 2] < -19.9``."""
         found = np.flatnonzero(where(self.points))
         if not len(found):
             raise ProblemError("no node is there", remedy=f"the mesh spans {_format_extent(self.points)}")
         return found
 
-    def faces_where(self, where: Callable[[NDArray[np.float64]], NDArray[np.bool_]]) -> NDArray[np.int64]:
+    def faces_where(self, where: Callable[[Array], Mask]) -> Indices:
         """Outward boundary faces (k, 3, 6 or 4) at all of whose nodes ``where(points)`` holds."""
         faces = boundary_faces(self)
         found = faces[np.asarray(where(self.points))[faces].all(axis=1)]
@@ -147,17 +157,17 @@ class Mesh:
         return found
 
 
-def node_jacobians(mesh: Mesh) -> NDArray[np.float64]:
+def node_jacobians(mesh: Mesh) -> Array:
     """Jacobian determinant (m, k) of each cell at its own nodes, for unit reference cells, in mm3."""
     return _compute_determinants(mesh, mesh.kind.nodes) * mesh.kind.side**3
 
 
-def cell_volumes(mesh: Mesh) -> NDArray[np.float64]:
+def cell_volumes(mesh: Mesh) -> Array:
     """Volumes (m,) of the cells, curved edges included, in mm3."""
     return _compute_determinants(mesh, mesh.kind.points) @ mesh.kind.weights
 
 
-def _compute_determinants(mesh: Mesh, where: NDArray[np.float64]) -> NDArray[np.float64]:
+def _compute_determinants(mesh: Mesh, where: Array) -> Array:
     """det(dx/dxi) (m, q) at local coordinates (q, 3)."""
     _, gradients = mesh.kind.shape(where)
     return np.linalg.det(np.einsum("mki,qkj->mqij", mesh.points[mesh.cells], gradients))
@@ -182,7 +192,7 @@ def check(mesh: Mesh) -> None:
         raise ProblemError(f"{inverted} of {len(mesh.cells)} cells are inverted", remedy="mesh again, finer")
 
 
-def boundary_faces(mesh: Mesh) -> NDArray[np.int64]:
+def boundary_faces(mesh: Mesh) -> Indices:
     """Outward faces (k, 3, 6 or 4) that belong to one cell only.
 
     Raises
@@ -213,7 +223,7 @@ def to_tet10(mesh: Mesh) -> Mesh:
     keys, inverse = np.unique(ends[..., 0] * count + ends[..., 1], return_inverse=True)
     edges = np.stack(np.divmod(keys, count), axis=1)
 
-    def with_mid_nodes(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    def with_mid_nodes(faces: Indices) -> Indices:
         pairs = np.sort(faces[:, TRI6_EDGES], axis=2)
         middle = count + np.searchsorted(keys, pairs[..., 0] * count + pairs[..., 1])
         return np.hstack([faces, middle])
@@ -229,22 +239,12 @@ def to_tet10(mesh: Mesh) -> Mesh:
     )
 
 
-def _promote_set(nodes: NDArray[np.int64], boundary: NDArray[np.int64]) -> NDArray[np.int64]:
+def _promote_set(nodes: Indices, boundary: Indices) -> Indices:
     inside = np.isin(boundary[:, :3], nodes).all(axis=1)
     return np.union1d(nodes, boundary[inside, 3:].ravel()).astype(np.int64)
 
 
-_VTK_NAMES = {cell.vtk: cell.name for cell in CELLS.values()} | {
-    1: "", 2: "", 3: "", 4: "", 5: "", 6: "", 7: "", 8: "", 9: "", 21: "", 22: "", 23: "", 28: "",
-    11: "voxels", 13: "wedges", 14: "pyramids", 25: "quadratic hexahedra", 29: "quadratic hexahedra",
-}  # fmt: skip
-_MESHIO_NAMES = {cell.meshio: cell.name for cell in CELLS.values()} | dict.fromkeys(
-    ("vertex", "line", "line3", "triangle", "triangle6", "quad", "quad8", "quad9"), ""
-)
-_MESHIO_REGIONS = ("gmsh:physical", "medit:ref", "region")
-
-
-def _select_one_kind(blocks: Iterable[tuple[str, Any]]) -> tuple[str, NDArray[np.int64]]:
+def _select_one_kind(blocks: Iterable[tuple[str, Any]]) -> tuple[str, Indices]:
     """The one supported kind of volume cells among named blocks, and its cells; surfaces are named ``""``."""
     solid: dict[str, list[Any]] = {}
     for name, cells in blocks:
@@ -269,7 +269,7 @@ def _read_cell_array(data: Mapping[str, Any], name: str) -> Any:
 
 
 def _from_arrays(
-    points: NDArray[np.float64],
+    points: Array,
     cells: NDArray[Any],
     regions: ArrayLike | None,
     names: Mapping[int, str] | None,
@@ -295,7 +295,7 @@ def _from_arrays(
 
 def _read_tissues(
     regions: ArrayLike | None, count: int, names: Mapping[int, str]
-) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+) -> tuple[Indices, tuple[str, ...]]:
     """The number of each cell's tissue (m,) and the tissues, in the order of their names or numbers."""
     if regions is None:
         return np.zeros(count, dtype=np.int64), ("tissue",)
@@ -310,6 +310,61 @@ def _read_tissues(
     return numbers.astype(np.int64), tuple(names.get(int(k), f"region {int(k)}") for k in kinds)
 
 
-def _format_extent(points: NDArray[np.float64]) -> str:
+def _format_extent(points: Array) -> str:
     low, high = points.min(axis=0), points.max(axis=0)
     return ", ".join(f"{axis} {a:g} to {b:g} mm" for axis, a, b in zip("xyz", low, high))
+
+
+@dataclass(frozen=True)
+class MeshQuality:
+    """Element quality of a mesh; angles in degrees, volumes in mm3.
+
+    Dihedral angles are those of the straight tetrahedra (NaN for hexahedra); the scaled Jacobian is the
+    smallest determinant over an element's nodes divided by its mean, 1 for every straight tetrahedron.
+    """
+
+    min_dihedral_deg: float
+    dihedral_percentiles_deg: Mapping[str, float]
+    max_dihedral_deg: float
+    volume_mm3: float
+    region_volumes_mm3: Mapping[str, float]
+    min_cell_volume_mm3: float
+    min_scaled_jacobian: float
+    inverted: int
+
+
+def measure_quality(mesh: Mesh) -> MeshQuality:
+    """Quality of a mesh; ``inverted`` counts cells whose Jacobian is not positive at some node."""
+    size = cell_volumes(mesh)
+    jacobians = node_jacobians(mesh)
+    scaled = jacobians.min(axis=1) / np.abs(jacobians.mean(axis=1))
+    angles = (
+        compute_dihedral_angles(mesh.points, mesh.cells[:, :4])
+        if mesh.kind.is_tetrahedron
+        else np.full((1, 6), np.nan)
+    )
+    smallest = angles.min(axis=1)
+    marks = (0.1, 1, 5, 50)
+    return MeshQuality(
+        min_dihedral_deg=float(smallest.min()),
+        dihedral_percentiles_deg={f"{q:g}": float(np.percentile(smallest, q)) for q in marks},
+        max_dihedral_deg=float(angles.max()),
+        volume_mm3=float(size.sum()),
+        region_volumes_mm3={
+            name: float(size[mesh.regions == index].sum()) for index, name in enumerate(mesh.region_names)
+        },
+        min_cell_volume_mm3=float(size.min()),
+        min_scaled_jacobian=float(scaled.min()),
+        inverted=int((jacobians.min(axis=1) <= 0).sum()),
+    )
+
+
+def compute_dihedral_angles(points: Array, tets: Indices) -> Array:
+    """The six dihedral angles (m, 6) of straight tetrahedra (m, 4), in degrees."""
+    corners = points[tets]
+    faces = corners[:, TET_FACES]
+    normals = np.cross(faces[:, :, 1] - faces[:, :, 0], faces[:, :, 2] - faces[:, :, 0])
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    first, second = np.triu_indices(4, 1)
+    cosines = np.einsum("mij,mij->mi", normals[:, first], normals[:, second])
+    return np.degrees(np.arccos(np.clip(-cosines, -1.0, 1.0)))

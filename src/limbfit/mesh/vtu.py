@@ -15,9 +15,12 @@ from vtkmodules.vtkCommonCore import vtkObject, vtkPoints, vtkStringArray
 from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkFieldData, vtkUnstructuredGrid
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader, vtkXMLUnstructuredGridWriter
 
+from ..arrays import Indices
 from ..errors import ProblemError
 from .cells import CELLS
 from .volume import Mesh
+
+_NODE_SET, _FACE_SET = "node_set:", "face_set:"
 
 
 def write_vtu(
@@ -50,9 +53,6 @@ def write_vtu(
         names.InsertNextValue(name)
     grid.GetFieldData().AddArray(names)
     _write(grid, Path(path))
-
-
-_NODE_SET, _FACE_SET = "node_set:", "face_set:"
 
 
 def _set_masks(mesh: Mesh) -> dict[str, NDArray]:
@@ -144,7 +144,7 @@ def read_grid(path: Path) -> vtkUnstructuredGrid:
     return grid
 
 
-def _read_sets(grid: vtkUnstructuredGrid, prefix: str) -> dict[str, NDArray[np.int64]]:
+def _read_sets(grid: vtkUnstructuredGrid, prefix: str) -> dict[str, Indices]:
     data = grid.GetFieldData()
     names = [data.GetAbstractArray(i).GetName() for i in range(data.GetNumberOfArrays())]
     chosen = [name for name in names if name and name.startswith(prefix)]

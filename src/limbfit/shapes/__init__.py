@@ -8,14 +8,10 @@ from __future__ import annotations
 
 from ..errors import InputError
 from ..extensions import Registry
-from .cylinder import Cylinder
+from .builtin import Cylinder, Sphere, Square, Stl
 from .facets import Facets, revolved, steps
-from .revolution import Revolution
 from .rigid_surface import RigidSurface
-from .shape import SHARP_EDGE, Measure, Shape, Size
-from .sphere import Sphere
-from .square import Square
-from .stl import Stl
+from .shape import SHARP_EDGE, Measure, Revolution, Shape, Size
 
 OWN: tuple[type[Shape], ...] = (Square, Sphere, Cylinder, Stl)
 SHAPES: Registry[type[Shape]] = Registry("indenter shape", {shape.name: shape for shape in OWN})

@@ -6,11 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array
-
-Indices = NDArray[np.int64]
+from ..arrays import Array, Indices
 
 STEEPEST_DEG = 68.0  # of a face: the skin under a punch does not reach what is steeper
 FLAT, ARC, RINGS = 8, 4, 6  # divisions of half a face, of its rounding, and around the middle of a disk
@@ -40,7 +37,7 @@ def steps(steepest_deg: float = STEEPEST_DEG) -> Array:
 
 
 def build_quadrilaterals(number: Indices) -> Indices:
-    """Faces (f, 4) of a grid (k, l) of node numbers, counter-clockwise where the axes are."""
+    """Indices (f, 4) of a grid (k, l) of node numbers, counter-clockwise where the axes are."""
     corners = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
     return np.stack(corners, axis=-1).reshape(-1, 4)
 

@@ -11,14 +11,22 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Indices
 from ..errors import ProblemError
-from .closest_point import INSIDE, Tree, build_tree, closest_point, curvature, feature_normal
-from .triangles import check_triangles, compute_normal_spread, compute_triangle_normals, find_neighbours
+from .triangles import (
+    INSIDE,
+    Tree,
+    build_tree,
+    check_triangles,
+    closest_point,
+    compute_normal_spread,
+    compute_triangle_normals,
+    curvature,
+    feature_normal,
+    find_neighbours,
+)
 
-Faces = NDArray[np.int64]
 # Corners (m, 3, 3); unit normals (m, 3) of faces and (m, 3, 3) of their edges and corners; directions
 # (m, 3, 3) of the straight edge that a corner lies on (zero: a true corner); trees over all and front faces.
 Body = tuple[Array, Array, Array, Array, Array, Tree, Tree]
@@ -47,7 +55,7 @@ class RigidSurface:
     """
 
     points: Array
-    faces: Faces
+    faces: Indices
     _rounded: dict[float, tuple[float, Body]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -106,7 +114,7 @@ class RigidSurface:
         return moved if upright[solid].all() else None
 
 
-def _check_closed(faces: Faces) -> None:
+def _check_closed(faces: Indices) -> None:
     """Every edge belongs to two faces, that run along it in opposite directions."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     count = int(faces.max()) + 1
@@ -134,7 +142,7 @@ def _check_size(points: Array) -> None:
         )
 
 
-def _build_body(points: Array, faces: Faces) -> Body:
+def _build_body(points: Array, faces: Indices) -> Body:
     """The arrays of the kernels; pseudo-normals after Baerentzen and Aanaes (2005)."""
     corners = np.ascontiguousarray(points[faces])
     normals, areas = compute_triangle_normals(corners)

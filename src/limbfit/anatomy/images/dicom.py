@@ -7,21 +7,34 @@ their number in the order of names, and by name only where that holds nothing bu
 
 from __future__ import annotations
 
+import os
 import re
+import sys
 from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pydicom
+import SimpleITK as sitk  # noqa: N813
+from numpy.typing import NDArray
+from pydicom.uid import UID
+
+from ...arrays import Array
 from ...errors import ImageError
 from ..bounds import check_voxels
 from ..grid import Volume
-from .dicom_headers import SliceHeader, read_headers
-from .dicom_pixels import read_pixels
-from .dicom_stack import has_same_plane, stack_slices
+from .dicom_headers import SliceHeader, read_headers, silence_readers
 
 _PLAIN_WORDS = {"dcm", "dicom", "ima", "im", "img", "image", "i", "slice", "mr", "ct", "pt", "ser", "series"}
 _MAX_COUNT = 9999  # of files; a larger number may be that of a person
+_VOLUMES = ("MR", "CT", "PT")
+_PLACE_TOLERANCE = 0.02  # of the slice spacing
+_AXIS_TOLERANCE = 1e-4
+_FINEST_MM = 0.02
 
 
 @dataclass(frozen=True)
@@ -178,3 +191,218 @@ def _is_one_stack(series: list[Series]) -> bool:
 
 def _join_series(series: list[Series]) -> Series:
     return Series(series[0].uid, tuple(one.slices[0] for one in series))
+
+
+def stack_slices(slices: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Array, Array]:
+    """Slices in order along their normal, spacing (3,) mm and direction (3, 3) of their grid.
+
+    Raises
+    ------
+    ImageError
+        For images that are no slices, of different geometry, missing, doubled or tilted ones.
+    """
+    first = slices[0]
+    _check_kind(slices)
+    for other in slices:
+        if not has_same_plane(first, other):
+            raise ImageError(
+                "slices of one series differ in orientation, size or pixel spacing",
+                remedy="leave out scout images, or choose another series",
+            )
+    rows, columns = _compute_axes(first)
+    normal = np.cross(rows, columns)
+    heights = np.array([one.position @ normal for one in slices])  # type: ignore[operator]
+    ordered = [slices[n] for n in np.argsort(heights, kind="stable")]
+    spacing = _slice_spacing(ordered, normal)
+    assert first.pixel_spacing is not None
+    return (
+        ordered,
+        np.array([first.pixel_spacing[1], first.pixel_spacing[0], spacing]),
+        np.column_stack([rows, columns, normal]),
+    )
+
+
+def has_same_plane(a: SliceHeader, b: SliceHeader) -> bool:
+    return (
+        (a.rows, a.columns, a.modality) == (b.rows, b.columns, b.modality)
+        and _close(a.orientation, b.orientation)
+        and _close(a.pixel_spacing, b.pixel_spacing)
+    )
+
+
+def _close(a: Array | None, b: Array | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    return bool(np.abs(a - b).max() <= _AXIS_TOLERANCE)
+
+
+def _check_kind(slices: Sequence[SliceHeader]) -> None:
+    for one in slices:
+        if one.modality not in _VOLUMES:
+            raise ImageError(
+                f"images of modality {_redact_modality(one.modality)} are not slices of a volume",
+                remedy="give an MR or CT series",
+            )
+        if one.position is None or one.orientation is None or one.pixel_spacing is None:
+            raise ImageError(
+                "images do not say where they lie in the patient (position, orientation, pixel spacing)",
+                remedy="export the original series, not screen captures",
+            )
+        if np.any(one.pixel_spacing <= 0):
+            raise ImageError("the pixel spacing is not positive", remedy="export the original series again")
+        if np.any(one.pixel_spacing < _FINEST_MM):
+            raise ImageError(
+                f"a pixel spacing of {one.pixel_spacing.min():.3g} mm",
+                remedy="it must be in millimetres; export the original series again",
+            )
+        if not np.all(np.isfinite(one.rescale)) or one.rescale[0] == 0:
+            raise ImageError(
+                "a rescale slope or intercept that is no usable number", remedy="export the series again"
+            )
+        if one.samples != 1:
+            raise ImageError("colour images", remedy="give the original grey-value series")
+        if one.photometric == "MONOCHROME1":
+            raise ImageError("inverted grey values (MONOCHROME1)", remedy="export the series as MONOCHROME2")
+    if len(slices) < 3:
+        raise ImageError(
+            f"a volume needs at least three slices, this series has {len(slices)}",
+            remedy="give the folder that holds all slices",
+        )
+
+
+def _redact_modality(modality: str) -> str:
+    """The modality for a message: a code of DICOM, never free text that someone typed into the tag."""
+    is_code = 2 <= len(modality) <= 10 and modality.isascii() and modality.isupper() and modality.isalpha()
+    return modality if is_code and len(modality) <= 3 else "unknown"
+
+
+def _compute_axes(header: SliceHeader) -> tuple[Array, Array]:
+    assert header.orientation is not None
+    rows, columns = header.orientation[:3], header.orientation[3:]
+    lengths = np.linalg.norm(rows), np.linalg.norm(columns)
+    if abs(rows @ columns) > 1e-3 or max(abs(length - 1) for length in lengths) > 1e-3:
+        raise ImageError(
+            "the orientation of the slices is not a pair of perpendicular unit vectors",
+            remedy="export the original series again",
+        )
+    rows = rows / lengths[0]
+    columns = columns - (columns @ rows) * rows
+    return rows, columns / np.linalg.norm(columns)
+
+
+def _slice_spacing(slices: list[SliceHeader], normal: Array) -> float:
+    """The uniform distance between slices sorted along the normal."""
+    places = np.array([one.position for one in slices])
+    gaps = np.diff(places @ normal)
+    usual = float(np.median(gaps))
+    tolerance = _PLACE_TOLERANCE * max(usual, 0.1)
+    if usual <= tolerance or gaps.min() <= tolerance:
+        n = int(np.argmin(gaps)) + 1
+        raise ImageError(
+            "two slices lie at the same place",
+            place=f"slices {n} and {n + 1} of {len(slices)}",
+            remedy="leave only one echo, time point or copy in the folder, or choose another series",
+        )
+    worst = int(np.argmax(np.abs(gaps - usual)))
+    if abs(gaps[worst] - usual) > tolerance:
+        raise ImageError(
+            f"a gap of {gaps[worst]:.3g} mm where slices are {usual:.3g} mm apart: a slice is missing",
+            place=f"between slices {worst + 1} and {worst + 2} of {len(slices)}",
+            remedy="export the whole series again",
+        )
+    _check_stated(slices[0], usual)
+    _check_tilt(places, normal, usual)
+    return float(gaps.mean())
+
+
+def _check_stated(header: SliceHeader, usual: float) -> None:
+    """Every second slice missing leaves even gaps; only the header's own spacing tells."""
+    stated, thickness = header.stated_spacing, header.thickness
+    if stated and thickness and stated >= 0.999 * thickness and usual > 1.5 * stated:
+        raise ImageError(
+            f"slices lie {usual:.3g} mm apart but were taken {stated:.3g} mm apart: slices are missing",
+            remedy="export the whole series again",
+        )
+
+
+def _check_tilt(places: Array, normal: Array, usual: float) -> None:
+    steps = np.diff(places, axis=0)
+    sideways = np.linalg.norm(steps - np.outer(steps @ normal, normal), axis=1).max()
+    if sideways > _PLACE_TOLERANCE * max(usual, 0.1):
+        raise ImageError(
+            f"slices shift sideways by {sideways:.3g} mm from one to the next (gantry tilt)",
+            remedy="resample the series to a rectangular grid",
+        )
+
+
+def read_pixels(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
+    """``[k, j, i]`` rescaled grey values of slices in their order.
+
+    Raises
+    ------
+    ImageError
+        For pixels that are cut short, cannot be decoded or do not match the headers.
+    """
+    with silence_readers():
+        try:
+            array = _read_files(slices) if slices[0].frame is None else _read_frames(slices)
+        except ImageError:
+            raise
+        except Exception:  # its text may hold file names and tag values
+            raise _build_decoding_error({one.syntax for one in slices}) from None
+    if array.shape != (len(slices), slices[0].rows, slices[0].columns):
+        raise ImageError("the pixels do not match the headers", remedy="export the series again")
+    return array
+
+
+def _read_files(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
+    """GDCM applies each image's own slope and intercept."""
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames([str(one.path) for one in slices])
+    reader.SetOutputPixelType(sitk.sitkFloat32)
+    with mute_libraries():
+        return sitk.GetArrayFromImage(reader.Execute())
+
+
+@contextmanager
+def mute_libraries() -> Iterator[None]:
+    """Keep the C libraries below ITK from writing to the terminal, which they do past every setting."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = [(stream, os.dup(stream)) for stream in (1, 2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for stream, _ in kept:
+            os.dup2(nowhere, stream)
+        yield
+    finally:
+        for stream, copy in kept:
+            os.dup2(copy, stream)
+            os.close(copy)
+        os.close(nowhere)
+
+
+def _read_frames(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
+    files = {one.path: pydicom.dcmread(one.path).pixel_array for one in slices}
+    planes = []
+    for one in slices:
+        stored = files[one.path]
+        plane = stored if stored.ndim == 2 else stored[one.frame]
+        slope, intercept = one.rescale
+        planes.append(plane.astype(np.float32) * np.float32(slope) + np.float32(intercept))
+    return np.stack(planes)
+
+
+def _build_decoding_error(syntaxes: set[str]) -> ImageError:
+    """What is wrong with pixels that no decoder took."""
+    names = sorted(UID(text).name for text in syntaxes if _is_compressed(UID(text)))
+    if names:
+        return ImageError(
+            f"the pixels, compressed as {', '.join(names)}, cannot be decoded",
+            remedy="export the series again, uncompressed",
+        )
+    return ImageError("the pixels are cut short or cannot be decoded", remedy="export the series again")
+
+
+def _is_compressed(uid: UID) -> bool:
+    return uid.is_valid and not uid.is_private and uid.is_transfer_syntax and uid.is_compressed

@@ -18,17 +18,15 @@ from pathlib import Path
 
 import numpy as np
 from contourpy import contour_generator
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Mask
 from ...errors import LabelError
 from ..grid import SOFT_TISSUE, Grid, LabelMap, Volume
-from .naming import flatten, normalise_name
-
-Mask = NDArray[np.bool_]
+from .labelfiles import flatten, normalise_name
 
 COLUMNS = ("label", "slice", "contour", "x_mm", "y_mm", "z_mm")
 _OFF_SLICE = 0.1  # slices: farther off, a contour was not drawn on this image
+_FORMAT = "give the columns " + ",".join(COLUMNS)
 
 
 def rasterise_polygons(polygons: Sequence[Array], like: Grid) -> Mask:
@@ -158,9 +156,6 @@ def build_labels(contours: Mapping[str, Sequence[Array]], like: Grid, path: Path
     except LabelError as error:
         raise LabelError(error.what, file=path, remedy=error.remedy) from None
     return LabelMap(array, like.spacing, like.origin, like.direction, names)
-
-
-_FORMAT = "give the columns " + ",".join(COLUMNS)
 
 
 def _read_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:

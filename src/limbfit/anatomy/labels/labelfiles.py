@@ -8,8 +8,9 @@ Header fields: https://slicer.readthedocs.io/en/latest/developer_guide/modules/s
 from __future__ import annotations
 
 import json
+import re
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,10 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
 
+from ...arrays import Array, Mask
 from ...errors import ImageError, LabelError
 from ..bounds import check_packed
 from ..grid import DEFAULT_NAMES, LabelMap
-from .naming import flatten, normalise_name
 
 COLOURS: Mapping[str, tuple[float, float, float]] = {
     "soft tissue": (0.85, 0.55, 0.45),
@@ -132,9 +133,7 @@ def _read_sidecar_names(path: Path) -> dict[int, str]:
         ) from None
 
 
-def _read_nrrd_geometry(
-    header: Mapping[str, Any], path: Path
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _read_nrrd_geometry(header: Mapping[str, Any], path: Path) -> tuple[Array, Array, Array]:
     sign = _SPACES.get(str(header.get("space", "")).lower())
     if sign is None or "space directions" not in header or "space origin" not in header:
         raise LabelError(
@@ -165,3 +164,38 @@ def _read_segments(header: Mapping[str, Any], layers: NDArray[Any], path: Path) 
 def to_label_error(error: ImageError, path: Path) -> LabelError:
     """An image that cannot be read, said about a label map."""
     return LabelError(error.what, file=path, place=error.place, remedy=error.remedy)
+
+
+def normalise_name(name: str) -> str:
+    """Users of other programs write ``Soft Tissue`` or ``soft_tissue``; here it is lower case with spaces.
+
+    Names become names of files, so whatever is not a letter, a digit or one of ``().+-`` becomes a space.
+    """
+    words = re.sub(r"[^\w().+-]|_", " ", str(name).lower()).strip(" .").split()
+    return " ".join(words)[:40] or "unnamed"
+
+
+def flatten(masks: Sequence[Mask], names: Sequence[str]) -> tuple[NDArray[np.uint8], dict[int, str]]:
+    """Overlapping segments as one map: where two overlap the smaller wins, as a bone in a limb does.
+
+    Raises
+    ------
+    LabelError
+        For no segment, or two of one name.
+    """
+    if not names:
+        raise LabelError("the file names no segment", remedy="export it again with its segments")
+    if len(set(names)) < len(names):
+        raise LabelError("two segments have the same name", remedy="give them different names")
+    values = _label_values(names)
+    flat = np.zeros(masks[0].shape, dtype=np.uint8)
+    for n in sorted(range(len(masks)), key=lambda n: -int(masks[n].sum())):
+        flat[masks[n]] = values[n]
+    return flat, dict(zip(values, names))
+
+
+def _label_values(names: Sequence[str]) -> list[int]:
+    """The default value of a known name, free values for others."""
+    default = {name: value for value, name in DEFAULT_NAMES.items()}
+    free = iter(range(len(default) + 1, 256))
+    return [default[name] if name in default else next(free) for name in names]

@@ -6,16 +6,13 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 from scipy.ndimage import label as connected
 
-from ...arrays import Array
-from ..ends import find_longest_axis
+from ...arrays import Array, Mask
+from ..frame import find_longest_axis
 from ..grid import SOFT_TISSUE, LabelMap
 from ..morphology import find_box
-
-Mask = NDArray[np.bool_]
 
 LIMB = "limb"
 _OUTLIER = 6.0  # robust standard deviations (1.4826 times the median absolute deviation)
@@ -112,9 +109,7 @@ def _compute_centroids(mask: Mask, spacing: Array) -> Array:
     return np.column_stack([x, y])
 
 
-def _find_outlying_slices(
-    name: str, area: Array, centre: Array, inner: NDArray[np.bool_]
-) -> list[SliceWarning]:
+def _find_outlying_slices(name: str, area: Array, centre: Array, inner: Mask) -> list[SliceWarning]:
     """Slices off the mean of the slice before and the slice after."""
     expected = (area[:-2] + area[2:]) / 2
     off = np.pad((area[1:-1] - expected) / expected, 1)
@@ -127,7 +122,7 @@ def _find_outlying_slices(
     return found
 
 
-def _find_area_jumps(name: str, area: Array, inner: NDArray[np.bool_]) -> list[SliceWarning]:
+def _find_area_jumps(name: str, area: Array, inner: Mask) -> list[SliceWarning]:
     """Slices at which the area changes for good."""
     change = np.pad(np.diff(area) / np.maximum(area[1:], area[:-1]), (1, 0))
     limit = max(_JUMP, _OUTLIER * _spread(change[inner]))
@@ -142,7 +137,7 @@ def _spread(values: Array) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
 
 
-def _find_peaks(values: Array, limit: float, inner: NDArray[np.bool_]) -> list[int]:
+def _find_peaks(values: Array, limit: float, inner: Mask) -> list[int]:
     """Where values pass the limit and are the largest of their neighbours'."""
     padded = np.pad(values, 1)
     highest = (values >= padded[:-2]) & (values >= padded[2:])

@@ -13,11 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Indices, Mask
 
-Ints = NDArray[np.int64]
 Field = Callable[[Array], tuple[Array, Array]]
 
 PLANE, LAYER, BONE, REGION = 1, 2, 4, 8  # of regions the first's; each further one's is twice as large
@@ -40,12 +38,12 @@ class TetGrid:
     """
 
     points: Array
-    tets: Ints
-    mask: Ints
+    tets: Indices
+    mask: Indices
     spacing: float
-    regions: Ints
+    regions: Indices
 
-    def kept(self, keep: NDArray[np.bool_]) -> TetGrid:
+    def kept(self, keep: Mask) -> TetGrid:
         """The grid of the chosen tetrahedra with its unused points dropped."""
         used, tets = np.unique(self.tets[keep], return_inverse=True)
         tets = tets.reshape(-1, 4)
@@ -66,7 +64,7 @@ def build_box_grid(low: Array, high: Array, spacing: float) -> TetGrid:
     return TetGrid(points, tets, mask, spacing, np.zeros(len(tets), dtype=np.int64))
 
 
-def refine_grid(grid: TetGrid, near: Callable[[Array], NDArray[np.bool_]], spacing: float) -> TetGrid:
+def refine_grid(grid: TetGrid, near: Callable[[Array], Mask], spacing: float) -> TetGrid:
     """The grid of a box halved, again and again, where ``near`` says so of its edges' middles.
 
     Halving the cubes' diagonals, their faces' and their edges in turn gives eight tetrahedra like the first
@@ -84,7 +82,7 @@ def refine_grid(grid: TetGrid, near: Callable[[Array], NDArray[np.bool_]], spaci
     return grid
 
 
-def compute_volumes(points: Array, tets: Ints) -> Array:
+def compute_volumes(points: Array, tets: Indices) -> Array:
     """Signed volumes (m,) of tetrahedra."""
     a, b, c, d = (points[tets[:, i]] for i in range(4))
     return np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6.0
@@ -92,7 +90,7 @@ def compute_volumes(points: Array, tets: Ints) -> Array:
 
 def cut(
     grid: TetGrid, field: Field, bit: int, slack: float = 0.0, region: int | None = None
-) -> tuple[TetGrid, NDArray[np.bool_]]:
+) -> tuple[TetGrid, Mask]:
     """Cut a grid along ``field = 0``.
 
     Parameters
@@ -121,7 +119,7 @@ def cut(
     return grid, values[grid.tets].sum(axis=1) > 0
 
 
-def _divide_edges(grid: TetGrid, edges: Ints, t: Array, bit: int) -> TetGrid:
+def _divide_edges(grid: TetGrid, edges: Indices, t: Array, bit: int) -> TetGrid:
     """The grid with edges (k, 2), sorted, divided at ``t`` (k,); the fresh points receive a mask bit too."""
     a, b = edges.T
     fresh = grid.points[a] + t[:, None] * (grid.points[b] - grid.points[a])
@@ -150,19 +148,19 @@ def compute_in_band(field: Field, points: Array, band: float, spacing: float, sl
     return values
 
 
-def _find_crossed_edges(tets: Ints, values: Array) -> Ints:
+def _find_crossed_edges(tets: Indices, values: Array) -> Indices:
     """Unique edges (k, 2), smaller node first and sorted, whose ends differ strictly in sign."""
     ends = np.sort(tets[:, TET_EDGES].reshape(-1, 2), axis=1)
     return _select_unique_edges(ends[values[ends[:, 0]] * values[ends[:, 1]] < 0], len(values))
 
 
-def _select_unique_edges(edges: Ints, count: int) -> Ints:
+def _select_unique_edges(edges: Indices, count: int) -> Indices:
     """Each of some edges (k, 2) between ``count`` points once, sorted."""
     keys = np.unique(edges[:, 0] * count + edges[:, 1])
     return np.stack(np.divmod(keys, max(count, 1)), axis=1)
 
 
-def _find_roots(points: Array, edges: Ints, values: Array, field: Field) -> Array:
+def _find_roots(points: Array, edges: Indices, values: Array, field: Field) -> Array:
     """Where (k,) the field is zero on each edge, from 0 at its first node to 1; regula falsi (Illinois)."""
     a, b = points[edges[:, 0]], points[edges[:, 1]]
     low, high = np.zeros(len(edges)), np.ones(len(edges))
@@ -182,7 +180,7 @@ def _find_roots(points: Array, edges: Ints, values: Array, field: Field) -> Arra
     return low + (high - low) * f_low / (f_low - f_high)
 
 
-def _snap_vertices(grid: TetGrid, edges: Ints, t: Array, bit: int) -> tuple[TetGrid, NDArray[np.bool_]]:
+def _snap_vertices(grid: TetGrid, edges: Indices, t: Array, bit: int) -> tuple[TetGrid, Mask]:
     """Move vertices that almost touch the level set onto it, along edges that keep them on their surfaces."""
     near, far = np.vstack([edges, edges[:, ::-1]]).T
     t = np.concatenate([t, 1.0 - t])
@@ -199,7 +197,7 @@ def _snap_vertices(grid: TetGrid, edges: Ints, t: Array, bit: int) -> tuple[TetG
     return replace(grid, points=np.where(moved[:, None], target, grid.points)), moved
 
 
-def _select_sound_moves(grid: TetGrid, target: Array, moved: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _select_sound_moves(grid: TetGrid, target: Array, moved: Mask) -> Mask:
     """The moves that can be made together without flattening a tetrahedron."""
     before = compute_volumes(grid.points, grid.tets)
     floor = np.minimum(SMALLEST_VOLUME * before.max(), 0.2 * before)
@@ -214,7 +212,7 @@ def _select_sound_moves(grid: TetGrid, target: Array, moved: NDArray[np.bool_]) 
     return moved
 
 
-def _bisect_tetrahedra(tets: Ints, edges: Ints, offset: int) -> tuple[Ints, Ints]:
+def _bisect_tetrahedra(tets: Indices, edges: Indices, offset: int) -> tuple[Indices, Indices]:
     """Bisect tetrahedra at their crossed ``edges``, the first in order first; edge i gets node offset + i.
 
     Also the number of the tetrahedron that each came from.
@@ -233,7 +231,7 @@ def _bisect_tetrahedra(tets: Ints, edges: Ints, offset: int) -> tuple[Ints, Ints
     return np.vstack(done), np.concatenate(origin)
 
 
-def _find_first_crossed(tets: Ints, edges: Ints, offset: int) -> Ints:
+def _find_first_crossed(tets: Indices, edges: Indices, offset: int) -> Indices:
     """Index (m,) of the first crossed edge of each tetrahedron; ``len(edges)`` where there is none."""
     if not len(edges):
         return np.zeros(len(tets), dtype=np.int64)

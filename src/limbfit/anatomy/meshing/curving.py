@@ -1,21 +1,31 @@
-"""Mid-edge nodes of quadratic tetrahedra put on the smooth surfaces where the elements stay sound."""
+"""Mid-edge nodes of quadratic tetrahedra put on the smooth surfaces where the elements stay sound.
+
+Faces on bone lie on it in the mean, where they are too coarse to follow it. A bone bulges: coarse faces with
+their nodes on it cut into it, also curved ones where elements do not allow their mid-edge nodes as far out.
+Tissue over the bone is then too thick, and a site too soft (by 5 % at 11 mm over a rod of 8 mm). So their
+nodes are moved off the bone by what the faces around them lack.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Indices
 from ...mesh import TET10_EDGES, Mesh, node_jacobians
-from .columns import Columns
-
-Ints = NDArray[np.int64]
+from ...mesh.cells import quadratic_simplex
+from .extrusion import Columns, find_bone_faces, find_inner_faces
+from .layers import Level, LimbFields
+from .projection import project_to_level
+from .regions import build_region_level, find_interfaces
 
 SMALLEST_JACOBIAN = 0.3  # of the straight element's, at every node
 BISECTIONS = 5
+ROUNDS = 4
+SPLITS = 4  # of each edge of a face: so many squared places tell where it lies
 
 
 def curve_mesh(mesh: Mesh, target: Array, straight: Array) -> Mesh:
@@ -33,6 +43,34 @@ def curve_mesh(mesh: Mesh, target: Array, straight: Array) -> Mesh:
             return moved
         share[nodes] = share[nodes] / 2 if attempt < BISECTIONS - 1 else 0.0
     raise AssertionError("each pass straightens more")
+
+
+def compute_curved_target(mesh: Mesh, fields: LimbFields) -> Array:
+    """Where the mid-edge nodes of skin, layers' inner face, bone and regions would lie on smooth surfaces."""
+    target = mesh.points.copy()
+    free = np.where(mesh.points[:, 2] == 0.0, 0.0, 1.0)
+    for nodes, level in _smooth_mid_nodes(mesh, fields):
+        target[nodes] = project_to_level(level, target[nodes], free[nodes])
+    return target
+
+
+def _smooth_mid_nodes(mesh: Mesh, fields: LimbFields) -> list[tuple[Indices, Callable[[Array], Level]]]:
+    corners, layers = mesh.cells[:, :4].max() + 1, len(fields.depths)
+    regions = [
+        (_find_mid_nodes(found, corners), build_region_level(fields, number))
+        for number, found in enumerate(find_interfaces(mesh, layers))
+    ]
+    return [
+        *regions,
+        (_find_mid_nodes(mesh.face_sets["skin"], corners), fields.depth),
+        (_find_mid_nodes(find_inner_faces(mesh, layers - 1), corners), fields.layer),
+        (_find_mid_nodes(find_bone_faces(mesh), corners), fields.void),
+    ]
+
+
+def _find_mid_nodes(faces: Indices, corners: int) -> Indices:
+    nodes = np.unique(faces)
+    return nodes[nodes >= corners]
 
 
 def curve_diagonals(mesh: Mesh, target: Array, stack: Columns) -> Array:
@@ -75,7 +113,55 @@ def curve_diagonals(mesh: Mesh, target: Array, stack: Columns) -> Array:
     return target
 
 
-def _number_edges(ends: Ints, count: int) -> Ints:
+def _number_edges(ends: Indices, count: int) -> Indices:
     """One number (n,) for each edge (n, 2) between ``count`` nodes."""
     low, high = np.sort(ends, axis=1).T
     return np.asarray(low * count + high)
+
+
+def balance_bone_faces(mesh: Mesh, fields: LimbFields, straight: Array) -> Mesh:
+    """A tet10 mesh in the limb frame whose bone faces lie on the bone in the mean, as far as elements allow.
+
+    No node comes nearer to the layers than bone may. ``straight`` (m,) is the least Jacobian of each
+    straight-sided element, which keeps a share of it.
+    """
+    faces = find_bone_faces(mesh)
+    if not len(faces):
+        return mesh
+    nodes = np.unique(faces)
+    in_plane = mesh.points[nodes, 2] == 0.0
+    shapes = _compute_shape_functions()
+    for _ in range(ROUNDS):
+        corners = mesh.points[faces[:, :3]]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        places = np.einsum("qk,fki->fqi", shapes, mesh.points[faces])
+        level, _ = fields.void(places.reshape(-1, 3))
+        lack = -level.reshape(places.shape[:2]).mean(axis=1)
+        total, away = (
+            np.bincount(faces.ravel(), np.repeat(of_faces, faces.shape[1]))
+            for of_faces in (area, area * lack)
+        )
+        _, slope = fields.void(mesh.points[nodes])
+        room = np.maximum(fields.layer(mesh.points[nodes])[0] - fields.bone_clearance_mm, 0.0)
+        moves = np.zeros_like(mesh.points)
+        moves[nodes] = np.minimum(away[nodes] / total[nodes], room)[:, None] * slope
+        moves[nodes[in_plane], 2] = 0.0
+        mesh = curve_mesh(mesh, mesh.points + _move_mid_nodes(mesh, moves, nodes), straight)
+    return mesh
+
+
+def _move_mid_nodes(mesh: Mesh, moves: Array, stated: Indices) -> Array:
+    """Moves (n, 3) in which mid-edge nodes other than those ``stated`` go with the ends of their edges."""
+    found = moves.copy()
+    middles, ends = mesh.cells[:, 4:].ravel(), mesh.cells[:, TET10_EDGES].reshape(-1, 2)
+    found[middles] = moves[ends].mean(axis=1)
+    found[stated] = moves[stated]
+    return found
+
+
+def _compute_shape_functions() -> Array:
+    """Shape functions (q, 6) of a quadratic triangle at the middles of equal parts of it."""
+    i, j = (axis.ravel() for axis in np.meshgrid(range(SPLITS), range(SPLITS), indexing="ij"))
+    whole = np.column_stack([i, j])
+    upright, turned = whole[i + j < SPLITS] + 1 / 3, whole[i + j < SPLITS - 1] + 2 / 3
+    return quadratic_simplex(np.concatenate([upright, turned]) / SPLITS)[0]

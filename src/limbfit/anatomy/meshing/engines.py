@@ -16,12 +16,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, Indices
 from ...errors import MeshingError
 
-MMG_WORKER = Path(__file__).with_name("_mmg_worker.py")
-NETGEN_WORKER = Path(__file__).with_name("_netgen_worker.py")
+_WORKER = Path(__file__).with_name("_worker.py")
 
 
 class MesherError(MeshingError):
@@ -29,38 +28,36 @@ class MesherError(MeshingError):
 
 
 @dataclass(frozen=True)
-class VolumeTask:
-    """A tetrahedral mesh to be adapted to a size.
+class VolumeMesh:
+    """Tetrahedra in regions, and the triangles of their surfaces: what an engine returns.
 
     Attributes
     ----------
     points, tets : (n, 3) mm and (m, 4).
-    regions : (m,) the region of each tetrahedron; faces between two are kept.
+    regions : (m,) the region of each tetrahedron.
     triangles, triangle_refs : boundary triangles (k, 3), outward, and those between regions, and the surface
         (k,) that each lies on.
-    size : (n,) wanted edge length at the points, mm.
-    hausdorff_mm : how far the new surface may stray from the old one.
     """
 
-    points: NDArray[np.float64]
-    tets: NDArray[np.int64]
-    regions: NDArray[np.int64]
-    triangles: NDArray[np.int64]
-    triangle_refs: NDArray[np.int64]
-    size: NDArray[np.float64]
-    hausdorff_mm: float
+    points: Array
+    tets: Indices
+    regions: Indices
+    triangles: Indices
+    triangle_refs: Indices
 
 
 @dataclass(frozen=True)
-class VolumeMesh:
-    """What an engine returns: points (n, 3), tets (m, 4) and their regions (m,), triangles (k, 3) and their
-    surfaces (k,)."""
+class VolumeTask(VolumeMesh):
+    """A tetrahedral mesh to be adapted to a size; faces between two regions are kept.
 
-    points: NDArray[np.float64]
-    tets: NDArray[np.int64]
-    regions: NDArray[np.int64]
-    triangles: NDArray[np.int64]
-    triangle_refs: NDArray[np.int64]
+    Attributes
+    ----------
+    size : (n,) requested edge length at the points, mm.
+    hausdorff_mm : how far the new surface may stray from the old one.
+    """
+
+    size: Array
+    hausdorff_mm: float
 
 
 def run_mmg(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
@@ -71,7 +68,7 @@ def run_mmg(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
     MesherError
         When MMG crashes, gives nothing or exceeds the time limit.
     """
-    return _run_in_worker(MMG_WORKER, "MMG", task, time_limit_s)
+    return _run_engine("MMG", task, time_limit_s)
 
 
 def run_netgen(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
@@ -90,16 +87,16 @@ def run_netgen(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
             "the mesher Netgen is not installed; install it with  pip install 'limbfit[netgen]'  "
             'or choose mesh.engine = "mmg"'
         )
-    return _run_in_worker(NETGEN_WORKER, "Netgen", task, time_limit_s)
+    return _run_engine("Netgen", task, time_limit_s)
 
 
-def _run_in_worker(worker: Path, name: str, task: VolumeTask, time_limit_s: float) -> VolumeMesh:
+def _run_engine(engine: str, task: VolumeTask, time_limit_s: float) -> VolumeMesh:
     with tempfile.TemporaryDirectory(prefix="limbfit-mesh-") as folder:
         source, target = Path(folder, "task.npz"), Path(folder, "mesh.npz")
         np.savez(source, **{name: getattr(task, name) for name in task.__dataclass_fields__})
-        run_worker([sys.executable, str(worker), str(source), str(target)], time_limit_s)
+        run_worker([sys.executable, str(_WORKER), engine.lower(), str(source), str(target)], time_limit_s)
         if not target.is_file():
-            raise MesherError(f"the mesher {name} gave no mesh; choose larger edges or thicker layers")
+            raise MesherError(f"the mesher {engine} gave no mesh; choose larger edges or thicker layers")
         with np.load(target) as stored:
             return VolumeMesh(**{name: stored[name] for name in VolumeMesh.__dataclass_fields__})
 

@@ -21,9 +21,8 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Indices
 from ...errors import SurfaceError
 from ..frame import Frame, build_limb_frame
 from ..surfaces.surfaces import Anatomy
@@ -270,7 +269,7 @@ def prolong_surface(surface: Surface) -> Surface:
     return Surface(points, np.vstack([body.faces[~cap], top[body.faces[cap]], walls]))
 
 
-def _find_rim(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+def _find_rim(faces: Indices) -> Indices:
     """Directed edges (k, 2) of a patch of faces that no other face of the patch shares."""
     edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     _, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)

@@ -9,7 +9,7 @@ The recipe
 3. Nodes of layer, bones and regions are put on their smooth surfaces; the skin layer is extruded from the
    interface to the skin, each node to its nearest skin point: its thickness is uniform by construction.
 4. Quadratic elements: promoted straight-sided, then curved to the smooth surfaces where they stay sound;
-   faces that are too coarse to follow a bone are put on it in the mean (`balancing`).
+   faces that are too coarse to follow a bone are put on it in the mean (`curving`).
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
-from ...arrays import Array
+from ...arrays import Array, Mask
 from ...errors import MeshingError, ProblemError
 from ...mesh import Mesh, boundary_faces, check, node_jacobians, to_tet10
 from ..surfaces.surfaces import Anatomy
 from . import background
 from .background import BONE, LAYER, PLANE, REGION, TetGrid, compute_volumes
-from .balancing import balance_bone_faces
-from .curving import curve_diagonals, curve_mesh
+from .curving import balance_bone_faces, compute_curved_target, curve_diagonals, curve_mesh
 from .engines import ENGINES, MesherError, VolumeMesh, VolumeTask
-from .layered import build_core_mesh, compute_curved_target, extrude_layers
-from .layers import BonePolicy, LayerSpec, LimbFields, TrimmedBone, build_limb_fields
+from .extrusion import build_core_mesh, extrude_layers
+from .layers import BonePolicy, LayerSpec, LimbFields, TrimmedBone, build_limb_fields, compute_signed_distance
 from .meshreport import GOOD_DIHEDRAL_DEG, MeshReport, compute_enclosed_volume, mesh_report
 from .projection import project_safely, project_to_level
 from .regions import (
@@ -46,7 +46,6 @@ from .regions import (
     refine_at_regions,
 )
 from .smoothing import smooth_elements
-from .thinbones import refine_at_bones
 from .untangling import (
     describe_narrowest_gap,
     describe_unrepaired,
@@ -55,8 +54,6 @@ from .untangling import (
     untangle_cells,
 )
 
-Ints = NDArray[np.int64]
-
 SURFACES = (PLANE, LAYER, BONE)
 HAUSDORFF_RADIUS_MM = 250.0  # MMG takes edges of sqrt(9/2 hausdorff R) on a surface of radius R
 LAYER_RATIO = 5.0  # greatest edge over thickness of the skin layer: about 13 degrees in an even prism
@@ -64,6 +61,9 @@ SHEET_RATIO = 3.0  # greatest edge over thickness where muscle is a thin sheet o
 REGION_RATIO = 0.6  # greatest edge over thickness in a region inside the core
 STRAY = 0.5  # of the layers' thickness: a node of their inner face so far outside it is put back
 NEAR_RADII = 2.0  # of the fine zone: within them elements have to be good
+PROBE = 1.4  # of the spacing: how far below a bone's surface the depth is measured
+FLANK = 0.4  # of that way: a lesser depth is that below the bone's far side; with PROBE, bone thinner than 2
+MAX_HALVINGS = 2  # of the grid: tips and edges of a bone are thin at every spacing
 DEPTH_RATIO = 1.5  # the fine zone is an ellipsoid, shallower than wide by this ratio
 
 
@@ -154,6 +154,37 @@ def build_base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Arra
     limit = size_limit(fields, grid, settings)
     enclosed = compute_enclosed_volume(anatomy, fields, trimmed)
     return BaseMesh(fields, grid, limit, trimmed, enclosed, compute_region_volumes(fields))
+
+
+def refine_at_bones(grid: TetGrid, fields: LimbFields) -> TetGrid:
+    """A box's grid, halved about bone that is thinner than two of its cells.
+
+    A grid is cut only where an edge has one end in a bone and one outside. Of a round bone as thin as its
+    spacing that keeps a quarter, in beads; of one twice as thick nine tenths.
+    """
+    for halving in range(MAX_HALVINGS):
+        spacing = grid.spacing / 2**halving
+        thin = find_thin_bone(fields, spacing)
+        if not len(thin):
+            break
+        grid = background.refine_grid(
+            grid, partial(_has_neighbour, KDTree(thin), background.LONGEST_EDGE * spacing), 0.5 * spacing
+        )
+    return grid
+
+
+def find_thin_bone(fields: LimbFields, spacing: float) -> Array:
+    """Vertices (k, 3) of bones, in the limb frame, where they are thinner than about two spacings (mm)."""
+    found = [np.zeros((0, 3))]
+    for bone in fields.bones.values():
+        depth = -compute_signed_distance(bone, bone.points - PROBE * spacing * bone.vertex_normals)[0]
+        below = bone.points[:, 2] < 0.0
+        found.append(bone.points[below & (depth < FLANK * PROBE * spacing)])
+    return np.vstack(found)
+
+
+def _has_neighbour(places: KDTree, distance_mm: float, points: Array) -> Mask:
+    return np.isfinite(places.query(points, distance_upper_bound=distance_mm)[0])
 
 
 def mesh_site(
@@ -351,7 +382,7 @@ def _recover_interface(points: Array, target: Array, core: VolumeMesh, fields: L
     return moved if (compute_volumes(moved, core.tets) > 0.0).all() else points
 
 
-def _find_nodes_on(core: VolumeMesh, surface: int) -> NDArray[np.bool_]:
+def _find_nodes_on(core: VolumeMesh, surface: int) -> Mask:
     chosen = np.zeros(len(core.points), dtype=bool)
     chosen[core.triangles[core.triangle_refs == surface]] = True
     return chosen

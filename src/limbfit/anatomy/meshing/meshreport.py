@@ -7,21 +7,20 @@ from dataclasses import dataclass, field
 
 import igl
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Indices
 from ...mesh import Mesh, MeshQuality, compute_dihedral_angles, measure_quality
 from ..surfaces.surfaces import Anatomy, Surface
-from .layered import find_inner_faces
+from .extrusion import find_bone_faces, find_inner_faces
 from .layers import LimbFields, ThinnedSkin, TrimmedBone
 from .regions import build_region_level, find_interfaces
-from .thinbones import warn_of_lost_bone
 from .untangling import Repair
-
-Ints = NDArray[np.int64]
 
 # Smallest angle near the indenter, and anywhere: far off, layers are thin beside the edges and strain little.
 GOOD_DIHEDRAL_DEG, SOUND_DIHEDRAL_DEG = 8.0, 3.0
+LOST_MM = 4.0  # bone that the mesh misses by more than that on a tenth of its surface is lost in part
+TRIMMED_MM = 0.5  # from the bone as trimmed: surface that was not left out on purpose
+SEEN_RADII = 1.5  # of the zone whose elements have to be good: bone that bears an indentation
 GOOD_VOLUME = 0.02  # long edges far from the indenter cut across a round limb by up to a hundredth
 
 
@@ -147,7 +146,40 @@ def mesh_warnings(
     return tuple(warnings)
 
 
-def _measure_thickness(mesh: Mesh, inner: Ints, outer: Ints) -> Array:
+def warn_of_lost_bone(mesh: Mesh, fields: LimbFields, near: tuple[Array, float] | None) -> tuple[str, ...]:
+    """Which bones about a site a mesh in the limb frame lacks in part; ``near``: the place (3,) and radius
+    (mm) within which elements have to be good, None for all of the limb."""
+    bones = {
+        name: places
+        for name, bone in fields.bones.items()
+        if len(places := _select_kept_vertices(fields, bone.points, near))
+    }
+    if not bones:
+        return ()
+    faces = find_bone_faces(mesh)[:, :3]
+    warnings = []
+    for name, places in bones.items():
+        squared = igl.point_mesh_squared_distance(places, mesh.points, faces)[0] if len(faces) else np.inf
+        off = float(np.quantile(np.sqrt(squared), 0.9))
+        if off > LOST_MM:
+            warnings.append(
+                f"the mesh loses part of the {name}: a tenth of its surface is off by {off:.0f} mm or more; "
+                "choose a smaller mesh.edge_far_mm"
+            )
+    return tuple(warnings)
+
+
+def _select_kept_vertices(fields: LimbFields, points: Array, near: tuple[Array, float] | None) -> Array:
+    """Of a bone's vertices (n, 3) those below the cut that were not trimmed, near the site."""
+    chosen = points[:, 2] < -LOST_MM
+    if near is not None:
+        place, radius = near
+        chosen &= np.linalg.norm(points - place, axis=1) < SEEN_RADII * radius
+    points = points[chosen]
+    return points[np.abs(fields.void(points)[0]) < TRIMMED_MM] if len(points) else points
+
+
+def _measure_thickness(mesh: Mesh, inner: Indices, outer: Indices) -> Array:
     """Distance (n,) from the middles of inner facets to the surface of outer ones, mm."""
     squared = igl.point_mesh_squared_distance(mesh.points[inner].mean(axis=1), mesh.points, outer)[0]
     return np.asarray(np.sqrt(squared))
@@ -158,7 +190,7 @@ def _summarise(values: Array) -> dict[str, float]:
     return {name: float(value) for name, value in parts.items()}
 
 
-def _split_into_facets(faces: Ints) -> Ints:
+def _split_into_facets(faces: Indices) -> Indices:
     """Flat triangles of 3-node faces (themselves) or 6-node faces (four each)."""
     if faces.shape[1] == 3:
         return faces

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Indices
 from ...mesh import compute_dihedral_angles
 from .background import compute_volumes
 
-Ints = NDArray[np.int64]
 Field = Callable[[Array], tuple[Array, Array]]
 
 NEWTON_STEPS = 4
@@ -32,7 +30,7 @@ def project_to_level(field: Field, points: Array, z_freedom: Array) -> Array:
     return points
 
 
-def project_safely(points: Array, target: Array, tets: Ints, floor_deg: float) -> Array:
+def project_safely(points: Array, target: Array, tets: Indices, floor_deg: float) -> Array:
     """Points moved towards ``target`` as far as no dihedral angle falls below the floor or sinks under it."""
     share = np.ones(len(points))
     before = np.minimum(compute_dihedral_angles(points, tets).min(axis=1), floor_deg)

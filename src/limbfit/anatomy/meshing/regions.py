@@ -15,16 +15,13 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Indices, Mask
 from ...errors import SurfaceError
 from ...mesh import Mesh, boundary_faces
 from ..surfaces.triangles import Surface
 from .background import LONGEST_EDGE, REGION, Field, TetGrid, cut, refine_grid
 from .layers import Level, LimbFields, compute_box_distance, compute_signed_distance, sample_box
-
-Ints = NDArray[np.int64]
 
 FAR_MM = 15.0  # of a region's box: a bound of the distance does there
 GENTLEST = 0.2  # slope of a region's level, below which it does not tell a distance
@@ -118,7 +115,7 @@ def refine_at_regions(grid: TetGrid, fields: LimbFields) -> TetGrid:
     return grid
 
 
-def _is_near(surface: Surface, distance_mm: float, points: Array) -> NDArray[np.bool_]:
+def _is_near(surface: Surface, distance_mm: float, points: Array) -> Mask:
     """Which points (n,) lie inside a closed surface, or no farther outside than so."""
     found = compute_box_distance(surface, points) < distance_mm
     found[found] = compute_signed_distance(surface, points[found])[0] < distance_mm
@@ -161,22 +158,22 @@ def compute_region_volumes(fields: LimbFields) -> dict[str, float]:
     return found
 
 
-def mesh_numbers(regions: Ints, layers: int, count: int) -> Ints:
+def mesh_numbers(regions: Indices, layers: int, count: int) -> Indices:
     """Numbers (m,) in a mesh, whose core comes last, of the ``regions`` (m,) of a grid, whose core is 0."""
     return np.where(regions == 0, layers + count, layers + regions - 1)
 
 
-def find_interfaces(mesh: Mesh, layers: int) -> list[Ints]:
+def find_interfaces(mesh: Mesh, layers: int) -> list[Indices]:
     """Outward faces (k, 3 or 6) of each region after a mesh's layers to what comes after it, to the core."""
     return [_find_interface(mesh, number) for number in range(layers, len(mesh.region_names) - 1)]
 
 
-def _find_interface(mesh: Mesh, number: int) -> Ints:
+def _find_interface(mesh: Mesh, number: int) -> Indices:
     sides = [_find_outward_faces(mesh, chosen) for chosen in (mesh.regions == number, mesh.regions > number)]
     return sides[0][find_same_faces(sides[0][:, :3], sides[1][:, :3], len(mesh.points))]
 
 
-def _find_outward_faces(mesh: Mesh, chosen: NDArray[np.bool_]) -> Ints:
+def _find_outward_faces(mesh: Mesh, chosen: Mask) -> Indices:
     """Outward faces of some cells together."""
     if not chosen.any():
         return np.zeros((0, mesh.kind.faces.shape[1]), dtype=np.int64)
@@ -184,7 +181,7 @@ def _find_outward_faces(mesh: Mesh, chosen: NDArray[np.bool_]) -> Ints:
     return boundary_faces(part)
 
 
-def find_same_faces(faces: Ints, chosen: Ints, count: int) -> NDArray[np.bool_]:
+def find_same_faces(faces: Indices, chosen: Indices, count: int) -> Mask:
     """Which faces (m, 3) are among the chosen (k, 3), in any order of nodes; ``count`` nodes in all."""
     packed = [np.sort(part, axis=1) @ [count * count, count, 1] for part in (faces, chosen)]
     return np.isin(packed[0], packed[1])

@@ -5,18 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Indices, Mask
 from ...mesh import Mesh
 from ..surfaces.triangles import Surface
 from .background import Field
-from .columns import Columns
+from .extrusion import Columns
 from .layers import LimbFields
 from .projection import project_safely, project_to_level
 from .regions import build_region_level, find_interfaces
-
-Ints = NDArray[np.int64]
 
 GOOD_DEG = 9.0
 WORKED_BELOW_DEG = 11.0
@@ -47,9 +44,7 @@ class SmoothingMoves:
     skin: Surface
 
     @classmethod
-    def of(
-        cls, points: Array, normals: Array, in_layers: NDArray[np.bool_], fields: LimbFields
-    ) -> SmoothingMoves:
+    def of(cls, points: Array, normals: Array, in_layers: Mask, fields: LimbFields) -> SmoothingMoves:
         depth = np.full(len(points), np.nan)
         depth[in_layers] = np.sqrt(fields.skin.search.nearest(points[in_layers])[0])
         return cls(normals, depth, fields.skin)
@@ -89,7 +84,7 @@ def put_back(points: Array, mesh: Mesh, fields: LimbFields, stack: Columns) -> A
     return project_safely(points, target, mesh.cells, GOOD_DEG)
 
 
-def find_constraints(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Array, NDArray[np.bool_]]:
+def find_constraints(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Array, Mask]:
     """Unit normals (n, 3) of the surface that a node moves on, zero for inner ones; which may move (n,)."""
     points = mesh.points
     on_plane, in_layers, on_bone = _find_places(mesh, stack)
@@ -101,12 +96,12 @@ def find_constraints(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Ar
     return normals, _count(on_plane, in_layers, on_bone, *(chosen for chosen, _ in walls)) < 2
 
 
-def _count(*places: NDArray[np.bool_]) -> Ints:
+def _count(*places: Mask) -> Indices:
     """On how many surfaces (n,) each node lies."""
     return np.sum(places, axis=0)
 
 
-def _find_region_walls(mesh: Mesh, fields: LimbFields) -> list[tuple[NDArray[np.bool_], Field]]:
+def _find_region_walls(mesh: Mesh, fields: LimbFields) -> list[tuple[Mask, Field]]:
     """Which nodes (n,) lie on the surface of each region inside the core, and its level."""
     found = []
     for number, faces in enumerate(find_interfaces(mesh, len(fields.depths))):
@@ -116,7 +111,7 @@ def _find_region_walls(mesh: Mesh, fields: LimbFields) -> list[tuple[NDArray[np.
     return found
 
 
-def _find_places(mesh: Mesh, stack: Columns) -> NDArray[np.bool_]:
+def _find_places(mesh: Mesh, stack: Columns) -> Mask:
     """Which nodes lie on the cut plane, in the layers, on bone (3, n)."""
     on_plane, in_layers, on_bone = np.zeros((3, len(mesh.points)), dtype=bool)
     on_plane[:] = mesh.points[:, 2] == 0.0
@@ -126,7 +121,7 @@ def _find_places(mesh: Mesh, stack: Columns) -> NDArray[np.bool_]:
 
 
 def improve_angles(
-    points: Array, tets: Ints, goal_deg: float, ways: SmoothingMoves, movable: NDArray[np.bool_]
+    points: Array, tets: Indices, goal_deg: float, ways: SmoothingMoves, movable: Mask
 ) -> Array:
     """Points (n, 3) with nodes of poor tetrahedra moved so that the smallest dihedral angle about each grows.
 
@@ -154,7 +149,9 @@ def improve_angles(
     return points
 
 
-def _find_best_place(points: Array, opposite: Ints, node: int, ways: SmoothingMoves) -> tuple[Array, Array]:
+def _find_best_place(
+    points: Array, opposite: Indices, node: int, ways: SmoothingMoves
+) -> tuple[Array, Array]:
     """Where the smallest angle of the tetrahedra about a node is greatest, among a pattern of places.
 
     ``opposite`` (s, 3) are their other nodes.  Also the smallest angle (s,) of each with the node there.

@@ -10,18 +10,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Indices, Mask
 from ...mesh import Mesh, node_jacobians
 from ..frame import Frame
 from .background import compute_volumes
-from .columns import Columns
+from .extrusion import Columns
 from .layers import LimbFields, compute_signed_distance
 from .smoothing import DIRECTIONS, find_constraints, put_back
-
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 SOUND = 0.03  # volume over that of a regular tetrahedron of the same edges; worked on below it
 SWEEPS = 12
@@ -79,18 +75,18 @@ def repair_mesh(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Mesh, t
     return mesh.with_points(points), tuple(repairs)
 
 
-def find_inverted_cells(mesh: Mesh) -> Bools:
+def find_inverted_cells(mesh: Mesh) -> Mask:
     """Cells (m,) that have no positive Jacobian at one of their nodes."""
     return np.asarray(node_jacobians(mesh).min(axis=1) <= 0.0)
 
 
-def _repair(what: str, before: Array, after: Array, cells: Ints, count: int, frame: Frame) -> Repair:
+def _repair(what: str, before: Array, after: Array, cells: Indices, count: int, frame: Frame) -> Repair:
     place = frame.to_patient(before[cells].reshape(-1, 3).mean(axis=0))
     moved = float(np.linalg.norm(after - before, axis=1).max())
     return Repair(count, what, (float(place[0]), float(place[1]), float(place[2])), moved)
 
 
-def untangle_cells(points: Array, tets: Ints, normals: Array, movable: Bools) -> Array:
+def untangle_cells(points: Array, tets: Indices, normals: Array, movable: Mask) -> Array:
     """Points (n, 3) with nodes of inverted tetrahedra, and of nearly flat ones beside them, where the worst
     about each is best.
 
@@ -115,7 +111,7 @@ def untangle_cells(points: Array, tets: Ints, normals: Array, movable: Bools) ->
     return points
 
 
-def _find_best_place(points: Array, star: Ints, node: int, normal: Array, before: Array) -> Array:
+def _find_best_place(points: Array, star: Indices, node: int, normal: Array, before: Array) -> Array:
     """Where the worst of the cells about a node is best: here, among a pattern, or amidst its neighbours.
 
     No farther from where it was at first than its neighbours were: a node would run from hopeless cells.
@@ -141,7 +137,7 @@ def _compute_roundness(corners: Array) -> Array:
     return np.asarray(_REGULAR * volume / np.maximum((edges**2).sum(axis=2).mean(axis=1) ** 1.5, 1e-30))
 
 
-def thin_inverted_layers(points: Array, mesh: Mesh, stack: Columns, normals: Array, movable: Bools) -> Array:
+def thin_inverted_layers(points: Array, mesh: Mesh, stack: Columns, normals: Array, movable: Mask) -> Array:
     """Layers thinner from below where their cells are inverted: columns that cross do so at their feet."""
     points = points.copy()
     own = stack.top[0] + np.arange(len(stack.owner))
@@ -176,7 +172,7 @@ def describe_unrepaired(mesh: Mesh, fields: LimbFields) -> str:
     return f"{int(bad.sum())} of {len(mesh.cells)} cells are inverted, the first in {region} {where}: {why}"
 
 
-def describe_narrowest_gap(points: Array, tets: Ints, fields: LimbFields) -> str:
+def describe_narrowest_gap(points: Array, tets: Indices, fields: LimbFields) -> str:
     """Where the flattest of tetrahedra in the limb frame is (LPS mm), and next to what."""
     corners = points[tets]
     return _place(corners[np.argmin(_compute_roundness(corners))].mean(axis=0), fields)

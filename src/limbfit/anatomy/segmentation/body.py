@@ -1,20 +1,32 @@
-"""The limb in the image: its outline, the bias field, and the grey level of muscle."""
+"""The limb in the image: whether it is one, its outline without supports, bias field and muscle's grey level.
+
+Supports are tables and cushions that touch the limb. Such a slab is thinner than the limb. Opened by a ball
+wider than it, the mask keeps the limb and loses the slab but for the strip under the limb; what is lost and
+reaches far out is slab, and the hull of both its wings closes the strip between them.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
-from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, grey_dilation
+from scipy.ndimage import (
+    binary_closing,
+    binary_fill_holes,
+    binary_opening,
+    distance_transform_edt,
+    find_objects,
+    gaussian_filter,
+    grey_dilation,
+)
+from scipy.ndimage import label as connected
+from scipy.spatial import ConvexHull, QhullError
 
+from ...arrays import Array, Mask
 from ...errors import ImageError
-from ..ends import find_longest_axis
-from ..grid import Volume
-from ..morphology import close_mask, erode_mask, fill_slices, find_box, find_largest_piece, open_mask
-from .supports import remove_supports
-
-Mask = NDArray[np.bool_]
-Field = NDArray[np.float32]
+from ..frame import find_longest_axis
+from ..grid import Grid, Volume
+from ..labels.contours import fill_even_odd
+from ..morphology import Field, close_mask, erode_mask, fill_slices, find_box, find_largest_piece, open_mask
 
 _SMOOTH_MM = 0.6
 _TISSUE = 0.45  # of the median of the tissue: between the noise of air and muscle
@@ -24,6 +36,17 @@ _RIM_MM = 2.5  # the outline is at half of the brightest tissue this near
 _BIAS_GRID_MM = 5.0
 _BIAS_ITERATIONS = [25, 20, 15]
 _SMALLEST_LIMB_MM3 = 5.0e4
+BALL_MM = 20.0  # half the thickness of the thickest slab
+_REACH_MM = 15.0  # a support sticks out of the limb by more
+_SHARE = 0.15  # of the limb's length, along which it does
+_BITE_MM = 10.0  # how deep the strip under the limb may be
+_STEP_MM = 2.0
+_COARSE_MM = 4.0
+_OTHER = 0.3  # of the largest cross-section of the slice: less is a table, a coil or a marker
+_SMALLEST_MM2 = 700.0
+_LONGEST = 2.5  # a cross-section is rounder than this; a limb cut lengthwise is not
+_TWO_LIMBS_SHARE = 0.3  # of the slices with a cross-section
+_FEWEST = 8  # slices
 
 
 def smooth_image(volume: Volume) -> Field:
@@ -101,3 +124,115 @@ def estimate_muscle_level(smooth: Field, limb: Mask) -> float:
     start = 8
     best = start + int(np.argmax(counts[start:]))
     return float(edges[best] + edges[best + 1]) / 2
+
+
+def remove_supports(mask: Mask, grid: Grid) -> Mask:
+    """The mask ``[k, j, i]`` (k along the limb) without slabs of up to 40 mm that stick out of the limb."""
+    steps = np.maximum((_STEP_MM / grid.spacing[::-1]).astype(int), 1)
+    coarse = mask[:: steps[0], :: steps[1], :: steps[2]]
+    sampling = grid.spacing[::-1] * steps
+    body = _open_limb(coarse, sampling)
+    wings = _find_wings(coarse & ~body, body, sampling)
+    if not wings.any():
+        return mask
+    strip = _fill_hulls(wings) & (_compute_depth(body, sampling) < _BITE_MM)
+    support = wings | strip
+    for axis, step in enumerate(steps):
+        support = np.repeat(support, step, axis=axis)
+    return np.asarray(mask & ~support[: mask.shape[0], : mask.shape[1], : mask.shape[2]])
+
+
+def _open_limb(mask: Mask, sampling: Array) -> Mask:
+    """Opened by a large ball; beyond the image the limb goes on, beside it there is nothing."""
+    reach = np.ceil(2 * BALL_MM / sampling).astype(int) + 1
+    padded = np.pad(mask, [(reach[0], reach[0]), (0, 0), (0, 0)], mode="edge")
+    padded = np.pad(padded, [(0, 0), (reach[1], reach[1]), (reach[2], reach[2])])
+    inner = distance_transform_edt(padded, sampling=sampling) > BALL_MM
+    opened = distance_transform_edt(~inner, sampling=sampling) <= BALL_MM
+    return np.asarray(opened[tuple(slice(r, -r) for r in reach)]) & mask
+
+
+def _find_wings(residue: Mask, body: Mask, sampling: Array) -> Mask:
+    """Pieces of the residue that stick far out of the body along much of it."""
+    away = distance_transform_edt(~body, sampling=sampling)
+    length = np.ptp(np.flatnonzero(body.any(axis=(1, 2)))) + 1 if body.any() else 1
+    parts, _ = connected(residue, np.ones((3, 3, 3)))
+    wings = np.zeros(residue.shape, dtype=bool)
+    for value, box in enumerate(find_objects(parts), start=1):
+        piece = parts[box] == value
+        far = piece & (away[box] > _REACH_MM)
+        beside = far.any(axis=(1, 2)) & body[box[0]].any(axis=(1, 2))  # else it is a thin end of the limb
+        if beside.sum() > _SHARE * length:
+            wings[box] |= piece
+    return wings
+
+
+def _compute_depth(body: Mask, sampling: Array) -> Array:
+    return np.asarray(distance_transform_edt(body, sampling=sampling))
+
+
+def _fill_hulls(wings: Mask) -> Mask:
+    """The convex hull of each slice."""
+    found = wings.copy()
+    for k, plane in enumerate(wings):
+        points = np.argwhere(plane)[:, ::-1].astype(float)
+        if len(points) < 3:
+            continue
+        try:
+            corners = points[ConvexHull(points).vertices]
+        except QhullError:  # all on one line
+            continue
+        found[k] |= fill_even_odd([corners], plane.shape[1], plane.shape[0])
+    return found
+
+
+def check_one_limb(volume: Volume) -> None:
+    """Refuse an image whose slices across some axis show two large, roundish sections side by side.
+
+    Raises
+    ------
+    ImageError
+        With the remedy: crop, or give labels.
+    """
+    tissue, step = _find_tissue(volume)
+    for axis in range(3):
+        counts = np.array([_count_sections(plane, step) for plane in np.moveaxis(tissue, axis, 0)])
+        if (counts > 0).sum() >= _FEWEST and (counts > 1).sum() > _TWO_LIMBS_SHARE * (counts > 0).sum():
+            raise ImageError(
+                "two limbs in one image",
+                remedy="crop the image to one limb, or give its labels (segmentation.labels in study.toml)",
+            )
+
+
+def _find_tissue(volume: Volume) -> tuple[Mask, float]:
+    """What is brighter than air (Otsu) on coarse cubic voxels, closed over thin dark bone; their edge, mm."""
+    step = max(_COARSE_MM, float(volume.spacing.max()))
+    size = np.maximum(np.floor((np.array(volume.size) - 1) * volume.spacing / step).astype(int) + 1, 1)
+    image = sitk.SmoothingRecursiveGaussian(volume.to_sitk(), step / 2)
+    coarse = sitk.Resample(
+        image,
+        size.tolist(),
+        sitk.Transform(),
+        sitk.sitkLinear,
+        volume.origin.tolist(),
+        [step] * 3,
+        volume.direction.ravel().tolist(),
+        0.0,
+        sitk.sitkFloat32,
+    )
+    tissue = sitk.GetArrayFromImage(sitk.OtsuThreshold(coarse, 0, 1)).astype(bool)
+    padded = binary_closing(np.pad(tissue, 2), np.ones((3, 3, 3)))
+    return padded[2:-2, 2:-2, 2:-2] | tissue, step
+
+
+def _count_sections(plane: Mask, step: float) -> int:
+    """How many large roundish sections a slice shows."""
+    solid = binary_opening(np.pad(binary_fill_holes(plane), 1, mode="edge"), np.ones((3, 3)))
+    parts, count = connected(solid)
+    if count == 0:
+        return 0
+    areas = np.bincount(parts.ravel())[1:]
+    large = (areas > _OTHER * areas.max()) & (areas * step**2 > _SMALLEST_MM2)
+    extents = [[part.stop - part.start for part in box] for box in find_objects(parts)]
+    round_ = np.array([max(sides) <= _LONGEST * min(sides) for sides in extents])
+    return int((large & round_).sum())

@@ -4,24 +4,27 @@ The *escape level* of a voxel is the brightest that the darkest point of a way o
 be. Marrow cannot get out without crossing cortex, so its escape level is dark; subcutaneous fat, fat between
 muscles and vessels get out through tissue. (Grey-scale hole filling by reconstruction, Soille 2003, of the
 negative image.) Grey levels are relative to muscle throughout.
+
+Bones are named by size and place, or by seeds: points that a user put into them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_propagation, distance_transform_edt, find_objects
 from scipy.ndimage import label as connected
 
-from ..morphology import compute_depth, dilate_mask, erode_mask, fill_slices, find_box, open_mask
-
-Mask = NDArray[np.bool_]
-Field = NDArray[np.float32]
-Spacing = NDArray[np.float64]
+from ...arrays import Array, Mask
+from ...errors import ImageError
+from ..grid import Grid
+from ..morphology import Field, compute_depth, dilate_mask, erode_mask, fill_slices, find_box, open_mask
+from ..surfaces.extraction import compute_signed_distance_to
 
 _BRIGHT = 1.15  # marrow is brighter
 _ESCAPE = 0.78  # and cannot get out without crossing something darker
@@ -32,9 +35,10 @@ _TAIL_MM = 2.0  # dark fascia and vessels thinner than twice this are taken off 
 _SEED_PART = 0.15  # of the smallest bone's volume, for its marrow to count
 _STEP_IN_MM, _STEP_OUT_MM = 2.0, 6.0  # how far a bone's outline may move from slice to slice
 _GROWTH = (0.6, 1.8)
+_NEAR_MM = 3.0  # a seed this near to a bone is in it
 
 
-def find_bones(levels: Field, limb: Mask, spacing: Spacing, smallest_mm3: float) -> list[Mask]:
+def find_bones(levels: Field, limb: Mask, spacing: Array, smallest_mm3: float) -> list[Mask]:
     """Masks of the bones, largest first.
 
     Parameters
@@ -83,7 +87,7 @@ def _number_cavities(marrow: Mask, smallest: float) -> NDArray[np.int32]:
 
 
 def _follow(
-    parts: NDArray[np.int32], value: int, slices: slice, levels: Field, deep: Mask, spacing: Spacing
+    parts: NDArray[np.int32], value: int, slices: slice, levels: Field, deep: Mask, spacing: Array
 ) -> None:
     """Go on beyond a part's slices where the cortex is too thin to enclose the marrow, as near a joint.
 
@@ -103,7 +107,7 @@ def _follow(
             here[found] = value
 
 
-def _find_next_section(previous: Mask, plane: Field, free: Mask, spacing: Spacing) -> Mask | None:
+def _find_next_section(previous: Mask, plane: Field, free: Mask, spacing: Array) -> Mask | None:
     """The marrow in the next slice, split from fat around it along the darkest line (watershed)."""
     inside = erode_mask(previous, _STEP_IN_MM, spacing) & free
     allowed = dilate_mask(previous, _STEP_OUT_MM, spacing) & free
@@ -132,7 +136,7 @@ def _join_cavities(parts: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.unique(root, return_inverse=True)[1].astype(np.int32)[parts]
 
 
-def _add_cortex(parts: NDArray[np.int32], levels: Field, deep: Mask, spacing: Spacing) -> NDArray[np.int32]:
+def _add_cortex(parts: NDArray[np.int32], levels: Field, deep: Mask, spacing: Array) -> NDArray[np.int32]:
     """Each cavity with the dark cortex around it, without the fascia and vessels that hang on."""
     marrow = parts > 0
     distance, nearest = distance_transform_edt(~marrow, sampling=spacing[::-1], return_indices=True)
@@ -143,7 +147,7 @@ def _add_cortex(parts: NDArray[np.int32], levels: Field, deep: Mask, spacing: Sp
     return np.where(bone, parts[tuple(nearest)], 0)
 
 
-def name_bones(bones: list[Mask], spacing: Spacing) -> list[str]:
+def name_bones(bones: list[Mask], spacing: Array) -> list[str]:
     """Names by size and place; slices run from distal to proximal, ``bones`` from large to small.
 
     The femur is the upper of two large bones that lie one above the other; the tibia the largest below it;
@@ -183,7 +187,7 @@ class _Extent:
     volume: float
 
     @classmethod
-    def of(cls, bone: Mask, spacing: Spacing) -> _Extent:
+    def of(cls, bone: Mask, spacing: Array) -> _Extent:
         areas = bone.sum(axis=(1, 2))
         filled = np.flatnonzero(areas)
         return cls(
@@ -203,3 +207,78 @@ class _Extent:
         """Part of the shorter one's length that both share."""
         shared = min(self.high, other.high) - max(self.low, other.low)
         return shared / min(self.high - self.low, other.high - other.low)
+
+
+def grow_from_seeds(
+    bones: Sequence[Mask], seeds: Mapping[str, ArrayLike], grid: Grid
+) -> tuple[list[Mask], list[str]]:
+    """One bone for each name: the pieces that hold its seeds; a piece with seeds of several names is divided.
+
+    Parameters
+    ----------
+    bones : masks ``[k, j, i]`` on the grid.
+    seeds : (n, 3) points in LPS mm for each name.
+
+    Raises
+    ------
+    ImageError
+        For a seed in no bone.
+    """
+    names = list(seeds)
+    found = [np.zeros(grid.array.shape, dtype=bool) for _ in names]
+    holders: dict[int, dict[int, list[tuple[int, int, int]]]] = {}
+    for n, name in enumerate(names):
+        for point in np.asarray(seeds[name], dtype=float).reshape(-1, 3):
+            voxel, piece = _find_piece(point, bones, grid, name)
+            holders.setdefault(piece, {}).setdefault(n, []).append(voxel)
+    for piece, marked in holders.items():
+        if len(marked) == 1:
+            found[next(iter(marked))] |= bones[piece]
+            continue
+        divided = _divide_piece(bones[piece], marked, grid)
+        for n in marked:
+            found[n] |= divided == n + 1
+    return found, names
+
+
+def _find_piece(
+    point: Array, bones: Sequence[Mask], grid: Grid, name: str
+) -> tuple[tuple[int, int, int], int]:
+    """The voxel ``(k, j, i)`` of the nearest bone, and which bone that is."""
+    index = grid.point_to_index(point)
+    reach = np.ceil(_NEAR_MM / grid.spacing).astype(int)
+    low = np.maximum(np.round(index).astype(int) - reach, 0)[::-1]
+    high = np.maximum(np.round(index).astype(int) + reach + 1, 0)[::-1]
+    box = tuple(slice(a, b) for a, b in zip(low, high))
+    best, nearest = None, _NEAR_MM
+    for piece, bone in enumerate(bones):
+        inside = np.argwhere(bone[box]) + low
+        if len(inside) == 0:
+            continue
+        away = np.linalg.norm((inside[:, ::-1] - index) * grid.spacing, axis=1)
+        if away.min() <= nearest:
+            k, j, i = inside[int(away.argmin())]
+            best, nearest = ((int(k), int(j), int(i)), piece), float(away.min())
+    if best is None:
+        place = ", ".join(f"{x:g}" for x in point)
+        raise ImageError(
+            f"the seed of {name!r} at ({place}) mm lies in no bone that was found",
+            remedy="put it into the bone (LPS, mm), or label the bone by hand (segmentation.labels)",
+        )
+    return best
+
+
+def _divide_piece(
+    bone: Mask, marked: Mapping[int, list[tuple[int, int, int]]], grid: Grid
+) -> NDArray[np.uint8]:
+    """One piece parted between names where it is thinnest (watershed of the depth); values are name + 1."""
+    depth = compute_signed_distance_to(bone, grid)
+    markers = np.zeros(bone.shape, dtype=np.uint8)
+    markers[~bone] = 255
+    for n, voxels in marked.items():
+        for voxel in voxels:
+            markers[voxel] = n + 1
+    basins = sitk.MorphologicalWatershedFromMarkers(
+        sitk.GetImageFromArray(-depth), sitk.GetImageFromArray(markers), False, True
+    )
+    return np.where(bone, sitk.GetArrayFromImage(basins), 0).astype(np.uint8)

@@ -7,15 +7,11 @@ the septa of fat that reach in from the skin do not.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_propagation, distance_transform_edt, gaussian_filter
 from scipy.ndimage import label as connected
 
-from ..morphology import find_largest_piece, open_mask
-
-Mask = NDArray[np.bool_]
-Field = NDArray[np.float32]
-Spacing = NDArray[np.float64]
+from ...arrays import Array, Mask
+from ..morphology import Field, find_largest_piece, open_mask
 
 SKIN_MM = 1.5  # skin is darker than fat; so deep everything counts as skin
 SEPTUM_MM = 1.5  # sheets of fat thinner than twice this are septa
@@ -32,7 +28,7 @@ _SAMPLE_MM = 2.5
 _NOISE_MM = 0.9
 
 
-def find_bright_fat(levels: Field, limb: Mask, bones: Mask, depth: Field, spacing: Spacing) -> Mask:
+def find_bright_fat(levels: Field, limb: Mask, bones: Mask, depth: Field, spacing: Array) -> Mask:
     """Voxels nearer to fat than to muscle in MRI, as bright as these are in their neighbourhood.
 
     ``levels`` are relative to muscle, ``depth`` is that below the skin (:func:`compute_depth`). What a coil
@@ -44,7 +40,7 @@ def find_bright_fat(levels: Field, limb: Mask, bones: Mask, depth: Field, spacin
     )
 
 
-def _average_in_limb(levels: Field, limb: Mask, spacing: Spacing) -> Field:
+def _average_in_limb(levels: Field, limb: Mask, spacing: Array) -> Field:
     """The mean of the neighbourhood inside the limb."""
     sigma = _NOISE_MM / spacing[::-1]
     weight = gaussian_filter(limb.astype(np.float32), sigma, mode="nearest")
@@ -52,7 +48,7 @@ def _average_in_limb(levels: Field, limb: Mask, spacing: Spacing) -> Field:
     return np.asarray(total / np.maximum(weight, 1e-3))
 
 
-def _compute_half_way_level(levels: Field, rind: Mask, spacing: Spacing) -> Field:
+def _compute_half_way_level(levels: Field, rind: Mask, spacing: Array) -> Field:
     """Half-way between muscle and fat around each voxel."""
     every = np.maximum((_SAMPLE_MM / spacing[::-1]).astype(int), 1)
     thinned = tuple(slice(None, None, n) for n in every)
@@ -91,11 +87,11 @@ def _compute_isodata_level(values: Field) -> float:
     return level if high > _FAINTEST * low else np.nan
 
 
-def _compute_centres(count: int, step: float) -> NDArray[np.float64]:
+def _compute_centres(count: int, step: float) -> Array:
     return np.linspace(0, count - 1, max(2, round(count / max(step, 1.0)) + 1))
 
 
-def _interpolate_places(places: NDArray[np.float64], count: int) -> Field:
+def _interpolate_places(places: Array, count: int) -> Field:
     """The matrix (n, count) that interpolates ``count`` values linearly at fractional indices (n,)."""
     low = np.minimum(places.astype(int), count - 2)
     rows, part = np.arange(len(places)), (places - low).astype(np.float32)
@@ -104,7 +100,7 @@ def _interpolate_places(places: NDArray[np.float64], count: int) -> Field:
     return weights
 
 
-def select_subcutaneous(bright: Mask, limb: Mask, bones: Mask, depth: Field, spacing: Spacing) -> Mask:
+def select_subcutaneous(bright: Mask, limb: Mask, bones: Mask, depth: Field, spacing: Array) -> Mask:
     """The part of ``bright`` that belongs to the skin's layer, skin included; all masks ``[k, j, i]``.
 
     The image's ends (first and last k) do not count as skin.
@@ -119,7 +115,7 @@ def select_subcutaneous(bright: Mask, limb: Mask, bones: Mask, depth: Field, spa
     return np.asarray(joined & limb & ~bones)
 
 
-def _fill_small_holes(mask: Mask, spacing: Spacing) -> Mask:
+def _fill_small_holes(mask: Mask, spacing: Array) -> Mask:
     """Vessels and nerves in the fat filled, slice by slice."""
     in_slice = np.zeros((3, 3, 3), dtype=int)
     in_slice[1] = [[0, 1, 0], [1, 1, 1], [0, 1, 0]]

@@ -6,23 +6,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import binary_fill_holes
 
+from ...arrays import Array, Mask
 from ...errors import ImageError
-from ..ends import ProximalEnd, find_proximal_end
+from ..frame import ProximalEnd, find_proximal_end
 from ..grid import BONES, DEFAULT_NAMES, FAT, LabelMap, Volume
-from ..morphology import Box, compute_depth, find_box, find_largest_piece
+from ..morphology import Box, Field, compute_depth, find_box, find_largest_piece
 from .body import estimate_bias_field, estimate_muscle_level, find_limb_axis, find_limb_mask, smooth_image
-from .bones import find_bones, name_bones
-from .contrast import Contrast, is_ct, rescale_above_air
-from .dense import find_dense_bones
+from .bones import find_bones, grow_from_seeds, name_bones
+from .ct import Contrast, find_dense_bones, is_ct, rescale_above_air
 from .fat import FAT_HU, find_bright_fat, select_subcutaneous
-from .seeds import grow_from_seeds
 
-Mask = NDArray[np.bool_]
-Field = NDArray[np.float32]
-Spacing = NDArray[np.float64]
 Seeds = Mapping[str, ArrayLike]
 
 _MARGIN = 2  # voxels around the limb
@@ -77,7 +73,7 @@ class _Tissues:
     levels: Field
     ct: bool
 
-    def fat(self, spacing: Spacing) -> Mask:
+    def fat(self, spacing: Array) -> Mask:
         """Subcutaneous fat."""
         bone = np.zeros(self.limb.shape, dtype=bool)
         for mask in self.bones:
@@ -121,7 +117,7 @@ def _segment(
 
 
 def _find_tissues_in_mri(
-    smooth: Field, limb: Mask, end: ProximalEnd, spacing: Spacing, smallest_mm3: float
+    smooth: Field, limb: Mask, end: ProximalEnd, spacing: Array, smallest_mm3: float
 ) -> _Tissues:
     levels = smooth / np.float32(estimate_muscle_level(smooth, limb))
     found = find_bones(end.along(levels), end.along(limb), spacing, smallest_mm3)
@@ -129,7 +125,7 @@ def _find_tissues_in_mri(
 
 
 def _find_tissues_in_ct(
-    hounsfield: Field, limb: Mask, end: ProximalEnd, spacing: Spacing, smallest_mm3: float
+    hounsfield: Field, limb: Mask, end: ProximalEnd, spacing: Array, smallest_mm3: float
 ) -> _Tissues:
     found = find_dense_bones(hounsfield, limb, spacing, smallest_mm3)
     return _Tissues(limb, found, hounsfield, ct=True)

@@ -15,17 +15,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, grey_dilation
 from scipy.spatial import cKDTree
 
-from ...arrays import Array
+from ...arrays import Array, Mask
 from ...errors import ImageError
 from ..grid import Volume
-from ..morphology import dilate_mask, erode_mask, find_box
+from ..morphology import Field, dilate_mask, erode_mask, find_box
 from ..segmentation.body import find_limb_mask, smooth_image
-from ..segmentation.contrast import is_ct
+from ..segmentation.ct import is_ct
 from ..surfaces.triangles import Surface, find_bodies, from_pyvista
 from .markers import Bump, cap_faces, find_bumps, find_near_cap
-
-Mask = NDArray[np.bool_]
-Field = NDArray[np.float32]
 
 _RIM_MM = 2.5  # the outline lies this near to the mask's, and at half of the brightest tissue this near
 _SPACING_MM = 3.0  # of the places where patches are fitted

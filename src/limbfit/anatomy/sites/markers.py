@@ -10,17 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ...arrays import Array
+from ...arrays import Array, Indices, Mask
 from ...errors import SiteError
-from ..surfaces.search import SurfaceSearch
-from ..surfaces.triangles import Surface, find_half_edges
-
-Indices = NDArray[np.int64]
+from ..surfaces.triangles import Surface, SurfaceSearch, find_half_edges
 
 CAP_MARGIN_MM = 6.0
 MIN_HEIGHT_MM, MAX_AREA_MM2 = 2.0, 500.0
@@ -179,7 +175,7 @@ class _Skin:
         """Signed distance (n,), positive outside."""
         return self.surface.search.signed(points)[0]
 
-    def near_cap(self, points: Array) -> NDArray[np.bool_]:
+    def near_cap(self, points: Array) -> Mask:
         """Which points (n,) lie beyond the cap's plane or just under it."""
         return find_near_cap(self.surface, self.cap, points)
 
@@ -194,7 +190,7 @@ class _Skin:
         return foot, normal / np.linalg.norm(normal)
 
 
-def cap_faces(surface: Surface) -> NDArray[np.bool_]:
+def cap_faces(surface: Surface) -> Mask:
     """Faces of the one plane that holds more than 3 % of a surface: the cut; skin has no such plane."""
     normals, areas, centres = surface.face_normals, surface.face_areas, surface.triangles.mean(axis=1)
     levels = (normals * centres).sum(axis=1)
@@ -211,7 +207,7 @@ def cap_faces(surface: Surface) -> NDArray[np.bool_]:
     return (normals @ normal > 0.98) & (np.abs(centres @ normal - level) < 1.0)
 
 
-def find_near_cap(surface: Surface, cap: NDArray[np.bool_], points: Array) -> NDArray[np.bool_]:
+def find_near_cap(surface: Surface, cap: Mask, points: Array) -> Mask:
     """Which points (n,) lie beyond the plane of a surface's cap (faces of it) or just under it."""
     if not cap.any():
         return np.zeros(len(points), bool)
@@ -222,7 +218,7 @@ def find_near_cap(surface: Surface, cap: NDArray[np.bool_], points: Array) -> ND
     return points @ normal > level - CAP_MARGIN_MM
 
 
-def _number_clusters(raised: NDArray[np.bool_], faces: NDArray[np.int64]) -> NDArray[np.int64]:
+def _number_clusters(raised: Mask, faces: Indices) -> Indices:
     """Cluster number (n,) of raised vertices that share edges; -1 elsewhere."""
     edges = find_half_edges(faces)
     edges = edges[raised[edges].all(axis=1)]

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from ...arrays import Array
+from ...arrays import Array, Mask
 from ...errors import ImageError
 from ..grid import Volume
 
@@ -56,7 +56,7 @@ class LimbMotion:
         return float(np.linalg.norm(self.shift))
 
 
-def register_limb(image: Volume, moved: Volume, limb: NDArray[np.bool_]) -> LimbMotion:
+def register_limb(image: Volume, moved: Volume, limb: Mask) -> LimbMotion:
     """The motion that lays the limb of ``moved`` onto that of ``image``.
 
     Parameters
@@ -95,7 +95,7 @@ def register_limb(image: Volume, moved: Volume, limb: NDArray[np.bool_]) -> Limb
     return LimbMotion(turn.T, centre, -turn.T @ unknowns[3:6], correlation)
 
 
-def _sample(image: Volume, limb: NDArray[np.bool_]) -> Array:
+def _sample(image: Volume, limb: Mask) -> Array:
     """Jittered indices (n, 3), i j k, of points within the limb, off the image's border."""
     random = np.random.default_rng(0)
     voxels = np.argwhere(limb)[:, ::-1]

@@ -12,16 +12,13 @@ import gpytoolbox
 import numpy as np
 import pyvista as pv
 import SimpleITK as sitk  # noqa: N813
-from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes, gaussian_filter
 
+from ...arrays import Indices, Mask
 from ...errors import LabelError
 from ..grid import Grid, LabelMap, Volume
-from ..morphology import compute_distance, find_box, find_largest_piece
+from ..morphology import Field, compute_distance, find_box, find_largest_piece
 from .triangles import Surface, find_bodies, find_half_edges, find_self_intersections, from_pyvista
-
-Mask = NDArray[np.bool_]
-Field = NDArray[np.float32]
 
 _SIGMA_VOXELS = 0.7
 # Passes and pass band of Taubin's filter, which takes out terraces wider than the Gaussian; skin has no
@@ -135,7 +132,7 @@ def _smooth(surface: Surface, passes: int, band: float) -> Surface:
 
 
 def remesh(
-    surface: Surface, edge_mm: float, creases: NDArray[np.int64] | None = None, passes: int = _REMESH_PASSES
+    surface: Surface, edge_mm: float, creases: Indices | None = None, passes: int = _REMESH_PASSES
 ) -> Surface:
     """Even triangles of ``edge_mm`` on the same shape (Botsch and Kobbelt 2004).
 

@@ -16,17 +16,15 @@ from pathlib import Path
 import igl
 import manifold3d
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ...arrays import Array
+from ...arrays import Array, Indices
 from ...errors import SurfaceError
 from .extraction import untangle_surface
 from .surfaces import Anatomy, check_anatomy
 from .triangles import Surface, find_bodies, find_half_edges, find_self_intersections, from_pyvista
-
-Ints = NDArray[np.int64]
 
 SMALL_MM = 10.0  # a hole that is no wider is filled
 FEW_EDGES, FEW_SHARE = 6, 0.02  # so is one of few edges that is a small share of the surface
@@ -213,7 +211,7 @@ def count_turned(before: Surface, after: Surface) -> int:
     return int((np.einsum("ij,ij->i", before.face_normals, after.face_normals) < 0.0).sum())
 
 
-def _has_turned(faces: Ints) -> bool:
+def _has_turned(faces: Indices) -> bool:
     """True where two faces run along an edge in the same direction."""
     edges = find_half_edges(faces)
     return len(np.unique(edges, axis=0)) < len(edges)
@@ -238,14 +236,14 @@ def _remove_loose_pieces(surface: Surface, name: str) -> tuple[Surface, tuple[st
     return Surface(np.concatenate([part.points for part in kept]), faces), (note,)
 
 
-def open_edges(surface: Surface) -> Ints:
+def open_edges(surface: Surface) -> Indices:
     """(k, 2) directed edges of the faces that no other face shares."""
     edges = find_half_edges(surface.faces)
     _, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     return edges[counts[inverse.ravel()] == 1]
 
 
-def open_loops(surface: Surface) -> list[Ints]:
+def open_loops(surface: Surface) -> list[Indices]:
     """Points of each loop in the order of its faces' edges; loops that touch in a point are taken apart."""
     following: dict[int, list[int]] = {}
     for start, end in open_edges(surface).tolist():
@@ -267,7 +265,7 @@ def open_loops(surface: Surface) -> list[Ints]:
     return loops
 
 
-def _is_small(surface: Surface, loop: Ints) -> bool:
+def _is_small(surface: Surface, loop: Indices) -> bool:
     points = surface.points[loop]
     if np.linalg.norm(np.ptp(points, axis=0)) <= SMALL_MM:
         return True
@@ -285,7 +283,7 @@ def _compute_area(loop: Array) -> float:
     return float(np.linalg.norm(_compute_area_vector(loop)))
 
 
-def _fill_hole(surface: Surface, loop: Ints) -> tuple[Surface, float]:
+def _fill_hole(surface: Surface, loop: Indices) -> tuple[Surface, float]:
     """A small hole closed, by one triangle or a fan about its middle; the area of the fan (mm2)."""
     points, back = surface.points, loop[::-1]
     if len(loop) == 3:
@@ -322,7 +320,7 @@ def _cap_open_end(surface: Surface, rim: Array, name: str, file: Path | None) ->
     return Surface(body.points, np.vstack([body.faces, faces])), cap, area
 
 
-def _triangulate_polygon(polygon: Array, normal: Array) -> Ints | None:
+def _triangulate_polygon(polygon: Array, normal: Array) -> Indices | None:
     """Triangles (n - 2, 3) that fill a flat polygon (n, 3), seen from ``normal``; None where none do."""
     along = np.linalg.svd(normal[None])[2][1]
     flat = polygon @ np.column_stack([along, np.cross(normal, along)])

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import pyvista as pv
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ...arrays import Array
+from ...arrays import Array, Indices, Mask
 from ...errors import LabelError, SurfaceError
-from ..ends import ProximalEnd, find_proximal_end, select_layer
+from ..frame import ProximalEnd, find_proximal_end, select_layer
 from ..grid import LabelMap
 from .extraction import extract_fine_surface, extract_surface, remesh
 from .surfacefiles import read_surface, write_surface
@@ -44,8 +44,6 @@ __all__ = [
     "save_anatomy",
     "write_surface",
 ]
-
-
 _CUT_INSIDE_MM = 2.0  # of the image's proximal end
 _STICK_OUT_MM = 6.0  # of the bones beyond the cut
 _SKIN_TOLERANCE_MM = 0.05  # how far a bone may lie outside the skin: rounding of files
@@ -190,7 +188,7 @@ def _normalise_plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]
     return np.asarray(point, dtype=float), vector / length
 
 
-def _check_sides(limb: NDArray[np.bool_], end: ProximalEnd) -> None:
+def _check_sides(limb: Mask, end: ProximalEnd) -> None:
     """Refuse a limb, distal of the cut, that a side of the image cuts off."""
     for axis in range(3):
         if axis == end.axis:
@@ -220,7 +218,7 @@ def cut_and_cap(surface: Surface, point: Array, normal: Array, edge_mm: float) -
     return remesh(whole, edge_mm, _find_rim(whole, point, normal), _PASSES_AFTER)
 
 
-def _find_rim(surface: Surface, point: Array, normal: Array) -> NDArray[np.int64]:
+def _find_rim(surface: Surface, point: Array, normal: Array) -> Indices:
     """(n, 2) edges between the flat cap and the rest."""
     on_plane = np.abs((surface.points - point) @ normal) < _JOIN_MM
     in_cap = np.tile(on_plane[surface.faces].all(axis=1), 3)

@@ -6,19 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pyvista as pv
-from numpy.typing import NDArray
 from scipy.sparse import coo_array, diags_array
 from scipy.spatial import KDTree
 
-from ...arrays import Array
+from ...arrays import Array, Indices
 from ...errors import LabelError, SurfaceError
 from ..grid import LabelMap
 from ..morphology import find_largest_piece, open_mask
 from .extraction import extract_surface
 from .surfaces import Anatomy, compute_signed_distance
 from .triangles import Surface, find_half_edges
-
-Ints = NDArray[np.int64]
 
 FAT = "fat"
 FAT_DEPTH = "fat_depth_mm"
@@ -127,7 +124,7 @@ def transfer_values(surface: Surface, values: Array, points: Array) -> Array:
     return np.asarray(np.einsum("kmi,mi->km", values[:, surface.faces[face]], share))
 
 
-def find_edges(surface: Surface) -> Ints:
+def find_edges(surface: Surface) -> Indices:
     """Edges (e, 2) of a closed surface, each once."""
     edges = find_half_edges(surface.faces)
     return edges[edges[:, 0] < edges[:, 1]]

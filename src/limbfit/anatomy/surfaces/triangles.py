@@ -1,4 +1,4 @@
-"""Closed triangle surfaces: the type, and whether one may bound a body."""
+"""Closed triangle surfaces: the type, the search for nearest points, and whether one may bound a body."""
 
 from __future__ import annotations
 
@@ -7,18 +7,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import igl
 import numpy as np
 import pyvista as pv
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from ...arrays import Array
+from ...arrays import Array, Indices, Mask
 from ...errors import SurfaceError
-from .search import SurfaceSearch
-
-Faces = NDArray[np.int64]
 
 # Diagonals of the bounding box: a limb and a bone from a file are larger; in inches or centimetres they are
 # not. What is left of a bone after a virtual amputation may be small.
@@ -37,7 +35,7 @@ class Surface:
     """
 
     points: Array
-    faces: Faces
+    faces: Indices
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", np.asarray(self.points, dtype=np.float64))
@@ -53,7 +51,7 @@ class Surface:
         return SurfaceSearch(self.points, self.faces)
 
     @cached_property
-    def crossings(self) -> NDArray[np.int64]:
+    def crossings(self) -> Indices:
         """(p, 2) pairs of faces that cross; see :func:`find_self_intersections`."""
         return _find_crossings(self)
 
@@ -130,14 +128,14 @@ def find_bodies(surface: Surface) -> list[Surface]:
     return [remove_unused_points(replace(surface, faces=surface.faces[labels == value])) for value in order]
 
 
-def _number_bodies(surface: Surface) -> NDArray[np.int64]:
+def _number_bodies(surface: Surface) -> Indices:
     edges = find_half_edges(surface.faces)
     n = len(surface.points)
     graph = coo_array((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(n, n))
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
-def find_half_edges(faces: Faces) -> Faces:
+def find_half_edges(faces: Indices) -> Indices:
     """(3 m, 2) directed edges of the faces."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
@@ -241,12 +239,12 @@ def check_sides(surface: Surface, name: str, file: str | Path | None = None) -> 
         )
 
 
-def find_self_intersections(surface: Surface) -> NDArray[np.int64]:
+def find_self_intersections(surface: Surface) -> Indices:
     """(p, 2) pairs of faces without a common point of which an edge of one pierces the other."""
     return surface.crossings
 
 
-def _find_crossings(surface: Surface) -> NDArray[np.int64]:
+def _find_crossings(surface: Surface) -> Indices:
     pairs = _find_near_pairs(surface)
     triangles = surface.triangles
     crossing = np.zeros(len(pairs), dtype=bool)
@@ -257,7 +255,7 @@ def _find_crossings(surface: Surface) -> NDArray[np.int64]:
     return pairs[crossing]
 
 
-def _find_near_pairs(surface: Surface) -> NDArray[np.int64]:
+def _find_near_pairs(surface: Surface) -> Indices:
     """Pairs (p, 2) of faces that share no point and may cross: bounding boxes of pieces of them overlap.
 
     Pieces whose spheres meet are looked up in trees, one for each octave of sizes, some pieces at a time.
@@ -281,7 +279,7 @@ def _find_near_pairs(surface: Surface) -> NDArray[np.int64]:
     return np.unique(np.concatenate(found), axis=0)
 
 
-def _select_distinct_pairs(i: NDArray[np.int64], j: NDArray[np.int64], faces: Faces) -> NDArray[np.int64]:
+def _select_distinct_pairs(i: Indices, j: Indices, faces: Indices) -> Indices:
     """Pairs (p, 2) of faces, the lower number first, each once, without those that share a point."""
     keys = np.unique(np.minimum(i, j) * len(faces) + np.maximum(i, j))
     pairs = np.column_stack(np.divmod(keys, len(faces)))
@@ -289,7 +287,7 @@ def _select_distinct_pairs(i: NDArray[np.int64], j: NDArray[np.int64], faces: Fa
     return pairs[~(first[:, :, None] == second[:, None, :]).any(axis=(1, 2))]
 
 
-def _split_large(triangles: Array) -> tuple[NDArray[np.int64], Array]:
+def _split_large(triangles: Array) -> tuple[Indices, Array]:
     """Triangles (m, 3, 3) with the large ones halved until they are of a usual size, and whose each is.
 
     The flat caps of scans consist of long slivers, to each of which thousands of small faces are near.
@@ -320,7 +318,7 @@ def _compute_radii(triangles: Array) -> Array:
     return np.linalg.norm(triangles - triangles.mean(axis=1, keepdims=True), axis=2).max(axis=1)
 
 
-def _find_piercing(start: Array, end: Array, triangle: Array) -> NDArray[np.bool_]:
+def _find_piercing(start: Array, end: Array, triangle: Array) -> Mask:
     """Whether each segment passes through the inside of its triangle (signed volumes)."""
     a, b, c = np.moveaxis(triangle, 1, 0)
 
@@ -331,3 +329,46 @@ def _find_piercing(start: Array, end: Array, triangle: Array) -> NDArray[np.bool
     u, v, w = side(start, end, a, b), side(start, end, b, c), side(start, end, c, a)
     same = ((u > 0) & (v > 0) & (w > 0)) | ((u < 0) & (v < 0) & (w < 0))
     return same & (above * below < 0)
+
+
+class SurfaceSearch:
+    """The trees of a surface: ``points`` (n, 3) mm and ``faces`` (m, 3), which must not change any more."""
+
+    def __init__(self, points: Array, faces: Indices) -> None:
+        self._surface = np.ascontiguousarray(points), np.ascontiguousarray(faces)
+
+    def nearest(self, points: ArrayLike) -> tuple[Array, Indices, Array]:
+        """Squared distance (k,) of points (k, 3), mm^2, the nearest face (k,), and where on it (k, 3)."""
+        query = _to_query(points)
+        if not len(query):
+            return np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+        squared, face, foot = self._boxes.squared_distance(*self._surface, query)
+        return squared, face, foot
+
+    def signed(self, points: ArrayLike) -> tuple[Array, Indices, Array]:
+        """As `nearest`, with the distance (k,) to a closed outward surface, mm, negative inside.
+
+        Inside is where the fast winding number says so (Barill et al. 2018, ACM Trans Graph 37, 43), which
+        small holes and crossing faces do not mislead.
+        """
+        squared, face, foot = self.nearest(points)
+        if not len(face):
+            return squared, face, foot
+        inside = self._windings.winding_number(_to_query(points)) > 0.5
+        return np.where(inside, -1.0, 1.0) * np.sqrt(squared), face, foot
+
+    @cached_property
+    def _boxes(self) -> igl.AABB:
+        tree = igl.AABB()
+        tree.init(*self._surface)
+        return tree
+
+    @cached_property
+    def _windings(self) -> igl.FastWindingNumberBVH:
+        tree = igl.FastWindingNumberBVH()
+        tree.init(*self._surface)
+        return tree
+
+
+def _to_query(points: ArrayLike) -> Array:
+    return np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)

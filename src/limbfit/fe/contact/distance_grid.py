@@ -16,8 +16,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ...shapes.closest_point import Tree, build_tree, closest_point, feature_normal
-from ...shapes.triangles import compute_normal_spread, compute_triangle_normals, find_neighbours
+from ...shapes.triangles import (
+    Tree,
+    build_tree,
+    closest_point,
+    compute_normal_spread,
+    compute_triangle_normals,
+    feature_normal,
+    find_neighbours,
+)
 
 Array = NDArray[np.float64]
 # In grid spacings: how far the wall goes on past its brim, how far behind the brim is told, and how often the

@@ -14,8 +14,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...errors import ProblemError
-from ...shapes.closest_point import INSIDE, Tree, build_tree, closest_point, curvature, feature_normal
-from ...shapes.triangles import compute_normal_spread, compute_triangle_normals, find_neighbours
+from ...shapes.triangles import (
+    INSIDE,
+    Tree,
+    build_tree,
+    closest_point,
+    compute_normal_spread,
+    compute_triangle_normals,
+    curvature,
+    feature_normal,
+    find_neighbours,
+)
 from .wall import Wall, check_open_surface
 
 Array = NDArray[np.float64]

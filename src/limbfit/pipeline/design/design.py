@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.sites.under import measure_tissue_under
+from ...anatomy.sites.sites import measure_tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...arrays import Array
 from ...errors import InputError, RunError, StudyError

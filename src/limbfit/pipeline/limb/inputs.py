@@ -8,9 +8,9 @@ import numpy as np
 
 from ...anatomy.imaging import LabelMap, Volume, check_image, clean_labels, read_labels, read_volume
 from ...anatomy.labels.contours import read_contours
-from ...anatomy.labels.naming import normalise_name
-from ...anatomy.labels.placement import place_on_grid
-from ...anatomy.segmentation.one_limb import check_one_limb
+from ...anatomy.labels.labelcheck import place_on_grid
+from ...anatomy.labels.labelfiles import normalise_name
+from ...anatomy.segmentation.body import check_one_limb
 from ...anatomy.segmentation.segmentation import segment
 from ...anatomy.surfaces.thickness import check_fat
 from ...study import Study

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...anatomy.imaging import LabelMap, read_labels
-from ...anatomy.segmentation.amputation import amputate_limb
-from ...anatomy.segmentation.voxels import amputate_anatomy
+from ...anatomy.segmentation.amputation import amputate_anatomy, amputate_limb
 from ...anatomy.surfaces.mending import build_closed_anatomy, orient_outward
 from ...anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface, save_anatomy
 from ...anatomy.surfaces.thickness import measure_fat_depth, write_thickness

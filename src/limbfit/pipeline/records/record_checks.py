@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.sites.sites import compute_indenter_axis
-from ...anatomy.sites.under import measure_tissue_under
+from ...anatomy.sites.sites import compute_indenter_axis, measure_tissue_under
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...identify.checks.plausibility import RecordFacts, RecordWarning, check_plausibility
 from ...indentation import compute_contact_radius

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
-from ...anatomy.sites.sites import compute_indenter_axis, compute_square_edges
-from ...anatomy.sites.under import measure_tissue_under
+from ...anatomy.sites.sites import compute_indenter_axis, compute_square_edges, measure_tissue_under
 from ...anatomy.surfaces.surfaces import Anatomy
 from ...arrays import Array
 from ...donning import Held

@@ -1,4 +1,4 @@
-"""What the grey values of an image mean: MRI, in which air is dark and bones are dark rings, or CT.
+"""CT: whether an image is one, its outline as that of an MRI, and its bones.
 
 T1 and UTE images are segmented alike, by grey levels relative to muscle. CT has Hounsfield units.
 """
@@ -8,9 +8,13 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import find_objects, grey_dilation
+from scipy.ndimage import label as connected
 
+from ...arrays import Array, Mask
 from ...errors import ImageError
 from ..grid import Volume
+from ..morphology import Field, close_mask, fill_slices, open_mask
 
 Contrast = Literal["auto", "T1", "UTE", "CT"]
 
@@ -20,6 +24,11 @@ _DENSEST_AIR_HU = -400.0  # no air is denser, where a grey-value window cut it o
 _AIR_WIDTH_HU = 100.0  # half the width of its peak in the histogram
 _AIR_SHARE = 0.03  # of the voxels: fewer are an artefact of resampling
 _TOP_HU = 100.0  # the outline does not tell bone from soft tissue
+_DENSE_HU = 200.0  # cancellous bone is denser, muscle and contrast-free vessels are not
+_COMPACT_HU = 1200.0  # denser than this counts as this, so that metal does not move outlines
+_RIM_MM = 2.5  # the outline is at half of the densest bone this near
+_CLOSE_MM = 2.0  # gaps in thin cortex
+_SMOOTH_MM = 1.0
 
 
 def is_ct(volume: Volume, stated: Contrast = "auto") -> bool:
@@ -67,3 +76,45 @@ def _has_air_peak(volume: Volume, low: float) -> bool:
 def rescale_above_air(volume: Volume) -> Volume:
     """A CT image as an MRI-like one for the outline: air 0, soft tissue about 1000, bone no brighter."""
     return volume.with_array(np.clip(volume.array, AIR_HU, _TOP_HU) - AIR_HU)
+
+
+def find_dense_bones(hounsfield: Field, limb: Mask, spacing: Array, smallest_mm3: float) -> list[Mask]:
+    """Masks of the bones, largest first; bones that touch are one.
+
+    Parameters
+    ----------
+    hounsfield : ``[k, j, i]``, k along the limb.
+    limb : everything inside the skin.
+    spacing : mm along i, j, k.
+    smallest_mm3 : bones smaller than this are left out.
+    """
+    compact = np.minimum(hounsfield, _COMPACT_HU)
+    size = 2 * np.ceil(_RIM_MM / spacing[::-1]).astype(int) + 1
+    half = (grey_dilation(compact, size=tuple(size)) + MUSCLE_HU) / 2
+    dense = limb & (compact > _DENSE_HU)
+    sharp = dense & (compact > half)
+    parts, _ = connected(sharp | (dense & _find_enclosed(sharp, dense, spacing)))
+    voxel = float(np.prod(spacing))
+    found = []
+    for value, box in enumerate(find_objects(parts), start=1):
+        if (parts[box] == value).sum() * voxel < 0.1 * smallest_mm3:
+            continue
+        bone = np.zeros(limb.shape, dtype=bool)
+        bone[box] = _fill_bone(parts[box] == value, spacing)
+        bone &= limb
+        if bone.sum() * voxel >= smallest_mm3:
+            found.append(bone)
+    return sorted(found, key=lambda bone: -int(bone.sum()))
+
+
+def _find_enclosed(sharp: Mask, dense: Mask, spacing: Array) -> Mask:
+    """Dense voxels that sharp ones enclose: cancellous bone, which is below half of the cortex beside it."""
+    return _fill_bone(sharp, spacing) & dense
+
+
+def _fill_bone(part: Mask, spacing: Array) -> Mask:
+    """Closed over gaps of the cortex, filled slice by slice, without spikes."""
+    padded = np.pad(part, ((0, 0), (1, 1), (1, 1)))  # a bone goes on beyond its ends, not beside them
+    closed = fill_slices(close_mask(padded, _CLOSE_MM, spacing))
+    opened = open_mask(closed, _SMOOTH_MM, spacing) | padded
+    return np.asarray(opened[:, 1:-1, 1:-1])
