@@ -41,19 +41,22 @@ from limbfit.acquire import (
     run_session,
 )
 from limbfit.acquire.events import PINS, Abort, Event, Flags, Sample, Stop
-from limbfit.acquire.messages import (
+from limbfit.acquire.line_protocol import (
+    HOST_LINE,
     Accepted,
     Bye,
+    Decoder,
+    Encoder,
     Heartbeat,
     Hello,
     Identity,
     SetLimits,
+    derive_salt,
     format_sample,
     parse_command,
 )
 from limbfit.acquire.session import prioritise
-from limbfit.acquire.wire import HOST_LINE, Decoder, Encoder, derive_salt
-from limbfit.study.acquisition import AcquireTable
+from limbfit.study.tables import AcquireTable
 
 SITE = "bench"
 WATCHDOG_S = 60.0  # a machine that stalls is to be measured, not to end the measurement

@@ -31,8 +31,7 @@ from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, write_surface
 from limbfit.bench.limbs import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, draw_random_sites, make_amputated_calf
 from limbfit.phantom.build import draw_true_parameters
 from limbfit.phantom.geometry import make_limb
-from limbfit.phantom.labels import build_true_labels
-from limbfit.phantom.mri import make_grid
+from limbfit.phantom.mri import build_true_labels, make_grid
 from limbfit.phantom.record import Ramp, record
 from limbfit.phantom.surfaces import Box, extract_contour
 

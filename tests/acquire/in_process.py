@@ -9,13 +9,12 @@ import numpy as np
 
 from acquiring import indentation
 from limbfit.acquire.device import HostConnection
-from limbfit.acquire.events import PINS, Confirm, KeyDown, KeyUp
-from limbfit.acquire.phases import Phase
+from limbfit.acquire.events import PINS, Confirm, KeyDown, KeyUp, Settings
+from limbfit.acquire.protocol import Phase
 from limbfit.acquire.session import Session
-from limbfit.acquire.settings import Settings
 from limbfit.acquire.virtual import Fault, VirtualFitSocket, VirtualLimb, fit_surrogate
 from limbfit.acquire.virtual.pins import BRAKING
-from limbfit.study.acquisition import AcquireTable
+from limbfit.study.tables import AcquireTable
 
 FAST = {
     "clamp_speed_mm_s": 8.0,

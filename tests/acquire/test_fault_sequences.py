@@ -24,7 +24,7 @@ from hypothesis.stateful import (
 from in_process import Bench
 
 from limbfit.acquire.events import PINS, Abort, KeyDown, KeyUp, LinkLost
-from limbfit.acquire.phases import Phase
+from limbfit.acquire.protocol import Phase
 from limbfit.acquire.virtual import FAULT_KINDS, Fault
 
 WAY = [

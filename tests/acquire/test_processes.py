@@ -24,9 +24,8 @@ from in_process import settings
 from acquiring import SPEED, fitsocket, start
 from limbfit.acquire import LineDevice, LiveUpdate, Session, connect, read_recording, run_session
 from limbfit.acquire.events import Abort, Confirm, Flags, Sample
-from limbfit.acquire.messages import SetLimits
-from limbfit.acquire.phases import Phase
-from limbfit.acquire.wire import Encoder
+from limbfit.acquire.line_protocol import Encoder, SetLimits
+from limbfit.acquire.protocol import Phase
 from limbfit.errors import RunError
 from limbfit.pipeline.records.traces import read_record
 from limbfit.study import load_study

@@ -7,7 +7,7 @@ import pytest
 from in_process import FAST, Bench, settings
 
 from limbfit.acquire.events import Abort, Confirm, KeyDown, KeyUp
-from limbfit.acquire.phases import FINAL, TRANSITIONS, Outcome, Phase
+from limbfit.acquire.protocol import FINAL, TRANSITIONS, Outcome, Phase
 from limbfit.acquire.session import PhaseUpdate
 from limbfit.acquire.virtual import Fault
 

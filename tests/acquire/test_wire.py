@@ -10,10 +10,14 @@ from hypothesis import strategies as st
 from in_process import Bench, Direct, device
 
 from limbfit.acquire.events import PINS, Fence, Hold, Move, Sample, Stop
-from limbfit.acquire.messages import (
+from limbfit.acquire.line_protocol import (
+    DEVICE_LINE,
+    HOST_LINE,
     Accepted,
     Bye,
     Declined,
+    Decoder,
+    Encoder,
     Heartbeat,
     Hello,
     Identity,
@@ -21,13 +25,13 @@ from limbfit.acquire.messages import (
     NoteCommand,
     OutOfReach,
     SetLimits,
+    derive_salt,
     format_command,
     format_sample,
     parse_command,
     parse_report,
 )
-from limbfit.acquire.phases import Phase
-from limbfit.acquire.wire import DEVICE_LINE, HOST_LINE, Decoder, Encoder, derive_salt
+from limbfit.acquire.protocol import Phase
 
 COMMANDS = [
     Hello("0123456789abcdef"),

@@ -15,8 +15,7 @@ from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.errors import InputError, StudyError
 from limbfit.phantom import Limb, build_true_sites, make_limb, make_phantom
 from limbfit.phantom.forces import choose_discretisation
-from limbfit.phantom.labels import FILE, write_true_labels
-from limbfit.phantom.mri import build_image, make_grid
+from limbfit.phantom.mri import LABELS_FILE, build_image, make_grid, write_true_labels
 from limbfit.phantom.sites import DETAIL_SITES, SAFE_SHARE
 from limbfit.phantom.socket import LINER_MM, make_socket
 from limbfit.phantom.surfaces import build_outer_surface, build_true_anatomy
@@ -108,7 +107,9 @@ def test_its_study_needs_no_tibia(tmp_path: Path) -> None:
     assert point == pytest.approx(socket.points[socket.brim].mean(axis=0), abs=5.0)
     write_true_labels(tmp_path / "study", thigh(0), make_grid(thigh(0), "coarse", 0))
     with (tmp_path / "study" / "study.toml").open("a") as file:
-        file.write(f'[[socket.loads]]\nname = "x"\npreset = "toe-off"\n[segmentation]\nlabels = "{FILE}"\n')
+        file.write(
+            f'[[socket.loads]]\nname = "x"\npreset = "toe-off"\n[segmentation]\nlabels = "{LABELS_FILE}"\n'
+        )
     with pytest.raises(StudyError, match="beside the knee centre, which is not known"):
         check_study(load_study(tmp_path / "study"))
 

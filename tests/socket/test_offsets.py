@@ -14,8 +14,7 @@ from limbfit.anatomy.frame import build_limb_frame
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, Zone, rectify_limb
-from limbfit.socket.offsets import Offsets, compute_offsets
-from limbfit.socket.rays import compute_profile
+from limbfit.socket.rays import Offsets, compute_offsets, compute_profile
 from limbfit.socket.rectify import reduce_to_volume
 from limbfit.socket.trim import Trim
 from limbfit.socket.wall import build_wall, measure_thickness

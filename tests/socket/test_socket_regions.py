@@ -8,8 +8,14 @@ from socket_limbs import FILES, real_limb, round_limb
 
 from limbfit.anatomy.surfaces.surfaces import Anatomy
 from limbfit.errors import SurfaceError
-from limbfit.socket.landmarks import find_bone, find_directions, find_knee_centre
-from limbfit.socket.regions import SkinRegion, build_default_regions, build_stated_region
+from limbfit.socket.landmarks import (
+    SkinRegion,
+    build_default_regions,
+    build_stated_region,
+    find_bone,
+    find_directions,
+    find_knee_centre,
+)
 
 SIDES = ("anterior", "posterior", "medial", "lateral")
 LEVELS = ("proximal", "middle", "distal")

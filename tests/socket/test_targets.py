@@ -12,8 +12,7 @@ from limbfit.anatomy.frame import build_limb_frame
 from limbfit.anatomy.surfaces.surfaces import compute_signed_distance
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, rectify_limb
-from limbfit.socket.landmarks import find_directions
-from limbfit.socket.regions import build_default_regions
+from limbfit.socket.landmarks import build_default_regions, find_directions
 from limbfit.socket.targets import PRESETS, TISSUE_DEPTH, Target, build_zone
 from limbfit.socket.trim import Trim
 

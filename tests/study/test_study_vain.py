@@ -22,7 +22,7 @@ from keyed_studies import (
 from test_study_docs import KEYS
 
 from limbfit.errors import StudyError
-from limbfit.study.vain import VAIN, VAIN_OF_SITE
+from limbfit.study.unused_keys import VAIN, VAIN_OF_SITE
 
 # Studies that state a key in vain: what is set in which study, and the key that is refused.
 AMPUTATED = ("geometry.amputation", {"point": [0.0, 0.0, 0.0]})

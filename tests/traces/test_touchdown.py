@@ -12,7 +12,7 @@ import pytest
 from scipy.signal import lfilter
 
 from limbfit.traces import Trace, find_touch_down
-from limbfit.traces.scatter import Scatter, estimate_scatter
+from limbfit.traces.numerics import Scatter, estimate_scatter
 
 NOISE_N, RATE_HZ = 0.05, 500.0
 

@@ -8,14 +8,12 @@ of the device are us of its own clock.
 Nothing here knows a study, a mesh or a solver: `limbfit.pipeline` puts them together.
 """
 
-from .device import Device, LineDevice
-from .events import Event
-from .links import DEFAULT_ADDRESS, DEFAULT_PORT, connect
+from .device import DEFAULT_ADDRESS, DEFAULT_PORT, Device, LineDevice, connect
+from .events import Event, Settings
 from .operator import Keyboard, NoOperator
 from .quality import RecordedRamp, Verdict, check_record, find_ramps
 from .recording import Recorder, Recording, follow_recording, read_recording
 from .session import Ending, Listener, LiveUpdate, PhaseUpdate, Session, Update, prioritise, run_session
-from .settings import Settings
 
 __all__ = [
     "DEFAULT_ADDRESS",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from queue import SimpleQueue
 
 from .events import Abort, Confirm, Event, KeyDown, KeyUp
-from .phases import Phase
+from .protocol import Phase
 from .session import PhaseUpdate, Update
 
 FIRST_REPEAT_S = 0.75  # a keyboard waits before a held key repeats

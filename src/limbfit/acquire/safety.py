@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from .events import PINS, Flags, Sample
-from .settings import Settings, to_thousandths
+from .events import PINS, Flags, Sample, Settings, to_thousandths
 
 FROZEN_S = 0.010  # a sensor whose last digit has not changed for so long, and so many samples, is dead
 FROZEN_SAMPLES = 8

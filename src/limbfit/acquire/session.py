@@ -19,12 +19,33 @@ from typing import Any
 
 from ..errors import RunError
 from .device import Device
-from .events import PERIOD_US, Abort, Action, Begin, Event, Hold, LinkLost, Move, Sample, Stop, Tick
-from .messages import Bye, Declined, Heartbeat, Identity, LimitTripped, NoteCommand, OutOfReach, SetLimits
-from .phases import Phase
-from .protocol import DeviceFacts, Protocol
+from .events import (
+    PERIOD_US,
+    Abort,
+    Action,
+    Begin,
+    Event,
+    Hold,
+    LinkLost,
+    Move,
+    Sample,
+    Settings,
+    Stop,
+    Tick,
+    to_thousandths,
+)
+from .line_protocol import (
+    Bye,
+    Declined,
+    Heartbeat,
+    Identity,
+    LimitTripped,
+    NoteCommand,
+    OutOfReach,
+    SetLimits,
+)
+from .protocol import DeviceFacts, Phase, Protocol
 from .recording import Recorder
-from .settings import Settings, to_thousandths
 
 LIVE_EVERY = 20  # samples between two that are told: 25 a second
 PACED_SILENCE_S = 20.0  # wall time, where the device's clock waits for limbfit's

@@ -20,7 +20,7 @@ from rich.panel import Panel
 from rich.text import Text
 
 from ..acquire import Event, Keyboard, LiveUpdate, PhaseUpdate, Update
-from ..study.acquisition import AcquireTable
+from ..study.tables import AcquireTable
 from .console import STDERR
 
 WIDTH, HEIGHT = 60, 12

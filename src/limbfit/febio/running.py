@@ -16,12 +16,10 @@ from ..errors import InputError, ProblemError, RunError
 from ..fe import Result, Step, System, solve
 from ..fe.kernel.laws import Laws
 from ..fe.observables import ElementFields, compute_element_fields, compute_nodal_forces
-from .drive import find_drive, group_contacts
 from .parts import build_tissue
 from .penalty import FacePenalties
-from .problem import build_step_control, has_penalty, to_problem
-from .reading.model import FebModel, read_feb
-from .reading.requests import Request
+from .problem import build_step_control, find_drive, group_contacts, has_penalty, to_problem
+from .reading.model import FebModel, Request, read_feb
 
 _CAUCHY = ("sx", "sy", "sz", "sxy", "syz", "sxz")
 

@@ -36,8 +36,7 @@ from .forces import (
     simulate_true_force,
 )
 from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, make_limb
-from .labels import write_true_labels
-from .mri import DETAIL_GRIDS, make_grid, write_series
+from .mri import DETAIL_GRIDS, make_grid, write_series, write_true_labels
 from .record import Ramp, SecondaryMeasurements, record, write_surface, write_ultrasound, write_waves
 from .sites import DETAIL_SITES, INDENTER_MM, TrueSite, build_markers, build_true_sites, select_sites
 from .socket import write_socket

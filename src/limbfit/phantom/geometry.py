@@ -10,9 +10,17 @@ from numpy.typing import NDArray
 
 from ..anatomy.meshing.layers import LayerSpec
 from ..errors import InputError
-from .fields import PROXIMAL_CUT_MM, Array, LimbShape, compute_skin_field, compute_surface_point, vary
-from .shank import Shank, compute_tendon_field
-from .thigh import Thigh
+from .limb_shapes import (
+    PROXIMAL_CUT_MM,
+    Array,
+    LimbShape,
+    Shank,
+    Thigh,
+    compute_skin_field,
+    compute_surface_point,
+    compute_tendon_field,
+    vary,
+)
 
 TENDON = "tendon"  # the region's name
 LIMBS: dict[str, LimbShape] = {"transtibial": Shank(), "transfemoral": Thigh()}

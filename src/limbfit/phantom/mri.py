@@ -21,9 +21,10 @@ from pydicom.uid import UID, ExplicitVRLittleEndian, MRImageStorage, generate_ui
 from pydicom.valuerep import format_number_as_ds
 from scipy.special import ndtr
 
-from ..anatomy.grid import Volume
-from .fields import PROXIMAL_CUT_MM
+from ..anatomy.grid import DEFAULT_NAMES, Volume
+from ..anatomy.imaging import LabelMap, write_labels
 from .geometry import Limb, build_rotation
+from .limb_shapes import PROXIMAL_CUT_MM
 
 FAT, MUSCLE, MARROW, CORTEX, TENDON, MARKER = 1.0, 0.5, 0.8, 0.12, 0.3, 1.15
 MARKER_DIAMETER_MM, MARKER_HEIGHT_MM = 9.0, 5.0
@@ -313,3 +314,31 @@ def _place(data: FileDataset, grid: ScanGrid, index: int) -> None:
     data.PixelSpacing = _format_decimals([grid.spacing[1], grid.spacing[0]])
     data.SliceThickness = data.SpacingBetweenSlices = _format_decimals([grid.spacing[2]])[0]
     data.SliceLocation = _format_decimals([float(position @ grid.direction[:, 2])])[0]
+
+
+LABELS_FILE = Path("labels") / "labels.seg.nrrd"
+TENDON_LABEL, TENDON_VALUE = "patellar tendon", 7
+
+
+def build_true_labels(limb: Limb, grid: ScanGrid) -> LabelMap:
+    """Soft tissue, bones and, where the limb has one, the patellar tendon, voxel by voxel."""
+    values = {name: value for value, name in DEFAULT_NAMES.items()}
+    array = np.zeros(grid.shape, dtype=np.uint8)
+    for start in range(0, grid.shape[0], SLAB):
+        k = slice(start, min(start + SLAB, grid.shape[0]))
+        points = grid.points(k, slice(0, grid.shape[1]), slice(0, grid.shape[2]))
+        part = (limb.skin(points) < 0).astype(np.uint8)
+        if limb.has_tendon:
+            part[limb.tendon(points) < 0] = TENDON_VALUE
+        for name in limb.bone_names:
+            part[limb.bone(name, points) < 0] = values[name]
+        array[k] = part
+    names = {value: name for value, name in DEFAULT_NAMES.items() if (array == value).any()}
+    tendon = {TENDON_VALUE: TENDON_LABEL} if limb.has_tendon else {}
+    return LabelMap(array, np.array(grid.spacing), grid.origin, grid.direction, names | tendon)
+
+
+def write_true_labels(folder: Path, limb: Limb, grid: ScanGrid) -> None:
+    """Write the label map to ``LABELS_FILE`` below a folder."""
+    (folder / LABELS_FILE.parent).mkdir()
+    write_labels(folder / LABELS_FILE, build_true_labels(limb, grid))

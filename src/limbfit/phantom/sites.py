@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from ..errors import SiteError
 from .geometry import Limb
+from .limb_shapes import Shank
 from .mri import SkinMarker
-from .shank import Shank
 
 INDENTER_MM, INDENTER_EDGE_MM = 20.0, 2.0
 SAFE_SHARE = 0.4  # of the thinnest soft tissue under the indenter

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 from ..anatomy.meshing.layers import LayerSpec
 from .geometry import TENDON, Limb
-from .labels import FILE, TENDON_LABEL
+from .limb_shapes import Shank
+from .mri import LABELS_FILE, TENDON_LABEL
 from .record import NOTHING, SecondaryMeasurements
-from .shank import Shank
 from .sites import INDENTER_EDGE_MM, INDENTER_MM, TrueSite
 from .socket import FILE as SOCKET_FILE
 from .socket import LINER_MM
@@ -51,7 +51,7 @@ accuracy = "fine"
 
 _LABELS = f"""\
 [segmentation]
-labels = "{FILE.as_posix()}"   # the tendon was drawn by hand
+labels = "{LABELS_FILE.as_posix()}"   # the tendon was drawn by hand
 
 """
 _REGIONS = f"""\

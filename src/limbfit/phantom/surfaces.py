@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
 from ..anatomy.surfaces.triangles import find_bodies, find_half_edges, from_pyvista
-from .fields import PROXIMAL_CUT_MM, compute_skin_field
 from .geometry import TENDON, Limb
+from .limb_shapes import PROXIMAL_CUT_MM, compute_skin_field
 
 Array = NDArray[np.floating]
 Field = Callable[[Array], Array]

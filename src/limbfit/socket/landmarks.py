@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
+import igl
 import numpy as np
+from numpy.typing import NDArray
 
 from ..anatomy.frame import build_limb_frame
 from ..anatomy.surfaces.surfaces import Anatomy
@@ -102,3 +105,171 @@ def load_point(anatomy: Anatomy, brim: Array) -> Array:
     local = Surface(frame.to_limb(skin.points), skin.faces)
     x, y, _ = measure_section(cut_section(local, (0.0, 0.0, z), (0.0, 0.0, 1.0)))
     return frame.to_patient(np.array([x, y, z]))
+
+
+Mask = NDArray[np.bool_]
+
+LEVELS = ("proximal", "middle", "distal")
+CREST_MM = 12.0  # half the width of the strip over the tibial crest
+CREST_SHARE = (0.15, 0.85)  # of the tibia's length, from its top
+BONE_END_MM = 15.0  # of a bone's end that its prominence belongs to
+PROMINENCE_MM = 20.0  # radius of the regions over ends of bones
+FACING = 0.3  # cosine: what a round region holds looks its way
+FAR_MM = 20.0  # a stated position so far off the skin is a mistake
+
+
+@dataclass(frozen=True, eq=False)
+class SkinRegion:
+    """A part of the skin: its middle on the skin (LPS mm) and the skin's faces that belong to it (m,)."""
+
+    name: str
+    position: Array
+    faces: Mask
+
+
+def build_default_regions(
+    anatomy: Anatomy, known: Directions, below: float | None = None
+) -> dict[str, SkinRegion]:
+    """The regions of a limb by name, where nothing is stated.
+
+    Four sides in three levels between ``below`` and the distal end; over the bones that have these names, the
+    tibial crest, the fibular head, the ends of tibia and fibula and the patellar tendon.
+
+    Parameters
+    ----------
+    known : where anterior and medial are; where medial is not, the sides are ``left`` and ``right``.
+    below : height over the proximal cut (negative, mm) at which the highest level starts, such as the brim's;
+        by default that of the knee centre, or 30 mm below the cut.
+    """
+    knee = find_knee_centre(anatomy)
+    top = below if below is not None else float(anatomy.height(knee)) if knee is not None else -30.0
+    masks = _select_levels(anatomy, known, top) | _select_skin_over_bones(anatomy, known)
+    skin, middles = anatomy.skin, anatomy.skin.triangles.mean(axis=1)
+    regions = {}
+    for name, mask in masks.items():
+        if mask.any():
+            centre = np.average(middles[mask], axis=0, weights=skin.face_areas[mask])
+            nearest = np.flatnonzero(mask)[np.linalg.norm(middles[mask] - centre, axis=1).argmin()]
+            regions[name] = SkinRegion(name, middles[nearest], mask)
+    return regions
+
+
+def build_stated_region(anatomy: Anatomy, name: str, position: Array, radius_mm: float) -> SkinRegion:
+    """The round region of a name: faces of the skin within a radius that look the way of the middle.
+
+    Raises
+    ------
+    SurfaceError
+        Where the position is off the skin.
+    """
+    skin = anatomy.skin
+    squared, face, foot = igl.point_mesh_squared_distance(np.atleast_2d(position), skin.points, skin.faces)
+    if squared[0] > FAR_MM**2:
+        raise SurfaceError(
+            f"region {name!r} lies {np.sqrt(squared[0]):.0f} mm off the skin",
+            remedy="give a position on the skin (LPS, mm)",
+        )
+    return SkinRegion(name, foot[0], _select_disc(skin, foot[0], radius_mm, skin.face_normals[face[0]]))
+
+
+def _select_disc(skin: Surface, middle: Array, radius_mm: float, outward: Array) -> Mask:
+    near = np.linalg.norm(skin.triangles.mean(axis=1) - middle, axis=1) <= radius_mm
+    near[np.linalg.norm(skin.triangles.mean(axis=1) - middle, axis=1).argmin()] = True
+    return near & (skin.face_normals @ outward > FACING)
+
+
+def _select_levels(anatomy: Anatomy, known: Directions, top: float) -> dict[str, Mask]:
+    middles = anatomy.skin.triangles.mean(axis=1)
+    height = anatomy.height(middles)
+    bottom = float(height.min())
+    level = np.floor(3.0 * (top - height) / (top - bottom + 1e-9)).astype(int)
+    left = np.cross(known.proximal, known.anterior)
+    ahead, beside = np.zeros(len(middles)), np.zeros(len(middles))
+    for k in range(len(LEVELS)):  # sides are told from the middle of their level
+        here = level == k
+        spokes = middles[here] - middles[here].mean(axis=0) if here.any() else middles[here]
+        ahead[here], beside[here] = spokes @ known.anterior, spokes @ left
+    if known.lateral is None:
+        names = ("anterior", "left", "posterior", "right")
+    else:
+        outside = float(known.lateral @ left) > 0.0
+        names = (
+            "anterior",
+            "lateral" if outside else "medial",
+            "posterior",
+            "medial" if outside else "lateral",
+        )
+    quarter = np.round(np.arctan2(beside, ahead) / (np.pi / 2)).astype(int) % 4
+    return {
+        f"{side} {word}": (quarter == q) & (level == k)
+        for q, side in enumerate(names)
+        for k, word in enumerate(LEVELS)
+    }
+
+
+def _select_skin_over_bones(anatomy: Anatomy, known: Directions) -> dict[str, Mask]:
+    found: dict[str, Mask] = {}
+    tibia, fibula, patella = (find_bone(anatomy, name) for name in ("tibia", "fibula", "patella"))
+    if tibia is not None:
+        found["tibial crest"] = _select_crest(anatomy, known, tibia)
+        found["distal tibia"] = _select_skin_over_end(anatomy, tibia, distal=True)
+        if patella is not None:
+            found["patellar tendon"] = _select_tendon(anatomy, known, patella, tibia)
+    if fibula is not None:
+        found["fibular head"] = _select_skin_over_end(anatomy, fibula, distal=False)
+        found["distal fibula"] = _select_skin_over_end(anatomy, fibula, distal=True)
+    return found
+
+
+def _find_thinnest_tissue(skin: Surface, ends: Array, allowed: Mask) -> tuple[Array, Array]:
+    """The point (3,) of the skin with the least tissue over bone points (n, 3), and its normal."""
+    faces = np.flatnonzero(allowed)
+    middles = skin.triangles[faces].mean(axis=1)
+    apart = np.linalg.norm(middles[:, None] - ends[None], axis=2).min(axis=1)
+    best = faces[apart.argmin()]
+    return skin.triangles[best].mean(axis=0), skin.face_normals[best]
+
+
+def _select_skin_over_end(anatomy: Anatomy, surface: Surface, *, distal: bool) -> Mask:
+    """Round about the place with the least tissue over an end of a bone."""
+    skin, height = anatomy.skin, anatomy.height(surface.points)
+    near = height < height.min() + BONE_END_MM if distal else height > height.max() - BONE_END_MM
+    below_cut = anatomy.height(skin.triangles.mean(axis=1)) < -1.0
+    middle, outward = _find_thinnest_tissue(skin, surface.points[near], below_cut)
+    return _select_disc(skin, middle, PROMINENCE_MM, outward)
+
+
+def _select_crest(anatomy: Anatomy, known: Directions, tibia: Surface) -> Mask:
+    """Faces near the line along which the tissue ahead of the tibia's shaft is thinnest."""
+    middles = anatomy.skin.triangles.mean(axis=1)
+    height, ends = anatomy.height(middles), anatomy.height(tibia.points)
+    length = float(np.ptp(ends))
+    upper, lower = (ends.max() - share * length for share in CREST_SHARE)
+    axis = tibia.points.mean(axis=0)
+    front = (middles - axis) @ known.anterior > 0.0
+    shaft = front & (height < upper) & (height > lower)
+    if not shaft.any():
+        return shaft
+    depth = np.full(len(middles), np.inf)
+    squared, _, _ = igl.point_mesh_squared_distance(middles[shaft], tibia.points, tibia.faces)
+    depth[shaft] = np.sqrt(squared)
+    slabs = np.linspace(lower, upper, max(2, round((upper - lower) / 5.0)) + 1)
+    line = []
+    for low, high in pairwise(slabs):
+        here = np.flatnonzero(shaft & (height >= low) & (height <= high))
+        if len(here):
+            line.append(middles[here[depth[here].argmin()]])
+    apart = np.linalg.norm(middles[:, None] - np.array(line)[None], axis=2).min(axis=1)
+    return shaft & (apart <= CREST_MM)
+
+
+def _select_tendon(anatomy: Anatomy, known: Directions, patella: Surface, tibia: Surface) -> Mask:
+    """Faces ahead of the gap between the patella's lower pole and the tibia's upper fifth."""
+    middles = anatomy.skin.triangles.mean(axis=1)
+    pole = patella.points[anatomy.height(patella.points).argmin()]
+    ends = anatomy.height(tibia.points)
+    tuberosity = ends.max() - 0.2 * float(np.ptp(ends))
+    height = anatomy.height(middles)
+    across = np.abs((middles - pole) @ np.cross(known.proximal, known.anterior))
+    ahead = (middles - pole) @ known.anterior > -15.0
+    return ahead & (across < 15.0) & (height < anatomy.height(pole)) & (height > tuberosity)

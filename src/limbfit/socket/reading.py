@@ -22,8 +22,7 @@ from ..anatomy.surfaces.triangles import (
 )
 from ..arrays import Array
 from ..errors import SurfaceError
-from .bones import refuse_bones
-from .clearance import apply_clearance
+from .clearance import apply_clearance, refuse_bones
 from .rays import Rays, compute_profile, find_ray_hits
 from .shape import Socket
 

@@ -13,7 +13,7 @@ from ..anatomy.surfaces.surfaces import Anatomy
 from ..arrays import Array
 from ..errors import SurfaceError
 from .areas import Zone
-from .regions import SkinRegion
+from .landmarks import SkinRegion
 from .shape import Socket
 
 PROMINENCES = ("tibial crest", "fibular head", "distal tibia", "distal fibula")

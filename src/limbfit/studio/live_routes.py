@@ -14,7 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from ..acquire import Recording, follow_recording
 from ..acquire.events import PINS
-from ..acquire.phases import FINAL
+from ..acquire.protocol import FINAL
 from ..errors import TraceError
 from ..pipeline.commands.acquire import FOLDER as ACQUIRED
 from ..pipeline.commands.acquire import RECORD, VERDICT

@@ -4,13 +4,11 @@ Relative paths are relative to the study file and must stay inside its folder's 
 ``results/`` beside it.
 """
 
-from .acquisition import AcquireTable
-from .clamps import ClampsTable
 from .loading import load_study
 from .material import MaterialTable
 from .records import Indentation, Record, Site
-from .tables import IndenterTable, SolverTable, Vector
-from .whole import Study
+from .study import Study
+from .tables import AcquireTable, ClampsTable, IndenterTable, SolverTable, Vector
 
 __all__ = [
     "AcquireTable",

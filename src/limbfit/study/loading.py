@@ -11,8 +11,8 @@ from pydantic import ValidationError
 from ..anatomy.sites.markups import read_markups
 from ..errors import StudyError
 from ..extensions import load_extensions
-from .vain import refuse_vain
-from .whole import Study
+from .study import Study
+from .unused_keys import refuse_vain
 
 
 def load_study(path: str | Path, *, recorded: bool = True) -> Study:

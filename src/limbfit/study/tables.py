@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import InitErrorDetails
 
 from ..errors import InputError
 from ..shapes import SHAPES, Size
-from .friction import Friction
+
+
+def _check(value: Any) -> Any:
+    """One line for all that it cannot be, instead of one for each kind of value."""
+    number = isinstance(value, int | float) and not isinstance(value, bool) and 0.0 <= value < math.inf
+    if not number and value not in ("frictionless", "sticky"):
+        raise ValueError(f'{value!r} is not "frictionless", "sticky" or a coefficient from 0 on')
+    return value
+
+
+Friction = Annotated[Literal["frictionless", "sticky"] | float, BeforeValidator(_check)]
+
 
 Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -372,3 +392,112 @@ class ExecutionTable(TomlTable):
     workers: Annotated[int, Field(ge=0, le=1024)] = 0
     time_limit_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 3600.0
     memory_limit_GB: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+
+
+class AcquireTable(TomlTable):
+    """Speeds, forces, pauses, repeats and limits of the experiment; defaults are the paper's (section 2.1.2).
+
+    What the paper does not state (approach, retraction, limits) is what suits a seated person's limb.
+    """
+
+    pin: Annotated[int, Field(ge=1, le=14)] = 1
+    clamp_N: Annotated[float, Field(ge=1, le=25)] = 15.0
+    clamp_tolerance_N: Positive = 1.0
+    clamp_speed_mm_s: Positive = 5.0
+    settle_s: Annotated[float, Field(ge=0.1, le=60)] = 1.0
+    approach_speed_mm_s: Positive = 2.0
+    touch_N: Annotated[float, Field(ge=0.1, le=2)] = 0.2
+    start_gap_mm: Annotated[float, Field(ge=0, le=5)] = 0.5
+    search_speed_mm_s: Positive = 5.0
+    search_force_N: Positive = 18.0
+    search_depth_mm: Positive = 15.0
+    min_depth_mm: Positive = 1.0
+    pause_s: Annotated[float, Field(ge=0, le=600)] = 5.0
+    precondition: Annotated[int, Field(ge=0, le=50)] = 0
+    repeats: Annotated[int, Field(ge=1, le=50)] = 1
+    ramp_speed_mm_s: Positive = 0.96
+    hold_s: Annotated[float, Field(ge=0, le=599)] = 0.0
+    retract_speed_mm_s: Annotated[float, Field(gt=0, le=100)] = 20.0
+    force_limit_N: Annotated[float, Field(gt=0, le=45)] = 25.0
+    clamp_limit_N: Annotated[float, Field(gt=0, le=45)] = 25.0
+    depth_limit_mm: Annotated[float, Field(gt=0, le=50)] = 20.0
+    speed_limit_mm_s: Annotated[float, Field(gt=0, le=12)] = 8.0
+    time_limit_s: Annotated[float, Field(ge=1, le=600)] = 90.0
+    operator_limit_s: Annotated[float, Field(ge=1, le=3600)] = 600.0
+    watchdog_ms: Annotated[float, Field(ge=10, le=500)] = 20.0
+    key_gap_ms: Annotated[float, Field(ge=30, le=1000)] = 120.0
+
+    @model_validator(mode="after")
+    def _below_the_limits(self) -> AcquireTable:
+        for name in ("clamp", "approach", "search", "ramp"):
+            if getattr(self, f"{name}_speed_mm_s") > self.speed_limit_mm_s:
+                raise ValueError(f"{name}_speed_mm_s is over speed_limit_mm_s")
+        if self.hold_s >= self.time_limit_s:
+            raise ValueError("hold_s is not below time_limit_s: the hold would end in a stop")
+        if self.search_force_N >= self.force_limit_N:
+            raise ValueError("search_force_N is not below force_limit_N: the search would end in a stop")
+        if self.search_depth_mm >= self.depth_limit_mm:
+            raise ValueError("search_depth_mm is not below depth_limit_mm: the search would end in a stop")
+        if self.min_depth_mm >= self.search_depth_mm:
+            raise ValueError("min_depth_mm is not below search_depth_mm")
+        if self.clamp_N + self.clamp_tolerance_N >= self.clamp_limit_N:
+            raise ValueError(
+                "clamp_N with its tolerance is not below clamp_limit_N: clamping would end in a stop"
+            )
+        if self.clamp_tolerance_N >= self.clamp_N:
+            raise ValueError("clamp_tolerance_N is not below clamp_N")
+        return self
+
+
+RING = 14  # pins of the device of the source paper (section 2.1), the test pin among them
+CLEAR = 1  # on either side of the test pin, off the skin, so that tissue can bulge
+Angle = Annotated[float, Field(ge=-180.0, le=180.0)]
+
+
+class ClampsTable(TomlTable):
+    """Square pins that press by ``force_N`` each before the indenter touches; none where there is no table.
+
+    ``angles_degrees`` are around the limb from the test pin, by default those of the paper's eleven;
+    ``levels_mm`` how far proximally of its plane, one for each angle or one for all.
+    """
+
+    force_N: Annotated[float, Field(gt=0, le=100)] = 15.0
+    angles_degrees: tuple[Angle, ...] = ()
+    levels_mm: tuple[float, ...] = (0.0,)
+    width_mm: Annotated[float, Field(ge=5, le=60)] = 20.0
+    clamping_s: Positive = 2.0
+    settling_s: Positive = 5.0
+
+    @field_validator("angles_degrees")
+    @classmethod
+    def _apart(cls, angles: tuple[float, ...]) -> tuple[float, ...]:
+        if len(set(angles)) < len(angles):
+            raise ValueError("two pins are at one angle; give each angle once")
+        if 0.0 in angles:
+            raise ValueError("0 is where the test pin is; leave it out")
+        return angles
+
+    @model_validator(mode="after")
+    def _one_level_each(self) -> ClampsTable:
+        if len(self.levels_mm) not in (1, len(self.angles)):
+            raise ValueError(
+                f"levels_mm has {len(self.levels_mm)} levels for {len(self.angles)} pins; "
+                "give one, or one for each angle"
+            )
+        return self
+
+    @property
+    def angles(self) -> tuple[float, ...]:
+        """Degrees of each pin, those stated or the paper's."""
+        usual = tuple(360.0 * k / RING for k in range(CLEAR + 1, RING - CLEAR))
+        return self.angles_degrees or usual
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """Level of each pin, mm."""
+        return self.levels_mm if len(self.levels_mm) > 1 else self.levels_mm * len(self.angles)
+
+    @property
+    def begun_s(self) -> float:
+        """When the indenter touches, after clamping began, s."""
+        return self.clamping_s + self.settling_s

@@ -12,15 +12,24 @@ beside it, ``read_surface_motion`` tells how the skin there moved.
 Units: s, mm, N; force positive when pushing, displacement positive into the limb.
 """
 
-from .creep import Creep, regularise_creep
-from .layers import Layers, Thinning, compute_thinnings, read_layers
+from .interpretation import InterpretedRecord, interpret_record
 from .reading import read_trace
 from .record import COLUMNS, Remark, Trace, check_trace
-from .regularise import Regularised, regularise
-from .surface import SurfaceMeans, SurfaceMotion, read_surface_motion, select_frames_in_contact
+from .regularise import Creep, Regularised, regularise, regularise_creep
+from .secondary_measurements import (
+    Layers,
+    SurfaceMeans,
+    SurfaceMotion,
+    Thinning,
+    WaveMeans,
+    WaveSpeeds,
+    compute_thinnings,
+    read_layers,
+    read_surface_motion,
+    read_wave_speeds,
+    select_frames_in_contact,
+)
 from .touchdown import TouchDown, find_touch_down, touch_down_at
-from .understanding import InterpretedRecord, interpret_record
-from .waves import WaveMeans, WaveSpeeds, read_wave_speeds
 
 __all__ = [
     "COLUMNS",

@@ -17,11 +17,9 @@ from scipy.optimize import nnls
 
 from ..phases import MotionPhase
 from .displacement import BrokenLine
-from .numerics import Array, average_in_bins, estimate_noise_level, find_resolution
-from .onset import compute_memory
+from .numerics import Array, Scatter, average_in_bins, estimate_noise_level, find_resolution
 from .record import Remark, Trace
-from .scatter import Scatter
-from .touchdown import TouchDown, find_depth_at
+from .touchdown import TouchDown, compute_memory, find_depth_at
 
 _SHARPLY = 0.5  # of the largest speed: a corner at which the speed changes by more
 _WINDOW_S = 1.0  # on either side of a corner

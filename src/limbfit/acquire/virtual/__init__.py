@@ -6,9 +6,8 @@ that such devices plausibly have; it is no model of a particular one.
 
 from .faults import FAULT_KINDS, Fault, read_faults
 from .fitsocket import VirtualFitSocket
-from .limb import VirtualLimb
+from .limb import Surrogate, VirtualLimb, fit_surrogate
 from .server import Serving, serve
-from .surrogate import Surrogate, fit_surrogate
 
 __all__ = [
     "FAULT_KINDS",

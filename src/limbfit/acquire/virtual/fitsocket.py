@@ -13,11 +13,15 @@ from collections import deque
 import numpy as np
 
 from ..events import PINS, RATE_HZ, Fence, Flags, Hold, Move, Sample, Stop
-from ..messages import (
+from ..line_protocol import (
+    HOST_LINE,
+    VERSION,
     Accepted,
     Bye,
     Command,
     Declined,
+    Decoder,
+    Encoder,
     Heartbeat,
     Hello,
     Identity,
@@ -25,11 +29,11 @@ from ..messages import (
     NoteCommand,
     OutOfReach,
     SetLimits,
+    derive_salt,
     format_sample,
     parse_command,
 )
 from ..safety import FROZEN_S, FROZEN_SAMPLES, Guard, SafetyLimits
-from ..wire import HOST_LINE, VERSION, Decoder, Encoder, derive_salt
 from .faults import Fault, FaultClock
 from .limb import VirtualLimb
 from .pins import STROKE_MM, Motors, Sensors

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ...errors import InputError, RunError
+from ..device import Link, TcpLink
 from ..events import PERIOD_US
-from ..links import Link, TcpLink
 from .fitsocket import EVERY, VirtualFitSocket
 
 AHEAD_US = 4 * PERIOD_US  # how far a paced device runs ahead of what its host has dealt with

@@ -7,7 +7,7 @@ Source: FEBio User Manual 4.0, sections 4.1.1 and 4.1.3.
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,8 @@ from ...arrays import Array
 from ...errors import ProblemError
 from ...fe import Contractile, Fibred, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
 from ...fe.materials import Uncoupled
+from .geometry import Part
+from .timing import LoadCurve
 from .tree import XmlNode
 
 ELASTIC = {
@@ -241,3 +243,163 @@ def _check_modulus(node: XmlNode, mu: float) -> float:
     if not mu > 0.0:
         raise node.error(f"the shear modulus of small strains is {mu:.4g} MPa, not positive")
     return mu
+
+
+GRADIENT, MATRIX = "prestrain gradient", "mat3"
+_FIRST = (1.0, 0.0, 0.0)  # FEBio's, where nothing is said
+
+
+@dataclass(frozen=True)
+class Contraction:
+    """The load curve of a material's active stress (0: it is constant)."""
+
+    material: str
+    curve: int
+    line: int
+
+
+@dataclass(frozen=True)
+class Prestrain:
+    """The pre-strain of the cells (m, 3, 3) of a part, and the load curve with which it grows (0: none)."""
+
+    gradient: Array
+    curve: int
+    factor: float
+    line: int
+
+
+def read_contractions(
+    section: XmlNode, materials: Mapping[str, Material], curves: Mapping[int, LoadCurve]
+) -> tuple[Contraction, ...]:
+    """Read the courses of the active stresses of the materials that have some."""
+    found = []
+    for node in section:
+        if materials.get(node.attribute("name")) is not None:
+            for solid in _walk(node):
+                if solid.attributes.get("type") == ACTIVE:
+                    curve = _read_curve_number(solid.child("activation"), curves)
+                    found.append(Contraction(node.attribute("name"), curve, solid.line))
+    return tuple(found)
+
+
+def _walk(node: XmlNode) -> Iterator[XmlNode]:
+    for child in node:
+        yield child
+        yield from _walk(child)
+
+
+def _read_curve_number(value: XmlNode, curves: Mapping[int, LoadCurve]) -> int:
+    number = value.attributes.get("lc", "")
+    if number and not (number.isdecimal() and int(number) in curves):
+        raise value.error(f"there is no load curve {number!r}")
+    return int(number or 0)
+
+
+def read_prestrains(
+    root: XmlNode,
+    materials: Mapping[str, Material],
+    curves: Mapping[int, LoadCurve],
+    parts: Mapping[str, Part],
+) -> dict[str, Prestrain]:
+    """Read the pre-strains of the parts that have some.
+
+    Raises
+    ------
+    ProblemError
+        For generators other than a gradient, and for gradients that change the volume, which FEBio's pressure
+        does not see and limbfit's does.
+    """
+    maps = {(data.attribute("name"), data.attribute("elem_set")): data for data in _find_matrices(root)}
+    nodes = {node.attribute("name"): node for node in root.child("Material")}
+    found = {}
+    for name, part in parts.items():
+        node = nodes[part.material]
+        prestrain = node.find("prestrain") if node.attributes.get("type") == PRESTRAINED else None
+        if part.material not in materials or prestrain is None:
+            continue
+        if prestrain.attribute("type") != GRADIENT:
+            raise prestrain.error(f"a pre-strain is read as {GRADIENT!r} only")
+        ramp, value = prestrain.find("ramp"), prestrain.child("F0")
+        gradient = _read_gradient(value, maps, name, len(part.cells))
+        if np.abs(np.linalg.det(gradient) - 1.0).max(initial=0.0) > 1e-9:
+            raise value.error("changes the volume, which FEBio's pressure does not see and limbfit's does")
+        curve, factor = (0, 1.0) if ramp is None else (_read_curve_number(ramp, curves), ramp.scalar())
+        found[name] = Prestrain(gradient, curve, factor, prestrain.line)
+    return found
+
+
+def _find_matrices(root: XmlNode) -> list[XmlNode]:
+    """Return the matrices of elements in the section of mesh data."""
+    section = root.find("MeshData") or ()
+    return [data for data in section if data.attributes.get("data_type") == MATRIX]
+
+
+def _read_gradient(value: XmlNode, maps: Mapping[tuple[str, str], XmlNode], part: str, count: int) -> Array:
+    if value.attributes.get("type") != "map":
+        return np.tile(np.reshape(value.numbers(9), (3, 3)), (count, 1, 1))
+    name, found = value.text.strip(), np.full((count, 9), np.nan)
+    data = maps.get((name, part))
+    if data is None:
+        raise value.error(f"there is no map {name[:40]!r} of the part {part!r}")
+    for element in data:
+        found[_find_cell(element, count)] = element.numbers(9)
+    if np.isnan(found).any():
+        raise data.error("has no value for some element of the part")
+    return found.reshape(-1, 3, 3)
+
+
+def read_fibres(
+    root: XmlNode, materials: Mapping[str, Material], parts: Mapping[str, Part]
+) -> dict[str, Array]:
+    """Read the direction of the fibres of each cell (m, 3) of the parts that have some.
+
+    Raises
+    ------
+    ProblemError
+        For axes that are not given by vectors, and for other data of the mesh.
+    """
+    axes = {node.attribute("name"): _read_material_axis(node) for node in root.child("Material")}
+    found = {}
+    for name, part in parts.items():
+        if part.material in materials and materials[part.material].table().has_fibres:
+            found[name] = np.tile(axes[part.material], (len(part.cells), 1))
+    for data in root.find("MeshData") or ():
+        if data.attributes.get("data_type") == MATRIX:
+            continue
+        if data.tag != "ElementData" or data.attribute("type") != "mat_axis":
+            raise data.error(f"of <MeshData> only the mat_axis of elements, and {MATRIX}, are supported")
+        name = data.attribute("elem_set")
+        if name not in parts:
+            raise data.error(f"there is no part {name!r}")
+        if name in found:
+            _read_element_axes(data, found[name])
+    return found
+
+
+def _read_material_axis(node: XmlNode) -> Array:
+    axis = node.find("mat_axis")
+    if axis is None:
+        return np.array(_FIRST)
+    if axis.attribute("type") != "vector":
+        raise axis.error("is not given by vectors", 'use type="vector" with <a> and <d>')
+    return _read_vector(axis)
+
+
+def _read_element_axes(data: XmlNode, out: Array) -> None:
+    for element in data:
+        out[_find_cell(element, len(out))] = _read_vector(element)
+
+
+def _find_cell(element: XmlNode, count: int) -> int:
+    """Return the place of an element among the ``count`` cells of its part, by the attribute ``lid``."""
+    text = element.attribute("lid")
+    if not text.isdecimal() or not 1 <= int(text[:9]) <= count:
+        raise element.error(f"there is no element {text[:20]} in the part")
+    return int(text) - 1
+
+
+def _read_vector(node: XmlNode) -> Array:
+    found = np.array(node.child("a").numbers(3))
+    if not found.any():
+        raise node.error("has an axis of no length")
+    return found

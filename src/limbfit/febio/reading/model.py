@@ -8,18 +8,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from ...arrays import Array, Indices
 from ...errors import ProblemError
 from ...fe import Material
-from .controls import ControlPhase, compute_step_times, read_phases
-from .curves import LoadCurve, read_curves
 from .geometry import Geometry, Part, find_node_set, read_geometry
-from .materials import RigidMaterial, read_materials
-from .requests import Request, read_requests
+from .materials import (
+    Contraction,
+    Prestrain,
+    RigidMaterial,
+    read_contractions,
+    read_fibres,
+    read_materials,
+    read_prestrains,
+)
 from .rigid import (
     RigidCondition,
     RigidRail,
@@ -31,14 +36,7 @@ from .rigid import (
     read_factor,
     read_rails,
 )
-from .tissue_state import (
-    Contraction,
-    Prestrain,
-    compute_settling_time_s,
-    read_contractions,
-    read_fibres,
-    read_prestrains,
-)
+from .timing import ControlPhase, LoadCurve, compute_step_times, read_curves, read_phases
 from .tree import XmlNode, read_tree
 
 COMPONENTS = ("x", "y", "z")
@@ -48,6 +46,7 @@ _KNOWN_SECTIONS = (
     "Module", "Control", "Globals", "Material", "Mesh", "MeshDomains", "Boundary", "Rigid", "Contact",
     "Loads", "LoadData", "MeshData", "Step", "Output",
 )  # fmt: skip
+MIN_RELAXATION_TIMES = 20.0  # longest relaxation times after which no more than 2e-9 of a stress is left
 # Read by `_find_tied_sets`, and what only shells have.
 _OTHER_CONDITIONS = ("rigid", "zero rotation", "zero shell displacement")
 # What none of limbfit's contact rules does; the rest of a contact is how FEBio gets there.
@@ -216,7 +215,7 @@ def _drop_settling(model: FebModel) -> FebModel:
     others |= {c.curve: f"the rigid body {c.body!r}" for c in model.conditions if c.curve and not c.step}
     others |= {p.curve: f"the pressure on {p.surface!r}" for p in model.pressures}
     others |= {c.curve: f"the contraction of {c.material!r}" for c in model.contractions if c.curve}
-    first = compute_settling_time_s(
+    first = _compute_settling_time_s(
         model.prestrains, model.materials, model.phases, model.curves, others, model.conditions
     )
     if not first:
@@ -229,6 +228,77 @@ def _drop_settling(model: FebModel) -> FebModel:
         conditions=tuple(replace(c, step=None if c.step is None else c.step - 1) for c in kept),
         settling_time_s=first,
     )
+
+
+def _compute_settling_time_s(
+    prestrains: Mapping[str, Prestrain], materials: Mapping[str, Material], phases: tuple[ControlPhase, ...],
+    curves: Mapping[int, LoadCurve], other_curves: Mapping[int, str], conditions: tuple[RigidCondition, ...],
+) -> float:  # fmt: skip
+    """Return the length of the first step, s, in which pre-strained tissue settles; 0 if it needs none.
+
+    Parameters
+    ----------
+    other_curves : the load curves of what else moves tissue, each with a description.
+
+    Raises
+    ------
+    ProblemError
+        If the pre-strain goes on growing, the tissue has not relaxed, or something else moves it.
+    """
+    slowest = max(
+        (tau for law in materials.values() for g, tau in law.table().prony if g != 0.0), default=0.0
+    )
+    growing = [one for one in prestrains.values() if one.curve]
+    steady = [one for one in prestrains.values() if not one.curve]
+    if steady and slowest > 0.0:
+        remedy = "let its ramp grow in a first step of its own, and rest"
+        raise _build_prestrain_error("acts at once in tissue that relaxes", steady[0], remedy)
+    if not growing:
+        return 0.0
+    first = phases[0].seconds
+    if len(phases) < 2:
+        raise _build_prestrain_error(
+            "grows in the only step", growing[0], "let it grow in a first step of its own, and rest"
+        )
+    rested = max(_compute_rest_start(one, first, slowest, curves) for one in growing)
+    times = np.linspace(rested, first, 101)
+    for number, description in other_curves.items():
+        values = curves[number].at(times)
+        if np.abs(values - values[0]).max() > 0.0:
+            raise _build_prestrain_error(
+                f"settles while {description} changes", growing[0], "let it change after the first step"
+            )
+    for held in conditions:
+        gone = held.curve and held.step == 0 and held.kind == "moved"
+        later = {(c.body, c.freedom) for c in conditions if c.kind == "moved" and c.step in (None, 1)}
+        if gone and held.factor * curves[held.curve].at(first) and (held.body, held.freedom) not in later:
+            raise _build_prestrain_error(
+                f"settles while the rigid body {held.body!r} goes elsewhere", growing[0]
+            )
+    return first
+
+
+def _compute_rest_start(
+    prestrain: Prestrain, step_end_s: float, slowest: float, curves: Mapping[int, LoadCurve]
+) -> float:
+    """Return when a pre-strain has grown, s; it then rests until the first step ends."""
+    points = curves[prestrain.curve].points
+    if not len(points) or curves[prestrain.curve].corners is None:
+        raise _build_prestrain_error("grows along no line through points", prestrain, "use LINEAR points")
+    grown = float(points[np.flatnonzero(points[:, 1] != points[-1, 1]).max(initial=-1) + 1, 0])
+    rest = step_end_s - grown
+    if rest < 0.0:
+        raise _build_prestrain_error("goes on growing after the first step", prestrain)
+    if rest < MIN_RELAXATION_TIMES * slowest:
+        what = f"rests for {rest:.4g} s in the first step, in which tissue of {slowest:.4g} s does not relax"
+        raise _build_prestrain_error(
+            what, prestrain, f"let it rest for {MIN_RELAXATION_TIMES * slowest:.4g} s"
+        )
+    return grown
+
+
+def _build_prestrain_error(what: str, prestrain: Prestrain, remedy: str | None = None) -> ProblemError:
+    return ProblemError(f"a pre-strain {what}", place=f"line {prestrain.line}, <prestrain>", remedy=remedy)
 
 
 def _read_node_motions(
@@ -301,3 +371,87 @@ def _read_contact(node: XmlNode, geometry: Geometry) -> Contact:
         raise node.child("fric_coeff").error("is negative")
     automatic = node.flag("auto_penalty")
     return Contact(rule, geometry.pairs[pair], penalty, automatic, augmented, node.line, friction)
+
+
+KNOWN_DATA = {
+    "node_data": ("x", "y", "z", "ux", "uy", "uz"),
+    "element_data": ("x", "y", "z", "sx", "sy", "sz", "sxy", "syz", "sxz", "s1", "s2", "s3", "J"),
+    "rigid_body_data": ("x", "y", "z", "thx", "thy", "thz", "Fx", "Fy", "Fz", "Mx", "My", "Mz"),
+}
+
+
+@dataclass(frozen=True)
+class Request:
+    """One table per step: ``names`` of its columns, the ``items`` (ranges of FEBio's numbers; empty: all).
+
+    ``members`` are the items if a set is asked for.
+    """
+
+    kind: str
+    names: tuple[str, ...]
+    file: str
+    delimiter: str
+    items: tuple[tuple[int, int], ...]
+    members: frozenset[int] | None = None
+
+    def includes(self, number: int) -> bool:
+        """True if the item of that number is asked for."""
+        if self.members is not None:
+            return number in self.members
+        return not self.items or any(low <= number <= high for low, high in self.items)
+
+
+def read_requests(section: XmlNode | None, geometry: Geometry) -> tuple[tuple[Request, ...], tuple[str, ...]]:
+    """Read the requests that limbfit can answer, with a note for everything else.
+
+    Raises
+    ------
+    ProblemError
+        For a set that does not exist, and for items that are no numbers.
+    """
+    requests, notes = [], list[str]()
+    for output in section or ():
+        if output.tag != "logfile":
+            notes.append(f"{output.place}: not written")
+            continue
+        for entry in output:
+            if entry.tag not in KNOWN_DATA:
+                notes.append(f"{entry.place}: not written")
+                continue
+            names = [name.strip() for name in entry.attribute("data").split(";")]
+            known = tuple(name for name in names if name in KNOWN_DATA[entry.tag])
+            unknown = [name for name in names if name not in known]
+            if unknown:
+                what = ", ".join(repr(name[:40]) for name in unknown)
+                notes.append(
+                    f"{entry.place}: {what} not written; known are {', '.join(KNOWN_DATA[entry.tag])}"
+                )
+            if known:
+                file = PurePosixPath(entry.attributes.get("file", "").replace("\\", "/")).name
+                delimiter, members = entry.attributes.get("delim", " "), _find_members(entry, geometry)
+                items = _read_items(entry) if members is None else ()
+                requests.append(Request(entry.tag, known, file, delimiter, items, members))
+    return tuple(requests), tuple(notes)
+
+
+def _find_members(entry: XmlNode, geometry: Geometry) -> frozenset[int] | None:
+    """Return the items of the set that an entry names, if it does."""
+    node, element = entry.attributes.get("node_set"), entry.attributes.get("elem_set")
+    if node is not None:
+        return frozenset(geometry.node_ids[find_node_set(geometry, node, entry)].tolist())
+    if element is None:
+        return None
+    if element not in geometry.element_sets:
+        raise entry.error(f"there is no element set {element!r}")
+    return frozenset(geometry.element_sets[element].tolist())
+
+
+def _read_items(entry: XmlNode) -> tuple[tuple[int, int], ...]:
+    """Read ranges of numbers: ``1,4,10:20`` (FEBio also has ``10:20:2``, which is refused)."""
+    ranges = []
+    for text in filter(None, (part.strip() for part in entry.text.split(","))):
+        low, _, high = text.partition(":")
+        if not (low.isdecimal() and (high or low).isdecimal()):
+            raise entry.error(f"{text[:40]!r} is neither a number nor a range of numbers")
+        ranges.append((int(low), int(high or low)))
+    return tuple(ranges)

@@ -19,10 +19,9 @@ from ...arrays import Array, Indices
 from ...errors import ProblemError
 from ...fe import ELEMENTS, Motion
 from ...fe.kernel.elements import compute_reference_gradients
-from .controls import ControlPhase, compute_step_times
-from .curves import LoadCurve
 from .geometry import Geometry, Part, collect_nodes, find_node_set, split_into_triangles
 from .materials import RigidMaterial
+from .timing import ControlPhase, LoadCurve, compute_step_times
 from .tree import XmlNode
 
 _PRISM = ([0, 1, 2, 5], [0, 1, 5, 4], [0, 4, 5, 3])  # three tetrahedra of a penta6

@@ -22,7 +22,7 @@ from ...identify.uncertainty.noise import SiteNoise, estimate_record_noise
 from ...indentation import SiteModel, compute_contact_radius
 from ...mesh import read_vtu
 from ...study import Study
-from ...traces.scatter import estimate_scatter
+from ...traces.numerics import estimate_scatter
 from ..engine.context import Context
 from .records import SiteRecord
 from .traces import read_record

@@ -26,8 +26,7 @@ from ...fe.materials import Material
 from ...indentation import Parameters, build_fibre_field
 from ...mesh import Mesh, write_vtu
 from ...socket import Recipe, Socket, rectify_limb
-from ...socket.offsets import compute_offsets
-from ...socket.rays import compute_profile
+from ...socket.rays import compute_offsets, compute_profile
 from ...socket.rectify import reduce_to_volume
 from ...socket.targets import Target, build_zone
 from ...socket.wall import measure_thickness

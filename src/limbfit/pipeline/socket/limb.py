@@ -36,8 +36,7 @@ from ...fe.materials import Material
 from ...indentation import Direction, Parameters, build_fibre_field, build_materials
 from ...mesh import Mesh, read_vtu
 from ...socket import Socket
-from ...socket.landmarks import find_directions, load_point
-from ...socket.regions import SkinRegion
+from ...socket.landmarks import SkinRegion, find_directions, load_point
 from ...study import Study
 from ..engine.context import Context
 from ..engine.partial_results import Begun, Made, ResultFiles

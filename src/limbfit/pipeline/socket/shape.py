@@ -17,10 +17,17 @@ from ...arrays import Array
 from ...errors import StudyError, SurfaceError
 from ...laws import FIBRED
 from ...socket import Area, Recipe, Socket, read_socket, rectify_limb
-from ...socket.bones import refuse_bones
-from ...socket.landmarks import find_bone, find_directions, find_knee_centre, load_point
+from ...socket.clearance import refuse_bones
+from ...socket.landmarks import (
+    SkinRegion,
+    build_default_regions,
+    build_stated_region,
+    find_bone,
+    find_directions,
+    find_knee_centre,
+    load_point,
+)
 from ...socket.loads import STANDARD_LOADS
-from ...socket.regions import SkinRegion, build_default_regions, build_stated_region
 from ...socket.targets import Target
 from ...socket.trim import Trim
 from ...socket.wall import build_wall

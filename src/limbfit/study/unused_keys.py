@@ -12,7 +12,7 @@ from ..laws import ACTIVE, FIBRED, POWER, has_fibres
 from ..shapes import SHAPES
 from .meshing import ACCURACIES, CoarseMeshTable, MeshTable
 from .records import Site
-from .whole import Study
+from .study import Study
 
 
 @dataclass(frozen=True)

@@ -23,14 +23,14 @@ from ..laws import (
     to_vector,
 )
 from ..priors import of_tissues
-from .acquisition import AcquireTable
-from .clamps import ClampsTable
 from .material import MaterialTable
 from .meshing import MeshTable, list_stated_widths, replace_edges
 from .records import RECORDED, Indentation, Record, RecordTable, Site, list_records
 from .socket import SocketTable
 from .tables import (
+    AcquireTable,
     CalibrationTable,
+    ClampsTable,
     ExecutionTable,
     FebioTable,
     GeometryTable,

@@ -27,10 +27,17 @@ from .faults import (
     mend_times,
     step_remarks,
 )
-from .numerics import Array, Bools, average_in_bins, estimate_noise_level, find_resolution, find_runs
+from .numerics import (
+    Array,
+    Bools,
+    average_in_bins,
+    estimate_noise_level,
+    estimate_scatter,
+    find_resolution,
+    find_runs,
+)
 from .passivity import find_lag, find_swings
 from .record import Remark, Trace
-from .scatter import estimate_scatter
 from .touchdown import TouchDown, compute_deviation_before, find_depth_at, find_touch_down, touch_down_at
 
 _SPIKE_WIDTH = 2  # samples; what lasts longer may have happened
