@@ -116,7 +116,7 @@ class Bench:
         if host:
             reports = self.wire.receive()
             if reports:
-                self.session.reports(reports, self.now)
+                self.session.handle_reports(reports, self.now)
             self.session.tick(self.now)
 
     def operate(self) -> None:

@@ -8,27 +8,27 @@ from limbfit.acquire.operator import Keyboard
 
 def test_a_touch_of_the_key_moves_nothing() -> None:
     keyboard = Keyboard(0.12)
-    assert keyboard.typed(b" ", 0.0) == []
-    assert keyboard.passed(0.5) == []
-    assert keyboard.typed(b" ", 5.0) == []  # and neither do two touches apart
+    assert keyboard.read(b" ", 0.0) == []
+    assert keyboard.check_release(0.5) == []
+    assert keyboard.read(b" ", 5.0) == []  # and neither do two touches apart
 
 
 def test_a_held_key_repeats_and_a_released_one_stops() -> None:
     keyboard = Keyboard(0.12)
-    assert keyboard.typed(b" ", 0.0) == []
-    assert keyboard.typed(b" ", 0.4) == [KeyDown()]
+    assert keyboard.read(b" ", 0.0) == []
+    assert keyboard.read(b" ", 0.4) == [KeyDown()]
     for k in range(1, 30):
-        assert keyboard.typed(b" ", 0.4 + 0.033 * k) == []
-        assert keyboard.passed(0.4 + 0.033 * k + 0.03) == []
+        assert keyboard.read(b" ", 0.4 + 0.033 * k) == []
+        assert keyboard.check_release(0.4 + 0.033 * k + 0.03) == []
     end = 0.4 + 0.033 * 29
-    assert keyboard.passed(end + 0.11) == []
-    assert keyboard.passed(end + 0.13) == [KeyUp()]
-    assert keyboard.passed(end + 0.2) == []
+    assert keyboard.check_release(end + 0.11) == []
+    assert keyboard.check_release(end + 0.13) == [KeyUp()]
+    assert keyboard.check_release(end + 0.2) == []
 
 
 def test_enter_confirms_and_anything_else_stops() -> None:
     keyboard = Keyboard(0.12)
-    assert keyboard.typed(b"\r", 0.0) == [Confirm()]
+    assert keyboard.read(b"\r", 0.0) == [Confirm()]
     for other in (b"q", b"\x1b", b"\x03", b"x"):
-        (event,) = keyboard.typed(other, 0.0)
+        (event,) = keyboard.read(other, 0.0)
         assert isinstance(event, Abort)

@@ -48,7 +48,7 @@ def test_any_history_gives_bounded_forces_that_relax(corners: list[float]) -> No
 
 def test_the_stepped_limb_is_the_surrogate() -> None:
     limb = VirtualLimb({"1": SURROGATE}, np.random.default_rng(0), (4.0, 4.0))
-    limb.bring("1", 1)
+    limb.place_site("1", 1)
     time, displacement, force = indentation()
     fine = np.arange(0.001, time[-1], 0.001)
     found = []

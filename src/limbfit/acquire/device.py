@@ -1,8 +1,10 @@
-"""The device as a session sees it, and the one driver there is: the line protocol over a wire.
+"""The device as a session sees it, the wires to it, and its one driver: the line protocol over a wire.
+
+A wire is a TCP connection, or a serial port (with ``pip install 'limbfit[serial]'``).
 
 `HostConnection` is limbfit's end of the protocol without a wire: bytes in, reports out; commands in, bytes
-out.  A command that the device does not answer is sent again under a new number; one that is replaced by a
-newer one for the same pin is not.  It reads no clock: times are given, in s.
+out. A command that the device does not answer is sent again under a new number; one that is replaced by a
+newer one for the same pin is not. It reads no clock: times are given, in s.
 """
 
 from __future__ import annotations
@@ -46,12 +48,12 @@ DEFAULT_ADDRESS = f"tcp://127.0.0.1:{DEFAULT_PORT}"
 BAUD = 2_000_000
 _TCP = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+)(?::([0-9]{1,5}))?\Z")
 _SERIAL = re.compile(r"serial:(/[\x21-\x3f\x41-\x7e]+)(?:@([0-9]{3,7}))?\Z")
-_CHUNK = 1 << 16
-_REFUSALS: tuple[type[Exception], ...] = (OSError, ValueError)  # what opening a port may raise
+_READ_BYTES = 1 << 16
+_PORT_ERRORS: tuple[type[Exception], ...] = (OSError, ValueError)  # what opening a port may raise
 with suppress(ImportError):  # Windows
     import termios
 
-    _REFUSALS = (*_REFUSALS, termios.error)
+    _PORT_ERRORS = (*_PORT_ERRORS, termios.error)
 
 
 class Link(Protocol):
@@ -83,7 +85,7 @@ class TcpLink:
 
     def read(self) -> bytes:
         try:
-            data = self._socket.recv(_CHUNK)
+            data = self._socket.recv(_READ_BYTES)
         except BlockingIOError:
             return b""
         except OSError:
@@ -116,8 +118,8 @@ class SerialLink:
             raise InputError("serial ports need pyserial", place="--device", remedy=remedy) from None
         try:
             self._port: Any = serial.Serial(port, baud, timeout=0, write_timeout=0, exclusive=True)
-        except _REFUSALS as error:
-            raise RunError(f"{port} cannot be opened: {_describe_why(error, baud)}") from None
+        except _PORT_ERRORS as error:
+            raise RunError(f"{port} cannot be opened: {_explain_port_error(error, baud)}") from None
         self._port.reset_input_buffer()
 
     def fileno(self) -> int:
@@ -125,7 +127,7 @@ class SerialLink:
 
     def read(self) -> bytes:
         try:
-            return bytes(self._port.read(_CHUNK))
+            return bytes(self._port.read(_READ_BYTES))
         except OSError:
             raise RunError("the serial port is gone") from None
 
@@ -142,7 +144,7 @@ class SerialLink:
             self._port.close()
 
 
-def _describe_why(error: Exception, baud: int) -> str:
+def _explain_port_error(error: Exception, baud: int) -> str:
     """Why a port does not open: pyserial wraps the system's reason in words of its own."""
     if isinstance(error, ValueError):
         return f"it does not support {baud} baud; give another after @"
@@ -185,10 +187,10 @@ def connect(address: str, timeout_s: float = 5.0) -> Link:
 
 
 GREETING_S = 3.0
-GREET_AGAIN_S = 0.5  # between greetings: a device on a serial port may still be coming home
-RESEND_S = 0.006  # a command is answered at once: after so long it is sent again
-PACED_RESEND_S = 0.5  # where the device's clock, which runs ahead of its ears, is the one that counts
-ATTEMPTS = 6
+GREETING_INTERVAL_S = 0.5  # between greetings: a device on a serial port may still be coming home
+ANSWER_S = 0.006  # a command is answered at once: after so long it is sent again
+PACED_ANSWER_S = 0.5  # where the device's clock, which runs ahead of its ears, is the one that counts
+MAX_ATTEMPTS = 6
 
 
 class Device(Protocol):
@@ -213,7 +215,7 @@ class Device(Protocol):
 
 
 @dataclass
-class _Pending:
+class _PendingCommand:
     command: Command
     due: float
     attempts: int = 1
@@ -227,8 +229,8 @@ class HostConnection:
         self.identity: Identity | None = None
         self._encoder = Encoder(first=0)
         self._decoder = Decoder(DEVICE_LINE, numbered=False)
-        self._pending: dict[int, _Pending] = {}
-        self._patience_s = RESEND_S
+        self._pending: dict[int, _PendingCommand] = {}
+        self._answer_time_s = ANSWER_S
 
     @property
     def refused(self) -> Refusals:
@@ -251,33 +253,29 @@ class HostConnection:
             if not isinstance(report, Identity):
                 self.refused.unknown += 1
                 continue
-            _check(report)
+            _check_identity(report)
             salt = derive_salt(self.nonce, report.nonce)
             self._encoder = Encoder(salt)
             self._decoder.restart(salt)
             self.identity = report
-            self._patience_s = PACED_RESEND_S if report.clock == "paced" else RESEND_S
+            self._answer_time_s = PACED_ANSWER_S if report.clock == "paced" else ANSWER_S
             return report
         return None
 
     def send(self, command: Command, now: float) -> bytes:
         """The line of a command; one that needs an answer is remembered until it comes."""
         number, line = self._encoder.encode(format_command(command))
-        if isinstance(command, (Heartbeat, Bye)):
-            return line
-        self._replace(command)
-        self._pending[number] = _Pending(command, now + self._patience_s)
-        return line
-
-    def _replace(self, command: Command) -> None:
-        """What a newer command makes void: the older ones for its pin; a stop, all."""
-        match command:
+        match command:  # what a newer command makes void: the older ones for its pin; a stop, all
+            case Heartbeat() | Bye():
+                return line
             case Stop():
                 self._pending.clear()
             case Move(pin=pin) | Hold(pin=pin):
-                for number, old in list(self._pending.items()):
-                    if isinstance(old.command, (Move, Hold)) and old.command.pin == pin:
-                        del self._pending[number]
+                for older, waiting in list(self._pending.items()):
+                    if isinstance(waiting.command, (Move, Hold)) and waiting.command.pin == pin:
+                        del self._pending[older]
+        self._pending[number] = _PendingCommand(command, now + self._answer_time_s)
+        return line
 
     def feed(self, data: bytes) -> list[Sample | Declined | LimitTripped | OutOfReach]:
         """What the device says that concerns the session, in order."""
@@ -303,16 +301,18 @@ class HostConnection:
             if now < waiting.due:
                 continue
             del self._pending[number]
-            if waiting.attempts >= ATTEMPTS and not isinstance(waiting.command, Stop):
+            if waiting.attempts >= MAX_ATTEMPTS and not isinstance(waiting.command, Stop):
                 reason = "the device does not answer commands"
                 continue
             fresh, line = self._encoder.encode(format_command(waiting.command))
-            self._pending[fresh] = _Pending(waiting.command, now + self._patience_s, waiting.attempts + 1)
+            self._pending[fresh] = _PendingCommand(
+                waiting.command, now + self._answer_time_s, waiting.attempts + 1
+            )
             lines += line
         return lines, reason
 
 
-def _check(identity: Identity) -> None:
+def _check_identity(identity: Identity) -> None:
     if identity.version != VERSION:
         raise RunError(
             f"the device speaks version {identity.version} of the protocol, limbfit {VERSION}; "
@@ -327,20 +327,20 @@ class LineDevice:
     """A device that speaks the line protocol (docs/device-protocol.md)."""
 
     def __init__(self, link: Link) -> None:
-        self._link, self._end = link, HostConnection()
+        self._link, self._connection = link, HostConnection()
         self.identity = self._greet()
 
     @property
     def refused(self) -> Refusals:
-        return self._end.refused
+        return self._connection.refused
 
     def _greet(self) -> Identity:
         end = time.monotonic() + GREETING_S
         try:
             while time.monotonic() < end:
-                self._link.write(self._end.hello())
-                select.select([self._link], [], [], GREET_AGAIN_S)
-                if identity := self._end.greet(self._link.read()):
+                self._link.write(self._connection.hello())
+                select.select([self._link], [], [], GREETING_INTERVAL_S)
+                if identity := self._connection.greet(self._link.read()):
                     return identity
         except RunError as error:
             self._link.close()
@@ -353,14 +353,14 @@ class LineDevice:
         )
 
     def send(self, command: Command, now: float) -> None:
-        self._link.write(self._end.send(command, now))
+        self._link.write(self._connection.send(command, now))
 
     def receive(self, timeout_s: float) -> list[Sample | Declined | LimitTripped | OutOfReach]:
         select.select([self._link], [], [], timeout_s)
-        return self._end.feed(self._link.read())
+        return self._connection.feed(self._link.read())
 
     def resend(self, now: float) -> str:
-        lines, reason = self._end.resend(now)
+        lines, reason = self._connection.resend(now)
         if lines:
             self._link.write(lines)
         return reason

@@ -1,7 +1,14 @@
-"""What lines say: each message as a type, to a body and from one.
+"""The line protocol: lines on the wire, and the messages that they carry.
 
-A body that is not exactly one of these is no message: `parse_command` and `parse_report` return None, and the
-line is counted as unknown and not acted on.
+A line is ``<number> <body>*<crc>`` and a newline: the sequence number in decimal, a body of printable ASCII,
+the CRC-32 (IEEE 802.3, eight hexadecimal digits) of all before the asterisk. The CRC starts from the
+session's *salt*, so a line of another session fails it, and numbers only rise, so a line that comes again or
+out of order is refused. Nothing here protects against an attacker on the wire: it is no authentication.
+
+Each message is a type. A body that is not exactly one of these is no message: `parse_command` and
+`parse_report` return None, and the line is counted as unknown and not acted on.
+
+`docs/device-protocol.md` is the reference for whoever writes the other end.
 """
 
 from __future__ import annotations
@@ -81,17 +88,17 @@ class Decoder:
         found = []
         *ended, rest = data.split(b"\n")
         for part in ended:
-            line = self._end(part)
+            line = self._end_line(part)
             if line is not None:
                 found.append(line)
-        self._keep(rest)
+        self._buffer(rest)
         return found
 
     def restart(self, salt: int) -> None:
         """A new session begins with the next line."""
         self.salt, self.last, self.numbered = salt, 0, True
 
-    def _keep(self, part: bytes) -> None:
+    def _buffer(self, part: bytes) -> None:
         if self._skipping:
             return
         if len(self._rest) + len(part) >= self.limit:
@@ -100,8 +107,8 @@ class Decoder:
             return
         self._rest += part
 
-    def _end(self, part: bytes) -> Line | None:
-        self._keep(part)
+    def _end_line(self, part: bytes) -> Line | None:
+        self._buffer(part)
         if self._skipping:
             self._skipping = False
             self.refused.oversized += 1
@@ -137,7 +144,7 @@ _NONCE = re.compile(r"[0-9a-f]{16}\Z")
 _SAMPLE = re.compile(
     rf"S ([0-9]{{1,15}}),([0-9]{{1,4}}),([0-9]{{1,5}})((?:,-?[0-9]{{1,8}}){{{3 * PINS}}})\Z", re.ASCII
 )
-MAX_MICRO = 1_000_000  # no length, speed or force of this device is larger (um, um/s, mN)
+MAX_VALUE = 1_000_000  # no length, speed or force of this device is larger (um, um/s, mN)
 
 
 class Message:
@@ -233,7 +240,7 @@ def parse_command(body: str) -> Command | None:
         version = _read_integers(words[:1])
         return Hello(words[1], version[0]) if version and _NONCE.match(words[1]) else None
     numbers = _read_integers(words)
-    if numbers is None or any(abs(n) > MAX_MICRO for n in numbers if verb != "BEAT"):
+    if numbers is None or any(abs(n) > MAX_VALUE for n in numbers if verb != "BEAT"):
         return None
     match verb, numbers:
         case "BEAT", [number]:
@@ -337,7 +344,13 @@ def format_sample(sample: Sample) -> str:
 def parse_report(body: str, number: int) -> Report | None:
     """The report that a body states, or None; ``number`` is its line's."""
     if body.startswith("S "):
-        return _sample(body, number)
+        match = _SAMPLE.match(body)
+        if match is None:
+            return None
+        time, flags, moving = (int(word) for word in match.groups()[:3])
+        values = tuple(map(int, match[4][1:].split(",")))
+        position, force, capacitance = values[:PINS], values[PINS : 2 * PINS], values[2 * PINS :]
+        return Sample(number, time, flags, moving, position, force, capacitance)
     verb, *words = body.split(" ")
     if verb == "ID" and len(words) == 11:
         return _read_identity(words)
@@ -353,22 +366,6 @@ def parse_report(body: str, number: int) -> Report | None:
         case "STUCK", [pins] if 0 <= pins < 1 << PINS:
             return OutOfReach(pins)
     return None
-
-
-def _sample(body: str, number: int) -> Sample | None:
-    match = _SAMPLE.match(body)
-    if match is None:
-        return None
-    values = tuple(map(int, match[4][1:].split(",")))
-    return Sample(
-        number,
-        int(match[1]),
-        int(match[2]),
-        int(match[3]),
-        values[:PINS],
-        values[PINS : 2 * PINS],
-        values[2 * PINS :],
-    )
 
 
 def _read_identity(words: list[str]) -> Identity | None:

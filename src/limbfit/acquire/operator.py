@@ -23,15 +23,15 @@ class DeadMansKey:
         self.is_held = False
         self._last: float | None = None
 
-    def pressed(self, now: float) -> Event | None:
+    def press(self, now: float) -> Event | None:
         before, self._last = self._last, now
         if not self.is_held and before is not None and now - before <= FIRST_REPEAT_S:
             self.is_held = True
             return KeyDown()
         return None
 
-    def passed(self, now: float) -> Event | None:
-        """To be asked often: the release, once."""
+    def check_release(self, now: float) -> Event | None:
+        """The release of the key, reported once; ask often."""
         if self._last is None:
             return None
         if self.is_held and now - self._last > self.gap_s:
@@ -46,20 +46,20 @@ class Keyboard:
     def __init__(self, gap_s: float) -> None:
         self.key = DeadMansKey(gap_s)
 
-    def typed(self, characters: bytes, now: float) -> list[Event]:
+    def read(self, characters: bytes, now: float) -> list[Event]:
         found: list[Event] = []
         for one in characters:
             if one in b"\r\n":
                 found.append(Confirm())
             elif one == 0x20:
-                if event := self.key.pressed(now):
+                if event := self.key.press(now):
                     found.append(event)
             else:
                 found.append(Abort("the operator stopped it by a key"))
         return found
 
-    def passed(self, now: float) -> list[Event]:
-        event = self.key.passed(now)
+    def check_release(self, now: float) -> list[Event]:
+        event = self.key.check_release(now)
         return [event] if event else []
 
 
@@ -69,10 +69,10 @@ class NoOperator:
     def __init__(self, events: SimpleQueue[Event]) -> None:
         self.events = events
 
-    def __call__(self, told: Update) -> None:
-        if not isinstance(told, PhaseUpdate):
+    def __call__(self, update: Update) -> None:
+        if not isinstance(update, PhaseUpdate):
             return
-        if told.phase == Phase.POSITION:
+        if update.phase == Phase.POSITION:
             self.events.put(Confirm())
-        elif told.phase == Phase.READY:
+        elif update.phase == Phase.READY:
             self.events.put(KeyDown())

@@ -1,12 +1,12 @@
-"""The protocol's state machine: events in, actions out, no clock, no wire, no file.
+"""The protocol of a session: its phases as a table, and the state machine that goes through them.
 
-One `Protocol` is one session.  `Protocol.handle` takes an event and the time in s (of whatever clock its
-caller has), and returns what is to be done.  Where a session can go stands in `phases.TRANSITIONS` alone.
+Events come in and actions go out; there is no clock, no wire and no file. One `Protocol` is one session.
+`Protocol.handle` takes an event and the time in s, of whatever clock its caller has, and returns what is to
+be done. `TRANSITIONS` alone says where a session can go.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
 
 from .events import (
@@ -28,6 +28,7 @@ from .events import (
     Stop,
     to_thousandths,
 )
+from .line_protocol import Identity
 from .safety import ClampWatch, Guard, Violation, check_device_flags, check_sensitivity, make_session_limits
 
 
@@ -97,7 +98,7 @@ CLAMPED = frozenset(
     }
 )
 
-_WAY: dict[tuple[Phase, Outcome], Phase] = {
+_PROTOCOL_STEPS: dict[tuple[Phase, Outcome], Phase] = {
     (Phase.IDLE, Outcome.BEGUN): Phase.POSITION,
     (Phase.POSITION, Outcome.IN_PLACE): Phase.CLAMP,
     (Phase.CLAMP, Outcome.FORCES_REACHED): Phase.SETTLE,
@@ -122,25 +123,16 @@ _WAY: dict[tuple[Phase, Outcome], Phase] = {
     (Phase.STOPPING, Outcome.OUT_OF_REACH): Phase.UNREACHABLE,
 }
 # A stop is possible everywhere but where it has happened or nothing is left to stop.
-TRANSITIONS = _WAY | {
+TRANSITIONS = _PROTOCOL_STEPS | {
     (phase, Outcome.STOP): Phase.STOPPING for phase in Phase if phase not in FINAL | {Phase.STOPPING}
 }
 
 
-QUIET_S = 0.05  # a command is under way for less: nothing is concluded from a pin that does not move yet
-NEAR_UM = 60  # a pin that is so near to its target has arrived
-CLAMP_ROUNDS = 30
-SILENCE_S = 5.0  # a device that says nothing for so long after a stop is out of reach
-STOP_PATIENCE_S = 15.0  # and so is one that has not come home by then
-
-
-@dataclass(frozen=True)
-class DeviceFacts:
-    """What a session must know of the device: see `device.Identity`."""
-
-    stroke_um: int
-    range_mN: int
-    touch_fF: int
+COMMAND_DELAY_S = 0.05  # a pin may stand still for so long before a command reaches it
+ARRIVAL_TOLERANCE_UM = 60  # a pin that is so near to its target has arrived
+MAX_CLAMP_ROUNDS = 30
+MAX_SILENCE_S = 5.0  # a device that says nothing for so long after a stop is out of reach
+MAX_STOP_S = 15.0  # and so is one that has not come home by then
 
 
 class Protocol:
@@ -153,90 +145,101 @@ class Protocol:
     cycle : ramps begun so far, those of preconditioning included.
     """
 
-    def __init__(self, settings: Settings, device: DeviceFacts) -> None:
+    def __init__(self, settings: Settings, device: Identity) -> None:
         self.settings, self.device = settings, device
         self.phase, self.reason = Phase.IDLE, ""
         self.touch_um = self.start_um = self.depth_um = self.cycle = 0
         self.guard = Guard(make_session_limits(settings, device.stroke_um, device.range_mN, RATE_HZ))
-        self._watch = ClampWatch(settings.clamps)
-        self._entered = self._heard = 0.0
+        self._clamp_watch = ClampWatch(settings.clamps)
+        self._phase_start_s = self._last_sample_s = 0.0
         self._rounds = 0
-        self._key = False
-        self._tare: list[int] = []
-        self._touching: int | None = None  # where the capacitance first said so
+        self._is_confirmed = False
+        self._tare_samples: list[int] = []
+        self._contact_um: int | None = None  # where the capacitance first said so
 
     @property
     def is_over(self) -> bool:
         return self.phase in FINAL
 
     def handle(self, event: Event, now: float) -> tuple[Action, ...]:
-        """What an event leads to.
+        """Return the actions that an event leads to.
 
         Parameters
         ----------
         now : s, never less than in the call before.
         """
         if isinstance(event, Sample):
-            self._heard = now
-            return self._sample(event, now)
+            self._last_sample_s = now
+            return self._handle_sample(event, now)
         if self.is_over:
             return ()
         match event:
             case Begin() if self.phase is Phase.IDLE:
-                self._heard = now
-                return self._go(Outcome.BEGUN, now)
+                self._last_sample_s = now
+                return self._transition(Outcome.BEGUN, now)
             case Abort(reason=reason):
                 return self._stop(reason, now)
             case LinkLost(reason=reason):
-                return self._lost(reason, now)
+                self.reason = f"{self.reason}; {reason}" if self.reason else reason
+                if self.phase is not Phase.STOPPING:
+                    self._transition(Outcome.STOP, now)
+                return self._transition(
+                    self._report_unreachable("whether the device has retracted is not known"), now
+                )
             case Confirm() if self.phase is Phase.POSITION:
-                self._key = True
+                self._is_confirmed = True
             case KeyDown() if self.phase is Phase.READY:
-                return self._go(Outcome.KEY_HELD, now)
+                return self._transition(Outcome.KEY_HELD, now)
             case KeyUp() if self.phase is Phase.SEARCH:
-                self._key = False
+                self._is_confirmed = False
                 return (Hold(self.settings.pin),)
-        return self._late(now)
+        return self._check_time(now)
 
     # -- whatever the phase
 
-    def _sample(self, sample: Sample, now: float) -> tuple[Action, ...]:
+    def _handle_sample(self, sample: Sample, now: float) -> tuple[Action, ...]:
         if self.phase in FINAL or self.phase is Phase.IDLE:
             return ()
         if self.phase is not Phase.STOPPING:
-            wrong = check_device_flags(sample.flags) or self.guard.check(sample) or self._in_phase(sample)
+            wrong = (
+                check_device_flags(sample.flags)
+                or self.guard.check(sample)
+                or self._check_phase_limits(sample)
+            )
             if wrong:
                 return self._stop(wrong.text, now)
-        outcome = self._end(sample, now)
-        return self._go(outcome, now) if outcome else self._late(now)
+        outcome = self._find_outcome(sample, now)
+        return self._transition(outcome, now) if outcome else self._check_time(now)
 
-    def _in_phase(self, sample: Sample) -> Violation | None:
-        """Limits that hold in some phases only."""
-        if self.phase in CLAMPED and (wrong := self._watch.check(sample)):
+    def _check_phase_limits(self, sample: Sample) -> Violation | None:
+        """Check the limits that hold in some phases only."""
+        if self.phase in CLAMPED and (wrong := self._clamp_watch.check(sample)):
             return wrong
         pin = self.settings.pin
-        if self.phase is Phase.APPROACH and self._touching is not None:
-            felt, travel = self._felt(sample), sample.position_um[pin - 1] - self._touching
+        if self.phase is Phase.APPROACH and self._contact_um is not None:
+            force_mN, travel = self._compute_net_force(sample), sample.position_um[pin - 1] - self._contact_um
         elif self.phase is Phase.SEARCH:  # the first push: on a ramp the tissue may not be back yet
-            felt, travel = self._felt(sample), sample.position_um[pin - 1] - self.touch_um
+            force_mN, travel = self._compute_net_force(sample), sample.position_um[pin - 1] - self.touch_um
         else:
             return None
-        return check_sensitivity(travel, felt, to_thousandths(self.settings.touch_N) // 2, pin)
+        return check_sensitivity(travel, force_mN, to_thousandths(self.settings.touch_N) // 2, pin)
 
-    def _late(self, now: float) -> tuple[Action, ...]:
-        """Every phase has its time."""
+    def _check_time(self, now: float) -> tuple[Action, ...]:
+        """Stop, or give up, where a phase takes longer than it may."""
         if self.phase in FINAL or self.phase is Phase.IDLE:
             return ()
         if self.phase is Phase.STOPPING:
-            if now - self._heard > SILENCE_S:
-                why = f"silence for {SILENCE_S:g} s: whether the device has retracted is not known"
-                return self._go(self._give_up(why), now)
-            if now - self._entered > STOP_PATIENCE_S:
-                return self._go(self._give_up(f"not every pin is home {STOP_PATIENCE_S:g} s later"), now)
+            if now - self._last_sample_s > MAX_SILENCE_S:
+                why = f"silence for {MAX_SILENCE_S:g} s: whether the device has retracted is not known"
+                return self._transition(self._report_unreachable(why), now)
+            if now - self._phase_start_s > MAX_STOP_S:
+                return self._transition(
+                    self._report_unreachable(f"not every pin is home {MAX_STOP_S:g} s later"), now
+                )
             return ()
         waits = self.phase in WAITS_FOR_OPERATOR
         limit = self.settings.operator_limit_s if waits else self.settings.time_limit_s
-        if now - self._entered > limit:
+        if now - self._phase_start_s > limit:
             return self._stop(f"{self.phase} took longer than {limit:g} s", now)
         return ()
 
@@ -244,17 +247,11 @@ class Protocol:
         if (self.phase, Outcome.STOP) not in TRANSITIONS:
             return ()
         self.reason = reason
-        return self._go(Outcome.STOP, now)
+        return self._transition(Outcome.STOP, now)
 
-    def _lost(self, reason: str, now: float) -> tuple[Action, ...]:
-        self.reason = f"{self.reason}; {reason}" if self.reason else reason
-        if self.phase is not Phase.STOPPING:
-            self._go(Outcome.STOP, now)
-        return self._go(self._give_up("whether the device has retracted is not known"), now)
-
-    def _go(self, outcome: Outcome, now: float) -> tuple[Action, ...]:
+    def _transition(self, outcome: Outcome, now: float) -> tuple[Action, ...]:
         self.phase = TRANSITIONS[self.phase, outcome]
-        self._entered = now
+        self._phase_start_s = now
         return self._enter()
 
     # -- moves
@@ -262,32 +259,32 @@ class Protocol:
     def _drive(self, target_um: int, speed_mm_s: float, halt_mN: int = 0) -> tuple[Action, ...]:
         return (Move(self.settings.pin, target_um, to_thousandths(speed_mm_s), halt_mN),)
 
-    def _home(self, pins: tuple[int, ...]) -> tuple[Action, ...]:
+    def _drive_home(self, pins: tuple[int, ...]) -> tuple[Action, ...]:
         return tuple(Move(pin, 0, to_thousandths(self.settings.retract_speed_mm_s)) for pin in pins)
 
     def _enter(self) -> tuple[Action, ...]:
-        """What a phase begins with."""
+        """Return the actions with which a phase begins."""
         settings, stroke_um = self.settings, self.device.stroke_um
         match self.phase:
             case Phase.POSITION:
-                self._key = False
-                return self._home(tuple(range(1, len(self.guard.limits.force_mN) + 1)))
+                self._is_confirmed = False
+                return self._drive_home(tuple(range(1, len(self.guard.limits.force_mN) + 1)))
             case Phase.CLAMP:
                 self._rounds += 1
                 speed = to_thousandths(settings.clamp_speed_mm_s / (1 if self._rounds == 1 else 5))
                 halt = to_thousandths(settings.clamp_N)
                 return tuple(Move(pin, stroke_um, speed, halt) for pin in settings.clamps)
             case Phase.APPROACH:
-                self._touching = None
-                halt = self._zero() + to_thousandths(settings.touch_N)
+                self._contact_um = None
+                halt = self._compute_tare() + to_thousandths(settings.touch_N)
                 return self._drive(stroke_um, settings.approach_speed_mm_s, max(halt, 1))
             case Phase.BACK | Phase.RETURN:
-                fence = Fence(settings.pin, self._deepest())
+                fence = Fence(settings.pin, self._compute_deepest_um())
                 return (fence, *self._drive(self.start_um, settings.retract_speed_mm_s))
             case Phase.SEARCH:
-                self._key, self.depth_um = True, 0
+                self._is_confirmed, self.depth_um = True, 0
                 deepest = min(self.touch_um + to_thousandths(settings.search_depth_mm), stroke_um)
-                halt = self._zero() + to_thousandths(settings.search_force_N)
+                halt = self._compute_tare() + to_thousandths(settings.search_force_N)
                 return self._drive(deepest, settings.search_speed_mm_s, halt)
             case Phase.LOAD:
                 self.cycle += 1
@@ -295,105 +292,108 @@ class Protocol:
             case Phase.UNLOAD:
                 return self._drive(self.start_um, settings.ramp_speed_mm_s)
             case Phase.RETRACT:
-                return self._home((settings.pin,))
+                return self._drive_home((settings.pin,))
             case Phase.RELEASE:
-                return self._home(settings.clamps)
+                return self._drive_home(settings.clamps)
             case Phase.STOPPING:
                 return (Stop(self.reason),)
         return ()
 
     # -- how phases end
 
-    def _zero(self) -> int:
-        """What the test pin's sensor shows off the skin."""
-        return sum(self._tare) // len(self._tare) if self._tare else 0
+    def _compute_tare(self) -> int:
+        """The mean force of the test pin off the skin, mN."""
+        return sum(self._tare_samples) // len(self._tare_samples) if self._tare_samples else 0
 
-    def _deepest(self) -> int:
+    def _compute_deepest_um(self) -> int:
         return min(self.touch_um + to_thousandths(self.settings.depth_limit_mm), self.device.stroke_um)
 
-    def _felt(self, sample: Sample) -> int:
-        return sample.force_mN[self.settings.pin - 1] - self._zero()
+    def _compute_net_force(self, sample: Sample) -> int:
+        return sample.force_mN[self.settings.pin - 1] - self._compute_tare()
 
-    def _rests(self, sample: Sample, now: float, pins: tuple[int, ...]) -> bool:
-        return now - self._entered > QUIET_S and not any(sample.is_moving(pin) for pin in pins)
+    def _is_at_rest(self, sample: Sample, now: float, pins: tuple[int, ...]) -> bool:
+        return now - self._phase_start_s > COMMAND_DELAY_S and not any(sample.is_moving(pin) for pin in pins)
 
-    def _arrived(self, sample: Sample, now: float, target_um: int) -> bool:
+    def _has_arrived(self, sample: Sample, now: float, target_um: int) -> bool:
         pin = self.settings.pin
-        near = abs(sample.position_um[pin - 1] - target_um) < NEAR_UM
-        return near and self._rests(sample, now, (pin,))
+        near = abs(sample.position_um[pin - 1] - target_um) < ARRIVAL_TOLERANCE_UM
+        return near and self._is_at_rest(sample, now, (pin,))
 
-    def _end(self, sample: Sample, now: float) -> Outcome | None:
-        """How a sample ends the phase; None where it goes on."""
-        settings, passed_s = self.settings, now - self._entered
+    def _find_outcome(self, sample: Sample, now: float) -> Outcome | None:
+        """The outcome of the phase if this sample ends it, else None."""
+        settings, passed_s = self.settings, now - self._phase_start_s
         is_home = bool(sample.flags & Flags.HOME)
         match self.phase:
-            case Phase.POSITION if self._key and is_home:
+            case Phase.POSITION if self._is_confirmed and is_home:
                 return Outcome.IN_PLACE
-            case Phase.CLAMP if self._rests(sample, now, settings.clamps):
+            case Phase.CLAMP if self._is_at_rest(sample, now, settings.clamps):
                 return Outcome.FORCES_REACHED
             case Phase.SETTLE:
-                return self._end_settle(sample, now)
+                return self._find_settle_outcome(sample, now)
             case Phase.APPROACH:
-                return self._end_approach(sample, now)
-            case Phase.BACK | Phase.RETURN if self._arrived(sample, now, self.start_um):
+                return self._find_approach_outcome(sample, now)
+            case Phase.BACK | Phase.RETURN if self._has_arrived(sample, now, self.start_um):
                 return Outcome.AT_START
             case Phase.SEARCH:
                 self.depth_um = max(self.depth_um, sample.position_um[settings.pin - 1])
-                if self._rests(sample, now, (settings.pin,)):
+                if self._is_at_rest(sample, now, (settings.pin,)):
                     enough = self.depth_um - self.touch_um >= to_thousandths(settings.min_depth_mm)
                     return Outcome.DEPTH_FOUND if enough else Outcome.TOO_SHALLOW
             case Phase.PAUSE if passed_s >= settings.pause_s:
                 return Outcome.RESTED
-            case Phase.LOAD if self._arrived(sample, now, self.depth_um):
+            case Phase.LOAD if self._has_arrived(sample, now, self.depth_um):
                 is_held = settings.hold_s > 0.0 and self.cycle > settings.precondition
                 return Outcome.TO_HOLD if is_held else Outcome.AT_DEPTH
             case Phase.DWELL if passed_s >= settings.hold_s:
                 return Outcome.HELD_OUT
-            case Phase.UNLOAD if self._arrived(sample, now, self.start_um):
+            case Phase.UNLOAD if self._has_arrived(sample, now, self.start_um):
                 if self.cycle == settings.cycles:
                     return Outcome.CYCLES_DONE
                 return Outcome.NEXT_CYCLE if self.cycle < settings.precondition else Outcome.REST
-            case Phase.RETRACT if self._arrived(sample, now, 0):
+            case Phase.RETRACT if self._has_arrived(sample, now, 0):
                 return Outcome.HOME
-            case Phase.RELEASE if is_home and passed_s > QUIET_S:
+            case Phase.RELEASE if is_home and passed_s > COMMAND_DELAY_S:
                 return Outcome.HOME
             case Phase.STOPPING if sample.flags & Flags.GIVEN_UP:
-                return self._give_up("the device cannot bring every pin home")
+                return self._report_unreachable("the device cannot bring every pin home")
             case Phase.STOPPING if sample.flags & Flags.STOPPED and is_home:
                 return Outcome.RETRACTED
         return None
 
-    def _end_settle(self, sample: Sample, now: float) -> Outcome | None:
-        self._tare.append(sample.force_mN[self.settings.pin - 1])
-        if now - self._entered < self.settings.settle_s:
+    def _find_settle_outcome(self, sample: Sample, now: float) -> Outcome | None:
+        self._tare_samples.append(sample.force_mN[self.settings.pin - 1])
+        if now - self._phase_start_s < self.settings.settle_s:
             return None
         least = to_thousandths(self.settings.clamp_N - self.settings.clamp_tolerance_N)
         force, pin = min((sample.force_mN[pin - 1], pin) for pin in self.settings.clamps)
         if force >= least:
             return Outcome.HELD
-        if self._rounds < CLAMP_ROUNDS:
+        if self._rounds < MAX_CLAMP_ROUNDS:
             return Outcome.SLACKENED
-        return self._fail(f"pin {pin} clamps with {force / 1000:.1f} N only, after {CLAMP_ROUNDS} rounds")
+        return self._fail(f"pin {pin} clamps with {force / 1000:.1f} N only, after {MAX_CLAMP_ROUNDS} rounds")
 
-    def _end_approach(self, sample: Sample, now: float) -> Outcome | None:
+    def _find_approach_outcome(self, sample: Sample, now: float) -> Outcome | None:
         pin = self.settings.pin
         touches = sample.capacitance_fF[pin - 1] >= self.device.touch_fF
-        if touches and self._touching is None:
-            self._touching = sample.position_um[pin - 1]
-        if not self._rests(sample, now, (pin,)):
+        if touches and self._contact_um is None:
+            self._contact_um = sample.position_um[pin - 1]
+        if not self._is_at_rest(sample, now, (pin,)):
             return None
-        if self._felt(sample) >= to_thousandths(self.settings.touch_N) // 2 and self._touching is not None:
-            self.touch_um = self._touching
+        if (
+            self._compute_net_force(sample) >= to_thousandths(self.settings.touch_N) // 2
+            and self._contact_um is not None
+        ):
+            self.touch_um = self._contact_um
             self.start_um = max(self.touch_um - to_thousandths(self.settings.start_gap_mm), 0)
-            self.guard.set_depth(pin, self._deepest())
+            self.guard.set_depth(pin, self._compute_deepest_um())
             return Outcome.TOUCHED
         if touches:
             return None  # the limb gave way: the limits of deafness and time decide
-        if self._felt(sample) >= to_thousandths(self.settings.touch_N) // 2:
+        if self._compute_net_force(sample) >= to_thousandths(self.settings.touch_N) // 2:
             return self._fail(f"pin {pin} feels a force where its capacitance sees no skin")
         return self._fail(f"pin {pin} met nothing up to the end of its stroke")
 
-    def _give_up(self, why: str) -> Outcome:
+    def _report_unreachable(self, why: str) -> Outcome:
         self.reason = f"{self.reason}; {why}; use the device's own release"
         return Outcome.OUT_OF_REACH
 

@@ -1,4 +1,4 @@
-"""Whether a session's record is good, judged while the limb is still in the device."""
+"""Checks of a session's record, made while the limb is still in the device."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from ..traces import Regularised, Trace, find_touch_down, regularise
 from .events import PERIOD_US
 from .recording import Recording
 
-SPEED_OFF = 0.5 / 0.96  # of the ramp's speed; paper, section 2.1.2: 0.96 +- 0.5 mm/s
-TOUCH_MM = 0.3
-REPEATABLE_PERCENT = 5.0
-DRIFT_N = 0.2
-LOST_PERCENT = 0.1
-AROUND_US = 200_000  # of rest on either side of a ramp that belongs to its record
+SPEED_TOLERANCE = 0.5 / 0.96  # of the ramp's speed; paper, section 2.1.2: 0.96 +- 0.5 mm/s
+MAX_TOUCH_SD_MM = 0.3
+MAX_DIFFERENCE_PERCENT = 5.0
+MAX_DRIFT_N = 0.2
+MAX_LOST_PERCENT = 0.1
+REST_US = 200_000  # of rest on either side of a ramp that belongs to its record
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def find_ramps(recording: Recording) -> list[RecordedRamp]:
     for load, unload, after in zip(marks, marks[1:], marks[2:]):
         if (load["phase"], unload["phase"]) != ("load", "unload") or after["phase"] == "stopping":
             continue
-        start, end = load["at_us"] - AROUND_US, after["at_us"] + AROUND_US
+        start, end = load["at_us"] - REST_US, after["at_us"] + REST_US
         rows = (recording.host_us >= start) & (recording.host_us <= end)
         # The rest around it belongs to a ramp; the way there and the way home do not.
         start_um = int(load.get("start_um", 0))
@@ -86,22 +86,17 @@ def _find_near_rows(position: Indices, start_um: int) -> slice:
 
 
 def check_record(recording: Recording) -> Verdict:
-    """The verdict on a session that came to its end."""
-    precondition = int(recording.head["settings"]["precondition"])
+    """Judge the record of a session that came to its end."""
+    precondition, repeats = (int(recording.head["settings"][key]) for key in ("precondition", "repeats"))
     counted = [ramp for ramp in find_ramps(recording) if ramp.cycle > precondition]
+    found = f"{len(counted)} of {repeats} ramps"
     checks = [
-        _check_ramps(recording, counted),
+        Check("ramps", len(counted) == repeats, found, "record the site again"),
         *_check_curves(counted, float(recording.head["settings"]["ramp_speed_mm_s"])),
         _check_drift(recording),
         _check_saturation(recording),
     ]
     return Verdict((*checks, _check_losses(recording)))
-
-
-def _check_ramps(recording: Recording, counted: list[RecordedRamp]) -> Check:
-    wanted = int(recording.head["settings"]["repeats"])
-    found = f"{len(counted)} of {wanted} ramps"
-    return Check("ramps", len(counted) == wanted, found, "record the site again")
 
 
 def _check_curves(counted: list[RecordedRamp], speed_mm_s: float) -> list[Check]:
@@ -120,7 +115,7 @@ def _check_curves(counted: list[RecordedRamp], speed_mm_s: float) -> list[Check]
 
 
 def _check_speed(curve: Regularised, stated_mm_s: float) -> Check:
-    low, high = stated_mm_s * (1.0 - SPEED_OFF), stated_mm_s * (1.0 + SPEED_OFF)
+    low, high = stated_mm_s * (1.0 - SPEED_TOLERANCE), stated_mm_s * (1.0 + SPEED_TOLERANCE)
     speeds = (curve.speed_load_mm_s, curve.speed_unload_mm_s)
     found = f"{speeds[0]:.3f} mm/s in, {speeds[1]:.3f} mm/s out ({low:.3g} to {high:.3g})"
     remedy = "see acquire.ramp_speed_mm_s, and the device's drive"
@@ -128,9 +123,9 @@ def _check_speed(curve: Regularised, stated_mm_s: float) -> Check:
 
 
 def _check_touch(place_mm: float, uncertainty_mm: float) -> Check:
-    found = f"{place_mm:.2f} +- {uncertainty_mm:.2f} mm from the start (at most {TOUCH_MM:g})"
+    found = f"{place_mm:.2f} +- {uncertainty_mm:.2f} mm from the start (at most {MAX_TOUCH_SD_MM:g})"
     remedy = "give the ramps a larger acquire.start_gap_mm, or clean the force sensor"
-    return Check("touch-down", uncertainty_mm <= TOUCH_MM, found, remedy)
+    return Check("touch-down", uncertainty_mm <= MAX_TOUCH_SD_MM, found, remedy)
 
 
 def _check_repeatability(curves: list[Regularised]) -> Check:
@@ -142,12 +137,14 @@ def _check_repeatability(curves: list[Regularised]) -> Check:
         np.interp(at, c.displacement_mm[: c.peak_index + 1], c.force_N[: c.peak_index + 1]) for c in curves
     ]
     spread = float(np.ptp(ways, axis=0).max() / max(curve.peak_force_N for curve in curves) * 100)
-    found = f"ramps differ by up to {spread:.1f} % of the largest force (at most {REPEATABLE_PERCENT:g})"
-    return Check("repeatability", spread <= REPEATABLE_PERCENT, found, "precondition more, or pause longer")
+    found = f"ramps differ by up to {spread:.1f} % of the largest force (at most {MAX_DIFFERENCE_PERCENT:g})"
+    return Check(
+        "repeatability", spread <= MAX_DIFFERENCE_PERCENT, found, "precondition more, or pause longer"
+    )
 
 
 def _check_drift(recording: Recording) -> Check:
-    """The test pin's force off the skin, before and after."""
+    """Compare the test pin's force off the skin before and after."""
     pin = int(recording.head["settings"]["pin"]) - 1
     spans = recording.phases()
     rests = []
@@ -160,13 +157,13 @@ def _check_drift(recording: Recording) -> Check:
             return Check("drift", None, "no samples off the skin")
         rests.append(float(recording.force_mN[rows, pin].mean()) / 1000)
     drift = rests[1] - rests[0]
-    found = f"the force off the skin changed by {drift:+.3f} N (at most {DRIFT_N:g})"
-    return Check("drift", abs(drift) <= DRIFT_N, found, "let the device warm up, zero its sensors")
+    found = f"the force off the skin changed by {drift:+.3f} N (at most {MAX_DRIFT_N:g})"
+    return Check("drift", abs(drift) <= MAX_DRIFT_N, found, "let the device warm up, zero its sensors")
 
 
 def _check_saturation(recording: Recording) -> Check:
-    full = int(recording.head["device"]["range_mN"])
-    count = int((np.abs(recording.force_mN) >= full).any(axis=1).sum())
+    range_mN = int(recording.head["device"]["range_mN"])
+    count = int((np.abs(recording.force_mN) >= range_mN).any(axis=1).sum())
     return Check(
         "saturation", count == 0, f"{count} samples at the end of a force sensor's range", "see the sensor"
     )
@@ -177,4 +174,6 @@ def _check_losses(recording: Recording) -> Check:
     lost = int(np.maximum(np.rint(steps / PERIOD_US) - 1, 0).sum()) if steps.size else 0
     share = 100 * lost / max(len(recording.device_us) + lost, 1)
     found = f"{lost} of {len(recording.device_us) + lost} samples never came"
-    return Check("samples", share <= LOST_PERCENT, found, "see the wire, and what else runs on this machine")
+    return Check(
+        "samples", share <= MAX_LOST_PERCENT, found, "see the wire, and what else runs on this machine"
+    )

@@ -33,9 +33,9 @@ from ..arrays import Indices
 from ..errors import RunError, TraceError
 from .events import PINS, Sample
 
-FIRST = "#limbfit-recording 1"
-ROWS = 25  # per block: 50 ms
-SYNC_S = 1.0  # how often the disk is asked to keep what was written
+FIRST_LINE = "#limbfit-recording 1"
+ROWS_PER_BLOCK = 25  # per block: 50 ms
+SYNC_INTERVAL_S = 1.0  # how often the disk is asked to keep what was written
 MAX_BYTES = 2_000_000_000
 FOLLOWED_BYTES = 1 << 22  # read at once by who follows a record: half a minute of it
 _HEAD_BYTES = 1 << 16  # the first block and a closing line are shorter than these
@@ -62,10 +62,10 @@ class Recorder:
 
     def __init__(self, file: Path, head: dict[str, Any]) -> None:
         self.file = file
-        self._lines = [FIRST, f"#head {json.dumps(head, allow_nan=False)}", ",".join(COLUMNS)]
+        self._lines = [FIRST_LINE, f"#head {json.dumps(head, allow_nan=False)}", ",".join(COLUMNS)]
         self._rows = self._index = self._crc = 0
         self._failed = ""
-        self._full: SimpleQueue[bytes | None] = SimpleQueue()
+        self._finished_blocks: SimpleQueue[bytes | None] = SimpleQueue()
         self._handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
         self._close_block()
         self._writer = threading.Thread(target=self._write, name="recorder", daemon=True)
@@ -78,7 +78,7 @@ class Recorder:
             + ",".join(map(str, channels))
         )
         self._rows += 1
-        if self._rows >= ROWS:
+        if self._rows >= ROWS_PER_BLOCK:
             self._close_block()
 
     def event(self, name: str, host_us: int, **facts: Any) -> None:
@@ -88,7 +88,7 @@ class Recorder:
 
     def close(self) -> None:
         self._close_block()
-        self._full.put(None)
+        self._finished_blocks.put(None)
         self._writer.join()
         if self._failed:
             raise RunError(f"{self.file}: the record is not complete: {self._failed}")
@@ -98,16 +98,16 @@ class Recorder:
             raise RunError(f"{self.file}: cannot be written: {self._failed}")
         data = ("\n".join(self._lines) + "\n").encode("ascii")
         self._crc = crc32(data, self._crc)
-        self._full.put(data + b"#block %d %d %08X\n" % (self._index, len(data), self._crc))
+        self._finished_blocks.put(data + b"#block %d %d %08X\n" % (self._index, len(data), self._crc))
         self._lines, self._rows, self._index = [], 0, self._index + 1
 
     def _write(self) -> None:
         kept = time.monotonic()
         try:
-            while (data := self._full.get()) is not None:
+            while (data := self._finished_blocks.get()) is not None:
                 while data:
                     data = data[os.write(self._handle, data) :]
-                if time.monotonic() - kept > SYNC_S:
+                if time.monotonic() - kept > SYNC_INTERVAL_S:
                     os.fdatasync(self._handle) if hasattr(os, "fdatasync") else os.fsync(self._handle)
                     kept = time.monotonic()
             os.fsync(self._handle)
@@ -170,7 +170,7 @@ def follow_recording(file: str | Path, offset: int = 0, *, every: int = 1) -> tu
     Parameters
     ----------
     offset : where a block ends, as an earlier call gave it; 0: from the start.
-    every : only each so many-th sample (a divisor of `ROWS`: then they stay even over the calls).
+    every : only each so many-th sample (a divisor of `ROWS_PER_BLOCK`: then they stay even over the calls).
 
     Notes
     -----
@@ -202,7 +202,7 @@ def follow_recording(file: str | Path, offset: int = 0, *, every: int = 1) -> tu
 
 
 @dataclass(frozen=True)
-class _Blocks:
+class _WholeBlocks:
     """Blocks that are whole: their content, where the last ends, its CRC, and the index of the next."""
 
     content: bytes
@@ -215,27 +215,27 @@ class _Blocks:
 _CLOSING = re.compile(rb"#block ([0-9]{1,9}) ([0-9]{1,9}) ([0-9A-F]{8})\n")
 
 
-def _read_first_block(data: bytes, path: Path) -> _Blocks:
+def _read_first_block(data: bytes, path: Path) -> _WholeBlocks:
     """The block that holds the head."""
-    if not data.startswith(FIRST.encode()):
+    if not data.startswith(FIRST_LINE.encode()):
         raise TraceError("not a record of limbfit acquire", file=path, place="line 1")
-    first = _read_whole_blocks(data, _Blocks(b"", 0, 0, 0), most=1)
+    first = _read_whole_blocks(data, _WholeBlocks(b"", 0, 0, 0), most=1)
     if not first.content:
         raise TraceError("its first block is damaged", file=path, remedy="nothing can be read from it")
     return first
 
 
-def _read_block_before(stream: BinaryIO, offset: int, path: Path) -> _Blocks:
+def _read_block_before(stream: BinaryIO, offset: int, path: Path) -> _WholeBlocks:
     """What the closing line of the block that ends at an offset says."""
     stream.seek(max(offset - _CLOSING_BYTES, 0))
     line = stream.read(min(offset, _CLOSING_BYTES))
     closing = _CLOSING.fullmatch(line, line.rfind(b"\n", 0, -1) + 1)
     if closing is None:
         raise TraceError("no block ends here", file=path, place=f"byte {offset}", remedy="read it anew")
-    return _Blocks(b"", offset, int(closing[3], 16), int(closing[1]) + 1)
+    return _WholeBlocks(b"", offset, int(closing[3], 16), int(closing[1]) + 1)
 
 
-def _read_whole_blocks(data: bytes, before: _Blocks, most: int = sys.maxsize) -> _Blocks:
+def _read_whole_blocks(data: bytes, before: _WholeBlocks, most: int = sys.maxsize) -> _WholeBlocks:
     """The blocks after ``before``, which ends at its ``end`` in ``data``, up to one that is not whole."""
     parts: list[bytes] = []
     at, crc, is_damaged = before.end, before.crc, False
@@ -248,7 +248,7 @@ def _read_whole_blocks(data: bytes, before: _Blocks, most: int = sys.maxsize) ->
             break
         parts.append(part)
         at, crc = closing.end(), next_crc
-    return _Blocks(b"".join(parts), at, crc, before.next + len(parts), is_damaged)
+    return _WholeBlocks(b"".join(parts), at, crc, before.next + len(parts), is_damaged)
 
 
 def _make_recording(

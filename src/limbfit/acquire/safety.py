@@ -16,24 +16,24 @@ FROZEN_SAMPLES = 8
 SPEED_WINDOW_US = 10_000
 SPEED_MARGIN = 1.25  # of a measured speed over a limit: encoder noise, and the corner of a ramp
 POSITION_MARGIN_UM = 100  # of a measured position over a limit: noise, and what braking takes
-LOST_CLAMP_MN = 500  # a clamping pin that pushes less has lost the limb
-CLAMP_JUMP_MN = 3000  # and so has one whose force changes by more, within the time below
+MIN_CLAMP_MN = 500  # a clamping pin that pushes less has lost the limb
+MAX_CLAMP_JUMP_MN = 3000  # and so has one whose force changes by more, within the time below
 CLAMP_JUMP_US = 200_000
-DEAF_UM = 1500  # a push so far beyond touch must be felt
+MAX_UNFELT_TRAVEL_UM = 1500  # a push so far beyond touch must be felt
 
 
 @dataclass(frozen=True)
 class SafetyLimits:
     """Per pin: largest force (mN) and position (um).
 
-    For all: speed towards the limb (um/s), sensor range (mN), and how many samples alike mean a dead sensor.
+    For all: speed towards the limb (um/s), sensor range (mN), and how often a live sensor may repeat itself.
     """
 
     force_mN: tuple[int, ...]
     position_um: tuple[int, ...]
     speed_um_s: int
     range_mN: int
-    alike: int
+    max_unchanged_samples: int
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def make_session_limits(settings: Settings, stroke_um: int, range_mN: int, rate_
         position_um=(stroke_um,) * PINS,
         speed_um_s=to_thousandths(settings.speed_limit_mm_s),
         range_mN=range_mN,
-        alike=max(round(FROZEN_S * rate_hz), FROZEN_SAMPLES),
+        max_unchanged_samples=max(round(FROZEN_S * rate_hz), FROZEN_SAMPLES),
     )
 
 
@@ -63,32 +63,34 @@ class Guard:
 
     def __init__(self, limits: SafetyLimits) -> None:
         self.limits = limits
-        self._least_mN = min(*limits.force_mN, limits.range_mN - 1)
-        self._past: deque[Sample] = deque()
-        self._last: tuple[int, ...] = ()
-        self._alike = [0] * PINS
+        self._lowest_limit_mN = min(*limits.force_mN, limits.range_mN - 1)
+        self._recent_samples: deque[Sample] = deque()
+        self._last_forces: tuple[int, ...] = ()
+        self._unchanged_samples = [0] * PINS
 
     def set_depth(self, pin: int, position_um: int) -> None:
         """From now on a pin may not go beyond a position."""
         position = list(self.limits.position_um)
         position[pin - 1] = min(position_um, position[pin - 1])
         old = self.limits
-        self.limits = SafetyLimits(old.force_mN, tuple(position), old.speed_um_s, old.range_mN, old.alike)
+        self.limits = SafetyLimits(
+            old.force_mN, tuple(position), old.speed_um_s, old.range_mN, old.max_unchanged_samples
+        )
 
     def check(self, sample: Sample) -> Violation | None:
-        """The first limit that the sample passes."""
+        """Return the first limit that the sample passes, if any."""
         most = self.limits
         # The common case at once; which pin it is matters only where one is over.
-        strong = max(sample.force_mN) > self._least_mN or min(sample.force_mN) <= -most.range_mN
-        if strong and (wrong := self._forced(sample)):
+        strong = max(sample.force_mN) > self._lowest_limit_mN or min(sample.force_mN) <= -most.range_mN
+        if strong and (wrong := self._check_forces(sample)):
             return wrong
         for pin, (position, far) in enumerate(zip(sample.position_um, most.position_um, strict=True), 1):
             if position > far + POSITION_MARGIN_UM:
                 text = f"pin {pin}: {position / 1000:.2f} mm is over the limit of {far / 1000:.2f} mm"
                 return Violation("depth", pin, text)
-        return self._too_fast(sample) or self._frozen(sample)
+        return self._check_speeds(sample) or self._check_frozen_sensors(sample)
 
-    def _forced(self, sample: Sample) -> Violation | None:
+    def _check_forces(self, sample: Sample) -> Violation | None:
         limits = self.limits
         for pin, (force, most) in enumerate(zip(sample.force_mN, limits.force_mN, strict=True), 1):
             if abs(force) >= limits.range_mN:
@@ -98,8 +100,8 @@ class Guard:
                 return Violation("force", pin, text)
         return None
 
-    def _too_fast(self, sample: Sample) -> Violation | None:
-        past = self._past
+    def _check_speeds(self, sample: Sample) -> Violation | None:
+        past = self._recent_samples
         past.append(sample)
         while len(past) > 2 and sample.time_us - past[1].time_us >= SPEED_WINDOW_US:
             past.popleft()
@@ -116,18 +118,18 @@ class Guard:
                 return Violation("speed", pin, text)
         return None
 
-    def _frozen(self, sample: Sample) -> Violation | None:
-        """A live sensor is noisy: one that repeats itself does not measure."""
-        if self._last:
-            alike = self._alike
-            for k, (now, then) in enumerate(zip(sample.force_mN, self._last, strict=True)):
-                alike[k] = alike[k] + 1 if now == then else 0
-                if alike[k] >= self.limits.alike:
-                    self._last = sample.force_mN
+    def _check_frozen_sensors(self, sample: Sample) -> Violation | None:
+        """Find a sensor that repeats itself: a live one is noisy."""
+        if self._last_forces:
+            max_unchanged_samples = self._unchanged_samples
+            for k, (now, then) in enumerate(zip(sample.force_mN, self._last_forces, strict=True)):
+                max_unchanged_samples[k] = max_unchanged_samples[k] + 1 if now == then else 0
+                if max_unchanged_samples[k] >= self.limits.max_unchanged_samples:
+                    self._last_forces = sample.force_mN
                     return Violation(
                         "dead", k + 1, f"the force sensor of pin {k + 1} is dead: it repeats itself"
                     )
-        self._last = sample.force_mN
+        self._last_forces = sample.force_mN
         return None
 
 
@@ -136,25 +138,25 @@ class ClampWatch:
 
     def __init__(self, pins: tuple[int, ...]) -> None:
         self.pins = pins
-        self._past: deque[Sample] = deque()
+        self._recent_samples: deque[Sample] = deque()
 
     def check(self, sample: Sample) -> Violation | None:
-        past = self._past
+        past = self._recent_samples
         past.append(sample)
         while sample.time_us - past[0].time_us > CLAMP_JUMP_US:
             past.popleft()
         for pin in self.pins:
             now, then = sample.force_mN[pin - 1], past[0].force_mN[pin - 1]
-            if now < LOST_CLAMP_MN:
+            if now < MIN_CLAMP_MN:
                 return Violation("limb", pin, f"the limb has moved: pin {pin} has lost contact")
-            if abs(now - then) > CLAMP_JUMP_MN:
+            if abs(now - then) > MAX_CLAMP_JUMP_MN:
                 text = f"the limb has moved: the force of pin {pin} jumped by {(now - then) / 1000:+.1f} N"
                 return Violation("limb", pin, text)
         return None
 
 
 def check_device_flags(flags: int) -> Violation | None:
-    """What the device says of itself."""
+    """Check what the device says of itself."""
     if flags & Flags.BUTTON:
         return Violation("button", 0, "the device's emergency stop was pressed")
     if flags & Flags.NO_POWER:
@@ -164,9 +166,9 @@ def check_device_flags(flags: int) -> Violation | None:
     return None
 
 
-def check_sensitivity(travel_um: int, felt_mN: int, least_mN: int, pin: int) -> Violation | None:
-    """A force sensor that feels nothing of a push that the capacitance saw begin."""
-    if travel_um > DEAF_UM and felt_mN < least_mN:
+def check_sensitivity(travel_um: int, force_mN: int, expected_mN: int, pin: int) -> Violation | None:
+    """Refuse a force sensor that feels nothing of a push that the capacitance saw begin."""
+    if travel_um > MAX_UNFELT_TRAVEL_UM and force_mN < expected_mN:
         text = f"pin {pin} touches ({travel_um / 1000:.1f} mm ago) but feels no force: see its force sensor"
         return Violation("deaf", pin, text)
     return None

@@ -38,24 +38,23 @@ from .line_protocol import (
     Bye,
     Declined,
     Heartbeat,
-    Identity,
     LimitTripped,
     NoteCommand,
     OutOfReach,
     SetLimits,
 )
-from .protocol import DeviceFacts, Phase, Protocol
+from .protocol import Phase, Protocol
 from .recording import Recorder
 
-LIVE_EVERY = 20  # samples between two that are told: 25 a second
+SAMPLES_PER_LIVE_UPDATE = 20  # the listener gets 25 updates a second
 PACED_SILENCE_S = 20.0  # wall time, where the device's clock waits for limbfit's
-LOOP_S = 0.002
-FIRST_S = 1.0  # the first sample may take longer than those after it
-DRIFT_S = 1e-6  # per sample: two clocks may run apart by 500 ppm without making samples look late
+LOOP_TIMEOUT_S = 0.002
+FIRST_SAMPLE_S = 1.0  # the first sample may take longer than those after it
+CLOCK_DRIFT_S = 1e-6  # per sample: two clocks may run apart by 500 ppm without making samples look late
 
 
 # What the words of a device mean; it may have others.
-_MEANINGS = {
+_CODE_MEANINGS = {
     "watchdog": "it heard from limbfit too late: check the wire, and what else runs on this machine",
     "stuck": "a driven pin does not move",
     "power": "the actuators have no power",
@@ -71,8 +70,8 @@ _MEANINGS = {
 }
 
 
-def _describe_why(code: str) -> str:
-    return f" ({_MEANINGS[code]})" if code in _MEANINGS else ""
+def _explain_code(code: str) -> str:
+    return f" ({_CODE_MEANINGS[code]})" if code in _CODE_MEANINGS else ""
 
 
 @dataclass(frozen=True)
@@ -139,19 +138,16 @@ class Session:
         recorder: Recorder | None = None,
         listener: Listener | None = None,
     ) -> None:
-        identity: Identity = device.identity
         self.settings, self.device, self.recorder, self.listener = settings, device, recorder, listener
-        self.protocol = Protocol(
-            settings, DeviceFacts(identity.stroke_um, identity.range_mN, identity.touch_fF)
-        )
+        self.protocol = Protocol(settings, device.identity)
         self.counts = Counts()
         self.unreachable: tuple[int, ...] = ()
-        self._paced = identity.clock == "paced"
+        self._paced = device.identity.clock == "paced"
         self._site = site
-        self._last: Sample | None = None
-        self._lead = float("inf")  # least of (arrival - device time): a sample that leads no other is fresh
-        self._fresh = 0.0
-        self._told = Phase.IDLE
+        self._last_sample: Sample | None = None
+        self._smallest_lead_s = float("inf")  # the least of arrival minus device time
+        self._last_fresh_s = 0.0
+        self._reported_phase = Phase.IDLE
 
     # -- in
 
@@ -161,62 +157,64 @@ class Session:
         force, clamp = to_thousandths(settings.force_limit_N), to_thousandths(settings.clamp_limit_N)
         speed, watchdog = to_thousandths(settings.speed_limit_mm_s), max(round(settings.watchdog_ms), 1)
         limits = SetLimits(settings.pin, force, clamp, identity.stroke_um, speed, watchdog)
-        self._fresh = now + FIRST_S
-        with self._wire(now):
+        self._last_fresh_s = now + FIRST_SAMPLE_S
+        with self._guard_link(now):
             self.device.send(limits, now)
             self.device.send(NoteCommand("SITE", self._site), now)
         self.handle(Begin(), now)
 
-    def reports(self, reports: list[Sample | Declined | LimitTripped | OutOfReach], now: float) -> None:
-        """What the device said."""
+    def handle_reports(
+        self, reports: list[Sample | Declined | LimitTripped | OutOfReach], now: float
+    ) -> None:
+        """Pass what the device said on to the protocol, the record and the counts."""
         newest = None
         for report in reports:
             match report:
                 case Sample():
                     newest = report
-                    self._sample(report, now)
+                    self._handle_sample(report, now)
                 case Declined(code=code):
                     self.counts.declined[code] = self.counts.declined.get(code, 0) + 1
                     self._record("declined", now, code=code)
                     if not self.protocol.is_over and self.protocol.phase is not Phase.STOPPING:
-                        self.handle(Abort(f"the device declined a command: {code}{_describe_why(code)}"), now)
+                        self.handle(Abort(f"the device declined a command: {code}{_explain_code(code)}"), now)
                 case LimitTripped(code=code, pin=pin):
                     self._record("fault", now, code=code, pin=pin)
                     where = f", pin {pin}" if pin else ""
                     self.handle(
-                        Abort(f"the device stopped by itself: {code}{where}{_describe_why(code)}"), now
+                        Abort(f"the device stopped by itself: {code}{where}{_explain_code(code)}"), now
                     )
                 case OutOfReach(pins=pins):
                     self.unreachable = tuple(k + 1 for k in range(pins.bit_length()) if pins >> k & 1)
                     self._record("unreachable", now, pins=list(self.unreachable))
         if newest is not None:
-            with self._wire(now):
+            with self._guard_link(now):
                 self.device.send(Heartbeat(newest.number), now)
 
     def handle(self, event: Event, now: float) -> None:
-        """An event to the protocol, its actions to the device."""
-        self._do(self.protocol.handle(event, now), now)
-        if self.protocol.phase is not self._told:
-            self._told = self.protocol.phase
-            self._tell_phase(now)
+        """Give an event to the protocol, and its actions to the device."""
+        self._execute(self.protocol.handle(event, now), now)
+        if self.protocol.phase is not self._reported_phase:
+            self._reported_phase = self.protocol.phase
+            self._report_phase(now)
 
     def tick(self, now: float) -> None:
-        """Time passes: the watchdog, and commands that went unanswered."""
+        """Check the watchdog, and repeat commands that went unanswered."""
         protocol = self.protocol
         if not self._paced and protocol.phase is not Phase.STOPPING and not protocol.is_over:
-            silent = now - self._fresh
+            silent = now - self._last_fresh_s
             if silent * 1000 > self.settings.watchdog_ms:
                 self.handle(Abort(f"no fresh sample for {silent * 1000:.0f} ms"), now)
         self.handle(Tick(), now)
-        with self._wire(now):
+        with self._guard_link(now):
             if reason := self.device.resend(now):
                 self.handle(Abort(reason), now)
 
-    def lost(self, reason: str, now: float) -> None:
-        """The wire is gone."""
+    def lose_link(self, reason: str, now: float) -> None:
+        """End the session because the wire is gone."""
         self.handle(LinkLost(reason), now)
 
-    def ending(self) -> Ending:
+    def build_ending(self) -> Ending:
         p = self.protocol
         return Ending(
             p.phase, p.reason, p.touch_um, p.start_um, p.depth_um, self.counts.samples, self.unreachable
@@ -224,23 +222,23 @@ class Session:
 
     # -- out
 
-    def _sample(self, sample: Sample, now: float) -> None:
+    def _handle_sample(self, sample: Sample, now: float) -> None:
         if self.recorder is not None:
             self.recorder.sample(sample, round(now * 1e6))
         counts = self.counts
         counts.samples += 1
-        if self._last is not None:
-            counts.lost += max((sample.time_us - self._last.time_us) // PERIOD_US - 1, 0)
-        self._last = sample
+        if self._last_sample is not None:
+            counts.lost += max((sample.time_us - self._last_sample.time_us) // PERIOD_US - 1, 0)
+        self._last_sample = sample
         lead = now - sample.time_us / 1e6
-        self._lead = min(self._lead + DRIFT_S, lead)
-        if (lead - self._lead) * 1000 <= self.settings.watchdog_ms:
-            self._fresh = now
+        self._smallest_lead_s = min(self._smallest_lead_s + CLOCK_DRIFT_S, lead)
+        if (lead - self._smallest_lead_s) * 1000 <= self.settings.watchdog_ms:
+            self._last_fresh_s = now
         self.handle(sample, now)
-        if self.listener is not None and counts.samples % LIVE_EVERY == 0:
-            self.listener(self._live(sample, now))
+        if self.listener is not None and counts.samples % SAMPLES_PER_LIVE_UPDATE == 0:
+            self.listener(self._make_live_update(sample, now))
 
-    def _live(self, sample: Sample, now: float) -> LiveUpdate:
+    def _make_live_update(self, sample: Sample, now: float) -> LiveUpdate:
         k = self.settings.pin - 1
         clamps = [sample.force_mN[pin - 1] for pin in self.settings.clamps]
         return LiveUpdate(
@@ -252,7 +250,7 @@ class Session:
             clamp_N=sum(clamps) / len(clamps) / 1000,
         )
 
-    def _tell_phase(self, now: float) -> None:
+    def _report_phase(self, now: float) -> None:
         protocol = self.protocol
         phase = str(protocol.phase)
         facts: dict[str, Any] = {"phase": phase, "cycle": protocol.cycle}
@@ -262,7 +260,7 @@ class Session:
             facts["reason"] = protocol.reason
         self._record("phase", now, **facts)
         if not protocol.is_over:
-            with self._wire(now):
+            with self._guard_link(now):
                 self.device.send(NoteCommand("PHASE", phase), now)
         if self.listener is not None:
             self.listener(PhaseUpdate(phase, now, protocol.reason, protocol.cycle))
@@ -271,8 +269,8 @@ class Session:
         if self.recorder is not None:
             self.recorder.event(name, round(now * 1e6), **facts)
 
-    def _do(self, actions: tuple[Action, ...], now: float) -> None:
-        with self._wire(now):
+    def _execute(self, actions: tuple[Action, ...], now: float) -> None:
+        with self._guard_link(now):
             for action in actions:
                 self.device.send(action, now)
                 match action:
@@ -284,12 +282,12 @@ class Session:
                         self._record("stop", now, reason=reason)
 
     @contextmanager
-    def _wire(self, now: float) -> Iterator[None]:
-        """A block in which the device may turn out to be gone."""
+    def _guard_link(self, now: float) -> Iterator[None]:
+        """A block in which the device may turn out to be gone, which ends the session."""
         try:
             yield
         except RunError as error:
-            self.lost(str(error), now)
+            self.lose_link(str(error), now)
 
 
 def prioritise() -> str:
@@ -328,7 +326,7 @@ def run_session(session: Session, operator: SimpleQueue[Event]) -> Ending:
         with suppress(RunError):
             session.device.send(Bye(), 0.0)
         session.device.close()
-    return session.ending()
+    return session.build_ending()
 
 
 def _run_loop(session: Session, operator: SimpleQueue[Event]) -> None:
@@ -339,9 +337,9 @@ def _run_loop(session: Session, operator: SimpleQueue[Event]) -> None:
     session.begin(now)
     while not session.protocol.is_over:
         try:
-            reports = device.receive(LOOP_S)
+            reports = device.receive(LOOP_TIMEOUT_S)
         except RunError as error:
-            session.lost(str(error), now)
+            session.lose_link(str(error), now)
             return
         wall = time.monotonic()
         if not paced:
@@ -352,9 +350,9 @@ def _run_loop(session: Session, operator: SimpleQueue[Event]) -> None:
             if times:
                 origin = times[0] if origin is None else origin
                 now = max(now, max(times) - origin)
-            session.reports(reports, now)
+            session.handle_reports(reports, now)
         elif paced and wall - heard > PACED_SILENCE_S:
-            session.lost(f"the device has been silent for {PACED_SILENCE_S:g} s", now)
+            session.lose_link(f"the device has been silent for {PACED_SILENCE_S:g} s", now)
             return
         with suppress(Empty):
             while True:

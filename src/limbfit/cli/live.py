@@ -45,13 +45,13 @@ class PlainLines:
     def __exit__(self, *what: object) -> None:
         """Nothing to take down."""
 
-    def listen(self, told: Update) -> None:
-        if isinstance(told, PhaseUpdate):
-            self._began = told.time_s if self._began is None else self._began
-            cycle = f" (ramp {told.cycle})" if told.phase in ("load", "hold", "unload") else ""
-            reason = f": {told.reason}" if told.reason else ""
-            since = told.time_s - self._began
-            STDERR.print(f"[{since:8.3f} s] site {self.site}: {told.phase}{cycle}{reason}", soft_wrap=True)
+    def listen(self, update: Update) -> None:
+        if isinstance(update, PhaseUpdate):
+            self._began = update.time_s if self._began is None else self._began
+            cycle = f" (ramp {update.cycle})" if update.phase in ("load", "hold", "unload") else ""
+            reason = f": {update.reason}" if update.reason else ""
+            since = update.time_s - self._began
+            STDERR.print(f"[{since:8.3f} s] site {self.site}: {update.phase}{cycle}{reason}", soft_wrap=True)
 
 
 class Live:
@@ -70,11 +70,11 @@ class Live:
     def __exit__(self, *what: object) -> None:
         self._shown.stop()
 
-    def listen(self, told: Update) -> None:
-        if isinstance(told, PhaseUpdate):
-            self._phase = told
+    def listen(self, update: Update) -> None:
+        if isinstance(update, PhaseUpdate):
+            self._phase = update
         else:
-            self._samples.append(told)
+            self._samples.append(update)
 
     def _draw(self) -> Any:
         samples = list(self._samples)
@@ -132,7 +132,7 @@ def read_keys(events: SimpleQueue[Event], gap_s: float) -> Iterator[None]:
         while not over.is_set():
             ready, _, _ = select.select([handle], [], [], 0.01)
             typed = os.read(handle, 64) if ready else b""
-            for event in (*keyboard.typed(typed, monotonic()), *keyboard.passed(monotonic())):
+            for event in (*keyboard.read(typed, monotonic()), *keyboard.check_release(monotonic())):
                 events.put(event)
 
     thread = Thread(target=read, name="keys", daemon=True)

@@ -1,4 +1,9 @@
-"""A FEBio input as limbfit's own problem: same mesh, supports, materials, history and time steps."""
+"""A FEBio input as limbfit's own problem: same mesh, supports, materials, history and time steps.
+
+A single body that goes straight in is an indenter. Its advance is the history, and everything else is a
+multiple of it. Bodies that turn, that forces drive, or that are open, and several bodies at once, have
+motions of their own. Then the history is that of prescribed nodes, and of bodies that carry tissue.
+"""
 
 from __future__ import annotations
 

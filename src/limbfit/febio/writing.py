@@ -1,6 +1,13 @@
 """A problem written as an input of FEBio 4.0 (``.feb``) that runs unedited and opens in FEBio Studio.
 
 Numbers are written so that they are read back exactly. Units: mm, N, s, MPa.
+
+In a tissue, a contraction stands beside what relaxes, because an active stress is given as it is. A
+pre-strain stands around all of it, and FEBio's pressure does not see it. A material has one axis of fibres if
+all its cells have the same direction, else each cell has its own.
+
+Source: FEBio User Manual 4.0, chapter 4, and the section on ``MeshData``; ``FEActiveFiberStressUC`` and
+``FEPreStrainUncoupledElastic``.
 """
 
 from __future__ import annotations

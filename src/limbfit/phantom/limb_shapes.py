@@ -1,4 +1,4 @@
-"""Smooth implicit functions of which synthetic limbs are made.
+"""Synthetic limbs as smooth implicit functions: a transtibial and a transfemoral residuum.
 
 Limb frame (mm): origin at the distal tip, z proximal, -y anterior, +x medial (a right limb). A *field* is
 negative inside, zero on the surface, and close to the distance in millimetres near it; divide it by the

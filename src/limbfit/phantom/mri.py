@@ -6,6 +6,8 @@ Partial volume is the exact box average over a voxel of a locally flat
 interface, blurred to a Gaussian: ``Phi(-sqrt(12) d / w)`` with ``d`` the distance to the interface and ``w``
 the voxel's extent along its normal. Noise of MRI is Rician: the magnitude
 of a signal with complex Gaussian noise.
+
+The true label map is what someone who knew the limb would have drawn on the image.
 """
 
 from __future__ import annotations

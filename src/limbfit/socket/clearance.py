@@ -1,4 +1,4 @@
-"""A socket's face moved clear of the limb along its rays, which cannot fold it."""
+"""A socket's face clear of the limb, moved along its rays, which cannot fold it, and of the bones inside."""
 
 from __future__ import annotations
 

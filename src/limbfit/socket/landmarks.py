@@ -1,4 +1,7 @@
-"""Where anterior and medial are on a limb, where its knee is, and about which point it is loaded."""
+"""Directions, landmarks and named regions of a limb.
+
+Regions are sides and levels of the skin, places over bones, and what the user states.
+"""
 
 from __future__ import annotations
 

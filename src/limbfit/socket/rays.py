@@ -4,7 +4,7 @@ The middle line follows the centres of the limb's sections down to the centre of
 on up rays run across the limb frame's z axis; below, they leave that centre in all distal directions. A point
 has three coordinates: its angle around the limb, its station (mm: height over the centre, or the arc below
 it, which is negative) and its radius. Rays do not cross, so a face that has one radius for each angle and
-station cannot fold.
+station cannot fold. `Offsets` are moves along them, such as the shape that pressures give a socket.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Rectification: the inner face of a socket from the outer surface of a limb and a recipe."""
+"""Rectification: the inner face of a socket from the outer surface of a limb and a recipe.
+
+The face consists of even triangles between rings of points around the limb.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The table ``[socket]``: the socket's shape, liner, donning and loads."""
+"""The tables ``[socket]`` and ``[socket.design]``: shape, liner, donning, loads, and designed pressures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small numerics that the trace modules share."""
+"""Numerics that the trace modules share: noise and its correlation, runs, means and interpolation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Smooth curves counted from touch-down."""
+"""Smooth curves counted from touch-down.
+
+What is stated to the machine is piecewise straight, what answers is a smoothing spline for each phase: the
+force under a stated displacement, the displacement under a stated force.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""What ultrasound through the indenter sees: tissues that become thinner from touch-down on."""
+"""What is measured of an indentation beside its force.
+
+Ultrasound through the indenter sees tissues that become thinner from touch-down on, elastography reads the
+speeds of shear waves in them, and cameras or scans see points of the skin around the indenter move.
+"""
 
 from __future__ import annotations
 

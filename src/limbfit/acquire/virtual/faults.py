@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -40,7 +39,7 @@ class Fault(BaseModel):
     value: Annotated[float, Field(ge=-100, le=10_000)] = 0.0
 
 
-class _File(BaseModel):
+class _FaultFile(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     faults: tuple[Fault, ...]
@@ -57,7 +56,7 @@ def read_faults(file: Path) -> tuple[Fault, ...]:
     if not file.is_file():
         raise InputError("no such file", file=file, remedy="give a TOML file with [[faults]]")
     try:
-        return _File(**tomllib.loads(file.read_text(encoding="utf-8"))).faults
+        return _FaultFile(**tomllib.loads(file.read_text(encoding="utf-8"))).faults
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"not valid TOML: {error}", file=file) from None
     except ValidationError as error:
@@ -67,13 +66,11 @@ def read_faults(file: Path) -> tuple[Fault, ...]:
         raise InputError(first["msg"], file=file, place=place, remedy=remedy) from None
 
 
-@dataclass
 class FaultClock:
     """Which faults are on, as time goes and phases are entered."""
 
-    faults: tuple[Fault, ...]
-
-    def __post_init__(self) -> None:
+    def __init__(self, faults: tuple[Fault, ...]) -> None:
+        self.faults = faults
         self._entered: dict[str, int] = {}
         self.now_us = 0
 
@@ -82,11 +79,7 @@ class FaultClock:
 
     def on(self, kind: str) -> list[Fault]:
         """The faults of a kind that are on."""
-        return (
-            [fault for fault in self.faults if fault.kind == kind and self._is_on(fault)]
-            if self.faults
-            else []
-        )
+        return [fault for fault in self.faults if fault.kind == kind and self._is_on(fault)]
 
     def share(self, fault: Fault) -> float:
         """How much of a fault's time has passed, 0 to 1."""

@@ -39,15 +39,15 @@ from .limb import VirtualLimb
 from .pins import STROKE_MM, Motors, Sensors
 
 STEP_US = 1000
-EVERY = 1_000_000 // RATE_HZ // STEP_US  # steps per sample
+STEPS_PER_SAMPLE = 1_000_000 // RATE_HZ // STEP_US  # steps per sample
 RETRACT_MM_S = 100.0
 # Built in: no session's limits go beyond them.
-MOST_FORCE_MN = 45_000
-MOST_SPEED_UM_S = 12_000
-MOST_RETRACT_UM_S = 100_000
-MOST_WATCHDOG_MS = 500
-LAG_US = 50_000  # a driven pin that stands for so long is stuck
-PATIENCE_US = 3_000_000  # pins that are not home so long after a stop are out of reach
+MAX_FORCE_MN = 45_000
+MAX_SPEED_UM_S = 12_000
+MAX_RETRACT_UM_S = 100_000
+MAX_WATCHDOG_MS = 500
+MAX_LAG_US = 50_000  # a driven pin that stands for so long is stuck
+MAX_HOMING_US = 3_000_000  # pins that are not home so long after a stop are out of reach
 
 
 class VirtualFitSocket:
@@ -58,7 +58,7 @@ class VirtualFitSocket:
     time_us : of the device.
     stopped : the code of the stop that is latched, empty for none.
     is_armed : a session runs, samples are sent, the watchdog watches.
-    has_left : the host has ended its session.
+    host_has_left : the host has ended its session.
     acknowledged_us : device time of the newest sample that limbfit has dealt with.
     """
 
@@ -75,36 +75,36 @@ class VirtualFitSocket:
         self.stopped, self.is_armed = "", False
         self.acknowledged_us = 0
         self._begun_us = self._stopped_us = 0
-        self._watchdog_us = MOST_WATCHDOG_MS * 1000
-        self._most = SafetyLimits(
-            (MOST_FORCE_MN,) * PINS, (round(1000 * STROKE_MM),) * PINS, MOST_SPEED_UM_S, 1 << 30, 1 << 30
+        self._watchdog_us = MAX_WATCHDOG_MS * 1000
+        self._built_in_limits = SafetyLimits(
+            (MAX_FORCE_MN,) * PINS, (round(1000 * STROKE_MM),) * PINS, MAX_SPEED_UM_S, 1 << 30, 1 << 30
         )
-        self._guard = Guard(self._most)
-        self._halts = [0] * PINS
-        self._lags = np.zeros(PINS, dtype=int)
-        self._force: tuple[int, ...] = (0,) * PINS
+        self._guard = Guard(self._built_in_limits)
+        self._halt_forces_mN = [0] * PINS
+        self._lag_times_us = np.zeros(PINS, dtype=int)
+        self._forces_mN: tuple[int, ...] = (0,) * PINS
         self._given_up = False
-        self._shifted: dict[Fault, float] = {}
+        self._limb_shifts_mm: dict[Fault, float] = {}
         self._sent: deque[tuple[int, int]] = deque(maxlen=2000)
-        self._held: deque[tuple[int, bytes]] = deque()
+        self._delayed: deque[tuple[int, bytes]] = deque()
         self.connect()
 
     # -- sessions
 
     def connect(self) -> None:
-        """A host is at the wire."""
+        """Begin with a new host."""
         self._decoder = Decoder(HOST_LINE, numbered=False)
         self._encoder: Encoder | None = None
-        self.has_left = False
+        self.host_has_left = False
 
     @property
     def refused(self) -> object:
         return self._decoder.refused
 
     def disconnect(self) -> None:
-        """The host has gone: whatever is not home goes home."""
+        """End with the host: whatever is not home goes home."""
         if self.is_armed:
-            self._leave()
+            self._end_session()
         self._encoder = None
 
     @property
@@ -114,10 +114,10 @@ class VirtualFitSocket:
 
     @property
     def is_home(self) -> bool:
-        return bool(self.motors.at_home().all())
+        return bool(self.motors.find_withdrawn().all())
 
     def feed(self, data: bytes) -> bytes:
-        """Lines of the host; what is said in answer."""
+        """Take bytes of the host; return the answer."""
         if self.faults.on("deaf"):
             return b""
         out = b""
@@ -126,27 +126,29 @@ class VirtualFitSocket:
             if command is None:
                 self._decoder.refused.unknown += 1
                 continue
-            out += self._command(command, line.number)
-        return self._through_faults(out)
+            out += self._handle_command(command, line.number)
+        return self._apply_faults(out)
 
-    def _command(self, command: Command, number: int) -> bytes:
+    def _handle_command(self, command: Command, number: int) -> bytes:
         if isinstance(command, Hello):
             return (
-                self._greet(command) if self._encoder is None else self._say(Declined(number, "greeted").body)
+                self._greet(command)
+                if self._encoder is None
+                else self._encode(Declined(number, "greeted").body)
             )
         if self._encoder is None:
             self._decoder.refused.unknown += 1
             return b""
         match command:
             case Heartbeat():
-                self._beat(command.number)
+                self._acknowledge(command.number)
                 return b""
             case Bye():
-                self._leave()
-                self.has_left = True
+                self._end_session()
+                self.host_has_left = True
                 return b""
-        code = self._obey(command)
-        return self._say(Declined(number, code).body if code else Accepted(number).body)
+        code = self._execute(command)
+        return self._encode(Declined(number, code).body if code else Accepted(number).body)
 
     def _greet(self, hello: Hello) -> bytes:
         if hello.version != VERSION:
@@ -173,13 +175,13 @@ class VirtualFitSocket:
         self._decoder.restart(salt)
         return line
 
-    def _obey(self, command: Command) -> str:
-        """Do a command; why not, in a word."""
+    def _execute(self, command: Command) -> str:
+        """Carry out a command; return why not, in a word, or an empty text."""
         match command:
             case SetLimits():
                 return self._arm(command)
             case NoteCommand(kind="SITE", word=word):
-                return "" if self.limb.bring(word, self._pin) else "unknown-site"
+                return "" if self.limb.place_site(word, self._test_pin) else "unknown-site"
             case NoteCommand(word=word):
                 self.faults.enter(word)
                 return ""
@@ -197,25 +199,27 @@ class VirtualFitSocket:
         assert isinstance(command, Move)
         return self._move(command)
 
-    _pin = 1
+    _test_pin = 1
 
     def _arm(self, limits: SetLimits) -> str:
         if self.is_armed:
             return "armed"
         if self.stopped:
             return "stopped"
-        force = [min(limits.clamp_mN, MOST_FORCE_MN)] * PINS
-        force[limits.pin - 1] = min(limits.force_mN, MOST_FORCE_MN)
+        force = [min(limits.clamp_mN, MAX_FORCE_MN)] * PINS
+        force[limits.pin - 1] = min(limits.force_mN, MAX_FORCE_MN)
         most = min(limits.position_um, round(1000 * STROKE_MM))
-        alike = max(round(FROZEN_S * 1e6 / STEP_US), FROZEN_SAMPLES)
-        speed = min(limits.speed_um_s, MOST_SPEED_UM_S)
-        self._guard = Guard(SafetyLimits(tuple(force), (most,) * PINS, speed, self.sensors.range_mN, alike))
-        self._watchdog_us = 1000 * min(limits.watchdog_ms, MOST_WATCHDOG_MS)
-        self._pin = limits.pin
+        max_unchanged_samples = max(round(FROZEN_S * 1e6 / STEP_US), FROZEN_SAMPLES)
+        speed = min(limits.speed_um_s, MAX_SPEED_UM_S)
+        self._guard = Guard(
+            SafetyLimits(tuple(force), (most,) * PINS, speed, self.sensors.range_mN, max_unchanged_samples)
+        )
+        self._watchdog_us = 1000 * min(limits.watchdog_ms, MAX_WATCHDOG_MS)
+        self._test_pin = limits.pin
         self.is_armed = True
         self.faults = FaultClock(self.faults.faults)
         self._begun_us = self.acknowledged_us = self.time_us
-        self._lags[:] = 0
+        self._lag_times_us[:] = 0
         self._sent.clear()
         return ""
 
@@ -226,17 +230,17 @@ class VirtualFitSocket:
             return "stopped"
         if move.target_um > self._guard.limits.position_um[k]:
             return "position"
-        if move.speed_um_s > (self._guard.limits.speed_um_s if inward else MOST_RETRACT_UM_S):
+        if move.speed_um_s > (self._guard.limits.speed_um_s if inward else MAX_RETRACT_UM_S):
             return "speed"
-        if move.halt_mN and self._force[k] >= move.halt_mN and inward:
+        if move.halt_mN and self._forces_mN[k] >= move.halt_mN and inward:
             self.motors.halt(k)
             return ""
-        self._halts[k] = move.halt_mN if inward else 0
-        self._lags[k] = 0
+        self._halt_forces_mN[k] = move.halt_mN if inward else 0
+        self._lag_times_us[k] = 0
         self.motors.drive(k, move.target_um / 1000, move.speed_um_s / 1000)
         return ""
 
-    def _beat(self, number: int) -> None:
+    def _acknowledge(self, number: int) -> None:
         for sent, at in self._sent:
             if sent == number:
                 self.acknowledged_us = max(self.acknowledged_us, at)
@@ -244,20 +248,20 @@ class VirtualFitSocket:
         while self._sent and self._sent[0][0] <= number:
             self._sent.popleft()
 
-    def _leave(self) -> None:
+    def _end_session(self) -> None:
         if not self.is_home:
             self._stop("left")
         self.is_armed = False
 
-    def hang_up(self) -> None:
-        """The host says nothing any more, by a clock that is not the device's."""
+    def stop_without_host(self) -> None:
+        """Stop because the host has been silent, by a clock that is not the device's."""
         if self.is_armed and not self.stopped:
             self._stop("watchdog")
 
     # -- time
 
     def step(self) -> bytes:
-        """One millisecond; what is said at its end."""
+        """Advance by a millisecond; return what the device sends at its end."""
         self.time_us += STEP_US
         self.faults.now_us = self.time_us - self._begun_us if self.is_armed else self.faults.now_us + STEP_US
         jammed = [fault.pin - 1 for fault in self.faults.on("stuck")]
@@ -267,17 +271,17 @@ class VirtualFitSocket:
         self.limb.step(self.motors.head_mm)
         sample = self._measure(powered)
         self._halt_at_forces()
-        out = self._watch(sample, powered)
-        out += self._look_home()
-        if self.is_armed and self.time_us // STEP_US % EVERY == 0 and self._encoder is not None:
+        out = self._check_limits(sample, powered)
+        out += self._check_home()
+        if self.is_armed and self.time_us // STEP_US % STEPS_PER_SAMPLE == 0 and self._encoder is not None:
             number, line = self._encoder.encode(format_sample(sample))
             self._sent.append((number, self.time_us))
             out += line
-        return self._through_faults(out)
+        return self._apply_faults(out)
 
     def _measure(self, powered: bool) -> Sample:
         faults = self.faults
-        position, self._force, seen = self.sensors.read(
+        position, self._forces_mN, seen = self.sensors.read(
             self.motors.position_mm,
             self.motors.head_mm,
             self.limb.force_N,
@@ -290,55 +294,55 @@ class VirtualFitSocket:
         )
         flags |= Flags.BUTTON * bool(faults.on("button")) | Flags.GIVEN_UP * self._given_up
         moving = int(np.packbits(self.motors.driving, bitorder="little").view("<u2")[0])
-        return Sample(0, self.time_us, int(flags), moving, position, self._force, seen)
+        return Sample(0, self.time_us, int(flags), moving, position, self._forces_mN, seen)
 
     def _halt_at_forces(self) -> None:
-        for k, most in enumerate(self._halts):
-            if most and self._force[k] >= most:
-                self._halts[k] = 0
+        for k, most in enumerate(self._halt_forces_mN):
+            if most and self._forces_mN[k] >= most:
+                self._halt_forces_mN[k] = 0
                 if not self.stopped:
                     self.motors.halt(k)
 
-    def _watch(self, sample: Sample, powered: bool) -> bytes:
-        """The device's own limits; a stop of its own is told."""
+    def _check_limits(self, sample: Sample, powered: bool) -> bytes:
+        """Stop at the device's own limits, and report that."""
         if self.stopped or not (self.is_armed or self.faults.on("button")):
             return b""
         code, pin = "", 0
-        self._lags = np.where(self.motors.lags(), self._lags + STEP_US, 0)
+        self._lag_times_us = np.where(self.motors.find_lagging(), self._lag_times_us + STEP_US, 0)
         if self.faults.on("button"):
             code = "button"
         elif not powered:
             code = "power"
         elif violation := self._guard.check(sample):
             code, pin = violation.code, violation.pin
-        elif self._lags.max() > LAG_US:
-            code, pin = "stuck", int(self._lags.argmax()) + 1
+        elif self._lag_times_us.max() > MAX_LAG_US:
+            code, pin = "stuck", int(self._lag_times_us.argmax()) + 1
         elif self.time_us - self.acknowledged_us > self._watchdog_us:
             code = "watchdog"
         if not code:
             return b""
         self._stop(code)
-        return self._say(LimitTripped(code, pin).body)
+        return self._encode(LimitTripped(code, pin).body)
 
     def _stop(self, code: str) -> None:
         if not self.stopped:
             self.stopped, self._stopped_us = code, self.time_us
-        self._halts = [0] * PINS
+        self._halt_forces_mN = [0] * PINS
         self.motors.retract(RETRACT_MM_S)
 
-    def _look_home(self) -> bytes:
-        """After a stop: is everything home?  A pin that was stuck or without power is tried on and on."""
+    def _check_home(self) -> bytes:
+        """Bring all pins home after a stop, again and again; report those that stay out too long."""
         if not self.stopped:
             return b""
         if self.is_home:
             self._given_up = False
             return b""
         self.motors.retract(RETRACT_MM_S)
-        if self._given_up or self.time_us - self._stopped_us < PATIENCE_US:
+        if self._given_up or self.time_us - self._stopped_us < MAX_HOMING_US:
             return b""
         self._given_up = True
-        pins = sum(1 << int(k) for k in np.flatnonzero(~self.motors.at_home()))
-        return self._say(OutOfReach(pins).body)
+        pins = sum(1 << int(k) for k in np.flatnonzero(~self.motors.find_withdrawn()))
+        return self._encode(OutOfReach(pins).body)
 
     # -- what goes wrong
 
@@ -346,27 +350,27 @@ class VirtualFitSocket:
         for fault in self.faults.faults:
             if fault.kind == "limb":
                 moved = fault.value * self.faults.share(fault)
-                self.limb.shift(fault.pin, moved - self._shifted.get(fault, 0.0))
-                self._shifted[fault] = moved
+                self.limb.shift(fault.pin, moved - self._limb_shifts_mm.get(fault, 0.0))
+                self._limb_shifts_mm[fault] = moved
 
-    def _say(self, body: str) -> bytes:
+    def _encode(self, body: str) -> bytes:
         return self._encoder.encode(body)[1] if self._encoder is not None else b""
 
-    def _through_faults(self, out: bytes) -> bytes:
-        """What of it goes out now: lost, late or corrupt lines."""
+    def _apply_faults(self, out: bytes) -> bytes:
+        """Return what goes out now of the lines: faults lose, delay or corrupt them."""
         if self.faults.on("lost"):
             out = b""
         if out and self.faults.on("corrupt"):
-            out = b"\n".join(self._spoil(line) for line in out.split(b"\n")[:-1]) + b"\n"
+            out = b"\n".join(self._corrupt(line) for line in out.split(b"\n")[:-1]) + b"\n"
         late = self.faults.on("late")
-        if out and (late or self._held):
+        if out and (late or self._delayed):
             due = self.time_us + round(1000 * max([fault.value for fault in late], default=0.0))
-            self._held.append((max(due, self._held[-1][0] if self._held else 0), out))
+            self._delayed.append((max(due, self._delayed[-1][0] if self._delayed else 0), out))
             out = b""
-        while self._held and self._held[0][0] <= self.time_us:
-            out += self._held.popleft()[1]
+        while self._delayed and self._delayed[0][0] <= self.time_us:
+            out += self._delayed.popleft()[1]
         return out
 
-    def _spoil(self, line: bytes) -> bytes:
+    def _corrupt(self, line: bytes) -> bytes:
         at = int(self._random.integers(len(line)))
         return line[:at] + bytes([(line[at] + 1) % 256]) + line[at + 1 :]

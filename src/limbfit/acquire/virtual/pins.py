@@ -14,7 +14,7 @@ STROKE_MM = 60.0
 ACCELERATION = 1000.0  # mm/s2, when driven
 BRAKING = 8000.0  # mm/s2, when stopped or halted
 PLAY_MM = 0.02
-NEAR_MM = 0.001
+ARRIVAL_TOLERANCE_MM = 0.001
 HOME_MM = 0.1
 
 
@@ -25,7 +25,7 @@ class Motors:
     ----------
     position_mm, speed_mm_s : (14,) of the motors, positive towards the limb.
     head_mm : (14,) of the heads.
-    driving : (14,) whether a motor is under way.
+    driving : (14,) whether a motor is under distance.
     """
 
     def __init__(self, step_s: float) -> None:
@@ -44,27 +44,31 @@ class Motors:
 
     def retract(self, speed_mm_s: float) -> None:
         """Everything home, as hard as can be."""
-        self.driving[:] = self.position_mm > NEAR_MM
+        self.driving[:] = self.position_mm > ARRIVAL_TOLERANCE_MM
         self._target[:], self._speed[:], self._acceleration[:] = 0.0, speed_mm_s, BRAKING
 
-    def at_home(self) -> NDArray[np.bool_]:
+    def find_withdrawn(self) -> NDArray[np.bool_]:
         """Withdrawn, and not about to leave."""
         return (self.position_mm < HOME_MM) & ~(self.driving & (self._target > self.position_mm))
 
     def step(self, jammed: Collection[int], powered: bool) -> None:
         """One time step; jammed motors (indices) and those without power stand."""
-        way = self._target - self.position_mm
+        distance = self._target - self.position_mm
         braking = np.where(self.driving, self._acceleration, BRAKING)
-        reach = np.sqrt(2 * braking * np.abs(way))
-        wanted = np.where(self.driving, np.sign(way) * np.minimum(self._speed, reach), 0.0)
+        reach = np.sqrt(2 * braking * np.abs(distance))
+        target_speed = np.where(self.driving, np.sign(distance) * np.minimum(self._speed, reach), 0.0)
         change = braking * self.step_s
-        self.speed_mm_s += np.minimum(np.maximum(wanted - self.speed_mm_s, -change), change)
+        self.speed_mm_s += np.minimum(np.maximum(target_speed - self.speed_mm_s, -change), change)
         if not powered:
             self.speed_mm_s[:] = 0.0
         for k in jammed:
             self.speed_mm_s[k] = 0.0
         moved = self.speed_mm_s * self.step_s
-        arrives = self.driving & (np.abs(way) <= np.maximum(np.abs(moved), NEAR_MM)) & (moved * way >= 0)
+        arrives = (
+            self.driving
+            & (np.abs(distance) <= np.maximum(np.abs(moved), ARRIVAL_TOLERANCE_MM))
+            & (moved * distance >= 0)
+        )
         if not powered:
             arrives[:] = False
         reached = np.where(arrives, self._target, self.position_mm + moved)
@@ -74,7 +78,7 @@ class Motors:
         lowest, highest = self.position_mm - PLAY_MM / 2, self.position_mm + PLAY_MM / 2
         self.head_mm = np.minimum(np.maximum(self.head_mm, lowest), highest)
 
-    def lags(self) -> NDArray[np.bool_]:
+    def find_lagging(self) -> NDArray[np.bool_]:
         """Driven, far from the target, and standing."""
         far = np.abs(self._target - self.position_mm) > 0.05
         return self.driving & far & (np.abs(self.speed_mm_s) < 0.1 * self._speed)
@@ -94,9 +98,9 @@ class Sensors:
     def __init__(self, random: np.random.Generator, step_s: float) -> None:
         self._random = random
         self._zero = random.normal(0, 40, PINS)
-        self._walk = self._drift_mN * np.sqrt(step_s)
-        self._frozen: dict[int, int] = {}
-        self._noises: list[Array] = []
+        self._drift_step_mN = self._drift_mN * np.sqrt(step_s)
+        self._frozen_forces_mN: dict[int, int] = {}
+        self._noise_blocks: list[Array] = []
 
     def read(
         self,
@@ -105,23 +109,23 @@ class Sensors:
         force_N: Array,
         gap_mm: Array,
         dead: Collection[int],
-        full: Collection[int],
+        saturated: Collection[int],
     ) -> tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]:
-        """Positions, forces, capacitances; ``dead`` and ``full`` (saturated) force sensors by index."""
-        if not self._noises:
-            self._noises = list(self._random.standard_normal((500, 4, PINS)))
-        noise = self._noises.pop()
-        self._zero += self._walk * noise[0]
+        """Positions, forces, capacitances; ``dead`` and ``saturated`` are indices of force sensors."""
+        if not self._noise_blocks:
+            self._noise_blocks = list(self._random.standard_normal((500, 4, PINS)))
+        noise = self._noise_blocks.pop()
+        self._zero += self._drift_step_mN * noise[0]
         raw = 1000 * force_N + self._zero + self._force_noise_mN * noise[1]
         quantised = np.rint(raw / self._force_step_mN) * self._force_step_mN
         force = np.minimum(np.maximum(quantised, -self.range_mN), self.range_mN).astype(int).tolist()
-        for k in full:
+        for k in saturated:
             force[k] = self.range_mN
         for k in dead:
-            force[k] = self._frozen.setdefault(k, force[k])
-        for k in [k for k in self._frozen if k not in dead]:
-            del self._frozen[k]
+            force[k] = self._frozen_forces_mN.setdefault(k, force[k])
+        for k in [k for k in self._frozen_forces_mN if k not in dead]:
+            del self._frozen_forces_mN[k]
         position = np.rint(1000 * position_mm + self._encoder_noise_um * noise[2]).astype(int).tolist()
         air = np.maximum(gap_mm - head_mm, 0.0) + self._film_mm
-        seen = self._area / air + 50 * force_N + self._capacitance_noise_fF * noise[3]
-        return tuple(position), tuple(force), tuple(np.rint(seen).astype(int).tolist())
+        capacitance = self._area / air + 50 * force_N + self._capacitance_noise_fF * noise[3]
+        return tuple(position), tuple(force), tuple(np.rint(capacitance).astype(int).tolist())

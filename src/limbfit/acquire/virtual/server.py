@@ -9,18 +9,18 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from ...errors import InputError, RunError
 from ..device import Link, TcpLink
 from ..events import PERIOD_US
-from .fitsocket import EVERY, VirtualFitSocket
+from .fitsocket import STEPS_PER_SAMPLE, VirtualFitSocket
 
-AHEAD_US = 4 * PERIOD_US  # how far a paced device runs ahead of what its host has dealt with
-HANG_S = 10.0  # wall time after which a paced device takes its host for gone
+MAX_LEAD_US = 4 * PERIOD_US  # how far a paced device runs ahead of what its host has dealt with
+MAX_HOST_SILENCE_S = 10.0  # wall time after which a paced device takes its host for gone
 GREETING_S = 5.0  # a connection that does not become a session is closed
-STALL_S = 0.25  # a device that could not run for so long does not make up for it
+MAX_CATCH_UP_S = 0.25  # a device that could not run for so long does not make up for it
 IDLE_S = 0.02
 
 
@@ -64,7 +64,7 @@ class Serving:
 
     listener: socket.socket | None = None
     pty: PtyLink | None = None
-    stopping: bool = field(default=False)
+    stopping: bool = False
     refused: int = 0  # connections beside the one that holds the device
 
     @classmethod
@@ -144,49 +144,49 @@ class _Server:
         self.paced = device.clock == "paced"
         self.link: Link | None = serving.pty
         self.stopped = ""
-        self.next = self.heard = time.monotonic()
+        self.next_step_s = self.last_heard_s = time.monotonic()
 
     def run(self) -> None:
         while not self.serving.stopping:
             self._wait()
-            self._listen()
-            self._time()
-            self._look()
-        if self.link is not None:
-            self.link.close() if self.serving.pty is None else None
+            self._read_host()
+            self._step_device()
+            self._check_session()
+        if self.link is not None and self.serving.pty is None:
+            self.link.close()
 
-    def _runs(self) -> bool:
-        """Whether there is anything to step: a session, or pins that are not home."""
+    def _is_running(self) -> bool:
+        """True if there is anything to step: a session, or pins that are not home."""
         return self.device.is_armed or not self.device.is_home
 
-    def _waits(self) -> bool:
-        """Whether a paced device has to wait for its host."""
+    def _is_waiting(self) -> bool:
+        """True if a paced device has to wait for its host."""
         device = self.device
         return (
             self.paced
             and self.link is not None
             and device.is_armed
-            and time.monotonic() - self.heard < HANG_S
-            and device.time_us - device.acknowledged_us >= AHEAD_US
+            and time.monotonic() - self.last_heard_s < MAX_HOST_SILENCE_S
+            and device.time_us - device.acknowledged_us >= MAX_LEAD_US
         )
 
     def _wait(self) -> None:
         now = time.monotonic()
-        due = self.next - now if self._runs() and not self._waits() else IDLE_S
+        due = self.next_step_s - now if self._is_running() and not self._is_waiting() else IDLE_S
         watched: list[Any] = [self.link] if self.link is not None else []
         if self.serving.listener is not None:
             watched.append(self.serving.listener)
         if due > 0:
             select.select(watched, [], [], due)
 
-    def _listen(self) -> None:
+    def _read_host(self) -> None:
         self._accept()
         if self.link is None:
             return
         try:
             data = self.link.read()
             if data:
-                self.heard = time.monotonic()
+                self.last_heard_s = time.monotonic()
                 self.link.write(self.device.feed(data))
         except RunError as error:
             self._drop(str(error))
@@ -203,31 +203,31 @@ class _Server:
             self.serving.refused += 1
             return
         self.link = TcpLink(connection)
-        self.heard = time.monotonic()
+        self.last_heard_s = time.monotonic()
         self.device.connect()
         self.tell("a host is connected")
 
-    def _time(self) -> None:
+    def _step_device(self) -> None:
         now = time.monotonic()
-        if not self._runs():
-            self.next = now
+        if not self._is_running():
+            self.next_step_s = now
             return
-        if now - self.next > STALL_S:
-            self.next = now
-        while self.next <= now and self._runs() and not self._waits():
-            out = b"".join([self.device.step() for _ in range(EVERY)])
-            self.next += self.period_s
+        if now - self.next_step_s > MAX_CATCH_UP_S:
+            self.next_step_s = now
+        while self.next_step_s <= now and self._is_running() and not self._is_waiting():
+            out = b"".join([self.device.step() for _ in range(STEPS_PER_SAMPLE)])
+            self.next_step_s += self.period_s
             if out and self.link is not None:
                 try:
                     self.link.write(out)
                 except RunError as error:
                     self._drop(str(error))
 
-    def _look(self) -> None:
-        """Hosts that hang, sessions that are over, stops to be told."""
-        device, silent = self.device, time.monotonic() - self.heard
-        if self.paced and device.is_armed and silent > HANG_S:
-            device.hang_up()
+    def _check_session(self) -> None:
+        """Deal with hosts that hang and sessions that are over, and report stops."""
+        device, silent = self.device, time.monotonic() - self.last_heard_s
+        if self.paced and device.is_armed and silent > MAX_HOST_SILENCE_S:
+            device.stop_without_host()
         if device.stopped != self.stopped:
             self.stopped = device.stopped
             self.tell(f"stop: {self.stopped}" if self.stopped else "ready")
@@ -235,7 +235,7 @@ class _Server:
             return
         over = device.stopped and device.is_home and silent > 1.0
         if self.serving.pty is not None:
-            ended = device.has_left and device.is_home
+            ended = device.host_has_left and device.is_home
             if ended or (over and device.has_session):
                 device.disconnect()
                 device.connect()

@@ -1,8 +1,10 @@
-"""Materials of FEBio as limbfit's: uncoupled hyperelastic laws, fibres beside and Prony terms around them.
+"""Materials of FEBio as limbfit's, and the state of the tissue that they make.
 
-A contraction may stand beside, and a pre-strain around all of it (`tissue_state`).
+Laws are uncoupled and hyperelastic, with fibres beside and Prony terms around them. A contraction may stand
+beside, and a pre-strain around all of it. Fibres and pre-strains may have a value for each cell.
 
-Source: FEBio User Manual 4.0, sections 4.1.1 and 4.1.3.
+Source: FEBio User Manual 4.0, sections 4.1.1 and 4.1.3, on local material axes and on ``MeshData``; FEBio's
+feature manual, ``uncoupled active fiber stress``, ``uncoupled prestrain elastic`` and ``prestrain gradient``.
 """
 
 from __future__ import annotations

@@ -2,6 +2,9 @@
 
 Everything is read that an indentation needs. A part of the format that would change the mechanics and is not
 supported is an error that names its line; it is never skipped (FEBio User Manual 4.0, chapter 3).
+
+limbfit's pre-strained tissue is in equilibrium, and has relaxed, before time begins. In FEBio the pre-strain
+grows while everything else rests: that step is read as the beginning, and the time after it begins at 0.
 """
 
 from __future__ import annotations

@@ -1,6 +1,9 @@
-"""Load controllers of a FEBio input: curves through points, and expressions of the time.
+"""Time in a FEBio input: load curves, the steps of the analysis, and the automatic time stepper.
 
-Source: FEBio User Manual 4.0, section 3.14; ``PointCurve::value`` for what lies between and beyond points.
+A load controller is a curve through points, or an expression of the time.
+
+Source: FEBio User Manual 4.0, sections 3.3 and 3.14; ``PointCurve::value`` for what lies between and beyond
+points.
 """
 
 from __future__ import annotations
