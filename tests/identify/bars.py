@@ -37,32 +37,40 @@ class Bars:
     depth: float
     points: int = 60
 
-    @staticmethod
-    def elastic(section: float, stretch: np.ndarray, c: float, m: float) -> np.ndarray:
-        """Elastic force of a bar, N."""
-        powers = stretch ** (m - 1) - stretch ** (-m - 1) - stretch ** (-m / 2 - 1) + stretch ** (m / 2 - 1)
-        return -section * c * 1e-3 / m * powers
+    @property
+    def times_s(self) -> np.ndarray:
+        """Evenly spread times (points,) of loading and unloading."""
+        return np.linspace(0, 2 * self.depth / 0.96, self.points)
+
+    def split(self, p: np.ndarray) -> np.ndarray:
+        """Elastic force (..., tissues, points) N of each bar, of parameters (..., p)."""
+        c, m = np.moveaxis(p.reshape(*p.shape[:-1], -1, 4), -1, 0)[:2, ..., None]
+        ramps = np.minimum(self.times_s, self.times_s[-1] - self.times_s)
+        travel = np.minimum(0.96 * ramps, self.depth)
+        stretch = 1 - travel / np.array(self.lengths)[:, None]
+        half = stretch ** (m / 2)
+        stress = -c * 1e-3 / m * (half**2 - half**-2 - 1 / half + half) / stretch
+        return np.array(self.sections)[:, None] * stress
+
+    def remember(self, elastic: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        """What relaxation by times ``tau`` (...) s leaves of the rises of a force (..., points)."""
+        x = np.moveaxis(np.diff(self.times_s) / tau[..., None], -1, 0)
+        decays = np.exp(-x)
+        rises = (1 - decays) / x * np.moveaxis(np.diff(elastic), -1, 0)
+        history = [np.zeros_like(rises[0])]
+        for decay, rise in zip(decays, rises):
+            history.append(decay * history[-1] + rise)
+        return np.stack(history, axis=-1)
 
     def force(self, p: np.ndarray) -> np.ndarray:
-        """Force (points,) N at evenly spread times of loading and unloading."""
-        n = self.points
-        time = np.linspace(0, 2 * self.depth / 0.96, n)
-        travel = 0.96 * np.minimum(time, time[-1] - time)
-        total = np.zeros(n, dtype=p.dtype)
-        for section, length, (c, m, gamma, tau) in zip(self.sections, self.lengths, p.reshape(-1, 4)):
-            elastic = self.elastic(section, 1 - travel / length, c, m)
-            dt = time[1] - time[0]
-            decay, history = np.exp(-dt / tau), np.zeros(n, dtype=p.dtype)
-            rise = (1 - decay) / (dt / tau)
-            for k in range(1, n):
-                history[k] = decay * history[k - 1] + rise * (elastic[k] - elastic[k - 1])
-            total += elastic + gamma * history
-        return total
+        """Force (..., points) N of parameters (..., p)."""
+        elastic = self.split(p)
+        gamma, tau = np.moveaxis(p.reshape(*p.shape[:-1], -1, 4), -1, 0)[2:]
+        return (elastic + gamma[..., None] * self.remember(elastic, tau)).sum(axis=-2)
 
     def respond(self, p: np.ndarray) -> SiteResponse:
         step = 1e-30
-        columns = [self.force(p + 1j * step * row).imag / step for row in np.eye(len(p))]
-        return SiteResponse(self.force(p), np.stack(columns, axis=1))
+        return SiteResponse(self.force(p), self.force(p + 1j * step * np.eye(len(p))).imag.T / step)
 
 
 SITES = (
@@ -134,8 +142,8 @@ def coarsened(parameters):
         def biased(p, site=site, factor=factor):
             return factor * site.force(p * np.array([1.03, 1.0, 0.98, 1.02, 1.02, 1.01, 1.0, 0.99]))
 
-        columns = [biased(parameters + 1e-30j * row).imag / 1e-30 for row in np.eye(len(parameters))]
-        responses.append(SiteResponse(biased(parameters), np.stack(columns, axis=1)))
+        derivatives = biased(parameters + 1e-30j * np.eye(len(parameters))).imag.T / 1e-30
+        responses.append(SiteResponse(biased(parameters), derivatives))
     return responses
 
 

@@ -29,6 +29,17 @@ def test_shares_of_one_parameter_are_those_of_its_precisions():
     assert wider[0] == pytest.approx(np.sqrt((records_ + prior + bounds) / (records_ + bounds)))
 
 
+def test_shares_of_correlated_parameters_are_those_of_the_estimates_without_priors():
+    """Records see two parameters together, priors know each of them: nothing is diagonal but the bounds."""
+    seen, rows = np.array([[5.0, 3.0], [3.0, 4.0]]), np.array([[1.5, 0.0], [0.5, 2.0]])
+    beliefs = PriorPrecision(np.array([0.8, 0.6]), rows, np.zeros(2))
+    without = np.linalg.inv(seen + np.diag(beliefs.sd**-2))
+    together = np.linalg.inv(seen + np.diag(beliefs.sd**-2) + rows.T @ rows)
+    share, wider = beliefs.compute_shares(together, np.eye(2))
+    assert wider == pytest.approx(np.sqrt(np.diag(without) / np.diag(together)))
+    assert share == pytest.approx(np.sum((together @ rows.T) ** 2, axis=1) / np.diag(together))
+
+
 def test_a_parameter_that_does_not_move_has_no_share():
     beliefs = PriorPrecision(np.ones(1), np.ones((1, 1)), np.zeros(1))
     share, wider = beliefs.compute_shares(np.array([[0.2]]), np.array([[1.0], [0.0]]))
@@ -36,7 +47,7 @@ def test_a_parameter_that_does_not_move_has_no_share():
 
 
 def told(unknowns, seed=0):
-    """Logarithms of the answer and what is known of it, as a run states it, for a draw of noise."""
+    """The answer and what is known of it, as a run states it, for a draw of noise."""
     kept, data = EvaluationStore(), records(0.03, seed=seed, sites=THIN)
 
     def simulate(parameters):
@@ -47,7 +58,15 @@ def told(unknowns, seed=0):
         found.parameters, found.responses, data, unknowns, estimate_curve_noise(found.responses, data)
     )
     space = build_space(unknowns, group_separately(NAMES))
-    return np.log(found.parameters), sample_uncertainty(known, data, unknowns, space, kept, simulate)
+    return found, sample_uncertainty(known, data, unknowns, space, kept, simulate)
+
+
+def precision(found, known, unknowns):
+    """Precision of the logarithms by records and what is known of ``unknowns``, at the answer."""
+    J = [response.jacobian * found.parameters for response in found.responses]
+    records_ = sum(own.T @ solved for own, solved in zip(J, known.residual_model.solve(J), strict=True))
+    space = build_space(unknowns, group_separately(NAMES))
+    return records_ + PriorPrecision.from_unknowns(unknowns, space).precision
 
 
 def half_widths(known):
@@ -63,14 +82,18 @@ def test_priors_of_people_narrow_what_records_leave_open_and_let_stand_what_they
     shown = np.array([name.startswith("muscle") for name in NAMES])
     assert {without.verdicts[i] for i in np.flatnonzero(shown)} == {"determined"}
     assert "determined" not in {without.verdicts[i] for i in np.flatnonzero(~shown)}
-    assert np.abs(helped - alone)[shown].max() < 0.02
+    assert np.abs(np.log(helped.parameters / alone.parameters))[shown].max() < 0.02
     assert half_widths(with_people)[shown] == pytest.approx(half_widths(without)[shown], rel=0.2)
     assert with_people.prior_share[shown].max() < 0.02
     skin = [NAMES.index("skin.c_kPa"), NAMES.index("skin.m")]
     share = with_people.prior_share[skin]
     assert share.min() > 0.2
-    # Exact for one parameter with a prior; c and m of the skin are correlated.
-    assert with_people.wider_without[skin] == pytest.approx((1 - share) ** -0.5, rel=0.1)
+    # The shares are those of the linearised estimates at the answer, with and without the priors.
+    variances = [
+        np.diag(np.linalg.inv(precision(helped, with_people, known)))
+        for known in (PAPER, replace(PAPER, priors=PEOPLE))
+    ]
+    assert with_people.wider_without == pytest.approx(np.sqrt(variances[0] / variances[1]), rel=1e-6)
     low, high = with_people.intervals_95.T
     assert np.all((low < TRUTH) & (high > TRUTH))
     # The width of an open parameter hangs on the noise: 0.5 to 1.2 times that without, one draw by another.

@@ -45,31 +45,12 @@ class Held(Bars):
         held = np.linspace(ramp, ramp + self.hold_s, third + 1)[1:]
         return np.r_[np.linspace(0, ramp, third), held, held[-1] + np.linspace(0, ramp, third + 1)[1:]]
 
-    def split(self, p: np.ndarray) -> list[np.ndarray]:
-        """The elastic force of each tissue."""
-        end = self.times_s[-1]
-        travel = 0.96 * np.minimum(np.minimum(self.times_s, end - self.times_s), self.depth / 0.96)
-        return [
-            Bars.elastic(section, 1 - travel / length, c, m)
-            for section, length, (c, m, *_) in zip(self.sections, self.lengths, p.reshape(-1, 4))
-        ]
-
     def relax(self, p: np.ndarray, terms) -> np.ndarray:
         """The force with terms, amplitude and time, of each tissue."""
-        steps, total = np.diff(self.times_s), 0.0
-        for elastic, own in zip(self.split(p), terms):
-            total = total + elastic
-            for amplitude, tau in own:
-                history = np.zeros_like(elastic)
-                for k, dt in enumerate(steps):
-                    x = dt / tau
-                    rise = (1 - np.exp(-x)) / x * (elastic[k + 1] - elastic[k])
-                    history[k + 1] = np.exp(-x) * history[k] + rise
-                total = total + amplitude * history
-        return total
-
-    def force(self, p: np.ndarray) -> np.ndarray:
-        return self.relax(p, [((gamma, tau),) for _, _, gamma, tau in p.reshape(-1, 4)])
+        return sum(
+            elastic + sum(amplitude * self.remember(elastic, np.array(tau)) for amplitude, tau in own)
+            for elastic, own in zip(self.split(p), terms)
+        )
 
     def respond(self, p: np.ndarray) -> SiteResponse:
         """The same without pulling, as an indenter."""
