@@ -139,7 +139,7 @@ def test_an_affine_field_is_kept():
     np.testing.assert_allclose(result.states[-1].u, u, atol=1e-8)
 
 
-def test_every_parameter_has_its_sensitivity():
+def test_every_parameter_of_fibred_tissue_has_its_sensitivity():
     """Under a punch, which shortens tissue along its axis and stretches it across.
 
     In eight steps: in four, the way to the peak decides which of several equilibria it ends in.
@@ -151,10 +151,10 @@ def test_every_parameter_has_its_sensitivity():
     assert centre.completed
     plain = solve(replace(problem, materials={"skin": GROUND, "muscle": GROUND}), control).force
     assert centre.peak_force > 1.02 * plain.max()
-    for region, name in centre.parameter_names:
-        slope, difference = parameter_slope(centre, control, region, name)
+    for name in TISSUE.parameter_names:
+        slope, difference = parameter_slope(centre, control, "muscle", name)
         error = np.abs(difference - slope).max()
-        assert error <= 1e-3 * np.abs(difference).max(), (region, name)
+        assert error <= 1e-3 * np.abs(difference).max(), name
 
 
 @pytest.mark.parametrize(
