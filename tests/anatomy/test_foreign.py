@@ -13,7 +13,7 @@ from limbs import SHARED, rotation
 
 from limbfit.anatomy.meshing import meshing, untangling
 from limbfit.anatomy.meshing.background import compute_volumes
-from limbfit.anatomy.meshing.engines import VolumeMesh
+from limbfit.anatomy.meshing.engines import ENGINES, VolumeMesh, run_mmg
 from limbfit.anatomy.meshing.extrusion import extrude_layers
 from limbfit.anatomy.meshing.layers import LimbFields
 from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
@@ -31,7 +31,7 @@ from limbfit.mesh import check, measure_quality
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import foreign_meshes
 
-COARSE = MeshSettings(edge_near_mm=6.0, edge_far_mm=15.0, near_radius_mm=10.0, growth=0.6)
+COARSE = MeshSettings(edge_near_mm=6.0, edge_far_mm=22.0, near_radius_mm=10.0, growth=0.9, flatness=1.3)
 NO_LIMBS = not (SHARED / "data" / "limbs").is_dir()
 needs_limbs = pytest.mark.skipif(NO_LIMBS, reason="shared/data/limbs is not here")
 
@@ -42,20 +42,40 @@ def anatomy():
 
 
 @pytest.fixture(scope="module")
+def base(anatomy):
+    return build_base_mesh(anatomy, COARSE)
+
+
+@pytest.fixture(scope="module")
 def site(anatomy):
     point, _ = project_to_skin(anatomy, anatomy.skin.triangles[900].mean(axis=0))
     return point, compute_indenter_axis(anatomy.skin, point, 20.0)
 
 
-def spoiled(monkeypatch: pytest.MonkeyPatch, spoil) -> None:
-    """Let something go wrong between the layers' extrusion and the repairs."""
+@pytest.fixture(scope="module")
+def core(anatomy, base, site) -> VolumeMesh:
+    """What the mesher makes of the site, once for all tests."""
+    made = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(ENGINES, "mmg", lambda *task: made.append(run_mmg(*task)) or made[0])
+        mesh_site(anatomy, *site, COARSE, base)
+    return made[0]
 
-    def layers(core: VolumeMesh, fields: LimbFields, regions: tuple[str, ...]):
-        mesh, stack = extrude_layers(core, fields, regions)
-        return spoil(mesh, stack), stack
 
-    monkeypatch.setattr(meshing, "extrude_layers", layers)
-    monkeypatch.setattr(meshing, "smooth_elements", lambda mesh, fields, stack: mesh)
+@pytest.fixture
+def spoiled(monkeypatch, core):
+    """``spoiled(spoil)`` lets something go wrong between the layers' extrusion and the repairs."""
+
+    def apply(spoil) -> None:
+        def layers(core: VolumeMesh, fields: LimbFields, regions: tuple[str, ...]):
+            mesh, stack = extrude_layers(core, fields, regions)
+            return spoil(mesh, stack), stack
+
+        monkeypatch.setitem(ENGINES, "mmg", lambda *task: core)
+        monkeypatch.setattr(meshing, "extrude_layers", layers)
+        monkeypatch.setattr(meshing, "smooth_elements", lambda mesh, fields, stack: mesh)
+
+    return apply
 
 
 def through(mesh, node: int):
@@ -84,7 +104,7 @@ def inner_node(mesh, stack) -> int:
 
 
 @pytest.mark.parametrize("where", ["core", "skin", "foot of a column", "columns"])
-def test_inverted_cells_are_mended_and_told(monkeypatch, anatomy, site, where):
+def test_inverted_cells_are_mended_and_told(spoiled, anatomy, base, site, where):
     places = []
 
     def spoil(mesh, stack):
@@ -95,8 +115,7 @@ def test_inverted_cells_are_mended_and_told(monkeypatch, anatomy, site, where):
         assert (compute_volumes(worse.points, worse.cells) <= 0).any()
         return worse
 
-    spoiled(monkeypatch, spoil)
-    base = build_base_mesh(anatomy, COARSE)
+    spoiled(spoil)
     mesh, report = mesh_site(anatomy, *site, COARSE, base)
     check(mesh)
     assert measure_quality(mesh).inverted == 0
@@ -107,15 +126,14 @@ def test_inverted_cells_are_mended_and_told(monkeypatch, anatomy, site, where):
     assert abs(report.volume_error) < 0.01
 
 
-def test_thinner_layers_alone_make_crossed_columns_sound(monkeypatch, anatomy, site):
+def test_thinner_layers_alone_make_crossed_columns_sound(spoiled, anatomy, base, site):
     made = []
 
     def spoil(mesh, stack):
         made.append((crossed(mesh, stack), stack))
         return mesh
 
-    spoiled(monkeypatch, spoil)
-    base = build_base_mesh(anatomy, COARSE)
+    spoiled(spoil)
     mesh_site(anatomy, *site, COARSE, base)
     worse, stack = made[0]
     assert find_inverted_cells(worse).any()
@@ -123,24 +141,24 @@ def test_thinner_layers_alone_make_crossed_columns_sound(monkeypatch, anatomy, s
     assert (compute_volumes(points, worse.cells) > 0).all()
 
 
-def test_what_cannot_be_mended_is_refused_with_its_place(monkeypatch, anatomy, site):
-    spoiled(monkeypatch, lambda mesh, stack: through(mesh, inner_node(mesh, stack)))
+def test_what_cannot_be_mended_is_refused_with_its_place(monkeypatch, spoiled, anatomy, base, site):
+    spoiled(lambda mesh, stack: through(mesh, inner_node(mesh, stack)))
     monkeypatch.setattr(untangling, "SWEEPS", 0)
     told = (
         r"\d+ of \d+ cells are inverted, the first in muscle at \(.*\) mm, .* mm from .*: there is too little"
     )
     with pytest.raises(MeshingError, match=told):
-        mesh_site(anatomy, *site, COARSE)
+        mesh_site(anatomy, *site, COARSE, base)
 
 
-def test_a_mesher_that_fails_is_told_with_a_place(anatomy, site):
+def test_a_mesher_that_fails_is_told_with_a_place(anatomy, base, site):
     hurried = replace(COARSE, time_limit_s=0.01)
     told = r"did not end in 0\.01 s; .*; its input is flattest at \(.*\) mm, [\d.]+ mm from the "
     with pytest.raises(MeshingError, match=told):
-        mesh_site(anatomy, *site, hurried)
+        mesh_site(anatomy, *site, hurried, base)
 
 
-def test_a_sound_mesh_is_left_alone(monkeypatch, anatomy, site):
+def test_a_sound_mesh_is_left_alone(monkeypatch, anatomy, base, core, site):
     kept = []
 
     def watched(mesh, fields, stack):
@@ -148,8 +166,9 @@ def test_a_sound_mesh_is_left_alone(monkeypatch, anatomy, site):
         kept.append(np.array_equal(after.points, mesh.points) and not find_inverted_cells(mesh).any())
         return after, repairs
 
+    monkeypatch.setitem(ENGINES, "mmg", lambda *task: core)
     monkeypatch.setattr(meshing, "repair_mesh", watched)
-    _, report = mesh_site(anatomy, *site, COARSE)
+    _, report = mesh_site(anatomy, *site, COARSE, base)
     assert kept == [True]
     assert report.repairs == ()
 
