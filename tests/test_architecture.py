@@ -23,7 +23,7 @@ FLOORS = [
     {"socket"},
     {"identify", "execution", "traces", "anatomy", "fe", "web"},
     {"mesh", "phases", "autoregressive", "laws", "shapes", "priors"},
-    {"extensions", "relaxation"},
+    {"extensions", "relaxation", "results"},
     {"errors", "arrays", "renamed", "_version"},
 ]
 HEIGHT = {room: -level for level, rooms in enumerate(FLOORS) for room in rooms}

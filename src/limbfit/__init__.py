@@ -28,6 +28,7 @@ Everything the command line does is one call away:
 ``limbfit cube``          ``compress_cube(folder)``, without a study
 ``limbfit studio``        ``serve_studio(study, port=0, browser=True, tell=print)``
 ``limbfit EXPERIMENT``    ``run_experiment(load_study(path), "regions", listener=print)``, and others
+``limbfit schema``        ``build_schema("predict")``
 ``limbfit report``        ``report_study(load_study(path), listener=print)``
 ``limbfit bench``         ``bench_febio_parity(tell=print)``, ``bench_forward(..)``, ``bench_scaling(..)``
 ========================  =========================================================

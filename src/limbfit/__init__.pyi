@@ -94,6 +94,11 @@ from .pipeline.commands.run import (
 )
 from .pipeline.commands.show import show_stage as show_stage
 from .pipeline.commands.simulate import simulate_site as simulate_site
+from .results.reference import build_schema as build_schema
+from .results.study_results import (
+    StudyResults as StudyResults,
+    load_results as load_results,
+)
 from .shapes import (
     Measure as Measure,
     Shape as Shape,

@@ -321,4 +321,11 @@ def show_sites(summary: dict[str, Any]) -> None:
         STDOUT.print(f"fit: {summary['fit_quality']}")
 
 
-VERBS = (demo, phantom, series, check, run, status, simulate, report)
+def schema(
+    result: Annotated[str, typer.Argument(help="name of the result, such as predict")],
+) -> None:
+    """Print the JSON schema of a stored result: its keys, their types and what they mean."""
+    print_json(limbfit.build_schema(result))
+
+
+VERBS = (demo, phantom, series, check, run, status, simulate, report, schema)

@@ -13,7 +13,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     "Trust": ("uncertainty", "crossvalidate", "regions", "sensitivity", "cube", "experiment"),
     "Socket": ("socket",),
     "Experiment": ("design", "acquire", "recording", "virtual-fitsocket"),
-    "Exchange": ("export", "febio", "compare"),
+    "Exchange": ("export", "febio", "compare", "schema"),
     "Machine": ("studio", "doctor", "bench"),
 }
 _LONGEST = 500  # characters: none of the sentences is cut

@@ -1,0 +1,104 @@
+"""What every stored result is: a frozen model that knows its keys, checked when written and when read."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from ..errors import InputError
+
+Parameters = Mapping[str, Mapping[str, float]]  # by tissue, then by key
+Interval = tuple[float, float]
+Intervals = Mapping[str, Mapping[str, Interval]]
+Vector = tuple[float, float, float]
+Matrix = Sequence[Sequence[float]]
+
+
+class ResultPart(BaseModel):
+    """A table of a stored result: unknown keys and numbers that are not finite are refused.
+
+    A part can be built from any object whose attributes have its keys. A key with a default is left out of
+    the file where it was not given.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, from_attributes=True)
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return what JSON knows, with the keys that were given, in the order of the model."""
+        return self.model_dump(mode="json", exclude_unset=True)
+
+    @classmethod
+    def read_file(cls, file: Path, remedy: str) -> Self:
+        """Read a file that is there.
+
+        Raises
+        ------
+        InputError
+            In one line, for a file that is not JSON or has not the keys of this version.
+        """
+        try:
+            return cls.model_validate(json.loads(file.read_text(encoding="utf-8")))
+        except ValidationError as error:
+            raise InputError(_describe_first(error), file=file, remedy=remedy) from None
+        except ValueError as error:
+            raise InputError(f"not readable: {error}", file=file, remedy=remedy) from None
+
+
+class StoredResult(ResultPart):
+    """A result with a JSON file of its own: ``FILE`` below the results folder, made by ``COMMAND``.
+
+    ``FILE`` has a star where there is a file for each site or stage.
+    """
+
+    FILE: ClassVar[str]
+    COMMAND: ClassVar[str] = "limbfit run"
+
+    @classmethod
+    def find(cls, results: Path, name: str = "") -> Self | None:
+        """Read it from a results folder, ``name`` in place of the star; None where it is not there.
+
+        Raises
+        ------
+        InputError
+            In one line, for a file that is not JSON or has not the keys of this version.
+        """
+        file = results / cls.FILE.replace("*", name)
+        return cls.read_file(file, f"run {cls.COMMAND} again") if file.is_file() else None
+
+    @classmethod
+    def read(cls, results: Path, name: str = "") -> Self:
+        """Read it as `find` does.
+
+        Raises
+        ------
+        InputError
+            Also where it is not there.
+        """
+        found = cls.find(results, name)
+        if found is None:
+            file = results / cls.FILE.replace("*", name)
+            raise InputError("not there yet", file=file, remedy=f"run {cls.COMMAND} first")
+        return found
+
+    @classmethod
+    def list_names(cls, results: Path) -> list[str]:
+        """Return what stands in place of the star, of every file that is there."""
+        start, end = cls.FILE.split("*")
+        files = sorted(file.relative_to(results).as_posix() for file in results.glob(cls.FILE))
+        names = [file.removeprefix(start).removesuffix(end) for file in files]
+        return [name for name in names if not name.startswith(".")]  # of stages that are not done
+
+
+def _describe_first(error: ValidationError) -> str:
+    """The first thing that is wrong, with its key."""
+    first = error.errors()[0]
+    key = ".".join(map(str, first["loc"]))
+    if first["type"] == "missing":
+        return f"has no key {key!r}: another version of limbfit wrote it"
+    if first["type"] == "extra_forbidden":
+        return f"has an unknown key {key!r}: another version of limbfit wrote it"
+    return f"is wrong at {key!r}: {first['msg']}"

@@ -1,0 +1,217 @@
+"""The limb: what the stages `segment`, `surfaces`, `sites` and `mesh` store."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+from pydantic import Field
+
+from .base import ResultPart, StoredResult, Vector
+
+
+class LimbMotion(ResultPart):
+    """How the limb moved between the image and that with markers."""
+
+    shift_mm: float = Field(description="Translation of the limb.")
+    turn_deg: float = Field(description="Rotation of the limb.")
+    correlation: float = Field(description="Correlation of the two images after the motion, 1 at most.")
+
+
+class SegmentResult(StoredResult):
+    """The label map of the image."""
+
+    FILE: ClassVar = "segment/segment.json"
+
+    method: str = Field(description="`automatic`, or `corrected by hand`.")
+    volumes_cm3: Mapping[str, float] = Field(description="Volume of each label.")
+    repairs: Sequence[str] = Field(description="What was repaired in a given label map, in words.")
+    warnings: Sequence[str] = Field(description="What the image warns of, in words.")
+    labels_sha256: str = Field(description="SHA-256 of the label map as the stage wrote it.")
+    markers_removed: int | None = Field(default=None, description="Markers taken off the skin in this image.")
+    motion: LimbMotion | None = Field(default=None, description="Motion to the image with markers.")
+
+
+class LabelMeasures(ResultPart):
+    """Measures of a label."""
+
+    volume_cm3: float = Field(description="Volume.")
+    pieces: int = Field(description="Number of pieces whose voxels share faces.")
+    largest_piece: float = Field(description="Share of the volume in the largest piece.")
+    holes: int = Field(description="Number of closed holes.")
+    holes_cm3: float = Field(description="Volume of the closed holes.")
+    slices: tuple[int, int] = Field(description="First and last slice.")
+    slices_without: int = Field(description="Slices in between without the label.")
+
+
+class SuspectSlice(ResultPart):
+    """A slice that does not fit its neighbours."""
+
+    label: str = Field(description="Name of the label.")
+    slice: int = Field(description="Number of the slice, from 0.")
+    what: str = Field(description="What looks wrong there, in words.")
+
+
+class QualityResult(StoredResult):
+    """The quality of the label map."""
+
+    FILE: ClassVar = "segment/quality.json"
+
+    axis: str = Field(description="Axis of the image along the limb: `i`, `j` or `k`.")
+    labels: Mapping[str, LabelMeasures] = Field(description="Measures of each label, and of the `limb`.")
+    suspects: Sequence[SuspectSlice] = Field(description="Slices to look at.")
+
+
+class SurfaceMeasures(ResultPart):
+    """Measures of a surface."""
+
+    faces: int = Field(description="Number of triangles.")
+    volume_mm3: float = Field(description="Enclosed volume.")
+    area_mm2: float = Field(description="Area.")
+
+
+class SurfacesResult(StoredResult):
+    """The surfaces of the limb."""
+
+    FILE: ClassVar = "surfaces/surfaces.json"
+
+    coordinates: str = Field(description="Axes of all places: `LPS`.")
+    unit: str = Field(description="Unit of all lengths: `mm`.")
+    cut_point: Vector = Field(description="A point of the proximal cut, in mm.")
+    cut_normal: Vector = Field(description="Unit normal of the proximal cut.")
+    skin: SurfaceMeasures = Field(description="Measures of the skin.")
+    bones: Mapping[str, SurfaceMeasures] = Field(description="Measures of each bone.")
+    regions: Mapping[str, SurfaceMeasures] = Field(description="Measures of each region inside the core.")
+    notes: Sequence[str] = Field(description="What was repaired to close the surfaces, in words.")
+
+
+class MarkerEvidence(ResultPart):
+    """The marker that a site was matched to."""
+
+    height_mm: float = Field(description="Height of the marker over the skin.")
+    distance_to_hint_mm: float = Field(description="Distance from where the study says the site is.")
+
+
+class PlacedSite(ResultPart):
+    """Where a site is on the skin."""
+
+    site: str = Field(description="Name of the site.")
+    region: str | None = Field(description="Region of the limb, as the study states it.")
+    fitted: bool = Field(description="Whether parameters are identified from its records.")
+    position_mm: Vector = Field(description="Place on the skin, LPS.")
+    axis: Vector = Field(description="Unit vector along which the indenter goes in.")
+    off_skin_mm: float = Field(description="Distance from the given place to the skin.")
+    marker: MarkerEvidence | None = Field(description="The site's marker; null where it has none.")
+
+
+class SitesResult(StoredResult):
+    """The sites, in the order of the study."""
+
+    FILE: ClassVar = "sites/sites.json"
+
+    sites: Sequence[PlacedSite] = Field(description="Each site.")
+
+
+class LayerSettings(ResultPart):
+    """A layer of tissue as it was asked for."""
+
+    name: str = Field(description="Name of the tissue.")
+    thickness_mm: float | None = Field(description="Thickness; null where it is that of the segmented fat.")
+    min_thickness_mm: float = Field(description="Least thickness of a mapped layer.")
+
+
+class MeshingSettings(ResultPart):
+    """How the meshes were made; see the study's table `mesh`."""
+
+    element: str = Field(description="Type of the cells.")
+    edge_near_mm: float = Field(description="Edge length at the site.")
+    edge_far_mm: float = Field(description="Edge length far from the site.")
+    near_radius_mm: float = Field(description="Radius around the site with the edge length of the site.")
+    growth: float = Field(description="Growth of the edge length with the distance.")
+    layers: Sequence[LayerSettings] = Field(description="Layers from the skin inwards.")
+    core: str = Field(description="Name of the tissue inside the layers.")
+    bone_policy: str = Field(description="What gives way where bone and layers meet.")
+    bone_clearance_mm: float = Field(description="Least distance of bone and layers.")
+    time_limit_s: float = Field(description="Time limit of the mesher.")
+    curved: bool = Field(description="Whether quadratic cells follow the surfaces.")
+    flatness: float = Field(description="How much flatter cells may be far from the site.")
+    engine: str = Field(description="Name of the mesher.")
+
+
+class ThicknessMeasures(ResultPart):
+    """Thickness of a layer in mm."""
+
+    mean: float = Field(description="Mean, in mm.")
+    std: float = Field(description="Standard deviation, in mm.")
+    min: float = Field(description="Least, in mm.")
+    max: float = Field(description="Greatest, in mm.")
+
+
+class InterfaceError(ResultPart):
+    """Distance of the meshed inner face of the layers from where it was asked for."""
+
+    mean: float = Field(description="Mean, in mm.")
+    max: float = Field(description="Greatest, in mm.")
+
+
+class RegionError(ResultPart):
+    """A region inside the core, and how far its meshed surface is from the given one."""
+
+    enclosed_mm3: float = Field(description="Volume that the given surface encloses.")
+    mean_mm: float = Field(description="Mean distance.")
+    max_mm: float = Field(description="Greatest distance.")
+
+
+class BoneLoss(ResultPart):
+    """What was taken from a bone to keep it below the layers."""
+
+    volume_mm3: float = Field(description="Volume.")
+    depth_mm: float = Field(description="Greatest depth.")
+
+
+class SkinLoss(ResultPart):
+    """What was taken from the layers to keep them above the bones."""
+
+    volume_mm3: float = Field(description="Volume.")
+    thinnest_mm: float = Field(description="Least thickness that is left.")
+
+
+class MeshMeasures(ResultPart):
+    """A mesh of a site, or of the whole limb."""
+
+    nodes: int = Field(description="Number of nodes.")
+    cells: int = Field(description="Number of cells.")
+    region_cells: Mapping[str, int] = Field(description="Number of cells of each tissue.")
+    min_dihedral_deg: float = Field(description="Smallest dihedral angle.")
+    dihedral_percentiles_deg: Mapping[str, float] = Field(description="Percentiles of the dihedral angles.")
+    min_scaled_jacobian: float = Field(description="Smallest scaled Jacobian.")
+    volume_mm3: float = Field(description="Volume.")
+    region_volumes_mm3: Mapping[str, float] = Field(description="Volume of each tissue.")
+    volume_error: float = Field(description="Relative error of the volume that the surfaces enclose.")
+    layer_mean_mm: float = Field(description="Mean thickness of all layers together.")
+    layer_std_mm: float = Field(description="Standard deviation of that thickness.")
+    layer_thickness_mm: Mapping[str, ThicknessMeasures] = Field(description="Thickness of each layer.")
+    interface_error_mm: InterfaceError = Field(description="Error of the inner face of the layers.")
+    regions: Mapping[str, RegionError] = Field(description="Error of each region inside the core.")
+    trimmed_bone: Mapping[str, BoneLoss] = Field(description="What was taken from each bone.")
+    thinned_skin: SkinLoss | None = Field(description="What was taken from the layers; null: nothing.")
+    seconds: float = Field(description="Time that meshing took, in s.")
+    engine: str = Field(description="Name of the mesher.")
+    warnings: Sequence[str] = Field(description="What is wrong with the mesh, in words.")
+    repairs: Sequence[str] = Field(description="Inverted cells that were repaired, in words.")
+    element: str = Field(description="Type of the cells.")
+
+
+class MeshSet(ResultPart):
+    """One mesh for each site."""
+
+    settings: MeshingSettings = Field(description="How the meshes were made.")
+    sites: Mapping[str, MeshMeasures] = Field(description="The mesh of each site.")
+
+
+class MeshResult(MeshSet, StoredResult):
+    """The meshes of the sites."""
+
+    FILE: ClassVar = "mesh/mesh.json"
+
+    coarse: MeshSet | None = Field(default=None, description="Coarse meshes, where the study has them.")

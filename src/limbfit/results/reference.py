@@ -1,0 +1,122 @@
+"""The stored results as a page of Markdown (docs/results.md), and as JSON schemas."""
+
+from __future__ import annotations
+
+import re
+import types
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Union, get_args, get_origin
+
+from pydantic.fields import FieldInfo
+
+from ..errors import InputError
+from .base import ResultPart
+from .study_results import MODELS
+
+HEAD = """# Results
+
+Made by `python -m limbfit.results.reference`. Every result of a study is a JSON file below `results`.
+In Python it is an attribute of [`load_results(study)`](python.md#stored-results) with the same keys, and
+`limbfit schema RESULT` prints its JSON schema. Numbers are in the unit of their row. Curves and tables
+are CSV files beside these.
+"""
+_UNITS = ("mm", "mm2", "mm3", "cm3", "N", "Nmm", "kPa", "s", "m_s", "mm_s", "deg", "percent", "GB")
+_UNIT_WORDS = {"mm2": "mm²", "mm3": "mm³", "cm3": "cm³", "Nmm": "N mm", "m_s": "m/s", "mm_s": "mm/s"}
+_WORDS: Mapping[Any, str] = {
+    str: "text",
+    float: "number",
+    int: "integer",
+    bool: "true or false",
+    Any: "anything",
+    type(None): "null",
+}
+
+
+def build_schema(result: str) -> dict[str, Any]:
+    """Build the JSON schema of a stored result.
+
+    Raises
+    ------
+    InputError
+        For a name that no result has.
+    """
+    if result not in MODELS:
+        raise InputError(f"no result is named {result!r}", remedy=f"use {', '.join(MODELS)}")
+    return MODELS[result].model_json_schema()
+
+
+def build_results_page() -> str:
+    """All results with their keys, as Markdown."""
+    parts, told = [HEAD], set[type[ResultPart]]()
+    for name, model in MODELS.items():
+        parts.append(f"## {name}\n")
+        parts.append(f"`{model.FILE.replace('*', '<name>')}`, by `{model.COMMAND}`. {_describe(model)}\n")
+        for part in _list_parts(model):
+            if part not in told:
+                told.add(part)
+                parts += [] if part is model else [f"### {part.__name__}\n", f"{_describe(part)}\n"]
+                parts.append(_format_table(part))
+    return "\n".join(parts)
+
+
+def _describe(model: type[ResultPart]) -> str:
+    return " ".join((model.__doc__ or "").split())
+
+
+def _list_parts(model: type[ResultPart]) -> Iterator[type[ResultPart]]:
+    """The model, then those inside it, each once."""
+    found, waiting = list[type[ResultPart]](), [model]
+    while waiting:
+        here = waiting.pop(0)
+        if here not in found:
+            found.append(here)
+            waiting += [
+                part for field in here.model_fields.values() for part in _find_models(field.annotation)
+            ]
+    yield from found
+
+
+def _find_models(annotation: Any) -> Iterator[type[ResultPart]]:
+    if isinstance(annotation, type) and issubclass(annotation, ResultPart):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _find_models(part)
+
+
+def _format_table(model: type[ResultPart]) -> str:
+    rows = [_format_row(name, field) for name, field in model.model_fields.items()]
+    return "\n".join(["| key | value | unit | meaning |", "|---|---|---|---|", *rows, ""])
+
+
+def _format_row(name: str, field: FieldInfo) -> str:
+    meaning = field.description or ""
+    if not field.is_required():
+        meaning += " Absent where it does not apply."
+    return f"| `{name}` | {_format_type(field.annotation)} | {_find_unit(name)} | {meaning} |"
+
+
+def _find_unit(name: str) -> str:
+    """The unit that ends a key, or stands before ``_by_site``."""
+    plain = re.sub(r"_by_site$", "", name)
+    unit = max((unit for unit in _UNITS if plain.endswith(f"_{unit}")), key=len, default="")
+    return _UNIT_WORDS.get(unit, unit.replace("percent", "%"))
+
+
+def _format_type(annotation: Any) -> str:
+    """The type of a key in words."""
+    if isinstance(annotation, type) and issubclass(annotation, ResultPart):
+        return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Mapping:
+        return f"table of {_format_type(parts[1])}"
+    if origin is Sequence:
+        return f"list of {_format_type(parts[0])}"
+    if origin is tuple:
+        return f"{len(parts)} of {_format_type(parts[0])}"
+    if origin in (Union, types.UnionType):
+        return " or ".join(_format_type(part) for part in parts)
+    return _WORDS[annotation]
+
+
+if __name__ == "__main__":
+    print(build_results_page(), end="")

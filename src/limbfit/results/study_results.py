@@ -1,0 +1,162 @@
+"""All stored results of a study by name, each read when it is first used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Generic, Protocol, Self, TypeVar, overload
+
+from ..arrays import Array
+from ..errors import InputError
+from .base import StoredResult
+from .curves import read_curves
+from .identification import CalibrationResult, PredictResult
+from .limb import MeshResult, QualityResult, SegmentResult, SitesResult, SurfacesResult
+from .planning import DesignResult, ProtocolResult
+from .records import TracesResult
+from .runs import CompareResult, RunResult, SimulateResult, StageResult
+from .socket import SocketDesignResult, SocketResult
+from .uncertainty import CrossvalidateResult, RegionsResult, UncertaintyResult
+from .variants import (
+    CubeResult,
+    FrictionResult,
+    IndenterResult,
+    RefinementResult,
+    StiffnessResult,
+    VolumeResult,
+)
+
+R = TypeVar("R", bound=StoredResult)
+
+
+class HasResults(Protocol):
+    """A study: its ``results`` is the folder of its results."""
+
+    @property
+    def results(self) -> Path: ...
+
+
+class Single(Generic[R]):
+    """An attribute of `StudyResults` that has one file."""
+
+    def __init__(self, model: type[R]) -> None:
+        self.model = model
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    @overload
+    def __get__(self, results: None, owner: type) -> Self: ...
+
+    @overload
+    def __get__(self, results: StudyResults, owner: type) -> R: ...
+
+    def __get__(self, results: StudyResults | None, owner: type) -> Self | R:
+        if results is None:
+            return self
+        found = self.model.read(results.folder)
+        results.__dict__[self.name] = found  # which Python takes from now on
+        return found
+
+
+class Each(Generic[R]):
+    """An attribute of `StudyResults` that has a file for each site or stage: a dictionary by their names."""
+
+    def __init__(self, model: type[R]) -> None:
+        self.model = model
+
+    @overload
+    def __get__(self, results: None, owner: type) -> Self: ...
+
+    @overload
+    def __get__(self, results: StudyResults, owner: type) -> dict[str, R]: ...
+
+    def __get__(self, results: StudyResults | None, owner: type) -> Self | dict[str, R]:
+        if results is None:
+            return self
+        return {name: self.model.read(results.folder, name) for name in self.model.list_names(results.folder)}
+
+
+class StudyResults:
+    """The stored results of a study; an attribute is read from its file when it is first used.
+
+    An attribute whose command was not run yet raises `limbfit.InputError`, which names the command. Those
+    with several files (``stages``, ``simulate``, ``compare``) are dictionaries by stage or site.
+    """
+
+    run = Single(RunResult)
+    stages = Each(StageResult)
+    segment = Single(SegmentResult)
+    quality = Single(QualityResult)
+    surfaces = Single(SurfacesResult)
+    sites = Single(SitesResult)
+    traces = Single(TracesResult)
+    mesh = Single(MeshResult)
+    calibration = Single(CalibrationResult)
+    predict = Single(PredictResult)
+    uncertainty = Single(UncertaintyResult)
+    crossvalidate = Single(CrossvalidateResult)
+    regions = Single(RegionsResult)
+    sensitivity_c = Single(StiffnessResult)
+    sensitivity_kappa = Single(VolumeResult)
+    sensitivity_contact = Single(FrictionResult)
+    sensitivity_indenter = Single(IndenterResult)
+    sensitivity_mesh = Single(RefinementResult)
+    cube = Single(CubeResult)
+    socket = Single(SocketResult)
+    socket_design = Single(SocketDesignResult)
+    design = Single(DesignResult)
+    protocol = Single(ProtocolResult)
+    simulate = Each(SimulateResult)
+    compare = Each(CompareResult)
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __repr__(self) -> str:
+        stored = [name for name, model in MODELS.items() if any(self.folder.glob(model.FILE))]
+        return f"StudyResults({str(self.folder)!r}: {', '.join(stored) or 'nothing is stored yet'})"
+
+    def curves(self, stage: str, name: str) -> dict[str, Array]:
+        """Return the columns (n,) of ``results/<stage>/<name>.csv`` by their heads, such as ``force_N``.
+
+        Raises
+        ------
+        InputError
+            Where there is no such file; it names those that there are.
+        """
+        file = self.folder / stage / f"{name}.csv"
+        if not file.is_file():
+            there = ", ".join(sorted(one.stem for one in file.parent.glob("*.csv"))) or "none"
+            raise InputError("no such curves", file=file, remedy=f"there are: {there}")
+        return read_curves(file)
+
+
+def _list_models() -> dict[str, type[StoredResult]]:
+    kinds = vars(StudyResults).items()
+    return {name: kind.model for name, kind in kinds if isinstance(kind, Single | Each)}
+
+
+MODELS = _list_models()  # of each stored result, by its attribute
+
+
+def load_results(study: HasResults | str | Path) -> StudyResults:
+    """Load the stored results of a study, stale or not.
+
+    Parameters
+    ----------
+    study : a study, or its folder.
+
+    Returns
+    -------
+    StudyResults
+        ``load_results(study).predict.sites[0].error_percent``, for example.
+
+    Raises
+    ------
+    InputError
+        Where nothing is stored.
+    """
+    folder = Path(study) / "results" if isinstance(study, str | Path) else study.results
+    if not folder.is_dir():
+        raise InputError("nothing is stored there", file=folder, remedy="run limbfit run first")
+    return StudyResults(folder)
