@@ -83,7 +83,11 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
         {"calibration": {"stopping": "paper", "relative_tolerance": 0.01}},
         "calibration.relative_tolerance",
     ),
-    (GIVEN, {"calibration.force_error_percent": 2.0}, "calibration.force_error_percent"),
+    (
+        GIVEN,
+        {"calibration.force_error_percent": 2.0, "calibration.objective": "paper"},
+        "calibration.force_error_percent",
+    ),
     (GIVEN, {"calibration.prior_tissues": {"skin": "none"}}, "calibration.prior_tissues"),
     (GIVEN, {"calibration.seed": 3}, "calibration.seed"),
     (GIVEN, {"clamps.force_N": 9.0, "calibration.search_radius_mm": 50.0}, "calibration.search_radius_mm"),

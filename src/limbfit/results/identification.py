@@ -111,9 +111,7 @@ class PriorShares(ResultPart):
 
     stated: Mapping[str, StatedPrior] = Field(description="The prior of each parameter that has one.")
     share: Mapping[str, float] = Field(description="Share of each interval that comes from priors.")
-    wider_without: Mapping[str, float] = Field(
-        description="Factor by which intervals are wider without."
-    )
+    wider_without: Mapping[str, float] = Field(description="Factor by which intervals are wider without.")
 
 
 class RecordResiduals(ResultPart):

@@ -54,9 +54,7 @@ class RunResult(StoredResult):
 
     limbfit: str = Field(description="Version of limbfit.")
     study: StudyName = Field(description="What the study is called.")
-    settings: Mapping[str, Any] = Field(
-        description="Every setting; digests in place of paths."
-    )
+    settings: Mapping[str, Any] = Field(description="Every setting; digests in place of paths.")
     versions: Mapping[str, str] = Field(description="Versions of the libraries.")
     machine: MachineFacts = Field(description="The machine.")
     inputs: Mapping[str, str] = Field(description="SHA-256 of each input, by its key in the study.")

@@ -131,8 +131,9 @@ VAIN: tuple[Vain, ...] = (
     ),
     Vain(
         ("calibration.force_error_percent",),
-        lambda s: not s.priors and not any(record.observed for record in s.recorded),
-        "it sets forces against priors and what is seen beside them, and there is neither",
+        lambda s: s.calibration.objective == "paper" and not s.priors,
+        'it sets forces against priors and the touch-down; objective = "paper" ignores the touch-down, and '
+        "there are no priors",
     ),
     Vain(
         ("calibration.prior_tissues",),
