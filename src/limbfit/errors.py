@@ -18,6 +18,8 @@ A *failed simulation* is not an exception: it is a result with ``completed=False
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -60,6 +62,17 @@ class InputError(LimbfitError):
 def _rebuild(kind: type[InputError], state: dict) -> InputError:
     what = state.pop("what")
     return kind(what, **state)
+
+
+@contextmanager
+def add_location(file: str | Path | None = None, place: str | None = None) -> Iterator[None]:
+    """Say of an `InputError` that is raised within in which file, and where in it, the fault lies."""
+    try:
+        yield
+    except InputError as error:
+        raise type(error)(
+            error.what, file=file or error.file, place=place or error.place, remedy=error.remedy
+        ) from None
 
 
 class StudyError(InputError):

@@ -20,7 +20,6 @@ from limbfit.anatomy.surfaces.surfaces import (
     check_anatomy,
     check_closed,
     extract_surface,
-    find_self_intersections,
     load_anatomy,
     read_surface,
     save_anatomy,
@@ -152,7 +151,7 @@ def test_self_intersections_agree_with_testing_every_pair(seed, large):
     """Also where a few faces are so large, as in a scan's cap, that they are looked for in pieces."""
     points = scatter_triangles(seed, large).reshape(-1, 3)
     surface = Surface(points, np.arange(60).reshape(-1, 3))
-    fast = {tuple(sorted(pair)) for pair in find_self_intersections(surface)}
+    fast = {tuple(sorted(pair)) for pair in surface.self_intersections}
     slow = set()
     for i in range(20):
         for j in range(i + 1, 20):
@@ -207,9 +206,9 @@ def test_folded_triangles_are_untangled():
     first, second = points[0], points[np.argsort(np.linalg.norm(points - points[0], axis=1))[12]]
     points[0] = first + 1.3 * (second - first)  # beyond its neighbours: their triangles lie over others
     folded = Surface(points, surface.faces)
-    assert len(find_self_intersections(folded)) > 0
+    assert len(folded.self_intersections) > 0
     mended = untangle_surface(folded)
-    assert len(find_self_intersections(mended)) == 0
+    assert len(mended.self_intersections) == 0
     assert np.median(np.linalg.norm(mended.points - surface.points, axis=1)) == 0
     assert np.abs(np.linalg.norm(mended.points, axis=1) - 50).max() < 3
 

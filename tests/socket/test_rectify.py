@@ -11,7 +11,7 @@ from socket_limbs import CUT_NORMAL, FILES, TOP, real_limb, revolved, round_limb
 
 from limbfit.anatomy.frame import Frame, build_limb_frame
 from limbfit.anatomy.surfaces.surfaces import Anatomy, compute_signed_distance
-from limbfit.anatomy.surfaces.triangles import Surface, find_self_intersections
+from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
 from limbfit.socket import Area, Recipe, Socket, measure_circumference, rectify_limb
 from limbfit.socket.landmarks import find_knee_centre
@@ -41,7 +41,7 @@ def check_face(socket: Socket, anatomy: Anatomy) -> None:
     """What holds of every socket: one brim, one side, no crossing, and clear where it is clear."""
     skin = anatomy.skin
     face, clear = socket.surface, Surface(socket.clear, socket.faces)
-    assert len(find_self_intersections(face)) == len(find_self_intersections(clear)) == 0
+    assert len(face.self_intersections) == len(clear.self_intersections) == 0
     assert socket.closed.volume > 0
     edges = np.sort(np.vstack([socket.faces[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
     alone, counts = np.unique(edges, axis=0, return_counts=True)

@@ -13,6 +13,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations
+from math import prod
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -28,6 +30,7 @@ BONES = ("tibia", "fibula", "femur", "patella")
 DEFAULT_NAMES: Mapping[int, str] = {1: SOFT_TISSUE, **dict(enumerate(BONES, 2)), 6: FAT}
 SOFT_NAMES = frozenset({SOFT_TISSUE, "skin", FAT, "muscle", "limb", "body"})
 
+MAX_VOXELS = 1_000_000_000  # a leg of 1 m in voxels of 0.4 mm has a quarter of that
 _ORTHONORMAL = 1e-4  # largest deviation of direction^T direction from the identity
 _SAME_POINT_MM = 0.01
 
@@ -65,13 +68,25 @@ class Grid:
             raise ImageError(f"voxel spacing must be three positive lengths, not {self.spacing.tolist()}")
         if self.origin.shape != (3,) or not np.all(np.isfinite(self.origin)):
             raise ImageError("the image has no usable origin")
-        check_direction(self.direction)
+        if self.direction.shape != (3, 3) or not np.all(np.isfinite(self.direction)):
+            raise ImageError("the image axes are not a 3 x 3 matrix of numbers")
+        skew = np.abs(self.direction.T @ self.direction - np.eye(3)).max()
+        if skew > _ORTHONORMAL:  # a sheared grid (gantry tilt) would be read as a straight one
+            raise ImageError(
+                f"the image axes are not orthonormal (off by {skew:.2g})",
+                remedy="resample the image to a rectangular grid",
+            )
 
     @property
     def size(self) -> tuple[int, int, int]:
         """Number of voxels along i, j, k."""
         k, j, i = self.array.shape
         return i, j, k
+
+    @property
+    def corners(self) -> Array:
+        """(8, 3) indices (i, j, k) of the corner voxels."""
+        return np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T * (np.array(self.size) - 1.0)
 
     @property
     def affine(self) -> Array:
@@ -157,9 +172,7 @@ class Grid:
         """Whether both sample the same points: every corner voxel within 0.01 mm."""
         if self.array.shape != other.array.shape:
             return False
-        ends = np.array(self.size) - 1.0
-        corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T * ends
-        gap = np.abs(self.index_to_point(corners) - other.index_to_point(corners))
+        gap = np.abs(self.index_to_point(self.corners) - other.index_to_point(self.corners))
         return bool(gap.max() <= _SAME_POINT_MM)
 
     def to_sitk(self) -> sitk.Image:
@@ -273,15 +286,12 @@ class LabelMap(Grid):
         return replace(self, array=np.asarray(array), names=dict(names or self.names))
 
 
-def check_direction(direction: Array) -> None:
-    """Refuse axes that are not orthonormal: a sheared grid (gantry tilt) would be read as a straight one."""
-    if direction.shape != (3, 3) or not np.all(np.isfinite(direction)):
-        raise ImageError("the image axes are not a 3 x 3 matrix of numbers")
-    skew = np.abs(direction.T @ direction - np.eye(3)).max()
-    if skew > _ORTHONORMAL:
+def check_voxel_count(size: Sequence[int], path: str | Path) -> None:
+    """Raise `ImageError` for an image of more than `MAX_VOXELS`, before it takes the memory."""
+    if prod(int(n) for n in size) > MAX_VOXELS:
+        shape = " x ".join(str(n) for n in size)
         raise ImageError(
-            f"the image axes are not orthonormal (off by {skew:.2g})",
-            remedy="resample the image to a rectangular grid",
+            f"{shape} voxels are more than {MAX_VOXELS:.0e}", file=path, remedy="crop or resample the image"
         )
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
 
-from ..errors import ImageError, LabelError
+from ..errors import ImageError, LabelError, add_location
 from .grid import BONES, DEFAULT_NAMES, SOFT_TISSUE, LabelMap, Volume
 from .images.dicom import Series, describe_series, list_series, read_series
 from .images.formats import describe_forms, format_of, read_image
@@ -22,7 +22,6 @@ from .labels.labelfiles import (
     is_seg_nrrd,
     read_label_image,
     read_seg_nrrd,
-    to_label_error,
     write_seg_nrrd,
     write_sidecar,
 )
@@ -64,7 +63,11 @@ def read_volume(path: str | Path, series_uid: str | None = None) -> Volume:
     if path.is_dir():
         volume = read_series(path, series_uid)
     else:
-        volume = _to_volume(read_image(path), path)
+        image = read_image(path)
+        if image.GetNumberOfComponentsPerPixel() != 1:
+            raise ImageError("an image needs one grey value per voxel", file=path)
+        with add_location(file=path):
+            volume = Volume.from_sitk(image)
         if format_of(path).name == "NIfTI":
             volume = replace(volume, notes=describe_forms(path, volume.affine))
     if not np.all(np.isfinite(volume.array)):
@@ -112,16 +115,22 @@ def read_labels(path: str | Path, like: Volume | None = None) -> LabelMap:
         Also for a map whose voxels are not those of ``like``, and for one without a single labelled voxel.
     """
     path = Path(path)
-    dicom = find_dicom_labels(path)
-    if dicom is not None:
-        labels = read_dicom_labels(dicom, like)
-    elif is_seg_nrrd(path) and path.is_file():
-        labels = read_seg_nrrd(path)
-    else:
-        labels = _read_label_file(path)
+    try:
+        labels = _read_label_file(path, like)
+    except ImageError as error:  # of a label map it is an error of labels
+        raise LabelError(error.what, file=path, place=error.place, remedy=error.remedy) from None
     if not labels.array.any():
         raise LabelError("the label map is empty", file=path, remedy="give one with the limb labelled")
     return labels if like is None else place_on_grid(labels, like, path)
+
+
+def _read_label_file(path: Path, like: Volume | None) -> LabelMap:
+    dicom = find_dicom_labels(path)
+    if dicom is not None:
+        return read_dicom_labels(dicom, like)
+    if is_seg_nrrd(path) and path.is_file():
+        return read_seg_nrrd(path)
+    return read_label_image(path, read_image(path))
 
 
 def write_labels(path: str | Path, labels: LabelMap) -> None:
@@ -133,20 +142,3 @@ def write_labels(path: str | Path, labels: LabelMap) -> None:
     format_of(path, written=True)
     sitk.WriteImage(labels.to_sitk(), str(path), useCompression=True)
     write_sidecar(path, labels.names)
-
-
-def _read_label_file(path: Path) -> LabelMap:
-    try:
-        image = read_image(path)
-        return read_label_image(path, image)
-    except ImageError as error:
-        raise to_label_error(error, path) from None
-
-
-def _to_volume(image: sitk.Image, path: Path) -> Volume:
-    if image.GetNumberOfComponentsPerPixel() != 1:
-        raise ImageError("an image needs one grey value per voxel", file=path)
-    try:
-        return Volume.from_sitk(image)
-    except ImageError as error:
-        raise ImageError(error.what, file=path, remedy=error.remedy) from None

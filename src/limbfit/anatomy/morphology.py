@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
-from scipy.ndimage import binary_fill_holes
+from scipy.ndimage import binary_fill_holes, grey_dilation
 from scipy.ndimage import label as connected
 
 from ..arrays import Array, Indices, Mask
@@ -93,6 +93,12 @@ def find_box(mask: Mask, margin: Indices | int = 0) -> Box:
 def fill_slices(mask: Mask) -> Mask:
     """Holes filled within each slice: a bone that reaches the image's end is a hole there, not in 3-D."""
     return np.stack([binary_fill_holes(plane) for plane in mask])
+
+
+def find_local_maximum(values: Field, radius_mm: float, spacing: Array) -> Field:
+    """The largest value in a box of a radius around each voxel."""
+    size = 2 * np.ceil(radius_mm / spacing[::-1]).astype(int) + 1
+    return np.asarray(grey_dilation(values, size=tuple(size)))
 
 
 def find_largest_piece(mask: Mask) -> Mask:

@@ -86,24 +86,14 @@ def quadratic_simplex(x: Array) -> tuple[Array, Array]:
     return values, np.concatenate([corner, middle], axis=1)
 
 
-def _evaluate_tensor_linear(x: Array, corners: Array) -> tuple[Array, Array]:
-    d = x.shape[1]
+def linear_tensor(x: Array) -> tuple[Array, Array]:
+    """Bilinear quadrilateral (d = 2) or trilinear hexahedron (d = 3)."""
+    corners = QUAD_CORNERS if x.shape[1] == 2 else HEX_CORNERS
     factors = 0.5 * (1.0 + x[:, None, :] * corners[None])
-    gradients = np.empty((len(x), len(corners), d))
-    for i in range(d):
-        others = np.delete(factors, i, axis=2).prod(axis=2)
-        gradients[:, :, i] = 0.5 * corners[None, :, i] * others
+    gradients = np.empty((len(x), *corners.shape))
+    for i in range(x.shape[1]):
+        gradients[:, :, i] = 0.5 * corners[None, :, i] * np.delete(factors, i, axis=2).prod(axis=2)
     return factors.prod(axis=2), gradients
-
-
-def linear_quadrilateral(x: Array) -> tuple[Array, Array]:
-    """Bilinear quadrilateral, 4 nodes."""
-    return _evaluate_tensor_linear(x, QUAD_CORNERS)
-
-
-def linear_hexahedron(x: Array) -> tuple[Array, Array]:
-    """Trilinear hexahedron, 8 nodes."""
-    return _evaluate_tensor_linear(x, HEX_CORNERS)
 
 
 CELLS: dict[str, CellType] = {
@@ -120,7 +110,7 @@ CELLS: dict[str, CellType] = {
         ),
         CellType(
             "hex8", 12, "hexahedron", HEX_CORNERS, 8, 4, _HEX_FACES, (4, 5, 6, 7, 0, 1, 2, 3),
-            linear_hexahedron, HEX_CORNERS / np.sqrt(3.0), np.ones(8), side=2.0,
+            linear_tensor, HEX_CORNERS / np.sqrt(3.0), np.ones(8), side=2.0,
         ),
     )
 }  # fmt: skip

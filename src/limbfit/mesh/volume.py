@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..arrays import Array, Indices, Mask
 from ..errors import ProblemError
@@ -102,7 +102,24 @@ class Mesh:
         ProblemError
             For cells that are not solved, not finite or flat, and regions that do not fit them.
         """
-        return _from_arrays(np.asarray(points, dtype=float), np.asarray(cells), regions, names)
+        points, cells = np.asarray(points, dtype=float), np.asarray(cells)
+        width = cells.shape[1] if cells.ndim == 2 else 0
+        kinds = {len(cell.nodes): cell.name for cell in CELLS.values()}
+        if width not in kinds or not len(cells):
+            *some, last = (f"(m, {n})" for n in kinds)
+            raise ProblemError(
+                f"cells have shape {cells.shape}, not {', '.join(some)} or {last}",
+                remedy="give tetrahedra or linear hexahedra",
+            )
+        if cells.min() < 0 or cells.max() >= len(points):
+            raise ProblemError("cells name nodes that do not exist", remedy="count nodes from 0")
+        numbers, tissues = _read_tissues(regions, len(cells), names or {})
+        used, inverse = np.unique(cells, return_inverse=True)
+        mesh = cls(points[used], inverse.reshape(cells.shape), kinds[width], numbers, tissues)
+        turned = cell_volumes(mesh) < 0.0
+        mesh.cells[turned] = mesh.cells[turned][:, mesh.kind.turned]
+        check(mesh)
+        return mesh
 
     @classmethod
     def from_pyvista(cls, grid: Any, region: str = "") -> Mesh:
@@ -126,14 +143,10 @@ class Mesh:
         Cells of fewer dimensions are left out. See `from_arrays`.
         """
         kind, cells = _select_one_kind([(_MESHIO_NAMES.get(b.type, b.type), b.data) for b in mesh.cells])
-        known = [name for name in _MESHIO_REGIONS if name in mesh.cell_data]
-        data = (
-            _read_cell_array(mesh.cell_data, region)
-            if region
-            else mesh.cell_data[known[0]]
-            if known
-            else None
-        )
+        groups = [name for name in _MESHIO_REGIONS if name in mesh.cell_data]
+        data = None
+        if region or groups:
+            data = _read_cell_array(mesh.cell_data, region or groups[0])
         chosen = [k for k, block in enumerate(mesh.cells) if _MESHIO_NAMES.get(block.type) == kind]
         tissues = None if data is None else np.concatenate([np.asarray(data[k]) for k in chosen])
         names = {int(number): name for name, (number, dim) in mesh.field_data.items() if dim == 3}
@@ -192,16 +205,18 @@ def check(mesh: Mesh) -> None:
         raise ProblemError(f"{inverted} of {len(mesh.cells)} cells are inverted", remedy="mesh again, finer")
 
 
-def boundary_faces(mesh: Mesh) -> Indices:
-    """Outward faces (k, 3, 6 or 4) that belong to one cell only.
+def boundary_faces(mesh: Mesh, chosen: Mask | None = None) -> Indices:
+    """Outward faces (k, 3, 6 or 4) that belong to one cell only, of all cells or of the ``chosen`` (m,).
 
     Raises
     ------
     ProblemError
         When a face belongs to more than two cells.
     """
-    faces = mesh.cells[:, mesh.kind.faces]
+    faces = (mesh.cells if chosen is None else mesh.cells[chosen])[:, mesh.kind.faces]
     faces = faces.reshape(-1, faces.shape[2])
+    if not len(faces):
+        return faces
     # Three of its corners tell a face of a conforming mesh, quadrilaterals included.
     low, middle, high = np.sort(faces[:, : mesh.kind.face_corners], axis=1)[:, :3].T
     count = len(mesh.points)
@@ -229,19 +244,19 @@ def to_tet10(mesh: Mesh) -> Mesh:
         return np.hstack([faces, middle])
 
     boundary = with_mid_nodes(boundary_faces(mesh))
+
+    def promote_set(nodes: Indices) -> Indices:
+        inside = np.isin(boundary[:, :3], nodes).all(axis=1)
+        return np.union1d(nodes, boundary[inside, 3:].ravel()).astype(np.int64)
+
     return replace(
         mesh,
         points=np.vstack([mesh.points, mesh.points[edges].mean(axis=1)]),
         cells=np.hstack([mesh.cells, count + inverse.reshape(-1, 6)]),
         cell_type="tet10",
-        node_sets={name: _promote_set(nodes, boundary) for name, nodes in mesh.node_sets.items()},
+        node_sets={name: promote_set(nodes) for name, nodes in mesh.node_sets.items()},
         face_sets={name: with_mid_nodes(faces) for name, faces in mesh.face_sets.items()},
     )
-
-
-def _promote_set(nodes: Indices, boundary: Indices) -> Indices:
-    inside = np.isin(boundary[:, :3], nodes).all(axis=1)
-    return np.union1d(nodes, boundary[inside, 3:].ravel()).astype(np.int64)
 
 
 def _select_one_kind(blocks: Iterable[tuple[str, Any]]) -> tuple[str, Indices]:
@@ -266,31 +281,6 @@ def _read_cell_array(data: Mapping[str, Any], name: str) -> Any:
         known = ", ".join(map(str, data)) or "none"
         raise ProblemError(f"no cell data {name!r}", remedy=f"there is {known}")
     return data[name]
-
-
-def _from_arrays(
-    points: Array,
-    cells: NDArray[Any],
-    regions: ArrayLike | None,
-    names: Mapping[int, str] | None,
-) -> Mesh:
-    width = cells.shape[1] if cells.ndim == 2 else 0
-    kinds = {len(cell.nodes): cell.name for cell in CELLS.values()}
-    if width not in kinds or not len(cells):
-        *some, last = (f"(m, {n})" for n in kinds)
-        raise ProblemError(
-            f"cells have shape {cells.shape}, not {', '.join(some)} or {last}",
-            remedy="give tetrahedra or linear hexahedra",
-        )
-    if cells.min() < 0 or cells.max() >= len(points):
-        raise ProblemError("cells name nodes that do not exist", remedy="count nodes from 0")
-    numbers, tissues = _read_tissues(regions, len(cells), names or {})
-    used, inverse = np.unique(cells, return_inverse=True)
-    mesh = Mesh(points[used], inverse.reshape(cells.shape), kinds[width], numbers, tissues)
-    turned = cell_volumes(mesh) < 0.0
-    mesh.cells[turned] = mesh.cells[turned][:, mesh.kind.turned]
-    check(mesh)
-    return mesh
 
 
 def _read_tissues(
@@ -328,7 +318,6 @@ class MeshQuality:
     max_dihedral_deg: float
     volume_mm3: float
     region_volumes_mm3: Mapping[str, float]
-    min_cell_volume_mm3: float
     min_scaled_jacobian: float
     inverted: int
 
@@ -353,7 +342,6 @@ def measure_quality(mesh: Mesh) -> MeshQuality:
         region_volumes_mm3={
             name: float(size[mesh.regions == index].sum()) for index, name in enumerate(mesh.region_names)
         },
-        min_cell_volume_mm3=float(size.min()),
         min_scaled_jacobian=float(scaled.min()),
         inverted=int((jacobians.min(axis=1) <= 0).sum()),
     )

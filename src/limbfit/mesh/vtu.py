@@ -44,7 +44,9 @@ def write_vtu(
     cells.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), connectivity)
     grid.SetCells(mesh.kind.vtk, cells)
     _add_arrays(grid.GetCellData(), {"region": mesh.regions, **(cell_data or {})})
-    _add_arrays(grid.GetPointData(), _set_masks(mesh) | dict(point_data or {}))
+    numbers = np.arange(len(mesh.points))
+    masks = {f"in {name}": np.isin(numbers, nodes).astype(np.uint8) for name, nodes in mesh.node_sets.items()}
+    _add_arrays(grid.GetPointData(), masks | dict(point_data or {}))
     _add_arrays(grid.GetFieldData(), {f"{_NODE_SET}{name}": nodes for name, nodes in mesh.node_sets.items()})
     _add_arrays(grid.GetFieldData(), {f"{_FACE_SET}{name}": faces for name, faces in mesh.face_sets.items()})
     names = vtkStringArray()
@@ -52,12 +54,19 @@ def write_vtu(
     for name in mesh.region_names:
         names.InsertNextValue(name)
     grid.GetFieldData().AddArray(names)
-    _write(grid, Path(path))
-
-
-def _set_masks(mesh: Mesh) -> dict[str, NDArray]:
-    numbers = np.arange(len(mesh.points))
-    return {f"in {name}": np.isin(numbers, nodes).astype(np.uint8) for name, nodes in mesh.node_sets.items()}
+    path = Path(path)
+    draft = path.with_name(f".{path.name}.part")  # a run that is killed leaves no half of a mesh at ``path``
+    writer = vtkXMLUnstructuredGridWriter()
+    writer.SetFileName(str(draft))
+    writer.SetInputData(grid)
+    writer.SetDataModeToAppended()
+    writer.EncodeAppendedDataOff()
+    with silence_vtk():
+        written = writer.Write()
+    if not written:
+        draft.unlink(missing_ok=True)
+        raise ProblemError("cannot be written", file=path, remedy="check the folder and the free disk space")
+    draft.replace(path)
 
 
 def _add_arrays(data: vtkFieldData, arrays: Mapping[str, NDArray]) -> None:
@@ -76,21 +85,6 @@ def silence_vtk() -> Iterator[None]:
         yield
     finally:
         vtkObject.SetGlobalWarningDisplay(shown)
-
-
-def _write(grid: vtkUnstructuredGrid, path: Path) -> None:
-    draft = path.with_name(f".{path.name}.part")  # a run that is killed leaves no half of a mesh at ``path``
-    writer = vtkXMLUnstructuredGridWriter()
-    writer.SetFileName(str(draft))
-    writer.SetInputData(grid)
-    writer.SetDataModeToAppended()
-    writer.EncodeAppendedDataOff()
-    with silence_vtk():
-        written = writer.Write()
-    if not written:
-        draft.unlink(missing_ok=True)
-        raise ProblemError("cannot be written", file=path, remedy="check the folder and the free disk space")
-    draft.replace(path)
 
 
 def read_vtu(path: str | Path) -> Mesh:
@@ -117,9 +111,7 @@ def grid_to_mesh(grid: vtkUnstructuredGrid, path: str | Path) -> Mesh:
         cells=cells,
         cell_type=cell_type,
         regions=np.zeros(len(cells), np.int64) if region is None else vtk_to_numpy(region).astype(np.int64),
-        region_names=("all",)
-        if names is None
-        else tuple(names.GetValue(i) for i in range(names.GetNumberOfValues())),
+        region_names=tuple(map(names.GetValue, range(names.GetNumberOfValues()))) if names else ("all",),
         node_sets=_read_sets(grid, _NODE_SET),
         face_sets=_read_sets(grid, _FACE_SET),
     )
@@ -154,9 +146,9 @@ def _read_sets(grid: vtkUnstructuredGrid, prefix: str) -> dict[str, Indices]:
 def write_pvd(path: str | Path, frames: Sequence[tuple[float, Path]]) -> None:
     """Write a ParaView collection of (time in s, VTU file); the files are named relative to ``path``."""
     folder = Path(path).parent.resolve()
-    lines = [
-        f'    <DataSet timestep="{float(time)!r}" part="0" file={quoteattr(relpath(file, folder))}/>'
-        for time, file in ((time, Path(file).resolve()) for time, file in frames)
-    ]
+    lines = []
+    for time, file in frames:
+        name = quoteattr(relpath(file.resolve(), folder))
+        lines.append(f'    <DataSet timestep="{float(time)!r}" part="0" file={name}/>')
     head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>'
     Path(path).write_text("\n".join([head, *lines, "  </Collection>\n</VTKFile>\n"]), encoding="utf-8")

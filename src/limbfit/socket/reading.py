@@ -17,7 +17,6 @@ from ..anatomy.surfaces.triangles import (
     check_sides,
     find_bodies,
     find_half_edges,
-    find_self_intersections,
     remove_unused_points,
 )
 from ..arrays import Array
@@ -93,7 +92,7 @@ def _read(surface: Surface, outer: Surface, frame: Frame, bones: Mapping[str, Su
         face = face.flipped
         brim = brim[::-1]
         notes.append("its triangles looked away from the tissue and were turned")
-    crossing = find_self_intersections(face)
+    crossing = face.self_intersections
     if len(crossing):
         raise SurfaceError(
             f"the socket crosses itself ({len(crossing)} pairs of faces)",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from ..anatomy.frame import Frame
-from ..anatomy.surfaces.triangles import Surface, find_self_intersections
+from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError
 from .areas import Area, Zone
@@ -218,7 +218,7 @@ def _compute_flare(drawn: SocketSurface, normals: Array, radius: float) -> Array
 
 
 def _refuse_crossing(face: Surface, recipe: Recipe) -> None:
-    crossing = find_self_intersections(face)
+    crossing = face.self_intersections
     if not len(crossing):
         return
     place = face.triangles[crossing[0, 0]].mean(axis=0)

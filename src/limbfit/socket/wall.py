@@ -9,7 +9,7 @@ import manifold3d
 import numpy as np
 from numpy.typing import NDArray
 
-from ..anatomy.surfaces.triangles import Surface, find_self_intersections
+from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError
 from .rays import find_ray_hits
@@ -79,7 +79,7 @@ def _build_shell(socket: Socket, thickness: float) -> Surface:
     squared = igl.point_mesh_squared_distance(outer, inner, socket.faces)[0]
     least = float(np.sqrt(squared.min()))
     body = _build_sides(socket, outer, outwards, thickness)
-    if least < THINNEST * thickness or len(find_self_intersections(body)):
+    if least < THINNEST * thickness or len(body.self_intersections):
         raise SurfaceError(
             f"a wall of {thickness:g} mm would fold outside the socket's narrow places ({least:.1f} mm)",
             remedy="make it thinner, the flare larger, or the areas of the socket wider or less deep",

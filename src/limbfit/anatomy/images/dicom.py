@@ -24,9 +24,8 @@ from numpy.typing import NDArray
 from pydicom.uid import UID
 
 from ...arrays import Array
-from ...errors import ImageError
-from ..bounds import check_voxels
-from ..grid import Volume
+from ...errors import ImageError, add_location
+from ..grid import Volume, check_voxel_count
 from .dicom_headers import SliceHeader, read_headers, silence_readers
 
 _PLAIN_WORDS = {"dcm", "dicom", "ima", "im", "img", "image", "i", "slice", "mr", "ct", "pt", "ser", "series"}
@@ -56,15 +55,15 @@ def list_series(folder: str | Path) -> list[Series]:
     groups: dict[str, list[SliceHeader]] = defaultdict(list)
     files = [path for path in sorted(Path(folder).rglob("*")) if path.is_file()]
     for number, path in enumerate(files, 1):
-        try:
+        place = f"file {number} of {len(files)} by name{_redact_name(path.relative_to(folder))}"
+        with add_location(file=folder, place=place):
             headers = read_headers(path)
-        except ImageError as error:
-            place = f"file {number} of {len(files)} by name{_redact_name(path.relative_to(folder))}"
-            raise ImageError(error.what, file=folder, place=place, remedy=error.remedy) from None
         for header in headers or ():
             groups[header.series_uid].append(header)
     series = [Series(uid, tuple(slices)) for uid, slices in sorted(groups.items())]
-    return [_join_series(series)] if _is_one_stack(series) else series
+    if _is_one_stack(series):
+        return [Series(series[0].uid, tuple(single.slices[0] for single in series))]
+    return series
 
 
 def _redact_name(path: Path) -> str:
@@ -132,18 +131,12 @@ def read_series(folder: str | Path, series_uid: str | None = None) -> Volume:
         For no or several series, slices missing, doubled, tilted or of different geometry.
     """
     series = _choose(Path(folder), list_series(folder), series_uid)
-    try:
-        return _read_volume(series)
-    except ImageError as error:
-        raise ImageError(error.what, file=folder, place=error.place, remedy=error.remedy) from None
-
-
-def _read_volume(series: Series) -> Volume:
-    slices, spacing, direction = stack_slices(series.slices)
-    origin = slices[0].position
-    assert origin is not None
-    check_voxels((slices[0].columns, slices[0].rows, len(slices)), slices[0].path)
-    return Volume(read_pixels(slices), spacing, origin, direction, slices[0].modality)
+    with add_location(file=folder):
+        slices, spacing, direction = stack_slices(series.slices)
+        first = slices[0]
+        assert first.position is not None
+        check_voxel_count((first.columns, first.rows, len(slices)), folder)
+        return Volume(read_pixels(slices), spacing, first.position, direction, first.modality)
 
 
 def _build_none_error(folder: Path) -> ImageError:
@@ -175,22 +168,18 @@ def _choose(folder: Path, found: list[Series], uid: str | None) -> Series:
 
 
 def _is_one_stack(series: list[Series]) -> bool:
-    """Whether an anonymiser gave each slice of one series its own UID.
+    """True if an anonymiser gave each slice of one series its own UID.
 
-    So it is where every series has one image, there are at least three, all with the same series number and
+    Then every series has one image, and there are at least three, all with the same series number and
     geometry: two true series would not interleave into one stack, which the gap check still verifies.
     """
-    if len(series) < 3 or any(len(one.slices) > 1 for one in series):
+    if len(series) < 3 or any(len(single.slices) > 1 for single in series):
         return False
-    slices = [one.slices[0] for one in series]
+    slices = [single.slices[0] for single in series]
     first = slices[0]
     return all(
         other.series_number == first.series_number and has_same_plane(first, other) for other in slices
     )
-
-
-def _join_series(series: list[Series]) -> Series:
-    return Series(series[0].uid, tuple(one.slices[0] for one in series))
 
 
 def stack_slices(slices: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Array, Array]:

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from ...arrays import Array
 from ...errors import ImageError, InputError
 from ...extensions import Registry
-from ..bounds import check_voxels
+from ..grid import check_voxel_count
 from .dicom import mute_libraries
 
 Read = Callable[[Path], sitk.Image]
@@ -58,7 +58,7 @@ def _read_itk(path: Path, is_placed: Callable[[sitk.ImageFileReader], bool] = la
     try:
         with mute_libraries():
             reader.ReadImageInformation()
-            check_voxels(reader.GetSize(), path)
+            check_voxel_count(reader.GetSize(), path)
             image = reader.Execute()
     except RuntimeError as error:
         raise _build_reading_error(path, str(error)) from None
@@ -158,7 +158,7 @@ def read_image(path: Path) -> sitk.Image:
     except Exception as error:
         what = f"not readable as {form.name}: {type(error).__name__}: {error}"
         raise ImageError(what, file=path, remedy="check that the file is whole") from error
-    check_voxels(image.GetSize(), path)
+    check_voxel_count(image.GetSize(), path)
     return image
 
 

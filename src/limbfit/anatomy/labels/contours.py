@@ -20,7 +20,7 @@ import numpy as np
 from contourpy import contour_generator
 
 from ...arrays import Array, Mask
-from ...errors import LabelError
+from ...errors import LabelError, add_location
 from ..grid import SOFT_TISSUE, Grid, LabelMap, Volume
 from .labelfiles import flatten, normalise_name
 
@@ -147,14 +147,10 @@ def build_labels(contours: Mapping[str, Sequence[Array]], like: Grid, path: Path
     """
     masks = []
     for name, polygons in contours.items():
-        try:
+        with add_location(file=path, place=name):
             masks.append(rasterise_polygons(polygons, like))
-        except LabelError as error:
-            raise LabelError(error.what, file=path, place=name, remedy=error.remedy) from None
-    try:
+    with add_location(file=path):
         array, names = flatten(masks, list(contours))
-    except LabelError as error:
-        raise LabelError(error.what, file=path, remedy=error.remedy) from None
     return LabelMap(array, like.spacing, like.origin, like.direction, names)
 
 

@@ -107,8 +107,8 @@ def read_dicom_seg(path: Path) -> LabelMap:
     try:
         with silence_readers():
             frames = _read_frames(pydicom.dcmread(path))
-        grid, index = _stack(frames)
-        masks = [_mask(frames, grid, index, number) for number in frames.names]
+        grid, index = _stack_frames(frames)
+        masks = [_build_mask(frames, grid, index, number) for number in frames.names]
         array, names = flatten(masks, list(frames.names.values()))
     except LabelError as error:
         raise LabelError(error.what, file=path, remedy=error.remedy) from None
@@ -126,16 +126,22 @@ def _read_frames(data: FileDataset) -> _SegmentFrames:
     groups = [
         (group, data.SharedFunctionalGroupsSequence[0]) for group in data.PerFrameFunctionalGroupsSequence
     ]
-    axes = np.array([_read_orientation(group) for group in groups])
-    if np.abs(axes - axes[0]).max() > 1e-4:
+    orientations, positions = (
+        np.array([getattr(find_functional_group(group, sequence), name) for group in groups], dtype=float)
+        for sequence, name in (
+            ("PlaneOrientationSequence", "ImageOrientationPatient"),
+            ("PlanePositionSequence", "ImagePositionPatient"),
+        )
+    )
+    if np.abs(orientations - orientations[0]).max() > 1e-4:
         raise LabelError("frames of several orientations", remedy="export one for each orientation")
     measures = find_functional_group(groups[0], "PixelMeasuresSequence")
     stated = (measures.get("SpacingBetweenSlices"), measures.get("SliceThickness"))
     return _SegmentFrames(
         data.pixel_array.reshape(len(groups), data.Rows, data.Columns),
-        np.array([_segment(group) if kind == "BINARY" else 0 for group in groups]),
-        np.array([_position(group) for group in groups]),
-        axes[0],
+        np.array([_read_segment_number(group) if kind == "BINARY" else 0 for group in groups]),
+        positions,
+        orientations[0],
         np.array(measures.PixelSpacing, dtype=float),
         tuple(float(s) for s in stated if s),
         {
@@ -145,21 +151,11 @@ def _read_frames(data: FileDataset) -> _SegmentFrames:
     )
 
 
-def _read_orientation(groups: tuple[Dataset, Dataset]) -> list[float]:
-    return [
-        float(x) for x in find_functional_group(groups, "PlaneOrientationSequence").ImageOrientationPatient
-    ]
-
-
-def _position(groups: tuple[Dataset, Dataset]) -> list[float]:
-    return [float(x) for x in find_functional_group(groups, "PlanePositionSequence").ImagePositionPatient]
-
-
-def _segment(groups: tuple[Dataset, Dataset]) -> int:
+def _read_segment_number(groups: tuple[Dataset, Dataset]) -> int:
     return int(find_functional_group(groups, "SegmentIdentificationSequence").ReferencedSegmentNumber)
 
 
-def _stack(frames: _SegmentFrames) -> tuple[Grid, Indices]:
+def _stack_frames(frames: _SegmentFrames) -> tuple[Grid, Indices]:
     """The smallest grid that holds all frames, and the slice (n,) of each."""
     rows, columns = frames.orientation[:3], frames.orientation[3:]
     normal = np.cross(rows, columns)
@@ -190,7 +186,7 @@ def _slice_spacing(heights: Array, stated: tuple[float, ...]) -> float | None:
     return None
 
 
-def _mask(frames: _SegmentFrames, grid: Grid, index: Indices, number: int) -> Mask:
+def _build_mask(frames: _SegmentFrames, grid: Grid, index: Indices, number: int) -> Mask:
     mask = np.zeros(grid.array.shape, dtype=bool)
     for pixels, segment, k in zip(frames.pixels, frames.segments, index):
         if segment == 0:

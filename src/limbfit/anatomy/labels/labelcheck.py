@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +10,9 @@ from scipy.ndimage import binary_fill_holes
 from scipy.ndimage import label as connected
 
 from ...arrays import Indices, Mask
-from ...errors import LabelError
+from ...errors import LabelError, add_location
 from ..grid import SOFT_NAMES, Grid, LabelMap, Volume
+from ..morphology import find_box
 
 # A second piece this large beside the largest is no stray: another limb, or another bone.
 _ISLAND = 0.2
@@ -28,14 +28,12 @@ def clean_labels(labels: LabelMap, path: Path) -> tuple[LabelMap, list[str]]:
     LabelError
         For values without a name, no soft tissue, two limbs, or a bone in two large pieces.
     """
-    try:
+    with add_location(file=path):
         _check_names(labels)
         labels, notes = _keep_one_limb(labels)
         for name in labels.bone_names:
             labels, dropped = _keep_one_piece(labels, name)
             notes += dropped
-    except LabelError as error:
-        raise LabelError(error.what, file=path, place=error.place, remedy=error.remedy) from None
     return labels, notes
 
 
@@ -120,7 +118,7 @@ def place_on_grid(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
     if labels.same_grid(like):
         return labels
     given, labels = labels, _crop_labels(labels.along(like.direction))
-    offset = _offset(labels, like)
+    offset = _find_offset(labels, like)
     if offset is None:
         raise LabelError(
             "the label map is on a different grid from the image",
@@ -144,20 +142,14 @@ def _crop_labels(labels: LabelMap) -> LabelMap:
     """Without the empty layers around what is labelled; a margin of zeros may lie outside the image."""
     if not labels.array.any():
         return labels
-    box = []
-    for axis in range(3):
-        filled = np.flatnonzero(labels.array.any(axis=tuple(n for n in range(3) if n != axis)))
-        box.append(slice(filled[0], filled[-1] + 1))
-    start = [part.start for part in box[::-1]]
-    return replace(labels, array=labels.array[tuple(box)], origin=labels.index_to_point(start))
+    return labels.cropped(find_box(labels.limb))
 
 
-def _offset(labels: Grid, like: Grid) -> Indices | None:
+def _find_offset(labels: Grid, like: Grid) -> Indices | None:
     """First voxel (i, j, k) of ``labels`` on the grid of ``like``, None if voxels do not coincide."""
-    ends = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T * (np.array(labels.size) - 1.0)
-    seen = like.point_to_index(labels.index_to_point(ends))
-    whole = np.round(seen[0])
-    if np.abs(seen - whole - ends).max() > _ON_GRID:
+    place = like.point_to_index(labels.index_to_point(labels.corners))
+    whole = np.round(place[0])
+    if np.abs(place - whole - labels.corners).max() > _ON_GRID:
         return None
     return whole.astype(np.int64)
 

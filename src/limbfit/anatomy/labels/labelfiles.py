@@ -7,10 +7,12 @@ Header fields: https://slicer.readthedocs.io/en/latest/developer_guide/modules/s
 
 from __future__ import annotations
 
+import bz2
 import json
 import re
 import zlib
 from collections.abc import Mapping, Sequence
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +22,8 @@ import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
 
 from ...arrays import Array, Mask
-from ...errors import ImageError, LabelError
-from ..bounds import check_packed
-from ..grid import DEFAULT_NAMES, LabelMap
+from ...errors import LabelError, add_location
+from ..grid import DEFAULT_NAMES, LabelMap, check_voxel_count
 
 COLOURS: Mapping[str, tuple[float, float, float]] = {
     "soft tissue": (0.85, 0.55, 0.45),
@@ -33,6 +34,8 @@ COLOURS: Mapping[str, tuple[float, float, float]] = {
     "fat": (0.98, 0.90, 0.55),
 }
 _OTHER_COLOURS = ((0.9, 0.6, 0.2), (0.4, 0.6, 0.9), (0.5, 0.8, 0.7), (0.8, 0.5, 0.6))
+_LARGEST_TYPE = 8  # bytes of a voxel
+_BLOCK = 1 << 20
 _SPACES = {
     "left-posterior-superior": np.ones(3),
     "lps": np.ones(3),
@@ -53,7 +56,7 @@ def is_seg_nrrd(path: Path) -> bool:
 def read_seg_nrrd(path: Path) -> LabelMap:
     """A ``.seg.nrrd`` on its own, maybe cropped, grid."""
     try:
-        check_packed(path, nrrd.read_header(str(path)))
+        _check_packed(path, nrrd.read_header(str(path)))
         voxels, header = nrrd.read(str(path))
     except (nrrd.NRRDError, OSError, ValueError, EOFError, KeyError, zlib.error):
         raise LabelError(
@@ -63,11 +66,40 @@ def read_seg_nrrd(path: Path) -> LabelMap:
     spacing, origin, direction = _read_nrrd_geometry(header, path)
     segments = _read_segments(header, layers, path)
     masks = [layers[layer] == value for _, layer, value in segments]
-    try:
+    with add_location(file=path):
         flat, names = flatten(masks, [name for name, _, _ in segments])
-    except LabelError as error:
-        raise LabelError(error.what, file=path, remedy=error.remedy) from None
     return LabelMap(np.transpose(flat, (2, 1, 0)), spacing, origin, direction, names)
+
+
+def _check_packed(path: Path, header: Mapping[str, Any]) -> None:
+    """Refuse a NRRD of too many voxels, or whose data unpack to more than these can take."""
+    check_voxel_count(header["sizes"], path)
+    encoding = str(header.get("encoding", "raw")).lower()
+    if encoding in ("gzip", "gz", "bzip2", "bz2"):
+        data_file = header.get("data file", header.get("datafile"))
+        unpacker = zlib.decompressobj(47) if encoding.startswith("g") else bz2.BZ2Decompressor()
+        place = path if data_file is None else path.parent / str(data_file)
+        limit = _LARGEST_TYPE * prod(int(n) for n in header["sizes"])
+        if _is_larger_unpacked(place, data_file is None, unpacker, limit):
+            raise LabelError(
+                "its data unpack to more than its header states", file=path, remedy="save it again"
+            )
+
+
+def _is_larger_unpacked(path: Path, after_header: bool, unpacker: Any, limit: int) -> bool:
+    """True if compressed data come to more than ``limit`` bytes; they are not kept."""
+    total, waiting = 0, b""
+    with path.open("rb") as stream:
+        while after_header and stream.readline().strip():  # a header ends with an empty line
+            pass
+        while total <= limit and not unpacker.eof:
+            if not waiting and getattr(unpacker, "needs_input", True):
+                waiting = stream.read(_BLOCK)
+                if not waiting:
+                    break
+            total += len(unpacker.decompress(waiting, _BLOCK))
+            waiting = getattr(unpacker, "unconsumed_tail", b"")
+    return total > limit
 
 
 def write_seg_nrrd(path: Path, labels: LabelMap) -> None:
@@ -103,10 +135,8 @@ def read_label_image(path: Path, image: sitk.Image) -> LabelMap:
     if image.GetNumberOfComponentsPerPixel() != 1:
         raise LabelError("a label image has one value per voxel", file=path)
     names = _read_sidecar_names(path)
-    try:
+    with add_location(file=path):
         return LabelMap.from_sitk(image, names)
-    except LabelError as error:
-        raise LabelError(error.what, file=path) from None
 
 
 def find_sidecar(path: Path) -> Path:
@@ -159,11 +189,6 @@ def _read_segments(header: Mapping[str, Any], layers: NDArray[Any], path: Path) 
             raise LabelError(f"segment {name!r} is in a layer that the file does not have", file=path)
         found.append((normalise_name(name), layer, value))
     return found
-
-
-def to_label_error(error: ImageError, path: Path) -> LabelError:
-    """An image that cannot be read, said about a label map."""
-    return LabelError(error.what, file=path, place=error.place, remedy=error.remedy)
 
 
 def normalise_name(name: str) -> str:

@@ -8,7 +8,6 @@ nodes are moved off the bone by what the faces around them lack.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
 
@@ -18,7 +17,7 @@ from ...arrays import Array, Indices
 from ...mesh import TET10_EDGES, Mesh, node_jacobians
 from ...mesh.cells import quadratic_simplex
 from .extrusion import Columns, find_bone_faces, find_inner_faces
-from .layers import Level, LimbFields
+from .layers import LimbFields
 from .projection import project_to_level
 from .regions import build_region_level, find_interfaces
 
@@ -47,30 +46,18 @@ def curve_mesh(mesh: Mesh, target: Array, straight: Array) -> Mesh:
 
 def compute_curved_target(mesh: Mesh, fields: LimbFields) -> Array:
     """Where the mid-edge nodes of skin, layers' inner face, bone and regions would lie on smooth surfaces."""
-    target = mesh.points.copy()
+    target, layers = mesh.points.copy(), len(fields.depths)
     free = np.where(mesh.points[:, 2] == 0.0, 0.0, 1.0)
-    for nodes, level in _smooth_mid_nodes(mesh, fields):
+    surfaces = [
+        *((faces, build_region_level(fields, k)) for k, faces in enumerate(find_interfaces(mesh, layers))),
+        (mesh.face_sets["skin"], fields.depth),
+        (find_inner_faces(mesh, layers - 1), fields.layer),
+        (find_bone_faces(mesh), fields.void),
+    ]
+    for faces, level in surfaces:
+        nodes = np.unique(faces[:, 3:])
         target[nodes] = project_to_level(level, target[nodes], free[nodes])
     return target
-
-
-def _smooth_mid_nodes(mesh: Mesh, fields: LimbFields) -> list[tuple[Indices, Callable[[Array], Level]]]:
-    corners, layers = mesh.cells[:, :4].max() + 1, len(fields.depths)
-    regions = [
-        (_find_mid_nodes(found, corners), build_region_level(fields, number))
-        for number, found in enumerate(find_interfaces(mesh, layers))
-    ]
-    return [
-        *regions,
-        (_find_mid_nodes(mesh.face_sets["skin"], corners), fields.depth),
-        (_find_mid_nodes(find_inner_faces(mesh, layers - 1), corners), fields.layer),
-        (_find_mid_nodes(find_bone_faces(mesh), corners), fields.void),
-    ]
-
-
-def _find_mid_nodes(faces: Indices, corners: int) -> Indices:
-    nodes = np.unique(faces)
-    return nodes[nodes >= corners]
 
 
 def curve_diagonals(mesh: Mesh, target: Array, stack: Columns) -> Array:

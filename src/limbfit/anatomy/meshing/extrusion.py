@@ -97,10 +97,8 @@ def find_bone_faces(mesh: Mesh) -> Indices:
 
 def find_inner_faces(mesh: Mesh, layer: int) -> Indices:
     """Faces between a layer (counted from the skin) and what lies under it, outward from the latter."""
-    under = mesh.regions > layer
     above = np.unique(mesh.corners[mesh.regions == layer])
-    part = replace(mesh, cells=mesh.cells[under], regions=mesh.regions[under], node_sets={}, face_sets={})
-    faces = boundary_faces(part)
+    faces = boundary_faces(mesh, mesh.regions > layer)
     outer = boundary_faces(mesh)
     return faces[
         np.isin(faces[:, :3], above).all(axis=1)

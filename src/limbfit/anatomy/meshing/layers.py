@@ -22,12 +22,12 @@ from typing import Literal
 
 import numpy as np
 
-from ...arrays import Array, Indices
+from ...arrays import Array
 from ...errors import SurfaceError
 from ..frame import Frame, build_limb_frame
 from ..surfaces.surfaces import Anatomy
 from ..surfaces.thickness import SLOPE, limit_slope, transfer_values
-from ..surfaces.triangles import Surface, from_pyvista
+from ..surfaces.triangles import Surface, find_open_edges, from_pyvista
 
 Level = tuple[Array, Array]  # a signed function at points and its gradient there
 
@@ -264,16 +264,9 @@ def prolong_surface(surface: Surface) -> Surface:
     top = np.full(len(body.points), -1)
     top[moved] = len(body.points) + np.arange(len(moved))
     points = np.vstack([body.points, body.points[moved] + [0.0, 0.0, PROLONGATION_MM]])
-    a, b = _find_rim(body.faces[cap]).T
+    a, b = find_open_edges(body.faces[cap]).T
     walls = np.vstack([np.stack([a, b, top[b]], axis=1), np.stack([a, top[b], top[a]], axis=1)])
     return Surface(points, np.vstack([body.faces[~cap], top[body.faces[cap]], walls]))
-
-
-def _find_rim(faces: Indices) -> Indices:
-    """Directed edges (k, 2) of a patch of faces that no other face of the patch shares."""
-    edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    _, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    return edges[counts[inverse.ravel()] == 1]
 
 
 def compute_box_distance(surface: Surface, points: Array) -> Array:

@@ -58,8 +58,7 @@ def _extract_offset_surface(surface: Surface, distance_mm: float) -> Surface:
     grid = pv.ImageData(dimensions=size, spacing=[SPACING_MM] * 3, origin=low)
     grid.point_data["distance"] = compute_signed_distance(surface, np.asarray(grid.points))[0]
     found = grid.contour([distance_mm], scalars="distance", method="flying_edges", compute_normals=False)
-    outer = find_bodies(from_pyvista(found.clean()))[0]
-    outer = outer if outer.volume > 0.0 else outer.flipped
+    outer = find_bodies(from_pyvista(found.clean()))[0].outward
     return Surface(_project_to_offset(surface, outer.points, distance_mm), outer.faces)
 
 

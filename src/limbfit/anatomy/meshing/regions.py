@@ -72,9 +72,8 @@ def _measure_to_wall(fields: LimbFields, number: int, points: Array) -> Level:
 def measure_thickness(fields: LimbFields, number: int) -> float:
     """Thickness (mm) of a region where it is thickest: twice the greatest depth in it, below the cut."""
     surface = list(fields.regions.values())[number]
-    return 2.0 * max(
-        0.0, -float(compute_signed_distance(surface, _sample_region(fields, number)[0])[0].min(initial=0.0))
-    )
+    samples, _ = _sample_region(fields, number)
+    return 2.0 * abs(float(compute_signed_distance(surface, samples)[0].min(initial=0.0)))
 
 
 def _sample_region(fields: LimbFields, number: int, pad_mm: float = 0.0) -> tuple[Array, float]:
@@ -165,20 +164,14 @@ def mesh_numbers(regions: Indices, layers: int, count: int) -> Indices:
 
 def find_interfaces(mesh: Mesh, layers: int) -> list[Indices]:
     """Outward faces (k, 3 or 6) of each region after a mesh's layers to what comes after it, to the core."""
-    return [_find_interface(mesh, number) for number in range(layers, len(mesh.region_names) - 1)]
-
-
-def _find_interface(mesh: Mesh, number: int) -> Indices:
-    sides = [_find_outward_faces(mesh, chosen) for chosen in (mesh.regions == number, mesh.regions > number)]
-    return sides[0][find_same_faces(sides[0][:, :3], sides[1][:, :3], len(mesh.points))]
-
-
-def _find_outward_faces(mesh: Mesh, chosen: Mask) -> Indices:
-    """Outward faces of some cells together."""
-    if not chosen.any():
-        return np.zeros((0, mesh.kind.faces.shape[1]), dtype=np.int64)
-    part = replace(mesh, cells=mesh.cells[chosen], regions=mesh.regions[chosen], node_sets={}, face_sets={})
-    return boundary_faces(part)
+    found = []
+    for number in range(layers, len(mesh.region_names) - 1):
+        inner, outer = (
+            boundary_faces(mesh, mesh.regions == number),
+            boundary_faces(mesh, mesh.regions > number),
+        )
+        found.append(inner[find_same_faces(inner[:, :3], outer[:, :3], len(mesh.points))])
+    return found
 
 
 def find_same_faces(faces: Indices, chosen: Indices, count: int) -> Mask:

@@ -77,7 +77,7 @@ def put_back(points: Array, mesh: Mesh, fields: LimbFields, stack: Columns) -> A
     on_plane, in_layers, on_bone = _find_places(mesh, stack)
     walls = _find_region_walls(mesh, fields)
     target, free = points.copy(), np.where(on_plane, 0.0, 1.0)
-    alone = _count(on_plane, in_layers, on_bone, *(chosen for chosen, _ in walls)) < 2
+    alone = np.sum([on_plane, in_layers, on_bone, *(chosen for chosen, _ in walls)], axis=0) < 2
     own = [(np.flatnonzero(chosen & alone), level) for chosen, level in (*walls, (on_bone, fields.void))]
     for nodes, level in (*own, (stack.base, fields.layer), (stack.top, fields.depth)):
         target[nodes] = project_to_level(level, target[nodes], free[nodes])
@@ -93,12 +93,7 @@ def find_constraints(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Ar
     for chosen, level in ((in_layers, fields.depth), (on_bone, fields.void), *walls):
         slope = level(points[chosen])[1]
         normals[chosen] = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
-    return normals, _count(on_plane, in_layers, on_bone, *(chosen for chosen, _ in walls)) < 2
-
-
-def _count(*places: Mask) -> Indices:
-    """On how many surfaces (n,) each node lies."""
-    return np.sum(places, axis=0)
+    return normals, np.sum([on_plane, in_layers, on_bone, *(chosen for chosen, _ in walls)], axis=0) < 2
 
 
 def _find_region_walls(mesh: Mesh, fields: LimbFields) -> list[tuple[Mask, Field]]:

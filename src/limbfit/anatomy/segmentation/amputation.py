@@ -6,7 +6,7 @@ plane is carried on distally and rounded off, so that the limb ends ``pad_mm`` b
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -71,7 +71,7 @@ def amputate_limb(
     end = pad_mm * _evaluate_quarter_ellipse(depth / min(section.largest_depth, _ROUNDING * pad_mm))
     kept = -height[near] < end
     array[tuple(axis[kept] for axis in near)] = labels.soft_value
-    _check(labels, array, section, height, pad_mm)
+    _check_room(array, section, height, pad_mm)
     return labels.with_array(array)
 
 
@@ -177,8 +177,7 @@ class _Section:
 def _cut_section(labels: LabelMap, point: Array, normal: Array) -> _Section:
     """Where the plane cuts the limb; of several pieces the largest."""
     axes = np.linalg.svd(normal[None])[2][1:].T
-    corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T * (np.array(labels.size) - 1)
-    flat = (labels.index_to_point(corners) - point) @ axes
+    flat = (labels.index_to_point(labels.corners) - point) @ axes
     low, high = flat.min(axis=0), flat.max(axis=0)
     u, v = (np.arange(a, b + _STEP_MM, _STEP_MM) for a, b in zip(low, high))
     points = point + u[:, None, None] * axes[:, 0] + v[None, :, None] * axes[:, 1]
@@ -196,7 +195,7 @@ def _cut_section(labels: LabelMap, point: Array, normal: Array) -> _Section:
     return _Section(point + axes @ low, axes, distance_transform_edt(inside) * _STEP_MM, not rim.any())
 
 
-def _check(labels: LabelMap, array: NDArray[np.uint8], section: _Section, height: Array, pad: float) -> None:
+def _check_room(array: NDArray[np.uint8], section: _Section, height: Array, pad: float) -> None:
     if not section.whole:
         raise LabelError(
             "the image ends within the limb's cross-section at the amputation plane",
@@ -271,7 +270,8 @@ def fill_surface(surface: Surface, grid: Grid) -> Mask:
     stencil.SetInputData(index.to_pyvista())
     stencil.SetOutputSpacing(1.0, 1.0, 1.0)
     stencil.SetOutputOrigin(0.0, 0.0, 0.0)
-    stencil.SetOutputWholeExtent(_find_extent(grid.size))
+    i, j, k = grid.size
+    stencil.SetOutputWholeExtent(0, i - 1, 0, j - 1, 0, k - 1)
     image = vtkImageStencilToImage()
     image.SetInputConnection(stencil.GetOutputPort())
     image.SetInsideValue(1)
@@ -280,7 +280,3 @@ def fill_surface(surface: Surface, grid: Grid) -> Mask:
     image.Update()
     values = vtk_to_numpy(image.GetOutput().GetPointData().GetScalars())
     return values.reshape(grid.array.shape).astype(bool)
-
-
-def _find_extent(size: Sequence[int]) -> tuple[int, int, int, int, int, int]:
-    return (0, size[0] - 1, 0, size[1] - 1, 0, size[2] - 1)

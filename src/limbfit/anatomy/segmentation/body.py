@@ -16,7 +16,6 @@ from scipy.ndimage import (
     distance_transform_edt,
     find_objects,
     gaussian_filter,
-    grey_dilation,
 )
 from scipy.ndimage import label as connected
 from scipy.spatial import ConvexHull, QhullError
@@ -26,7 +25,16 @@ from ...errors import ImageError
 from ..frame import find_longest_axis
 from ..grid import Grid, Volume
 from ..labels.contours import fill_even_odd
-from ..morphology import Field, close_mask, erode_mask, fill_slices, find_box, find_largest_piece, open_mask
+from ..morphology import (
+    Field,
+    close_mask,
+    erode_mask,
+    fill_slices,
+    find_box,
+    find_largest_piece,
+    find_local_maximum,
+    open_mask,
+)
 
 _SMOOTH_MM = 0.6
 _TISSUE = 0.45  # of the median of the tissue: between the noise of air and muscle
@@ -70,21 +78,20 @@ def find_limb_mask(volume: Volume, smooth: Field) -> Mask:
     outline is then put where the signal falls to half of the tissue beside it, so that bright fat does not
     push it outward by partial volume.
     """
-    tissue = float(np.median(smooth[smooth > _compute_otsu_threshold(smooth)]))
-    body = find_largest_piece(smooth > _TISSUE * tissue)
+    darkest = _TISSUE * float(np.median(smooth[smooth > _compute_otsu_threshold(smooth)]))
+    body = find_largest_piece(smooth > darkest)
     box = find_box(body, np.ceil(_CLOSE_MM / volume.spacing[::-1]).astype(int))
     limb = np.zeros(body.shape, dtype=bool)
-    limb[box] = _outline(body[box], smooth[box], _TISSUE * tissue, volume)
+    limb[box] = _find_outline(body[box], smooth[box], darkest, volume)
     return limb
 
 
-def _outline(body: Mask, smooth: Field, darkest: float, volume: Volume) -> Mask:
+def _find_outline(body: Mask, smooth: Field, darkest: float, volume: Volume) -> Mask:
     """The limb in the box of the largest body, of what is brighter than ``darkest``."""
     rough = find_largest_piece(remove_supports(_fill_limb(body, volume), volume))
     if rough.sum() * volume.voxel_mm3 < _SMALLEST_LIMB_MM3:
         raise ImageError("no limb was found in the image", remedy="check the series and its contrast")
-    size = 2 * np.ceil(_RIM_MM / volume.spacing[::-1]).astype(int) + 1
-    half = 0.5 * grey_dilation(smooth, size=tuple(size))
+    half = 0.5 * find_local_maximum(smooth, _RIM_MM, volume.spacing)
     core = erode_mask(rough, _RIM_MM, volume.spacing)
     return find_largest_piece(_fill_limb(core | (rough & (smooth > np.maximum(half, darkest))), volume))
 
@@ -135,7 +142,7 @@ def remove_supports(mask: Mask, grid: Grid) -> Mask:
     wings = _find_wings(coarse & ~body, body, sampling)
     if not wings.any():
         return mask
-    strip = _fill_hulls(wings) & (_compute_depth(body, sampling) < _BITE_MM)
+    strip = _compute_hulls(wings) & (distance_transform_edt(body, sampling=sampling) < _BITE_MM)
     support = wings | strip
     for axis, step in enumerate(steps):
         support = np.repeat(support, step, axis=axis)
@@ -167,11 +174,7 @@ def _find_wings(residue: Mask, body: Mask, sampling: Array) -> Mask:
     return wings
 
 
-def _compute_depth(body: Mask, sampling: Array) -> Array:
-    return np.asarray(distance_transform_edt(body, sampling=sampling))
-
-
-def _fill_hulls(wings: Mask) -> Mask:
+def _compute_hulls(wings: Mask) -> Mask:
     """The convex hull of each slice."""
     found = wings.copy()
     for k, plane in enumerate(wings):

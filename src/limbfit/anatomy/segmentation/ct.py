@@ -8,13 +8,13 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import find_objects, grey_dilation
+from scipy.ndimage import find_objects
 from scipy.ndimage import label as connected
 
 from ...arrays import Array, Mask
 from ...errors import ImageError
 from ..grid import Volume
-from ..morphology import Field, close_mask, fill_slices, open_mask
+from ..morphology import Field, close_mask, fill_slices, find_local_maximum, open_mask
 
 Contrast = Literal["auto", "T1", "UTE", "CT"]
 
@@ -89,11 +89,11 @@ def find_dense_bones(hounsfield: Field, limb: Mask, spacing: Array, smallest_mm3
     smallest_mm3 : bones smaller than this are left out.
     """
     compact = np.minimum(hounsfield, _COMPACT_HU)
-    size = 2 * np.ceil(_RIM_MM / spacing[::-1]).astype(int) + 1
-    half = (grey_dilation(compact, size=tuple(size)) + MUSCLE_HU) / 2
+    half = (find_local_maximum(compact, _RIM_MM, spacing) + MUSCLE_HU) / 2
     dense = limb & (compact > _DENSE_HU)
     sharp = dense & (compact > half)
-    parts, _ = connected(sharp | (dense & _find_enclosed(sharp, dense, spacing)))
+    # Cancellous bone is below half of the cortex beside it, which encloses it.
+    parts, _ = connected(sharp | (dense & _fill_bone(sharp, spacing)))
     voxel = float(np.prod(spacing))
     found = []
     for value, box in enumerate(find_objects(parts), start=1):
@@ -105,11 +105,6 @@ def find_dense_bones(hounsfield: Field, limb: Mask, spacing: Array, smallest_mm3
         if bone.sum() * voxel >= smallest_mm3:
             found.append(bone)
     return sorted(found, key=lambda bone: -int(bone.sum()))
-
-
-def _find_enclosed(sharp: Mask, dense: Mask, spacing: Array) -> Mask:
-    """Dense voxels that sharp ones enclose: cancellous bone, which is below half of the cortex beside it."""
-    return _fill_bone(sharp, spacing) & dense
 
 
 def _fill_bone(part: Mask, spacing: Array) -> Mask:

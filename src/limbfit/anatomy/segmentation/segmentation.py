@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,7 +10,7 @@ from scipy.ndimage import binary_fill_holes
 
 from ...arrays import Array, Mask
 from ...errors import ImageError
-from ..frame import ProximalEnd, find_proximal_end
+from ..frame import find_proximal_end
 from ..grid import BONES, DEFAULT_NAMES, FAT, LabelMap, Volume
 from ..morphology import Box, Field, compute_depth, find_box, find_largest_piece
 from .body import estimate_bias_field, estimate_muscle_level, find_limb_axis, find_limb_mask, smooth_image
@@ -64,71 +63,38 @@ def segment(
     return found.turned([order.index(n) for n in range(3)])
 
 
-@dataclass(frozen=True)
-class _Tissues:
-    """What the contrast shows in the limb's box: the limb, its bones, and grey levels."""
-
-    limb: Mask
-    bones: list[Mask]
-    levels: Field
-    ct: bool
-
-    def fat(self, spacing: Array) -> Mask:
-        """Subcutaneous fat."""
-        bone = np.zeros(self.limb.shape, dtype=bool)
-        for mask in self.bones:
-            bone |= mask
-        depth = compute_depth(self.limb, spacing)
-        if self.ct:
-            bright = (self.levels > FAT_HU[0]) & (self.levels < FAT_HU[1])
-        else:
-            bright = find_bright_fat(self.levels, self.limb, bone, depth, spacing)
-        return select_subcutaneous(bright, self.limb, bone, depth, spacing)
-
-
 def _segment(
     volume: Volume, ct: bool, bias_correction: bool, min_bone_volume_mm3: float, seeds: Seeds | None
 ) -> LabelMap:
-    """The same for a volume whose slices lie across the limb."""
+    """As `segment`, for a volume whose slices lie across the limb."""
+    spacing, smallest = volume.spacing, _SEEDED_MM3 if seeds else min_bone_volume_mm3
     visible = rescale_above_air(volume) if ct else volume
     smooth = smooth_image(visible)
-    limb = find_limb_mask(visible, smooth)
+    whole = find_limb_mask(visible, smooth)
     del visible
-    end, box = find_proximal_end(limb, volume, axis=2), find_box(limb, _MARGIN)
-    smallest = _SEEDED_MM3 if seeds else min_bone_volume_mm3
+    end, box = find_proximal_end(whole, volume, axis=2), find_box(whole, _MARGIN)
+    limb = whole[box]
     if ct:
-        found = _find_tissues_in_ct(smooth_image(volume)[box], limb[box], end, volume.spacing, smallest)
+        levels = smooth_image(volume)[box]
+        pieces = find_dense_bones(levels, limb, spacing, smallest)
     else:
         if bias_correction:
-            smooth /= estimate_bias_field(volume, limb)
-        found = _find_tissues_in_mri(smooth[box], limb[box], end, volume.spacing, smallest)
+            smooth /= estimate_bias_field(volume, whole)
+        levels = smooth[box] / np.float32(estimate_muscle_level(smooth[box], limb))
+        pieces = [end.along(p) for p in find_bones(end.along(levels), end.along(limb), spacing, smallest)]
     del smooth
-    if not found.bones:
+    if not pieces:
         raise ImageError(
             "no bone was found in the limb",
             remedy="label the bones by hand and give the label map (segmentation.labels in study.toml)",
         )
-    bones = [_fill_piece(bone) for bone in found.bones]
+    bones = [_fill_piece(piece) for piece in pieces]
     if seeds:
         bones, names = grow_from_seeds(bones, seeds, volume.cropped(box))
     else:
-        names = name_bones([end.along(bone) for bone in bones], volume.spacing)
-    return _build_labels(found.limb, found.fat(volume.spacing), bones, names, volume, box)
-
-
-def _find_tissues_in_mri(
-    smooth: Field, limb: Mask, end: ProximalEnd, spacing: Array, smallest_mm3: float
-) -> _Tissues:
-    levels = smooth / np.float32(estimate_muscle_level(smooth, limb))
-    found = find_bones(end.along(levels), end.along(limb), spacing, smallest_mm3)
-    return _Tissues(limb, [end.along(bone) for bone in found], levels, ct=False)
-
-
-def _find_tissues_in_ct(
-    hounsfield: Field, limb: Mask, end: ProximalEnd, spacing: Array, smallest_mm3: float
-) -> _Tissues:
-    found = find_dense_bones(hounsfield, limb, spacing, smallest_mm3)
-    return _Tissues(limb, found, hounsfield, ct=True)
+        names = name_bones([end.along(bone) for bone in bones], spacing)
+    fat = _find_fat(levels, limb, np.any(pieces, axis=0), ct, spacing)
+    return _build_labels(limb, fat, bones, names, volume, box)
 
 
 def _fill_piece(mask: Mask) -> Mask:
@@ -137,6 +103,16 @@ def _fill_piece(mask: Mask) -> Mask:
     filled = np.zeros_like(mask)
     filled[box] = binary_fill_holes(find_largest_piece(mask[box]))
     return filled
+
+
+def _find_fat(levels: Field, limb: Mask, bone: Mask, ct: bool, spacing: Array) -> Mask:
+    """Subcutaneous fat, by grey levels relative to muscle or, in CT, by Hounsfield units."""
+    depth = compute_depth(limb, spacing)
+    if ct:
+        bright = (levels > FAT_HU[0]) & (levels < FAT_HU[1])
+    else:
+        bright = find_bright_fat(levels, limb, bone, depth, spacing)
+    return select_subcutaneous(bright, limb, bone, depth, spacing)
 
 
 def _build_labels(

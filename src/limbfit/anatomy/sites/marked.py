@@ -10,19 +10,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pyvista as pv
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, grey_dilation
+from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
 from ...arrays import Array, Mask
 from ...errors import ImageError
 from ..grid import Volume
-from ..morphology import Field, dilate_mask, erode_mask, find_box
+from ..morphology import Field, dilate_mask, erode_mask, find_box, find_local_maximum
 from ..segmentation.body import find_limb_mask, smooth_image
 from ..segmentation.ct import is_ct
-from ..surfaces.triangles import Surface, find_bodies, from_pyvista
-from .markers import Bump, cap_faces, find_bumps, find_near_cap
+from ..surfaces.extraction import extract_contour
+from ..surfaces.triangles import Surface
+from .markers import Bump, find_bumps, find_cap_faces, find_near_cap
 
 _RIM_MM = 2.5  # the outline lies this near to the mask's, and at half of the brightest tissue this near
 _SPACING_MM = 3.0  # of the places where patches are fitted
@@ -47,24 +47,20 @@ def extract_marked_skin(volume: Volume) -> tuple[Surface, Mask]:
     smooth = smooth_image(volume)
     limb = find_limb_mask(volume, smooth)
     box = find_box(limb, 2 * np.ceil(_RIM_MM / volume.spacing[::-1]).astype(int) + 2)
-    contour = _extract_contour(smooth[box], limb[box], volume.spacing)
-    skin = Surface(volume.cropped(box).index_to_point(contour.points), contour.faces)
-    return (skin if skin.volume > 0 else skin.flipped), limb
+    contour = _extract_outline(smooth[box], limb[box], volume.spacing)
+    return Surface(volume.cropped(box).index_to_point(contour.points), contour.faces).outward, limb
 
 
-def _extract_contour(smooth: Field, limb: Mask, spacing: Array) -> Surface:
+def _extract_outline(smooth: Field, limb: Mask, spacing: Array) -> Surface:
     """Where the signal falls to half of the tissue beside it, near to a limb's outline, in voxels."""
     core = erode_mask(limb, _RIM_MM, spacing)
-    size = 2 * np.ceil(_RIM_MM / spacing[::-1]).astype(int) + 1
-    half = gaussian_filter(0.5 * grey_dilation(smooth, size=tuple(size)), 1.0)
+    half = gaussian_filter(0.5 * find_local_maximum(smooth, _RIM_MM, spacing), 1.0)
     level = np.clip(smooth / np.maximum(half, 1e-6) - 1, -1, 1)
     level[core] = 1.0
     level[~dilate_mask(limb, _RIM_MM, spacing)] = -1.0
     padded = np.pad(level, 1, constant_values=-1.0)
-    data = pv.ImageData(dimensions=padded.shape[::-1])
-    data.point_data["level"] = padded.ravel()
-    found = from_pyvista(data.contour([0.0], scalars="level", method="flying_edges", compute_normals=False))
-    return find_bodies(Surface(found.points - 1, found.faces))[0]
+    contour = extract_contour(padded, 0.0)
+    return Surface(contour.points - 1, contour.faces)
 
 
 @dataclass(frozen=True)
@@ -106,7 +102,7 @@ def outline_height(skin: Surface) -> Array:
     normals = skin.vertex_normals
     cells = np.floor(skin.points / _SPACING_MM).astype(np.int64)
     places = np.unique(cells, axis=0, return_index=True)[1]
-    cap = find_near_cap(skin, cap_faces(skin), skin.points)
+    cap = find_near_cap(skin, find_cap_faces(skin), skin.points)
     places = places[~cap[places]]
     points = skin.points[places]
     tree = cKDTree(points)

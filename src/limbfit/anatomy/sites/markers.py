@@ -11,12 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ...arrays import Array, Indices, Mask
 from ...errors import SiteError
-from ..surfaces.triangles import Surface, SurfaceSearch, find_half_edges
+from ..surfaces.triangles import Surface, find_half_edges, number_components
 
 CAP_MARGIN_MM = 6.0
 MIN_HEIGHT_MM, MAX_AREA_MM2 = 2.0, 500.0
@@ -67,14 +65,15 @@ def find_markers(
     tuple[Marker, ...]
         Highest first; empty where nothing stands out.
     """
-    base = _Skin(skin_without)
-    height = base.height(skin_with.points)
-    height[base.near_cap(skin_with.points)] = 0.0
+    height = skin_without.search.signed(skin_with.points)[0]
+    cap = find_cap_faces(skin_without)
+    height[find_near_cap(skin_without, cap, skin_with.points)] = 0.0
     areas = _compute_vertex_areas(skin_with)
+    open_skin = Surface(skin_without.points, skin_without.faces[~cap])
     found = []
     for bump in find_bumps(skin_with, height, min_height_mm=min_height_mm, max_area_mm2=max_area_mm2):
         weights = areas[bump.upper] * height[bump.upper]
-        position, direction = base.foot(skin_with.points[bump.upper], weights)
+        position, direction = _find_foot(open_skin, skin_with.points[bump.upper], weights)
         found.append(Marker(position, bump.height, bump.area, direction))
     return tuple(sorted(found, key=lambda marker: -marker.height))
 
@@ -161,36 +160,19 @@ def _describe_spare(names: list[str], pairs: Mapping[int, int], distance: Array,
     return f"more than one marker within {reach:g} mm of {', '.join(doubled)}" if doubled else ""
 
 
-class _Skin:
-    """The skin without markers, asked for heights, closest points and normals; its cap set apart."""
-
-    def __init__(self, surface: Surface) -> None:
-        self.surface = surface
-        self.normals, self.areas = surface.face_normals, surface.face_areas
-        self.centres = surface.triangles.mean(axis=1)
-        self.cap = cap_faces(surface)
-        self.open = SurfaceSearch(surface.points, surface.faces[~self.cap])
-
-    def height(self, points: Array) -> Array:
-        """Signed distance (n,), positive outside."""
-        return self.surface.search.signed(points)[0]
-
-    def near_cap(self, points: Array) -> Mask:
-        """Which points (n,) lie beyond the cap's plane or just under it."""
-        return find_near_cap(self.surface, self.cap, points)
-
-    def foot(self, points: Array, weights: Array) -> tuple[Array, Array]:
-        """Where the weighted centroid of points (n, 3) stands on the skin, and the mean normal around it."""
-        centre = np.average(points, axis=0, weights=weights)[None]
-        (foot,) = self.open.nearest(centre)[2]
-        near = ~self.cap & (np.linalg.norm(self.centres - foot, axis=1) < NORMAL_RADIUS_MM)
-        if not near.any():
-            near = np.arange(len(self.centres)) == np.linalg.norm(self.centres - foot, axis=1).argmin()
-        normal = (self.normals[near] * self.areas[near, None]).sum(axis=0)
-        return foot, normal / np.linalg.norm(normal)
+def _find_foot(skin: Surface, points: Array, weights: Array) -> tuple[Array, Array]:
+    """Where the weighted centroid of points (n, 3) stands on the skin, and the mean normal around it."""
+    centre = np.average(points, axis=0, weights=weights)[None]
+    (foot,) = skin.search.nearest(centre)[2]
+    distance = np.linalg.norm(skin.triangles.mean(axis=1) - foot, axis=1)
+    near = distance < NORMAL_RADIUS_MM
+    if not near.any():
+        near = np.arange(len(distance)) == distance.argmin()
+    normal = (skin.face_normals[near] * skin.face_areas[near, None]).sum(axis=0)
+    return foot, normal / np.linalg.norm(normal)
 
 
-def cap_faces(surface: Surface) -> Mask:
+def find_cap_faces(surface: Surface) -> Mask:
     """Faces of the one plane that holds more than 3 % of a surface: the cut; skin has no such plane."""
     normals, areas, centres = surface.face_normals, surface.face_areas, surface.triangles.mean(axis=1)
     levels = (normals * centres).sum(axis=1)
@@ -222,10 +204,8 @@ def _number_clusters(raised: Mask, faces: Indices) -> Indices:
     """Cluster number (n,) of raised vertices that share edges; -1 elsewhere."""
     edges = find_half_edges(faces)
     edges = edges[raised[edges].all(axis=1)]
-    n = len(raised)
-    graph = coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), shape=(n, n))
-    _, component = connected_components(graph, directed=False)
-    labels = np.full(n, -1, np.int64)
+    component = number_components(edges, len(raised))
+    labels = np.full(len(raised), -1, np.int64)
     if raised.any():
         labels[raised] = np.unique(component[raised], return_inverse=True)[1]
     return labels

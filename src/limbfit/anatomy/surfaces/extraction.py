@@ -12,13 +12,14 @@ import gpytoolbox
 import numpy as np
 import pyvista as pv
 import SimpleITK as sitk  # noqa: N813
+from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes, gaussian_filter
 
 from ...arrays import Indices, Mask
 from ...errors import LabelError
 from ..grid import Grid, LabelMap, Volume
 from ..morphology import Field, compute_distance, find_box, find_largest_piece
-from .triangles import Surface, find_bodies, find_half_edges, find_self_intersections, from_pyvista
+from .triangles import Surface, find_bodies, find_half_edges, from_pyvista
 
 _SIGMA_VOXELS = 0.7
 # Passes and pass band of Taubin's filter, which takes out terraces wider than the Gaussian; skin has no
@@ -26,7 +27,7 @@ _SIGMA_VOXELS = 0.7
 _TAUBIN_SKIN, _TAUBIN_BONE = (80, 0.008), (40, 0.03)
 _MARGIN_MM = 4.0
 _REMESH_PASSES = 8
-_MOST_RELAXED = 20
+_MAX_RELAXATIONS = 20
 
 
 def extract_surface(labels: LabelMap, which: str | None, edge_mm: float = 3.0) -> Surface:
@@ -57,8 +58,11 @@ def extract_fine_surface(labels: LabelMap, which: str | None, edge_mm: float) ->
     mask = labels.limb if which is None else labels.mask(which)
     body, crop = _select_body(mask, labels, which or "limb")
     field, level = smooth_field(body, crop, edge_mm)
-    fine = _smooth(_extract_isosurface(field, level), *(_TAUBIN_SKIN if which is None else _TAUBIN_BONE))
-    return keep_volume(fine, float(body.sum()) * crop.voxel_mm3)
+    contour = extract_contour(field.array, level)
+    rough = Surface(field.index_to_point(contour.points), contour.faces).outward
+    passes, band = _TAUBIN_SKIN if which is None else _TAUBIN_BONE  # windowed sinc (Taubin 1995)
+    smooth = rough.to_pyvista().smooth_taubin(n_iter=passes, pass_band=band, normalize_coordinates=True)
+    return keep_volume(from_pyvista(smooth), float(body.sum()) * crop.voxel_mm3)
 
 
 def _select_body(mask: Mask, grid: Grid, name: str) -> tuple[Mask, Grid]:
@@ -114,21 +118,12 @@ def _resample_cubic(field: Volume, edge_mm: float) -> Volume:
     return Volume.from_sitk(resampled)
 
 
-def _extract_isosurface(field: Volume, level: float) -> Surface:
-    """The isosurface in LPS mm, outward; its largest body."""
-    image = pv.ImageData(dimensions=field.size)
-    image.point_data["distance"] = field.array.ravel()
-    found = from_pyvista(
-        image.contour([level], scalars="distance", method="flying_edges", compute_normals=False)
-    )
-    surface = find_bodies(Surface(field.index_to_point(found.points), found.faces))[0]
-    return surface if surface.volume > 0 else surface.flipped
-
-
-def _smooth(surface: Surface, passes: int, band: float) -> Surface:
-    """Without short waves (Taubin 1995: windowed sinc)."""
-    poly = surface.to_pyvista().smooth_taubin(n_iter=passes, pass_band=band, normalize_coordinates=True)
-    return from_pyvista(poly)
+def extract_contour(values: NDArray[np.floating], level: float) -> Surface:
+    """Largest body of the surface on which values ``[k, j, i]`` have a level, in indices (i, j, k)."""
+    image = pv.ImageData(dimensions=values.shape[::-1])
+    image.point_data["values"] = values.ravel()
+    contour = image.contour([level], scalars="values", method="flying_edges", compute_normals=False)
+    return find_bodies(from_pyvista(contour))[0]
 
 
 def remesh(
@@ -156,8 +151,8 @@ def untangle_surface(surface: Surface, share: float = 0.5) -> Surface:
     What still crosses after that is left to the check of the anatomy.
     """
     edges = find_half_edges(surface.faces)
-    for _ in range(_MOST_RELAXED):
-        crossing = find_self_intersections(surface)
+    for _ in range(_MAX_RELAXATIONS):
+        crossing = surface.self_intersections
         if not len(crossing):
             break
         moved = np.unique(surface.faces[np.unique(crossing)])

@@ -17,14 +17,20 @@ import igl
 import manifold3d
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from ...arrays import Array, Indices
 from ...errors import SurfaceError
 from .extraction import untangle_surface
 from .surfaces import Anatomy, check_anatomy
-from .triangles import Surface, find_bodies, find_half_edges, find_self_intersections, from_pyvista
+from .triangles import (
+    Surface,
+    find_bodies,
+    find_half_edges,
+    find_open_edges,
+    from_pyvista,
+    has_turned_faces,
+    number_components,
+)
 
 SMALL_MM = 10.0  # a hole that is no wider is filled
 FEW_EDGES, FEW_SHARE = 6, 0.02  # so is one of few edges that is a small share of the surface
@@ -175,8 +181,7 @@ def find_flat_ends(surface: Surface) -> list[tuple[Array, Array]]:
     same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
     one, other = order[:-1][same] % len(areas), order[1:][same] % len(areas)
     level = np.einsum("ij,ij->i", normals[one], normals[other]) > np.cos(LEVEL_RAD)
-    graph = coo_array((level[level], (one[level], other[level])), shape=(len(areas), len(areas)))
-    patch = connected_components(graph, directed=False)[1]
+    patch = number_components(np.column_stack([one[level], other[level]]), len(areas))
     ends = []
     for which in np.flatnonzero(np.bincount(patch, areas) > END_SHARE * surface.area):
         weights = areas * (patch == which)
@@ -200,21 +205,15 @@ def orient_outward(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...
 
 def orient_faces(surface: Surface) -> Surface:
     """The surface with all faces on one side, whichever; itself where they are, or where none is possible."""
-    if not _has_turned(surface.faces):
+    if not has_turned_faces(surface.faces):
         return surface
     faces, patches = igl.bfs_orient(surface.faces)
-    return surface if patches.max() > 0 or _has_turned(faces) else Surface(surface.points, faces)
+    return surface if patches.max() > 0 or has_turned_faces(faces) else Surface(surface.points, faces)
 
 
 def count_turned(before: Surface, after: Surface) -> int:
     """How many faces look the other way."""
     return int((np.einsum("ij,ij->i", before.face_normals, after.face_normals) < 0.0).sum())
-
-
-def _has_turned(faces: Indices) -> bool:
-    """True where two faces run along an edge in the same direction."""
-    edges = find_half_edges(faces)
-    return len(np.unique(edges, axis=0)) < len(edges)
 
 
 def _place(point: Array) -> str:
@@ -225,7 +224,7 @@ def _remove_loose_pieces(surface: Surface, name: str) -> tuple[Surface, tuple[st
     """Without small open pieces beside the largest body; a small closed one may be meant and stays."""
     main, *others = find_bodies(surface)
     few = LOOSE_SHARE * len(surface.faces)
-    loose = [part for part in others if len(part.faces) < few and len(open_edges(part))]
+    loose = [part for part in others if len(part.faces) < few and len(find_open_edges(part.faces))]
     if not loose:
         return surface, ()
     kept = [main, *(part for part in others if not any(part is piece for piece in loose))]
@@ -236,17 +235,10 @@ def _remove_loose_pieces(surface: Surface, name: str) -> tuple[Surface, tuple[st
     return Surface(np.concatenate([part.points for part in kept]), faces), (note,)
 
 
-def open_edges(surface: Surface) -> Indices:
-    """(k, 2) directed edges of the faces that no other face shares."""
-    edges = find_half_edges(surface.faces)
-    _, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    return edges[counts[inverse.ravel()] == 1]
-
-
 def open_loops(surface: Surface) -> list[Indices]:
     """Points of each loop in the order of its faces' edges; loops that touch in a point are taken apart."""
     following: dict[int, list[int]] = {}
-    for start, end in open_edges(surface).tolist():
+    for start, end in find_open_edges(surface.faces).tolist():
         following.setdefault(start, []).append(end)
     loops = []
     while following:
@@ -333,13 +325,13 @@ def _triangulate_polygon(polygon: Array, normal: Array) -> Indices | None:
 
 def _smooth_crossings(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
     """A few crossing faces smoothed apart; a surface that crosses itself more is left as it is."""
-    crossing = find_self_intersections(surface)
+    crossing = surface.self_intersections
     if not 0 < len(crossing) <= MOST_CROSSING:
         return surface, ()
     for share in (GENTLE, FIRM):
         smooth = untangle_surface(surface, share)
         moved = np.linalg.norm(smooth.points - surface.points, axis=1).max()
-        if moved <= MOST_SMOOTHED_MM and not len(find_self_intersections(smooth)):
+        if moved <= MOST_SMOOTHED_MM and not len(smooth.self_intersections):
             break
     else:
         return surface, ()

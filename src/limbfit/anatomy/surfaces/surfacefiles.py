@@ -15,11 +15,13 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 
 from ...errors import SurfaceError
 from ...mesh import silence_vtk
-from ..bounds import check_items
 from .triangles import Surface, from_pyvista, remove_unused_points
 
 SUFFIXES = (".stl", ".ply", ".vtp", ".obj")
 UNITS_MM: Mapping[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
+MAX_ITEMS = 50_000_000  # points or faces of a surface
+_BLOCK = 1 << 20
+_STATED = re.compile(rb"""NumberOf(?:Points|Polys|Strips|Lines|Verts|Tuples)\s*=\s*["'](\d+)["']""")
 _HEAD = 4096  # bytes in which a file may state its space
 
 
@@ -83,7 +85,7 @@ def _check_suffix(path: Path) -> None:
 
 def _read_poly(path: Path) -> pv.PolyData:
     if path.suffix.lower() == ".vtp":
-        check_items(path)
+        _check_stated_counts(path)
     try:
         with silence_vtk(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -98,6 +100,21 @@ def _read_poly(path: Path) -> pv.PolyData:
     if len(corners) and not 0 <= corners.min() <= corners.max() < poly.n_points:  # VTK would take any memory
         raise SurfaceError("faces of points that are not there", file=path, remedy="export the surface again")
     return poly
+
+
+def _check_stated_counts(path: Path) -> None:
+    """Refuse a VTK XML file that states more than `MAX_ITEMS` points, faces or values of an array."""
+    rest = b""
+    with path.open("rb") as stream:
+        while block := stream.read(_BLOCK):
+            text = rest + block
+            if any(int(match[1][:20]) > MAX_ITEMS for match in _STATED.finditer(text)):
+                raise SurfaceError(
+                    f"it states more than {MAX_ITEMS:.0e} points or faces",
+                    file=path,
+                    remedy="export the surface again, with fewer triangles",
+                )
+            rest = text[-64:]
 
 
 def _read_ply(path: Path) -> pv.PolyData:

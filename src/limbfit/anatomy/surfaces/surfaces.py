@@ -26,7 +26,6 @@ from .triangles import (
     check_closed,
     find_bodies,
     find_half_edges,
-    find_self_intersections,
     from_pyvista,
 )
 
@@ -38,7 +37,6 @@ __all__ = [
     "check_closed",
     "extract_surface",
     "find_bodies",
-    "find_self_intersections",
     "load_anatomy",
     "read_surface",
     "save_anatomy",
@@ -119,22 +117,17 @@ def build_anatomy(
     built = _build_anatomy(
         labels.in_own_frame(), end, edge_mm, own_point, own_normal / np.linalg.norm(own_normal)
     )
-    bones, regions = (
-        {name: _to_patient_space(body, labels) for name, body in bodies.items()}
-        for bodies in (built.bones, built.regions)
-    )
+
+    def to_patient(body: Surface) -> Surface:
+        return Surface(body.points @ labels.direction.T + labels.origin, body.faces)
+
     return Anatomy(
-        _to_patient_space(built.skin, labels),
-        bones,
+        to_patient(built.skin),
+        {name: to_patient(bone) for name, bone in built.bones.items()},
         labels.direction @ built.cut_point + labels.origin,
         labels.direction @ built.cut_normal,
-        regions,
+        {name: to_patient(region) for name, region in built.regions.items()},
     )
-
-
-def _to_patient_space(surface: Surface, grid: LabelMap) -> Surface:
-    """A surface in the own frame of a right-handed grid, in patient space."""
-    return Surface(surface.points @ grid.direction.T + grid.origin, surface.faces)
 
 
 def _build_anatomy(
@@ -144,7 +137,8 @@ def _build_anatomy(
     distal = labels.heights(point, normal) < 0
     _check_sides(labels.limb & distal, end)
     skin = cut_and_cap(extract_fine_surface(extended, None, edge_mm), point, normal, edge_mm)
-    reach = _select_distal(extended, point + _STICK_OUT_MM * normal, normal)
+    beyond = extended.heights(point + _STICK_OUT_MM * normal, normal) > 0
+    reach = extended.with_array(np.where(beyond, 0, extended.array))
     bones = {}
     for name in labels.bone_names:
         if (labels.mask(name) & distal).sum() * labels.voxel_mm3 >= _STUMP_MM3:
@@ -199,11 +193,6 @@ def _check_sides(limb: Mask, end: ProximalEnd) -> None:
                     "the limb runs out of the side of the image",
                     remedy="take an image that holds the whole limb, or move the proximal cut",
                 )
-
-
-def _select_distal(labels: LabelMap, point: Array, normal: Array) -> LabelMap:
-    """Only what lies distal of a plane."""
-    return labels.with_array(np.where(labels.heights(point, normal) <= 0, labels.array, 0))
 
 
 def cut_and_cap(surface: Surface, point: Array, normal: Array, edge_mm: float) -> Surface:
@@ -321,11 +310,10 @@ def save_anatomy(folder: str | Path, anatomy: Anatomy, notes: Sequence[str] = ()
     """Write skin.stl, bone-<name>.stl, region-<name>.stl and surfaces.json (cut, volumes, areas, notes)."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    write_surface(folder / "skin.stl", anatomy.skin)
-    for name, bone in anatomy.bones.items():
-        write_surface(folder / f"bone-{name}.stl", bone)
-    for name, region in anatomy.regions.items():
-        write_surface(folder / f"region-{name}.stl", region)
+    bones = {f"bone-{name}": bone for name, bone in anatomy.bones.items()}
+    regions = {f"region-{name}": region for name, region in anatomy.regions.items()}
+    for name, surface in {"skin": anatomy.skin, **bones, **regions}.items():
+        write_surface(folder / f"{name}.stl", surface)
     summary = {
         "coordinates": "LPS",
         "unit": "mm",
@@ -352,13 +340,16 @@ def load_anatomy(folder: str | Path) -> Anatomy:
     folder = Path(folder)
     try:
         summary = json.loads((folder / "surfaces.json").read_text(encoding="utf-8"))
-        names, inner = list(summary["bones"]), list(summary["regions"])
+        bones, regions = list(summary["bones"]), list(summary["regions"])
         point, normal = summary["cut_point"], summary["cut_normal"]
     except (OSError, ValueError, KeyError, TypeError):
         raise SurfaceError(
             "surfaces.json is missing or unreadable", file=folder, remedy="run the surfaces stage again"
         ) from None
-    skin = read_surface(folder / "skin.stl")
-    bones = {name: read_surface(folder / f"bone-{name}.stl") for name in names}
-    regions = {name: read_surface(folder / f"region-{name}.stl") for name in inner}
-    return Anatomy(skin, bones, point, normal, regions)
+    return Anatomy(
+        read_surface(folder / "skin.stl"),
+        {name: read_surface(folder / f"bone-{name}.stl") for name in bones},
+        point,
+        normal,
+        {name: read_surface(folder / f"region-{name}.stl") for name in regions},
+    )

@@ -51,8 +51,8 @@ class Surface:
         return SurfaceSearch(self.points, self.faces)
 
     @cached_property
-    def crossings(self) -> Indices:
-        """(p, 2) pairs of faces that cross; see :func:`find_self_intersections`."""
+    def self_intersections(self) -> Indices:
+        """(p, 2) pairs of faces without a common point of which an edge of one pierces the other."""
         return _find_crossings(self)
 
     @property
@@ -102,6 +102,11 @@ class Surface:
         """The same surface seen from the other side."""
         return replace(self, faces=self.faces[:, ::-1])
 
+    @property
+    def outward(self) -> Surface:
+        """The same closed surface with its faces looking outward."""
+        return self if self.volume > 0.0 else self.flipped
+
     def to_pyvista(self) -> pv.PolyData:
         faces: Any = self.faces  # pyvista's stubs know no int64
         return pv.PolyData.from_regular_faces(self.points, faces)
@@ -122,22 +127,35 @@ def remove_unused_points(surface: Surface) -> Surface:
 
 def find_bodies(surface: Surface) -> list[Surface]:
     """The connected bodies of a surface, the one with most faces first."""
-    labels = _number_bodies(surface)[surface.faces[:, 0]]
+    pieces = number_components(find_half_edges(surface.faces), len(surface.points))
+    labels = pieces[surface.faces[:, 0]]
     values, counts = np.unique(labels, return_counts=True)
     order = values[np.argsort(-counts)]
     return [remove_unused_points(replace(surface, faces=surface.faces[labels == value])) for value in order]
 
 
-def _number_bodies(surface: Surface) -> Indices:
-    edges = find_half_edges(surface.faces)
-    n = len(surface.points)
-    graph = coo_array((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(n, n))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
-
-
 def find_half_edges(faces: Indices) -> Indices:
     """(3 m, 2) directed edges of the faces."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def find_open_edges(faces: Indices) -> Indices:
+    """(k, 2) directed edges of the faces (m, 3) that no other face shares."""
+    edges = find_half_edges(faces)
+    _, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return edges[counts[inverse.ravel()] == 1]
+
+
+def has_turned_faces(faces: Indices) -> bool:
+    """True if two faces (m, 3) run along an edge in the same direction."""
+    edges = find_half_edges(faces)
+    return len(np.unique(edges, axis=0)) < len(edges)
+
+
+def number_components(edges: Indices, count: int) -> Indices:
+    """The number (count,) of the connected piece that each of the nodes belongs to, by the edges (k, 2)."""
+    graph = coo_array((np.ones(len(edges), dtype=np.int8), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 def check_closed(
@@ -165,7 +183,14 @@ def check_closed(
     if smallest_mm is None:
         smallest_mm = _SMALLEST_MM.get(name, _SMALLEST_OTHER_MM) if file or name == "skin" else 0.0
     _check_size(surface, name, file, smallest_mm)
-    _check_edges(surface, name, file)
+    open_edges = len(find_open_edges(surface.faces))
+    if open_edges:
+        raise SurfaceError(
+            f"{name}: the surface is open, {open_edges} edges have a face on one side only",
+            file=file,
+            remedy="close its holes",
+        )
+    check_sides(surface, name, file)
     parts = len(find_bodies(surface))
     if parts > 1:
         raise SurfaceError(
@@ -179,7 +204,7 @@ def check_closed(
             file=file,
             remedy="flip the normals so that they point outward",
         )
-    crossing = find_self_intersections(surface)
+    crossing = surface.self_intersections
     if len(crossing):
         place = ", ".join(f"{x:.1f}" for x in surface.triangles[crossing[0, 0]].mean(axis=0))
         raise SurfaceError(
@@ -202,19 +227,6 @@ def _check_size(surface: Surface, name: str, file: str | Path | None, smallest: 
         )
 
 
-def _check_edges(surface: Surface, name: str, file: str | Path | None) -> None:
-    edges = find_half_edges(surface.faces)
-    counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1]
-    open_edges = int((counts == 1).sum())
-    if open_edges:
-        raise SurfaceError(
-            f"{name}: the surface is open, {open_edges} edges have a face on one side only",
-            file=file,
-            remedy="close its holes",
-        )
-    check_sides(surface, name, file)
-
-
 def check_sides(surface: Surface, name: str, file: str | Path | None = None) -> None:
     """Refuse a surface, open or closed, whose triangles do not agree on a side.
 
@@ -231,17 +243,12 @@ def check_sides(surface: Surface, name: str, file: str | Path | None = None) -> 
             file=file,
             remedy="remove inner walls and doubled faces",
         )
-    if len(np.unique(edges, axis=0)) < len(edges):
+    if has_turned_faces(surface.faces):
         raise SurfaceError(
             f"{name}: neighbouring faces are oriented against each other",
             file=file,
             remedy="orient the normals consistently outward",
         )
-
-
-def find_self_intersections(surface: Surface) -> Indices:
-    """(p, 2) pairs of faces without a common point of which an edge of one pierces the other."""
-    return surface.crossings
 
 
 def _find_crossings(surface: Surface) -> Indices:

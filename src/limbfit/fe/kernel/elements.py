@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from ...mesh.cells import (
     QUAD_CORNERS,
     ShapeFunctions,
-    linear_hexahedron,
-    linear_quadrilateral,
     linear_simplex,
+    linear_tensor,
     quadratic_simplex,
 )
 
@@ -106,7 +105,7 @@ ELEMENTS: dict[str, Element] = {
         Element("tet10v", "tet10", quadratic_simplex, *_TET_8_VERTICES, False, quadratic_simplex, _TRI6),
         Element("tet10p0", "tet10", quadratic_simplex, *_TET_4, True, quadratic_simplex, _TRI6),
         Element("tet10g8p0", "tet10", quadratic_simplex, *_TET_8, True, quadratic_simplex, _TRI6),
-        Element("hex8", "hex8", linear_hexahedron, *_HEX, True, linear_quadrilateral, _QUAD4),
+        Element("hex8", "hex8", linear_tensor, *_HEX, True, linear_tensor, _QUAD4),
     )
 }
 
