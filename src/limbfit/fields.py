@@ -12,8 +12,8 @@ import numpy as np
 
 from .arrays import Array
 from .fe import Problem, State, Step, System
-from .fe.history import Memory
 from .fe.kernel.laws import Laws
+from .fe.memory import Memory
 from .fe.observables import (
     average_at_nodes,
     compute_contact_pressure,

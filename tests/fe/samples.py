@@ -7,8 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from limbfit.fe import Material, MooneyRivlin, NeoHookean, Ogden, OgdenPower, OgdenQLV
-from limbfit.fe.kernel.kinematics import invert, principal_axes
-from limbfit.fe.kernel.response import respond, stress_rates
+from limbfit.fe.kernel.response import evaluate_law, invert, principal_axes, stress_rates
 from limbfit.fe.lanes import LANES, workspace
 
 SIX = ((0.004, 4.8), (0.003, -4.8), (-0.001, 2.5), (0.002, -1.7), (0.0005, 9.0), (0.0015, 0.7))
@@ -85,7 +84,7 @@ def quotients(material: Material, c2: NDArray) -> NDArray:
 def _respond(points, law, numbers, rates):
     invert(points[0])
     principal_axes(points[0])
-    respond(points[0], law[0], numbers)
+    evaluate_law(points[0], law[0], numbers)
     stress_rates(points[0], law[0], numbers, rates)
 
 

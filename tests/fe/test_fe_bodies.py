@@ -25,10 +25,10 @@ from limbfit.fe import (
     solve,
 )
 from limbfit.fe.contact.friction import Coulomb
-from limbfit.fe.contact.pose import Pose
+from limbfit.fe.contact.tool import Pose
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.motion import Drives
-from limbfit.fe.solution.products import multiply_symmetric
+from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.system import Increment
 
 TOOL = Indenter("square", 20.0, 3.0, centre=(0.3, -0.4, 2.0), axis=(0.1, 0.05, -1.0))

@@ -11,7 +11,7 @@ from blocks import MUSCLE, SKIN, block, drive, punch
 from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, OgdenQLV, Problem, StepControl, System, solve
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.solution.products import multiply_symmetric
+from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.system import Increment
 from limbfit.mesh import Mesh
 

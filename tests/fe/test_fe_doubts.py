@@ -9,7 +9,7 @@ import pytest
 from blocks import punch
 
 from limbfit.fe import Problem, Result, StepControl, solve
-from limbfit.fe.doubts import find_inverted_elements
+from limbfit.fe.diagnostics import find_inverted_elements
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.observables import compute_contact_pressure
 from limbfit.fe.system import Increment

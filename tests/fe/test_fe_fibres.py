@@ -12,8 +12,8 @@ from scipy.optimize import fsolve
 from limbfit import History, OgdenQLV, Problem
 from limbfit.errors import ProblemError
 from limbfit.fe import Fibred, StepControl, Support, System, solve
-from limbfit.fe.history import compute_elastic_stresses
 from limbfit.fe.kernel.laws import Laws
+from limbfit.fe.memory import compute_elastic_stresses
 from limbfit.fe.observables import compute_element_fields
 from limbfit.fe.system import Increment
 

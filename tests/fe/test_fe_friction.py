@@ -23,7 +23,7 @@ from limbfit.fe import (
 from limbfit.fe.contact.friction import Coulomb
 from limbfit.fe.contact.tool import Tool
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.solution.products import multiply_symmetric
+from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.solution.simulation import SteppedRun
 from limbfit.fe.system import Increment
 

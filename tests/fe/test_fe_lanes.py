@@ -9,10 +9,10 @@ from numba import njit
 from samples import SAMPLES, energy, kirchhoff, point, quotients, slopes
 
 from limbfit.fe import ELEMENTS, History, Problem, System
-from limbfit.fe.history import compute_elastic_stresses
 from limbfit.fe.kernel.assembly import assemble
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.lanes import LANES, block_places, exponential, logarithm
+from limbfit.fe.memory import compute_elastic_stresses
 
 
 @njit(error_model="numpy", fastmath={"contract"})

@@ -11,17 +11,17 @@ from blocks import drive, punch
 
 from limbfit.bench.blocks import build_punched_block
 from limbfit.fe import StepControl, Support, System, solve
-from limbfit.fe.history import Memory
 from limbfit.fe.kernel.laws import Laws
+from limbfit.fe.memory import Memory
 from limbfit.fe.solution.factor import Factor
 from limbfit.fe.solution.linear import (
     SOLVERS,
     WITHOUT_PARDISO,
     NotPositiveDefiniteError,
     build_linear_solver,
+    multiply_symmetric,
 )
 from limbfit.fe.solution.multigrid import Multigrid
-from limbfit.fe.solution.products import multiply_symmetric
 from limbfit.fe.solution.simulation import SteppedRun
 from limbfit.fe.solution.springs import find_touched_unknowns
 

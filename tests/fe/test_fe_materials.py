@@ -24,7 +24,7 @@ from limbfit.fe import (
 )
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.materials import compute_prony_factors
-from limbfit.fe.materials.volumetric import volumetric
+from limbfit.fe.materials.elastic import volumetric
 from limbfit.fe.observables import compute_element_fields
 from limbfit.fe.system import Increment
 

@@ -26,7 +26,7 @@ from limbfit.fe import (
 )
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.pressure import Pressed
-from limbfit.fe.solution.products import multiply_symmetric
+from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.system import Increment
 from limbfit.mesh import Mesh
 

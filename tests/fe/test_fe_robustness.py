@@ -15,8 +15,8 @@ from blocks import SKIN, block, punch
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, OgdenQLV, Problem, Result, StepControl, Support, solve
-from limbfit.fe.doubts import find_slip
-from limbfit.fe.solution.pace import StepController
+from limbfit.fe.diagnostics import find_slip
+from limbfit.fe.solution.control import StepController
 from limbfit.study import MaterialTable
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"

@@ -10,9 +10,9 @@ from blocks import MUSCLE, SKIN, block, drive, punch, slope_and_difference, symm
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, NeoHookean, Problem, StepControl, System, iterate, solve
-from limbfit.fe.contact.sticky import Anchors
+from limbfit.fe.contact.friction import Anchors
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.solution.products import multiply_symmetric
+from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.system import Increment
 
 

@@ -9,7 +9,7 @@ from blocks import punch
 from limbfit.bench.layer import compute_curve_error, solve_layer, solve_reference_layer
 from limbfit.fe import History, StepControl, solve
 from limbfit.fe.materials import compute_prony_factors
-from limbfit.fe.solution.schedule import grade_steps, predict_remaining_times
+from limbfit.fe.solution.control import grade_steps, predict_remaining_times
 from limbfit.phantom.forces import DISCRETISATIONS
 from limbfit.study import SolverTable
 

@@ -10,7 +10,7 @@ import pytest
 from limbfit.bench.blocks import HEX, SIX_TETS, build_boxes, turn_upright
 from limbfit.errors import ProblemError
 from limbfit.indentation import build_fibre_field, cut_neighbourhood
-from limbfit.indentation.fibres import compute_flow_directions
+from limbfit.indentation.cell_fields import compute_flow_directions
 from limbfit.mesh import Mesh
 
 

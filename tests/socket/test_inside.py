@@ -8,8 +8,8 @@ import pytest
 from limbfit import History, Mesh, Problem
 from limbfit.donning import SHEAR_LEVELS, Strains
 from limbfit.fe import NeoHookean, State, System
-from limbfit.fe.history import Memory
 from limbfit.fe.kernel.laws import Laws
+from limbfit.fe.memory import Memory
 
 CORNERS = np.array([[i, j, k] for k in (0.0, 1.0) for j in (0.0, 1.0) for i in (0.0, 1.0)])
 CELLS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])

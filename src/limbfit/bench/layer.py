@@ -15,11 +15,10 @@ import numpy as np
 
 from ..arrays import Array
 from ..fe import History, StepControl
-from ..fe.history import Memory
-from ..fe.interpolation import interpolate
+from ..fe.memory import Memory
 from ..fe.motion import Drives
-from ..fe.solution.control import schedule_steps
-from ..fe.solution.schedule import predict_remaining_times
+from ..fe.result import interpolate
+from ..fe.solution.control import predict_remaining_times, schedule_steps
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,23 @@
 Or the other way round: under a stated pressure, whose shape is a socket's.
 """
 
-from .inside import RARE, SHEAR_LEVELS, Strains, TissueStrain
 from .model import Load, SocketFit, build_socket_problem, build_socket_steps
-from .outcome import SETTLING, WHOLE, Donned, DonnedPart, Held, Patch, SocketStep, don
-from .parts import pack, unpack
+from .outcome import (
+    RARE,
+    SETTLING,
+    SHEAR_LEVELS,
+    WHOLE,
+    Donned,
+    DonnedPart,
+    Held,
+    Patch,
+    SocketStep,
+    Strains,
+    TissueStrain,
+    don,
+    pack,
+    unpack,
+)
 from .pressing import build_pressed_problem, extract_outer_surface, press
 
 __all__ = [

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +24,89 @@ from ..fe import (
     solve,
 )
 from ..fe.kernel.laws import Laws
-from .inside import Strains
+from ..fe.observables import compute_element_fields
 from .model import SocketFit, build_socket_steps
 
 Mask = NDArray[np.bool_]
+
+SHEAR_LEVELS = (0.25, 0.5, 0.75)  # of which the sheared volume is told
+RARE = 0.01  # of a tissue's volume: strained by more than the strain that is told beside the largest
+
+
+@dataclass(frozen=True)
+class Strains:
+    """Strains of a state's cells (m,), from their volume-averaged principal stretches l1 >= l2 >= l3.
+
+    Parameters
+    ----------
+    shear : largest shear, (l1^2 - l3^2) / 4: half the difference of principal Green-Lagrange strains.
+    compression : of the most compressed direction, (1 - l3^2) / 2: its Green-Lagrange strain, positive.
+    energy_kPa : long-term elastic energy over the volume at rest.
+    volume_mm3 : at rest.
+    """
+
+    shear: Array
+    compression: Array
+    energy_kPa: Array
+    volume_mm3: Array
+
+    @classmethod
+    def of(cls, system: System, laws: Laws, state: State) -> Self:
+        """Of a state that kept its memory."""
+        fields = compute_element_fields(system, laws, state)
+        most, least = fields.stretches[:, 0] ** 2, fields.stretches[:, 2] ** 2
+        volume = system.weights.sum(axis=1)
+        return cls((most - least) / 4.0, (1.0 - least) / 2.0, 1e3 * fields.energy, volume)
+
+    @property
+    def fields(self) -> dict[str, Array]:
+        """As cell data of a file, by name and unit."""
+        return {
+            "shear_strain": self.shear,
+            "compressive_strain": self.compression,
+            "energy_density_kPa": self.energy_kPa,
+        }
+
+    def within(self, cells: Mask) -> TissueStrain:
+        """What is told of the chosen cells (m,)."""
+        volume, shear, compression = self.volume_mm3[cells], self.shear[cells], self.compression[cells]
+        return TissueStrain(
+            volume_mm3=float(volume.sum()),
+            shear=float(shear.max()),
+            shear_rare=_compute_exceeded(shear, volume),
+            compression=float(compression.max()),
+            compression_rare=_compute_exceeded(compression, volume),
+            energy_kPa=float(self.energy_kPa[cells].max()),
+            sheared_mm3={f"{level:g}": float(volume[shear > level].sum()) for level in SHEAR_LEVELS},
+            cell=int(np.flatnonzero(cells)[np.argmax(shear)]),
+        )
+
+
+@dataclass(frozen=True)
+class TissueStrain:
+    """Strain of a tissue: the largest of one cell, and ``_rare`` what 1 % of the volume exceeds.
+
+    ``sheared_mm3``: volume at rest that is sheared by more than each of ``SHEAR_LEVELS``; ``cell``: that of
+    the largest shear. The largest values grow as cells get smaller.
+    """
+
+    volume_mm3: float
+    shear: float
+    shear_rare: float
+    compression: float
+    compression_rare: float
+    energy_kPa: float
+    sheared_mm3: Mapping[str, float]
+    cell: int
+
+
+def _compute_exceeded(values: Array, volume: Array) -> float:
+    """The value that ``RARE`` of the volume exceeds."""
+    order = np.argsort(values)[::-1]
+    above = np.cumsum(volume[order])
+    return float(values[order][np.searchsorted(above, RARE * above[-1])])
+
+
 WHOLE, SETTLING = "the limb", "settling"
 LITTLE = 1e-4  # of a parameter: how far it is moved where pressures are differentiated
 
@@ -151,7 +231,7 @@ def don(
 
     def note(step: Step) -> None:
         found = compute_tractions(system, laws, step.state)
-        rows.append(_to_row(step, found, patches))
+        rows.append(_build_row(step, found, patches))
         for name, _, off in fit.ends:
             if np.isclose(step.time, off):
                 pressure, shear = found.at_nodes(len(problem.mesh.points))
@@ -175,7 +255,7 @@ def don(
     return Donned(result, told, held)
 
 
-def _to_row(step: Step, found: Tractions, patches: Mapping[str, Mask]) -> SocketStep:
+def _build_row(step: Step, found: Tractions, patches: Mapping[str, Mask]) -> SocketStep:
     values = {name: Patch.of(found, mask) for name, mask in patches.items()}
     return SocketStep(
         time=step.time,
@@ -219,3 +299,41 @@ def _compute_slopes(
 
 def _compute_mean(found: Tractions, areas: Array, chosen: Mask) -> float:
     return float(areas[chosen] @ found.face_pressure_kPa[chosen] / areas[chosen].sum())
+
+
+Facts = dict[str, Any]
+
+SOLVER = "solver."  # its arrays begin with it
+FIELDS = ("pressure", "shear", "displacement")
+STRAINS = ("shear", "compression", "energy_kPa", "volume_mm3")
+
+
+def pack(part: DonnedPart) -> tuple[Facts, dict[str, Array]]:
+    """As facts that JSON can hold, and arrays by name."""
+    arrays = {f"{SOLVER}{name}": array for name, array in part.snapshot.arrays.items()}
+    held: Facts = {}
+    for i, (name, one) in enumerate(part.held.items()):
+        arrays |= {f"{i}.{field}": getattr(one, field) for field in FIELDS}
+        arrays |= {f"{i}.strains.{field}": getattr(one.strains, field) for field in STRAINS}
+        arrays |= {f"{i}.slopes.{patch}": slopes for patch, slopes in one.slopes.items()}
+        held[name] = {"row": asdict(one.row), "slopes": list(one.slopes)}
+    rows = [asdict(row) for row in part.rows]
+    return {"solver": dict(part.snapshot.facts), "rows": rows, "held": held}, arrays
+
+
+def unpack(facts: Facts, arrays: Mapping[str, Array]) -> DonnedPart:
+    """From what `pack` gave."""
+    own = {name.removeprefix(SOLVER): array for name, array in arrays.items() if name.startswith(SOLVER)}
+    held = {}
+    for i, (name, one) in enumerate(facts["held"].items()):
+        slopes = {patch: arrays[f"{i}.slopes.{patch}"] for patch in one["slopes"]}
+        strains = Strains(**{field: arrays[f"{i}.strains.{field}"] for field in STRAINS})
+        fields = {field: arrays[f"{i}.{field}"] for field in FIELDS}
+        held[name] = Held(row=_to_row(one["row"]), strains=strains, slopes=slopes, **fields)
+    return DonnedPart(Snapshot(facts["solver"], own), tuple(map(_to_row, facts["rows"])), held)
+
+
+def _to_row(told: Facts) -> SocketStep:
+    vectors = {name: np.array(told[name]) for name in ("force", "moment", "move", "turn")}
+    regions = {name: Patch(**patch) for name, patch in told["regions"].items()}
+    return SocketStep(**{**told, **vectors, "whole": Patch(**told["whole"]), "regions": regions})

@@ -1,13 +1,21 @@
-"""Executors that run jobs: in this process, in worker processes, or on a Dask cluster.
+"""Executors that run jobs: in this process, in worker processes, or on a Dask cluster; and the choice of one.
 
 A job is anything that can be pickled, and the function that does it is importable. Answers come back in the
 order of the jobs whatever runs them, so a caller cannot tell one executor from another except by the time.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
 from typing import Any
 
+from ..errors import InputError
 from ..renamed import find_renamed
 from .base import (
+    NO_LIMITS,
     SAFE_PATH,
     THREAD_VARIABLES,
     Executor,
@@ -17,9 +25,7 @@ from .base import (
     report_progress,
 )
 from .cluster import QUEUES, DaskExecutor
-from .factory import Placement, make_executor, place_jobs, share_executor
-from .processes import ProcessExecutor
-from .worker import run_in_background
+from .processes import ProcessExecutor, run_in_background
 
 __all__ = [
     "QUEUES",
@@ -38,6 +44,97 @@ __all__ = [
     "run_in_background",
     "share_executor",
 ]
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a caller wants jobs to run instead of what studies say.
+
+    ``workers`` is their number, ``scheduler`` the address of a Dask scheduler, ``dask`` a batch system for
+    workers.
+    """
+
+    workers: int | None = None
+    scheduler: str | None = None
+    dask: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.scheduler is not None and (self.dask is not None or self.workers is not None):
+            raise InputError(
+                "a scheduler has its own workers",
+                place="--scheduler",
+                remedy="leave out --workers and --dask",
+            )
+
+
+_placement: ContextVar[Placement | None] = ContextVar("_placement", default=None)
+_shared: ContextVar[Executor | None] = ContextVar("_shared", default=None)
+
+
+@contextmanager
+def place_jobs(placement: Placement) -> Iterator[None]:
+    """Make executors that are created in this block run where ``placement`` says."""
+    token = _placement.set(placement)
+    try:
+        yield
+    finally:
+        _placement.reset(token)
+
+
+@contextmanager
+def share_executor(executor: Executor) -> Iterator[None]:
+    """Make `make_executor` return ``executor`` in this block; whoever asks for it leaves it running."""
+    token = _shared.set(executor)
+    try:
+        yield
+    finally:
+        _shared.reset(token)
+
+
+def make_executor(workers: int = 0, limits: Limits = NO_LIMITS) -> Executor:
+    """Make an executor with that many workers, one thread each; 0 means one worker per usable core.
+
+    One worker means this process itself. `place_jobs` and `share_executor` take precedence.
+
+    Raises
+    ------
+    InputError
+        For a scheduler or a batch system that cannot be used.
+    """
+    shared, placement = _shared.get(), _placement.get() or Placement()
+    if shared is not None:
+        return _SharedExecutor(shared, limits)
+    if placement.scheduler is not None:
+        return DaskExecutor.connect(placement.scheduler, limits)
+    count = (workers if placement.workers is None else placement.workers) or count_usable_cores()
+    if placement.dask is not None:
+        return DaskExecutor.from_queue(placement.dask, count, limits)
+    return ProcessExecutor(count, limits=limits) if count > 1 else SerialExecutor()
+
+
+class _SharedExecutor(Executor):
+    """Another's executor with limits of one's own; leaving its context does not end it."""
+
+    def __init__(self, executor: Executor, limits: Limits) -> None:
+        self._executor, self.limits = executor, limits
+        executor.limits = limits
+
+    @property
+    def workers(self) -> int:
+        return self._executor.workers
+
+    def threads_for(self, jobs: int) -> int:
+        return self._executor.threads_for(jobs)
+
+    def _run_jobs(
+        self,
+        function: Callable,
+        jobs: list,
+        keys: Sequence[str | None],
+        on_lost: Callable | None,
+        on_report: Callable | None,
+    ) -> Iterator[Any]:
+        return self._executor.map(function, jobs, keys, on_lost, on_report)
 
 
 def __getattr__(name: str) -> Any:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import partial
 from types import TracebackType
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 Job = TypeVar("Job")
 Answer = TypeVar("Answer")
@@ -58,25 +59,25 @@ def send_reports_to(listener: Callable[[Any], None] | None) -> Iterator[None]:
         _listener.reset(token)
 
 
-class Executor(Protocol):
+class Executor(ABC):
     """Runs a function over jobs; use it as a context, which ends its workers."""
 
-    limits: Limits
+    limits: Limits = NO_LIMITS
 
     @property
+    @abstractmethod
     def workers(self) -> int:
         """The number of jobs that it does at a time."""
-        ...
 
+    @abstractmethod
     def threads_for(self, jobs: int) -> int:
         """Return how many threads each of so many jobs may have, so that no worker is idle beside them."""
-        ...
 
     def map(
         self,
         function: Callable[[Job], Answer],
         jobs: Iterable[Job],
-        keys: Sequence[str] | None = None,
+        keys: Sequence[str | None] | None = None,
         on_lost: Callable[[Job, str], Answer] | None = None,
         on_report: Callable[[Job, Any], None] | None = None,
     ) -> Iterator[Answer]:
@@ -97,13 +98,31 @@ class Executor(Protocol):
         RunError
             If a worker died twice on the same job, and ``on_lost`` is not given.
         """
-        ...
+        listed = list(jobs)
+        if keys is not None and len(keys) != len(listed):
+            raise ValueError(f"{len(keys)} keys for {len(listed)} jobs")
+        every = [None] * len(listed) if keys is None else keys
+        return self._run_jobs(function, listed, every, on_lost, on_report)
 
-    def __enter__(self) -> Self: ...
+    @abstractmethod
+    def _run_jobs(
+        self,
+        function: Callable,
+        jobs: list,
+        keys: Sequence[str | None],
+        on_lost: Callable | None,
+        on_report: Callable | None,
+    ) -> Iterator[Any]:
+        """`map` with the jobs as a list, and the key of each; None if it has none."""
+
+    def __enter__(self) -> Self:
+        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+    ) -> None:
+        """End the workers; nothing to do where there are none."""
+        return None
 
 
 def count_usable_cores() -> int:
@@ -113,41 +132,26 @@ def count_usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def zip_jobs(jobs: Iterable[Job], keys: Sequence[str] | None) -> tuple[list[Job], list[str | None]]:
-    """Return the jobs as a list, and the key of each; None if they have none."""
-    listed = list(jobs)
-    if keys is None:
-        return listed, [None] * len(listed)
-    if len(keys) != len(listed):
-        raise ValueError(f"{len(keys)} keys for {len(listed)} jobs")
-    return listed, list(keys)
-
-
-class SerialExecutor:
+class SerialExecutor(Executor):
     """Runs jobs one after the other in this process; no limit can end them."""
 
-    workers = 1
-    limits = NO_LIMITS
-
-    def map(
-        self,
-        function: Callable[[Job], Answer],
-        jobs: Iterable[Job],
-        keys: Sequence[str] | None = None,
-        on_lost: Callable[[Job, str], Answer] | None = None,
-        on_report: Callable[[Job, Any], None] | None = None,
-    ) -> Iterator[Answer]:
-        def done(job: Job) -> Answer:
-            with send_reports_to(None if on_report is None else partial(on_report, job)):
-                return function(job)
-
-        return map(done, zip_jobs(jobs, keys)[0])
+    @property
+    def workers(self) -> int:
+        return 1
 
     def threads_for(self, jobs: int) -> int:
         return count_usable_cores()
 
-    def __enter__(self) -> Self:
-        return self
+    def _run_jobs(
+        self,
+        function: Callable,
+        jobs: list,
+        keys: Sequence[str | None],
+        on_lost: Callable | None,
+        on_report: Callable | None,
+    ) -> Iterator[Any]:
+        def done(job: Any) -> Any:
+            with send_reports_to(None if on_report is None else partial(on_report, job)):
+                return function(job)
 
-    def __exit__(self, *_: object) -> None:
-        return None
+        return map(done, jobs)

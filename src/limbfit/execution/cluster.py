@@ -11,7 +11,7 @@ import math
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from ..errors import InputError, RunError
-from .base import NO_LIMITS, Answer, Job, Limits, zip_jobs
+from .base import NO_LIMITS, Executor, Limits
 from .processes import ProcessExecutor
 
 QUEUES = {
@@ -66,7 +66,7 @@ def _run_contained(
     return next(executor.map(function, [job], on_lost=on_lost, on_report=on_report))
 
 
-class DaskExecutor:
+class DaskExecutor(Executor):
     """Runs jobs through a ``distributed.Client``, which it owns, with the cluster behind it if that is given.
 
     The jobs of a worker that dies are tried again elsewhere, as often as the scheduler allows
@@ -146,20 +146,10 @@ class DaskExecutor:
         except OSError as error:
             raise RunError(_SCHEDULER_GONE) from error
 
-    def map(
-        self,
-        function: Callable[[Job], Answer],
-        jobs: Iterable[Job],
-        keys: Sequence[str] | None = None,
-        on_lost: Callable[[Job, str], Answer] | None = None,
-        on_report: Callable[[Job, Any], None] | None = None,
-    ) -> Iterator[Answer]:
-        return self._yield_answers(function, *zip_jobs(jobs, keys), on_lost, on_report)
-
     def threads_for(self, jobs: int) -> int:
         return 1
 
-    def _yield_answers(
+    def _run_jobs(
         self,
         function: Callable,
         jobs: list,
@@ -235,9 +225,6 @@ class DaskExecutor:
             raise RunError(f"every Dask worker that tried a job died: {error}") from error
         except (distributed.CancelledError, distributed.comm.CommClosedError) as error:
             raise RunError(_SCHEDULER_GONE) from error
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

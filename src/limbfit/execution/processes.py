@@ -1,23 +1,32 @@
-"""Jobs side by side in worker processes of this machine."""
+"""Jobs side by side in worker processes of this machine, and one job in the background."""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
+import sys
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from multiprocessing.connection import wait
-from types import TracebackType
-from typing import Any, Self
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from types import ModuleType, TracebackType
+from typing import Any
+
+import psutil
 
 from ..errors import RunError
-from .base import NO_LIMITS, Answer, Job, Limits, zip_jobs
-from .worker import GRACE_S, READY, JobOutcome, JobReport, Worker
+from .base import NO_LIMITS, SAFE_PATH, THREAD_VARIABLES, Executor, Limits, send_reports_to
 
 MAX_TRIES = 2
 _POLL_S = 0.25  # between two looks at what jobs take
 _DEATH = "a worker process died: out of memory, killed or crashed"
 
 
-class ProcessExecutor:
+class ProcessExecutor(Executor):
     """Worker processes that live as long as the executor, each with ``threads`` threads.
 
     They start when first needed, and never run the caller's script again, guarded or not. A worker that dies
@@ -27,25 +36,19 @@ class ProcessExecutor:
     def __init__(self, workers: int, threads: int = 1, limits: Limits = NO_LIMITS) -> None:
         if workers < 1 or threads < 1:
             raise ValueError("workers and threads must be at least 1")
-        self.workers, self.threads, self.limits = workers, threads, limits
+        self.threads, self.limits = threads, limits
         self._seats: list[Worker | None] = [None] * workers
         self._home: dict[str, int] = {}
         self._mapping = False
 
-    def map(
-        self,
-        function: Callable[[Job], Answer],
-        jobs: Iterable[Job],
-        keys: Sequence[str] | None = None,
-        on_lost: Callable[[Job, str], Answer] | None = None,
-        on_report: Callable[[Job, Any], None] | None = None,
-    ) -> Iterator[Answer]:
-        return self._yield_answers(function, *zip_jobs(jobs, keys), on_lost, on_report)
+    @property
+    def workers(self) -> int:
+        return len(self._seats)
 
     def threads_for(self, jobs: int) -> int:
         return max(self.workers * self.threads // max(jobs, 1), self.threads)
 
-    def _yield_answers(
+    def _run_jobs(
         self,
         function: Callable,
         jobs: list,
@@ -132,9 +135,6 @@ class ProcessExecutor:
             worker.dismiss(at_once=True)
             worker.end(time.monotonic() + GRACE_S)
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
@@ -149,3 +149,207 @@ class ProcessExecutor:
 def _describe_death(function: Callable, job: int, key: str | None) -> str:
     name = f"{key!r}" if key is not None else f"number {job + 1}"
     return f"a worker process died twice in {function.__name__} of {name}: out of memory, killed or crashed"
+
+
+GRACE_S = 2.0  # for workers to end when told so
+READY = "ready"  # a worker's first word: its start is not its first job's time
+
+
+class JobOutcome:
+    """The outcome of a job: an answer, or an exception with the worker's traceback."""
+
+    def __init__(self, answer: Any = None, error: BaseException | None = None, trace: str = "") -> None:
+        self.answer, self.error, self.trace = answer, error, trace
+
+    def result(self) -> Any:
+        if self.error is not None:
+            raise self.error from RuntimeError(f"in a worker process:\n{self.trace}")
+        return self.answer
+
+
+@dataclass(frozen=True)
+class JobReport:
+    """What a job reports while it runs."""
+
+    message: Any
+
+
+class Worker:
+    """A process at the far end of a pipe."""
+
+    def __init__(self, threads: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.connection, far = context.Pipe()
+        self.process = context.Process(target=serve_jobs, args=(far,), daemon=True)
+        self.began: float | None = None  # its job; None before it is ready
+        variables = dict.fromkeys(THREAD_VARIABLES, str(threads)) | SAFE_PATH
+        with _set_environment(variables), _hide_main(), _allow_children():
+            self.process.start()
+        far.close()
+
+    def send(self, function: Callable, job: Any) -> None:
+        if self.began is not None:
+            self.began = time.monotonic()
+        with suppress(OSError):  # it died while idle: reading its line tells so
+            self.connection.send((function, job))
+
+    def receive(self) -> JobOutcome | JobReport | str | None:
+        """Return the outcome of the job, what it reports, `READY`, or None if the process is dead."""
+        try:
+            message = self.connection.recv()
+        except (EOFError, OSError):  # nothing more, or half a message
+            return None
+        if message == READY:
+            self.began = time.monotonic()
+        return message
+
+    def find_exceeded_limit(self, limits: Limits) -> str:
+        """Return which limit the running job exceeds, in words; empty if it is within them."""
+        began = self.began
+        if limits.time_s and began is not None and time.monotonic() - began > limits.time_s:
+            return f"it took longer than execution.time_limit_s = {limits.time_s:g} s"
+        if limits.memory_GB and self._memory_GB() > limits.memory_GB:
+            return f"it needed more than execution.memory_limit_GB = {limits.memory_GB:g} GB"
+        return ""
+
+    def _memory_GB(self) -> float:
+        """Return the resident memory of the process and its children (meshers)."""
+        total = 0
+        with suppress(psutil.Error):
+            whole = psutil.Process(self.process.pid)
+            for one in (whole, *whole.children(recursive=True)):
+                with suppress(psutil.Error):
+                    total += one.memory_info().rss
+        return total / 1e9
+
+    def dismiss(self, at_once: bool) -> None:
+        """Close the connection, which ends an idle worker; ``at_once`` ends one in the middle of a job."""
+        self.connection.close()
+        if at_once:
+            self.process.terminate()
+
+    def end(self, until: float) -> None:
+        """Wait for a dismissed worker to end until that time of the monotonic clock, then kill it."""
+        self.process.join(max(until - time.monotonic(), 0.0))
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join()
+        self.process.close()
+
+
+@contextmanager
+def _set_environment(variables: dict[str, str]) -> Iterator[None]:
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _hide_main() -> Iterator[None]:
+    """Hide the caller's main script, which a spawned process would import, and so run if it is unguarded."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+
+
+@contextmanager
+def _allow_children() -> Iterator[None]:
+    """Allow children in Dask's workers, which are daemons; the children end with their parent."""
+    config = multiprocessing.current_process()._config  # type: ignore[attr-defined]
+    before = config.get("daemon")
+    config["daemon"] = False
+    try:
+        yield
+    finally:
+        config["daemon"] = before
+
+
+def serve_jobs(connection: Connection) -> None:
+    """Do jobs until the connection is closed; the terminal's Ctrl-C is handled by the parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    with suppress(ConnectionError):
+        connection.send(READY)
+    while True:
+        try:
+            with send_reports_to(lambda message: connection.send(JobReport(message))):
+                outcome = _run_job(*connection.recv())
+        except (EOFError, ConnectionError):
+            return
+        except Exception as error:  # a function or job that this process cannot import
+            outcome = _build_failure(error)
+        _send_outcome(connection, outcome)
+
+
+def _run_job(function: Callable, job: Any) -> JobOutcome:
+    try:
+        return JobOutcome(function(job))
+    except MemoryError:
+        os._exit(1)  # the parent tries once more in a fresh process
+    except Exception as error:
+        return _build_failure(error)
+
+
+def _build_failure(error: Exception) -> JobOutcome:
+    return JobOutcome(error=error, trace=traceback.format_exc())
+
+
+def _send_outcome(connection: Connection, outcome: JobOutcome) -> None:
+    try:
+        connection.send(outcome)
+    except ConnectionError:
+        return
+    except Exception as error:  # neither every answer nor every exception can be pickled
+        what = outcome.error if outcome.error is not None else error
+        text = f"{type(what).__name__}: {what}"
+        connection.send(JobOutcome(error=RunError(text), trace=outcome.trace or traceback.format_exc()))
+
+
+def _die_with_parent() -> None:
+    """End this process with its parent: an orphan would keep a core for a job that nobody waits for."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+@contextmanager
+def run_in_background(function: Callable[[Any], Any], job: Any) -> Iterator[Callable[[], Any]]:
+    """Run ``function(job)`` beside the block, which gets a function that waits for the answer.
+
+    An exception of the job is raised where it is waited for. A job that is not done when the block ends is
+    ended.
+
+    Raises
+    ------
+    RunError
+        If the process died.
+    """
+    worker = Worker(threads=1)
+    worker.send(function, job)
+    found: list[JobOutcome] = []
+
+    def wait() -> Any:
+        while not found:
+            outcome = worker.receive()
+            if outcome is None:
+                raise RunError(f"the process of {function.__name__} died: out of memory, killed or crashed")
+            if isinstance(outcome, JobOutcome):
+                found.append(outcome)
+        return found[0].result()
+
+    try:
+        yield wait
+    finally:
+        worker.dismiss(at_once=not found)
+        worker.end(time.monotonic() + GRACE_S)

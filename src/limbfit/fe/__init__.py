@@ -23,11 +23,10 @@ the same mesh with other materials is quicker with ``warm_start=result`` of a ru
 from __future__ import annotations
 
 from ..shapes import RigidSurface
-from .activation import Activation
 from .contact.indenter import Indenter
 from .contact.open_surface import OpenSurface
 from .contact.smooth_surface import SmoothSurface
-from .doubts import SimulationWarning, list_texts
+from .diagnostics import SimulationWarning, list_texts
 from .kernel.elements import ELEMENTS
 from .materials import (
     ORDER_IN_TIME,
@@ -44,15 +43,13 @@ from .materials import (
 )
 from .motion import Motion, RigidBody
 from .pressure import Pressure
-from .prestretch import isochoric_stretch
-from .problem import History, Problem, Support
+from .problem import Activation, History, Problem, Support, isochoric_stretch
 from .result import Result, State, Step
-from .snapshot import Checkpoints, Snapshot
 from .solution.compiling import are_compiled, compile_kernels
 from .solution.control import StepControl
-from .solution.guesses import compute_tangent_at_rest
 from .solution.linear import build_linear_solver
-from .solution.stepping import iterate, solve
+from .solution.start import compute_tangent_at_rest
+from .solution.stepping import Checkpoints, Snapshot, iterate, solve
 from .system import System
 from .tractions import Tractions, compute_tractions
 

@@ -13,17 +13,23 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from .contact.contact import ContactSurface, Touch, add_springs, check_clear, contact, find_touching_offset
-from .contact.grip import StickyContact
-from .contact.pose import Pose
-from .contact.rigid import RigidShape
-from .contact.tool import Distances, Tool
+from ..arrays import Array
+from .contact.contact import (
+    ContactSurface,
+    RigidShape,
+    Touch,
+    add_springs,
+    check_clear,
+    contact,
+    find_touching_offset,
+)
+from .contact.friction import StickyContact
+from .contact.tool import Distances, Pose, Tool
 from .kernel.elements import Element
 from .motion import Drives, Motion, RigidBody
 from .pattern import Pattern, find_places, find_positions
 from .problem import Problem, ProblemError
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int32]
 
 

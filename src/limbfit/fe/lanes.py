@@ -55,10 +55,10 @@ POINT = np.dtype(
         ("tau", "f8", (6, _L)),  # Kirchhoff stress
         ("D", "f8", (6, 6, _L)),  # moduli
         ("fibre", "f8", (3, _L)),  # its direction, of length one
-        ("fibre_at_rest", "f8", (3, _L)),  # F^-1 of it
-        ("pull", "f8", _L),  # T = dW/d ln(its isochoric stretch)
-        ("pull_slope", "f8", _L),  # dT/d ln(its isochoric stretch)
-        ("pull_rates", "f8", (2, _L)),  # dT/d k1, dT/d k2
+        ("material_fibre", "f8", (3, _L)),  # F^-1 of it
+        ("fibre_tension", "f8", _L),  # T = dW/d ln(its isochoric stretch)
+        ("fibre_stiffness", "f8", _L),  # dT/d ln(its isochoric stretch)
+        ("fibre_tension_rates", "f8", (2, _L)),  # dT/d k1, dT/d k2
     ],
     align=True,
 )
@@ -69,7 +69,7 @@ LAW = np.dtype(
         ("response", "i8", _L),
         ("rates", "i8", _L),
         ("fibre", "f8", (3, _L)),  # k1, k2, active stress over the scale
-        ("along", "f8", (3, _L)),  # the fibre at rest, of length one
+        ("fibre_direction", "f8", (3, _L)),  # the fibre at rest, of length one
         ("energy", "f8", _L),
         ("beta", "f8", (3, _L)),
         ("slope", "f8", (6, _L)),

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
-from .contact.rigid import RigidShape
+from .contact.contact import RigidShape
 
-Array = NDArray[np.float64]
 HARDNESS_GROWING = 0.05  # of a surface that grows: its points move along it by tenths of a mm in a step
 # A body's coordinates: its move along the axes of its frame at the start, mm, and its rotation vector about
 # them, rad.  Conjugate to them are the force, N, and the moment about the pivot, N mm.

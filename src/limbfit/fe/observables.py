@@ -9,15 +9,13 @@ import scipy.sparse as sp
 from numba import njit
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from .kernel.elements import Element
-from .kernel.fibres import add_stress
 from .kernel.laws import Laws
-from .kernel.response import elastic_response, kirchhoff, pressures
+from .kernel.response import add_fibre_stress, elastic_response, kirchhoff_stress, pressures
 from .lanes import LANES, workspace
 from .result import State
 from .system import Increment, System
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -170,9 +168,9 @@ def _compute_fields(elements, mean, tables, history, u, records, out):  # type: 
                 out[start + l, 8] += w * np.sqrt(min(less, p.b[2, l]))
                 out[start + l, 9] += w * p.J[l]
                 out[start + l, 10] += w * (p.energy[l] + p.volumetric[l])
-            kirchhoff(p)
+            kirchhoff_stress(p)
             if len(elements[4]):
-                add_stress(p)
+                add_fibre_stress(p)
             for l in range(min(LANES, m - start)):
                 w = weights[start + l, t] / weights[start + l].sum() / p.J[l]
                 for i in range(6):

@@ -15,11 +15,10 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
 from .kernel.elements import Element
 from .pattern import Pattern, find_positions
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

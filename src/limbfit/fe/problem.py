@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arrays import Array
 from ..errors import ProblemError
 from ..mesh import Mesh
 from ..phases import MotionPhase, find_boundaries, find_loading_end, find_phases
-from .activation import Activation
 from .contact.indenter import Indenter
 from .kernel.elements import ELEMENTS, Element
 from .materials import Material
@@ -275,3 +275,70 @@ class Problem:
     def parameters(self) -> NDArray[np.float64]:
         """Values in the order of `parameter_names`; mm, N, s, MPa."""
         return np.array([v for region in self.mesh.region_names for v in self.materials[region].parameters])
+
+
+@dataclass(frozen=True)
+class Activation:
+    """The share of full activation over time, piecewise linear; the last one holds on.
+
+    Parameters
+    ----------
+    times : (n,) s, from 0.
+    shares : (n,) of the active stress of every `Contractile` tissue; 0 at rest, not negative.
+
+    Raises
+    ------
+    ProblemError
+        Where times do not grow from 0, or a share is negative or not finite.
+    """
+
+    times: Sequence[float] | Array
+    shares: Sequence[float] | Array
+
+    def __post_init__(self) -> None:
+        times, shares = np.asarray(self.times, dtype=float), np.asarray(self.shares, dtype=float)
+        if times.ndim != 1 or times.shape != shares.shape or len(times) < 2:
+            raise ProblemError("an activation needs two or more times and as many shares")
+        if not np.isfinite(times).all() or times[0] != 0.0 or not (np.diff(times) > 0).all():
+            raise ProblemError("the times of an activation do not grow from 0")
+        if not (np.isfinite(shares).all() and (shares >= 0.0).all()):
+            raise ProblemError("a share of an activation is negative or not finite")
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "shares", shares)
+
+    def at(self, t: float) -> float:
+        """The share at time ``t``, s."""
+        return float(np.interp(t, np.asarray(self.times), np.asarray(self.shares)))
+
+    def later(self, seconds: float) -> Activation:
+        """The same after so many seconds at its first share."""
+        times, shares = np.asarray(self.times), np.asarray(self.shares)
+        return Activation(np.append(0.0, times + seconds), np.append(shares[0], shares))
+
+    def moving_s(self, t: float) -> float:
+        """How long the share has changed up to time ``t``, s."""
+        times, steps = np.asarray(self.times), np.diff(self.times)
+        return float((np.clip(t - times[:-1], 0.0, steps) * (np.diff(self.shares) != 0.0)).sum())
+
+
+def isochoric_stretch(directions: ArrayLike, stretches: ArrayLike) -> Array:
+    """Pre-stretches (m, 3, 3) along ``directions`` at constant volume.
+
+    ``directions (m, 3)``, or one (3,), of any length; ``stretches``, one or (m,), along them: what is across
+    has their inverse root.  A layer that is stretched by s in its plane has 1/s^2 along its normal.
+
+    Raises
+    ------
+    ProblemError
+        Where a direction has no length, or a stretch is not positive.
+    """
+    n, along = np.atleast_2d(np.asarray(directions, dtype=float)), np.asarray(stretches, dtype=float)
+    length = np.linalg.norm(n, axis=1, keepdims=True)
+    if n.shape[1] != 3 or not (np.isfinite(n).all() and (length > 0.0).all()):
+        raise ProblemError("a direction of the pre-stretch is no vector of three numbers with a length")
+    if not (np.isfinite(along).all() and (along > 0.0).all()):
+        raise ProblemError("a pre-stretch is not positive")
+    n = n / length
+    along = np.broadcast_to(along, len(n))[:, None, None]
+    across = along**-0.5
+    return np.asarray(across * np.eye(3) + (along - across) * n[:, :, None] * n[:, None, :])

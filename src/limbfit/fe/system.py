@@ -14,10 +14,11 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from .bodies import Bodies, Contacts, count_body_rows
 from .checking import check
 from .contact.contact import ContactSurface, Touch
-from .contact.grip import StickyContact
+from .contact.friction import StickyContact
 from .contact.indenter import Indenter
 from .contact.tool import Tool
 from .kernel.assembly import Elements, assemble
@@ -26,11 +27,9 @@ from .kernel.laws import Laws
 from .motion import Drives
 from .pattern import Pattern, append_rows, build_node_graph, build_upper_pattern, find_positions
 from .pressure import Pressures
-from .prestretch import apply_prestretch
 from .problem import Problem, ProblemError
 from .threads import get_thread_pool
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 
@@ -134,8 +133,7 @@ class System:
         self.gradients, self.weights = compute_reference_gradients(self.element, self.points, mesh.cells)
         self.prestretch = np.zeros((0, 3, 3))
         if problem.prestretch is not None:
-            found = apply_prestretch(problem.prestretch, self.gradients, self.weights)
-            self.prestretch, self.gradients, self.weights = found
+            self._apply_prestretch(np.asarray(problem.prestretch, dtype=float))
         self._number_unknowns(problem)
         self._build_pattern(problem)
         self.bodies: Bodies | None = None
@@ -157,6 +155,20 @@ class System:
         start = self.bodies.first.start
         assert isinstance(start, Indenter)
         return start
+
+    def _apply_prestretch(self, stretches: Array) -> None:
+        """Make gradients (m, q, 3, k) 1/mm and weights (m, q) mm^3 those of the unstrained tissue.
+
+        The elastic deformation of the tissue is ``F G``: ``F`` is that of the mesh, ``G (m, 3, 3)`` the
+        deformation from tissue on its own, without stress, to the mesh before equilibrium (multiplicative
+        pre-strain; Weiss, Gardiner and Bonifasi-Lista 2002, J. Biomech. 35, 943).  With ``G^T grad N`` and
+        ``w/det G`` every kernel sees the tissue on its own; only ``F G = G + sum_a u_a x G^T grad N_a``
+        knows ``G`` itself.
+        """
+        G = np.ascontiguousarray(np.broadcast_to(stretches, (len(self.weights), 3, 3)))
+        gradients = np.einsum("mji,mqjk->mqik", G, self.gradients)
+        self.prestretch, self.gradients = G, np.ascontiguousarray(gradients)
+        self.weights = self.weights / np.linalg.det(G)[:, None]
 
     def _number_unknowns(self, problem: Problem) -> None:
         factors = np.full((self.rows, 3), np.nan)

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..renamed import find_renamed
 from .contact.contact import ContactSurface
 from .kernel.laws import Laws
 from .result import State
 from .system import System
 
-Array = NDArray[np.float64]
 KPA = 1e3  # per MPa
 
 

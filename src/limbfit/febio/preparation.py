@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..fe import History, Motion, Problem, StepControl, System
+from ..fe.solution.start import CLEAR, IndenterStart
 from ..fe.solution.stepping import FirstStep, solve_until_onset
-from ..fe.solution.touchdown import CLEAR, IndenterStart
 
 PRESTRAIN_S = 1.0  # in which the pre-strain grows
 RELAXATION_TIMES = 30.0  # of the longest relaxation time: what is left is 1e-13

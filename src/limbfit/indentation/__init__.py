@@ -4,14 +4,16 @@ from typing import Any
 
 from ..laws import Parameters, list_flat_names, to_parameters, to_vector
 from ..renamed import find_renamed
+from .cell_fields import Direction, build_fibre_field
 from .clamps import build_clamping_pins, clamp_problem
-from .fibres import Direction, build_fibre_field
 from .neighbourhood import Extension, cut_neighbourhood
 from .observing import (
     OFF_SKIN_MM,
     choose_points_around,
     find_layers_under,
     find_nearby_skin_points,
+    find_nearest_points,
+    find_skin_points,
     is_under,
     observe_result,
     place_waves_under,
@@ -33,7 +35,6 @@ from .sites import (
     compute_contact_radius,
     read_indenter,
 )
-from .skin_points import find_nearest_points, find_skin_points
 from .waves import WavePlace, to_vector3
 
 __all__ = [

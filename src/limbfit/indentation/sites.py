@@ -37,10 +37,9 @@ from ..mesh import Mesh
 from ..phases import spread
 from ..relaxation import DEFAULT_SPAN_S, choose_relaxation_times
 from ..study import ClampsTable, IndenterTable, SolverTable, Vector
+from .cell_fields import Direction, build_fibre_field, build_prestretch_field
 from .clamps import clamp_problem
-from .fibres import Direction, build_fibre_field
 from .neighbourhood import cut_neighbourhood, find_fixed_cut_nodes
-from .prestretch import build_prestretch_field
 from .waves import WavePlace
 
 RISE_S, REST_S = 2.0, 5.0  # muscle tenses, and rests tensed, before the indenter touches

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import Material, Result
-from ..fe.history import Memory
+from ..fe.kernel.evaluation_points import EvaluationPoints, evaluate_elastic_at
 from ..fe.kernel.laws import Laws
-from ..fe.kernel.places import Places, evaluate_elastic_at
+from ..fe.memory import Memory
 from ..mesh import Mesh, find_gauges_along, locate
 from ..study import Vector
 
@@ -101,7 +101,7 @@ def to_vector3(values: Array) -> Vector:
 class _Regions:
     """The points of several places: of number ``place`` (m,) each; ``A`` and ``N`` see `WavePlace`."""
 
-    points: Places
+    points: EvaluationPoints
     nodes: NDArray[np.int64]
     place: NDArray[np.int64]
     motion: Array
@@ -112,7 +112,7 @@ class _Regions:
         mesh, system = result.problem.mesh, result.system
         cells, local = zip(*(_locate_points(mesh, place) for place in places), strict=True)
         number = np.repeat(np.arange(len(places)), [len(own) for own in cells])
-        points = Places.at(
+        points = EvaluationPoints.at(
             mesh,
             result.problem.formulation,
             np.concatenate(cells),

@@ -1,31 +1,162 @@
-"""Coulomb friction as an incremental potential whose normal force and tangent plane are lagged.
+"""What holds contact points along a body: sticking, or Coulomb friction, in one form for the kernel.
 
-The force of a point in touch is at most ``mu`` times its normal force. In a step it is that of a
-`StickyContact` with the bound ``mu <-phi> |grad phi|`` mm, where penetration and normal are those of the
-last equilibrium: a convex potential (as in incremental potential contact, Li et al. 2020). The step is
-solved again with new ones until they do not change; what is in equilibrium then is Coulomb's law. Up to the
-bound a point sticks by ``hardness`` times the penalty of the contact, so the width in which sticking goes
-over into slipping is ``mu`` times the penetration over the hardness.
+A held point has an anchor ``a`` in the body's frame: the place where it was at the end of the step in which
+it first touched.  With its move along the tangent plane, ``s = P (x - a)``, ``P = 1 - n n^T``, its energy is
+``eps dA_0 H(|s|)`` with ``H(s) = s^2 / 2`` up to the bound ``b`` and ``b s - b^2 / 2`` beyond it: it sticks
+by the contact's own penalty up to a slip of ``b`` mm, and beyond pulls with ``eps b`` whatever the slip.  In
+a step anchors, planes and bounds are constant, so this is a convex potential with a symmetric tangent.
 
-A point is anchored where it is at the end of the step in which it first touched; the anchor of one that slips
-follows it at the distance of the bound (return mapping, Wriggers 2006, chapter 5.2).  So what sticks does not
-creep, however many steps it is held for.  `StepwiseCoulomb` is the other law, that of FEBio's
-``sliding-elastic``: slip counts from the start of the step.
+Its kink is sharp, ``b`` is thousandths of a mm: Newton's method with the second derivative does not foresee
+that a slip turns round or ends, and then takes as many iterations as there are points that do.  So it is
+primal-dual (Chan, Golub and Mulet 1999): the part ``p`` of the slip that pulls, ``|s| p = b s``, is a
+variable of its own, with which the tangent of a point that slips is ``eps b / |s| (P - (p s^T + s p^T) / (2 b
+|s|))``.  It is the second derivative where ``p`` is what the slip says, and positive where ``|p| <= b``.
+
+*Sticky* points have no bound.  The plane stays that at the anchor, so that the energy is quadratic, and an
+anchor neither pulls nor pushes along the normal.  An anchor whose point lets go is dropped, and the step is
+solved again.
+
+*Coulomb's* bound is ``mu <-phi> |grad phi|`` over the hardness, mm, where penetration and normal are those of
+the last equilibrium (as in incremental potential contact, Li et al. 2020).  The step is solved again with new
+ones until they do not change; what is in equilibrium then is Coulomb's law.  Up to the bound a point sticks
+by ``hardness`` times the penalty of the contact, so the width in which sticking goes over into slipping is
+``mu`` times the penetration over the hardness.  The anchor of a point that slips follows it at the distance
+of the bound (return mapping, Wriggers 2006, chapter 5.2), so what sticks does not creep, however many steps
+it is held for.  `StepwiseCoulomb` is the other law, that of FEBio's ``sliding-elastic``: slip counts from the
+start of the step.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from .contact import ContactSurface
-from .grip import StickyContact
 from .tool import Distances, Tool
 
-Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class StickyContact(ABC):
+    """The held points among the contact points (f, q), in the body's frame.
+
+    Parameters
+    ----------
+    held : (f, q) which points have an anchor.
+    places, normals : (f, q, 3) anchor, mm, and unit normal of the tangent plane.
+    bounds : (f, q) slip at which a point gives way, mm; infinite where it never does.
+    d_places : (f, q, 3, p) derivative of the anchors with respect to the parameters.
+    pulls : (f, q, 3) the dual variable, mm: the part of the slip that pulls, as the tangent takes it to be.
+    """
+
+    held: Bools
+    places: Array
+    normals: Array
+    bounds: Array
+    d_places: Array
+    pulls: Array
+
+    hardness = 1.0  # stiffness that holds a point over that of the contact
+    lags: ClassVar[bool] = False  # True if a step holds something constant that follows u (`coupling`)
+
+    @property
+    def arrays(self) -> tuple[Bools, Array, Array, Array, Array]:
+        """What the contact kernel takes of it, point by point."""
+        places, normals, pulls = (x.reshape(-1, 3) for x in (self.places, self.normals, self.pulls))
+        return self.held.ravel(), places, normals, self.bounds.ravel(), pulls
+
+    def bare(self) -> Self:
+        """The grip without derivatives, to be kept."""
+        return replace(self, d_places=np.zeros((*self.held.shape, 3, 0)))
+
+    def begun(self, tool: Tool) -> StickyContact:
+        """The grip before the first step, with the tool where it starts."""
+        return self
+
+    def foreseen(self, tool: Tool, du: Array) -> Self:
+        """The grip with the pulls that its tangent foresees after a change ``du (r, 3)`` of ``u``."""
+        return self
+
+    @abstractmethod
+    def renewed(self, tool: Tool) -> StickyContact:
+        """The grip that an equilibrium with the tool where it is asks for; itself where it holds."""
+
+    @abstractmethod
+    def after(self, tool: Tool, du: Array | None) -> StickyContact:
+        """The grip after a step that ended there; ``du (r, 3, p)`` the derivative of the tool's ``u``, where
+        wanted."""
+
+    @abstractmethod
+    def explicit(self, tool: Tool) -> Array:
+        """Derivative (f, q, 3, p) of the points' forces, over penalty and area, through the anchors alone."""
+
+    @abstractmethod
+    def coupling(self, tool: Tool) -> Array | None:
+        """Derivative (f, q, 3, 3) of the forces, over penalty and area, through what a step holds constant
+        although it follows the displacement; None where nothing does."""
+
+
+@dataclass(frozen=True)
+class Anchors(StickyContact):
+    """A `StickyContact` whose planes stay those at the anchors; ``d_normals (f, q, 3, p)`` is theirs."""
+
+    d_normals: Array
+
+    @classmethod
+    def none(cls, surface: ContactSurface, parameters: int = 0) -> Anchors:
+        shape = surface.areas.shape
+        vectors, slopes = np.zeros((*shape, 3)), np.zeros((*shape, 3, parameters))
+        held, bounds = np.zeros(shape, dtype=bool), np.full(shape, np.inf)
+        return cls(held, vectors, vectors, bounds, slopes, vectors, slopes)
+
+    def bare(self) -> Self:
+        """The anchors without derivatives, to be kept."""
+        nothing = np.zeros((*self.held.shape, 3, 0))
+        return replace(self, d_places=nothing, d_normals=nothing)
+
+    def renewed(self, tool: Tool) -> Anchors:
+        """The anchors without those whose points left the indenter."""
+        lost = self.held & (tool.gaps >= 0.0)
+        return replace(self, held=self.held & ~lost) if lost.any() else self
+
+    def after(self, tool: Tool, du: Array | None) -> Anchors:
+        """The anchors at the end of a step: points that touch for the first time are held where they are.
+
+        ``du (r, 3, p)`` is the derivative of the tool's ``u``, where that is wanted.
+        """
+        local = tool.local
+        near = Distances.of(tool)
+        closed, normals = np.zeros_like(self.held), np.zeros_like(self.normals)
+        closed.ravel()[near.points] = near.gaps < 0.0
+        normals.reshape(-1, 3)[near.points] = near.normals
+        new = (closed & ~self.held)[..., None]
+        d_places, d_normals = self.d_places, self.d_normals
+        if du is not None:
+            moved = tool.moved(du)
+            curvatures = np.zeros((*normals.shape, 3))
+            curvatures.reshape(-1, 3, 3)[near.points] = near.tilts
+            d_places = np.where(new[..., None], moved, d_places)
+            d_normals = np.where(new[..., None], curvatures @ moved, d_normals)
+        places, normals = np.where(new, local, self.places), np.where(new, normals, self.normals)
+        return Anchors(closed, places, normals, self.bounds, d_places, self.pulls, d_normals)
+
+    def explicit(self, tool: Tool) -> Array:
+        """Derivative (f, q, 3, p) of the points' forces, over penalty and area, through the anchors alone."""
+        move = tool.local - self.places
+        n, d_n, d_a = self.normals[..., None], self.d_normals, self.d_places
+        across = np.einsum("fqi,fqi->fq", self.normals, move)[..., None, None]
+        turned = np.einsum("fqip,fqi->fqp", d_n, move) + -np.einsum("fqi,fqip->fqp", self.normals, d_a)
+        change = -(d_n * across + n * turned[:, :, None]) - d_a
+        return np.asarray(self.held[..., None, None] * change)
+
+    def coupling(self, tool: Tool) -> None:
+        """Nothing: anchors and planes stay."""
 
 
 @dataclass(frozen=True)
@@ -112,12 +243,6 @@ class Coulomb(StickyContact):
         return np.where((self.held & (self.bounds > 0.0))[..., None, None], found, 0.0)
 
 
-def _shorten_to_bounds(vectors: Array, bounds: Array) -> Array:
-    """Vectors (f, q, 3) shortened to the bounds (f, q)."""
-    length = np.linalg.norm(vectors, axis=-1)
-    return vectors * np.minimum(1.0, bounds / np.where(length > 0.0, length, 1.0))[..., None]
-
-
 @dataclass(frozen=True)
 class StepwiseCoulomb(Coulomb):
     """`Coulomb` with every point anchored where it was at the end of the last step, in touch or not.
@@ -179,3 +304,9 @@ class _Slip:
         outer = np.where(stuck[..., None, None], 0.0, unit[..., :, None] * unit[..., None, :])
         tangent = np.where(grip.held[..., None, None], share * (planes - outer), 0.0)
         return cls(move, unit, stuck, share[..., 0] * slip, share, tangent)
+
+
+def _shorten_to_bounds(vectors: Array, bounds: Array) -> Array:
+    """Vectors (f, q, 3) shortened to the bounds (f, q)."""
+    length = np.linalg.norm(vectors, axis=-1)
+    return vectors * np.minimum(1.0, bounds / np.where(length > 0.0, length, 1.0))[..., None]

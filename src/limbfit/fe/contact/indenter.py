@@ -8,16 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import ProblemError
 from ...shapes import SHAPES, SHARP_EDGE, RigidSurface, Shape, Size
+from .contact import RigidShape
 
 
 @dataclass(frozen=True)
-class Indenter:
+class Indenter(RigidShape):
     """A rigid indenter that moves along ``axis``.
 
     Parameters
@@ -45,9 +48,9 @@ class Indenter:
     shape: str = "square"
     width: float = 20.0
     edge_radius: float = 0.0
-    centre: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 0.0)
-    axis: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, -1.0)
-    edge: Sequence[float] | NDArray[np.float64] | None = None
+    centre: Sequence[float] | Array = (0.0, 0.0, 0.0)
+    axis: Sequence[float] | Array = (0.0, 0.0, -1.0)
+    edge: Sequence[float] | Array | None = None
     surface: RigidSurface | None = None
     sharp: float = SHARP_EDGE
     measures: Mapping[str, float] = field(default_factory=dict)
@@ -64,10 +67,10 @@ class Indenter:
                 raise ProblemError(f"indenter {name} is not three finite numbers")
         if np.linalg.norm(self.axis) < 1e-12:
             raise ProblemError("indenter axis has no length")
-        if np.linalg.norm(np.cross(self.axis, self._edge_guess())) < 1e-9:
+        if np.linalg.norm(np.cross(self.axis, self._edge_direction())) < 1e-9:
             raise ProblemError("indenter edge is parallel to its axis")
 
-    def _edge_guess(self) -> NDArray[np.float64]:
+    def _edge_direction(self) -> Array:
         if self.edge is not None:
             return np.asarray(self.edge, dtype=float)
         axis = np.asarray(self.axis, dtype=float)
@@ -76,54 +79,21 @@ class Indenter:
         return np.array([1.0, 0.0, 0.0]) if small else guess
 
     @property
-    def frame(self) -> NDArray[np.float64]:
-        """(3, 3) orthonormal rows: edge, axis x edge, axis."""
-        axis = np.asarray(self.axis, dtype=float) / np.linalg.norm(self.axis)
-        edge = self._edge_guess()
-        edge = edge - (edge @ axis) * axis
-        edge = edge / np.linalg.norm(edge)
-        return np.array([edge, np.cross(axis, edge), axis])
-
-    @property
     def length(self) -> float:
         """From the foremost point to the far end of a surface; the width for shapes without one, mm."""
         return self.body.length
 
-    def moved(self, distance: float, across: Sequence[float] = (0.0, 0.0)) -> Indenter:
-        """The indenter, advanced along its axis by ``distance`` mm and ``across`` it, along x and y of its
-        frame."""
+    def placed(self, centre: Array, axis: Array, edge: Array) -> Self:
+        return replace(self, centre=centre, axis=axis, edge=edge)
+
+    def moved(self, distance: float, across: Sequence[float] = (0.0, 0.0)) -> Self:
         move = np.array([*across, distance]) @ self.frame
         return replace(self, centre=np.asarray(self.centre, dtype=float) + move)
 
-    @property
-    def grows(self) -> bool:
-        return False
-
-    def grown(self, share: float) -> Indenter:
-        return self
-
-    def placed(
-        self, centre: NDArray[np.float64], axis: NDArray[np.float64], edge: NDArray[np.float64]
-    ) -> Indenter:
-        """The indenter with another frame."""
-        return replace(self, centre=centre, axis=axis, edge=edge)
-
-    def signed_distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance (n,) of points (n, 3), mm; negative inside."""
-        local = (np.asarray(points, dtype=float) - np.asarray(self.centre, dtype=float)) @ self.frame.T
-        return self.local_distance(local)[0]
-
-    def near(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Which points (n, 3) of its frame it may touch; the distance of others is not looked for."""
+    def near(self, points: Array) -> NDArray[np.bool_]:
         x, y, z = points.T
         reach = self.body.reach
         return np.asarray((z <= self.width / 2) & (np.abs(x) <= reach) & (np.abs(y) <= reach))
 
-    def local_distance(
-        self, points: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Distance (...), mm, gradient (..., 3) and hessian (..., 3, 3) at points (..., 3) of its frame."""
-        shape = points.shape[:-1]
-        x = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
-        values, slopes, bends = self.body.distance(x)
-        return values.reshape(shape), slopes.reshape(*shape, 3), bends.reshape(*shape, 3, 3)
+    def _distances(self, x: Array) -> tuple[Array, Array, Array]:
+        return self.body.distance(x)

@@ -6,18 +6,23 @@ on the tissue's side.  Points beyond the brim, or farther away than the surface'
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import ProblemError
 from ...shapes.triangles import (
     INSIDE,
     Tree,
     build_tree,
+    check_triangles,
     closest_point,
     compute_normal_spread,
     compute_triangle_normals,
@@ -25,9 +30,68 @@ from ...shapes.triangles import (
     feature_normal,
     find_neighbours,
 )
-from .wall import Wall, check_open_surface
+from .contact import RigidShape
 
-Array = NDArray[np.float64]
+
+@dataclass(frozen=True, eq=False)
+class Wall(RigidShape):
+    """Triangles in a frame of their own.
+
+    Parameters
+    ----------
+    points : (n, 3) mm, in the body's frame.
+    faces : (m, 3) corners, counter-clockwise seen from the tissue.
+    centre : (3,) the origin of the body's frame, mm.
+    axis, edge : (3,) third and first axis of the frame; an advance moves along ``axis``.
+    """
+
+    points: Array
+    faces: NDArray[np.int64]
+    centre: Sequence[float] | Array = (0.0, 0.0, 0.0)
+    axis: Sequence[float] | Array = (0.0, 0.0, 1.0)
+    edge: Sequence[float] | Array = (1.0, 0.0, 0.0)
+
+    @cached_property
+    def _extent(self) -> Array:
+        return np.asarray(np.ptp(self.points[np.unique(self.faces)], axis=0))
+
+    @property
+    def width(self) -> float:
+        """Its largest extent across the axis, mm."""
+        return float(self._extent[:2].max())
+
+    @property
+    def length(self) -> float:
+        """Its extent along the axis, mm."""
+        return float(self._extent[2])
+
+    def placed(self, centre: Array, axis: Array, edge: Array) -> Self:
+        """The surface with another frame; what was derived from its triangles is kept."""
+        other = copy(self)
+        other.__dict__.pop("frame", None)
+        other.__dict__.update(centre=centre, axis=axis, edge=edge)
+        return other
+
+
+def check_open_surface(points: Array, faces: NDArray, name: str) -> tuple[Array, NDArray[np.int64]]:
+    """The arrays of a surface with one side.
+
+    Raises
+    ------
+    ProblemError
+        Where it is no triangle surface, or its triangles do not agree on a side.
+    """
+    points, faces = np.asarray(points, dtype=float), np.asarray(faces)
+    check_triangles(points, faces, name)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    if len(np.unique(edges, axis=0)) < len(edges):
+        raise ProblemError(
+            f"the triangles of {name} do not agree on a side, or more than two meet at an edge",
+            remedy="orient them alike, counter-clockwise seen from the tissue",
+        )
+    return points, faces.astype(np.int64)
+
+
 # What lies beyond the brim by less than this share of the triangle beside it is still met.
 BEYOND = 0.02
 Facets = tuple[Array, Array, Array, Array, NDArray[np.bool_], Tree]
@@ -56,7 +120,6 @@ class OpenSurface(Wall):
             raise ProblemError(f"a reach of {self.reach} mm is not positive")
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "faces", faces)
-
         _ = self._box, self._facets  # derived once, and kept where the surface is placed anew
 
     @cached_property
@@ -74,15 +137,7 @@ class OpenSurface(Wall):
         tree = build_tree(corners, np.arange(len(corners)))
         return corners, normals, edges, sums[self.faces], _find_brim(self.faces, beyond < 0), tree
 
-    @property
-    def grows(self) -> bool:
-        return False
-
-    def grown(self, share: float) -> OpenSurface:
-        return self
-
     def near(self, points: Array) -> NDArray[np.bool_]:
-        """Which points (n, 3) of its frame it may touch."""
         low, high = self._box
         return np.asarray(((points >= low) & (points <= high)).all(axis=1))
 

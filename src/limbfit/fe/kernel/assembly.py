@@ -14,12 +14,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..lanes import COMPILED, LANES, block_places, prefetch, workspace
-from .fibres import add_stress, add_weighted_moduli
 from .laws import Tables
-from .response import elastic_response, kirchhoff, pressures, weighted_moduli
+from .response import (
+    add_fibre_stress,
+    add_weighted_fibre_moduli,
+    elastic_response,
+    kirchhoff_stress,
+    pressures,
+    weighted_moduli,
+)
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int32]
 Elements = tuple[Indices, Array, Array, Indices, Array, Array]
 
@@ -79,14 +85,14 @@ def _assemble(  # type: ignore[no-untyped-def]
         count = min(LANES, m - start)
         if not elastic_response(elements, start, tables, u, points, law[0], numbers):
             return np.inf
-        _gather(elements, start, past, points, at_points)
+        _load_lanes(elements, start, past, points, at_points)
         pressures(weights, regions, tables, mean, start, points, element[0])
         for a in range(k):
-            _no_force(forces[a])
+            _clear_force(forces[a])
         for t in range(q):
-            kirchhoff(points[t])
+            kirchhoff_stress(points[t])
             if len(fibres):
-                add_stress(points[t])
+                add_fibre_stress(points[t])
             for l in range(LANES):
                 energy += points[t].energy[l]
             for a in range(k):
@@ -97,15 +103,15 @@ def _assemble(  # type: ignore[no-untyped-def]
                     residual[cells[start + l, a], i] += forces[a].f[i, l]
         if not tangent:
             continue
-        _ask_for(positions[start], k, data)
+        _prefetch_entries(positions[start], k, data)
         for t in range(q):
             weighted_moduli(points[t], element[0])
             if len(fibres):
-                add_weighted_moduli(points[t], element[0])
-        _stiffness(points, at_points, forces, element[0], blocks)
+                add_weighted_fibre_moduli(points[t], element[0])
+        _fill_blocks(points, at_points, forces, element[0], blocks)
         for l in range(count):
             if start + l + 1 < m:
-                _ask_for(positions[start + l + 1], k, data)
+                _prefetch_entries(positions[start + l + 1], k, data)
             for j in range(entries.shape[0]):
                 to = positions[start + l, j]
                 if to >= 0:
@@ -114,7 +120,7 @@ def _assemble(  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def _gather(elements, start, past, points, at_points):  # type: ignore[no-untyped-def]
+def _load_lanes(elements, start, past, points, at_points):  # type: ignore[no-untyped-def]
     """Read weights, what is past and gradients of the elements from ``start`` on into lanes."""
     cells, grads, weights, regions, _, _ = elements
     scale, history = past
@@ -137,7 +143,7 @@ def _gather(elements, start, past, points, at_points):  # type: ignore[no-untype
 
 
 @njit(**COMPILED)
-def _no_force(force):  # type: ignore[no-untyped-def]
+def _clear_force(force):  # type: ignore[no-untyped-def]
     for l in range(LANES):
         force.f[0, l], force.f[1, l], force.f[2, l] = 0.0, 0.0, 0.0
         force.volume[0, l], force.volume[1, l], force.volume[2, l] = 0.0, 0.0, 0.0
@@ -167,7 +173,7 @@ def _add_force(p, node, force):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def _stiffness(points, at_points, forces, element, blocks):  # type: ignore[no-untyped-def]
+def _fill_blocks(points, at_points, forces, element, blocks):  # type: ignore[no-untyped-def]
     """Fill the BLOCKs of all pairs of nodes, column by column."""
     k = forces.shape[0]
     for b in range(k):
@@ -175,7 +181,7 @@ def _stiffness(points, at_points, forces, element, blocks):  # type: ignore[no-u
         for a in range(b + 1):
             _begin_block(forces[a], forces[b], element, blocks[first + a])
         for q in range(points.shape[0]):
-            _strain(points[q], at_points[q * k + b], element)
+            _apply_moduli(points[q], at_points[q * k + b], element)
             for a in range(b + 1):
                 _add_block(at_points[q * k + a], at_points[q * k + b], element, blocks[first + a])
 
@@ -193,7 +199,7 @@ def _begin_block(a, b, element, block):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def _strain(p, node, element):  # type: ignore[no-untyped-def]
+def _apply_moduli(p, node, element):  # type: ignore[no-untyped-def]
     """``D B`` of one node: weighted stresses (6, 3) for its displacement along each axis."""
     for l in range(LANES):
         x, y, z = node.g[0, l], node.g[1, l], node.g[2, l]
@@ -226,7 +232,7 @@ def _add_block(a, b, element, block):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def _ask_for(positions, k, data):  # type: ignore[no-untyped-def]
+def _prefetch_entries(positions, k, data):  # type: ignore[no-untyped-def]
     """Prefetch where an element goes in ``data``: three rows for each pair of nodes."""
     for i in range(3):
         for a in range(k):

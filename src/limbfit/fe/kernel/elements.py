@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...mesh.cells import (
     QUAD_CORNERS,
     ShapeFunctions,
@@ -19,8 +20,6 @@ from ...mesh.cells import (
     linear_tensor,
     quadratic_simplex,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

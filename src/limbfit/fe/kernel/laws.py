@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..materials import Material
 
-Array = NDArray[np.float64]
 Tables = tuple[Array, Array, NDArray[np.int64], NDArray[np.int64], Array]
 
 

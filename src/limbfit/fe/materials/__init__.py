@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from .contractile import Contractile
-from .elastic import ElasticLaw, lane_function, mean_exponential
-from .fibred import Fibred
+from .elastic import VOLUMETRIC_LAWS, ElasticLaw, lane_function, mean_exponential
+from .fibred import Contractile, Fibred
 from .fung import FungQLV
 from .hyperelastic import MooneyRivlin, NeoHookean, Ogden, OgdenPower, OgdenQLV
 from .material import LawTable, Material, PronyTerms, Uncoupled
 from .viscoelastic import ORDER_IN_TIME, compute_prony_factors
-from .volumetric import VOLUMETRIC_LAWS
 
 __all__ = [
     "ORDER_IN_TIME",

@@ -15,14 +15,11 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol, Self, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import ProblemError
-from .elastic import ElasticLaw
-from .ogden import OGDEN
-from .volumetric import VOLUMETRIC_LAWS
+from .elastic import OGDEN, VOLUMETRIC_LAWS, ElasticLaw
 
-Array = NDArray[np.float64]
 PronyTerms = Sequence[tuple[float, float]]
 
 

@@ -17,9 +17,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from ...arrays import Array
+
 ORDER_IN_TIME = 3.0  # of the error of a force, against the length of the steps
 _SMALL = 0.02  # of x: closed forms lose digits below
 

@@ -16,9 +16,9 @@ from dataclasses import replace
 
 import numpy as np
 import scipy.sparse.linalg as spla
-from numpy.typing import NDArray
 
-from ..contact.grip import StickyContact
+from ...arrays import Array
+from ..contact.friction import StickyContact
 from ..kernel.laws import Laws
 from ..system import Evaluation, Increment, System
 from .direction import build_preconditioner, find_touching_bodies
@@ -27,7 +27,6 @@ from .linear import NotPositiveDefiniteError
 from .newton import Equilibrium, NewtonControl, compute_reaction_scale, compute_residual_norm
 from .sensitivity import solve_with_adjoint
 
-Array = NDArray[np.float64]
 # GMRES: vectors that it keeps, and how often it starts anew; the residual of Newton's directions, and of
 # derivatives, which no adjoint corrects.
 VECTORS, RESTARTS, FORCING, TOLERANCE = 40, 4, 1e-2, 2e-5

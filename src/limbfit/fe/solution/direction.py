@@ -13,13 +13,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..bodies import Bodies
 from ..contact.contact import Touch
 from ..system import Evaluation, System
 from .factor import Factor, LinearSolution
 from .springs import SpringChange
 
-Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 SWEEPS, ROUNDS = 12, 4
 

@@ -15,12 +15,12 @@ import scipy.sparse as sp
 from numba import njit
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...mesh import TET10_EDGES
 from ..pattern import build_node_graph, build_upper_pattern, place_of
 from ..system import System
 from .linear import Index, NotPositiveDefiniteError, SingleHalf, build_linear_solver
 
-Array = NDArray[np.float64]
 # A block is added to the upper triangle turned where its parents are in reverse, both ways on the diagonal.
 _TURNED, _BOTH = 1, 2
 

@@ -20,15 +20,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..kernel.laws import Laws
 from ..system import Evaluation, Increment, System
 from .direction import find_newton_direction
 from .factor import Factor
 from .linear import NotPositiveDefiniteError
 
-Array = NDArray[np.float64]
 # A shorter step damps the next directions, at first by this share of each tissue's own shear modulus; it is
 # changed by a factor, and less than the smallest is none.
 SHORT_STEP, FIRST_DAMPING, DAMPING_CHANGE, LEAST_DAMPING = 0.3, 0.1, 4.0, 0.02

@@ -1,30 +1,42 @@
 """Direct differentiation: the derivative of every step with respect to every material parameter.
 
 At a converged step ``R(u, history, p) = 0``, hence ``K du/dp = -dR/dp``; the right-hand side holds the
-explicit derivative and that of the history, which is carried along at the quadrature points
-(Michaleris, Tortorelli and Vidal 1994, transient problems).
+explicit derivative and that of the history, which is carried along at the quadrature points (Michaleris,
+Tortorelli and Vidal 1994, transient problems).  So are the forces that bodies take over from what held them:
+where a displacement drives a coordinate that a force drives next, and that force is left open, it begins as
+what held the coordinate.  A stiffer limb held the donned socket by more.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from ..history import Memory
-from ..kernel.fibres import add_moduli_at_rest, add_stress_at_rest
+from ...arrays import Array
+from ..bodies import Bodies
 from ..kernel.laws import Laws
-from ..kernel.response import elastic_response, elastic_stress, moduli, pressures, stress_rates
+from ..kernel.response import (
+    add_material_fibre_moduli,
+    add_material_fibre_stress,
+    elastic_moduli,
+    elastic_response,
+    pressures,
+    pull_back,
+    stress_rates,
+)
 from ..lanes import LANES, workspace
 from ..materials import compute_prony_factors
+from ..memory import Memory
+from ..motion import RigidBody
+from ..result import State
 from ..system import Evaluation, Increment, System
 from .direction import solve_at
 from .factor import Factor
 
-Array = NDArray[np.float64]
 # Residual of the linear systems, relative to their right-hand sides.  What is left then in the force is of
 # second order, but what the history hands on is not: 6e-6 of a force's derivative, 2e-4 of a displacement's.
 TOLERANCE = 1e-3
@@ -228,12 +240,12 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
         elastic_response(elements, start, tables, u, points, law[0], numbers)
         pressures(weights, regions, tables, mean, start, points, element[0])
         for q in range(len(points)):
-            elastic_stress(points[q])
+            pull_back(points[q])
             stress_rates(points[q], law[0], numbers, rates[q * n : (q + 1) * n])
-            moduli(points[q], element[0])
+            elastic_moduli(points[q], element[0])
             if len(fibres):
-                add_stress_at_rest(points[q])
-                add_moduli_at_rest(points[q], element[0])
+                add_material_fibre_stress(points[q])
+                add_material_fibre_moduli(points[q], element[0])
         for el in range(start, min(start + LANES, m)):
             l, region = el - start, regions[el]
             fe[:] = 0.0
@@ -261,11 +273,11 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
                             for t in range(6):
                                 part[t] += d_numbers[region, j, i] * rates[q * n + i].S[t, l]
                     if len(fibres):
-                        rate = d_fibre[region, j, 0] * at.pull_rates[0, l]
-                        rate += d_fibre[region, j, 1] * at.pull_rates[1, l]
+                        rate = d_fibre[region, j, 0] * at.fibre_tension_rates[0, l]
+                        rate += d_fibre[region, j, 1] * at.fibre_tension_rates[1, l]
                         for t in range(6):
                             x, y = t % 3, (t + (1 if t > 2 else 0)) % 3
-                            along = at.fibre_at_rest[x, l] * at.fibre_at_rest[y, l] - inverse[t] / 3.0
+                            along = at.material_fibre[x, l] * at.material_fibre[y, l] - inverse[t] / 3.0
                             part[t] += rate * along
                             S[t, p] += d_fibre[region, j, 2] * along
                     d_JU = d_kappa[region, j] * at.pressure[l]
@@ -333,3 +345,35 @@ def advance(  # type: ignore[no-untyped-def]
                         for t in range(6):
                             total = x * H[l, el, q, t] + y * change[el, q, t] + z * earlier[el, q, t]
                             prony[l, el, q, t, index[region, j]] += total
+
+
+@dataclass(frozen=True)
+class Takeover:
+    """When each body's forces were taken over last, ``since (b,)`` s, not a number where never, and their
+    derivatives ``slopes (r - n, 3, p)`` in the rows of `System`, N over mm."""
+
+    since: Array
+    slopes: Array
+
+    @classmethod
+    def never(cls, bodies: Sequence[RigidBody], slopes: Array) -> Takeover:
+        """Of bodies that took nothing over; ``slopes`` are zeros."""
+        return cls(np.full(len(bodies), np.nan), slopes)
+
+    def after(self, took: Sequence[bool], bodies: Bodies, state: State, modulus: float) -> Takeover:
+        """When some bodies ``took (b,)`` over what held them in a state with derivatives; ``modulus`` is that
+        of the contact's stiffness, MPa."""
+        assert state.bodies is not None
+        since, slopes = self.since.copy(), self.slopes.copy()
+        found = bodies.holding_slopes(state.drives, state.penalty * modulus, state.bodies)
+        for i, rows in enumerate(bodies.own_rows):
+            if took[i]:
+                since[i], slopes[rows] = state.time, found[rows]
+        return replace(self, since=since, slopes=slopes)
+
+    def left(self, stated: Sequence[RigidBody], bodies: Bodies, t: float) -> Array:
+        """Derivatives (r - n, 3, p) of the forces that are left at time ``t`` of those taken over."""
+        shares = np.zeros(len(self.slopes))
+        for body, since, rows in zip(stated, self.since, bodies.own_rows, strict=True):
+            shares[rows] = body.motion.lasting(since, t)
+        return np.asarray(self.slopes * shares[:, None, None])

@@ -8,38 +8,32 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..contact.grip import StickyContact
-from ..history import Memory, compute_elastic_stresses
+from ...arrays import Array
+from ..contact.friction import StickyContact
 from ..kernel.laws import Laws
+from ..memory import Memory, compute_elastic_stresses
 from ..motion import Drives
 from ..problem import Problem
 from ..result import Result, State, Step
 from ..system import Evaluation, Increment, System
-from ..takeover import Takeover
 from ..threads import limit_numpy_threads
-from .beginning import (
+from .control import StepControl, StepController, predict_remaining_times, schedule_steps
+from .coupling import Coupling, couple, renew_increment, solve_coupled
+from .direction import refactor_at
+from .factor import Factor
+from .linear import prefers_multigrid
+from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, compute_reaction_scale, equilibrate
+from .sensitivity import Explicit, MemoryDerivative, Takeover
+from .springs import find_touched_unknowns
+from .start import (
+    IndenterStart,
     build_grips,
-    build_system,
     compute_elastic_residual,
     measure_indenter_travel,
     start_grips,
 )
-from .control import StepControl, schedule_steps
-from .coupling import Coupling, couple, renew_increment, solve_coupled
-from .direction import refactor_at
-from .factor import Factor
-from .guesses import WarmStart, compute_extrapolation
-from .linear import prefers_multigrid
-from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, compute_reaction_scale, equilibrate
-from .pace import StepController
-from .schedule import predict_remaining_times
-from .sensitivity import Explicit, MemoryDerivative
-from .springs import find_touched_unknowns
-from .touchdown import IndenterStart
-
-Array = NDArray[np.float64]
+from .warm_start import WarmStart, compute_extrapolation
 
 # Penetration over the allowed one that a few more iterations will not mend; how often a penalty is raised.
 TOO_DEEP, MOST_RAISES = 1.2, 5
@@ -76,7 +70,7 @@ class SteppedRun:
     ) -> None:
         started = time.perf_counter()
         self.problem, self.control = problem, control
-        self.system = build_system(problem, warm_start, system, control.threads)
+        self.system = _find_system(problem, warm_start, system, control.threads)
         self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
         self.seconds: defaultdict[str, float] = defaultdict(float)
         moduli, threads, last = self.laws.moduli, control.threads, find_touched_unknowns(self.system, problem)
@@ -400,3 +394,11 @@ class SteppedRun:
         if self.problem.history.forced:  # the force is what is stated
             return du, np.zeros(laws.count)
         return du, at.force * d_penalty + d_reaction + d_force
+
+
+def _find_system(problem: Problem, warm_start: Result | None, system: System | None, threads: int) -> System:
+    """The discretisation that is at hand, where it fits the problem, or a new one."""
+    for known in (system, warm_start.system if warm_start is not None else None):
+        if known is not None and known.fits(problem):
+            return known
+    return System(problem, threads)

@@ -14,11 +14,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..problem import Problem
 from ..system import System
 from .linear import NONE, Halves, Index
 
-Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 # Smaller changes, relative to the stiffest spring, are left to the iteration.

@@ -1,22 +1,24 @@
 """The simulation in time: a generator of accepted steps, and the result made of them.
 
-A step that does not converge is cut and tried again; what was reached is a result with its reason.
+A step that does not converge is cut and tried again; what was reached is a result with its reason.  Between
+two steps a simulation can be kept as JSON values and arrays, from which a later call goes on.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import ProblemError
-from ..doubts import (
+from ..diagnostics import (
     SimulationWarning,
     find_inexact_sensitivities,
     find_inverted_elements,
@@ -28,12 +30,10 @@ from ..doubts import (
 from ..observables import compute_element_fields
 from ..problem import Problem
 from ..result import Result, State, Step
-from ..snapshot import Checkpoints, Snapshot
 from ..system import System
 from .control import StepControl
 from .simulation import SteppedRun
 
-Array = NDArray[np.float64]
 # What is kept of steps; of a run as it is; and of its parts, as dataclasses.
 _COLUMNS = (
     "time", "displacement", "force", "penetration", "contact_area", "newton_iterations", "force_sensitivity",
@@ -293,3 +293,62 @@ def _collect_statistics(run: SteppedRun, seconds: float, sunk_steps: int) -> dic
         "unknowns": run.system.unknowns,
         "seconds": {**parts, "total": seconds},
     }
+
+
+Kind = TypeVar("Kind")
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """What is known after a step: ``facts`` that JSON can hold, and ``arrays``, both by name."""
+
+    facts: Mapping[str, Any]
+    arrays: Mapping[str, NDArray[Any]]
+
+    @classmethod
+    def of(cls, **values: Any) -> Snapshot:
+        """Of dataclasses, sequences, arrays and plain values; what is in something is named after a dot."""
+        facts: dict[str, Any] = {}
+        arrays: dict[str, NDArray[Any]] = {}
+        for name, value in values.items():
+            _flatten(name, value, facts, arrays)
+        return cls(facts, arrays)
+
+    def like(self, name: str, pattern: Kind) -> Kind:
+        """The value of that name, a dataclass of the kind of ``pattern``, whose other fields it takes."""
+        known = {}
+        for one in fields(pattern):  # type: ignore[arg-type]
+            inner, old = f"{name}.{one.name}", getattr(pattern, one.name)
+            if inner in self.arrays or inner in self.facts:
+                known[one.name] = self[inner]
+            elif is_dataclass(old):
+                known[one.name] = self.like(inner, old)
+        return replace(pattern, **known)  # type: ignore[type-var]
+
+    def __getitem__(self, name: str) -> Any:
+        """An array, or a plain value."""
+        return self.arrays[name] if name in self.arrays else self.facts[name]
+
+
+@dataclass(frozen=True)
+class Checkpoints:
+    """When a simulation is kept: after the steps at ``times`` (s) ``keep`` is given a `Snapshot`."""
+
+    times: Sequence[float]
+    keep: Callable[[Snapshot], None]
+
+    def at(self, time: float) -> bool:
+        return bool(np.isclose(time, self.times, rtol=1e-9, atol=0.0).any())
+
+
+def _flatten(name: str, value: Any, facts: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    if isinstance(value, np.ndarray):
+        arrays[name] = value
+    elif is_dataclass(value):
+        for one in fields(value):
+            _flatten(f"{name}.{one.name}", getattr(value, one.name), facts, arrays)
+    elif isinstance(value, (list, tuple)) and any(is_dataclass(one) for one in value):
+        for i, one in enumerate(value):
+            _flatten(f"{name}.{i}", one, facts, arrays)
+    else:
+        facts[name] = value

@@ -6,16 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ..bodies import count_body_rows
-from ..history import Memory
-from ..kernel.laws import Laws
 from ..problem import Problem
 from ..result import Result, State
-from ..system import System
 
-Array = NDArray[np.float64]
 _SAME_S = 1e-9
 
 
@@ -75,12 +71,3 @@ class WarmStart:
 def _move_state(state: State, change: Array) -> Array:
     """All rows (r, 3) of a state, after a ``change (p,)`` of the parameters if its derivatives are known."""
     return state.rows if state.sensitivity is None else state.rows + state.slopes @ change
-
-
-def compute_tangent_at_rest(system: System) -> Array:
-    """Entries of the tangent of the undeformed body, before contact, with its problem's materials."""
-    problem = system.problem
-    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    start = problem.history.displacement_at(0.0)
-    increment = Memory.rest(system, laws).increment(system, laws, 1.0, 1.0, start, 0.0, problem.drives(0.0))
-    return system.evaluate(np.zeros((system.rows, 3)), laws, increment).tangent

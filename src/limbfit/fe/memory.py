@@ -6,17 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from .kernel.fibres import add_stress_at_rest
+from ..arrays import Array
 from .kernel.laws import Laws
-from .kernel.response import elastic_response, elastic_stress
+from .kernel.response import add_material_fibre_stress, elastic_response, pull_back
 from .lanes import LANES, workspace
 from .materials import compute_prony_factors
 from .motion import Drives
 from .system import Increment, Points, System
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -95,9 +92,9 @@ def _compute_elastic_stresses(elements, tables, u, records, out):  # type: ignor
     for start in range(0, m, LANES):
         elastic_response(elements, start, tables, u, points, law[0], numbers)
         for t in range(q):
-            elastic_stress(points[t])
+            pull_back(points[t])
             if len(elements[4]):
-                add_stress_at_rest(points[t])
+                add_material_fibre_stress(points[t])
             for l in range(min(LANES, m - start)):
                 for i in range(6):
                     out[start + l, t, i] = points[t].tau[i, l]

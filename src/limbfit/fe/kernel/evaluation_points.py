@@ -1,4 +1,4 @@
-"""The elastic law at any places of the elements, not at their quadrature points alone."""
+"""The elastic law at any points of the elements, not only at their quadrature points."""
 
 from __future__ import annotations
 
@@ -9,23 +9,28 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...mesh import Mesh
 from ..lanes import LANES, workspace
 from .elements import Element
-from .fibres import add_moduli_at_rest, add_stress_at_rest
 from .laws import Laws
-from .response import elastic_response, elastic_stress, moduli
+from .response import (
+    add_material_fibre_moduli,
+    add_material_fibre_stress,
+    elastic_moduli,
+    elastic_response,
+    pull_back,
+)
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Places:
-    """Places (m,) in a mesh, each as an element with one point (`Points` of `fe.system`).
+class EvaluationPoints:
+    """Points (m,) in a mesh, each as an element with one point (`Points` of `fe.system`).
 
     ``cells (m, k)`` are nodes of its element, ``gradients (m, 1, 3, k)`` of their shape functions at the
-    place, 1/mm; ``regions (m,)``, ``fibres`` and ``prestretch`` as a `System` has them.
+    point, 1/mm; ``regions (m,)``, ``fibres`` and ``prestretch`` as a `System` has them.
     """
 
     cells: NDArray[np.int32]
@@ -38,8 +43,8 @@ class Places:
     @classmethod
     def at(
         cls, mesh: Mesh, element: Element, cells: Ints, local: Array, fibres: Array, prestretch: Array
-    ) -> Places:
-        """Places with ``local`` coordinates (m, 3) in ``cells`` (m,) of a mesh.
+    ) -> EvaluationPoints:
+        """Points with ``local`` coordinates (m, 3) in ``cells`` (m,) of a mesh.
 
         ``fibres`` and ``prestretch`` are those of all cells, or of none.
         """
@@ -62,7 +67,7 @@ class Places:
         return self.cells, self.gradients, self.weights, self.regions, self.fibres, self.prestretch
 
 
-def evaluate_elastic_at(places: Places, laws: Laws, u: Array) -> tuple[Array, Array, Array]:
+def evaluate_elastic_at(points: EvaluationPoints, laws: Laws, u: Array) -> tuple[Array, Array, Array]:
     """What the elastic laws give at displacements ``u (n, 3)``, mm.
 
     Returns
@@ -71,27 +76,27 @@ def evaluate_elastic_at(places: Places, laws: Laws, u: Array) -> tuple[Array, Ar
     moduli : (m, 6, 6) its derivative by the strain E; tensor components in both, MPa.
     gradient : (m, 3, 3) the deformation gradient.
     """
-    m = len(places.cells)
+    m = len(points.cells)
     stress, D, F = np.empty((m, 6)), np.empty((m, 6, 6)), np.empty((m, 3, 3))
-    points, law, numbers, _, _, element, *_ = workspace(0, 1, laws.numbers.shape[1])
-    records = points, law, numbers, element
-    _evaluate_elastic_at(places.elements, laws.tables, u, records, stress, D, F)
+    point, law, numbers, _, _, element, *_ = workspace(0, 1, laws.numbers.shape[1])
+    records = point, law, numbers, element
+    _evaluate_elastic_at(points.elements, laws.tables, u, records, stress, D, F)
     return stress, D, F
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _evaluate_elastic_at(elements, tables, u, records, stress, D, F):  # type: ignore[no-untyped-def]
-    """The kernel of `evaluate_elastic_at`, `LANES` places side by side."""
+    """The kernel of `evaluate_elastic_at`, `LANES` points side by side."""
     points, law, numbers, element = records
     p = points[0]
     m = len(stress)
     for start in range(0, m, LANES):
         elastic_response(elements, start, tables, u, points, law[0], numbers)
-        elastic_stress(p)
-        moduli(p, element[0])
+        pull_back(p)
+        elastic_moduli(p, element[0])
         if len(elements[4]):
-            add_stress_at_rest(p)
-            add_moduli_at_rest(p, element[0])
+            add_material_fibre_stress(p)
+            add_material_fibre_moduli(p, element[0])
         for l in range(min(LANES, m - start)):
             for r in range(6):
                 stress[start + l, r] = p.tau[r, l]

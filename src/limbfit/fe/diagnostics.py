@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..mesh import Mesh, node_jacobians
 
-Array = NDArray[np.float64]
 Kind = Literal["folded", "slipped", "sunk", "unbalanced", "unsettled", "inexact"]
 
 SLIP = 0.9  # force over the one before, in an advancing step, that is no relaxation

@@ -1,0 +1,152 @@
+"""With what a simulation begins: what holds points along bodies, what it is judged by, where the indenter
+starts.
+
+Where tissue has moved before (pins hold it, it is tensed, or strained at rest), the indenter stays clear of
+it until `Problem.touch_down_s`; then it is advanced until it just touches, and its displacement counts from
+there. That place follows the parameters, and so its derivative enters all others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...arrays import Array
+from ..contact.contact import find_touching_offset
+from ..contact.friction import LAWS_OF_STICKING, Anchors, StickyContact
+from ..kernel.laws import Laws
+from ..memory import Memory
+from ..motion import Drives
+from ..problem import Problem
+from ..result import State
+from ..system import Evaluation, System
+from .coupling import Coupling
+
+
+def compute_elastic_residual(system: System, laws: Laws, state: State) -> float:
+    """Norm of the nodal forces of elastic tissue in a state, N."""
+    still = Memory.rest(system, laws).increment(system, laws, 0.0, 1.0, state.displacement, 0.0, state.drives)
+    return float(np.linalg.norm(system.evaluate(state.rows, laws, still, tangent=False).residual))
+
+
+def measure_indenter_travel(system: System, modulus: float) -> float:
+    """The way against which penetration is judged, mm: the largest of a body that is driven by displacement,
+    or how deep the tissue at rest lies in what a body grows to.
+
+    Where only forces drive bodies it is that of a flat punch on a half-space of the tissue's shear
+    ``modulus``, ``F / (4 mu w)``, and no more than half a width.
+    """
+    bodies = system.problem.rigid_bodies
+    if system.bodies is None:
+        return float(np.abs(system.problem.history.driver).max())
+    grown = [-one.surface.gaps_at_rest(one.start.grown(1.0)).min() for one in system.bodies.all
+             if one.stated.motion.grows]  # fmt: skip
+    if max(grown, default=0.0) > 0.0:
+        return float(max(grown))
+    sizes = [np.abs(np.nan_to_num(body.motion.values[:, :3])) for body in bodies]
+    ways = [np.where(body.motion.free[:3], 0.0, size).max() for body, size in zip(bodies, sizes)]
+    if max(ways) > 0.0:
+        return float(max(ways))
+    widths = [body.shape.width for body in bodies]
+    pushed = [float(size.max()) / (4.0 * modulus * width) for size, width in zip(sizes, widths)]
+    return max(min(way, width / 2) for way, width in zip(pushed, widths)) or max(widths) / 2
+
+
+def build_grips(system: System, parameters: int) -> tuple[StickyContact | None, ...]:
+    """What holds the points of each body at first; None where nothing ever does."""
+    found: list[StickyContact | None] = []
+    for body in [] if system.bodies is None else system.bodies.all:
+        friction = body.stated.friction
+        if friction in ("frictionless", 0.0):
+            found.append(None)
+        elif isinstance(friction, str):
+            found.append(Anchors.none(body.surface, parameters))
+        else:
+            law = LAWS_OF_STICKING[body.stated.sticking]
+            found.append(law.none(float(friction), body.surface, parameters, body.stated.holding))
+    return tuple(found)
+
+
+def start_grips(
+    system: System, grips: Sequence[StickyContact | None], u: Array, drives: Drives
+) -> tuple[StickyContact | None, ...]:
+    """The grips with which a run begins, its bodies at rest where they start."""
+    tools = [] if system.bodies is None else system.bodies.tools(u, drives)
+    return tuple(grip and grip.begun(tool) for grip, tool in zip(grips, tools, strict=True))
+
+
+def compute_tangent_at_rest(system: System) -> Array:
+    """Entries of the tangent of the undeformed body, before contact, with its problem's materials."""
+    problem = system.problem
+    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+    start = problem.history.displacement_at(0.0)
+    increment = Memory.rest(system, laws).increment(system, laws, 1.0, 1.0, start, 0.0, problem.drives(0.0))
+    return system.evaluate(np.zeros((system.rows, 3)), laws, increment).tangent
+
+
+CLEAR = 3.0  # widths of the indenter that it is off the tissue until it touches
+
+
+@dataclass(frozen=True)
+class IndenterStart:
+    """How far the indenter begins beyond where it would touch the tissue at rest.
+
+    Parameters
+    ----------
+    waits : whether it is still clear of the tissue.
+    offset : mm along its axis.
+    slope : (p,) derivative of the offset with respect to the parameters; None where it has none.
+    """
+
+    waits: bool = False
+    offset: float = 0.0
+    slope: Array | None = None
+
+    @classmethod
+    def of(cls, problem: Problem) -> IndenterStart:
+        """That with which a simulation begins."""
+        meets = problem.touch_down_s > 0.0 or (problem.prestretch is not None and problem.start == "touching")
+        if problem.indenter is None or not meets:
+            return cls()
+        return cls(True, -CLEAR * problem.indenter.width)
+
+    def after(self, system: System, u: Array, drives: Drives, du: Array | None) -> IndenterStart:
+        """It touches the tissue at ``u (r, 3)``, whose derivative is ``du (r, 3, p)``."""
+        assert system.bodies is not None
+        body = system.bodies.first
+        surface = replace(body.surface, points=body.surface.points + u[: system.nodes])
+        offset = find_touching_offset(surface, body.start)
+        if du is None:
+            return IndenterStart(False, offset)
+        moved = IndenterStart(False, offset).drives(drives)
+        tool = system.bodies.tools(u, moved)[0]
+        gaps, normals, _ = tool.body.local_distance(tool.local)
+        at = np.unravel_index(gaps.argmin(), gaps.shape)
+        normal = normals[at]
+        return IndenterStart(False, offset, normal @ tool.moved(du)[at] / normal[2])
+
+    def drives(self, stated: Drives) -> Drives:
+        """What drives the bodies, with the indenter moved by the offset."""
+        if not self.offset:
+            return stated
+        values = stated.values.copy()
+        values[0, 2] += self.offset
+        return replace(stated, values=values)
+
+    def pushed(self, system: System, at: Evaluation, coupling: Coupling) -> Array | None:
+        """Derivative (c, 3, p) of the forces on the contact points through the offset alone, N."""
+        if self.slope is None or system.bodies is None or at.touch is None:
+            return None
+        points, axis = system.bodies.first.points, system.bodies.first.frame[2]
+        out = np.zeros((system.bodies.count, 3, len(self.slope)))
+        stiff = (at.touch.blocks + coupling.blocks)[points]
+        out[points] = -(stiff @ axis)[..., None] * self.slope
+        return out
+
+    def beside(self, system: System, du: Array | None) -> Array | None:
+        """Derivatives (r, 3, p) of displacements, relative to where the indenter touched."""
+        if du is None or self.slope is None or system.bodies is None:
+            return du
+        return du - system.bodies.first.frame[2][:, None] * self.slope
