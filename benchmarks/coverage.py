@@ -44,7 +44,7 @@ from limbfit.identify.uncertainty.noise import SiteNoise, compute_depth_slope, e
 from limbfit.phantom.record import DISPLACEMENT_NOISE_MM, RATE_HZ
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.identification.record_simulator import build_unknowns
+from limbfit.pipeline.identification.problem import build_unknowns
 from limbfit.pipeline.records.deviations import estimate_site_deviation
 from limbfit.pipeline.records.records import SiteRecord, load_site_record
 from limbfit.pipeline.uncertainty.result import EMULATOR, read_emulator

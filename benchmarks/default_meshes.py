@@ -20,7 +20,7 @@ from limbfit.execution import SerialExecutor
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.identification.record_simulator import build_unknowns
+from limbfit.pipeline.identification.problem import build_unknowns
 from limbfit.pipeline.limb.mesh import mesh_settings
 from limbfit.pipeline.limb.remesh import mesh_models
 from limbfit.pipeline.records.records import load_site_record
@@ -53,7 +53,7 @@ def main() -> None:
         if given.sites and recorded.site.name not in given.sites:
             continue
         record = load_site_record(context, recorded)
-        (model,) = mesh_models(context, given.folder / "fine", [record.model], fine, "fine meshes")
+        (model,) = mesh_models(context, given.folder / "fine", [record.model], fine, lambda text: None)
         jobs = [one.job(start, sensitivities=False) for one in (record, replace(record, model=model))]
         found = list(cache.run(jobs, context.executor))
         if failed := [one.reason for one in found if not one.completed]:

@@ -43,8 +43,13 @@ from limbfit.phantom.record import NOTHING, ULTRASOUND_NOISE_MM, WAVES_NOISE_M_S
 from limbfit.pipeline.design.protocol import DETERMINED
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.identification.record_simulator import build_unknowns
-from limbfit.pipeline.simulation.simulations import SimulationCache, build_curve_job, build_site_model
+from limbfit.pipeline.identification.problem import build_unknowns
+from limbfit.pipeline.simulation.simulations import (
+    SimulationCache,
+    build_curve_job,
+    build_site_model,
+    coarsen_model,
+)
 from limbfit.study import Study
 
 FAST, HOLD_S = 4.8, 30.0
@@ -136,7 +141,7 @@ def told_of(
     jobs = []
     for take in plain:
         site = study.site(take.site).model_copy(update={"indenter": "ball" if take.ball else None})
-        model = build_site_model(context, site, *take.knots, searched=True, layers=TISSUES)
+        model = coarsen_model(context, build_site_model(context, site, *take.knots, layers=TISSUES))
         jobs.append(build_curve_job(replace(model, name=take.name), study.tissues, truth))
     found = {}
     done = SimulationCache(folder / f"expected-{limb.seed}").run(jobs, context.executor)

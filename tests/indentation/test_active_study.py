@@ -15,7 +15,7 @@ from limbfit.indentation import SimulationJob, build_materials, build_problem, s
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.simulation.simulations import build_recorded_model
+from limbfit.pipeline.records.records import build_model
 from limbfit.pipeline.socket.socket import check_socket
 from limbfit.study import Study
 
@@ -51,7 +51,7 @@ def test_its_course_decides_the_calibration(tmp_path):
 
 
 def test_it_tenses_before_touch_down_and_as_stated_from_there(context):
-    model = replace(build_recorded_model(context, context.study.recorded[0]), course=((0.0, 0.5), (2.0, 1.0)))
+    model = replace(build_model(context, context.study.recorded[0]), course=((0.0, 0.5), (2.0, 1.0)))
     problem = build_problem(model, read_vtu(model.mesh), TRUTH)
     assert problem.touch_down_s == model.waits_s == 7.0
     shares = [problem.activated(t) for t in (0.0, 1.0, 2.0, 7.0, 8.0, 9.0, 12.0)]
@@ -61,7 +61,7 @@ def test_it_tenses_before_touch_down_and_as_stated_from_there(context):
 
 def test_force_follows_the_active_stress_by_its_derivative(context):
     """And the tensed block is not as the passive one is."""
-    study, model = context.study, build_recorded_model(context, context.study.recorded[0])
+    study, model = context.study, build_model(context, context.study.recorded[0])
     flat, times = study.vector(TRUTH), (0.5 * model.knots_s[1], model.knots_s[1], 1.5 * model.knots_s[1])
     names = [f"{tissue}.{key}" for tissue, key in study.parameters]
 

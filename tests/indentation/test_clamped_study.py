@@ -18,7 +18,8 @@ from limbfit.pipeline.commands.run import compute_keys, run_study
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.limb.mesh import build_coarse_settings, mesh_settings
-from limbfit.pipeline.simulation.simulations import build_planned_model, compute_job_digest
+from limbfit.pipeline.records.records import build_model
+from limbfit.pipeline.simulation.simulations import compute_job_digest
 from limbfit.study import Study, load_study
 from small_limb import small_limb
 
@@ -69,7 +70,7 @@ def test_the_mesh_is_no_coarser_than_they_are_wide_and_searched_as_a_whole(tmp_p
 def test_a_clamped_site_is_indented_from_where_its_skin_is_then(context):
     """Force and its derivatives, which follow the place where the indenter touches too."""
     study = context.study
-    model = build_planned_model(context, study.sites[0])
+    model = build_model(context, study.sites[0])
     start = np.array([study.material.of(tissue, "start")[key] for tissue, key in study.parameters])
     times = (0.0, 0.5 * model.knots_s[1], model.knots_s[1])  # the way in
 
@@ -112,7 +113,7 @@ def test_a_clamped_site_goes_to_febio(context, tmp_path):
 
 
 def test_they_are_among_what_decides_a_kept_simulation(context):
-    model = build_planned_model(context, context.study.sites[0])
+    model = build_model(context, context.study.sites[0])
     clamps = model.clamps
     assert clamps is not None
     others = [None, clamps.model_copy(update={"force_N": 5.0})]
@@ -137,7 +138,7 @@ def test_pins_that_miss_are_refused_with_the_study_s_file(context):
     assert clamps is not None
     above = context.study.model_copy(update={"clamps": clamps.model_copy(update={"levels_mm": (300.0,)})})
     with pytest.raises(ProblemError) as caught:
-        build_planned_model(replace(context, study=above), above.sites[0])
+        build_model(replace(context, study=above), above.sites[0])
     told = str(caught.value)
     assert "study.toml: clamps: site 1: no clamping pin meets the skin; give clamps.angles_degrees" in told
     assert "\n" not in told

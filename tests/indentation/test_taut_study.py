@@ -13,7 +13,8 @@ from limbfit.indentation import SimulationJob, build_problem, simulate
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.simulation.simulations import build_recorded_model, compute_job_digest
+from limbfit.pipeline.records.records import build_model
+from limbfit.pipeline.simulation.simulations import compute_job_digest
 from limbfit.pipeline.socket.socket import check_socket
 
 TAUT = "prestretch = { skin = 1.1 }\n"
@@ -27,7 +28,7 @@ def context(tmp_path_factory) -> Context:
 
 
 def test_a_layer_is_stretched_in_its_plane_and_fibres_along_themselves(context):
-    model = replace(build_recorded_model(context, context.study.recorded[0]))
+    model = replace(build_model(context, context.study.recorded[0]))
     assert model.prestretch == (("skin", 1.1),)
     mesh = read_vtu(model.mesh)
     G = np.asarray(build_problem(model, mesh, TRUTH).prestretch)
@@ -49,7 +50,7 @@ def test_it_decides_the_calibration_on_whole_meshes(tmp_path):
 
 
 def test_force_follows_tissue_by_its_derivatives(context):
-    study, model = context.study, build_recorded_model(context, context.study.recorded[0])
+    study, model = context.study, build_model(context, context.study.recorded[0])
     flat, times = study.vector(TRUTH), (0.5 * model.knots_s[1], model.knots_s[1], 1.5 * model.knots_s[1])
     names = [f"{tissue}.{key}" for tissue, key in study.parameters]
     jobs = [SimulationJob(one, study.tissues, tuple(flat), times) for one in (model, model.bare)]

@@ -29,7 +29,8 @@ from limbfit.laws import LAWS, POWER, TissueLaw
 from limbfit.pipeline.commands.export import check_export
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.storage import write_json
-from limbfit.pipeline.simulation.simulations import build_recorded_model, compute_job_digest
+from limbfit.pipeline.records.records import build_model
+from limbfit.pipeline.simulation.simulations import compute_job_digest
 from limbfit.relaxation import DEFAULT_SPAN_S, choose_relaxation_times, compute_power_law_terms
 from limbfit.report.sections.methods import write_method_parts
 from limbfit.report.store import load_store
@@ -90,7 +91,7 @@ def test_a_study_has_its_times_and_tissues(tmp_path):
 def test_force_of_a_study_follows_its_law_by_its_derivatives(tmp_path):
     study = block_study(tmp_path, LAW + SPAN)
     context = block_context(study, TRUTH)
-    model = build_recorded_model(context, study.recorded[0])
+    model = build_model(context, study.recorded[0])
     made = build_site_materials(model, TRUTH)["muscle"]
     assert made == OgdenPower(0.004, 5.0, 0.4, 0.2, study.law.relaxation_times_s)
     times = (0.5 * model.knots_s[1], model.knots_s[1], 1.5 * model.knots_s[1])

@@ -13,7 +13,7 @@ from conftest import COARSE
 from limbfit.errors import InputError
 from limbfit.identify.checks.protocol import sample_tissues
 from limbfit.pipeline.design.protocol import DESIGNED, PLAIN, UNSEEN
-from limbfit.pipeline.identification.record_simulator import build_unknowns
+from limbfit.pipeline.identification.problem import build_unknowns
 
 BALL = '[indenters.ball]\nshape = "sphere"\nwidth_mm = 12.0\n[acquire]\nforce_limit_N = 45.0\n'
 

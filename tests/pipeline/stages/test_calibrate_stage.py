@@ -18,7 +18,7 @@ from limbfit.pipeline.engine.context import Context, Progress
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
-from limbfit.pipeline.identification.record_simulator import build_groupings
+from limbfit.pipeline.identification.problem import build_groupings
 from limbfit.priors import SOURCE
 from limbfit.study import Study, load_study
 

@@ -15,8 +15,9 @@ from limbfit.indentation import SimulationJob, build_materials, build_problem, s
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.identification.record_simulator import build_groupings, build_unknowns
-from limbfit.pipeline.simulation.simulations import build_recorded_model, find_fibre_directions
+from limbfit.pipeline.identification.problem import build_groupings, build_unknowns
+from limbfit.pipeline.records.records import build_model
+from limbfit.pipeline.simulation.simulations import find_fibre_directions
 from limbfit.pipeline.variants.cube import check_cube
 from limbfit.study import Study
 
@@ -69,7 +70,7 @@ def test_a_flow_is_known_site_by_site(context):
 
 
 def test_a_site_s_problem_has_them_and_its_force_their_derivatives(context):
-    model = build_recorded_model(context, context.study.recorded[0])
+    model = build_model(context, context.study.recorded[0])
     problem = build_problem(model, read_vtu(model.mesh), TRUTH)
     inside = problem.mesh.regions == problem.mesh.region_names.index("muscle")
     np.testing.assert_array_equal(problem.fibres[inside], np.tile([1.0, 0.0, 0.0], (inside.sum(), 1)))

@@ -20,11 +20,15 @@ from limbfit.indentation import (
 from limbfit.mesh import Mesh
 from limbfit.phantom.record import write_surface
 from limbfit.pipeline.identification.calibrate import run_calibrate
+from limbfit.pipeline.identification.fine_meshes import correct_to_fine_meshes
+from limbfit.pipeline.identification.intervals import estimate_linearised
 from limbfit.pipeline.identification.predict import run_predict
-from limbfit.pipeline.identification.record_simulator import RecordSimulator, estimate_linearised
+from limbfit.pipeline.identification.problem import build_problem
+from limbfit.pipeline.identification.record_simulator import RecordSimulator
+from limbfit.pipeline.records.records import load_records
+from limbfit.pipeline.records.secondary_measurements import MAX_POINTS, ChosenPoints, choose_points
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.pipeline.simulation.simulations import SimulationCache
-from limbfit.pipeline.simulation.surface_points import MAX_POINTS, ChosenPoints, choose_points
 from limbfit.report.drawing.figures import draw_skin_figure
 from limbfit.report.sections.prediction import make_observed_table
 from limbfit.report.store import load_store
@@ -79,18 +83,20 @@ def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -
         (tmp_path / name).mkdir()
         context = BLOCK.stored(tmp_path / name, monkeypatch, more)
         study = context.study
-        laboratory = RecordSimulator(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
-        at = laboratory.anchored(study.vector(TRUTH))
-        known = estimate_linearised(context, laboratory.records, study.vector(TRUTH), at)
+        records = load_records(context, study.recorded, secondary=True)
+        cache = SimulationCache(tmp_path / name / "runs")
+        simulator = RecordSimulator(records, cache, context.executor, lambda text: None)
+        at = correct_to_fine_meshes(study, simulator, study.vector(TRUTH))
+        known = estimate_linearised(context, build_problem(study), records.own, study.vector(TRUTH), at)
         widths.append(np.sqrt(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
-    assert [one.name for one in laboratory.records] == ["a", "a+surface"]
-    assert [one.unit for one in laboratory.measured] == ["N", "mm"]
-    assert {one.where for one in laboratory.measured} == {"a"}  # left out together
-    seen, noise = laboratory.records[1], known.residual_model.noise[1]
+    assert [one.name for one in records.own] == ["a", "a+surface"]
+    assert [one.unit for one in records.measured] == ["N", "mm"]
+    assert {one.where for one in records.measured} == {"a"}  # left out together
+    seen, noise = records.own[1], known.residual_model.noise[1]
     off = at.responses[1].force_N - seen.compared
     assert len(off) > 300
     assert off @ np.linalg.solve(noise.covariance, off) / len(off) == pytest.approx(1.0, abs=0.25)
-    assert laboratory.simulated == 1
+    assert records.simulations == 1
     assert (widths[1] < widths[0]).all()
     assert widths[0][0] > 2.0  # force alone: 2.6 for the skin's modulus, 1.7 for the muscle's
     assert widths[1][0] < 1.4  # 1.27
@@ -129,9 +135,11 @@ def test_one_component_in_the_frame_of_the_indenter(tmp_path: Path, monkeypatch)
         file, rows[:, [0, 1, 2, 3, 6]], delimiter=",", header="time_s,x_mm,y_mm,z_mm,uz_mm", comments=""
     )
     run_traces(context, context.store["traces"])
-    laboratory = RecordSimulator(context, SimulationCache(tmp_path / "runs"), context.study.recorded)
-    at = laboratory.anchored(context.study.vector(TRUTH))
-    seen = laboratory.records[1]
+    records = load_records(context, context.study.recorded, secondary=True)
+    cache = SimulationCache(tmp_path / "runs")
+    simulator = RecordSimulator(records, cache, context.executor, lambda text: None)
+    at = correct_to_fine_meshes(context.study, simulator, context.study.vector(TRUTH))
+    seen = records.own[1]
     assert set(seen.seen.components.tolist()) == {2}
     assert seen.compared.max() > 0.2  # into the limb
     off = at.responses[1].force_N - seen.compared

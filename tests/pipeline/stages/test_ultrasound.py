@@ -18,8 +18,12 @@ from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, 
 from limbfit.mesh import find_gauges_along
 from limbfit.phantom.record import write_ultrasound
 from limbfit.pipeline.identification.calibrate import run_calibrate
+from limbfit.pipeline.identification.fine_meshes import correct_to_fine_meshes
+from limbfit.pipeline.identification.intervals import estimate_linearised
 from limbfit.pipeline.identification.predict import run_predict
-from limbfit.pipeline.identification.record_simulator import RecordSimulator, estimate_linearised
+from limbfit.pipeline.identification.problem import build_problem
+from limbfit.pipeline.identification.record_simulator import RecordSimulator
+from limbfit.pipeline.records.records import load_records
 from limbfit.pipeline.simulation.simulations import SimulationCache
 from limbfit.report.drawing.figures import draw_layer_figure
 from limbfit.report.store import load_store
@@ -165,18 +169,20 @@ def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatc
         (tmp_path / name).mkdir()
         context = BLOCK.stored(tmp_path / name, monkeypatch, more)
         study = context.study
-        laboratory = RecordSimulator(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
-        at = laboratory.anchored(study.vector(TRUTH))
-        known = estimate_linearised(context, laboratory.records, study.vector(TRUTH), at)
+        records = load_records(context, study.recorded, secondary=True)
+        cache = SimulationCache(tmp_path / name / "runs")
+        simulator = RecordSimulator(records, cache, context.executor, lambda text: None)
+        at = correct_to_fine_meshes(study, simulator, study.vector(TRUTH))
+        known = estimate_linearised(context, build_problem(study), records.own, study.vector(TRUTH), at)
         widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
-    assert [one.name for one in laboratory.records] == ["a", "a+skin", "a+muscle"]
-    assert [one.unit for one in laboratory.measured] == ["N", "mm", "mm"]
+    assert [one.name for one in records.own] == ["a", "a+skin", "a+muscle"]
+    assert [one.unit for one in records.measured] == ["N", "mm", "mm"]
     for one, response, noise in zip(
-        laboratory.records[1:], at.responses[1:], known.residual_model.noise[1:], strict=True
+        records.own[1:], at.responses[1:], known.residual_model.noise[1:], strict=True
     ):
         off = response.force_N - one.compared
         assert off @ np.linalg.solve(noise.covariance, off) / len(off) < 2.0
-    assert laboratory.simulated == 1
+    assert records.simulations == 1
     assert (widths[1] < widths[0]).all()
     for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
         context.store[stage].mkdir()

@@ -14,10 +14,14 @@ from limbfit.indentation import Simulation, SiteModel, place_waves_under
 from limbfit.phantom.record import write_waves
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.identification.calibrate import run_calibrate
+from limbfit.pipeline.identification.fine_meshes import correct_to_fine_meshes
+from limbfit.pipeline.identification.intervals import estimate_linearised
 from limbfit.pipeline.identification.predict import run_predict
-from limbfit.pipeline.identification.record_simulator import RecordSimulator, estimate_linearised
+from limbfit.pipeline.identification.problem import build_problem
+from limbfit.pipeline.identification.record_simulator import RecordSimulator
+from limbfit.pipeline.records.records import build_model, load_records
 from limbfit.pipeline.records.traces import run_traces
-from limbfit.pipeline.simulation.simulations import SimulationCache, build_recorded_model
+from limbfit.pipeline.simulation.simulations import SimulationCache
 from limbfit.report.drawing.figures import draw_wave_figure
 from limbfit.report.sections.prediction import make_observed_table
 from limbfit.report.store import load_store
@@ -56,19 +60,21 @@ def test_speeds_are_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
         (tmp_path / name).mkdir()
         context = BLOCK.stored(tmp_path / name, monkeypatch, more)
         study = context.study
-        laboratory = RecordSimulator(context, SimulationCache(tmp_path / name / "runs"), study.recorded)
-        at = laboratory.anchored(study.vector(TRUTH))
-        known = estimate_linearised(context, laboratory.records, study.vector(TRUTH), at)
+        records = load_records(context, study.recorded, secondary=True)
+        cache = SimulationCache(tmp_path / name / "runs")
+        simulator = RecordSimulator(records, cache, context.executor, lambda text: None)
+        at = correct_to_fine_meshes(study, simulator, study.vector(TRUTH))
+        known = estimate_linearised(context, build_problem(study), records.own, study.vector(TRUTH), at)
         widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
-    assert [one.name for one in laboratory.records] == ["a", "a+skin-waves", "a+muscle-waves"]
-    assert [one.unit for one in laboratory.measured] == ["N", "m/s", "m/s"]
-    assert {one.where for one in laboratory.measured} == {"a"}
+    assert [one.name for one in records.own] == ["a", "a+skin-waves", "a+muscle-waves"]
+    assert [one.unit for one in records.measured] == ["N", "m/s", "m/s"]
+    assert {one.where for one in records.measured} == {"a"}
     for one, response, noise in zip(
-        laboratory.records[1:], at.responses[1:], known.residual_model.noise[1:], strict=True
+        records.own[1:], at.responses[1:], known.residual_model.noise[1:], strict=True
     ):
         off = response.force_N - one.compared
         assert off @ np.linalg.solve(noise.covariance, off) / len(off) < 2.5
-    assert laboratory.simulated == 1
+    assert records.simulations == 1
     assert (widths[1] < widths[0]).all()
     assert (widths[1][[0, 4]] < 0.6 * widths[0][[0, 4]]).all()
     for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
@@ -110,4 +116,4 @@ def test_a_place_that_is_not_there_is_refused(tmp_path: Path, monkeypatch) -> No
 
 def _model_anew(context: Context) -> SiteModel:
     run_traces(context, context.store["traces"])
-    return build_recorded_model(context, context.study.recorded[0])
+    return build_model(context, context.study.recorded[0])

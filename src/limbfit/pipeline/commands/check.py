@@ -19,6 +19,7 @@ from ..limb.inputs import check_labels, read_marked_image, read_study_image, rea
 from ..limb.sites import place_site
 from ..limb.surfaces import read_given_anatomy
 from ..records.record_checks import record_flags
+from ..records.secondary_measurements import choose_surface_points
 from ..records.traces import SecondaryMeasurement, read_observed, read_record
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, name_load, time_socket_loads
@@ -172,7 +173,7 @@ def _describe_surface_motion(
     limb: LimbGeometry | None,
 ) -> Iterator[str]:
     """How the skin around the indenter moves, and which of its points are compared where sites are known."""
-    chosen = {} if limb is None else limb.surface_points(study, motions)
+    chosen = {} if limb is None else choose_surface_points(limb, study, motions)
     for record in study.recorded:
         motion = motions[record.name]
         if motion is None:

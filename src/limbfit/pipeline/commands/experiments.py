@@ -24,8 +24,8 @@ from ..engine.context import Context
 from ..engine.keys import Keys, Stage
 from ..engine.storage import read_json
 from ..engine.store import Store
-from ..identification.calibrate import check_fitted
 from ..identification.crossvalidation import check_crossvalidate, run_crossvalidate
+from ..identification.problem import check_fitted
 from ..records.planned_records import SEEN
 from ..simulation.limb_geometry import Check, LimbGeometry
 from ..socket.design import check_socket_design, run_socket_design

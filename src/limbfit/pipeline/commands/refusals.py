@@ -8,7 +8,7 @@ from typing import Any
 
 from ...errors import InputError
 from ...study import Study
-from ..identification.calibrate import check_fitted
+from ..identification.problem import check_fitted
 from ..simulation.limb_geometry import LimbGeometry
 from .acquire import build_device_settings
 from .experiments import EXPERIMENTS, check_experiment

@@ -20,16 +20,17 @@ from ..engine.provenance import collect_versions, compute_input_digests, describ
 from ..engine.stale_reasons import collect_parts, describe_causes
 from ..engine.storage import write_json
 from ..engine.store import Store, lock
-from ..identification.calibrate import check_fitted, run_calibrate
+from ..identification.calibrate import run_calibrate
 from ..identification.predict import run_predict
+from ..identification.problem import check_fitted
 from ..limb.mesh import run_mesh
 from ..limb.segment import run_segment
 from ..limb.sites import run_sites
 from ..limb.surfaces import run_surfaces
 from ..records.record_checks import tell_flags
+from ..records.secondary_measurements import choose_surface_points, read_motion
 from ..records.traces import run_traces
 from ..simulation.limb_geometry import LimbGeometry
-from ..simulation.surface_points import read_motion
 from .experiments import (
     EXPERIMENTS,
     check_experiment,
@@ -264,7 +265,7 @@ def _check_limb(context: Context, check: Callable[[LimbGeometry], None] | None, 
         facts = store.read("traces", "traces.json")["sites"]
         moving = [one for one in study.recorded if facts[one.name].get("surface", {}).get("compared")]
         limb.clamping_pins(study)
-        limb.surface_points(study, {one.name: read_motion(store["traces"], one) for one in moving})
+        choose_surface_points(limb, study, {one.name: read_motion(store["traces"], one) for one in moving})
     if check is not None:
         check(limb)
 

@@ -18,9 +18,10 @@ from ...study import Record, Study
 from ..engine.context import Context, Listener, ignore_progress
 from ..engine.storage import write_curves, write_json
 from ..engine.store import Store
+from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
-from ..simulation.simulations import CURVE_POINTS, build_model
+from ..simulation.simulations import CURVE_POINTS
 from .run import compute_keys, run_study
 
 IDENTIFIED = "identified"

@@ -28,9 +28,10 @@ from ...indentation import Parameters, SiteModel
 from ...study import Site, Study
 from ..engine.context import Context
 from ..engine.storage import write_json, write_table
-from ..identification.record_simulator import build_unknowns
+from ..identification.problem import build_unknowns
+from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
-from ..simulation.simulations import build_curve_job, build_model, open_experiment_cache
+from ..simulation.simulations import build_curve_job, open_experiment_cache
 
 DEFAULT_SITES = 4
 DEEPEST_SHARE = 0.5  # of the tissue's thickness that a candidate may go

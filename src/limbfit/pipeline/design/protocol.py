@@ -36,15 +36,21 @@ from ...indentation import (
     place_waves_under,
 )
 from ...mesh import read_vtu
-from ...study import Site, Study
+from ...study import Study
 from ..engine.context import Context
 from ..engine.storage import write_json, write_table
-from ..identification.record_simulator import build_unknowns
+from ..identification.problem import build_unknowns
 from ..records.deviations import compute_expected_share, estimate_surface_error_mm, is_modulus
 from ..records.planned_records import PlannedRecord, press, write_records
+from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LoadHistory, describe_untested_times
-from ..simulation.simulations import build_curve_job, build_model, build_site_model, open_experiment_cache
+from ..simulation.simulations import (
+    build_curve_job,
+    build_site_model,
+    coarsen_model,
+    open_experiment_cache,
+)
 from .design import DEEPEST_SHARE
 
 DETERMINED = 1.25  # largest factor of a 95 % interval that counts as determined
@@ -204,9 +210,9 @@ def _plan_records(
         usual = deepest[site.name]
         wanted = depths_mm or (usual,)
         for name in study.all_indenters:
-            model = build_site_model(
-                context, _replace_indenter(site, name), (0.0, 1.0), (0.0, max(wanted)), searched=True
-            )
+            planned_site = site.model_copy(update={"indenter": name})
+            model = build_site_model(context, planned_site, (0.0, 1.0), (0.0, max(wanted)))
+            model = coarsen_model(context, model)
             if noises.layers is not None:
                 model = replace(model, layers=find_layers_under(model))
             if noises.skin is not None:
@@ -224,10 +230,6 @@ def _plan_records(
                 planned = press(model, depth, speed, hold)
                 found.append(PlannedRecord(site.name, name, depth, speed, hold, planned, depth == nearest))
     return found, list(dict.fromkeys(left_out))
-
-
-def _replace_indenter(site: Site, name: str | None) -> Site:
-    return site.model_copy(update={"indenter": name})
 
 
 def _build_options(

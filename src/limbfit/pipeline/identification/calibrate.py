@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...errors import StudyError
 from ...identify.fit.multifidelity import CorrectionRound
-from ...identify.fit.multistart import MultistartResult, describe_starts, run_multistart
-from ...identify.fit.parameters import Unknowns, build_space
+from ...identify.fit.multistart import MultistartResult, describe_starts
+from ...identify.fit.objective import MeasuredCurve
 from ...identify.fit.state import Calibration
 from ...identify.uncertainty.relaxation import assess_relaxation
 from ...identify.uncertainty.uncertainty import Uncertainty
@@ -21,22 +21,14 @@ from ...priors import SOURCE
 from ...study import Study
 from ..engine.context import Context
 from ..engine.storage import write_json
+from ..records.records import load_records
 from ..simulation.simulations import SimulationCache
-from .record_simulator import Array, RecordSimulator, build_groupings, build_unknowns, list_stage_titles
+from .fine_meshes import correct_answer, mesh_coarser_in_background
+from .intervals import sample_intervals
+from .problem import CalibrationProblem, build_problem
+from .record_simulator import RecordSimulator, WarmStarts
+from .search import search_from_starts
 from .simulation_warnings import contact_to_dict, warnings_to_dict
-
-
-def check_fitted(study: Study) -> None:
-    """Refuse a study that has nothing to identify parameters from.
-
-    Raises
-    ------
-    StudyError
-        With the remedy.
-    """
-    if not study.fitted:
-        remedy = "set fitted = true where there is a record, or stop before it: limbfit run --until mesh"
-        raise StudyError("no site is fitted", file=study.file, place="sites", remedy=remedy)
 
 
 def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
@@ -44,56 +36,56 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
 
     A run taken up again repeats the interrupted one from its kept simulations.
     """
-    study, table = context.study, context.study.calibration
+    study, report = context.study, partial(context.tell, "calibrate", 0, 0)
+    records = load_records(context, study.records_at(*study.fitted), secondary=True)
+    problem = build_problem(study)
     cache = SimulationCache(folder / "runs", also=[context.store["calibrate"] / "runs"])
-    laboratory = RecordSimulator(context, cache, study.records_at(*study.fitted))
-    stages = build_groupings(study)
-    rounds_of: dict[int, tuple[CorrectionRound, ...]] = {}
-
-    def run(number: int, start: Unknowns) -> Calibration:
-        if number:
-            context.tell("calibrate", 0, 0, f"start {number + 1} of {table.starts}")
-        found, rounds_of[number] = laboratory.identify(start, stages)
-        return found
-
-    with laboratory.meshing(folder / "coarser") as meshed:
-        tried = run_multistart(run, build_unknowns(study), table.starts, table.seed, stages[0])
-        meshed()
-    found, known = laboratory.uncertainty(tried.best, stages[-1], folder / "coarser")
-    rounds = rounds_of[tried.number]
-    answers = laboratory.answer(found.parameters)
-    for site, texts in laboratory.warnings.items():
-        context.tell("calibrate", 0, 0, f"warning: site {site}, at the answer: {'; '.join(texts)}")
-    content = _calibration_to_dict(context, found, known, laboratory)
-    content["uncertainty"] |= _assess_relaxation(study, found, known, laboratory)
+    simulator = RecordSimulator(records, cache, context.executor, report)
+    with mesh_coarser_in_background(context, records, folder / "coarser") as wait:
+        starts, rounds = search_from_starts(study, problem, simulator)
+        wait()
+    best = starts.best
+    correction, spent = correct_answer(
+        context, simulator, best.parameters, list(best.responses), folder / "coarser"
+    )
+    found, known = sample_intervals(context, problem, simulator, best, correction, spent)
+    simulations = simulator.run_answer(found.parameters)
+    answers = {one.site: one for one in records.select_forces(simulations)}
+    warnings = {site: list(one.warnings) for site, one in answers.items() if one.warnings}
+    for site, texts in warnings.items():
+        report(f"warning: site {site}, at the answer: {'; '.join(texts)}")
+    log = simulator.log
+    content = _calibration_to_dict(study, problem, found, known, simulator)
+    content["uncertainty"] |= _assess_relaxation(study, problem, found, known, records.measured)
     content |= {
-        "corrections": [_round_record(one, found.sites, study) for one in rounds],
-        "multistart": _multistart_to_dict(tried, study) if table.starts > 1 else None,
-        "warnings": laboratory.warnings,
+        "corrections": [_round_record(one, found.sites, problem, study) for one in rounds],
+        "multistart": _multistart_to_dict(starts, study) if study.calibration.starts > 1 else None,
+        "warnings": warnings,
         "contact": contact_to_dict(
-            laboratory.latest,
-            laboratory.penalties,
-            laboratory.of_records(answers),
-            laboratory.of_records(found.responses),
+            answers,
+            log.penalties,
+            records.select_forces(simulator.respond(simulations)),
+            records.select_forces(found.responses),
         ),
-        "doubts": warnings_to_dict(
-            laboratory.doubts, laboratory.latest, laboratory.evaluations * laboratory.simulated, found
-        ),
+        "doubts": warnings_to_dict(log.warnings, answers, log.evaluations * records.simulations, found),
     }
     write_json(folder / "calibration.json", content)
     return {}
 
 
 def _calibration_to_dict(
-    context: Context, found: Calibration, known: Uncertainty, laboratory: RecordSimulator
+    study: Study,
+    problem: CalibrationProblem,
+    found: Calibration,
+    known: Uncertainty,
+    simulator: RecordSimulator,
 ) -> dict[str, Any]:
     """What ``calibration.json`` holds."""
-    study, cache = context.study, laboratory.cache
-    bounds = build_unknowns(study)
+    cache, bounds = simulator.cache, problem.unknowns
     example = cache.example()
     return {
         "stages": [
-            _stage_to_dict(found, i, bounds.start, study, laboratory) for i in range(len(found.stages))
+            _stage_to_dict(found, i, problem, study, simulator.starts) for i in range(len(found.stages))
         ],
         "bounds": {
             "lower": study.by_tissue(bounds.lower),
@@ -110,18 +102,18 @@ def _calibration_to_dict(
 
 
 def _stage_to_dict(
-    found: Calibration, number: int, start: Array, study: Study, laboratory: RecordSimulator
+    found: Calibration, number: int, problem: CalibrationProblem, study: Study, warm_starts: WarmStarts
 ) -> dict[str, Any]:
-    """One stage: from ``start`` (the first) or the end of the stage before to its own end."""
+    """One stage: from the start of the problem, or the end of the stage before, to its own end."""
     stage = found.stages[number]
-    before = np.array(found.stages[number - 1].parameters) if number else start
+    before = np.array(found.stages[number - 1].parameters) if number else problem.unknowns.start
     iterates = [iterate for iterate in found.history if iterate.stage == number]
 
     def starts(parameters: Sequence[float]) -> list[Parameters]:
-        return [study.by_tissue(one) for one in laboratory.starts(np.array(parameters))]
+        return [study.by_tissue(one) for one in warm_starts.find(np.array(parameters))]
 
     return {
-        "name": list_stage_titles(study.tissues)[number],
+        "name": problem.titles[number],
         "start": study.by_tissue(before),
         "parameters": study.by_tissue(np.array(stage.parameters)),
         "cost": stage.cost,
@@ -142,10 +134,12 @@ def _stage_to_dict(
     }
 
 
-def _round_record(one: CorrectionRound, sites: Sequence[str], study: Study) -> dict[str, Any]:
+def _round_record(
+    one: CorrectionRound, sites: Sequence[str], problem: CalibrationProblem, study: Study
+) -> dict[str, Any]:
     """One correction of the search by the whole meshes; percentages are of each site's largest force."""
     return {
-        "stage": list_stage_titles(study.tissues)[one.stage] if one.stage >= 0 else "start",
+        "stage": problem.titles[one.stage] if one.stage >= 0 else "start",
         "parameters": study.by_tissue(np.array(one.parameters)),
         "scale_by_site": dict(zip(sites, one.scales, strict=True)),
         "difference_percent_by_site": dict(zip(sites, one.difference_percent, strict=True)),
@@ -196,15 +190,18 @@ def _uncertainty_to_dict(known: Uncertainty, study: Study) -> dict[str, Any]:
 
 
 def _assess_relaxation(
-    study: Study, found: Calibration, known: Uncertainty, laboratory: RecordSimulator
+    study: Study,
+    problem: CalibrationProblem,
+    found: Calibration,
+    known: Uncertainty,
+    measured: Sequence[MeasuredCurve],
 ) -> dict[str, Any]:
     """What is known of relaxation beyond the records, and the verdicts with that; none of other laws."""
     if not is_ogden(study.law.name) and study.law.name not in (FIBRED, FUNG):
         return {"relaxation": None}
-    bounds = build_unknowns(study)
-    space = build_space(bounds, build_groupings(study)[-1])
-    of_records = found.responses, laboratory.measured, known.residual_model
-    relaxation = assess_relaxation(found.parameters, *of_records, bounds, space)
+    relaxation = assess_relaxation(
+        found.parameters, found.responses, measured, known.residual_model, problem.unknowns, problem.space
+    )
     if relaxation is None:
         return {"relaxation": None}
     verdicts = dict(zip(known.names, relaxation.qualify_verdicts(known), strict=True))

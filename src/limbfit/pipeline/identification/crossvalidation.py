@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from math import comb
 from pathlib import Path
 from typing import Any
@@ -37,9 +38,12 @@ from ...identify.uncertainty.emulator import Emulator
 from ...study import Study
 from ..engine.context import Context
 from ..engine.storage import write_json, write_table
+from ..records.records import load_records
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import open_experiment_cache
-from .record_simulator import RecordSimulator, build_unknowns
+from .fine_meshes import correct_to_fine_meshes
+from .problem import build_unknowns
+from .record_simulator import RecordSimulator
 
 Runs = list[list[SiteResponse]]
 
@@ -77,10 +81,13 @@ def run_crossvalidate(
     study = context.study
     recorded = [site for site in study.sites if study.records_at(site)]
     size = fit or len(study.fitted)
-    laboratory = RecordSimulator(
-        context, open_experiment_cache(context, folder), study.records_at(*recorded), "crossvalidate"
+    simulator = RecordSimulator(
+        load_records(context, study.records_at(*recorded), secondary=True),
+        open_experiment_cache(context, folder),
+        context.executor,
+        partial(context.tell, "crossvalidate", 0, 0),
     )
-    bench = _Bench(context, laboratory, seed, runs)
+    bench = _Bench(context, simulator, seed, runs)
     own_choice = tuple(i for i, site in enumerate(recorded) if site.fitted)
     chosen = list_choices(len(recorded), size, choices, seed)
     regions = list_choices_without_regions([site.region for site in recorded])
@@ -110,13 +117,13 @@ class _Found:
 class _Bench:
     """Simulations of all recorded sites, the emulator made of them, and the fits on it."""
 
-    def __init__(self, context: Context, laboratory: RecordSimulator, seed: int, runs: int) -> None:
-        self.context, self.laboratory = context, laboratory
+    def __init__(self, context: Context, simulator: RecordSimulator, seed: int, runs: int) -> None:
+        self.context, self.simulator = context, simulator
         study = context.study
         stored = context.stored("calibrate", "calibration.json")
         self.best = study.vector(stored["stages"][-1]["parameters"])
         self.bounds = build_unknowns(study).with_start(self.best)
-        self.measured = laboratory.measured
+        self.measured = simulator.records.measured
         of_site: dict[str, list[int]] = {}
         for i, one in enumerate(self.measured):
             of_site.setdefault(one.site_name, []).append(i)
@@ -124,9 +131,9 @@ class _Bench:
         covariance = np.array(stored["uncertainty"]["covariance_log"])
         # Where nothing is known, fits go anywhere; the emulator must not.
         drawn = spread_points(self.best, covariance, self.bounds, runs, seed)
-        anchored = laboratory.anchored(self.best)
-        self.as_fine = anchored.as_fine
-        self.points, self.runs = [self.best], [anchored.responses]
+        correction = correct_to_fine_meshes(study, simulator, self.best)
+        self.as_fine = correction.as_fine
+        self.points, self.runs = [self.best], [correction.responses]
         self.learn(list(drawn))
 
     def learn(self, points: Sequence[Array]) -> Runs:
@@ -134,7 +141,7 @@ class _Bench:
         runs = []
         for i, point in enumerate(points):
             self.context.tell("crossvalidate", i, len(points), f"simulation {i + 1} of {len(points)}")
-            runs.append(self.as_fine(self.laboratory.search(point)))
+            runs.append(self.as_fine(self.simulator.search(point)))
         for point, run in zip(points, runs, strict=True):
             if failed := _describe_failed(run):
                 told = f"warning: a simulation failed at site {failed}: the emulator does without it"

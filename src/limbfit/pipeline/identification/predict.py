@@ -23,10 +23,9 @@ from ..engine.storage import write_curves, write_json
 from ..records.deviations import estimate_site_deviation, estimate_site_noise
 from ..records.outliers import outliers_to_dict
 from ..records.records import (
+    RecordSet,
     SiteRecord,
-    coarsen_records,
-    load_site_record,
-    select_compared_records,
+    load_records,
     to_response,
 )
 from ..simulation.limb_geometry import LimbGeometry
@@ -47,30 +46,29 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     answers = [Answer.of(stage, study) for stage in calibration["stages"]]
     one, best = answers[0].parameters, answers[-1].parameters
     known = PredictionModel.from_stored(calibration["uncertainty"])
-    records = [load_site_record(context, record) for record in study.recorded]
+    records = load_records(context, study.recorded)
     cache = SimulationCache(
         folder / "runs", also=[context.store[stage] / "runs" for stage in ("calibrate", "predict")]
     )
-    searched = coarsen_records(context, records)
-    jobs = build_answer_jobs(records, searched, answers[-1])
+    jobs = build_answer_jobs(records, answers[-1])
     if len(answers) > 1:
-        jobs += _build_one_material_jobs(records, searched, answers[0], best)
+        jobs += _build_one_material_jobs(records, answers[0], best)
     simulations = []
     for simulation in cache.run(jobs, context.executor):
         simulations.append(simulation)
-        context.tell("predict", len(simulations), len(jobs) + len(records), f"site {simulation.site}")
-    n = len(records)
-    near = simulations[n : 2 * n] if searched is not records else None
+        context.tell("predict", len(simulations), len(jobs) + len(records.own), f"site {simulation.site}")
+    n = len(records.own)
+    near = simulations[n : 2 * n] if records.is_coarsened else None
     ours = own = [to_response(simulation) for simulation in simulations[:n]]
     others = [to_response(simulation) for simulation in simulations[n:]]
     correction = None
-    if searched is not records:
+    if records.is_coarsened:
         coarse, others = others[:n], others[n:]
         correction = MeshCorrection(coarse, own)
         ours = correction(coarse)
         fine = correction(others) if others else []
-        others = [as_is if r.site.fitted else held for r, as_is, held in zip(records, others, fine)]
-    sites = [SitePrediction(*parts) for parts in zip_longest(records, simulations[:n], ours, others)]
+        others = [as_is if r.site.fitted else held for r, as_is, held in zip(records.own, others, fine)]
+    sites = [SitePrediction(*parts) for parts in zip_longest(records.own, simulations[:n], ours, others)]
     whole = [job for site, job in zip(sites, jobs) if site.own.completed]
     strains = _write_fields(context, folder, whole, len(jobs))
     bands = [_Band.compute(context, site, best, known) if site.ours.completed else None for site in sites]
@@ -78,11 +76,9 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
         _write_curves(folder, site, band)
     rows = [_to_row(site) for site in sites]
     for i, site in enumerate(sites):
-        rows[i]["observed"] = _write_observed(
-            context, folder, site, None if near is None else near[i], best, known
-        )
+        rows[i]["observed"] = _write_observed(folder, site, None if near is None else near[i], best, known)
     tested = _compare_with_records(context, sites, strains, rows)
-    doubts = outliers_to_dict(context, cache, records, ours, best, one, searched, correction)
+    doubts = outliers_to_dict(context, cache, records.own, ours, best, one, records.searched, correction)
     judged = [(site, band) for site, band in zip(sites, bands, strict=True) if band is not None]
     quality = _assess_fits(context, judged, best, known)
     fit = {"verdict": summarise_fit(quality), "records": [one.to_dict() for one in quality]}
@@ -105,24 +101,20 @@ class Answer:
         return cls(study.vector(stage["parameters"]), tuple(study.vector(one) for one in starts))
 
 
-def build_answer_jobs(
-    records: Sequence[SiteRecord], searched: Sequence[SiteRecord], answer: Answer
-) -> list[SimulationJob]:
-    """Every record at the answer, then so with derivatives as it is ``searched``, if that is another model.
+def build_answer_jobs(records: RecordSet, answer: Answer) -> list[SimulationJob]:
+    """Every record at the answer, then so with derivatives as it is searched, if that is another model.
 
     At the fitted sites the calibration has simulated all of them already; elsewhere they start from rest.
     """
     best = answer.parameters
-    if searched is records:
-        return [record.job(best) for record in records]
-    starts = [answer.starts if record.site.fitted else () for record in records]
-    own = [record.own_job(best, before) for record, before in zip(records, starts)]
-    return own + [record.job(best, starts=before) for record, before in zip(searched, starts)]
+    if not records.is_coarsened:
+        return [record.job(best) for record in records.own]
+    starts = [answer.starts if record.site.fitted else () for record in records.own]
+    own = [record.own_job(best, before) for record, before in zip(records.own, starts)]
+    return own + [record.job(best, starts=before) for record, before in zip(records.searched, starts)]
 
 
-def _build_one_material_jobs(
-    records: Sequence[SiteRecord], searched: Sequence[SiteRecord], one: Answer, best: Array
-) -> list[SimulationJob]:
+def _build_one_material_jobs(records: RecordSet, one: Answer, best: Array) -> list[SimulationJob]:
     """Every record with one material: at the fitted sites as the calibration has simulated it already.
 
     Elsewhere it is of where parameters are searched, and starts from that with all materials and derivatives,
@@ -135,7 +127,7 @@ def _build_one_material_jobs(
         simulated = record.job if near is record else record.own_job
         return simulated(one.parameters, starts=one.starts)
 
-    return [job(*pair) for pair in zip(records, searched)]
+    return [job(*pair) for pair in zip(records.own, records.searched)]
 
 
 @dataclass(frozen=True)
@@ -304,7 +296,6 @@ def _assess_fits(
 
 
 def _write_observed(
-    context: Context,
     folder: Path,
     site: SitePrediction,
     near: Simulation | None,
@@ -316,7 +307,7 @@ def _write_observed(
     ``near`` is the simulation with derivatives where that is another than the site's own.
     """
     rows = []
-    for one in select_compared_records(context, [site.record])[1:]:
+    for one in site.record.split()[1:]:
         assert one.seen is not None
         ours = whole = one.respond(site.own)
         if near is not None:

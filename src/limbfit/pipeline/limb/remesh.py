@@ -16,31 +16,38 @@ from ..engine.context import Context
 from ..engine.storage import compute_file_digest
 from .mesh import MeshJob, is_meshed, make_mesh, mesh_job
 
+Report = Callable[[str], None]
+
 
 def mesh_models(
-    context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings, title: str
+    context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings, report: Report
 ) -> list[SiteModel]:
     """The models on meshes of other settings, in ``folder``; those of an interrupted run are kept.
 
-    ``title`` is the stage or experiment that is told of progress.
+    ``report`` is given a line for each mesh.
     """
     jobs = _build_jobs(context, folder, models, settings)
     missing = _select_missing(jobs)
     for job, _ in zip(missing, context.executor.map(make_mesh, missing), strict=True):
-        context.tell(title, 0, 0, f"mesh of site {job.site}, {folder.name}")
+        report(f"mesh of site {job.site}, {folder.name}")
     return [_replace_mesh(model, job) for model, job in zip(models, jobs, strict=True)]
 
 
 def mesh_where_possible(
-    context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings, title: str, lost: str
+    context: Context,
+    folder: Path,
+    models: Sequence[SiteModel],
+    settings: MeshSettings,
+    report: Report,
+    lost: str,
 ) -> list[SiteModel | None]:
     """As `mesh_models`, but None for a site of which no such mesh can be made; a line says so, and that
     ``lost`` with it."""
     jobs = _build_jobs(context, folder, models, settings)
     missing = _select_missing(jobs)
     for job, error in zip(missing, context.executor.map(_try_mesh, missing), strict=True):
-        told = f"mesh of site {job.site}, {folder.name}"
-        context.tell(title, 0, 0, f"warning: {told}: {error}; {lost}" if error else told)
+        words = f"mesh of site {job.site}, {folder.name}"
+        report(f"warning: {words}: {error}; {lost}" if error else words)
     pairs = zip(models, jobs, strict=True)
     return [_replace_mesh(model, job) if is_meshed(job.file) else None for model, job in pairs]
 

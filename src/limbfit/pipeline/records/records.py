@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,14 +13,21 @@ from ...fe import list_texts
 from ...identify.fit.objective import MeasuredCurve, SiteResponse
 from ...identify.uncertainty.noise import compute_depth_slope
 from ...indentation import Simulation, SimulationJob, SiteModel
-from ...study import Record, Site, Study
-from ...traces import SurfaceMotion, Thinning, WaveMeans
+from ...mesh import read_vtu
+from ...study import Indentation, Record, Site, Study
 from ..engine.context import Context
-from ..engine.storage import read_curves
-from ..limb.files import LAYERS, SMOOTHING, WAVES
-from ..simulation.simulations import build_recorded_model, find_surface_points
-from ..simulation.surface_points import ChosenPoints, read_motion
-from .secondary_measurements import LayerMeasurement, SecondaryValues, SurfaceMeasurement, WaveMeasurement
+from ..simulation.simulations import build_site_model, coarsen_model
+from .secondary_measurements import (
+    ChosenPoints,
+    SecondaryValues,
+    StoredRecord,
+    build_secondary_values,
+    choose_points,
+    place_waves,
+    read_stored_record,
+)
+
+T = TypeVar("T")
 
 
 def is_moved(study: Study) -> bool:
@@ -44,9 +50,9 @@ class SiteRecord:
     ``smoothing`` (n, n) is what regularising did to the record, which is done to the simulated force as well
     before parameters are judged by their difference (``respond``): else the corner at the peak, which it
     blunts, would be taken for an error of the model. ``nested_mm``: parameters are searched on as much of the
-    same mesh. With ``seen`` it is what was seen beside the force that is compared, of the same simulation.
-    ``touch_down_sd_mm`` is how far the touch-down may be off, ``error_share`` how far forces may be beside
-    that.
+    same mesh. ``secondary`` is what was seen beside the force; with ``seen`` it is that which is compared, of
+    the same simulation. ``touch_down_sd_mm`` is how far the touch-down may be off, ``error_share`` how far
+    forces may be beside that.
     """
 
     record: Record
@@ -58,6 +64,7 @@ class SiteRecord:
     smoothing: Array
     nested_mm: float | None = None
     seen: SecondaryValues | None = None
+    secondary: tuple[SecondaryValues, ...] = ()
     touch_down_sd_mm: float = 0.0
     error_share: float = 0.01
 
@@ -98,6 +105,10 @@ class SiteRecord:
             return self.seen.value
         return self.displacement_mm if self.record.forced else self.force_N
 
+    def split(self) -> list[SiteRecord]:
+        """The record, followed by one for everything that was seen beside it."""
+        return [self, *(replace(self, seen=seen) for seen in self.secondary)]
+
     def respond(self, simulation: Simulation) -> SiteResponse:
         """What this record would show of a simulation."""
         plain = to_response(simulation)
@@ -134,139 +145,100 @@ def to_response(simulation: Simulation) -> SiteResponse:
     return SiteResponse(simulation.force_N, jacobian, *ended, simulation.site, simulation.warnings, *kinds)
 
 
+@dataclass(frozen=True)
+class RecordSet:
+    """Records on the study's own meshes, and the same records as parameters are searched.
+
+    ``searched`` is ``own`` itself where the search takes those meshes whole. What was seen beside a record
+    follows it as one more record (`SiteRecord.seen`).
+    """
+
+    own: tuple[SiteRecord, ...]
+    searched: tuple[SiteRecord, ...]
+
+    @property
+    def is_coarsened(self) -> bool:
+        """True if parameters are searched on something smaller than the sites' own meshes."""
+        return self.searched is not self.own
+
+    @property
+    def measured(self) -> list[MeasuredCurve]:
+        """What the calibration compares with."""
+        return [record.measured for record in self.own]
+
+    @property
+    def simulations(self) -> int:
+        """How many simulations an evaluation takes: one of each record."""
+        return sum(record.seen is None for record in self.own)
+
+    def select_forces(self, items: Sequence[T]) -> list[T]:
+        """Of one item a record those of the records themselves, not of what was seen beside them."""
+        return [item for record, item in zip(self.own, items, strict=True) if record.seen is None]
+
+
+def load_records(context: Context, records: Sequence[Record], secondary: bool = False) -> RecordSet:
+    """Stored records and their sites' models; with ``secondary`` what was seen beside each follows it."""
+    own = tuple(load_site_record(context, record) for record in records)
+    searched = own
+    if context.study.is_searched_apart:
+        searched = tuple(replace(one, model=coarsen_model(context, one.model)) for one in own)
+    if not secondary:
+        return RecordSet(own, searched)
+    compared = tuple(seen for one in own for seen in one.split())
+    if searched is own:
+        return RecordSet(compared, compared)
+    return RecordSet(compared, tuple(seen for one in searched for seen in one.split()))
+
+
 def load_site_record(context: Context, record: Record) -> SiteRecord:
-    """A stored record and its site's model, on the whole of its own mesh."""
-    curves = read_curves(context.store["traces"] / f"{record.name}.csv")
-    facts = context.stored("traces", "traces.json")["sites"][record.name]
+    """A stored record and its site's model, on the whole of its own mesh.
+
+    Raises
+    ------
+    TraceError
+        Where nothing of its surface can be compared, or the limb has no place of its shear waves.
+    """
+    study, stored = context.study, read_stored_record(context.store, record)
+    model, points = _build_model(context, record, stored)
     return SiteRecord(
         record=record,
-        tissues=context.study.tissues,
-        model=build_recorded_model(context, record),
-        times_s=curves["time_s"],
-        displacement_mm=curves["displacement_mm"],
-        force_N=curves["force_N"],
-        smoothing=np.load(context.store["traces"] / SMOOTHING.format(record.name)),
-        nested_mm=context.study.within_mm if context.study.mesh.coarse is None else None,
-        touch_down_sd_mm=facts["touch_down_uncertainty_mm"],
-        error_share=context.study.calibration.force_error_percent / 100.0,
+        tissues=study.tissues,
+        model=model,
+        times_s=stored.curves["time_s"],
+        displacement_mm=stored.curves["displacement_mm"],
+        force_N=stored.curves["force_N"],
+        smoothing=stored.smoothing,
+        nested_mm=study.within_mm if study.mesh.coarse is None else None,
+        secondary=build_secondary_values(record, stored, points),
+        touch_down_sd_mm=stored.facts["touch_down_uncertainty_mm"],
+        error_share=study.calibration.force_error_percent / 100.0,
     )
 
 
-def select_compared_records(context: Context, records: Sequence[SiteRecord]) -> list[SiteRecord]:
-    """The records, each followed by one for everything that was seen beside it."""
-    facts, folder = context.stored("traces", "traces.json")["sites"], context.store["traces"]
-    found = []
-    for one in records:
-        found.append(one)
-        own, points = facts[one.record.name], find_surface_points(context, one.record)
-        observed = _load_observed(folder, one.record, own, one.times_s, points)
-        found += [replace(one, seen=seen) for seen in observed]
-    return found
+def build_model(context: Context, one: Indentation) -> SiteModel:
+    """An indentation as it was recorded, from touch-down on, or as the study plans it."""
+    if isinstance(one, Record):
+        return _build_model(context, one, read_stored_record(context.store, one))[0]
+    assert one.depth_mm is not None
+    ramp = one.depth_mm / one.speed_mm_s  # in and out
+    return build_site_model(context, one, (0.0, ramp, 2 * ramp), (0.0, one.depth_mm, 0.0))
 
 
-def coarsen_records(context: Context, records: Sequence[SiteRecord]) -> Sequence[SiteRecord]:
-    """The records as parameters are searched (`build_site_model`); ``records`` where that is the same."""
-    if not context.study.is_searched_apart:
-        return records
-    return [replace(one, model=build_recorded_model(context, one.record, searched=True)) for one in records]
-
-
-def _load_observed(
-    folder: Path,
-    record: Record,
-    facts: dict[str, Any],
-    times_s: Array,
-    points: ChosenPoints | None,
-) -> tuple[SecondaryValues, ...]:
-    """What is compared beside a record, in the order of a simulation's gauges.
-
-    ``times_s`` (t,) are those of the record's simulation, ``points`` those of its surface.
-    """
-    stated = facts.get("layers", {})
-    tissues = [tissue for tissue, one in stated.items() if one["compared"]]
-    found: list[SecondaryValues] = []
-    if tissues:
-        curves = read_curves(folder / LAYERS.format(record.name))
-        for number, tissue in enumerate(tissues):
-            found.append(_build_layer_measurement(tissue, stated[tissue], curves, number, times_s))
-    if points is not None:
-        motion = read_motion(folder, record)
-        found.append(_build_surface_measurement(record, points, motion, len(tissues), times_s))
-    first = len(tissues) + (0 if points is None else 3 * len(points.points))
-    if places := facts.get("waves", []):
-        curves = read_curves(folder / WAVES.format(record.name))
-        for number, place in enumerate(places):
-            own = {name: values[curves["place"] == number] for name, values in curves.items()}
-            found.append(_build_wave_measurement(record, place["name"], own, first + number, times_s))
-    return tuple(found)
-
-
-def _build_layer_measurement(
-    tissue: str, stated: dict[str, Any], curves: dict[str, Array], number: int, times_s: Array
-) -> LayerMeasurement:
-    thinning = Thinning(
-        tissue,
-        stated["thickness_mm"],
-        curves["time_s"],
-        curves[f"{tissue}_mm"],
-        curves["samples"],
-        stated["before"],
-        stated["sd_mm"],
-    )
-    n = len(thinning.time_s)
-    return LayerMeasurement(
-        tissue,
-        thinning.compression_mm,
-        thinning.time_s,
-        np.full(n, number),
-        _build_interpolation(times_s, thinning.time_s),
-        thinning.covariance,
-        {"sd": stated["sd_mm"], "thickness_mm": stated["thickness_mm"], "compared": f"{n} times"},
-    )
-
-
-def _build_surface_measurement(
-    record: Record, points: ChosenPoints, motion: SurfaceMotion, first: int, times_s: Array
-) -> SurfaceMeasurement:
-    means = motion.means(points.which)
-    sd, words = record.surface_sd_mm, ("x", "y", "z")
-    if record.surface_frame == "site":
-        words = ("along the edge", "across it", "along the axis")
-    facts = {
-        "sd": sd,
-        "left_out": dict(points.left_out),
-        "components": list(words),
-        "compared": f"{len(points.points)} points, {len(means.moved_mm)} values",
-    }
-    return SurfaceMeasurement(
-        "surface",
-        means.moved_mm,
-        means.time_s,
-        first + 3 * means.point + means.component,
-        means.frames @ _build_interpolation(times_s, motion.time_s),
-        np.diag(sd**2 / means.samples),
-        facts,
-        np.array(points.points)[means.point],
-        means.component,
-    )
-
-
-def _build_wave_measurement(
-    record: Record, name: str, curves: dict[str, Array], gauge: int, times_s: Array
-) -> WaveMeasurement:
-    means, n = WaveMeans(curves["time_s"], curves["speed_m_s"], curves["samples"]), len(curves["time_s"])
-    sd, bias = record.shear_waves_sd_m_s, record.shear_waves_bias_m_s
-    return WaveMeasurement(
-        f"{name}-waves",
-        means.speed_m_s,
-        means.time_s,
-        np.full(n, gauge),
-        _build_interpolation(times_s, means.time_s),
-        means.covariance(sd, bias),
-        {"sd": sd, "bias": bias, "compared": f"{n} times"},
-    )
-
-
-def _build_interpolation(from_s: Array, to_s: Array) -> Array:
-    """Matrix (n, t) of linear interpolation from times (t,) to times (n,)."""
-    return np.array([np.interp(to_s, from_s, row) for row in np.eye(len(from_s))]).T
+def _build_model(
+    context: Context, record: Record, stored: StoredRecord
+) -> tuple[SiteModel, ChosenPoints | None]:
+    """A site driven by one of its records, and the points of its surface that are compared, if any."""
+    facts = stored.facts
+    force = facts["knots_N"] if record.forced else ()
+    model = build_site_model(context, record, facts["knots_s"], facts["knots_mm"], force, stored.tissues)
+    points, waves = None, facts.get("waves", [])
+    if stored.motion is None and not waves:
+        return model, None
+    mesh = read_vtu(model.mesh)
+    if stored.motion is not None:
+        place, skin = (model.position, model.axis), (mesh.points, mesh.face_sets["skin"])
+        points = choose_points(context.study, record, place, skin, stored.motion)
+        model = replace(model, skin_points=points.points, skin_axes=points.axes)
+    if waves:
+        model = replace(model, waves=place_waves(context.study, record, model, mesh, waves))
+    return model, points

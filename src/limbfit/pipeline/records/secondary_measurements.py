@@ -1,4 +1,4 @@
-"""What is seen beside a record's force, as it is compared with a simulation.
+"""What is measured beside a record's force, as it is stored and as it is compared with a simulation.
 
 Ultrasound through the indenter sees tissues become thinner and shear waves run, cameras see the skin around
 it move. One simulation tells them all (`SiteModel.layers`, `SiteModel.skin_points`, `SiteModel.waves`).
@@ -6,18 +6,79 @@ it move. One simulation tells them all (`SiteModel.layers`, `SiteModel.skin_poin
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array
+from ...errors import ProblemError, TraceError
 from ...identify.fit.objective import find_largest_magnitude
 from ...identify.uncertainty.noise import SiteNoise, compute_depth_slope, compute_skin_similarity
-from ...indentation import Simulation
+from ...indentation import (
+    OFF_SKIN_MM,
+    Simulation,
+    SiteModel,
+    WavePlace,
+    find_nearest_points,
+    is_under,
+    place_waves_under,
+    read_indenter,
+    to_vector3,
+)
+from ...mesh import Mesh
+from ...study import Record, Study, Vector
+from ...traces import SurfaceMotion, Thinning, WaveMeans
+from ..engine.storage import read_curves, write_curves
+from ..engine.store import Store
+from ..limb.files import LAYERS, SMOOTHING, WAVES
+from ..simulation.limb_geometry import LimbGeometry
 
+Ints = NDArray[np.int64]
+
+CURVES = "{}-surface"  # of a record
+NEAR_MM = 40.0
+MAX_POINTS = 30
+_COLUMNS = ("x_mm", "y_mm", "z_mm", "ux_mm", "uy_mm", "uz_mm")
 _LEAST_DEPTH = 0.1  # of the largest: nearer to touch-down moves are not in proportion to the depth
+
+
+@dataclass(frozen=True)
+class StoredRecord:
+    """What the stage ``traces`` stored of a record: curves by their columns, ``facts`` of ``traces.json``.
+
+    ``smoothing`` (n, n) is what regularising did. ``layers`` and ``waves`` have no column, and there is no
+    ``motion`` of the surface, where nothing of the kind is compared.
+    """
+
+    facts: dict[str, Any]
+    curves: dict[str, Array]
+    smoothing: Array
+    layers: dict[str, Array]
+    waves: dict[str, Array]
+    motion: SurfaceMotion | None
+
+    @property
+    def tissues(self) -> list[str]:
+        """The tissues whose compression is compared."""
+        return [name for name, facts in self.facts.get("layers", {}).items() if facts["compared"]]
+
+
+def read_stored_record(store: Store, record: Record) -> StoredRecord:
+    """What `run_traces` stored of a record."""
+    folder, facts = store["traces"], store.read("traces", "traces.json")["sites"][record.name]
+    layers = any(one["compared"] for one in facts.get("layers", {}).values())
+    return StoredRecord(
+        facts=facts,
+        curves=read_curves(folder / f"{record.name}.csv"),
+        smoothing=np.load(folder / SMOOTHING.format(record.name)),
+        layers=read_curves(folder / LAYERS.format(record.name)) if layers else {},
+        waves=read_curves(folder / WAVES.format(record.name)) if facts.get("waves") else {},
+        motion=read_motion(folder, record) if facts.get("surface", {}).get("compared") else None,
+    )
 
 
 @dataclass(frozen=True)
@@ -161,3 +222,247 @@ def _divide_by_depth(depth_mm: Array, values: Array) -> Array:
     if deepest <= 0.0:
         return np.zeros_like(values)
     return np.asarray(values / np.maximum(depth_mm, _LEAST_DEPTH * deepest))
+
+
+def build_secondary_values(
+    record: Record, stored: StoredRecord, points: ChosenPoints | None
+) -> tuple[SecondaryValues, ...]:
+    """What is compared beside a record, in the order of a simulation's gauges.
+
+    ``points`` are those of its surface that are compared; None: none.
+    """
+    times_s, found = stored.curves["time_s"], list[SecondaryValues]()
+    for number, tissue in enumerate(stored.tissues):
+        facts = stored.facts["layers"][tissue]
+        found.append(_build_layer_measurement(tissue, facts, stored.layers, number, times_s))
+    first = len(found)
+    if points is not None:
+        assert stored.motion is not None
+        found.append(_build_surface_measurement(record, points, stored.motion, first, times_s))
+        first += 3 * len(points.points)
+    for number, place in enumerate(stored.facts.get("waves", [])):
+        own = {name: values[stored.waves["place"] == number] for name, values in stored.waves.items()}
+        found.append(_build_wave_measurement(record, place["name"], own, first + number, times_s))
+    return tuple(found)
+
+
+def _build_layer_measurement(
+    tissue: str, stated: dict[str, Any], curves: dict[str, Array], number: int, times_s: Array
+) -> LayerMeasurement:
+    thinning = Thinning(
+        tissue,
+        stated["thickness_mm"],
+        curves["time_s"],
+        curves[f"{tissue}_mm"],
+        curves["samples"],
+        stated["before"],
+        stated["sd_mm"],
+    )
+    n = len(thinning.time_s)
+    return LayerMeasurement(
+        tissue,
+        thinning.compression_mm,
+        thinning.time_s,
+        np.full(n, number),
+        _build_interpolation(times_s, thinning.time_s),
+        thinning.covariance,
+        {"sd": stated["sd_mm"], "thickness_mm": stated["thickness_mm"], "compared": f"{n} times"},
+    )
+
+
+def _build_surface_measurement(
+    record: Record, points: ChosenPoints, motion: SurfaceMotion, first: int, times_s: Array
+) -> SurfaceMeasurement:
+    means = motion.means(points.which)
+    sd, words = record.surface_sd_mm, ("x", "y", "z")
+    if record.surface_frame == "site":
+        words = ("along the edge", "across it", "along the axis")
+    facts = {
+        "sd": sd,
+        "left_out": dict(points.left_out),
+        "components": list(words),
+        "compared": f"{len(points.points)} points, {len(means.moved_mm)} values",
+    }
+    return SurfaceMeasurement(
+        "surface",
+        means.moved_mm,
+        means.time_s,
+        first + 3 * means.point + means.component,
+        means.frames @ _build_interpolation(times_s, motion.time_s),
+        np.diag(sd**2 / means.samples),
+        facts,
+        np.array(points.points)[means.point],
+        means.component,
+    )
+
+
+def _build_wave_measurement(
+    record: Record, name: str, curves: dict[str, Array], gauge: int, times_s: Array
+) -> WaveMeasurement:
+    means, n = WaveMeans(curves["time_s"], curves["speed_m_s"], curves["samples"]), len(curves["time_s"])
+    sd, bias = record.shear_waves_sd_m_s, record.shear_waves_bias_m_s
+    return WaveMeasurement(
+        f"{name}-waves",
+        means.speed_m_s,
+        means.time_s,
+        np.full(n, gauge),
+        _build_interpolation(times_s, means.time_s),
+        means.covariance(sd, bias),
+        {"sd": sd, "bias": bias, "compared": f"{n} times"},
+    )
+
+
+def _build_interpolation(from_s: Array, to_s: Array) -> Array:
+    """Matrix (n, t) of linear interpolation from times (t,) to times (n,)."""
+    return np.array([np.interp(to_s, from_s, row) for row in np.eye(len(from_s))]).T
+
+
+@dataclass(frozen=True)
+class ChosenPoints:
+    """Points of a surface that are compared.
+
+    ``points`` are their places on the skin, LPS mm, ``axes`` the directions of the components, ``which`` (k,)
+    their numbers in the file's motion. ``left_out`` says how many others are not compared, by the reason.
+    """
+
+    points: tuple[Vector, ...]
+    axes: tuple[Vector, Vector, Vector]
+    which: Ints
+    left_out: Mapping[str, int]
+
+    @property
+    def words(self) -> str:
+        """How many are compared and left out."""
+        others = "".join(f", {number} {why}" for why, number in self.left_out.items())
+        return f"{len(self.points)} points compared{others}"
+
+
+def write_motion(folder: Path, record: Record, motion: SurfaceMotion) -> None:
+    """Store how a record's surface moves from touch-down on."""
+    time, place, moved = motion.rows
+    columns = dict(zip(_COLUMNS, (*place.T, *moved.T), strict=True))
+    write_curves(folder / f"{CURVES.format(record.name)}.csv", time_s=time, **columns)
+
+
+def read_motion(folder: Path, record: Record) -> SurfaceMotion:
+    """What `write_motion` stored."""
+    columns = read_curves(folder / f"{CURVES.format(record.name)}.csv")
+    rows = np.column_stack([columns[name] for name in _COLUMNS])
+    return SurfaceMotion.of_rows(columns["time_s"], rows[:, :3], rows[:, 3:])
+
+
+def choose_points(
+    study: Study,
+    record: Record,
+    place: tuple[Vector, Vector],
+    skin: tuple[Array, Ints],
+    motion: SurfaceMotion,
+) -> ChosenPoints:
+    """The points of a record's surface that can be compared, at most `MAX_POINTS`, evenly spread.
+
+    Parameters
+    ----------
+    place : position and axis of the indenter.
+    skin : points (n, 3) mm and faces (f, 3 or more).
+    motion : in the frame that the study states.
+
+    Raises
+    ------
+    TraceError
+        Where there is none, with the study's file.
+    """
+    assert record.surface is not None
+    indenter = read_indenter(study.indenter_of(record), *place, record.site.edge)
+    axes, points = np.eye(3), motion.points
+    if record.surface_frame == "site":
+        axes = indenter.frame
+        points = np.array(place[0]) + points @ axes
+    away = np.linalg.norm(points - place[0], axis=1)
+    if away.min() > NEAR_MM:
+        raise TraceError(
+            f"no point lies within {NEAR_MM:g} mm of site {record.site.name}: the nearest is "
+            f"{away.min():.0f} mm away",
+            file=study.path(record.surface),
+            place="x_mm, y_mm, z_mm",
+            remedy=_describe_remedy(record),
+        )
+    found = find_nearest_points(*skin, points)
+    reasons = {
+        f"farther than {NEAR_MM:g} mm from the site": away > NEAR_MM,
+        f"more than {OFF_SKIN_MM:g} mm off the skin": found.off_mm > OFF_SKIN_MM,
+        "under the indenter": is_under(indenter, found.points),
+        "never seen in contact": ~np.isfinite(motion.moved_mm).any(axis=(0, 2)),
+    }
+    left, left_out = np.ones(len(points), dtype=bool), {}
+    for why, bad in reasons.items():
+        if (number := int((bad & left).sum())) > 0:
+            left_out[why] = number
+        left &= ~bad
+    if not left.any():
+        told = ", ".join(f"{number} {why}" for why, number in left_out.items())
+        raise TraceError(
+            f"no point can be compared: {told}",
+            file=study.path(record.surface),
+            place="x_mm, y_mm, z_mm",
+            remedy=_describe_remedy(record),
+        )
+    usable = np.flatnonzero(left)
+    which = usable[_spread(found.points[usable], int(np.argmin(away[usable])))]
+    if len(which) < len(usable):
+        left_out[f"thinned out, to {MAX_POINTS}"] = len(usable) - len(which)
+    chosen = tuple(to_vector3(point) for point in found.points[which])
+    x, y, z = (to_vector3(axis) for axis in axes)
+    return ChosenPoints(chosen, (x, y, z), which, left_out)
+
+
+def _describe_remedy(record: Record) -> str:
+    if record.surface_frame == "site":
+        return 'give millimetres from the site, or surface_frame = "limb"'
+    return 'give LPS millimetres of the skin at rest, or surface_frame = "site"'
+
+
+def _spread(points: Array, first: int) -> Ints:
+    """At most `MAX_POINTS` of points (k, 3), each as far as can be from those before it; sorted."""
+    chosen = [first]
+    away = np.linalg.norm(points - points[first], axis=1)
+    while len(chosen) < min(len(points), MAX_POINTS):
+        chosen.append(int(np.argmax(away)))
+        away = np.minimum(away, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(sorted(chosen))
+
+
+def place_waves(
+    study: Study, record: Record, model: SiteModel, mesh: Mesh, waves: Sequence[Mapping[str, Any]]
+) -> tuple[WavePlace, ...]:
+    """Where the shear waves of a record are, in the site's own mesh; ``waves`` as ``traces.json`` has them.
+
+    Raises
+    ------
+    TraceError
+        Where the limb has no such place, with the record's file.
+    """
+    assert record.shear_waves is not None
+    try:
+        return place_waves_under(model, mesh, [(one["tissue"], one["depth_mm"]) for one in waves])
+    except ProblemError as error:
+        file = study.path(record.shear_waves)
+        what = f"site {record.site.name}: {error.what}"
+        raise TraceError(what, file=file, place="header", remedy=error.remedy) from None
+
+
+def choose_surface_points(
+    limb: LimbGeometry, study: Study, motions: Mapping[str, SurfaceMotion | None]
+) -> dict[str, ChosenPoints]:
+    """By record the points of its surface that can be compared; ``motions``: of records, by name.
+
+    Raises
+    ------
+    TraceError
+        Where a record has none.
+    """
+    skin, found = (limb.anatomy.skin.points, limb.anatomy.skin.faces), {}
+    for record in study.recorded:
+        motion = motions.get(record.name)
+        if motion is not None:
+            found[record.name] = choose_points(study, record, limb.place(record.site), skin, motion)
+    return found

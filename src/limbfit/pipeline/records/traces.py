@@ -36,7 +36,7 @@ from ..engine.context import Context
 from ..engine.storage import write_curves, write_json
 from ..limb.files import LAYERS, SMOOTHING, WAVES
 from ..simulation.simulations import CURVE_POINTS
-from ..simulation.surface_points import write_motion
+from .secondary_measurements import write_motion
 
 END_SHARE = 0.05  # of the largest force: an indenter that hardly pushes does not hold the tissue
 SEEN = 3.0  # standard deviations that the skin must move by to be compared

@@ -8,10 +8,8 @@ from typing import Any
 
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...study import Site, Study, Vector
-from ...traces import SurfaceMotion
 from ..engine.store import Store
 from .simulations import count_pins_met
-from .surface_points import ChosenPoints, choose_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,24 +42,10 @@ class LimbGeometry:
         found = {}
         for site in study.sites:
             one, faces = (study.records_at(site) or (site,))[0], (skin.points, skin.faces)
-            found[site.name] = count_pins_met(study, one, self.place(site), faces, (x, y, z))
-        return found
-
-    def surface_points(
-        self, study: Study, motions: Mapping[str, SurfaceMotion | None]
-    ) -> dict[str, ChosenPoints]:
-        """By record the points of its surface that can be compared; ``motions``: of records, by name.
-
-        Raises
-        ------
-        TraceError
-            Where a record has none.
-        """
-        faces, found = (self.anatomy.skin.points, self.anatomy.skin.faces), {}
-        for record in study.recorded:
-            motion = motions.get(record.name)
-            if motion is not None:
-                found[record.name] = choose_points(study, record, self.place(record.site), faces, motion)
+            place = self.place(site)
+            found[site.name] = count_pins_met(
+                study, one.name, study.indenter_of(one), place, faces, (x, y, z)
+            )
         return found
 
 

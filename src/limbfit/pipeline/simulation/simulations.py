@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array
-from ...errors import ProblemError, TraceError
+from ...errors import ProblemError
 from ...execution import Executor
 from ...extensions import compute_extensions_digest
 from ...fe import SimulationWarning
@@ -21,19 +21,16 @@ from ...indentation import (
     Simulation,
     SimulationJob,
     SiteModel,
-    WavePlace,
     build_clamping_pins,
-    place_waves_under,
     read_indenter,
     simulate,
 )
 from ...mesh import read_vtu
-from ...study import Indentation, Record, Site, Study, Vector
+from ...study import Indentation, IndenterTable, Record, Study, Vector
 from ..engine.context import Context
 from ..engine.sources import code_digest
 from ..engine.storage import compute_digest, compute_file_digest, write_atomically
 from ..engine.store import COARSE, EARLIER, RUNS
-from .surface_points import ChosenPoints, choose_points, read_motion
 
 CURVE_POINTS = 81  # times, about, at which measured and simulated force are compared
 
@@ -186,14 +183,12 @@ def build_site_model(
     one: Indentation,
     knots_s: Sequence[float],
     knots_mm: Sequence[float],
-    searched: bool = False,
     knots_N: Sequence[float] = (),
     layers: Sequence[str] = (),
 ) -> SiteModel:
     """The stored mesh and place of an indentation's site with a history of displacement, or of force.
 
-    ``searched``: as parameters are searched: on its coarse mesh where the study has one, and no more of it
-    than ``calibration.search_radius_mm``. ``layers``: tissues whose compression is wanted, too.
+    ``layers``: tissues whose compression is wanted, too.
 
     Raises
     ------
@@ -203,22 +198,18 @@ def build_site_model(
     study: Study = context.study
     site = one.site if isinstance(one, Record) else one
     placed = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}[site.name]
-    folder = COARSE if searched and study.mesh.coarse is not None else ""
-    mesh = context.store["mesh"] / folder / f"{site.name}.vtu"
-    indenter = study.indenter_of(one)
-    place = tuple(placed["position_mm"]), tuple(placed["axis"])
+    mesh, indenter = context.store["mesh"] / f"{site.name}.vtu", study.indenter_of(one)
     clamped: dict[str, Any] = {}
-    if study.clamps is not None:  # said here, with the study's file, before workers build the site
-        whole, along = read_vtu(mesh), read_limb_axis(context)
-        count_pins_met(study, one, place, (whole.points, whole.face_sets["skin"]), along)
-        clamped = {"clamps": study.clamps, "along": along}
-    return SiteModel(
+    if study.clamps is not None:
+        clamped = {"clamps": study.clamps, "along": read_limb_axis(context)}
+    model = SiteModel(
         name=one.name,
         site=site.name,
+        fibres=find_fibre_directions(context),
         mesh=mesh,
         mesh_digest=compute_file_digest(mesh),
-        position=place[0],
-        axis=place[1],
+        position=tuple(placed["position_mm"]),
+        axis=tuple(placed["axis"]),
         knots_s=tuple(knots_s),
         knots_mm=tuple(knots_mm),
         knots_N=tuple(knots_N),
@@ -228,21 +219,48 @@ def build_site_model(
         kappa_ratio=study.material.kappa_ratio,
         steps=study.solver,
         element=study.mesh.element,
-        within_mm=study.within_mm if searched else None,
         law=study.material.law,
         relaxation_span_s=study.material.relaxation_span_s,
-        fibres=find_fibre_directions(context),
         extensions=study.extensions,
         layers=tuple(layers),
         course=study.material.course,
         prestretch=tuple(sorted(study.material.prestretch.items())),
         **clamped,
     )
+    _check_pins(study, model)
+    return model
+
+
+def coarsen_model(context: Context, model: SiteModel) -> SiteModel:
+    """A site's model as parameters are searched: on its coarse mesh where the study has one.
+
+    No more of the mesh counts than ``calibration.search_radius_mm``.
+
+    Raises
+    ------
+    ProblemError
+        Where the study's clamps do not meet the limb there.
+    """
+    study = context.study
+    if study.mesh.coarse is not None:
+        mesh = context.store["mesh"] / COARSE / f"{model.site}.vtu"
+        model = replace(model, mesh=mesh, mesh_digest=compute_file_digest(mesh))
+        _check_pins(study, model)
+    return replace(model, within_mm=study.within_mm)
+
+
+def _check_pins(study: Study, model: SiteModel) -> None:
+    """Refuse clamps that do not meet the limb, with the study's file, before workers build the site."""
+    if study.clamps is not None:
+        mesh, place = read_vtu(model.mesh), (model.position, model.axis)
+        skin = mesh.points, mesh.face_sets["skin"]
+        count_pins_met(study, model.name, model.indenter, place, skin, model.along)
 
 
 def count_pins_met(
     study: Study,
-    one: Indentation,
+    name: str,
+    indenter: IndenterTable,
     place: tuple[Vector, Vector],
     skin: tuple[Array, NDArray[np.int64]],
     along: Vector,
@@ -251,6 +269,7 @@ def count_pins_met(
 
     Parameters
     ----------
+    name : of the indentation.
     place : position and axis of the indenter.
     skin : points (n, 3) mm and faces (f, 3 or more).
     along : the limb's axis, proximally.
@@ -262,79 +281,14 @@ def count_pins_met(
     """
     if study.clamps is None:
         return 0
-    indenter = read_indenter(study.indenter_of(one), *place, None)
     try:
-        return len(build_clamping_pins(*skin, indenter, np.array(along), study.clamps))
+        pins = build_clamping_pins(
+            *skin, read_indenter(indenter, *place, None), np.array(along), study.clamps
+        )
+        return len(pins)
     except ProblemError as error:
-        what = f"site {one.name}: {error.what}"
+        what = f"site {name}: {error.what}"
         raise ProblemError(what, file=study.file, place="clamps", remedy=error.remedy) from None
-
-
-def build_recorded_model(context: Context, record: Record, searched: bool = False) -> SiteModel:
-    """A site driven by one of its records, from touch-down; ``searched``: see `build_site_model`."""
-    facts = context.stored("traces", "traces.json")["sites"][record.name]
-    force = facts["knots_N"] if record.forced else ()
-    layers = [tissue for tissue, one in facts.get("layers", {}).items() if one["compared"]]
-    model = build_site_model(context, record, facts["knots_s"], facts["knots_mm"], searched, force, layers)
-    points = find_surface_points(context, record)
-    if points is not None:
-        model = replace(model, skin_points=points.points, skin_axes=points.axes)
-    waves = facts.get("waves", [])
-    return replace(model, waves=_place_waves(context, record, model, waves)) if waves else model
-
-
-def _place_waves(
-    context: Context, record: Record, model: SiteModel, waves: Sequence[Mapping[str, Any]]
-) -> tuple[WavePlace, ...]:
-    """Where the shear waves of a record are, in the site's own mesh.
-
-    Raises
-    ------
-    TraceError
-        Where the limb has no such place, with the record's file.
-    """
-    assert record.shear_waves is not None
-    mesh = read_vtu(context.store["mesh"] / f"{record.site.name}.vtu")
-    try:
-        return place_waves_under(model, mesh, [(one["tissue"], one["depth_mm"]) for one in waves])
-    except ProblemError as error:
-        file = context.study.path(record.shear_waves)
-        what = f"site {record.site.name}: {error.what}"
-        raise TraceError(what, file=file, place="header", remedy=error.remedy) from None
-
-
-def find_surface_points(context: Context, record: Record) -> ChosenPoints | None:
-    """The points of a record's surface that are compared, on the skin of the site's own mesh; None: nothing.
-
-    Raises
-    ------
-    TraceError
-        Where no point can be compared.
-    """
-    facts = context.stored("traces", "traces.json")["sites"][record.name].get("surface")
-    if facts is None or not facts["compared"]:
-        return None
-    (placed,) = (
-        row for row in context.stored("sites", "sites.json")["sites"] if row["site"] == record.site.name
-    )
-    mesh = read_vtu(context.store["mesh"] / f"{record.site.name}.vtu")
-    place = tuple(placed["position_mm"]), tuple(placed["axis"])
-    motion = read_motion(context.store["traces"], record)
-    return choose_points(context.study, record, place, (mesh.points, mesh.face_sets["skin"]), motion)
-
-
-def build_planned_model(context: Context, site: Site) -> SiteModel:
-    """The site driven by the depth and speed that the study plans for it, in and out."""
-    assert site.depth_mm is not None
-    ramp = site.depth_mm / site.speed_mm_s
-    return build_site_model(context, site, (0.0, ramp, 2 * ramp), (0.0, site.depth_mm, 0.0))
-
-
-def build_model(context: Context, one: Indentation) -> SiteModel:
-    """An indentation as it was recorded, or as the study plans it."""
-    return (
-        build_recorded_model(context, one) if isinstance(one, Record) else build_planned_model(context, one)
-    )
 
 
 def build_curve_job(model: SiteModel, tissues: tuple[str, ...], parameters: Iterable[float]) -> SimulationJob:

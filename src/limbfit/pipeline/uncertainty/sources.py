@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import cycle
 from pathlib import Path
 
@@ -23,10 +24,10 @@ from ...indentation import SimulationJob, SiteModel
 from ...shapes import SHAPES
 from ...study import SolverTable, Study, Vector
 from ..engine.context import Context
-from ..identification.record_simulator import estimate_own_mesh_error
+from ..identification.fine_meshes import estimate_own_mesh_error
 from ..limb.mesh import build_coarse_settings, mesh_settings
 from ..limb.remesh import mesh_models, scale_edges
-from ..records.records import SiteRecord, load_site_record
+from ..records.records import RecordSet, SiteRecord
 from ..simulation.extrapolation import MESH_ORDERS, estimate_coarse_error
 from ..simulation.simulations import SimulationCache
 
@@ -67,11 +68,11 @@ class Change:
 
 
 def build_variants(
-    context: Context, folder: Path, records: Sequence[SiteRecord], parameters: Array
+    context: Context, folder: Path, records: RecordSet, parameters: Array
 ) -> list[SourceVariant]:
-    """All variants of the study, their meshes made; ``records`` are those whose meshes are searched on."""
+    """All variants of the study, on the meshes of the search, their meshes made."""
     table = context.study.uncertainty
-    plain = tuple(record.job(parameters, sensitivities=False) for record in records)
+    plain = tuple(record.job(parameters, sensitivities=False) for record in records.searched)
 
     def vary(
         source: str, change: str, models: Sequence[SiteModel], shared: bool, counted: bool
@@ -79,7 +80,7 @@ def build_variants(
         jobs = tuple(replace(job, model=model) for job, model in zip(plain, models, strict=True))
         return SourceVariant(source, change, jobs, plain, shared, counted)
 
-    models = [record.model for record in records]
+    models = [record.model for record in records.searched]
     found = [
         vary(
             "layer thickness",
@@ -100,7 +101,7 @@ def build_variants(
     change = f"{MORE_STEPS} times as many, extrapolated at order {ORDER_IN_TIME:g}"
     in_time = vary("time steps", change, finer, True, True)
     found.append(replace(in_time, scale=estimate_coarse_error(ORDER_IN_TIME, MORE_STEPS)))
-    found.append(_build_mesh_variant(context, folder, records, plain, parameters))
+    found.append(_build_mesh_variant(context, folder, records, plain))
     return found
 
 
@@ -188,31 +189,33 @@ def _thicken_layer(context: Context, folder: Path, models: Sequence[SiteModel]) 
         layers[index] = replace(layer, min_thickness_mm=(layer.min_thickness_mm or 0.0) + more)
     else:
         layers[index] = replace(layer, thickness_mm=layer.thickness_mm + more)
+    thicker = replace(settings, layers=tuple(layers))
     return mesh_models(
-        context, folder / "thicker", models, replace(settings, layers=tuple(layers)), "uncertainty"
+        context, folder / "thicker", models, thicker, partial(context.tell, "uncertainty", 0, 0)
     )
 
 
 def _build_mesh_variant(
     context: Context,
     folder: Path,
-    records: Sequence[SiteRecord],
+    records: RecordSet,
     plain: tuple[SimulationJob, ...],
-    parameters: Array,
 ) -> SourceVariant:
     """How far forces are from those of an infinitely fine mesh, from two."""
     study = context.study
     settings = choose_searched_settings(study)
     if study.mesh.coarse is not None:
-        own = [load_site_record(context, record.record).model for record in records]
-        models = [replace(model, within_mm=study.within_mm) for model in own]
-        jobs = [replace(job, model=model) for job, model in zip(plain, models, strict=True)]
+        models = [replace(record.model, within_mm=study.within_mm) for record in records.own]
     else:
         finer = scale_edges(settings, FINER)
         models = mesh_models(
-            context, folder / "finer", [record.model for record in records], finer, "uncertainty"
+            context,
+            folder / "finer",
+            [record.model for record in records.searched],
+            finer,
+            partial(context.tell, "uncertainty", 0, 0),
         )
-        jobs = [replace(job, model=model) for job, model in zip(plain, models, strict=True)]
+    jobs = [replace(job, model=model) for job, model in zip(plain, models, strict=True)]
     change, scale = mesh_share(study)
     # With coarse meshes the residuals' covariance has it already.
     counted = study.mesh.coarse is None

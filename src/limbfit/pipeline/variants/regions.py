@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,12 @@ from ...identify.fit.state import Calibration
 from ...study import Site, Study
 from ..engine.context import Context
 from ..engine.storage import write_json, write_table
-from ..identification.record_simulator import RecordSimulator, build_groupings, build_unknowns
-from ..records.records import SiteRecord, load_site_record, to_response
+from ..identification.fine_meshes import correct_answer
+from ..identification.intervals import sample_intervals
+from ..identification.problem import CalibrationProblem, build_problem
+from ..identification.record_simulator import RecordSimulator
+from ..identification.search import search_parameters
+from ..records.records import SiteRecord, load_records, load_site_record, to_response
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import SimulationCache, open_experiment_cache
 
@@ -34,13 +39,19 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]
     stages = context.stored("calibrate", "calibration.json")["stages"]
     whole = study.vector(stages[-1]["parameters"])
     cache = open_experiment_cache(context, folder)
-    benches = {
-        name: RecordSimulator(context, cache, study.records_at(*fitted), "regions")
-        for name, (fitted, _) in members.items()
+    report, problem = partial(context.tell, "regions", 0, 0), build_problem(study)
+    simulators = {}
+    for name, (fitted, _) in members.items():
+        records = load_records(context, study.records_at(*fitted), secondary=True)
+        simulators[name] = RecordSimulator(records, cache, context.executor, report)
+    regions = {
+        name: _build_region(context, problem, simulators[name], mine) for name, (_, mine) in members.items()
     }
-    made = {name: _build_region(context, cache, benches[name], mine) for name, (_, mine) in members.items()}
-    found = fit_regions(made, build_unknowns(study), whole)
-    rows = [_to_row(context, name, benches[name], members[name], fit, folder) for name, fit in found.items()]
+    found = fit_regions(regions, problem.unknowns, whole)
+    rows = [
+        _to_row(context, problem, simulators[name], name, members[name], fit, folder)
+        for name, fit in found.items()
+    ]
     content = {
         "sites_used": sites,
         "left_out": _describe_left_out(context, members),
@@ -100,16 +111,16 @@ def _describe_left_out(context: Context, members: dict[str, Any]) -> list[str]:
 
 
 def _build_region(
-    context: Context, cache: SimulationCache, laboratory: RecordSimulator, mine: Sequence[Site]
+    context: Context, problem: CalibrationProblem, simulator: RecordSimulator, mine: Sequence[Site]
 ) -> RegionRecords:
-    records = [load_site_record(context, record) for record in context.study.records_at(*mine)]
-    stage = build_groupings(context.study)[-1:]
+    study = context.study
+    records = [load_site_record(context, record) for record in study.records_at(*mine)]
 
     def identify(start: Unknowns) -> Calibration:
-        return laboratory.identify(start, stage)[0]
+        return search_parameters(study, problem, simulator, start, problem.stages[-1:])[0]
 
     def simulate(parameters: Array) -> list[SiteResponse]:
-        return _simulate_forces(context, cache, records, parameters)
+        return _simulate_forces(context, simulator.cache, records, parameters)
 
     return RegionRecords(identify, simulate, tuple(record.measured for record in records))
 
@@ -125,8 +136,9 @@ def _simulate_forces(
 
 def _to_row(
     context: Context,
+    problem: CalibrationProblem,
+    simulator: RecordSimulator,
     name: str,
-    laboratory: RecordSimulator,
     chosen: tuple[list[Site], list[Site]],
     fit: RegionFit,
     folder: Path,
@@ -134,7 +146,9 @@ def _to_row(
     """What ``regions.json`` holds of a region."""
     study, found = context.study, fit.calibration
     fitted, mine = chosen
-    _, known = laboratory.uncertainty(found, build_groupings(study)[-1], folder / "coarser", moves=False)
+    responses = list(found.responses)
+    correction, spent = correct_answer(context, simulator, found.parameters, responses, folder / "coarser")
+    _, known = sample_intervals(context, problem, simulator, found, correction, spent, moves=False)
     intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in study.tissues}
     for (tissue, key), limits in zip(study.parameters, known.intervals_95.tolist(), strict=True):
         intervals[tissue][key] = limits

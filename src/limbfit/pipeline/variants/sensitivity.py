@@ -31,7 +31,7 @@ from ...shapes import OWN, SHAPES
 from ...study import IndenterTable
 from ..engine.context import Context
 from ..engine.storage import write_json, write_table
-from ..records.records import coarsen_records, load_site_record
+from ..records.records import load_records
 from ..simulation.simulations import SimulationCache, open_experiment_cache
 from .variants import (
     ChosenSite,
@@ -152,8 +152,8 @@ def _collect_derivatives(context: Context, folder: Path, identified: Parameters)
     It is each tissue's first.  They are of where parameters are searched, as those of the prediction.
     """
     study = context.study
-    own = [load_site_record(context, record) for record in study.recorded if not record.forced]
-    records, best = coarsen_records(context, own), study.vector(identified)
+    records = load_records(context, [record for record in study.recorded if not record.forced]).searched
+    best = study.vector(identified)
     cache = open_experiment_cache(context, folder)
     rows: list[dict[str, Any]] = []
     for record, found in zip(

@@ -16,8 +16,9 @@ from ...study import Indentation, Record, Site, Study
 from ..engine.context import Context
 from ..engine.storage import write_curves
 from ..records.deviations import measure_bone_distance_mm
+from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
-from ..simulation.simulations import CURVE_POINTS, SimulationCache, build_model
+from ..simulation.simulations import CURVE_POINTS, SimulationCache
 
 
 @dataclass(frozen=True)

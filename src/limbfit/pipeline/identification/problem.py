@@ -1,0 +1,95 @@
+"""What a study asks of its calibration: parameters with their bounds, stages, and when the search ends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from ...arrays import Array
+from ...errors import StudyError
+from ...identify.fit.parameters import (
+    Grouping,
+    Prior,
+    SearchSpace,
+    Unknowns,
+    build_space,
+    build_stage_groupings,
+    constrain,
+)
+from ...identify.fit.state import CalibrationSettings
+from ...study import Study
+
+COUNTS = ("no", "one", "two", "three", "four", "five", "six")
+
+
+@dataclass(frozen=True)
+class CalibrationProblem:
+    """The ``unknowns``, which of them move together in each of the ``stages``, whose ``titles`` are in words.
+
+    ``space`` is that of the last stage.
+    """
+
+    unknowns: Unknowns
+    stages: tuple[Grouping, ...]
+    titles: tuple[str, ...]
+    settings: CalibrationSettings
+    space: SearchSpace
+
+
+def check_fitted(study: Study) -> None:
+    """Refuse a study that has nothing to identify parameters from.
+
+    Raises
+    ------
+    StudyError
+        With the remedy.
+    """
+    if not study.fitted:
+        remedy = "set fitted = true where there is a record, or stop before it: limbfit run --until mesh"
+        raise StudyError("no site is fitted", file=study.file, place="sites", remedy=remedy)
+
+
+def build_problem(study: Study) -> CalibrationProblem:
+    """The problem that a study states."""
+    unknowns, stages = build_unknowns(study), build_groupings(study)
+    titles, settings = list_stage_titles(study.tissues), build_settings(study)
+    return CalibrationProblem(unknowns, stages, titles, settings, build_space(unknowns, stages[-1]))
+
+
+def build_unknowns(study: Study) -> Unknowns:
+    """The parameters of each tissue with the study's start and bounds."""
+
+    def flat(which: Literal["start", "lower", "upper"]) -> Array:
+        return study.vector({tissue: study.material.of(tissue, which) for tissue in study.tissues})
+
+    names = tuple(f"{tissue}.{name}" for tissue, name in study.parameters)
+    priors = tuple(Prior(name, p.median, p.factor) for name, p in study.priors.items())
+    return Unknowns(names, flat("start"), flat("lower"), flat("upper"), priors)
+
+
+def build_groupings(study: Study) -> tuple[Grouping, ...]:
+    """Which parameters move together in each stage, as far as the study lets them move."""
+    names = build_unknowns(study).names
+    made = [
+        constrain(one, names, study.fixed, study.calibration.tied) for one in build_stage_groupings(names)
+    ]
+    return tuple(dict.fromkeys(made))
+
+
+def build_settings(study: Study) -> CalibrationSettings:
+    """How the study wants its parameters found."""
+    table = study.calibration
+    return CalibrationSettings(
+        objective=table.objective,
+        relative_tolerance=table.relative_tolerance,
+        max_iterations=table.max_iterations,
+        stopping=table.stopping,
+        force_error_percent=table.force_error_percent,
+    )
+
+
+def list_stage_titles(tissues: Sequence[str]) -> tuple[str, ...]:
+    """Names of the stages of the identification; a single tissue has one."""
+    n = len(tissues)
+    return ("one material", f"{COUNTS[n] if n < len(COUNTS) else n} materials")[: min(n, 2)]
