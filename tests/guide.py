@@ -73,7 +73,7 @@ def identified(
     store["calibrate"].mkdir()
     with make_executor(2, Limits(0.0, 0.0)) as executor:
         run_calibrate(Context(study, store, executor, lambda event: None), store["calibrate"])
-    found: dict[str, Any] = store.read("calibrate", "calibration.json")
+    found: dict[str, Any] = store.results.calibration.to_plain()
     last, known = found["stages"][-1], found["uncertainty"]["intervals_95"]
     assert last["converged"], last["reason"]
     assert last["iterations"][-1]["error_percent"] < 1.0

@@ -16,6 +16,7 @@ from limbfit.identify.checks.domain import (
     describe_outside,
 )
 from limbfit.pipeline.simulation.loading import LoadHistory, describe_untested_times, time_socket_loads
+from limbfit.results.identification import RecordedExtents
 from limbfit.study.socket import SocketLoadTable, SocketTable
 
 RECORDS = (
@@ -26,7 +27,7 @@ TESTED = RecordedRange.from_records(RECORDS, (10.0, 350.0, 180.0))
 
 
 def find(*prediction: Extent) -> list[dict]:
-    return RecordedRange.from_dict(TESTED.to_dict()).find_outside(prediction)
+    return RecordedRange.from_stored(RecordedExtents.model_validate(TESTED)).find_outside(prediction)
 
 
 def test_records_together_go_as_far_as_each_of_them():
@@ -38,8 +39,8 @@ def test_records_together_go_as_far_as_each_of_them():
 def test_what_lasts_longer_or_comes_on_faster_is_outside_with_both_ranges():
     assert find(Extent(TIME, "s", 2.0, 15.0)) == []  # half as long again is little for relaxation
     (row,) = find(Extent(TIME, "s", 1.0, 3600.0))
-    assert (row["records"], row["prediction"]) == ([2.0, 13.0], [1.0, 3600.0])
-    assert row["share"] == pytest.approx(1.0 - 11.0 / 3599.0)
+    assert (row.records, row.prediction) == ((2.0, 13.0), (1.0, 3600.0))
+    assert row.share == pytest.approx(1.0 - 11.0 / 3599.0)
     (fast,) = find(Extent(TIME, "s", 0.1, 5.0))
     assert fast["share"] == pytest.approx(1.9 / 4.9)
 
@@ -48,17 +49,17 @@ def test_the_share_of_strained_volume_is_that_beyond_the_records():
     """Strain that rises evenly from 0 to 0.6 over the volume: 1 % exceeds 0.594, and half of it 0.3."""
     values = np.linspace(0.0, 0.6, 4001)
     (row,) = find(Extent.from_values(SHEAR, "", values, np.full(4001, 2.5), "muscle"))
-    assert row["prediction"] == [0.0, pytest.approx(0.594, abs=1e-3)]
-    assert row["share"] == pytest.approx(0.5, abs=3e-3)
+    assert row.prediction == (0.0, pytest.approx(0.594, abs=1e-3))
+    assert row.share == pytest.approx(0.5, abs=3e-3)
     weights = np.where(values > 0.3, 1.0, 4.0)
     (row,) = find(Extent.from_values(SHEAR, "", values, weights, "muscle"))
-    assert row["share"] == pytest.approx(0.2, abs=3e-3)
+    assert row.share == pytest.approx(0.2, abs=3e-3)
     assert find(Extent.from_values(SHEAR, "", 0.5 * values, weights, "muscle")) == []
 
 
 def test_a_tissue_that_no_record_strained_is_outside_and_an_unknown_quantity_is_not():
     (row,) = find(Extent(SHEAR, "", 0.0, 0.1, "fat"))
-    assert (row["tissue"], row["records"], row["share"]) == ("fat", [0.0, 0.0], 1.0)
+    assert (row.tissue, row.records, row.share) == ("fat", (0.0, 0.0), 1.0)
     assert find(Extent(PRESSURE, "kPa", 0.0, 50.0)) == []  # that of the records is not known
 
 

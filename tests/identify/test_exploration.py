@@ -15,6 +15,7 @@ from limbfit.identify.uncertainty.exploration import ExplorationSettings, explor
 from limbfit.identify.uncertainty.noise import estimate_curve_noise
 from limbfit.identify.uncertainty.posterior import Posterior, compute_principal_axes
 from limbfit.identify.uncertainty.uncertainty import estimate_uncertainty
+from limbfit.results.uncertainty import LikelihoodProfile
 
 SPACE = build_space(PAPER, group_separately(NAMES))
 
@@ -141,7 +142,7 @@ def test_profiles_say_where_they_are_extrapolated(vague):
         for at_bound, end, said in zip((0, 1), one.ends, one.ends_extrapolated):
             outside = bool(np.any((end < low * (1 - 1e-9)) | (end > high * (1 + 1e-9))))
             assert said == outside, (one.name, at_bound)
-        assert one.to_dict()["extrapolated"] == one.extrapolated.tolist()
+        assert LikelihoodProfile.model_validate(one).extrapolated == one.extrapolated.tolist()
     ends = [end for one in vague.profiles for end in one.ends_extrapolated]
     assert any(ends)
     assert not all(ends)

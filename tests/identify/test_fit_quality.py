@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from limbfit.identify.checks.fit_quality import FitQuality, assess_fit, refit_residuals, summarise_fit
+from limbfit.identify.checks.fit_quality import assess_fit, refit_residuals, summarise_fit
 from limbfit.identify.uncertainty.discrepancy import compute_matern
+from limbfit.results.identification import RecordFit
 
 TIMES = np.linspace(0.0, 12.0, 81)
 DEPTH = np.interp(TIMES, [0.0, 4.0, 8.0, 12.0], [0.0, 4.0, 4.0, 0.0])
@@ -17,7 +18,7 @@ COVARIANCE = SD**2 * np.eye(81) + 1e-4 * np.outer(FORCE, FORCE)
 SHAPE = np.stack([FORCE, DEPTH, DEPTH**2], axis=1)  # what three parameters would add, per logarithm
 
 
-def assess(residual: np.ndarray, fitted: bool = True, inside: np.ndarray | None = None) -> FitQuality:
+def assess(residual: np.ndarray, fitted: bool = True, inside: np.ndarray | None = None) -> RecordFit:
     return assess_fit("05", fitted, TIMES, DEPTH, residual, PEAK, COVARIANCE, inside)
 
 
@@ -64,7 +65,7 @@ def test_other_parameters_are_tried_before_the_model_is_blamed() -> None:
     own = [shared[0], shared[1] + 0.3 * np.sin(TIMES) * (TIMES > 8.0)]
     shapes, covariances = [SHAPE, 2 * SHAPE], [COVARIANCE, COVARIANCE]
 
-    def judge(residual: np.ndarray, refitted: np.ndarray) -> FitQuality:
+    def judge(residual: np.ndarray, refitted: np.ndarray) -> RecordFit:
         return assess_fit("06", True, TIMES, DEPTH, residual, PEAK, COVARIANCE, None, refitted)
 
     right = [judge(*pair) for pair in zip(shared, refit_residuals(shared, shapes, covariances), strict=True)]

@@ -123,7 +123,7 @@ def test_the_error_of_the_mesh_is_in_the_intervals():
 
     assert farthest(without) > 2
     assert farthest(counted) < 1
-    told = [u.residual_model.to_dict()["sites"]["s0"]["mesh_share"] for u in (without, counted)]
+    told = [u.residual_model.summarise().sites["s0"].mesh_share for u in (without, counted)]
     assert told[0] is None
     assert 0.005 < told[1] < 0.03
 

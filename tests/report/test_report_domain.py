@@ -12,6 +12,7 @@ from limbfit.report.formats import number
 from limbfit.report.page import Figure, Note, Section, Table
 from limbfit.report.sections.prediction import make_domain_section
 from limbfit.report.store import Results, load_store
+from limbfit.results.identification import QuantityRange, RecordedExtents
 
 
 def loading(ramp_s: float, end_s: float, skin: float, muscle: float) -> list[Extent]:
@@ -20,6 +21,13 @@ def loading(ramp_s: float, end_s: float, skin: float, muscle: float) -> list[Ext
         Extent(SHEAR, "", 0.0, skin, "skin"),
         Extent(SHEAR, "", 0.0, muscle, "muscle"),
     ]
+
+
+def told(own: list[Extent], tested: RecordedRange) -> dict:
+    return {
+        "loading": [QuantityRange.model_validate(one).to_plain() for one in own],
+        "outside_records": [row.to_plain() for row in tested.find_outside(own)],
+    }
 
 
 @pytest.fixture(scope="module")
@@ -31,19 +39,16 @@ def store(tmp_path_factory) -> Results:
         own = loading(7.0 + 0.1 * i, 14.0 + 0.2 * i, 0.24 - 0.01 * i, 0.2 + 0.01 * i)
         rows.append((row, own))
     tested = RecordedRange.from_records([own for row, own in rows if row["fitted"]], ())
-    sites = [
-        {**row, "loading": [one.to_dict() for one in own], "outside_records": tested.find_outside(own)}
-        for row, own in rows
-    ]
-    worn = loading(1.0, 3600.0, 0.36, 0.18)
-    load = {
-        "name": "stance",
-        "loading": [one.to_dict() for one in worn],
-        "outside_records": tested.find_outside(worn),
-    }
-    text = describe_outside({"the load 'stance'": load["outside_records"]})
+    sites = [{**row, **told(own, tested)} for row, own in rows]
+    load = {"name": "stance", **told(loading(1.0, 3600.0, 0.36, 0.18), tested)}
+    text = describe_outside({"the load 'stance'": tested.find_outside(loading(1.0, 3600.0, 0.36, 0.18))})
     donning = {"loading": None, "outside_records": None}
-    predict = {**found.predict, "sites": sites, "recorded_range": tested.to_dict(), "outside_text": []}
+    predict = {
+        **found.predict,
+        "sites": sites,
+        "recorded_range": RecordedExtents.model_validate(tested).to_plain(),
+        "outside_text": [],
+    }
     socket = {"donning": donning, "loads": [load], "outside_text": text}
     return replace(found, predict=predict, experiments={"socket": socket})
 

@@ -149,7 +149,7 @@ def test_stated_times_are_stored_beside_the_comments(study):
     assert "# by the robot" in file.read_text()
     assert states(study)["traces"] == "stale"
     run_study(load_study(study), until="traces", listener=lambda progress: None)
-    facts = StudyFolder(file).store.read("traces", "traces.json")["sites"]["1"]
+    facts = StudyFolder(file).store.results.traces.to_plain()["sites"]["1"]
     assert facts["touch_down_s"] == stored.touch_down_s
     assert facts["peak_s"] == pytest.approx(5.7)
     client.post("/api/traces/1", headers=SENT, json={})

@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from ..errors import InputError
 
-Parameters = Mapping[str, Mapping[str, float]]  # by tissue, then by key
+Parameters = dict[str, dict[str, float]]  # by tissue, then by key
 Interval = tuple[float, float]
 Intervals = Mapping[str, Mapping[str, Interval]]
 Vector = tuple[float, float, float]
@@ -26,6 +26,12 @@ class ResultPart(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, from_attributes=True)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _list_array(cls, value: Any) -> Any:
+        """An array or number of NumPy as what JSON knows."""
+        return value.tolist() if hasattr(value, "tolist") else value
 
     def to_plain(self) -> dict[str, Any]:
         """Return what JSON knows, with the keys that were given, in the order of the model."""

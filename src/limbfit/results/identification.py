@@ -190,6 +190,9 @@ class CalibrationUncertainty(ResultPart):
     most_probable: Parameters = Field(description="The most probable parameters.")
     priors: PriorShares | None = Field(description="The priors; null where none were stated.")
     residuals: ResidualsSummary = Field(description="What the residuals are made of.")
+    minus_2_log_evidence: float = Field(
+        description="Minus twice the logarithm of how probable the records are, to compare models by."
+    )
     relaxation: RelaxationSummary | None = Field(
         description="Relaxation beyond the records; null for laws without Ogden's relaxation terms."
     )

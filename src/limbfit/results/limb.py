@@ -10,7 +10,7 @@ from pydantic import Field
 from .base import ResultPart, StoredResult, Vector
 
 
-class LimbMotion(ResultPart):
+class MarkerImageMotion(ResultPart):
     """How the limb moved between the image and that with markers."""
 
     shift_mm: float = Field(description="Translation of the limb.")
@@ -29,7 +29,7 @@ class SegmentResult(StoredResult):
     warnings: Sequence[str] = Field(description="What the image warns of, in words.")
     labels_sha256: str = Field(description="SHA-256 of the label map as the stage wrote it.")
     markers_removed: int | None = Field(default=None, description="Markers taken off the skin in this image.")
-    motion: LimbMotion | None = Field(default=None, description="Motion to the image with markers.")
+    motion: MarkerImageMotion | None = Field(default=None, description="Motion to the image with markers.")
 
 
 class LabelMeasures(ResultPart):

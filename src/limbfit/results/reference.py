@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Union, get_args, get_origin
@@ -107,7 +108,7 @@ def _format_type(annotation: Any) -> str:
     if isinstance(annotation, type) and issubclass(annotation, ResultPart):
         return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
     origin, parts = get_origin(annotation), get_args(annotation)
-    if origin is Mapping:
+    if origin in (dict, Mapping):
         return f"table of {_format_type(parts[1])}"
     if origin is Sequence:
         return f"list of {_format_type(parts[0])}"
@@ -119,4 +120,4 @@ def _format_type(annotation: Any) -> str:
 
 
 if __name__ == "__main__":
-    print(build_results_page(), end="")
+    sys.stdout.write(build_results_page())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from .base import Parameters, ResultPart, StoredResult
 from .identification import OutsideRecords
@@ -71,8 +71,10 @@ class StageParts(ResultPart):
     stages: Mapping[str, str] = Field(description="Key of each stage below.")
 
 
-class StageResult(StoredResult):
-    """The stamp of a stage or experiment that is done."""
+class StageStamp(StoredResult):
+    """The stamp of a stage or experiment that is done; one of an extension may have keys of its own."""
+
+    model_config = ConfigDict(extra="allow")
 
     FILE: ClassVar = "*/stage.json"
 
@@ -122,7 +124,7 @@ class SolverRun(ResultPart):
     seconds: float | None = Field(description="Time that it took, in s; null where it is not known.")
 
 
-class FebioRun(SolverRun):
+class FebioSimulation(SolverRun):
     """The simulation by FEBio."""
 
     version: str = Field(description="FEBio with its version.")
@@ -137,7 +139,7 @@ class CurveDifference(ResultPart):
     peak_percent: float | None = Field(description="Difference of the largest forces.")
 
 
-class LimbfitRun(SolverRun):
+class LimbfitSimulation(SolverRun):
     """A simulation by limbfit."""
 
     penetration_mm: float = Field(description="How deep the indenter is in the skin at most.")
@@ -162,8 +164,8 @@ class CompareResult(StoredResult):
     parameters_from: str = Field(description="Where these are from.")
     element: str = Field(description="Type of the cells.")
     unknowns: int = Field(description="Number of unknowns.")
-    febio: FebioRun = Field(description="FEBio.")
-    limbfit: LimbfitRun = Field(description="limbfit, as it is used.")
-    limbfit_matched: LimbfitRun = Field(description="limbfit with FEBio's steps and penalty.")
+    febio: FebioSimulation = Field(description="FEBio.")
+    limbfit: LimbfitSimulation = Field(description="limbfit, as it is used.")
+    limbfit_matched: LimbfitSimulation = Field(description="limbfit with FEBio's steps and penalty.")
     febio_log: str | None = Field(description="FEBio's table of forces, where it was given.")
     files: CurveFiles = Field(description="Files of the comparison.")

@@ -11,9 +11,10 @@ from .base import StoredResult
 from .curves import read_curves
 from .identification import CalibrationResult, PredictResult
 from .limb import MeshResult, QualityResult, SegmentResult, SitesResult, SurfacesResult
+from .models import ModelsResult, SocketOfModels
 from .planning import DesignResult, ProtocolResult
 from .records import TracesResult
-from .runs import CompareResult, RunResult, SimulateResult, StageResult
+from .runs import CompareResult, RunResult, SimulateResult, StageStamp
 from .socket import SocketDesignResult, SocketResult
 from .uncertainty import CrossvalidateResult, RegionsResult, UncertaintyResult
 from .variants import (
@@ -84,7 +85,7 @@ class StudyResults:
     """
 
     run = Single(RunResult)
-    stages = Each(StageResult)
+    stages = Each(StageStamp)
     segment = Single(SegmentResult)
     quality = Single(QualityResult)
     surfaces = Single(SurfacesResult)
@@ -102,6 +103,8 @@ class StudyResults:
     sensitivity_indenter = Single(IndenterResult)
     sensitivity_mesh = Single(RefinementResult)
     cube = Single(CubeResult)
+    models = Single(ModelsResult)
+    models_socket = Single(SocketOfModels)
     socket = Single(SocketResult)
     socket_design = Single(SocketDesignResult)
     design = Single(DesignResult)

@@ -99,6 +99,12 @@ class ProfileCheck(ResultPart):
     solved: tuple[float | None, float | None] = Field(description="By the solver; null where it failed.")
     extrapolated: tuple[bool, bool] = Field(description="Whether each end is beyond the emulator's runs.")
 
+    @property
+    def largest_difference(self) -> float | None:
+        """The largest difference at the ends that were simulated; None if neither was."""
+        found = [abs(a - b) for a, b in zip(self.emulated, self.solved) if b is not None]
+        return max(found, default=None)
+
 
 class ModelEvidence(ResultPart):
     """A model on the records."""

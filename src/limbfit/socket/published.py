@@ -6,9 +6,10 @@ and thresholds of pain stand in the papers alone: no abstract gives them by regi
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+from ..results.socket import PublishedFindings
 
 WHOLE = "the limb"
 
@@ -91,11 +92,11 @@ FINDINGS = (
 )
 
 
-def select_published_findings(regions: Collection[str]) -> list[Mapping[str, Any]]:
+def select_published_findings(regions: Collection[str]) -> list[PublishedFindings]:
     """The findings over any of the ``regions``, or over the whole limb, as they are stored."""
-    rows: list[Mapping[str, Any]] = []
+    rows = []
     for finding in FINDINGS:
         here = [name for name in finding.regions if name in regions or name == WHOLE]
         if here:
-            rows.append(asdict(finding) | {"regions": here})
+            rows.append(PublishedFindings.model_validate(replace(finding, regions=tuple(here))))
     return rows

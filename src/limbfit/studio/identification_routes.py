@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict
 from ..pipeline import STAGE_NAMES
 from ..pipeline.engine.storage import read_curves
 from ..pipeline.simulation.simulations import find_newest_simulations
+from ..results.identification import CalibrationResult
 from ..study import Record
 from .folder import StudyFolder
 from .processes import find_running, find_starting, start_run, stop_run
@@ -94,21 +95,20 @@ def post_stop(folder: Folder) -> dict[str, Any]:
 
 
 def _answer(folder: StudyFolder) -> dict[str, Any] | None:
-    if not (folder.results / "calibrate" / "calibration.json").is_file():
+    found = CalibrationResult.find(folder.results)
+    if found is None:
         return None
-    found = folder.store.read("calibrate", "calibration.json")
-    known, last = found["uncertainty"], found["stages"][-1]
+    plain = found.to_plain()
+    known, stages = plain["uncertainty"], plain["stages"]
     keys = ("name", "cost", "evaluations", "converged", "reason", "parameters")
+    rows = ("parameters", "cost", "error_percent", "error_percent_by_site")
     return {
-        "stages": [{key: stage[key] for key in keys} for stage in found["stages"]],
-        "parameters": last["parameters"],
-        "warnings": found["warnings"],
+        "stages": [{key: stage[key] for key in keys} for stage in stages],
+        "parameters": found.parameters,
+        "warnings": plain["warnings"],
         "iterates": [
-            {
-                "of": stage["name"],
-                **{key: row[key] for key in ("parameters", "cost", "error_percent", "error_percent_by_site")},
-            }
-            for stage in found["stages"]
+            {"of": stage["name"], **{key: row[key] for key in rows}}
+            for stage in stages
             for row in stage["iterations"]
         ],
         **{key: known[key] for key in ("intervals_95", "correlation", "verdict", "at_bound", "combinations")},
@@ -120,7 +120,8 @@ def _collect_iterates(
 ) -> dict[str, Any]:
     """Iterates of the search that goes on or was stopped; else of the stored answer."""
     if state != "done":
-        finished = (folder.store.stamp("calibrate") or {}).get("finished", "")
+        stamp = folder.store.stamp("calibrate")
+        finished = stamp.finished if stamp else ""
         for log in reversed(logs[-LOGS_SEARCHED:]):
             rows = [
                 row for row in _read_events(log) if row["event"] == "fit" and row.get("stage") == "calibrate"

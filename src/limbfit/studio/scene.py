@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from ..mesh import read_vtu
 from ..pipeline.engine.storage import compute_digest
 from ..pipeline.limb.sites import place_site
 from ..pipeline.limb.surfaces import read_given_anatomy
+from ..results.limb import PlacedSite, SitesResult
 from ..study import Site, Study
 from ..web.arrays import pack
 from ..web.shapes import Shell, build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape
@@ -57,8 +58,8 @@ def describe_scene(folder: StudyFolder) -> dict[str, Any]:
     """
     study = folder.load()
     anatomy = read_anatomy(folder, study)
-    rows = read_stored(folder.results / "sites" / "sites.json").get("sites", [])
-    placed = {row["site"]: row for row in rows}
+    stored = SitesResult.find(folder.results)
+    placed = {row.site: row for row in stored.sites} if stored else {}
     meshes = read_stored(folder.results / "mesh" / "mesh.json")
     return {
         "surfaces": {} if anatomy is None else _mark_each_surface(folder, study, anatomy),
@@ -98,7 +99,7 @@ def _mesh_file(folder: StudyFolder, site: str) -> Path | None:
 
 
 def _describe_site(
-    site: Site, study: Study, anatomy: Anatomy | None, placed: Mapping[str, Any] | None
+    site: Site, study: Study, anatomy: Anatomy | None, placed: PlacedSite | None
 ) -> dict[str, Any]:
     row: dict[str, Any] = {
         "name": site.name,
@@ -118,7 +119,7 @@ def _describe_site(
         if placed is None:
             row["problem"] = "not on the skin yet: run the stages until sites"
         else:
-            row |= {key: placed[key] for key in ("position_mm", "axis", "off_skin_mm", "marker")}
+            row |= placed.model_dump(include={"position_mm", "axis", "off_skin_mm", "marker"}, mode="json")
     except SiteError as error:
         row["problem"] = error.what
     return row

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from fastapi import APIRouter
@@ -13,6 +13,9 @@ from ..anatomy.surfaces.surfaces import load_anatomy
 from ..errors import InputError
 from ..pipeline.records.record_checks import record_flags
 from ..pipeline.records.traces import read_record
+from ..results.identification import PredictResult
+from ..results.limb import SitesResult
+from ..results.records import TraceFacts
 from ..study import Record, Study
 from ..traces.numerics import average_in_bins
 from .editing import set_record
@@ -22,7 +25,6 @@ from .study_routes import Folder, list_stages
 router = APIRouter(prefix="/api/traces")
 MOST_POINTS, CURVE_POINTS = 2000, 400  # of a raw record and of a regularised one on the page
 _MOST_KEPT = 64
-_kept: dict[str, dict[str, Any]] = {}
 
 
 class Times(BaseModel):
@@ -42,7 +44,7 @@ def get_records(folder: Folder) -> dict[str, Any]:
     """
     study = folder.load()
     rows: list[dict[str, Any]] = []
-    records: dict[str, dict[str, Any]] = {}
+    records: dict[str, _Read] = {}
     for one in study.indentations:
         row: dict[str, Any] = {"site": one.name, "region": one.region, "fitted": one.fitted, "error": None}
         if isinstance(one, Record) and study.path(one.trace).is_file():
@@ -50,7 +52,7 @@ def get_records(folder: Folder) -> dict[str, Any]:
                 records[one.name] = _read(study, one)
             except InputError as error:
                 row["error"] = str(error)
-        found = records.get(one.name, {})
+        found = records[one.name].told if one.name in records else {}
         row |= {
             "has_trace": one.trace is not None,
             "facts": found.get("facts"),
@@ -64,14 +66,14 @@ def get_records(folder: Folder) -> dict[str, Any]:
 def get_record(folder: Folder, name: str) -> dict[str, Any]:
     """One record raw and regularised; times in s of the record, displacement in mm, force in N."""
     study = folder.load()
-    return _read(study, _find_record(study, name))
+    return _read(study, _find_record(study, name)).told
 
 
 @router.post("/{name}/preview")
 def preview_record(folder: Folder, name: str, times: Times) -> dict[str, Any]:
     """The record as it would be with other times; nothing is stored."""
     study = folder.load()
-    return _read(study, _replace_times(_find_record(study, name), times))
+    return _read(study, _replace_times(_find_record(study, name), times)).told
 
 
 @router.post("/{name}")
@@ -79,7 +81,7 @@ def post_times(folder: Folder, name: str, times: Times) -> dict[str, Any]:
     """Store the times in the study file, or remove them; the stage ``traces`` turns stale."""
     study = folder.load()
     record = _replace_times(_find_record(study, name), times)
-    found = _read(study, record)
+    found = _read(study, record).told
     set_record(folder.file, record, {"touch_down_s": record.touch_down_s, "peak_s": record.peak_s})
     return found
 
@@ -96,28 +98,50 @@ def _replace_times(record: Record, times: Times) -> Record:
     return replace(record, touch_down_s=rounded["touch_down_s"], peak_s=rounded["peak_s"])
 
 
-def _read(study: Study, record: Record) -> dict[str, Any]:
+class _Read(NamedTuple):
+    """A record that was read, and what the page is told of it."""
+
+    facts: TraceFacts
+    step_s: float
+    told: dict[str, Any]
+
+
+_kept: dict[str, _Read] = {}
+
+
+def _read(study: Study, record: Record) -> _Read:
     """A record with its curves, for as long as neither its file nor what is stated of it changes."""
     file = study.path(record.trace)
-    key = repr((str(file), compute_fingerprint([file]), study.traces, record.touch_down_s, record.peak_s))
+    key = repr(
+        (
+            record.name,
+            str(file),
+            compute_fingerprint([file]),
+            study.traces,
+            record.touch_down_s,
+            record.peak_s,
+        )
+    )
     if key not in _kept:
         if len(_kept) >= _MOST_KEPT:
             _kept.clear()
         _kept[key] = _record(study, record)
-    return {"site": record.name, **_kept[key]}
+    return _kept[key]
 
 
-def _record(study: Study, record: Record) -> dict[str, Any]:
+def _record(study: Study, record: Record) -> _Read:
     trace, smooth, facts = read_record(study, record)
     even = smooth.resample(CURVE_POINTS)
     time, force, _ = average_in_bins(trace.time_s, trace.force_N, MOST_POINTS)
     _, moved, _ = average_in_bins(trace.time_s, trace.displacement_mm, MOST_POINTS)
-    start = facts["touch_down_s"]
-    return {
-        "facts": {key: value for key, value in facts.items() if not key.startswith("knots")},
+    start = facts.touch_down_s
+    step_s = float(np.median(np.diff(trace.time_s)))
+    told = {
+        "site": record.name,
+        "facts": {key: value for key, value in facts.to_plain().items() if not key.startswith("knots")},
         "stated": {"touch_down_s": record.touch_down_s, "peak_s": record.peak_s},
         "samples": len(trace.time_s),
-        "step_s": float(np.median(np.diff(trace.time_s))),
+        "step_s": step_s,
         "raw": {
             "time_s": _shorten(time),
             "displacement_mm": _shorten(moved),
@@ -129,28 +153,26 @@ def _record(study: Study, record: Record) -> dict[str, Any]:
             "force_N": _shorten(even.force_N),
         },
     }
+    return _Read(facts, step_s, told)
 
 
 def _shorten(values: np.ndarray) -> list[float]:
     return np.round(values, 5).tolist()
 
 
-def _collect_flags(
-    folder: StudyFolder, study: Study, records: dict[str, dict[str, Any]]
-) -> list[dict[str, Any]]:
+def _collect_flags(folder: StudyFolder, study: Study, records: dict[str, _Read]) -> list[dict[str, Any]]:
     """Flags on the records as they are now, and those of the last prediction against the model."""
-    placed, anatomy = {}, None
-    if (folder.results / "sites" / "sites.json").is_file():
-        rows = folder.store.read("sites", "sites.json")["sites"]
-        placed = {row["site"]: row for row in rows}
+    sites, anatomy = SitesResult.find(folder.results), None
+    placed = {} if sites is None else {row.site: row for row in sites.sites}
+    if sites is not None:
         anatomy = load_anatomy(folder.results / "surfaces")
-    facts = {name: one["facts"] for name, one in records.items()}
-    steps = {name: one["step_s"] for name, one in records.items()}
+    facts = {name: one.facts for name, one in records.items()}
+    steps = {name: one.step_s for name, one in records.items()}
     flags = [flag.to_dict() for flag in record_flags(study, facts, steps, placed, anatomy)]
-    if (folder.results / "predict" / "predict.json").is_file():
+    if (predicted := PredictResult.find(folder.results)) is not None:
         states = {row["stage"]: row["state"] for row in list_stages(folder)}
         old = "" if states.get("predict") == "done" else " (of the last prediction, which is stale)"
-        for flag in folder.store.read("predict", "predict.json").get("flags", []):
-            if flag["found"] == "against the model":
-                flags.append({**flag, "text": flag["text"] + old})
+        for flag in predicted.flags:
+            if flag.found == "against the model":
+                flags.append(flag.to_plain() | {"text": flag.text + old})
     return flags

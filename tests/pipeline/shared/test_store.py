@@ -20,8 +20,8 @@ def test_stage_is_done_only_for_its_key(tmp_path):
     store.make("mesh", "a", lambda folder: write_json(folder / "x.json", 1) or {"facts": 7})
     assert store.state("mesh", "a").state == "done"
     assert store.state("mesh", "b").state == "stale"
-    assert store.stamp("mesh")["facts"] == 7
-    assert store.read("mesh", "x.json") == 1
+    assert store.stamp("mesh").facts == 7
+    assert read_json(store["mesh"] / "x.json") == 1
 
 
 def test_interrupted_stage_goes_on_in_its_folder(tmp_path):

@@ -89,7 +89,7 @@ class Disturbed(SerialExecutor):
 def calibrated(study: Study, store: Store, executor=None) -> dict:
     store["calibrate"].mkdir(exist_ok=True)
     run_calibrate(Context(study, store, executor or SerialExecutor(), quiet), store["calibrate"])
-    return store.read("calibrate", "calibration.json")
+    return store.results.calibration.to_plain()
 
 
 def vector(found: dict) -> np.ndarray:
@@ -132,7 +132,7 @@ def test_held_out_sites_are_predicted_on_the_fine_mesh(blocks):
     study, store, _ = blocks
     store["predict"].mkdir(exist_ok=True)
     run_predict(Context(study, store, SerialExecutor(), quiet), store["predict"])
-    predicted = store.read("predict", "predict.json")
+    predicted = store.results.predict.to_plain()
     assert predicted["mean_error_fitted_percent"] < 1.0
     assert predicted["mean_error_heldout_percent"] < 1.5
     assert all(row["error_one_material_percent"] > row["error_percent"] for row in predicted["sites"])

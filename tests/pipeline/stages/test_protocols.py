@@ -107,7 +107,7 @@ def test_a_protocol_goes_from_its_record_to_residuals_and_report(tmp_path, name)
     context = Context(study, store, SerialExecutor(), lambda event: None)
 
     run_traces(context, store["traces"])
-    facts = store.read("traces", "traces.json")["sites"][name]
+    facts = store.results.traces.to_plain()["sites"][name]
     assert facts["phases_in_words"] == words
     assert facts["phases"][0]["kind"] == "approach"
     assert facts["peak_s"] == pytest.approx(0.3 + knots_s[1], abs=0.02)

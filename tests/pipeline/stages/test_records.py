@@ -23,6 +23,7 @@ from limbfit.pipeline.limb.mesh import mesh_job, mesh_settings
 from limbfit.pipeline.records.traces import read_record
 from limbfit.report.sections.prediction import make_site_table
 from limbfit.report.store import load_store
+from limbfit.results.identification import RecordResiduals
 from limbfit.study import Record, Study, load_study
 
 STUDY = """
@@ -269,7 +270,7 @@ def test_a_wrong_touch_down_shifts_all_depths() -> None:
 def test_an_interval_takes_the_noise_of_what_is_compared() -> None:
     rows = {"1": ("N", 0.1), "2": ("N", 0.3), "2-creep": ("mm", 0.02)}
     sites = {
-        name: {"unit": unit, "compared_noise_sd_N": sd, "misfit_share": 0.0}
+        name: RecordResiduals.model_construct(unit=unit, compared_noise_sd_N=sd, misfit_share=0.0)
         for name, (unit, sd) in rows.items()
     }
     known = PredictionModel(np.zeros((1, 1)), np.ones(1), sites, 0.01, 50.0)
@@ -281,7 +282,7 @@ def test_an_interval_takes_the_noise_of_what_is_compared() -> None:
 
 def test_an_interval_covers_the_most_probable_parameters_too() -> None:
     """Force in proportion to the parameter, whose answer is 10 % above the most probable value."""
-    sites = {"1": {"unit": "N", "compared_noise_sd_N": 0.01, "misfit_share": 0.0}}
+    sites = {"1": RecordResiduals.model_construct(unit="N", compared_noise_sd_N=0.01, misfit_share=0.0)}
     force = np.linspace(0.0, 5.0, 6)
     known = PredictionModel(np.array([[1e-4]]), np.array([2.0]), sites, 0.0, 1e6)
     at_it, above = (

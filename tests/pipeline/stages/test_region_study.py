@@ -194,7 +194,7 @@ def test_its_stiffness_is_identified_beside_the_muscle_s(tmp_path) -> None:
         made.write(tmp_path / f"{name}.csv")
     study = load_study(tmp_path)
     run_study(study, until="calibrate")
-    found = Store(study.results).read("calibrate", "calibration.json")
+    found = Store(study.results).results.calibration.to_plain()
     last = found["stages"][-1]["parameters"]
     low, high = found["uncertainty"]["intervals_95"]["scar"]["c_kPa"]
     assert low < 25.0 < high < 2.0 * low

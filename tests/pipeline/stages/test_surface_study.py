@@ -104,7 +104,7 @@ def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -
     for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
         context.store[stage].mkdir()
         run(context, context.store[stage])
-    found = context.store.read("calibrate", "calibration.json")
+    found = context.store.results.calibration.to_plain()
     assert list(found["contact"]) == ["a"]
     assert found["uncertainty"]["residuals"]["sites"]["a+surface"]["unit"] == "mm"
     intervals = found["uncertainty"]["intervals_95"]
@@ -112,7 +112,7 @@ def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -
         for name, value in values.items():
             low, high = intervals[tissue][name]
             assert low <= value <= high, (tissue, name)
-    (row,) = context.store.read("predict", "predict.json")["sites"]
+    (row,) = context.store.results.predict.to_plain()["sites"]
     (surface,) = row["observed"]
     assert (surface["kind"], surface["left_out"]) == ("surface", {})
     assert surface["compared"].startswith("24 points, ")

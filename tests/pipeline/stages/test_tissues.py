@@ -224,7 +224,7 @@ def test_three_tissues_are_identified_from_blocks_and_reported(tmp_path):
     for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
         store[stage].mkdir()
         run(context, store[stage])
-    found = store.read("calibrate", "calibration.json")
+    found = store.results.calibration.to_plain()
     assert [stage["name"] for stage in found["stages"]] == ["one material", "three materials"]
     one, three = (stage["parameters"] for stage in found["stages"])
     assert one["skin"] == one["fat"] == one["muscle"]
@@ -237,7 +237,7 @@ def test_three_tissues_are_identified_from_blocks_and_reported(tmp_path):
         assert three[tissue]["c_kPa"] == pytest.approx(TRUTH[tissue]["c_kPa"], rel=0.1)
     inside = [low <= TRUTH[t][name] <= high for t in TISSUES for name, (low, high) in limits[t].items()]
     assert sum(inside) >= 11, limits
-    predicted = store.read("predict", "predict.json")
+    predicted = store.results.predict.to_plain()
     assert predicted["mean_error_fitted_percent"] < 0.2
     assert predicted["mean_error_heldout_percent"] < 0.5
     assert predicted["sites"][-1]["error_one_material_percent"] > 1.0

@@ -187,12 +187,12 @@ def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatc
     for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
         context.store[stage].mkdir()
         run(context, context.store[stage])
-    found = context.store.read("calibrate", "calibration.json")
+    found = context.store.results.calibration.to_plain()
     assert list(found["contact"]) == ["a"]
     assert found["uncertainty"]["residuals"]["sites"]["a+muscle"]["unit"] == "mm"
     last = found["stages"][-1]["iterations"][-1]
     assert list(last["error_percent_by_site"]) == ["a", "a+skin", "a+muscle"]
-    (row,) = context.store.read("predict", "predict.json")["sites"]
+    (row,) = context.store.results.predict.to_plain()["sites"]
     assert {one["what"]: one["thickness_mm"] for one in row["observed"]} == pytest.approx(
         {"skin": 3.0, "muscle": 9.0}, abs=0.1
     )

@@ -13,7 +13,7 @@ from limbfit.cli.commands import show_warnings
 from limbfit.execution import SerialExecutor
 from limbfit.fe import SimulationWarning
 from limbfit.indentation import Simulation
-from limbfit.pipeline.identification.simulation_warnings import SearchWarning, warnings_to_dict
+from limbfit.pipeline.identification.simulation_warnings import SearchWarning, summarise_doubts
 from limbfit.pipeline.simulation import simulations
 from limbfit.report import build_report
 
@@ -51,7 +51,7 @@ def test_the_report_shows_them_and_counts_those_of_the_search(tmp_path):
     found = SimpleNamespace(names=("c",), history=[SimpleNamespace(parameters=(1.0,))])
     searched = [SearchWarning(1, "tibia", (1.0,), FOLD), SearchWarning(2, "tibia", (2.0,), slip)]
     answer = Simulation("tibia", np.arange(3.0), None, True, "", 0.02, {}, (FOLD,))
-    content["doubts"] = warnings_to_dict(searched, {"tibia": answer}, 8, found)
+    content["doubts"] = summarise_doubts(searched, {"tibia": answer}, 8, found).to_plain()
     content["contact"] = {"tibia": {"from_rest_percent": 0.3}}
     file.write_text(json.dumps(content))
     text = build_report(results, tmp_path / "report.html").read_text()

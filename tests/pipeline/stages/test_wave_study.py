@@ -80,14 +80,14 @@ def test_speeds_are_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
     for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
         context.store[stage].mkdir()
         run(context, context.store[stage])
-    found = context.store.read("calibrate", "calibration.json")
+    found = context.store.results.calibration.to_plain()
     assert found["uncertainty"]["residuals"]["sites"]["a+muscle-waves"]["unit"] == "m/s"
     intervals = found["uncertainty"]["intervals_95"]
     for tissue, values in TRUTH.items():
         for name, value in values.items():
             low, high = intervals[tissue][name]
             assert low <= value <= high, (tissue, name)
-    (row,) = context.store.read("predict", "predict.json")["sites"]
+    (row,) = context.store.results.predict.to_plain()["sites"]
     skin, muscle = row["observed"]
     assert (skin["kind"], skin["unit"], skin["what"]) == ("shear waves", "m/s", "skin-waves")
     assert muscle["error_percent"] < 10.0

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import binary_fill_holes
 from scipy.ndimage import label as connected
 
 from ...arrays import Array, Mask
+from ...results.limb import LabelMeasures, QualityResult, SuspectSlice
 from ..frame import find_longest_axis
 from ..grid import SOFT_TISSUE, LabelMap
 from ..morphology import find_box
@@ -35,15 +35,13 @@ class LabelQuality:
     """Measures of each label, and slices to look at; ``axis`` 0, 1, 2 (i, j, k) is the limb's."""
 
     axis: int
-    labels: dict[str, dict[str, Any]]
+    labels: dict[str, LabelMeasures]
     suspects: tuple[SliceWarning, ...]
 
-    def as_json(self) -> dict[str, Any]:
-        return {
-            "axis": "ijk"[self.axis],
-            "labels": self.labels,
-            "suspects": [asdict(suspect) for suspect in self.suspects],
-        }
+    def summarise(self) -> QualityResult:
+        """Return what is stored."""
+        suspects = [SuspectSlice.model_validate(suspect) for suspect in self.suspects]
+        return QualityResult(axis="ijk"[self.axis], labels=self.labels, suspects=suspects)
 
 
 def assess_labels(labels: LabelMap) -> LabelQuality:
@@ -62,7 +60,7 @@ def assess_labels(labels: LabelMap) -> LabelQuality:
     return LabelQuality(axis, facts, tuple(sorted(suspects, key=lambda s: (s.slice, s.label))))
 
 
-def _measure_label(mask: Mask, labels: LabelMap) -> dict[str, Any]:
+def _measure_label(mask: Mask, labels: LabelMap) -> LabelMeasures:
     """Volume, pieces that share faces, closed holes, and the slices from first to last."""
     box = find_box(mask)
     mask = mask[box]
@@ -70,15 +68,15 @@ def _measure_label(mask: Mask, labels: LabelMap) -> dict[str, Any]:
     sizes = np.bincount(parts[mask])[1:]
     holes = binary_fill_holes(mask) & ~mask
     filled = box[0].start + np.flatnonzero(mask.any(axis=(1, 2)))
-    return {
-        "volume_cm3": round(float(mask.sum()) * labels.voxel_mm3 / 1000, 3),
-        "pieces": int(count),
-        "largest_piece": round(float(sizes.max() / sizes.sum()), 5),
-        "holes": int(connected(holes)[1]),
-        "holes_cm3": round(float(holes.sum()) * labels.voxel_mm3 / 1000, 4),
-        "slices": [int(filled[0]), int(filled[-1])],
-        "slices_without": int(filled[-1] - filled[0] + 1 - len(filled)),
-    }
+    return LabelMeasures(
+        volume_cm3=round(float(mask.sum()) * labels.voxel_mm3 / 1000, 3),
+        pieces=int(count),
+        largest_piece=round(float(sizes.max() / sizes.sum()), 5),
+        holes=int(connected(holes)[1]),
+        holes_cm3=round(float(holes.sum()) * labels.voxel_mm3 / 1000, 4),
+        slices=(int(filled[0]), int(filled[-1])),
+        slices_without=int(filled[-1] - filled[0] + 1 - len(filled)),
+    )
 
 
 def _find_odd_slices(name: str, mask: Mask, spacing: Array) -> list[SliceWarning]:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, Indices, Mask
 from ...errors import LabelError, SurfaceError
+from ...results.limb import SurfaceMeasures, SurfacesResult
 from ..frame import ProximalEnd, find_proximal_end, select_layer
 from ..grid import LabelMap
 from .extraction import extract_fine_surface, extract_surface, remesh
@@ -314,42 +315,33 @@ def save_anatomy(folder: str | Path, anatomy: Anatomy, notes: Sequence[str] = ()
     regions = {f"region-{name}": region for name, region in anatomy.regions.items()}
     for name, surface in {"skin": anatomy.skin, **bones, **regions}.items():
         write_surface(folder / f"{name}.stl", surface)
-    summary = {
-        "coordinates": "LPS",
-        "unit": "mm",
-        "cut_point": anatomy.cut_point.tolist(),
-        "cut_normal": anatomy.cut_normal.tolist(),
-        "skin": _measure_surface(anatomy.skin),
-        "bones": {name: _measure_surface(bone) for name, bone in anatomy.bones.items()},
-        "regions": {name: _measure_surface(region) for name, region in anatomy.regions.items()},
-        "notes": list(notes),
-    }
-    (folder / "surfaces.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    summary = SurfacesResult(
+        coordinates="LPS",
+        unit="mm",
+        cut_point=anatomy.cut_point.tolist(),
+        cut_normal=anatomy.cut_normal.tolist(),
+        skin=_measure_surface(anatomy.skin),
+        bones={name: _measure_surface(bone) for name, bone in anatomy.bones.items()},
+        regions={name: _measure_surface(region) for name, region in anatomy.regions.items()},
+        notes=notes,
+    )
+    (folder / "surfaces.json").write_text(json.dumps(summary.to_plain(), indent=2) + "\n", encoding="utf-8")
 
 
-def _measure_surface(surface: Surface) -> dict[str, float | int]:
-    return {
-        "faces": len(surface.faces),
-        "volume_mm3": round(surface.volume, 1),
-        "area_mm2": round(surface.area, 1),
-    }
+def _measure_surface(surface: Surface) -> SurfaceMeasures:
+    return SurfaceMeasures(
+        faces=len(surface.faces), volume_mm3=round(surface.volume, 1), area_mm2=round(surface.area, 1)
+    )
 
 
 def load_anatomy(folder: str | Path) -> Anatomy:
     """What :func:`save_anatomy` wrote."""
     folder = Path(folder)
-    try:
-        summary = json.loads((folder / "surfaces.json").read_text(encoding="utf-8"))
-        bones, regions = list(summary["bones"]), list(summary["regions"])
-        point, normal = summary["cut_point"], summary["cut_normal"]
-    except (OSError, ValueError, KeyError, TypeError):
-        raise SurfaceError(
-            "surfaces.json is missing or unreadable", file=folder, remedy="run the surfaces stage again"
-        ) from None
-    return Anatomy(
-        read_surface(folder / "skin.stl"),
-        {name: read_surface(folder / f"bone-{name}.stl") for name in bones},
-        point,
-        normal,
-        {name: read_surface(folder / f"region-{name}.stl") for name in regions},
-    )
+    file, remedy = folder / "surfaces.json", "run the surfaces stage again"
+    if not file.is_file():
+        raise SurfaceError("surfaces.json is missing", file=folder, remedy=remedy)
+    summary = SurfacesResult.read_file(file, remedy)
+    skin = read_surface(folder / "skin.stl")
+    bones = {name: read_surface(folder / f"bone-{name}.stl") for name in summary.bones}
+    regions = {name: read_surface(folder / f"region-{name}.stl") for name in summary.regions}
+    return Anatomy(skin, bones, np.array(summary.cut_point), np.array(summary.cut_normal), regions)

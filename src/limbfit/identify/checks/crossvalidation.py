@@ -15,12 +15,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
-from typing import Any
 
 import numpy as np
 
 from ...arrays import Array
 from ...errors import CalibrationError
+from ...results.uncertainty import FoldFit
 from ..fit.calibration import calibrate
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
 from ..fit.parameters import Unknowns, group_separately
@@ -67,18 +67,18 @@ class Fold:
     def mean_fitted(self) -> float:
         return float(np.mean([self.errors_percent[i] for i in self.fitted]))
 
-    def to_dict(self, sites: Sequence[str], names: Sequence[str]) -> dict[str, Any]:
-        """Return JSON-like values."""
-        return {
-            "label": self.label,
-            "fitted": [sites[i] for i in self.fitted],
-            "parameters": dict(zip(names, self.parameters.tolist(), strict=True)),
-            "errors_percent": dict(zip(sites, self.errors_percent, strict=True)),
-            "mean_error_fitted_percent": self.mean_fitted,
-            "mean_error_heldout_percent": self.mean_heldout if self.heldout else None,
-            "converged": self.converged,
-            "at_limit": list(self.at_limit),
-        }
+    def summarise(self, sites: Sequence[str], names: Sequence[str]) -> FoldFit:
+        """Return what is stored, by the names of sites and parameters."""
+        return FoldFit(
+            label=self.label,
+            fitted=[sites[i] for i in self.fitted],
+            parameters=dict(zip(names, self.parameters.tolist(), strict=True)),
+            errors_percent=dict(zip(sites, self.errors_percent, strict=True)),
+            mean_error_fitted_percent=self.mean_fitted,
+            mean_error_heldout_percent=self.mean_heldout if self.heldout else None,
+            converged=self.converged,
+            at_limit=self.at_limit,
+        )
 
 
 def list_choices(sites: int, size: int, most: int | None = None, seed: int = 0) -> list[Choice]:

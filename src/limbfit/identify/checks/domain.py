@@ -14,6 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from ...arrays import Array
+from ...results.identification import OutsideRecords, RecordedExtents
 
 SHEAR, COMPRESSION, RATE = "shear strain", "compressive strain", "shear strain rate"
 TIME, PRESSURE, DEPTH = "time", "pressure", "depth over thickness"
@@ -26,8 +27,6 @@ _PROBABILITIES = np.linspace(0.0, 1.0, 401)
 _FACTOR, _FACTORS, _ALLOWED = 1.1, {TIME: 1.5, ANGLE: 1.0}, {LEVEL: 20.0}
 _TWO_SIDED = (TIME, LEVEL)
 _MOST_TOLD = 3  # quantities in one sentence
-
-Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -56,16 +55,6 @@ class Extent:
         quantiles = values[order][np.minimum(places, len(values) - 1)]
         low, high = (float(np.interp(p, _PROBABILITIES, quantiles)) for p in (RARE, 1.0 - RARE))
         return cls(quantity, unit, low if quantity in _TWO_SIDED else 0.0, high, tissue, quantiles)
-
-    @classmethod
-    def from_dict(cls, stored: Row) -> Self:
-        """Build it from what `to_dict` stored; the distribution is not stored."""
-        return cls(**stored)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return quantity, unit, range and tissue as they are stored."""
-        keys = ("quantity", "unit", "low", "high", "tissue")
-        return {key: getattr(self, key) for key in keys}
 
     def is_within(self, tested: Extent) -> bool:
         """True if it goes no farther beyond the ``tested`` extent than is allowed."""
@@ -113,27 +102,19 @@ class RecordedRange:
         return cls((*merged.values(), *around), angles)
 
     @classmethod
-    def from_dict(cls, stored: Row) -> Self:
-        """Build it from what `to_dict` stored."""
-        return cls(tuple(map(Extent.from_dict, stored["extents"])), tuple(stored["angles_deg"]))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as it is stored."""
-        return {
-            "extents": [one.to_dict() for one in self.extents],
-            "angles_deg": list(self.angles_deg),
-        }
+    def from_stored(cls, stored: RecordedExtents) -> Self:
+        """Build it from what ``predict.json`` holds; distributions are not stored."""
+        return cls(tuple(Extent(**one.to_plain()) for one in stored.extents), tuple(stored.angles_deg))
 
     def measure_angle(self, angles_deg: Array) -> Array:
         """Return the angle (n,) in degrees from each direction (n,) to that of the nearest fitted site."""
         apart = np.abs(np.asarray(angles_deg)[:, None] - np.array(self.angles_deg)) % 360.0
         return np.asarray(np.minimum(apart, 360.0 - apart).min(axis=1))
 
-    def find_outside(self, prediction: Iterable[Extent]) -> list[dict[str, Any]]:
+    def find_outside(self, prediction: Iterable[Extent]) -> list[OutsideRecords]:
         """Return a row for each quantity of a ``prediction`` that goes beyond the records; none: all within.
 
-        A row holds ``quantity``, ``tissue``, ``unit``, the ranges ``records`` and ``prediction``, and the
-        ``share`` of the prediction that is outside. A tissue that no record strained was strained by 0.
+        A tissue that no record strained was strained by 0.
         """
         rows = []
         for extent in prediction:
@@ -141,27 +122,29 @@ class RecordedRange:
             tested = alike.get(extent.tissue, Extent(extent.quantity, extent.unit, 0.0, 0.0, extent.tissue))
             if alike and not extent.is_within(tested):
                 rows.append(
-                    {
-                        **{key: getattr(extent, key) for key in ("quantity", "tissue", "unit")},
-                        "records": [tested.low, tested.high],
-                        "prediction": [extent.low, extent.high],
-                        "share": extent.compute_share_outside(tested),
-                    }
+                    OutsideRecords(
+                        quantity=extent.quantity,
+                        tissue=extent.tissue,
+                        unit=extent.unit,
+                        records=(tested.low, tested.high),
+                        prediction=(extent.low, extent.high),
+                        share=extent.compute_share_outside(tested),
+                    )
                 )
         return rows
 
 
-def describe_outside(outside: Mapping[str, Sequence[Row] | None]) -> list[str]:
+def describe_outside(outside: Mapping[str, Sequence[OutsideRecords] | None]) -> list[str]:
     """Return at most two sentences on predictions by name, each that of the one farthest outside.
 
     The first is about times, the second about all else.
     """
-    times = {name: [row for row in rows or () if row["quantity"] == TIME] for name, rows in outside.items()}
-    others = {name: [row for row in rows or () if row["quantity"] != TIME] for name, rows in outside.items()}
+    times = {name: [row for row in rows or () if row.quantity == TIME] for name, rows in outside.items()}
+    others = {name: [row for row in rows or () if row.quantity != TIME] for name, rows in outside.items()}
     return [*_describe_worst(times, _describe_times), *_describe_worst(others, _describe_others)]
 
 
-def _describe_worst(outside: Mapping[str, Sequence[Row]], describe: Any) -> list[str]:
+def _describe_worst(outside: Mapping[str, Sequence[OutsideRecords]], describe: Any) -> list[str]:
     known = {name: rows for name, rows in outside.items() if rows}
     if not known:
         return []
@@ -170,17 +153,17 @@ def _describe_worst(outside: Mapping[str, Sequence[Row]], describe: Any) -> list
     return [f"{worst} {describe(known[worst])}{more}"]
 
 
-def _compute_excess(row: Row) -> float:
+def _compute_excess(row: OutsideRecords) -> float:
     """How many times as far as the records the prediction goes."""
-    (low, high), (least, most) = row["records"], row["prediction"]
-    if row["quantity"] == LEVEL:
+    (low, high), (least, most) = row.records, row.prediction
+    if row.quantity == LEVEL:
         return 1.0 + max(low - least, most - high) / max(high - low, 20.0)
     above = most / max(high, 1e-6)
-    return float(max(above, low / max(least, 1e-6) if row["quantity"] in _TWO_SIDED else 0.0))
+    return float(max(above, low / max(least, 1e-6) if row.quantity in _TWO_SIDED else 0.0))
 
 
-def _describe_times(rows: Sequence[Row]) -> str:
-    (low, high), (ramp, end) = rows[0]["records"], rows[0]["prediction"]
+def _describe_times(rows: Sequence[OutsideRecords]) -> str:
+    (low, high), (ramp, end) = rows[0].records, rows[0].prediction
     factor, told = _FACTORS[TIME], []
     if ramp * factor < low:
         told.append(f"comes on in {_format(ramp)} s (the records' shortest ramp takes {_format(low)} s)")
@@ -189,23 +172,23 @@ def _describe_times(rows: Sequence[Row]) -> str:
     return f"{' and '.join(told)}: no record tells how tissue relaxes at such times"
 
 
-def _describe_others(rows: Sequence[Row]) -> str:
+def _describe_others(rows: Sequence[OutsideRecords]) -> str:
     first = sorted(rows, key=_compute_excess, reverse=True)
     told = [_describe_row(row) for row in first[:_MOST_TOLD]]
     more = f", and {len(first) - _MOST_TOLD} more" if len(first) > _MOST_TOLD else ""
     return f"goes beyond the records: {'; '.join(told)}{more}"
 
 
-def _describe_row(row: Row) -> str:
-    unit = f" {row['unit']}" if row["unit"] else ""
-    of = f" of {row['tissue']}" if row["tissue"] else ""
-    (low, high), (least, most) = row["records"], row["prediction"]
-    if row["quantity"] == LEVEL:
+def _describe_row(row: OutsideRecords) -> str:
+    unit = f" {row.unit}" if row.unit else ""
+    of = f" of {row.tissue}" if row.tissue else ""
+    (low, high), (least, most) = row.records, row.prediction
+    if row.quantity == LEVEL:
         end, tested = (most, high) if most - high > low - least else (least, low)
         return f"{LEVEL} {end:.0f}{unit} (the fitted sites end at {tested:.0f})"
-    part = f", over {100.0 * row['share']:.0f} % of the volume" if "strain" in row["quantity"] else ""
-    part = "" if row["quantity"] == RATE else part
-    return f"{row['quantity']}{of} {_format(most, 2)}{unit} (records: {_format(high, 2)}{part})"
+    part = f", over {100.0 * row.share:.0f} % of the volume" if "strain" in row.quantity else ""
+    part = "" if row.quantity == RATE else part
+    return f"{row.quantity}{of} {_format(most, 2)}{unit} (records: {_format(high, 2)}{part})"
 
 
 def _format(value: float, digits: int = 3) -> str:

@@ -10,8 +10,6 @@ parameters would explain is taken out first: it is the model that is judged, not
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +18,7 @@ from scipy.special import chdtrc
 
 from ...arrays import Array
 from ...phases import find_phases
+from ...results.identification import PhaseFit, RecordFit
 
 _MIN_TIMES_NOISE, _MIN_SHARE = 2.0, 0.003  # of the largest force: less is of no use to say
 _MIN_POINTS = 4
@@ -27,45 +26,6 @@ _LAGS = 10  # of the test for autocorrelation
 _CLEAR_P = 1e-3
 _FEW_INSIDE = 0.5  # of the points of a held-out record
 _WORDS = {"load": "loading", "hold": "hold", "unload": "unloading"}
-
-
-@dataclass(frozen=True)
-class PhaseError:
-    """Root mean square error of one kind of phase, in N (mm if depths are compared).
-
-    In percent it is over the record's largest value, ``times_noise`` over what noise, touch-down, mesh and
-    site explain; ``bias_percent`` is its mean.
-    """
-
-    phase: str
-    error_N: float
-    error_percent: float
-    bias_percent: float
-    times_noise: float
-
-    @property
-    def is_clear(self) -> bool:
-        """True if the model does not follow the record there."""
-        return self.times_noise >= _MIN_TIMES_NOISE and self.error_percent >= 100 * _MIN_SHARE
-
-
-@dataclass(frozen=True)
-class FitQuality:
-    """A record beside the model: ``times_noise`` of all of it, ``autocorrelation`` of neighbouring residuals,
-    ``ljung_box_p`` the probability of so much of it by chance, ``inside_95`` the share of points in the 95 %
-    band, and the ``verdict``, empty where the model follows."""
-
-    record: str
-    fitted: bool
-    times_noise: float
-    autocorrelation: float
-    ljung_box_p: float
-    inside_95: float | None
-    phases: tuple[PhaseError, ...]
-    verdict: str
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def refit_residuals(
@@ -93,7 +53,7 @@ def assess_fit(
     covariance: Array,
     inside: NDArray[np.bool_] | None = None,
     refitted_N: Array | None = None,
-) -> FitQuality:
+) -> RecordFit:
     """Assess ``residual_N`` (n,), simulated minus measured, with ``covariance`` (n, n) of what may be off.
 
     ``depth_mm`` (n,) tells the phases, ``peak_N`` is the largest measured force, ``inside`` (n,) whether each
@@ -108,11 +68,21 @@ def assess_fit(
     phases = _assess_phases(times_s, depth_mm, residual_N, refitted, peak_N, covariance)
     share = None if inside is None else float(np.mean(inside))
     times_noise, p = float(np.sqrt(np.mean(white**2))), _test_autocorrelation(white)
-    found = FitQuality(record, fitted, times_noise, alike, p, share, phases, "")
-    return replace(found, verdict=_describe_fitted(found) if fitted else _describe_held_out(found))
+    found = RecordFit(
+        record=record,
+        fitted=fitted,
+        times_noise=times_noise,
+        autocorrelation=alike,
+        ljung_box_p=p,
+        inside_95=share,
+        phases=phases,
+        verdict="",
+    )
+    verdict = _describe_fitted(found) if fitted else _describe_held_out(found)
+    return found.model_copy(update={"verdict": verdict})
 
 
-def summarise_fit(records: Sequence[FitQuality]) -> str:
+def summarise_fit(records: Sequence[RecordFit]) -> str:
     """Say in one line how the model fits the study's records."""
     fitted = [one for one in records if one.fitted]
     off = [one for one in fitted if one.verdict]
@@ -121,12 +91,12 @@ def summarise_fit(records: Sequence[FitQuality]) -> str:
     if not off:
         what = "the model follows every fitted record within what noise, touch-down, mesh and site explain"
         return what + _count_held_out(records)
-    worst = max(off, key=lambda one: max(p.times_noise for p in one.phases if p.is_clear))
+    worst = max(off, key=lambda one: max(p.times_noise for p in one.phases if _is_clear(p)))
     also = f"; and {len(off) - 1} more of {len(fitted)} fitted records" if len(off) > 1 else ""
     return worst.verdict + also + _count_held_out(records)
 
 
-def _count_held_out(records: Sequence[FitQuality]) -> str:
+def _count_held_out(records: Sequence[RecordFit]) -> str:
     held = [one for one in records if not one.fitted and one.inside_95 is not None]
     off = [one for one in held if one.verdict]
     return f"; {len(off)} of {len(held)} held-out records lie mostly outside their 95 % band" if off else ""
@@ -151,7 +121,7 @@ def _assess_phases(
     refitted_N: Array,
     peak_N: float,
     covariance: Array,
-) -> tuple[PhaseError, ...]:
+) -> tuple[PhaseFit, ...]:
     kinds = np.full(len(times_s), "", dtype=object)
     for phase in find_phases(times_s, depth_mm):
         kinds[(times_s > phase.start_s) & (times_s <= phase.end_s)] = _WORDS.get(phase.kind, phase.kind)
@@ -164,12 +134,25 @@ def _assess_phases(
         rms = float(np.sqrt(np.mean(error**2)))
         white = _whiten(refitted_N[at], covariance[np.ix_(at, at)])
         times = float(np.sqrt(np.mean(white**2)))
-        found.append(PhaseError(kind, rms, 100 * rms / peak_N, 100 * float(error.mean()) / peak_N, times))
+        found.append(
+            PhaseFit(
+                phase=kind,
+                error_N=rms,
+                error_percent=100 * rms / peak_N,
+                bias_percent=100 * float(error.mean()) / peak_N,
+                times_noise=times,
+            )
+        )
     return tuple(found)
 
 
-def _describe_fitted(found: FitQuality) -> str:
-    clear = [phase for phase in found.phases if phase.is_clear]
+def _is_clear(phase: PhaseFit) -> bool:
+    """True if the model does not follow the record there."""
+    return phase.times_noise >= _MIN_TIMES_NOISE and phase.error_percent >= 100 * _MIN_SHARE
+
+
+def _describe_fitted(found: RecordFit) -> str:
+    clear = [phase for phase in found.phases if _is_clear(phase)]
     if not clear or found.ljung_box_p > _CLEAR_P:
         return ""
     worst = max(clear, key=lambda phase: phase.error_percent)
@@ -179,8 +162,12 @@ def _describe_fitted(found: FitQuality) -> str:
     )
 
 
-def _describe_held_out(found: FitQuality) -> str:
-    if found.inside_95 is None or found.inside_95 >= _FEW_INSIDE or not any(p.is_clear for p in found.phases):
+def _describe_held_out(found: RecordFit) -> str:
+    if (
+        found.inside_95 is None
+        or found.inside_95 >= _FEW_INSIDE
+        or not any(_is_clear(p) for p in found.phases)
+    ):
         return ""
     worst = max(found.phases, key=lambda phase: phase.error_percent)
     return (

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.special import stdtrit
 
 from ...arrays import Array
+from ...results.identification import CalibrationUncertainty, RecordResiduals, RelaxationBeyond
 from .objective import SiteResponse, find_largest_magnitude
 
 
@@ -89,25 +89,16 @@ class RelaxationSpread:
             shift[i], sd[i] = slopes[i] @ by_log, np.sqrt(slopes[i] @ covariance @ slopes[i])
         return shift, sd
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-like values."""
-        return {
-            "longest_s": self.longest_s,
-            "own_weight": self.own_weight,
-            "durations_s": self.durations_s.tolist(),
-            "shift_log": self.shift_log.tolist(),
-            "covariance_log": self.covariance_log.tolist(),
-        }
-
     @classmethod
-    def from_dict(cls, stored: dict[str, Any]) -> RelaxationSpread:
-        arrays = [np.array(stored[key]) for key in ("durations_s", "shift_log", "covariance_log")]
-        return cls(float(stored["longest_s"]), float(stored["own_weight"]), *arrays)
+    def from_stored(cls, stored: RelaxationBeyond) -> RelaxationSpread:
+        """Build it from what ``calibration.json`` holds."""
+        arrays = (np.array(part) for part in (stored.durations_s, stored.shift_log, stored.covariance_log))
+        return cls(stored.longest_s, stored.own_weight, *arrays)
 
 
 @dataclass(frozen=True)
 class PredictionModel:
-    """What a prediction interval needs of a stored uncertainty (``Uncertainty``, ``ResidualModel.to_dict``).
+    """What a prediction interval needs of a stored uncertainty.
 
     ``sites`` holds noise and misfit of the fitted records, and ``known_scale`` the number of independent
     residuals from which the size of the misfit is known. ``site_factor`` is the deviation of whole sites over
@@ -117,25 +108,24 @@ class PredictionModel:
 
     covariance_log: Array
     most_probable: Array
-    sites: dict[str, dict[str, Any]]
+    sites: Mapping[str, RecordResiduals]
     misfit_elsewhere: float
     known_scale: float
     site_factor: float = 1.0
     relaxation: RelaxationSpread | None = None
 
     @classmethod
-    def from_stored(cls, uncertainty: dict[str, Any]) -> PredictionModel:
+    def from_stored(cls, uncertainty: CalibrationUncertainty) -> PredictionModel:
         """Build the model from the part ``uncertainty`` of ``calibration.json``."""
-        residuals, probable = uncertainty["residuals"], uncertainty["most_probable"]
-        relaxation = (uncertainty.get("relaxation") or {}).get("beyond")
+        residuals, relaxation = uncertainty.residuals, uncertainty.relaxation
         return cls(
-            np.array(uncertainty["covariance_log"]),
-            np.array([value for one in probable.values() for value in one.values()]),
-            residuals["sites"],
-            float(residuals["misfit_elsewhere"]),
-            float(residuals["known_scale"]),
-            float(residuals.get("site_factor") or 1.0),
-            None if relaxation is None else RelaxationSpread.from_dict(relaxation),
+            np.array(uncertainty.covariance_log),
+            np.array([value for one in uncertainty.most_probable.values() for value in one.values()]),
+            residuals.sites,
+            residuals.misfit_elsewhere,
+            residuals.known_scale,
+            residuals.site_factor or 1.0,
+            None if relaxation is None else RelaxationSpread.from_stored(relaxation.beyond),
         )
 
     def find_residual_sd(self, site: str, unit: str = "N") -> tuple[float, float]:
@@ -145,16 +135,15 @@ class PredictionModel:
         expected elsewhere.
         """
         if site in self.sites:
-            return self.sites[site]["compared_noise_sd_N"], self.sites[site]["misfit_share"]
-        alike = [found for found in self.sites.values() if found.get("unit", "N") == unit]
-        noise = [found["compared_noise_sd_N"] for found in alike]
+            return self.sites[site].compared_noise_sd_N, self.sites[site].misfit_share
+        noise = [found.compared_noise_sd_N for found in self.sites.values() if found.unit == unit]
         return float(np.median(noise)) if noise else 0.0, self.misfit_elsewhere
 
     def find_mesh_share(self, site: str) -> float:
         """Return the error of a record's mesh over its largest force: elsewhere the median of the fitted."""
-        shares = [one.get("mesh_share") or 0.0 for one in self.sites.values()]
-        own = self.sites.get(site, {"mesh_share": np.median(shares) if shares else 0.0})
-        return float(own.get("mesh_share") or 0.0)
+        if site in self.sites:
+            return self.sites[site].mesh_share or 0.0
+        return float(np.median([one.mesh_share or 0.0 for one in self.sites.values()] or [0.0]))
 
     def compute_interval_95(
         self,

@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve, cholesky, eigh, solve_triangular
 from scipy.optimize import minimize
 
 from ...arrays import Array
+from ...results.identification import RecordResiduals, ResidualsSummary
 from .noise import SiteNoise
 
 # Of a record; longer ones cannot be told from an offset
@@ -72,29 +72,29 @@ class ResidualModel:
         of_force = np.array([noise.unit == "N" for noise in self.noise])
         return float(np.sqrt(np.mean(self.misfit[of_force if of_force.any() else ~of_force] ** 2)))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-like values: forces in N (depths under force in mm), misfits over the largest force."""
-        return {
-            "sites": {
-                noise.name: {
-                    "unit": noise.unit,
-                    "noise_sd_N": noise.sd_N,
-                    "noise_autocorrelation": noise.autocorrelation,
-                    "touch_down_sd_mm": noise.touch_down_sd_mm,
-                    "compared_noise_sd_N": float(np.sqrt(np.trace(noise.covariance) / len(noise.times_s))),
-                    "misfit_sd_N": float(misfit * peak),
-                    "misfit_share": float(misfit),
-                    "mesh_share": self._share(self.mesh_N, i),
-                    "site_share": self._share([self.site_factor * one for one in self.site_N], i),
-                }
+    def summarise(self) -> ResidualsSummary:
+        """Return what is stored: forces in N (depths under force in mm), misfits over the largest force."""
+        return ResidualsSummary(
+            sites={
+                noise.name: RecordResiduals(
+                    unit=noise.unit,
+                    noise_sd_N=noise.sd_N,
+                    noise_autocorrelation=noise.autocorrelation,
+                    touch_down_sd_mm=noise.touch_down_sd_mm,
+                    compared_noise_sd_N=float(np.sqrt(np.trace(noise.covariance) / len(noise.times_s))),
+                    misfit_sd_N=float(misfit * peak),
+                    misfit_share=float(misfit),
+                    mesh_share=self._share(self.mesh_N, i),
+                    site_share=self._share([self.site_factor * one for one in self.site_N], i),
+                )
                 for i, (noise, misfit, peak) in enumerate(zip(self.noise, self.misfit, self.peaks_N))
             },
-            "site_factor": self.site_factor if self.site_N else None,
-            "misfit_elsewhere": self.misfit_elsewhere,
-            "correlation": self.correlation,
-            "known_scale": self.known_scale,
-            "effective_samples": self.effective_samples(),
-        }
+            site_factor=self.site_factor if self.site_N else None,
+            misfit_elsewhere=self.misfit_elsewhere,
+            correlation=self.correlation,
+            known_scale=self.known_scale,
+            effective_samples=self.effective_samples(),
+        )
 
     def _share(self, sd_N: Sequence[Array], i: int) -> float | None:
         """Root mean square over the largest force of record i; None if nothing is given."""

@@ -8,18 +8,18 @@ over the posterior is below what the records can tell, or when the allowed runs 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ...arrays import Array
+from ...results.uncertainty import EmulatorRound, ProfileCheck
 from ..fit.objective import MeasuredCurve, SiteResponse
 from ..fit.parameters import SearchSpace, Unknowns
 from .emulator import Emulator
 from .likelihood import Likelihood, Optimum
 from .posterior import Posterior, sample_posterior
-from .profile import Profile, ProfileEndCheck, check_profile_ends, compute_profile, select_profiles_to_check
+from .profile import Profile, check_profile_ends, compute_profile, select_profiles_to_check
 from .uncertainty import Uncertainty
 
 SimulateMany = Callable[[Sequence[Array]], Sequence[Sequence[SiteResponse]]]
@@ -46,21 +46,6 @@ class ExplorationSettings:
 
 
 @dataclass(frozen=True)
-class ExplorationRound:
-    """The emulator after a round: its runs, and its expected error (sites,) over the posterior in percent.
-
-    ``new_percent`` (sites,) is its error at the round's runs before it knew them; it is empty in the first
-    round. ``outside`` is the share of the posterior outside the box of the runs.
-    """
-
-    runs: int
-    error_percent: tuple[float, ...]
-    loo_percent: tuple[float, ...]
-    new_percent: tuple[float, ...]
-    outside: float
-
-
-@dataclass(frozen=True)
 class Exploration:
     """The result; ``good_enough`` says whether the emulator's error came below ``needed_percent``.
 
@@ -72,14 +57,11 @@ class Exploration:
     best: Optimum
     posterior: Posterior
     profiles: tuple[Profile, ...]
-    checks: tuple[ProfileEndCheck, ...]
-    rounds: tuple[ExplorationRound, ...]
+    checks: tuple[ProfileCheck, ...]
+    rounds: tuple[EmulatorRound, ...]
     needed_percent: tuple[float, ...]
     good_enough: bool
     runs: tuple[Sequence[SiteResponse], ...] = field(repr=False)
-
-    def rounds_to_dicts(self) -> list[dict[str, Any]]:
-        return [asdict(one) for one in self.rounds]
 
 
 def explore_posterior(
@@ -131,7 +113,7 @@ class _Explorer:
         self.points: list[Array] = []
         self.responses: list[Sequence[SiteResponse]] = []
         self.spent = 0
-        self.rounds: list[ExplorationRound] = []
+        self.rounds: list[EmulatorRound] = []
         self.new_percent: tuple[float, ...] = ()
         model = linearised.residual_model
         # Recorded noise, or where the model is wrong by more than that, a third of by how much.
@@ -201,7 +183,13 @@ class _Explorer:
         outside = 1 - float(np.mean([self.emulator.is_inside(p) for p in samples]))
         loo = np.median(self.emulator.loo_percent, axis=0)
         self.rounds.append(
-            ExplorationRound(len(self.points), _to_tuple(error), _to_tuple(loo), self.new_percent, outside)
+            EmulatorRound(
+                runs=len(self.points),
+                error_percent=_to_tuple(error),
+                loo_percent=_to_tuple(loo),
+                new_percent=self.new_percent,
+                outside=outside,
+            )
         )
         self.good_enough = bool(np.all(error <= self.needed) and outside < 0.05)
         self.report(f"{len(self.points)} runs: emulator within {error.max():.2f} % of the largest force")
@@ -244,7 +232,7 @@ class _Explorer:
             runs=tuple(self.responses),
         )
 
-    def _check_profiles(self, profiles: Sequence[Profile]) -> tuple[ProfileEndCheck, ...]:
+    def _check_profiles(self, profiles: Sequence[Profile]) -> tuple[ProfileCheck, ...]:
         """Simulate the ends of some profiles with the solver."""
         chosen = select_profiles_to_check(profiles, self.settings.checked)
         if not chosen:

@@ -8,56 +8,20 @@ Laplace's method (MacKay 2003, section 28). A parameter that the records do not 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.special import ndtr, softmax, stdtr
 
 from ...arrays import Array
+from ...results.uncertainty import EvidenceComparison, ModelEvidence
 from .likelihood import MISFIT_FACTOR_BOUNDS, Likelihood, Optimum
 
 # Differences of minus twice the log of the evidence (Kass and Raftery 1995)
 _CLEAR_DIFFERENCE, _STRONG_DIFFERENCE = 2.0, 10.0
 
 
-@dataclass(frozen=True)
-class AlternativeModel:
-    """A model's fit: ``parameters`` counts the free ones and the size of the misfit.
-
-    ``minus_2_log_evidence`` depends on the bounds: of twice the width in logarithms, a parameter that the
-    records tell costs 1.4 more.
-    """
-
-    name: str
-    parameters: int
-    minus_2_log: float
-    effective_samples: float
-    misfit_factor: float
-    minus_2_log_evidence: float
-
-
-@dataclass(frozen=True)
-class ModelComparison:
-    """Two models compared: ``verdict`` in words, ``better`` the name of the supported one, or empty.
-
-    ``heldout`` holds the mean error of each in percent, the mean difference (first minus second), its
-    standard error, and the probability of so large a difference by chance (paired t-test). It is empty
-    without held-out sites.
-    """
-
-    first: AlternativeModel
-    second: AlternativeModel
-    heldout: dict[str, float]
-    better: str
-    verdict: str
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
-
-def fit_alternative(name: str, likelihood: Likelihood, start: Array) -> tuple[AlternativeModel, Optimum]:
+def fit_alternative(name: str, likelihood: Likelihood, start: Array) -> tuple[ModelEvidence, Optimum]:
     """Fit a model in the likelihood's space from ``start`` (k,), the size of the misfit included."""
     at = likelihood.find_optimum(start)
     factor = 1.0
@@ -72,13 +36,14 @@ def fit_alternative(name: str, likelihood: Likelihood, start: Array) -> tuple[Al
     width = likelihood.space.upper - likelihood.space.lower
     spread = np.linalg.slogdet(2 * np.pi * likelihood.compute_covariance(at.z, factor))[1]
     return (
-        AlternativeModel(
-            name,
-            len(start) + int(likelihood.has_misfit),
-            at.minus_2_log,
-            likelihood.model.effective_samples(),
-            factor,
-            at.minus_2_log - float(spread) + 2 * float(np.log(width).sum()),
+        ModelEvidence(
+            name=name,
+            parameters=len(start) + int(likelihood.has_misfit),
+            minus_2_log=at.minus_2_log,
+            effective_samples=likelihood.model.effective_samples(),
+            misfit_factor=factor,
+            # It depends on the bounds: twice the width costs a parameter that the records tell 1.4 more.
+            minus_2_log_evidence=at.minus_2_log - float(spread) + 2 * float(np.log(width).sum()),
         ),
         at,
     )
@@ -112,12 +77,16 @@ def compute_mixture_interval(means: Array, sds: Array, weights: Array) -> tuple[
 
 
 def compare_models(
-    first: AlternativeModel,
-    second: AlternativeModel,
+    first: ModelEvidence,
+    second: ModelEvidence,
     errors_first: Sequence[float] = (),
     errors_second: Sequence[float] = (),
-) -> ModelComparison:
-    """Compare two models by the records; the errors in percent are those at the same held-out sites."""
+) -> EvidenceComparison:
+    """Compare two models by the records; the errors in percent are those at the same held-out sites.
+
+    ``heldout`` of what is returned has the mean error of each, the mean difference (first minus second), its
+    standard error, and the probability of so large a difference by chance (paired t-test).
+    """
     heldout = _compare_held_out(np.asarray(errors_first, float), np.asarray(errors_second, float))
     by_fit = first.minus_2_log_evidence - second.minus_2_log_evidence
     better_fitted = 0 if abs(by_fit) < _CLEAR_DIFFERENCE else (1 if by_fit > 0 else -1)
@@ -125,7 +94,7 @@ def compare_models(
     if heldout.get("p_value", 1.0) < 0.05:
         better_unseen = 1 if heldout["difference_percent"] > 0 else -1
     better, verdict = _describe_comparison(first, second, better_fitted, better_unseen, by_fit, heldout)
-    return ModelComparison(first, second, heldout, better, verdict)
+    return EvidenceComparison(first=first, second=second, heldout=heldout, better=better, verdict=verdict)
 
 
 def _compare_held_out(errors_first: Array, errors_second: Array) -> dict[str, float]:
@@ -146,8 +115,8 @@ def _compare_held_out(errors_first: Array, errors_second: Array) -> dict[str, fl
 
 
 def _describe_comparison(
-    first: AlternativeModel,
-    second: AlternativeModel,
+    first: ModelEvidence,
+    second: ModelEvidence,
     better_fitted: int,
     better_unseen: int,
     by_evidence: float,

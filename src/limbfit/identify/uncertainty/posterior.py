@@ -8,13 +8,14 @@ et al. 2013).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.special import logsumexp
 
 from ...arrays import Array
+from ...results.uncertainty import PosteriorSummary
 from ..fit.parameters import SearchSpace
 from .likelihood import MISFIT_FACTOR_BOUNDS, Likelihood
 
@@ -60,18 +61,18 @@ class Posterior:
         """Covariance (p, p) of the logarithms."""
         return np.atleast_2d(np.cov(np.log(self.samples).T))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-like values, without the samples."""
-        return {
-            "median": dict(zip(self.names, self.median.tolist())),
-            "intervals_95": dict(zip(self.names, self.intervals_95.tolist())),
-            "covariance_log": self.covariance.tolist(),
-            "misfit_factor": np.quantile(self.misfit_factor, [0.025, 0.5, 0.975]).tolist(),
-            "acceptance": self.acceptance,
-            "autocorrelation_steps": self.autocorrelation_steps,
-            "independent_draws": self.independent,
-            "long_enough": self.long_enough,
-        }
+    def summarise(self) -> PosteriorSummary:
+        """Return what is stored: all but the samples."""
+        return PosteriorSummary(
+            median=dict(zip(self.names, self.median.tolist())),
+            intervals_95=dict(zip(self.names, self.intervals_95.tolist())),
+            covariance_log=self.covariance.tolist(),
+            misfit_factor=np.quantile(self.misfit_factor, [0.025, 0.5, 0.975]).tolist(),
+            acceptance=self.acceptance,
+            autocorrelation_steps=self.autocorrelation_steps,
+            independent_draws=self.independent,
+            long_enough=self.long_enough,
+        )
 
 
 def sample_posterior(

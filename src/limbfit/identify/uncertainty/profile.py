@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from scipy.optimize import brentq
 from scipy.special import stdtrit
 
 from ...arrays import Array
+from ...results.uncertainty import ProfileCheck
 from ..fit.objective import SiteResponse
 from .likelihood import Likelihood, Optimum
 
@@ -46,19 +46,6 @@ class Profile:
     @property
     def verdict(self) -> str:
         return (_OPEN, _ONE_SIDED, _CLOSED)[sum(self.closed)]
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-like values."""
-        return {
-            "values": self.values.tolist(),
-            "rise": self.rise.tolist(),
-            "threshold": self.threshold,
-            "interval_95": list(self.interval_95),
-            "closed": list(self.closed),
-            "extrapolated": self.extrapolated.tolist(),
-            "ends_extrapolated": list(self.ends_extrapolated),
-            "verdict": self.verdict,
-        }
 
 
 def compute_profile(
@@ -141,26 +128,6 @@ def _find_crossing(
     return found.get(value) or _optimise_with_fixed(likelihood, inner, k, value)
 
 
-@dataclass(frozen=True)
-class ProfileEndCheck:
-    """The rise at the ends of a profile by the emulator and by the solver; None where the solver failed.
-
-    ``why`` says why the profile was chosen, ``extrapolated`` which end lies outside the emulator's runs.
-    """
-
-    name: str
-    why: str
-    emulated: tuple[float, float]
-    solved: tuple[float | None, float | None]
-    extrapolated: tuple[bool, bool]
-
-    @property
-    def largest_difference(self) -> float | None:
-        """The largest difference at the ends that were simulated; None if neither was."""
-        found = [abs(a - b) for a, b in zip(self.emulated, self.solved) if b is not None]
-        return max(found, default=None)
-
-
 def select_profiles_to_check(profiles: Sequence[Profile], narrowest: int) -> list[tuple[str, Profile]]:
     """Select the narrowest profiles, on which verdicts rest, and the widest, which extrapolates most."""
     order = sorted(profiles, key=lambda one: np.log(one.interval_95[1] / one.interval_95[0]))
@@ -175,7 +142,7 @@ def check_profile_ends(
     profile: Profile,
     responses: Sequence[Sequence[SiteResponse]],
     why: str = "",
-) -> ProfileEndCheck:
+) -> ProfileCheck:
     """Compare a profile's two ends with ``responses`` of the solver there and at the optimum."""
     reference = likelihood.minus_2_log_of(best_responses, best.parameters)
 
@@ -188,4 +155,10 @@ def check_profile_ends(
     z = [likelihood.space.reduce(np.log(p)) for p in profile.ends]
     emulated = [float(likelihood.compute_minus_2_log(at)[0]) - best.minus_2_log for at in z]
     ends = emulated[0], emulated[1]
-    return ProfileEndCheck(profile.name, why, ends, (low, high), profile.ends_extrapolated)
+    return ProfileCheck(
+        name=profile.name,
+        why=why,
+        emulated=ends,
+        solved=(low, high),
+        extrapolated=profile.ends_extrapolated,
+    )

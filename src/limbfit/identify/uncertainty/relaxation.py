@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import nnls
 from scipy.special import logsumexp
 
 from ...arrays import Array
+from ...results.identification import LongTermModulus, RelaxationBeyond, RelaxationPrior, RelaxationSummary
 from ..fit.objective import MeasuredCurve, SiteResponse
 from ..fit.parameters import SearchSpace, Unknowns
 from ..fit.prediction import RelaxationSpread
@@ -128,22 +128,25 @@ class RelaxationAssessment:
                 verdicts[modulus] = self._judge_modulus(known, number, verdicts[modulus])
         return tuple(verdicts)
 
-    def to_dict(self, known: Uncertainty) -> dict[str, Any]:
-        """Return JSON-like values, with moduli at `STATED_S` and `LONG_TERM_S` in kPa."""
+    def summarise(self, known: Uncertainty) -> RelaxationSummary:
+        """Return what is stored, with moduli at `STATED_S` and `LONG_TERM_S`."""
         moduli = []
         for number, tissue in enumerate(self.tissues):
             for time in (*STATED_S, LONG_TERM_S):
                 value, interval = self.state_modulus(known, number, time)
-                row = {"tissue": tissue.name, "time_s": time, "modulus_kPa": value}
-                moduli.append(row | {"interval_95": interval.tolist()})
-        return {
-            "prefers": self.preferred,
-            "evidence": self.evidence,
-            "words": self.describe(known),
-            "moduli": moduli,
-            "prior": {"slope": [0.0, MAX_SLOPE], "source": SOURCE},
-            "beyond": self.spread.to_dict(),
-        }
+                moduli.append(
+                    LongTermModulus(
+                        tissue=tissue.name, time_s=time, modulus_kPa=value, interval_95=interval.tolist()
+                    )
+                )
+        return RelaxationSummary(
+            prefers=self.preferred,
+            evidence=self.evidence,
+            words=self.describe(known),
+            moduli=moduli,
+            prior=RelaxationPrior(slope=(0.0, MAX_SLOPE), source=SOURCE),
+            beyond=RelaxationBeyond.model_validate(self.spread),
+        )
 
     def _judge_modulus(self, known: Uncertainty, number: int, verdict: str) -> str:
         """The verdict on a long-term modulus whose ``verdict`` would hold if the model's terms were true."""

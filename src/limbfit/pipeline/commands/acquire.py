@@ -33,9 +33,10 @@ from ...acquire import (
 )
 from ...acquire.virtual import Fault, Serving, Surrogate, VirtualFitSocket, VirtualLimb, fit_surrogate, serve
 from ...errors import InputError, TraceError
+from ...results.records import TracesResult
 from ...study import AcquireTable, Indentation, Record, Site, Study
 from ..engine.storage import read_curves, write_curves, write_json
-from ..engine.store import Store, translate_disk_errors
+from ..engine.store import translate_disk_errors
 
 FOLDER = "acquired"  # beside the study file: measured data, no result
 RECORD, VERDICT = "record.csv", "verdict.json"
@@ -237,11 +238,9 @@ def build_device_settings(
 
 
 def _find_recorded_depth(study: Study, one: Indentation) -> float | None:
-    file = Store(study.results)["traces"] / "traces.json"
-    if not file.is_file():
-        return None
-    facts = Store(study.results).read("traces", "traces.json")["sites"].get(one.name)
-    return None if facts is None else float(facts["depth_mm"])
+    traces = TracesResult.find(study.results)
+    facts = None if traces is None else traces.sites.get(one.name)
+    return None if facts is None else facts.depth_mm
 
 
 def _make_folder(study: Study, one: Indentation) -> Path:

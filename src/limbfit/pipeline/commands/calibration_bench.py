@@ -64,14 +64,13 @@ def _select_left_out(folder: str, names: list[str]) -> set[str]:
 
 def _collect_facts(study: Study) -> dict[str, Any]:
     store = Store(study.results)
-    predicted = store.read("predict", "predict.json")
-    seconds = {stage: (store.stamp(stage) or {})["seconds"] for stage in ("calibrate", "predict")}
+    predicted = store.results.predict
+    seconds = {stage: store.results.stages[stage].seconds for stage in ("calibrate", "predict")}
     runs = {stage: SimulationCache(store[stage] / "runs") for stage in seconds}
     names = {file.name for cache in runs.values() for file in cache.folder.glob("*.npz")}
     parameters, sites = len(study.parameters), len(study.fitted)
     febio = FEBIO_SECONDS[FEBIO_CASE] * FEBIO_ITERATIONS * sites * (parameters + 1)
     total = seconds["calibrate"] + seconds["predict"]
-    mesh = store.read("mesh", "mesh.json")
     return {
         "study": study.study.name,
         "seconds": total,
@@ -81,10 +80,10 @@ def _collect_facts(study: Study) -> dict[str, Any]:
         "forward_runs_calibrate": len(runs["calibrate"]),
         "forward_runs_calibrate_with_sensitivities": runs["calibrate"].with_sensitivities(),
         "sites_fitted": sites,
-        "sites_predicted": len(predicted["sites"]),
-        "nodes_per_site": max(site["nodes"] for site in mesh["sites"].values()),
-        "mean_error_fitted_percent": predicted["mean_error_fitted_percent"],
-        "mean_error_heldout_percent": predicted["mean_error_heldout_percent"],
+        "sites_predicted": len(predicted.sites),
+        "nodes_per_site": max(site.nodes for site in store.results.mesh.sites.values()),
+        "mean_error_fitted_percent": predicted.mean_error_fitted_percent,
+        "mean_error_heldout_percent": predicted.mean_error_heldout_percent,
         "febio_loop_seconds": febio,
         "ratio": febio / total,
         "ratio_calibrate": febio / seconds["calibrate"],

@@ -11,6 +11,8 @@ from ...anatomy.imaging import Volume
 from ...anatomy.surfaces.surfaces import Anatomy
 from ...identify.checks.domain import Extent, RecordedRange, describe_outside
 from ...indentation import read_indenter
+from ...results.identification import OutsideRecords
+from ...results.records import TraceFacts
 from ...study import ClampsTable, Record, Site, Study
 from ...traces import Regularised, SurfaceMotion, Trace
 from ..engine.context import Listener, Progress, ignore_progress
@@ -62,10 +64,10 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
     seen = {record.name: _read_secondary(study, record, read[record.name]) for record in study.recorded}
     for name, record in records.items():
         facts.append(
-            f"site {name}: peak force {record['peak_force_N']:.2f} N at {record['depth_mm']:.2f} mm, "
-            f"touch-down after {record['touch_down_mm']:.2f} +- {record['touch_down_uncertainty_mm']:.2f} "
-            f"mm; {record['phases_in_words']}"
-            + ("" if record["speed_unload_mm_s"] is not None else "; loading only, no unloading")
+            f"site {name}: peak force {record.peak_force_N:.2f} N at {record.depth_mm:.2f} mm, "
+            f"touch-down after {record.touch_down_mm:.2f} +- {record.touch_down_uncertainty_mm:.2f} "
+            f"mm; {record.phases_in_words}"
+            + ("" if record.speed_unload_mm_s is not None else "; loading only, no unloading")
         )
     number = len(study.records_at(*study.fitted))
     facts.append(
@@ -97,17 +99,17 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
     return {
         "study": study.study.name,
         "facts": facts,
-        "sites": records,
+        "sites": {name: record.to_plain() for name, record in records.items()},
         "flags": [flag.to_dict() for flag in flags],
         "refused": refused,
-        "outside_records": outside,
+        "outside_records": {name: [row.to_plain() for row in rows] for name, rows in outside.items()},
         "outside_text": describe_outside(outside),
     }
 
 
 def _describe_outside(
-    study: Study, records: Mapping[str, Mapping[str, Any]], limb: LimbGeometry | None
-) -> dict[str, list[dict[str, Any]]]:
+    study: Study, records: Mapping[str, TraceFacts], limb: LimbGeometry | None
+) -> dict[str, list[OutsideRecords]]:
     """What other records, planned indentations and the socket do that no fitted record does, by name.
 
     Only what is known before a simulation: times, pressure, depth, and places where the limb is known.
@@ -116,14 +118,20 @@ def _describe_outside(
 
     def describe(one: Record | Site, tested: RecordedRange | None = None) -> list[Extent]:
         site = one.site if isinstance(one, Record) else one
-        facts = records.get(one.name) or _plan(site)
+        facts = records.get(one.name)
+        if facts is None:  # an indentation that the site plans, in and out
+            assert site.depth_mm is not None
+            ramp = site.depth_mm / site.speed_mm_s
+            history = LoadHistory.from_knots((0.0, ramp, 2 * ramp), (0.0, site.depth_mm, 0.0))
+        else:
+            history = LoadHistory.from_knots(facts.knots_s, facts.knots_N or facts.knots_mm)
         return describe_indentation(
-            LoadHistory.from_knots(facts["knots_s"], facts["knots_N"] or facts["knots_mm"]),
-            facts["depth_mm"],
+            history,
+            facts.depth_mm if facts else float(site.depth_mm or 0.0),
             study.indenter_of(one),
             None if limb is None else limb.place(site),
             axis,
-            force_N=facts["peak_force_N"],
+            force_N=facts.peak_force_N if facts else None,
             tested=tested,
         )
 
@@ -143,20 +151,12 @@ def _describe_outside(
     return found
 
 
-def _plan(site: Site) -> dict[str, Any]:
-    """What is known of an indentation that a site plans, in and out."""
-    assert site.depth_mm is not None
-    ramp = site.depth_mm / site.speed_mm_s
-    knots = {"knots_s": (0.0, ramp, 2 * ramp), "knots_mm": (0.0, site.depth_mm, 0.0), "knots_N": None}
-    return {**knots, "depth_mm": site.depth_mm, "peak_force_N": None}
-
-
 def _read_secondary(
-    study: Study, record: Record, read: tuple[Trace, Regularised, dict[str, Any]]
+    study: Study, record: Record, read: tuple[Trace, Regularised, TraceFacts]
 ) -> SecondaryMeasurement:
     """What was seen beside a record."""
     trace, smooth, facts = read
-    return read_observed(study, record, trace, facts["touch_down_s"], smooth)
+    return read_observed(study, record, trace, facts.touch_down_s, smooth)
 
 
 def _describe_waves(name: str, seen: SecondaryMeasurement) -> Iterator[str]:

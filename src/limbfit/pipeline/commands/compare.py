@@ -27,9 +27,10 @@ from ...febio import (
     read_log,
 )
 from ...indentation import Parameters, build_first_steps
+from ...results.runs import CompareResult, CurveDifference, CurveFiles, FebioSimulation, LimbfitSimulation
 from ...study import Study
 from ..engine.context import Listener, ignore_progress
-from ..engine.storage import write_curves, write_json
+from ..engine.storage import write_curves, write_result
 from .simulate import Indentation, build_feb_settings, build_site_problem, prepare_site, run_febio_site
 
 FREE = 1.0  # penetration over the depth: FEBio's punch sinks in as far as its penalty lets it
@@ -75,9 +76,22 @@ def compare_site(
     runs = {"limbfit": solve_as_simulated(found, problem, 1)}
     runs["limbfit_matched"] = _solve_matched(found, problem, other)
     found.context.tell("compare", 3, 3, f"site {name}")
-    summary = _summarise(found, other, runs) | {"febio_log": None if febio_log is None else str(febio_log)}
-    _write(folder, name, found, other, runs, summary)
-    return summary
+    files = CurveFiles(csv=str(folder / f"{name}.csv"), png=str(folder / f"{name}.png"))
+    _write(files, name, other, runs)
+    content = CompareResult(
+        site=name,
+        parameters=found.parameters,
+        parameters_from=found.origin,
+        element=other.statistics["element"],
+        unknowns=runs["limbfit"].statistics["unknowns"],
+        febio=_summarise_febio(found, other),
+        limbfit=_summarise_run(runs["limbfit"], other),
+        limbfit_matched=_summarise_run(runs["limbfit_matched"], other),
+        febio_log=None if febio_log is None else str(febio_log),
+        files=files,
+    )
+    write_result(folder / f"{name}.json", content)
+    return content.to_plain()
 
 
 def solve_as_simulated(found: Indentation, problem: Problem, part: int) -> Result:
@@ -120,72 +134,55 @@ def _select_common_times(other: Result, mine: Result) -> Array:
     return other.times[other.times <= mine.times[-1] * (1.0 + 1e-9)]
 
 
-def difference(other: Result, mine: Result) -> dict[str, float | None]:
+def difference(other: Result, mine: Result) -> CurveDifference:
     """limbfit less FEBio at FEBio's own times, in percent of FEBio's largest force."""
     times = _select_common_times(other, mine)
     peak = float(other.force[: len(times)].max(initial=0.0))
     if peak <= 0.0:
-        return dict.fromkeys(("max_percent", "mean_percent", "peak_percent"))
+        return CurveDifference(max_percent=None, mean_percent=None, peak_percent=None)
     gap = mine.force_at(times) - other.force[: len(times)]
-    return {
-        "max_percent": 100.0 * float(np.abs(gap).max()) / peak,
-        "mean_percent": 100.0 * float(np.abs(gap).mean()) / peak,
-        "peak_percent": 100.0 * (float(mine.force_at(times).max()) - peak) / peak,
-    }
+    return CurveDifference(
+        max_percent=100.0 * float(np.abs(gap).max()) / peak,
+        mean_percent=100.0 * float(np.abs(gap).mean()) / peak,
+        peak_percent=100.0 * (float(mine.force_at(times).max()) - peak) / peak,
+    )
 
 
-def _summarise(found: Indentation, other: Result, runs: dict[str, Result]) -> dict[str, Any]:
-    return {
-        "site": found.name,
-        "parameters": found.parameters,
-        "parameters_from": found.origin,
-        "element": other.statistics["element"],
-        "unknowns": runs["limbfit"].statistics["unknowns"],
-        "febio": {
-            "version": other.statistics["linear_solver"],
-            "completed": other.completed,
-            "reason": other.reason,
-            "peak_force_N": other.peak_force,
-            "steps": other.statistics["steps"],
-            "seconds": other.statistics["seconds"]["total"] or None,
-            "penalty": found.context.study.febio.penalty,  # times the automatic one; None: explicit
-        },
-        **{
-            key: {
-                "completed": mine.completed,
-                "reason": mine.reason,
-                "peak_force_N": mine.peak_force,
-                "penetration_mm": float(mine.penetration.max(initial=0.0)),
-                "steps": mine.statistics["steps"],
-                "seconds": mine.statistics["seconds"]["total"],
-                "difference": difference(other, mine),
-            }
-            for key, mine in runs.items()
-        },
-    }
+def _summarise_febio(found: Indentation, other: Result) -> FebioSimulation:
+    return FebioSimulation(
+        completed=other.completed,
+        reason=other.reason,
+        peak_force_N=other.peak_force,
+        steps=other.statistics["steps"],
+        seconds=other.statistics["seconds"]["total"] or None,
+        version=other.statistics["linear_solver"],
+        penalty=found.context.study.febio.penalty,
+    )
 
 
-def _write(
-    folder: Path,
-    name: str,
-    found: Indentation,
-    other: Result,
-    runs: dict[str, Result],
-    summary: dict[str, Any],
-) -> None:
+def _summarise_run(mine: Result, other: Result) -> LimbfitSimulation:
+    return LimbfitSimulation(
+        completed=mine.completed,
+        reason=mine.reason,
+        peak_force_N=mine.peak_force,
+        steps=mine.statistics["steps"],
+        seconds=mine.statistics["seconds"]["total"],
+        penetration_mm=float(mine.penetration.max(initial=0.0)),
+        difference=difference(other, mine),
+    )
+
+
+def _write(files: CurveFiles, name: str, other: Result, runs: dict[str, Result]) -> None:
     times = _select_common_times(other, min(runs.values(), key=lambda run: run.times[-1]))
     curves = {key: run.force_at(times) for key, run in runs.items()}
     write_curves(
-        folder / f"{name}.csv",
+        Path(files.csv),
         time_s=times,
         displacement_mm=other.displacement[: len(times)],
         febio_N=other.force[: len(times)],
         **{f"{key}_N": force for key, force in curves.items()},
     )
-    _draw(folder / f"{name}.png", name, times, other.force[: len(times)], curves)
-    files = {kind: str(folder / f"{name}.{kind}") for kind in ("csv", "png")}
-    summary["files"] = files
-    write_json(folder / f"{name}.json", summary)
+    _draw(Path(files.png), name, times, other.force[: len(times)], curves)
 
 
 def _draw(file: Path, name: str, times: Array, febio: Array, curves: dict[str, Array]) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 from ...errors import InputError
 from ...extensions import Registry
 from ...report.sections.contents import SECTIONS, Maker
+from ...results.runs import StageParts
 from ...study import Study
 from ..design.design import check_design, run_design
 from ..design.protocol import check_protocol, run_protocol
@@ -216,8 +217,8 @@ def list_experiment_rows(study: Study, keys: Keys, stages: Mapping[str, str]) ->
     """State of every experiment, as of a stage, each judged with the options that it was run with."""
     store, rows = Store(study.results), []
     for experiment in EXPERIMENTS:
-        stamp = store.stamp(experiment.name) or {}
-        options = {**experiment.options, **stamp.get("options", {})}
+        stamp = store.stamp(experiment.name)
+        options = {**experiment.options, **(stamp.options if stamp else {})}
         key = compute_experiment_key(experiment, keys, stages, options)
         state = store.state(experiment.name, key)
         rows.append(
@@ -238,7 +239,7 @@ def do_experiment(
     experiment: Experiment,
     key: str,
     options: Mapping[str, Any],
-    parts: Mapping[str, Any] | None = None,
+    parts: StageParts | None = None,
 ) -> Any:
     """Run an experiment where its result is not there yet; what its ``<name>.json`` holds.
 
@@ -253,5 +254,5 @@ def do_experiment(
             return {**experiment.run(context, folder, **options), "options": dict(options), "parts": parts}
 
         stamp = store.make(name, key, produce)
-        context.tell(name, 1, 1, f"done in {stamp['seconds']:.1f} s")
+        context.tell(name, 1, 1, f"done in {stamp.seconds:.1f} s")
     return read_json(store[name] / f"{name}.json")

@@ -53,10 +53,11 @@ def fit_socket(
     used, origin = (parameters, "given") if parameters else choose_tissues(study, literature)
     known: dict[str, Any] = {}
     if origin == IDENTIFIED:
-        calibration = Store(study.results).read("calibrate", "calibration.json")
-        known = {key: calibration["uncertainty"][key] for key in ("covariance_log", "most_probable")}
-        known["relaxation"] = (calibration["uncertainty"].get("relaxation") or {}).get("beyond")
-        known["recorded_range"] = read_recorded_range(study)
+        uncertainty = Store(study.results).results.calibration.uncertainty.to_plain()
+        known = {key: uncertainty[key] for key in ("covariance_log", "most_probable")}
+        known["relaxation"] = (uncertainty["relaxation"] or {}).get("beyond")
+        recorded = read_recorded_range(study)
+        known["recorded_range"] = None if recorded is None else recorded.to_plain()
     elif samples:
         what = f"there is nothing to draw {samples} samples from: the parameters were not identified"
         raise InputError(what, place="--samples", remedy="identify them (limbfit run)")

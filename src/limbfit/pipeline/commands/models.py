@@ -18,14 +18,26 @@ from typing import Any
 import numpy as np
 import tomlkit
 
+from ...arrays import Array
 from ...errors import InputError
 from ...identify.uncertainty.model_comparison import compute_mixture_interval, weigh_models
 from ...identify.uncertainty.uncertainty import NORMAL_95
 from ...laws import FIBRED, FUNG, LAWS, OGDEN, POWER
+from ...results.identification import RecordPrediction
+from ...results.models import (
+    CalibratedModel,
+    MixedLoad,
+    MixedPrediction,
+    MixedPressure,
+    ModelsResult,
+    ModelWeight,
+    SocketOfModels,
+)
+from ...results.socket import LoadedRegion, SocketResult
 from ...study import Study, load_study
 from ..engine.context import Listener, Progress, ignore_progress
 from ..engine.hand_labels import find_hand_labels
-from ..engine.storage import read_curves, write_curves, write_json
+from ..engine.storage import read_curves, write_curves, write_result
 from ..engine.store import Store, lock
 from .fitting import fit_socket
 from .run import run_study
@@ -251,9 +263,9 @@ def compare_models(
         derived[name] = derive_study(study, name)  # with what the run has stored since
         run_study(derived[name], until="predict", listener=_name_model(listener, words))
     with lock(study.results):
-        content = _mix_predictions(study, derived) | {"left_out": left_out}
-        write_json(study.results / FOLDER / "models.json", content)
-    return content | {"folder": str(study.results / FOLDER)}
+        content = _mix_predictions(study, derived, left_out)
+        write_result(study.results / ModelsResult.FILE, content)
+    return content.to_plain() | {"folder": str(study.results / FOLDER)}
 
 
 def _name_model(listener: Listener, words: str) -> Listener:
@@ -263,69 +275,66 @@ def _name_model(listener: Listener, words: str) -> Listener:
     return tell
 
 
-def _mix_predictions(study: Study, derived: Mapping[str, Study]) -> dict[str, Any]:
-    """Weights of the models, and for each record the interval of each and of all."""
+def _mix_predictions(study: Study, derived: Mapping[str, Study], left_out: Mapping[str, str]) -> ModelsResult:
+    """Weights of the models, and for each record the interval of the study's own and of all."""
     stores = {OWN: Store(study.results), **{name: Store(one.results) for name, one in derived.items()}}
-    calibrations = {name: store.read("calibrate", "calibration.json") for name, store in stores.items()}
-    evidence = [one["uncertainty"]["minus_2_log_evidence"] for one in calibrations.values()]
+    calibrations = [store.results.calibration for store in stores.values()]
+    evidence = [one.uncertainty.minus_2_log_evidence for one in calibrations]
     weights = weigh_models(evidence)
-    predicted = {name: store.read("predict", "predict.json") for name, store in stores.items()}
-    rows = [
-        {
-            "model": name,
-            "words": MODELS[name].words if name in MODELS else "as the study states it",
-            "weight": float(weight),
-            "evidence": float(evidence[0] - value),
-            "error_fitted_percent": predicted[name]["mean_error_fitted_percent"],
-            "error_heldout_percent": predicted[name]["mean_error_heldout_percent"],
-            "parameters": calibrations[name]["stages"][-1]["parameters"],
-        }
-        for name, weight, value in zip(stores, weights, evidence, strict=True)
+    predicted = [store.results.predict for store in stores.values()]
+    models = [
+        CalibratedModel(
+            model=name,
+            words=MODELS[name].words if name in MODELS else "as the study states it",
+            weight=weight,
+            evidence=evidence[0] - value,
+            error_fitted_percent=found.mean_error_fitted_percent,
+            error_heldout_percent=found.mean_error_heldout_percent,
+            parameters=calibration.parameters,
+        )
+        for name, weight, value, found, calibration in zip(
+            stores, weights, evidence, predicted, calibrations, strict=True
+        )
     ]
-    records = []
-    for row in predicted[OWN]["sites"]:
-        found = _mix_record(stores, weights, row["record"], study.results / FOLDER)
-        if found is not None:
-            records.append({key: row[key] for key in ("site", "record", "fitted")} | found)
-    return {"models": rows, "records": records}
+    records = [_mix_record(stores, weights, row, study.results / FOLDER) for row in predicted[0].sites]
+    mixed = [record for record in records if record is not None]
+    return ModelsResult(models=models, records=mixed, left_out=left_out)
 
 
 def _mix_record(
-    stores: Mapping[str, Store], weights: np.ndarray, record: str, folder: Path
-) -> dict[str, Any] | None:
+    stores: Mapping[str, Store], weights: Array, row: RecordPrediction, folder: Path
+) -> MixedPrediction | None:
     """The largest value of a record and its intervals, N or mm; None if a model does not predict it."""
-    curves = [read_curves(store["predict"] / f"{record}.csv") for store in stores.values()]
-    ends = [_find_band(one) for one in curves]
-    if any(band is None for band in ends):
+    curves = [read_curves(store["predict"] / f"{row.record}.csv") for store in stores.values()]
+    bands = [band for one in curves if (band := _find_band(one)) is not None]
+    if len(bands) < len(curves):
         return None
-    low, high = (np.array([band[k] for band in ends if band is not None]) for k in (0, 1))
+    low, high = (np.array(ends) for ends in zip(*bands, strict=True))
     means, sds = (low + high) / 2, (high - low) / (2 * NORMAL_95)
     mixed = compute_mixture_interval(means, sds, weights)
-    mean = weights @ means
-    between = np.sqrt(weights @ (means - mean) ** 2)
-    name, unit = next((key.split("_measured_") for key in curves[0] if "_measured_" in key), ("force", "N"))
-    write_curves(
-        folder / f"{record}.csv",
-        **{"time_s": curves[0]["time_s"], f"{name}_measured_{unit}": curves[0][f"{name}_measured_{unit}"]},
-        **{f"{name}_{word}_{unit}": value for word, value in zip(("low", "high"), mixed, strict=True)},
-        **{
-            f"{name}_{model.replace(OWN, 'own')}_{unit}": value
-            for model, value in zip(stores, means, strict=True)
-        },
-    )
-    measured = curves[0][f"{name}_measured_{unit}"]
+    between = np.sqrt(weights @ (means - weights @ means) ** 2)
+    head = next(key for key in curves[0] if "_measured_" in key)
+    name, unit = head.split("_measured_")
+    measured = curves[0][head]
+    by_model = {f"{name}_{'own' if key == OWN else key}_{unit}": one for key, one in zip(stores, means)}
+    ends = dict(zip((f"{name}_low_{unit}", f"{name}_high_{unit}"), mixed, strict=True))
+    times = {"time_s": curves[0]["time_s"]}
+    write_curves(folder / f"{row.record}.csv", **times, **{head: measured}, **ends, **by_model)
     peak = int(np.argmax(np.abs(measured)))
-    return {
-        "unit": unit,
-        "peak": float(measured[peak]),
-        "own_interval_95": [float(low[0][peak]), float(high[0][peak])],
-        "interval_95": [float(mixed[0][peak]), float(mixed[1][peak])],
-        "sd_between_models": float(between[peak]),
-        "inside_percent": 100 * float(np.mean((measured >= mixed[0]) & (measured <= mixed[1]))),
-    }
+    return MixedPrediction(
+        site=row.site,
+        record=row.record,
+        fitted=row.fitted,
+        unit=unit,
+        peak=measured[peak],
+        own_interval_95=(low[0][peak], high[0][peak]),
+        interval_95=(mixed[0][peak], mixed[1][peak]),
+        sd_between_models=between[peak],
+        inside_percent=100 * float(np.mean((measured >= mixed[0]) & (measured <= mixed[1]))),
+    )
 
 
-def _find_band(curves: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
+def _find_band(curves: Mapping[str, Array]) -> tuple[Array, Array] | None:
     """The columns of the 95 % band of a stored prediction."""
     low = next((values for key, values in curves.items() if "_low_" in key), None)
     high = next((values for key, values in curves.items() if "_high_" in key), None)
@@ -347,49 +356,49 @@ def fit_socket_of_models(study: Study, *, listener: Listener = ignore_progress) 
     InputError
         If no models were compared, or the study's own socket cannot be simulated.
     """
-    file = study.results / FOLDER / "models.json"
-    if not file.is_file():
+    stored = ModelsResult.find(study.results)
+    if stored is None:
         raise InputError(
             "no other models were compared", file=study.file, remedy="limbfit uncertainty --models all"
         )
-    known = [row["model"] for row in Store(study.results).read(FOLDER, "models.json")["models"]]
-    compared = compare_models(study, known[1:], listener=listener)["models"]  # anew where the study changed
-    chosen = [row for row in compared if row["weight"] >= MIN_SOCKET_WEIGHT]
-    found = []
-    for row in chosen:
-        of_model = study if row["model"] == OWN else load_study(study.results / FOLDER / row["model"])
-        found.append(fit_socket(of_model, listener=_name_model(listener, f"socket, {row['words']}")))
-    weights = np.array([row["weight"] for row in chosen])
-    content = {
-        "models": [{key: row[key] for key in ("model", "words", "weight")} for row in chosen],
-        "loads": _mix_pressures(found, weights / weights.sum()),
-    }
+    names = [one.model for one in stored.models if one.model != OWN]
+    compare_models(study, names, listener=listener)  # anew where the study has changed
+    chosen = [one for one in ModelsResult.read(study.results).models if one.weight >= MIN_SOCKET_WEIGHT]
+    sockets = []
+    for one in chosen:
+        of_model = study if one.model == OWN else load_study(study.results / FOLDER / one.model)
+        fit_socket(of_model, listener=_name_model(listener, f"socket, {one.words}"))
+        sockets.append(SocketResult.read(of_model.results))
+    weights = np.array([one.weight for one in chosen])
+    content = SocketOfModels(
+        models=[ModelWeight(model=one.model, words=one.words, weight=one.weight) for one in chosen],
+        loads=_mix_pressures(sockets, weights / weights.sum()),
+    )
     with lock(study.results):
-        write_json(study.results / FOLDER / "socket.json", content)
-    return content | {"folder": str(study.results / FOLDER)}
+        write_result(study.results / SocketOfModels.FILE, content)
+    return content.to_plain() | {"folder": str(study.results / FOLDER)}
 
 
-def _mix_pressures(sockets: Sequence[Mapping[str, Any]], weights: np.ndarray) -> list[dict[str, Any]]:
-    """For donning and each load, the mean pressure of each region by every model, and of all; kPa."""
+def _mix_pressures(sockets: Sequence[SocketResult], weights: Array) -> list[MixedLoad]:
+    """For donning and each load, the mean pressure of each region by every model, and of all."""
+    names = ["donning", *(load.name for load in sockets[0].loads)]
+    held = [[one.donning, *one.loads] for one in sockets]
+    return [
+        MixedLoad(
+            name=name,
+            regions=[
+                _mix_region(same, weights) for same in zip(*(state.regions for state in states), strict=True)
+            ],
+        )
+        for name, *states in zip(names, *held, strict=True)
+    ]
 
-    def list_held(one: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-        return [one["donning"] | {"name": "donning"}, *one["loads"]]
 
-    rows = []
-    for held in zip(*map(list_held, sockets), strict=True):
-        regions = []
-        for same in zip(*(one["regions"] for one in held), strict=True):
-            means = np.array([region["mean_kPa"] for region in same])
-            ends = np.array([region["interval_kPa"] or 2 * [region["mean_kPa"]] for region in same])
-            low, high = compute_mixture_interval(
-                ends.mean(axis=1)[:, None], (ends @ [-1.0, 1.0])[:, None] / (2 * NORMAL_95), weights
-            )
-            regions.append(
-                {
-                    "region": same[0]["region"],
-                    "mean_kPa": means.tolist(),
-                    "interval_kPa": [max(float(low[0]), 0.0), float(high[0])],
-                }
-            )
-        rows.append({"name": held[0]["name"], "regions": regions})
-    return rows
+def _mix_region(same: Sequence[LoadedRegion], weights: Array) -> MixedPressure:
+    means = np.array([region.mean_kPa for region in same])
+    ends = np.array([region.interval_kPa or 2 * (region.mean_kPa,) for region in same])
+    sds = (ends[:, 1] - ends[:, 0]) / (2 * NORMAL_95)
+    low, high = compute_mixture_interval(ends.mean(axis=1)[:, None], sds[:, None], weights)
+    return MixedPressure(
+        region=same[0].region, mean_kPa=means.tolist(), interval_kPa=(max(float(low[0]), 0.0), high[0])
+    )

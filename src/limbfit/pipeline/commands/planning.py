@@ -164,7 +164,7 @@ def _choose_speeds(study: Study, loads: Iterable[LoadHistory], depths_mm: Sequen
     stated = [site.depth_mm for site in study.sites if site.depth_mm is not None]
     store = Store(study.results)
     if store.stamp("traces") is not None:
-        stated += [facts["depth_mm"] for facts in store.read("traces", "traces.json")["sites"].values()]
+        stated += [facts.depth_mm for facts in store.results.traces.sites.values()]
     deepest = max(depths_mm or stated, default=0.0)
     fast = max((deepest / one.ramp_s for one in loads), default=0.0)
     return [slow, min(max(_FASTER * slow, fast), limit)]
@@ -183,15 +183,15 @@ def _read_socket_pressures(study: Study) -> dict[str, list[float]]:
     if "done" not in [row["state"] for row in study_status(study) if row["stage"] == SOCKET]:
         raise InputError("the study has no current socket", file=study.file, place=place, remedy=remedy)
     found = {}
-    for load in store.read(SOCKET, "socket.json")["loads"]:
-        for region in load["regions"]:
-            if region["change_kPa"] is None:
+    for load in store.results.socket.loads:
+        for region in load.regions:
+            if region.change_kPa is None:
                 what = "its socket's pressures have no derivatives"
                 raise InputError(what, file=study.file, place=place, remedy=remedy)
-            by = [region["change_kPa"].get(f"{tissue}.{name}", 0.0) for tissue, name in study.parameters]
+            by = [region.change_kPa.get(f"{tissue}.{name}", 0.0) for tissue, name in study.parameters]
             slopes = np.array(by) / np.log1p(CHANGE_PERCENT / 100.0)
-            if region["mean_kPa"] > 0:
-                found[f"{load['name']}, {region['region']}"] = (slopes / region["mean_kPa"]).tolist()
+            if region.mean_kPa > 0:
+                found[f"{load.name}, {region.region}"] = (slopes / region.mean_kPa).tolist()
     return found
 
 
@@ -199,10 +199,10 @@ def _find_noise(study: Study, origin: str) -> dict[str, float]:
     """Sensor noise and the model's own error, from the calibration's residuals where there is one."""
     if origin != IDENTIFIED:
         return {"sensor_N": _SENSOR_N, "misfit": _MISFIT, "correlation": _CORRELATION}
-    residuals = Store(study.results).read("calibrate", "calibration.json")["uncertainty"]["residuals"]
-    noise = [row["compared_noise_sd_N"] for row in residuals["sites"].values() if row["unit"] == "N"]
+    residuals = Store(study.results).results.calibration.uncertainty.residuals
+    noise = [row.compared_noise_sd_N for row in residuals.sites.values() if row.unit == "N"]
     return {
         "sensor_N": float(max(np.median(noise), 1e-3)) if noise else _SENSOR_N,
-        "misfit": float(residuals["misfit_elsewhere"]),
+        "misfit": residuals.misfit_elsewhere,
         "correlation": _CORRELATION,
     }

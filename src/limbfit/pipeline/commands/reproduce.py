@@ -58,7 +58,7 @@ def reproduce_study(
     _check_unchanged(study, known, file)
     _copy_inputs(study, folder)
     summary = run_study(load_study(folder), listener=listener)
-    then = Store(study.results).read("calibrate", "calibration.json")["stages"][-1]["parameters"]
+    then = Store(study.results).results.calibration.parameters
     parameters = dict(_compute_relative(then, summary["parameters"]))
     forces = dict(_compare_forces(study.results / "predict", folder / "results" / "predict"))
     return {

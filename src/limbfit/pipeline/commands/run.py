@@ -11,6 +11,15 @@ from ... import report
 from ..._version import __version__
 from ...errors import InputError
 from ...extensions import load_extensions
+from ...results.identification import CalibrationResult, PredictResult
+from ...results.runs import (
+    ExperimentRecord,
+    MachineFacts,
+    RunResult,
+    StageParts,
+    StageRecord,
+    StudyName,
+)
 from ...study import Study
 from ..engine.context import Context, Listener, build_executor, compile_in_background, ignore_progress
 from ..engine.hand_labels import keep_hand_labels
@@ -18,7 +27,7 @@ from ..engine.journal import write_journal
 from ..engine.keys import Keys, Stage
 from ..engine.provenance import collect_versions, compute_input_digests, describe_machine, record_settings
 from ..engine.stale_reasons import collect_parts, describe_causes
-from ..engine.storage import write_json
+from ..engine.storage import write_result
 from ..engine.store import Store, lock
 from ..identification.calibrate import run_calibrate
 from ..identification.predict import run_predict
@@ -171,15 +180,15 @@ def study_status(study: Study) -> list[dict[str, Any]]:
     return rows
 
 
-def _collect_parts(known: Keys, stage: Stage, chain: Mapping[str, str]) -> dict[str, dict[str, str]]:
+def _collect_parts(known: Keys, stage: Stage, chain: Mapping[str, str]) -> StageParts:
     """What the key of a stage is made of, for a later status to say what changed."""
     seen = _select_calibration_inputs(known.study) if stage.name == "calibrate" else known.study
     return collect_parts(stage, known, seen, chain)
 
 
 def _describe_why(known: Keys, stage: Stage, chain: Mapping[str, str]) -> list[str]:
-    stamp = Store(known.study.results).stamp(stage.name) or {}
-    return describe_causes(stamp.get("parts"), _collect_parts(known, stage, chain))
+    stamp = Store(known.study.results).stamp(stage.name)
+    return describe_causes(stamp.parts if stamp else None, _collect_parts(known, stage, chain))
 
 
 def run_study(
@@ -262,8 +271,8 @@ def _check_limb(context: Context, check: Callable[[LimbGeometry], None] | None, 
         return
     limb = LimbGeometry.stored(store)
     if meshing:
-        facts = store.read("traces", "traces.json")["sites"]
-        moving = [one for one in study.recorded if facts[one.name].get("surface", {}).get("compared")]
+        facts = store.results.traces.sites
+        moving = [one for one in study.recorded if (seen := facts[one.name].surface) and seen.compared]
         limb.clamping_pins(study)
         choose_surface_points(limb, study, {one.name: read_motion(store["traces"], one) for one in moving})
     if check is not None:
@@ -339,37 +348,39 @@ def run_experiment(
 def _do(context: Context, name: str, known: Keys, chain: Mapping[str, str]) -> None:
     stage = next(stage for stage in STAGES if stage.name == name)
     if name == "report":
-        write_json(context.store.folder / "run.json", run_record(context.study))
+        write_result(context.store.folder / "run.json", run_record(context.study))
     parts = _collect_parts(known, stage, chain)
     stamp = context.store.make(
         name, chain[name], lambda folder: {**stage.run(context, folder), "parts": parts}
     )
-    context.tell(name, 1, 1, f"done in {stamp['seconds']:.1f} s")
+    context.tell(name, 1, 1, f"done in {stamp.seconds:.1f} s")
 
 
-def run_record(study: Study) -> dict[str, Any]:
+def run_record(study: Study) -> RunResult:
     """``run.json``: versions, settings, digests of the inputs, how long each stage took."""
     store = Store(study.results)
     stamps = {stage.name: store.stamp(stage.name) for stage in list_stages(study)}
     inputs, known = compute_input_digests(study), Keys(study)
-    return {
-        "limbfit": __version__,
-        "study": study.study.model_dump(mode="json"),
-        "settings": record_settings(study, inputs),
-        "versions": collect_versions(),
-        "machine": describe_machine(),
-        "inputs": inputs,
-        "stages": {
-            name: {"seconds": stamp["seconds"], "finished": stamp["finished"], "key": stamp["key"]}
+    return RunResult(
+        limbfit=__version__,
+        study=StudyName(**study.study.model_dump(mode="json")),
+        settings=record_settings(study, inputs),
+        versions=collect_versions(),
+        machine=MachineFacts(**describe_machine()),
+        inputs=inputs,
+        stages={
+            name: StageRecord(seconds=stamp.seconds, finished=stamp.finished, key=stamp.key)
             for name, stamp in stamps.items()
             if stamp
         },
-        "experiments": {
-            row["experiment"]: {key: row[key] for key in ("state", "seconds", "finished", "options", "key")}
+        experiments={
+            row["experiment"]: ExperimentRecord(
+                **{key: row[key] for key in ("state", "seconds", "finished", "options", "key")}
+            )
             for row in list_experiment_rows(study, known, _chain_keys(known))
             if row["state"] in ("done", "stale")
         },
-    }
+    )
 
 
 def report_study(study: Study, *, listener: Listener = ignore_progress) -> dict[str, Any]:
@@ -384,30 +395,23 @@ def report_study(study: Study, *, listener: Listener = ignore_progress) -> dict[
 
 def summarise(study: Study) -> dict[str, Any]:
     """The figures of a study from what is stored: parameters, sites with errors, where the report is."""
-    store = Store(study.results)
     summary: dict[str, Any] = {"study": study.study.name, "results": str(study.results)}
-    if (store["calibrate"] / "calibration.json").is_file():
-        calibration = store.read("calibrate", "calibration.json")
-        summary["parameters"] = calibration["stages"][-1]["parameters"]
-        summary["intervals_95"] = calibration["uncertainty"]["intervals_95"]
-        if relaxation := calibration["uncertainty"].get("relaxation"):
+    if (calibration := CalibrationResult.find(study.results)) is not None:
+        summary["parameters"] = calibration.parameters
+        summary["intervals_95"] = calibration.uncertainty.to_plain()["intervals_95"]
+        if calibration.uncertainty.relaxation is not None:
+            relaxation = calibration.uncertainty.relaxation.to_plain()
             summary["relaxation"] = {key: relaxation[key] for key in ("prefers", "words", "moduli")}
-    if (store["predict"] / "predict.json").is_file():
-        predicted = store.read("predict", "predict.json")
-        columns = ("site", "record", "region", "fitted", "peak_force_N", "error_percent")
+    if (found := PredictResult.find(study.results)) is not None:
+        predicted = found.to_plain()
+        columns = ("site", "record", "region", "fitted", "peak_force_N", "error_percent", "warnings")
         summary["sites"] = [
-            {
-                **{key: row[key] for key in columns},
-                **{key: row.get(key, []) for key in ("warnings", "outside_records")},
-            }
-            for row in predicted["sites"]
+            {key: row[key] for key in (*columns, "outside_records")} for row in predicted["sites"]
         ]
-        summary["outside_text"] = predicted.get("outside_text", [])
-        for key in ("mean_error_fitted_percent", "mean_error_heldout_percent"):
-            summary[key] = predicted[key]
-        summary["flags"] = predicted.get("flags", [])
-        summary["fit_quality"] = predicted.get("fit_quality", {}).get("verdict", "")
-    report = store["report"] / "report.html"
+        keys = ("outside_text", "mean_error_fitted_percent", "mean_error_heldout_percent", "flags")
+        summary |= {key: predicted[key] for key in keys}
+        summary["fit_quality"] = found.fit_quality.verdict
+    report = study.results / "report" / "report.html"
     if report.is_file():
         summary["report"] = str(report)
     return summary

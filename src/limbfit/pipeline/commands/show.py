@@ -72,8 +72,7 @@ def _draw_one(job: tuple[Path, str, Path]) -> None:
 
 
 def _segment_facts(study: Study, store: Store) -> dict[str, Any]:
-    found = store.read("segment", "segment.json")
-    return {**found, "labels": str(store["segment"] / "labels.seg.nrrd")}
+    return {**store.results.segment.to_plain(), "labels": str(store["segment"] / "labels.seg.nrrd")}
 
 
 def _describe_surfaces(study: Study, store: Store) -> dict[str, Any]:
@@ -110,11 +109,11 @@ def _describe_amputation(study: Study, anatomy: Anatomy) -> dict[str, Any]:
 
 
 def _describe_sites(study: Study, store: Store) -> dict[str, Any]:
-    return {"sites": store.read("sites", "sites.json")["sites"]}
+    return store.results.sites.to_plain()
 
 
 def _mesh_facts(study: Study, store: Store) -> dict[str, Any]:
-    return dict(store.read("mesh", "mesh.json"))
+    return store.results.mesh.to_plain()
 
 
 _FACTS: dict[str, Callable[[Study, Store], dict[str, Any]]] = {

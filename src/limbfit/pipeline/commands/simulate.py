@@ -13,10 +13,12 @@ from ...febio import FebSettings, build_result, compute_end_time, find_febio, ru
 from ...identify.checks.domain import RecordedRange, describe_outside
 from ...indentation import Parameters, SiteModel, build_first_steps, build_problem, simulate_fields
 from ...mesh import read_vtu
+from ...results.identification import RecordedExtents
+from ...results.runs import SimulateResult
 from ...study import Indentation as Planned
 from ...study import Record, Study
 from ..engine.context import Context, Listener, ignore_progress
-from ..engine.storage import write_curves, write_json
+from ..engine.storage import write_curves, write_result
 from ..engine.store import Store
 from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
@@ -127,8 +129,9 @@ def simulate_site(
     }
     # A path may tell who the patient is: what is stored names the files as they lie beside it.
     beside = {kind: file and file.relative_to(folder).as_posix() for kind, file in files.items()}
-    write_json(folder / f"{name}.json", summary | beside)
-    return summary | {kind: file and str(file) for kind, file in files.items()}
+    stored = SimulateResult(**summary | beside)
+    write_result(folder / f"{name}.json", stored)
+    return stored.to_plain() | {kind: file and str(file) for kind, file in files.items()}
 
 
 def _compare_with_records(found: Indentation, result: Result, fields: Path | None) -> dict[str, Any]:
@@ -140,7 +143,7 @@ def _compare_with_records(found: Indentation, result: Result, fields: Path | Non
     stored = read_recorded_range(study) if found.origin == IDENTIFIED else None
     if stored is None:
         return {"outside_records": None, "outside_text": []}
-    tested, limb = RecordedRange.from_dict(stored), LimbGeometry.stored(found.context.store)
+    tested, limb = RecordedRange.from_stored(stored), LimbGeometry.stored(found.context.store)
     site = found.stated.site if isinstance(found.stated, Record) else found.stated
     rows = tested.find_outside(
         describe_indentation(
@@ -198,13 +201,12 @@ def run_febio_site(found: Indentation, program: Path, folder: Path) -> tuple[Res
     return build_result(problem, run.log, run.verdict, run.seconds), folder / "model.xplt"
 
 
-def read_recorded_range(study: Study) -> dict[str, Any] | None:
+def read_recorded_range(study: Study) -> RecordedExtents | None:
     """What the fitted records did to the tissue; None where the prediction, which stores it, is not done."""
     store = Store(study.results)
     if store.state("predict", compute_keys(study)["predict"]).state != "done":
         return None
-    tested: dict[str, Any] = store.read("predict", "predict.json")["recorded_range"]
-    return tested
+    return store.results.predict.recorded_range
 
 
 def choose_parameters(study: Study, store: Store) -> tuple[Parameters, str]:
@@ -222,4 +224,4 @@ def choose_parameters(study: Study, store: Store) -> tuple[Parameters, str]:
             file=store["calibrate"] / "calibration.json",
             remedy="identify again (limbfit run), or give --parameters",
         )
-    return store.read("calibrate", "calibration.json")["stages"][-1]["parameters"], IDENTIFIED
+    return store.results.calibration.parameters, IDENTIFIED

@@ -25,9 +25,10 @@ from ...identify.checks.design import (
 )
 from ...identify.fit.objective import SiteResponse
 from ...indentation import Parameters, SiteModel
+from ...results.planning import DesignCandidate, DesignResult, DesignSite, ExpectedNoise, SiteDesign
 from ...study import Site, Study
 from ..engine.context import Context
-from ..engine.storage import write_json, write_table
+from ..engine.storage import write_result, write_rows, write_table
 from ..identification.problem import build_unknowns
 from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
@@ -105,9 +106,13 @@ def run_design(
         found.append(
             (build_candidate(model.site, depth, response, vector, model_noise), simulation.force_N.max())
         )
-    content = _to_content(context, found, count_wanted_sites(study, sites), vector, left_out)
-    content |= {"parameters": parameters, "parameters_from": parameters_from, "noise": noise}
-    write_json(folder / "design.json", content)
+    content = DesignResult(
+        **_choose_designs(context, found, count_wanted_sites(study, sites), left_out),
+        parameters=parameters,
+        parameters_from=parameters_from,
+        noise=ExpectedNoise(**noise),
+    )
+    write_result(folder / "design.json", content)
     _write_tables(folder, content)
     return {}
 
@@ -141,14 +146,13 @@ def _scale_to_depth(own: SiteModel, depth: float) -> SiteModel:
     return replace(own, knots_s=tuple(knots_s.tolist()), knots_mm=tuple(knots_mm.tolist()))
 
 
-def _to_content(
+def _choose_designs(
     context: Context,
     found: Sequence[tuple[Candidate, float]],
     sites: int,
-    vector: Array,
     left_out: list[str],
 ) -> dict[str, Any]:
-    """What ``design.json`` holds: the best choices, the study's own, all sites, and the candidates."""
+    """The best choices, the study's own, all sites, and the candidates."""
     study = context.study
     every = [one for one, _ in found]
     if len({one.site for one in every}) < sites:
@@ -168,14 +172,14 @@ def _to_content(
     for name, design in designs.items():
         chosen = [every[i] for i in design.chosen]
         rows.append(
-            {
-                "design": name,
-                "sites": [{"site": one.site, "depth_mm": one.depth_mm} for one in chosen],
-                "d_efficiency": compute_efficiency(design, best_d, "D"),
-                "a_efficiency": compute_efficiency(design, best_a, "A"),
-                "factor_95": dict(zip(bounds.names, design.factors_95.tolist(), strict=True)),
-                "exhaustive": design.exhaustive,
-            }
+            SiteDesign(
+                design=name,
+                sites=[DesignSite(site=one.site, depth_mm=one.depth_mm) for one in chosen],
+                d_efficiency=compute_efficiency(design, best_d, "D"),
+                a_efficiency=compute_efficiency(design, best_a, "A"),
+                factor_95=dict(zip(bounds.names, design.factors_95.tolist(), strict=True)),
+                exhaustive=design.exhaustive,
+            )
         )
     return {
         "wanted": sites,
@@ -186,15 +190,15 @@ def _to_content(
     }
 
 
-def _to_row(one: Candidate, peak: float, prior: Array) -> dict[str, Any]:
+def _to_row(one: Candidate, peak: float, prior: Array) -> DesignCandidate:
     """A candidate, and what it tells alone: bits of information over the bounds."""
     gain = np.linalg.slogdet(prior + one.information)[1] - np.linalg.slogdet(prior)[1]
-    return {
-        "site": one.site,
-        "depth_mm": one.depth_mm,
-        "peak_force_N": float(peak),
-        "bits": float(gain / (2 * np.log(2))),
-    }
+    return DesignCandidate(
+        site=one.site,
+        depth_mm=one.depth_mm,
+        peak_force_N=float(peak),
+        bits=float(gain / (2 * np.log(2))),
+    )
 
 
 def _own_choice(study: Study, every: Sequence[Candidate]) -> tuple[int, ...]:
@@ -232,21 +236,18 @@ def _describe_verdict(designs: dict[str, Design], names: Sequence[str]) -> str:
     return "; ".join(words) or "the best choice determines every parameter within a factor of two"
 
 
-def _write_tables(folder: Path, content: dict[str, Any]) -> None:
-    names = list(content["designs"][0]["factor_95"])
+def _write_tables(folder: Path, content: DesignResult) -> None:
+    names = list(content.designs[0].factor_95)
     rows = [
         [
-            row["design"],
-            " ".join(f"{one['site']}@{one['depth_mm']:.2f}mm" for one in row["sites"]),
-            row["d_efficiency"],
-            row["a_efficiency"],
-            *(row["factor_95"][name] for name in names),
+            row.design,
+            " ".join(f"{one.site}@{one.depth_mm:.2f}mm" for one in row.sites),
+            row.d_efficiency,
+            row.a_efficiency,
+            *(row.factor_95[name] for name in names),
         ]
-        for row in content["designs"]
+        for row in content.designs
     ]
     heads = ["design", "sites", "d_efficiency", "a_efficiency", *(f"factor_95_{name}" for name in names)]
     write_table(folder / "designs.csv", heads, rows)
-    keys = ("site", "depth_mm", "peak_force_N", "bits")
-    write_table(
-        folder / "candidates.csv", keys, [[row[key] for key in keys] for row in content["candidates"]]
-    )
+    write_rows(folder / "candidates.csv", content.candidates)

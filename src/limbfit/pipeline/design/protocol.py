@@ -36,9 +36,10 @@ from ...indentation import (
     place_waves_under,
 )
 from ...mesh import read_vtu
+from ...results.planning import ExpectedNoise, ProtocolPlan, ProtocolRecord, ProtocolResult
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import write_json, write_table
+from ..engine.storage import write_result, write_rows, write_table
 from ..identification.problem import build_unknowns
 from ..records.deviations import compute_expected_share, estimate_surface_error_mm, is_modulus
 from ..records.planned_records import PlannedRecord, press, write_records
@@ -135,27 +136,27 @@ def run_protocol(
     chosen = (found[i].model for i in plans[DESIGNED])
     histories = [LoadHistory.from_knots(model.knots_s, model.knots_mm) for model in chosen]
     left_out += describe_untested_times(histories, socket_times)
-    content = {
-        "minutes": minutes,
-        "setup_s": setup_s,
-        "rest_s": rest_s,
-        "criterion": wanted.criterion,
-        "determine": [known.names[i] for i in which],
-        "draws": tissues.tolist(),
-        "records": [_record(found[i], options[i], peaks[i]) for i in plans[DESIGNED]],
-        "pressures": list(pressures),
-        "protocols": told,
-        "verdict": _describe_verdict(told[0], [known.names[i] for i in which]),
-        "candidates": [_record(one, option, peak) for one, option, peak in zip(found, options, peaks)],
-        "left_out": left_out,
-        "parameters": parameters,
-        "parameters_from": parameters_from,
-        "noise": noise,
+    content = ProtocolResult(
+        minutes=minutes,
+        setup_s=setup_s,
+        rest_s=rest_s,
+        criterion=wanted.criterion,
+        determine=[known.names[i] for i in which],
+        draws=tissues.tolist(),
+        records=[_record(found[i], options[i], peaks[i]) for i in plans[DESIGNED]],
+        pressures=list(pressures),
+        protocols=told,
+        verdict=_describe_verdict(told[0], [known.names[i] for i in which]),
+        candidates=[_record(one, option, peak) for one, option, peak in zip(found, options, peaks)],
+        left_out=left_out,
+        parameters=parameters,
+        parameters_from=parameters_from,
+        noise=ExpectedNoise(**noise),
         **seen,
-    }
-    write_json(folder / "protocol.json", content)
+    )
+    write_result(folder / "protocol.json", content)
     _write_tables(folder, content)
-    write_records(folder / "records.toml", content["records"], seen)
+    write_records(folder / "records.toml", content.records, seen)
     return {}
 
 
@@ -339,7 +340,7 @@ def _to_row(
     parameters: tuple[Sequence[str], Sequence[int]],
     pressures: Iterable[str],
     draws: int,
-) -> dict[str, Any]:
+) -> ProtocolPlan:
     """A protocol, and what to expect of it: the middle of the draws and the worst.
 
     ``parameters``: all of their names, and which are to be determined.
@@ -349,55 +350,54 @@ def _to_row(
     factors = compute_factors_95(covariances)
     middle, worst = np.median(factors, axis=0), factors.max(axis=0)
     of_pressures = np.median(compute_factors_95(wanted.project(covariances)), axis=0)
-    return {
-        "design": name,
-        "records": len(chosen),
-        "minutes": compute_duration_s(options, chosen, budget) / 60.0,
-        "factor_95": dict(zip(names, middle.tolist(), strict=True)),
-        "worst_95": dict(zip(names, worst.tolist(), strict=True)),
-        "pressures_95": dict(zip(pressures, of_pressures.tolist())),
-        "determined": int(np.sum(middle[list(which)] <= DETERMINED)),
-        "cost": wanted.compute_cost(covariances),
-    }
+    return ProtocolPlan(
+        design=name,
+        records=len(chosen),
+        minutes=compute_duration_s(options, chosen, budget) / 60.0,
+        factor_95=dict(zip(names, middle.tolist(), strict=True)),
+        worst_95=dict(zip(names, worst.tolist(), strict=True)),
+        pressures_95=dict(zip(pressures, of_pressures.tolist())),
+        determined=int(np.sum(middle[list(which)] <= DETERMINED)),
+        cost=wanted.compute_cost(covariances),
+    )
 
 
-def _record(one: PlannedRecord, option: RecordOption, peak: float) -> dict[str, Any]:
-    return {
-        "site": one.site,
-        "indenter": one.tool,
-        "depth_mm": one.depth_mm,
-        "speed_mm_s": one.speed_mm_s,
-        "hold_s": one.hold_s,
-        "seconds": option.seconds,
-        "peak_force_N": peak,
-    }
+def _record(one: PlannedRecord, option: RecordOption, peak: float) -> ProtocolRecord:
+    return ProtocolRecord(
+        site=one.site,
+        indenter=one.tool,
+        depth_mm=one.depth_mm,
+        speed_mm_s=one.speed_mm_s,
+        hold_s=one.hold_s,
+        seconds=option.seconds,
+        peak_force_N=peak,
+    )
 
 
-def _describe_verdict(best: Mapping[str, Any], wanted: Sequence[str]) -> str:
+def _describe_verdict(best: ProtocolPlan, wanted: Sequence[str]) -> str:
     """In words: how much of what is wanted the protocol determines."""
-    if best["pressures_95"]:
-        worst = max(best["pressures_95"], key=best["pressures_95"].__getitem__)
+    if best.pressures_95:
+        worst = max(best.pressures_95, key=best.pressures_95.__getitem__)
         return (
-            f"{best['records']} records in {best['minutes']:.0f} min tell the mean pressures of the socket's "
-            f"regions within {100 * (best['pressures_95'][worst] - 1):.1f} % (95 %) as far as tissue decides "
-            f"them, the worst at {worst}; {best['determined']} of {len(wanted)} parameters within 25 %"
+            f"{best.records} records in {best.minutes:.0f} min tell the mean pressures of the socket's "
+            f"regions within {100 * (best.pressures_95[worst] - 1):.1f} % (95 %) as far as tissue decides "
+            f"them, the worst at {worst}; {best.determined} of {len(wanted)} parameters within 25 %"
         )
-    open_ones = [name for name in wanted if best["factor_95"][name] > DETERMINED]
+    open_ones = [name for name in wanted if best.factor_95[name] > DETERMINED]
     head = (
-        f"{best['records']} records in {best['minutes']:.0f} min determine {best['determined']} of "
+        f"{best.records} records in {best.minutes:.0f} min determine {best.determined} of "
         f"{len(wanted)} parameters within 25 %"
     )
     return f"{head}; not {', '.join(open_ones)}" if open_ones else head
 
 
-def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:
-    keys = ("site", "indenter", "depth_mm", "speed_mm_s", "hold_s", "seconds", "peak_force_N")
-    for name in ("records", "candidates"):
-        write_table(folder / f"{name}.csv", keys, [[row[key] for key in keys] for row in content[name]])
-    names = list(content["protocols"][0]["factor_95"])
+def _write_tables(folder: Path, content: ProtocolResult) -> None:
+    write_rows(folder / "records.csv", content.records)
+    write_rows(folder / "candidates.csv", content.candidates)
+    names = list(content.protocols[0].factor_95)
     heads = ["protocol", "records", "minutes", "determined", *(f"factor_95_{name}" for name in names)]
     rows = [
-        [row["design"], row["records"], row["minutes"], row["determined"], *row["factor_95"].values()]
-        for row in content["protocols"]
+        [row.design, row.records, row.minutes, row.determined, *row.factor_95.values()]
+        for row in content.protocols
     ]
     write_table(folder / "protocols.csv", heads, rows)

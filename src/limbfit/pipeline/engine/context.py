@@ -9,6 +9,7 @@ from typing import Any
 
 from ...execution import Executor, Limits, make_executor, run_in_background
 from ...fe import are_compiled, compile_kernels
+from ...results.study_results import StudyResults
 from ...study import Study
 from .store import Store
 
@@ -60,9 +61,10 @@ class Context:
     ) -> None:
         self.listener(Progress(stage, done, total, text, fit, facts))
 
-    def stored(self, stage: str, name: str) -> Any:
-        """A JSON artefact of a finished stage."""
-        return self.store.read(stage, name)
+    @property
+    def results(self) -> StudyResults:
+        """What the finished stages have stored."""
+        return self.store.results
 
 
 def build_executor(study: Study) -> Executor:

@@ -9,11 +9,11 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from ...results.limb import SegmentResult
 from ...study import Study
-from .storage import compute_file_digest, read_json, write_atomically
+from .storage import compute_file_digest, write_atomically
 
 LABELS = "labels.seg.nrrd"
-DIGEST = "labels_sha256"  # key of segment.json: the label map as the stage wrote it
 _BY_HAND = Path("results") / "by-hand" / LABELS
 
 
@@ -42,8 +42,7 @@ def _is_edited(study: Study) -> bool:
     labels, facts = study.results / "segment" / LABELS, study.results / "segment" / "segment.json"
     if not labels.is_file() or not facts.is_file():
         return False
-    written = read_json(facts).get(DIGEST)
-    if written is None or compute_file_digest(labels) == written:
+    if compute_file_digest(labels) == SegmentResult.read(study.results).labels_sha256:
         return False
     kept = study.path(_BY_HAND)
     return not (kept.is_file() and compute_file_digest(kept) == compute_file_digest(labels))

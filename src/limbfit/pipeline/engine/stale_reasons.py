@@ -9,17 +9,17 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from ..._version import __version__
+from ...results.runs import StageParts
 from ...study import Study
 from .keys import Keys, Stage, select_records_read
 from .provenance import list_input_files
 from .sources import code_parts
 from .storage import compute_digest
 
-Parts = dict[str, dict[str, str]]
 _FEW = 4  # causes of one kind that are named
 
 
-def collect_parts(stage: Stage, known: Keys, study: Study, keys: Mapping[str, str]) -> Parts:
+def collect_parts(stage: Stage, known: Keys, study: Study, keys: Mapping[str, str]) -> StageParts:
     """Digests of the settings, inputs, files of code and keys of lower stages that make up a stage's key."""
     stated = study.model_dump(mode="json")
     settings = dict(_iterate_leaves(stage.read(stated), ""))
@@ -31,12 +31,12 @@ def collect_parts(stage: Stage, known: Keys, study: Study, keys: Mapping[str, st
         settings |= dict(_iterate_leaves(read, f"records.{row['site']}-{row['name']}."))
     names = {path: key for key, path in study.inputs.items()}
     files = list_input_files(study).get(stage.name, [])
-    return {
-        "settings": {name: compute_digest(value) for name, value in settings.items()},
-        "inputs": {names.get(path, "labels corrected by hand"): known.digests[path][:16] for path in files},
-        "code": code_parts(stage.run) | {"limbfit": __version__},
-        "stages": {below: keys[below] for below in stage.needs if below in keys},
-    }
+    return StageParts(
+        settings={name: compute_digest(value) for name, value in settings.items()},
+        inputs={names.get(path, "labels corrected by hand"): known.digests[path][:16] for path in files},
+        code=code_parts(stage.run) | {"limbfit": __version__},
+        stages={below: keys[below] for below in stage.needs if below in keys},
+    )
 
 
 def _iterate_leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
@@ -47,7 +47,7 @@ def _iterate_leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
         yield name.removesuffix("."), value
 
 
-def describe_causes(before: Mapping[str, Mapping[str, str]] | None, now: Parts) -> list[str]:
+def describe_causes(before: StageParts | None, now: StageParts) -> list[str]:
     """What differs, in words; what is above a lower stage's change comes last."""
     if before is None:
         return ["made by an older version, which did not store what its key depends on"]
@@ -58,9 +58,9 @@ def describe_causes(before: Mapping[str, Mapping[str, str]] | None, now: Parts) 
         "stages": "stage {} changed",
     }
     for kind, text in words.items():
-        names = _find_different(before.get(kind, {}), now[kind])
+        names = _find_different(getattr(before, kind), getattr(now, kind))
         found += [text.format(_list_few(names))] if names else []
-    code, then = _find_different(before.get("code", {}), now["code"]), before.get("code", {}).get("limbfit")
+    code, then = _find_different(before.code, now.code), before.code.get("limbfit")
     if then != __version__:
         found.append(f"limbfit was {then}, is {__version__}")
     elif code:

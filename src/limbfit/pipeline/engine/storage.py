@@ -15,6 +15,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from ...results.base import ResultPart
+
 DRAFT = ".part"
 
 
@@ -42,6 +44,11 @@ def write_json(path: Path, content: Any) -> None:
     text = json.dumps(content, indent=1, allow_nan=False, default=to_plain)
     with write_atomically(path) as stream:
         stream.write(text.encode())
+
+
+def write_result(path: Path, result: ResultPart) -> None:
+    """Write a result as JSON; its model has checked it."""
+    write_json(path, result.to_plain())
 
 
 def read_json(path: Path) -> Any:
@@ -74,6 +81,12 @@ def write_table(file: Path, heads: Sequence[str], rows: Iterable[Sequence[Any]])
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(heads)
         writer.writerows([_format_cell(value) for value in row] for row in rows)
+
+
+def write_rows(file: Path, rows: Sequence[ResultPart], leave_out: Sequence[str] = ()) -> None:
+    """A CSV file of parts of a result whose keys are its columns, but for some."""
+    heads = [key for key in (type(rows[0]).model_fields if rows else ()) if key not in leave_out]
+    write_table(file, heads, [[getattr(row, key) for key in heads] for row in rows])
 
 
 def _format_cell(value: Any) -> str:

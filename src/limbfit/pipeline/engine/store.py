@@ -21,7 +21,9 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from ...errors import RunError
-from .storage import DRAFT, read_json, write_json
+from ...results.runs import StageStamp
+from ...results.study_results import StudyResults
+from .storage import DRAFT, read_json, write_json, write_result
 
 STAMP = "stage.json"
 LOCK, HOLDER = ".lock", ".holder"
@@ -51,26 +53,26 @@ class Store:
     def __getitem__(self, stage: str) -> Path:
         return self.folder / stage
 
-    def read(self, stage: str, name: str) -> Any:
-        """A JSON artefact of a finished stage."""
-        return read_json(self[stage] / name)
+    @property
+    def results(self) -> StudyResults:
+        """What is stored now."""
+        return StudyResults(self.folder)
 
-    def stamp(self, stage: str) -> dict[str, Any] | None:
-        file = self[stage] / STAMP
-        return read_json(file) if file.is_file() else None
+    def stamp(self, stage: str) -> StageStamp | None:
+        return StageStamp.find(self.folder, stage)
 
     def work_folder(self, stage: str, key: str) -> Path:
         return self.folder / f".work-{stage}-{key}"
 
     def state(self, stage: str, key: str) -> StageState:
         stamp = self.stamp(stage)
-        if stamp and stamp["key"] == key:
-            return StageState(stage, "done", stamp["seconds"], stamp["finished"])
+        if stamp and stamp.key == key:
+            return StageState(stage, "done", stamp.seconds, stamp.finished)
         if self.work_folder(stage, key).is_dir():
             return StageState(stage, "begun")
         return StageState(stage, "stale" if stamp else "missing")
 
-    def make(self, stage: str, key: str, produce: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
+    def make(self, stage: str, key: str, produce: Callable[[Path], dict[str, Any]]) -> StageStamp:
         """Run ``produce(folder)`` in the stage's work folder and put the folder in its place.
 
         ``produce`` returns facts for the stamp. Seconds add up over interrupted attempts. A folder that was
@@ -83,7 +85,7 @@ class Store:
                 self._take_over_others(stage, work)
                 self._complete(stage, key, work, produce)
             self._put_in_place(work, self[stage])
-        return read_json(self[stage] / STAMP)
+        return StageStamp.read(self.folder, stage)
 
     def _complete(self, stage: str, key: str, work: Path, produce: Callable[[Path], dict[str, Any]]) -> None:
         clock = _Clock(work / ".seconds")
@@ -95,14 +97,14 @@ class Store:
         shutil.rmtree(work / EARLIER, ignore_errors=True)
         for draft in work.rglob(f".*{DRAFT}"):  # of attempts that were killed while writing
             draft.unlink()
-        stamp = {
-            "stage": stage,
-            "key": key,
-            "seconds": round(seconds, 3),
-            "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        stamp = StageStamp(
+            stage=stage,
+            key=key,
+            seconds=round(seconds, 3),
+            finished=datetime.now(UTC).isoformat(timespec="seconds"),
             **facts,
-        }
-        write_json(work / STAMP, stamp)
+        )
+        write_result(work / STAMP, stamp)
 
     def _take_over_others(self, stage: str, work: Path) -> None:
         """Drop unfinished folders of other inputs, but for their simulations."""

@@ -13,14 +13,29 @@ from ...identify.fit.multifidelity import CorrectionRound
 from ...identify.fit.multistart import MultistartResult, describe_starts
 from ...identify.fit.objective import MeasuredCurve
 from ...identify.fit.state import Calibration
-from ...identify.uncertainty.relaxation import assess_relaxation
+from ...identify.uncertainty.relaxation import RelaxationAssessment, assess_relaxation
 from ...identify.uncertainty.uncertainty import Uncertainty
 from ...indentation import Parameters
 from ...laws import FIBRED, FUNG, is_ogden
 from ...priors import SOURCE
+from ...results.base import Interval, Intervals
+from ...results.identification import (
+    CalibrationResult,
+    CalibrationUncertainty,
+    CorrelationMatrix,
+    MeshCorrectionRound,
+    ParameterBounds,
+    PriorShares,
+    SearchIteration,
+    SearchStage,
+    SearchStart,
+    SearchStarts,
+    StatedPrior,
+    StoredLaw,
+)
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import write_json
+from ..engine.storage import write_result
 from ..records.records import load_records
 from ..simulation.simulations import SimulationCache
 from .fine_meshes import correct_answer, mesh_coarser_in_background
@@ -28,7 +43,7 @@ from .intervals import sample_intervals
 from .problem import CalibrationProblem, build_problem
 from .record_simulator import RecordSimulator, WarmStarts
 from .search import search_from_starts
-from .simulation_warnings import contact_to_dict, warnings_to_dict
+from .simulation_warnings import summarise_contact, summarise_doubts
 
 
 def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
@@ -49,61 +64,43 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
         context, simulator, best.parameters, list(best.responses), folder / "coarser"
     )
     found, known = sample_intervals(context, problem, simulator, best, correction, spent)
+    relaxation = _assess_relaxation(study, problem, found, known, records.measured)
     simulations = simulator.run_answer(found.parameters)
     answers = {one.site: one for one in records.select_forces(simulations)}
     warnings = {site: list(one.warnings) for site, one in answers.items() if one.warnings}
     for site, texts in warnings.items():
         report(f"warning: site {site}, at the answer: {'; '.join(texts)}")
-    log = simulator.log
-    content = _calibration_to_dict(study, problem, found, known, simulator)
-    content["uncertainty"] |= _assess_relaxation(study, problem, found, known, records.measured)
-    content |= {
-        "corrections": [_round_record(one, found.sites, problem, study) for one in rounds],
-        "multistart": _multistart_to_dict(starts, study) if study.calibration.starts > 1 else None,
-        "warnings": warnings,
-        "contact": contact_to_dict(
+    log, bounds, example = simulator.log, problem.unknowns, cache.example()
+    content = CalibrationResult(
+        stages=[
+            _summarise_stage(found, i, problem, study, simulator.starts) for i in range(len(found.stages))
+        ],
+        bounds=ParameterBounds(lower=study.by_tissue(bounds.lower), upper=study.by_tissue(bounds.upper)),
+        law=StoredLaw(**study.law.record()),
+        objective=study.calibration.objective,
+        uncertainty=_summarise_uncertainty(known, study, relaxation),
+        forward_runs=len(cache),
+        forward_runs_with_sensitivities=cache.with_sensitivities(),
+        linear_solver=example.facts["linear_solver"] if example else None,
+        element=example.facts["element"] if example else None,
+        corrections=[_summarise_round(one, found.sites, problem, study) for one in rounds],
+        multistart=_summarise_starts(starts, study) if study.calibration.starts > 1 else None,
+        warnings=warnings,
+        contact=summarise_contact(
             answers,
             log.penalties,
             records.select_forces(simulator.respond(simulations)),
             records.select_forces(found.responses),
         ),
-        "doubts": warnings_to_dict(log.warnings, answers, log.evaluations * records.simulations, found),
-    }
-    write_json(folder / "calibration.json", content)
+        doubts=summarise_doubts(log.warnings, answers, log.evaluations * records.simulations, found),
+    )
+    write_result(folder / "calibration.json", content)
     return {}
 
 
-def _calibration_to_dict(
-    study: Study,
-    problem: CalibrationProblem,
-    found: Calibration,
-    known: Uncertainty,
-    simulator: RecordSimulator,
-) -> dict[str, Any]:
-    """What ``calibration.json`` holds."""
-    cache, bounds = simulator.cache, problem.unknowns
-    example = cache.example()
-    return {
-        "stages": [
-            _stage_to_dict(found, i, problem, study, simulator.starts) for i in range(len(found.stages))
-        ],
-        "bounds": {
-            "lower": study.by_tissue(bounds.lower),
-            "upper": study.by_tissue(bounds.upper),
-        },
-        "law": study.law.record(),
-        "objective": study.calibration.objective,
-        "uncertainty": _uncertainty_to_dict(known, study),
-        "forward_runs": len(cache),
-        "forward_runs_with_sensitivities": cache.with_sensitivities(),
-        "linear_solver": example.facts["linear_solver"] if example else None,
-        "element": example.facts["element"] if example else None,
-    }
-
-
-def _stage_to_dict(
+def _summarise_stage(
     found: Calibration, number: int, problem: CalibrationProblem, study: Study, warm_starts: WarmStarts
-) -> dict[str, Any]:
+) -> SearchStage:
     """One stage: from the start of the problem, or the end of the stage before, to its own end."""
     stage = found.stages[number]
     before = np.array(found.stages[number - 1].parameters) if number else problem.unknowns.start
@@ -112,81 +109,89 @@ def _stage_to_dict(
     def starts(parameters: Sequence[float]) -> list[Parameters]:
         return [study.by_tissue(one) for one in warm_starts.find(np.array(parameters))]
 
-    return {
-        "name": problem.titles[number],
-        "start": study.by_tissue(before),
-        "parameters": study.by_tissue(np.array(stage.parameters)),
-        "cost": stage.cost,
-        "evaluations": stage.evaluations,
-        "converged": stage.converged,
-        "reason": stage.reason,
-        "iterations": [
-            {
-                "iteration": i,
-                "parameters": study.by_tissue(np.array(iterate.parameters)),
-                "starts": starts(iterate.parameters),
-                "cost": iterate.cost,
-                "error_percent": float(np.mean(iterate.errors_percent)),
-                "error_percent_by_site": dict(zip(found.sites, iterate.errors_percent, strict=True)),
-            }
+    return SearchStage(
+        name=problem.titles[number],
+        start=study.by_tissue(before),
+        parameters=study.by_tissue(np.array(stage.parameters)),
+        cost=stage.cost,
+        evaluations=stage.evaluations,
+        converged=stage.converged,
+        reason=stage.reason,
+        iterations=[
+            SearchIteration(
+                iteration=i,
+                parameters=study.by_tissue(np.array(iterate.parameters)),
+                starts=starts(iterate.parameters),
+                cost=iterate.cost,
+                error_percent=float(np.mean(iterate.errors_percent)),
+                error_percent_by_site=dict(zip(found.sites, iterate.errors_percent, strict=True)),
+            )
             for i, iterate in enumerate(iterates)
         ],
-    }
+    )
 
 
-def _round_record(
+def _summarise_round(
     one: CorrectionRound, sites: Sequence[str], problem: CalibrationProblem, study: Study
-) -> dict[str, Any]:
+) -> MeshCorrectionRound:
     """One correction of the search by the whole meshes; percentages are of each site's largest force."""
-    return {
-        "stage": problem.titles[one.stage] if one.stage >= 0 else "start",
-        "parameters": study.by_tissue(np.array(one.parameters)),
-        "scale_by_site": dict(zip(sites, one.scales, strict=True)),
-        "difference_percent_by_site": dict(zip(sites, one.difference_percent, strict=True)),
-        "change_percent_by_site": dict(zip(sites, one.expected_percent, strict=True)),
-        "reason": one.reason,
-    }
+    return MeshCorrectionRound(
+        stage=problem.titles[one.stage] if one.stage >= 0 else "start",
+        parameters=study.by_tissue(np.array(one.parameters)),
+        scale_by_site=dict(zip(sites, one.scales, strict=True)),
+        difference_percent_by_site=dict(zip(sites, one.difference_percent, strict=True)),
+        change_percent_by_site=dict(zip(sites, one.expected_percent, strict=True)),
+        reason=one.reason,
+    )
 
 
-def _multistart_to_dict(tried: MultistartResult, study: Study) -> dict[str, Any]:
+def _summarise_starts(tried: MultistartResult, study: Study) -> SearchStarts:
     """What came of every start."""
     names = [f"{tissue}.{name}" for tissue, name in study.parameters]
-    return {
-        "summary": describe_starts(tried, names),
-        "reached": tried.reached,
-        "starts": [
-            {
-                "start": study.by_tissue(np.array(one.start)),
-                "parameters": None if one.parameters is None else study.by_tissue(np.array(one.parameters)),
-                **{
-                    key: getattr(one, key)
-                    for key in ("cost", "evaluations", "converged", "reason", "same", "apart")
-                },
-            }
-            for one in tried.starts
-        ],
-    }
+    starts = [
+        SearchStart(
+            start=study.by_tissue(np.array(one.start)),
+            parameters=None if one.parameters is None else study.by_tissue(np.array(one.parameters)),
+            cost=one.cost,
+            evaluations=one.evaluations,
+            converged=one.converged,
+            reason=one.reason,
+            same=one.same,
+            apart=one.apart,
+        )
+        for one in tried.starts
+    ]
+    return SearchStarts(summary=describe_starts(tried, names), reached=tried.reached, starts=starts)
 
 
-def _uncertainty_to_dict(known: Uncertainty, study: Study) -> dict[str, Any]:
+def _summarise_uncertainty(
+    known: Uncertainty, study: Study, relaxation: RelaxationAssessment | None
+) -> CalibrationUncertainty:
     """What is stored of the uncertainty; intervals by tissue and name, like the parameters."""
-    intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in study.tissues}
-    for (tissue, name), interval in zip(study.parameters, known.intervals_95.tolist(), strict=True):
-        intervals[tissue][name] = interval
-    return {
-        "method": known.method,
-        "intervals_95": intervals,
-        "correlation": {"names": list(known.names), "matrix": known.correlation.tolist()},
-        "covariance_log": known.covariance.tolist(),
-        "sampling_covariance_log": known.sampling_covariance.tolist(),
-        "verdict": dict(zip(known.names, known.verdicts, strict=True)),
-        "at_bound": dict(zip(known.names, map(bool, known.at_bound), strict=True)),
-        "combinations": [f"{c.text}: {c.verdict}" for c in known.combinations],
-        "most_probable": study.by_tissue(known.centre),
-        "priors": _priors_to_dict(known, study),
-        "residuals": known.residual_model.to_dict(),
-        "minus_2_log_evidence": known.minus_2_log_evidence,
-    }
+    verdicts = known.verdicts if relaxation is None else relaxation.qualify_verdicts(known)
+    return CalibrationUncertainty(
+        method=known.method,
+        intervals_95=group_intervals(known, study),
+        correlation=CorrelationMatrix(names=known.names, matrix=known.correlation.tolist()),
+        covariance_log=known.covariance.tolist(),
+        sampling_covariance_log=known.sampling_covariance.tolist(),
+        verdict=dict(zip(known.names, verdicts, strict=True)),
+        at_bound=dict(zip(known.names, map(bool, known.at_bound), strict=True)),
+        combinations=[f"{c.text}: {c.verdict}" for c in known.combinations],
+        most_probable=study.by_tissue(known.centre),
+        priors=_summarise_priors(known, study),
+        residuals=known.residual_model.summarise(),
+        minus_2_log_evidence=known.minus_2_log_evidence,
+        relaxation=None if relaxation is None else relaxation.summarise(known),
+    )
+
+
+def group_intervals(known: Uncertainty, study: Study) -> Intervals:
+    """The 95 % intervals by tissue and name."""
+    intervals: dict[str, dict[str, Interval]] = {tissue: {} for tissue in study.tissues}
+    for (tissue, name), (low, high) in zip(study.parameters, known.intervals_95.tolist(), strict=True):
+        intervals[tissue][name] = (low, high)
+    return intervals
 
 
 def _assess_relaxation(
@@ -195,29 +200,27 @@ def _assess_relaxation(
     found: Calibration,
     known: Uncertainty,
     measured: Sequence[MeasuredCurve],
-) -> dict[str, Any]:
-    """What is known of relaxation beyond the records, and the verdicts with that; none of other laws."""
+) -> RelaxationAssessment | None:
+    """What is known of relaxation beyond the records; none of other laws."""
     if not is_ogden(study.law.name) and study.law.name not in (FIBRED, FUNG):
-        return {"relaxation": None}
-    relaxation = assess_relaxation(
+        return None
+    return assess_relaxation(
         found.parameters, found.responses, measured, known.residual_model, problem.unknowns, problem.space
     )
-    if relaxation is None:
-        return {"relaxation": None}
-    verdicts = dict(zip(known.names, relaxation.qualify_verdicts(known), strict=True))
-    return {"verdict": verdicts, "relaxation": relaxation.to_dict(known)}
 
 
-def _priors_to_dict(known: Uncertainty, study: Study) -> dict[str, Any] | None:
+def _summarise_priors(known: Uncertainty, study: Study) -> PriorShares | None:
     """The priors that counted, and how much of each interval comes from them; none where none were stated."""
     if not study.priors:
         return None
     stated = study.calibration.prior
-    return {
-        "stated": {
-            name: {**prior.model_dump(), "source": "the study" if name in stated else SOURCE}
+    return PriorShares(
+        stated={
+            name: StatedPrior(
+                median=prior.median, factor=prior.factor, source="the study" if name in stated else SOURCE
+            )
             for name, prior in study.priors.items()
         },
-        "share": dict(zip(known.names, known.prior_share.tolist(), strict=True)),
-        "wider_without": dict(zip(known.names, known.wider_without.tolist(), strict=True)),
-    }
+        share=dict(zip(known.names, known.prior_share.tolist(), strict=True)),
+        wider_without=dict(zip(known.names, known.wider_without.tolist(), strict=True)),
+    )

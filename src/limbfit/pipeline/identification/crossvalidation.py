@@ -35,9 +35,10 @@ from ...identify.fit.parameters import Unknowns
 from ...identify.fit.prediction import compute_error_percent
 from ...identify.fit.state import CalibrationSettings
 from ...identify.uncertainty.emulator import Emulator
+from ...results.uncertainty import CrossvalidateResult, FoldCheck, FoldEmulator, HeldoutSite, OwnFold
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import write_json, write_table
+from ..engine.storage import write_result, write_rows, write_table
 from ..records.records import load_records
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import open_experiment_cache
@@ -95,8 +96,8 @@ def run_crossvalidate(
     checks = bench.check(first.spread(_CHECKED), 1)
     found = bench.validate(own_choice, chosen, regions)
     checks += bench.check(found.spread(_CHECKED), 2)
-    content = _to_content(context, bench, found, size, comb(len(recorded), size), checks)
-    write_json(folder / "crossvalidate.json", content)
+    content = _build_result(context, bench, found, size, comb(len(recorded), size), checks)
+    write_result(folder / "crossvalidate.json", content)
     _write_tables(folder, content)
     return {}
 
@@ -120,15 +121,15 @@ class _Bench:
     def __init__(self, context: Context, simulator: RecordSimulator, seed: int, runs: int) -> None:
         self.context, self.simulator = context, simulator
         study = context.study
-        stored = context.stored("calibrate", "calibration.json")
-        self.best = study.vector(stored["stages"][-1]["parameters"])
+        stored = context.results.calibration
+        self.best = study.vector(stored.parameters)
         self.bounds = build_unknowns(study).with_start(self.best)
         self.measured = simulator.records.measured
         of_site: dict[str, list[int]] = {}
         for i, one in enumerate(self.measured):
             of_site.setdefault(one.site_name, []).append(i)
         self.sites, self.groups = tuple(of_site), tuple(map(tuple, of_site.values()))
-        covariance = np.array(stored["uncertainty"]["covariance_log"])
+        covariance = np.array(stored.uncertainty.covariance_log)
         # Where nothing is known, fits go anywhere; the emulator must not.
         drawn = spread_points(self.best, covariance, self.bounds, runs, seed)
         correction = correct_to_fine_meshes(study, simulator, self.best)
@@ -178,7 +179,7 @@ class _Bench:
         numbered = fitted({str(i): choice for i, choice in enumerate(chosen)}, tell)
         return _Found(alone, tuple(replace(fold, label="") for fold in numbered), fitted(regions))
 
-    def check(self, folds: Sequence[Fold], number: int) -> list[dict[str, Any]]:
+    def check(self, folds: Sequence[Fold], number: int) -> list[FoldCheck]:
         """The solver's errors at the optima of some fits beside the emulator's, which then learns them."""
         emulated = [self.emulator(fold.parameters) for fold in folds]
         runs = self.learn([fold.parameters for fold in folds])
@@ -193,14 +194,14 @@ class _Bench:
             ]
             away = [compute_error_percent(cheap[i].force_N, run[i].force_N) for i in range(len(run))]
             rows.append(
-                {
-                    "round": number,
-                    "fitted": [self.sites[i] for i in fold.fitted],
-                    "heldout_emulated_percent": fold.mean_heldout,
-                    "heldout_solved_percent": float(np.mean(solved)),
-                    "emulator_error_percent": float(np.mean(away)),
-                    "emulator_error_largest_percent": float(np.max(away)),
-                }
+                FoldCheck(
+                    round=number,
+                    fitted=[self.sites[i] for i in fold.fitted],
+                    heldout_emulated_percent=fold.mean_heldout,
+                    heldout_solved_percent=float(np.mean(solved)),
+                    emulator_error_percent=float(np.mean(away)),
+                    emulator_error_largest_percent=float(np.max(away)),
+                )
             )
         return rows
 
@@ -210,68 +211,65 @@ def _describe_failed(run: Sequence[SiteResponse]) -> str:
     return ", ".join(response.site for response in run if not response.completed)
 
 
-def _to_content(
-    context: Context, bench: _Bench, found: _Found, size: int, possible: int, checks: list[dict[str, Any]]
-) -> dict[str, Any]:
+def _build_result(
+    context: Context, bench: _Bench, found: _Found, size: int, possible: int, checks: Sequence[FoldCheck]
+) -> CrossvalidateResult:
     """What ``crossvalidate.json`` holds."""
     names, sites = bench.bounds.names, bench.sites
     regions = {site.name: site.region for site in context.study.sites}
     place = rank_fold(found.own, found.folds)
     by_site = summarise_errors_by_site(found.folds, len(sites))
-    return {
-        "fitted_sites": size,
-        "choices": len(found.folds),
-        "choices_possible": possible,
-        "own": found.own.to_dict(sites, names)
-        | {
-            "share_better": place.share_better,
-            "median_percent": place.median_percent,
-            "low_percent": place.low_percent,
-            "high_percent": place.high_percent,
-        },
-        "sites": [
-            {
-                "site": name,
-                "region": regions[name],
-                "fitted": i in found.own.fitted,
-                "left_out_of": summary.sites,
-                "mean_percent": _to_plain(summary.mean_percent),
-                "sd_percent": _to_plain(summary.sd_percent),
-                "own_percent": found.own.errors_percent[i],
-            }
+    return CrossvalidateResult(
+        fitted_sites=size,
+        choices=len(found.folds),
+        choices_possible=possible,
+        own=OwnFold(
+            **dict(found.own.summarise(sites, names)),
+            share_better=place.share_better,
+            median_percent=place.median_percent,
+            low_percent=place.low_percent,
+            high_percent=place.high_percent,
+        ),
+        sites=[
+            HeldoutSite(
+                site=name,
+                region=regions[name],
+                fitted=i in found.own.fitted,
+                left_out_of=summary.sites,
+                mean_percent=_to_plain(summary.mean_percent),
+                sd_percent=_to_plain(summary.sd_percent),
+                own_percent=found.own.errors_percent[i],
+            )
             for i, (name, summary) in enumerate(zip(sites, by_site))
         ],
-        "regions": [fold.to_dict(sites, names) for fold in found.regions],
-        "folds": [fold.to_dict(sites, names) for fold in found.folds],
-        "at_limit_share": float(np.mean([bool(fold.at_limit) for fold in found.folds])),
-        "emulator": {
-            "runs": len(bench.points),
-            "loo_percent": float(np.median(bench.emulator.loo_percent)),
-            "checks": checks,
-        },
-    }
+        regions=[fold.summarise(sites, names) for fold in found.regions],
+        folds=[fold.summarise(sites, names) for fold in found.folds],
+        at_limit_share=float(np.mean([bool(fold.at_limit) for fold in found.folds])),
+        emulator=FoldEmulator(
+            runs=len(bench.points), loo_percent=float(np.median(bench.emulator.loo_percent)), checks=checks
+        ),
+    )
 
 
 def _to_plain(value: float) -> float | None:
     return None if np.isnan(value) else value
 
 
-def _write_tables(folder: Path, content: dict[str, Any]) -> None:
+def _write_tables(folder: Path, content: CrossvalidateResult) -> None:
     """Every fit and its errors, and errors by site, as CSV."""
-    sites = [row["site"] for row in content["sites"]]
-    names = list(content["own"]["parameters"])
+    sites = [row.site for row in content.sites]
+    names = list(content.own.parameters)
     heads = ["fitted", "mean_error_fitted_percent", "mean_error_heldout_percent", *names]
     heads += [f"error_{site}_percent" for site in sites]
     rows = [
         [
-            " ".join(fold["fitted"]),
-            fold["mean_error_fitted_percent"],
-            fold["mean_error_heldout_percent"],
-            *(fold["parameters"][name] for name in names),
-            *(fold["errors_percent"][site] for site in sites),
+            " ".join(fold.fitted),
+            fold.mean_error_fitted_percent,
+            fold.mean_error_heldout_percent,
+            *(fold.parameters[name] for name in names),
+            *(fold.errors_percent[site] for site in sites),
         ]
-        for fold in (content["own"], *content["folds"], *content["regions"])
+        for fold in (content.own, *content.folds, *content.regions)
     ]
     write_table(folder / "fits.csv", heads, rows)
-    keys = ("site", "region", "fitted", "left_out_of", "mean_percent", "sd_percent", "own_percent")
-    write_table(folder / "sites.csv", keys, [[row[key] for key in keys] for row in content["sites"]])
+    write_rows(folder / "sites.csv", content.sites)

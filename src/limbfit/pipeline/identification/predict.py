@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -12,16 +12,28 @@ import numpy as np
 
 from ...arrays import Array
 from ...identify.checks.domain import Extent, RecordedRange, describe_outside
-from ...identify.checks.fit_quality import FitQuality, assess_fit, refit_residuals, summarise_fit
+from ...identify.checks.fit_quality import assess_fit, refit_residuals, summarise_fit
 from ...identify.fit.correction import MeshCorrection
 from ...identify.fit.objective import SiteResponse, find_largest_magnitude
 from ...identify.fit.prediction import PredictionModel, compute_error_percent, summarise_errors
 from ...indentation import Simulation, SimulationJob, store_job_fields
+from ...results.identification import (
+    FitSummary,
+    ObservedError,
+    OutsideRecords,
+    PredictResult,
+    QuantityRange,
+    RecordedExtents,
+    RecordFit,
+    RecordPrediction,
+    SearchStage,
+    SimulationDoubt,
+)
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import write_curves, write_json
+from ..engine.storage import write_curves, write_result
 from ..records.deviations import estimate_site_deviation, estimate_site_noise
-from ..records.outliers import outliers_to_dict
+from ..records.outliers import check_records
 from ..records.records import (
     RecordSet,
     SiteRecord,
@@ -32,6 +44,7 @@ from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
 from ..simulation.simulations import SimulationCache
 
+Loading = tuple[Sequence[Extent], Sequence[OutsideRecords]]
 _MISSING = {
     "force": "no force is predicted",
     "interval": "no 95 % interval and no check against the other sites",
@@ -42,10 +55,10 @@ _MISSING = {
 def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     """Force at every recorded site with all materials and with one, intervals, and the fields at the peak."""
     study = context.study
-    calibration = context.stored("calibrate", "calibration.json")
-    answers = [Answer.of(stage, study) for stage in calibration["stages"]]
+    calibration = context.results.calibration
+    answers = [Answer.of(stage, study) for stage in calibration.stages]
     one, best = answers[0].parameters, answers[-1].parameters
-    known = PredictionModel.from_stored(calibration["uncertainty"])
+    known = PredictionModel.from_stored(calibration.uncertainty)
     records = load_records(context, study.recorded)
     cache = SimulationCache(
         folder / "runs", also=[context.store[stage] / "runs" for stage in ("calibrate", "predict")]
@@ -74,16 +87,27 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     bands = [_Band.compute(context, site, best, known) if site.ours.completed else None for site in sites]
     for site, band in zip(sites, bands, strict=True):
         _write_curves(folder, site, band)
-    rows = [_to_row(site) for site in sites]
-    for i, site in enumerate(sites):
-        rows[i]["observed"] = _write_observed(folder, site, None if near is None else near[i], best, known)
-    tested = _compare_with_records(context, sites, strains, rows)
-    doubts = outliers_to_dict(context, cache, records.own, ours, best, one, records.searched, correction)
+    observed = [
+        _write_observed(folder, site, None if near is None else near[i], best, known)
+        for i, site in enumerate(sites)
+    ]
+    tested, loadings = _compare_with_records(context, sites, strains)
+    rows = [_summarise_site(*parts) for parts in zip(sites, observed, loadings, strict=True)]
+    outside = {f"site {row.record}": row.outside_records for row in rows if not row.fitted}
+    warnings = check_records(context, cache, records.own, ours, best, one, records.searched, correction)
     judged = [(site, band) for site, band in zip(sites, bands, strict=True) if band is not None]
     quality = _assess_fits(context, judged, best, known)
-    fit = {"verdict": summarise_fit(quality), "records": [one.to_dict() for one in quality]}
-    content = {"sites": rows, **_compute_means(rows), **tested, **doubts, "fit_quality": fit}
-    write_json(folder / "predict.json", content)
+    content = PredictResult(
+        sites=rows,
+        recorded_range=RecordedExtents.model_validate(tested),
+        outside_text=describe_outside(outside),
+        flags=warnings.flags,
+        left_out=warnings.left_out,
+        failed=warnings.failed,
+        fit_quality=FitSummary(verdict=summarise_fit(quality), records=quality),
+        **_compute_means(rows),
+    )
+    write_result(folder / "predict.json", content)
     return {}
 
 
@@ -95,10 +119,10 @@ class Answer:
     starts: tuple[Array, ...]
 
     @classmethod
-    def of(cls, stage: dict[str, Any], study: Study) -> Answer:
+    def of(cls, stage: SearchStage, study: Study) -> Answer:
         """The answer of a stage as ``calibration.json`` holds it."""
-        starts = stage["iterations"][-1]["starts"]
-        return cls(study.vector(stage["parameters"]), tuple(study.vector(one) for one in starts))
+        starts = stage.iterations[-1].starts
+        return cls(study.vector(stage.parameters), tuple(study.vector(one) for one in starts))
 
 
 def build_answer_jobs(records: RecordSet, answer: Answer) -> list[SimulationJob]:
@@ -188,12 +212,8 @@ def _compare_with_records(
     context: Context,
     sites: Sequence[SitePrediction],
     strains: Mapping[str, Sequence[Extent]],
-    rows: Sequence[dict[str, Any]],
-) -> dict[str, Any]:
-    """Add to the ``rows`` of the sites what they do to the tissue, and what of it no fitted record did.
-
-    Returns what the fitted records did together, and what is outside in words.
-    """
+) -> tuple[RecordedRange, list[Loading]]:
+    """What the fitted records did to the tissue; what each site does, and what of it none of them did."""
     limb = LimbGeometry.stored(context.store)
     axis = LimbAxis(limb.anatomy)
 
@@ -214,13 +234,14 @@ def _compare_with_records(
     loading = {site.record.name: describe(site) for site in fitted}
     places = np.array([limb.place(site.record.site)[0] for site in fitted]).reshape(-1, 3)
     tested = RecordedRange.from_records(loading.values(), map(float, axis.measure_angle(places)))
-    for site, row in zip(sites, rows, strict=True):
-        name = site.record.name
-        own = loading.get(name) or describe(site, tested)
-        row["loading"] = [one.to_dict() for one in own]
-        row["outside_records"] = [] if name in loading else tested.find_outside(own)
-    outside = {f"site {row['record']}": row["outside_records"] for row in rows if not row["fitted"]}
-    return {"recorded_range": tested.to_dict(), "outside_text": describe_outside(outside)}
+    found: list[Loading] = []
+    for site in sites:
+        if (own := loading.get(site.record.name)) is not None:
+            found.append((own, ()))
+        else:
+            own = describe(site, tested)
+            found.append((own, tested.find_outside(own)))
+    return tested, found
 
 
 @dataclass(frozen=True)
@@ -261,7 +282,7 @@ def _write_curves(folder: Path, site: SitePrediction, band: _Band | None) -> Non
 
 def _assess_fits(
     context: Context, judged: Sequence[tuple[SitePrediction, _Band]], best: Array, known: PredictionModel
-) -> list[FitQuality]:
+) -> list[RecordFit]:
     """How well the model follows each record, beside its noise and the errors of its mesh and site."""
     sites = [site for site, _ in judged]
     allowed, residuals = [], [site.ours.force_N - site.record.compared for site in sites]
@@ -301,7 +322,7 @@ def _write_observed(
     near: Simulation | None,
     best: Array,
     known: PredictionModel,
-) -> list[dict[str, Any]]:
+) -> list[ObservedError]:
     """Everything that was seen beside a record's force with its prediction, as files and rows.
 
     ``near`` is the simulation with derivatives where that is another than the site's own.
@@ -322,23 +343,23 @@ def _write_observed(
             columns |= {f"{what}_low_{unit}": low, f"{what}_high_{unit}": high}
         write_curves(folder / f"{one.name}.csv", **columns)
         rows.append(
-            {
-                "kind": seen.kind,
-                "what": seen.what,
-                "name": one.name,
-                "unit": seen.unit,
-                "largest": find_largest_magnitude(one.compared),
-                "noise": seen.noise_sd,
+            ObservedError(
+                kind=seen.kind,
+                what=seen.what,
+                name=one.name,
+                unit=seen.unit,
+                largest=find_largest_magnitude(one.compared),
+                noise=seen.noise_sd,
                 **seen.facts,
-                "error_percent": compute_error_percent(whole.force_N, one.compared)
-                if whole.completed
-                else None,
-            }
+                error_percent=compute_error_percent(whole.force_N, one.compared) if whole.completed else None,
+            )
         )
     return rows
 
 
-def _to_row(site: SitePrediction) -> dict[str, Any]:
+def _summarise_site(
+    site: SitePrediction, observed: Sequence[ObservedError], loading: Loading
+) -> RecordPrediction:
     record, own = site.record, site.own
 
     def error(found: Simulation | SiteResponse | None) -> float | None:
@@ -346,39 +367,41 @@ def _to_row(site: SitePrediction) -> dict[str, Any]:
             return None
         return compute_error_percent(found.force_N, record.compared)
 
-    return {
-        "site": record.site.name,
-        "record": record.name,
-        "control": record.record.control,
-        "region": record.site.region,
-        "fitted": record.site.fitted,
-        "peak_force_N": float(record.force_N.max()),
-        "error_percent": error(own),
-        "error_one_material_percent": error(site.one),
-        "penetration_mm": own.penetration_mm,
-        "completed": own.completed,
-        "reason": own.reason,
-        "not_predicted": site.missing,
-        "warnings": site.warnings,
-        "doubts": [asdict(doubt) for doubt in own.doubts],
-        "steps": own.facts["steps"],
-        "element": own.facts["element"],
-    }
+    return RecordPrediction(
+        site=record.site.name,
+        record=record.name,
+        control=record.record.control,
+        region=record.site.region,
+        fitted=record.site.fitted,
+        peak_force_N=float(record.force_N.max()),
+        error_percent=error(own),
+        error_one_material_percent=error(site.one),
+        penetration_mm=own.penetration_mm,
+        completed=own.completed,
+        reason=own.reason,
+        not_predicted=site.missing,
+        warnings=site.warnings,
+        doubts=[SimulationDoubt.model_validate(doubt) for doubt in own.doubts],
+        steps=own.facts["steps"],
+        element=own.facts["element"],
+        observed=observed,
+        loading=[QuantityRange.model_validate(one) for one in loading[0]],
+        outside_records=loading[1],
+    )
 
 
-def _compute_means(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _compute_means(rows: Sequence[RecordPrediction]) -> dict[str, float | None]:
     """Mean and standard deviation of the errors of fitted and held-out sites; None where there are none.
 
     A site's is the mean of its records'.
     """
-    found: dict[str, Any] = {}
+    found: dict[str, float | None] = {}
     for kind, fitted in (("fitted", True), ("heldout", False)):
         errors: dict[str, list[float]] = {}
         for row in rows:
-            if row["fitted"] == fitted and row["error_percent"] is not None:
-                errors.setdefault(row["site"], []).append(row["error_percent"])
-        summary = asdict(summarise_errors([float(np.mean(of_site)) for of_site in errors.values()]))
-        for key in ("mean_percent", "sd_percent"):
-            name = f"{key.removesuffix('_percent')}_error_{kind}_percent"
-            found[name] = None if np.isnan(summary[key]) else summary[key]
+            if row.fitted == fitted and row.error_percent is not None:
+                errors.setdefault(row.site, []).append(row.error_percent)
+        summary = summarise_errors([float(np.mean(of_site)) for of_site in errors.values()])
+        for name, value in (("mean", summary.mean_percent), ("sd", summary.sd_percent)):
+            found[f"{name}_error_{kind}_percent"] = None if np.isnan(value) else value
     return found

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from ...fe import SimulationWarning
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.state import Calibration
 from ...indentation import Simulation
+from ...results.identification import ContactSummary, SearchDoubt, SimulationDoubt, SimulationDoubts
 
 
 @dataclass(frozen=True)
@@ -24,12 +24,12 @@ class SearchWarning:
     doubt: SimulationWarning
 
 
-def contact_to_dict(
+def summarise_contact(
     answers: Mapping[str, Simulation],
     searched: Mapping[str, float | None],
     rested: Sequence[SiteResponse],
     fitted: Sequence[SiteResponse],
-) -> dict[str, Any]:
+) -> dict[str, ContactSummary]:
     """Per site the penalty that all of its simulations hold, and what contact does at the answer.
 
     ``search_penalty_per_mm`` is that of the mesh on which parameters are searched; ``from_rest_percent`` how
@@ -38,20 +38,20 @@ def contact_to_dict(
     content = {}
     for (site, simulation), answer, fit in zip(answers.items(), rested, fitted, strict=True):
         off = np.max(np.abs(answer.force_N - fit.force_N)) / np.max(np.abs(fit.force_N))
-        content[site] = {
-            **{
-                key: simulation.facts.get(key) for key in ("penalty_per_mm", "sunk_steps", "unbalanced_steps")
-            },
-            "search_penalty_per_mm": searched.get(site),
-            "penetration_mm": simulation.penetration_mm,
-            "from_rest_percent": 100 * float(off) if np.isfinite(off) else None,
-        }
+        content[site] = ContactSummary(
+            penalty_per_mm=simulation.facts.get("penalty_per_mm"),
+            sunk_steps=simulation.facts.get("sunk_steps"),
+            unbalanced_steps=simulation.facts.get("unbalanced_steps"),
+            search_penalty_per_mm=searched.get(site),
+            penetration_mm=simulation.penetration_mm,
+            from_rest_percent=100 * float(off) if np.isfinite(off) else None,
+        )
     return content
 
 
-def warnings_to_dict(
+def summarise_doubts(
     searched: Sequence[SearchWarning], answers: Mapping[str, Simulation], simulations: int, found: Calibration
-) -> dict[str, Any]:
+) -> SimulationDoubts:
     """How many of the ``simulations`` of the search are doubtful, which, and what is at the answer.
 
     ``iterate`` is the number of the accepted iterate that a doubt belongs to, from the beginning of the best
@@ -61,20 +61,22 @@ def warnings_to_dict(
     for number, iterate in enumerate(found.history):
         accepted.setdefault(iterate.parameters, number)
     rows = [
-        {
-            "evaluation": one.evaluation,
-            "iterate": accepted.get(one.parameters),
-            "site": one.site,
-            "parameters": dict(zip(found.names, one.parameters, strict=True)),
+        SearchDoubt(
+            evaluation=one.evaluation,
+            iterate=accepted.get(one.parameters),
+            site=one.site,
+            parameters=dict(zip(found.names, one.parameters, strict=True)),
             **asdict(one.doubt),
-        }
+        )
         for one in searched
     ]
-    return {
-        "simulations": simulations,
-        "doubtful": len({(one.evaluation, one.site) for one in searched}),
-        "search": rows,
-        "answer": {
-            site: [asdict(doubt) for doubt in one.doubts] for site, one in answers.items() if one.doubts
+    return SimulationDoubts(
+        simulations=simulations,
+        doubtful=len({(one.evaluation, one.site) for one in searched}),
+        search=rows,
+        answer={
+            site: [SimulationDoubt.model_validate(doubt) for doubt in one.doubts]
+            for site, one in answers.items()
+            if one.doubts
         },
-    }
+    )

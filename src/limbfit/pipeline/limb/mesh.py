@@ -17,9 +17,10 @@ from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...anatomy.surfaces.thickness import read_thickness
 from ...arrays import Array
 from ...mesh import Mesh, write_vtu
+from ...results.limb import MeshingSettings, MeshMeasures, MeshResult, MeshSet
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import read_json, write_json
+from ..engine.storage import write_result
 from ..engine.store import COARSE
 from .files import THICKNESS
 
@@ -52,12 +53,13 @@ def mesh_job(
     study = context.study
     wider = max(study.width_at(study.site(site)) - study.indenter.width_mm, 0.0)
     settings = replace(settings, near_radius_mm=settings.near_radius_mm + wider / 2)
-    key = str((context.store.stamp("surfaces") or {})["key"])
+    stamp = context.store.stamp("surfaces")
+    assert stamp is not None
     surfaces = context.store["surfaces"]
-    return MeshJob(site, surfaces, key, tuple(position), tuple(axis), settings, file)
+    return MeshJob(site, surfaces, stamp.key, tuple(position), tuple(axis), settings, file)
 
 
-def make_mesh(job: MeshJob) -> dict[str, Any]:
+def make_mesh(job: MeshJob) -> MeshMeasures:
     """Mesh one site and store it; returns the facts that ``mesh.json`` holds."""
     shared = replace(job.settings, near_radius_mm=0.0)
     anatomy, base = _build_base(job.surfaces, job.surfaces_key, shared)
@@ -65,13 +67,18 @@ def make_mesh(job: MeshJob) -> dict[str, Any]:
     return keep_mesh(mesh, report, job.settings, job.file)
 
 
-def keep_mesh(mesh: Mesh, report: MeshReport, settings: MeshSettings, file: Path) -> dict[str, Any]:
+def keep_mesh(mesh: Mesh, report: MeshReport, settings: MeshSettings, file: Path) -> MeshMeasures:
     """Write a mesh, and beside it the facts that are returned."""
     write_vtu(mesh, file)
-    facts = {**asdict(report), "element": settings.element}
-    facts["repairs"] = [repair.text for repair in report.repairs]
-    write_json(file.with_suffix(".json"), facts)
+    repairs = [repair.text for repair in report.repairs]
+    facts = MeshMeasures(**asdict(report) | {"element": settings.element, "repairs": repairs})
+    write_result(file.with_suffix(".json"), facts)
     return facts
+
+
+def read_mesh_facts(file: Path) -> MeshMeasures:
+    """What `keep_mesh` wrote beside a mesh."""
+    return MeshMeasures.read_file(file.with_suffix(".json"), "delete its folder and run the command again")
 
 
 @lru_cache(maxsize=1)
@@ -129,40 +136,35 @@ def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
     Meshes of an interrupted run are kept.
     """
     study = context.study
-    content = _make_meshes(context, folder, mesh_settings(study), "")
+    content = MeshResult(**dict(_make_meshes(context, folder, mesh_settings(study), "")))
     coarse = build_coarse_settings(study)
     if coarse is not None:
         (folder / COARSE).mkdir(exist_ok=True)
-        content["coarse"] = _make_meshes(context, folder / COARSE, coarse, "coarse, ")
-    write_json(folder / "mesh.json", content)
+        made = _make_meshes(context, folder / COARSE, coarse, "coarse, ")
+        content = content.model_copy(update={"coarse": made})
+    write_result(folder / "mesh.json", content)
     for facts in (*folder.glob("*.vtu"), *folder.glob(f"{COARSE}/*.vtu")):
         facts.with_suffix(".json").unlink()
     return {}
 
 
-def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: str) -> dict[str, Any]:
+def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: str) -> MeshSet:
     """The meshes of all sites that are not there yet; returns what ``mesh.json`` holds of all."""
-    sites = context.stored("sites", "sites.json")["sites"]
     jobs = [
-        mesh_job(
-            context,
-            site["site"],
-            site["position_mm"],
-            site["axis"],
-            settings,
-            folder / f"{site['site']}.vtu",
-        )
-        for site in sites
+        mesh_job(context, one.site, one.position_mm, one.axis, settings, folder / f"{one.site}.vtu")
+        for one in context.results.sites.sites
     ]
-    facts = {job.site: read_json(job.file.with_suffix(".json")) for job in jobs if is_meshed(job.file)}
+    facts = {job.site: read_mesh_facts(job.file) for job in jobs if is_meshed(job.file)}
     missing = [job for job in jobs if job.site not in facts]
     context.tell("mesh", len(facts), len(jobs), word.removesuffix(", "))
     for job, made in zip(missing, context.executor.map(make_mesh, missing), strict=True):
         facts[job.site] = made
-        context.tell("mesh", len(facts), len(jobs), f"{word}site {job.site}: {made['nodes']} nodes")
-        for repair in made["repairs"]:
+        context.tell("mesh", len(facts), len(jobs), f"{word}site {job.site}: {made.nodes} nodes")
+        for repair in made.repairs:
             context.tell("mesh", len(facts), len(jobs), f"{word}site {job.site}: {repair}")
-    return {"settings": asdict(settings), "sites": {job.site: facts[job.site] for job in jobs}}
+    return MeshSet(
+        settings=MeshingSettings(**asdict(settings)), sites={job.site: facts[job.site] for job in jobs}
+    )
 
 
 def is_meshed(file: Path) -> bool:

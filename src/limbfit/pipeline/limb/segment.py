@@ -15,10 +15,11 @@ from ...anatomy.sites.marked import extract_marked_skin, remove_markers
 from ...anatomy.sites.registration import register_limb
 from ...anatomy.surfaces.surfaces import write_surface
 from ...report.drawing.sheet import draw_sheet
+from ...results.limb import MarkerImageMotion, SegmentResult
 from ...study import Study
 from ..engine.context import Context
-from ..engine.hand_labels import DIGEST, LABELS
-from ..engine.storage import compute_file_digest, write_json
+from ..engine.hand_labels import LABELS
+from ..engine.storage import compute_file_digest, write_result
 from .files import MARKED_SKIN, name_file_in_errors
 from .inputs import read_marked_image, read_study_image, read_study_labels, segment_automatically
 
@@ -42,13 +43,19 @@ def run_segment(context: Context, folder: Path) -> dict[str, Any]:
     write_labels(folder / LABELS, labels)
     write_contours(folder / "contours.csv", labels)
     quality = assess_labels(labels)
-    write_json(folder / "quality.json", quality.as_json())
+    write_result(folder / "quality.json", quality.summarise())
     draw_sheet(folder / "quality.png", volume, labels, quality)
     context.tell("segment", 2, 3, "outlining the skin with markers")
-    facts = {"method": method, "volumes_cm3": label_volumes(labels), "repairs": notes}
-    facts["warnings"] = [f"image: {note}" for note in volume.notes]
-    facts[DIGEST] = compute_file_digest(folder / LABELS)
-    write_json(folder / "segment.json", facts | removed | store_second_skin(study, volume, labels, folder))
+    found = SegmentResult(
+        method=method,
+        volumes_cm3=label_volumes(labels),
+        repairs=notes,
+        warnings=[f"image: {note}" for note in volume.notes],
+        labels_sha256=compute_file_digest(folder / LABELS),
+        markers_removed=removed,
+        motion=store_second_skin(study, volume, labels, folder),
+    )
+    write_result(folder / "segment.json", found)
     return {}
 
 
@@ -61,31 +68,36 @@ def label_volumes(labels: LabelMap) -> dict[str, float]:
     }
 
 
-def remove_own_markers(study: Study, volume: Volume, folder: Path) -> tuple[Volume, dict[str, Any]]:
+def remove_own_markers(study: Study, volume: Volume, folder: Path) -> tuple[Volume, int | None]:
     """The image without the markers on its skin, if the study says that there are some; else as it is.
 
-    The skin with them on is stored in ``folder``. The facts say how many were taken off.
+    The skin with them on is stored in ``folder``. The number says how many were taken off.
     """
     assert study.image is not None
     if study.image.markers != "same":
-        return volume, {}
+        return volume, None
     with name_file_in_errors(study.path(study.image.path)):
         skin, _ = extract_marked_skin(volume)
         plain, count = remove_markers(volume, skin)
     write_surface(folder / MARKED_SKIN, skin)
-    return plain, {"markers_removed": count}
+    return plain, count
 
 
-def store_second_skin(study: Study, volume: Volume, labels: LabelMap, folder: Path) -> dict[str, Any]:
+def store_second_skin(
+    study: Study, volume: Volume, labels: LabelMap, folder: Path
+) -> MarkerImageMotion | None:
     """Store the skin of the second image, moved to where the limb lies in the first; how it was moved."""
     marked = read_marked_image(study)
     if marked is None:
-        return {}
+        return None
     assert study.image is not None
     assert study.image.marked is not None
     with name_file_in_errors(study.path(study.image.marked)):
         skin, _ = extract_marked_skin(marked)
         motion = register_limb(volume, marked, labels.limb)
     write_surface(folder / MARKED_SKIN, replace(skin, points=motion.apply(skin.points)))
-    measures = {"shift_mm": motion.shift_mm, "turn_deg": motion.turn_deg, "correlation": motion.correlation}
-    return {"motion": {name: round(value, 3) for name, value in measures.items()}}
+    return MarkerImageMotion(
+        shift_mm=round(motion.shift_mm, 3),
+        turn_deg=round(motion.turn_deg, 3),
+        correlation=round(motion.correlation, 3),
+    )

@@ -11,9 +11,10 @@ from ...anatomy.sites.markers import find_markers, match_markers
 from ...anatomy.sites.sites import compute_indenter_axis, project_to_skin
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy, read_surface
 from ...errors import SiteError
+from ...results.limb import MarkerEvidence, PlacedSite, SitesResult
 from ...study import Site, Study
 from ..engine.context import Context
-from ..engine.storage import write_json
+from ..engine.storage import write_result
 from .files import MARKED_SKIN
 
 
@@ -26,7 +27,7 @@ def run_sites(context: Context, folder: Path) -> dict[str, Any]:
     context.tell("sites", 0, 1, "placing sites")
     markers = _match_markers(context, anatomy)
     placed = [place_site(site, study, anatomy, markers.get(site.name)) for site in study.sites]
-    write_json(folder / "sites.json", {"sites": placed})
+    write_result(folder / "sites.json", SitesResult(sites=placed))
     return {}
 
 
@@ -38,7 +39,7 @@ def _match_markers(context: Context, anatomy: Anatomy) -> dict[str, Any]:
     return dict(match_markers(find_markers(marked, anatomy.skin), hints))
 
 
-def place_site(site: Site, study: Study, anatomy: Anatomy, marker: Any) -> dict[str, Any]:
+def place_site(site: Site, study: Study, anatomy: Anatomy, marker: Any) -> PlacedSite:
     """A site on the skin with its axis; ``marker`` is what was matched to it, or None.
 
     Raises
@@ -58,14 +59,16 @@ def place_site(site: Site, study: Study, anatomy: Anatomy, marker: Any) -> dict[
     if marker is not None:
         assert site.near is not None
         distance = float(np.linalg.norm(marker.position - np.array(site.near)))
-        evidence = {"height_mm": round(float(marker.height), 3), "distance_to_hint_mm": round(distance, 3)}
+        evidence = MarkerEvidence(
+            height_mm=round(float(marker.height), 3), distance_to_hint_mm=round(distance, 3)
+        )
     unit = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
-    return {
-        "site": site.name,
-        "region": site.region,
-        "fitted": site.fitted,
-        "position_mm": [float(x) for x in point],
-        "axis": [float(x) for x in unit],
-        "off_skin_mm": round(float(off), 3),
-        "marker": evidence,
-    }
+    return PlacedSite(
+        site=site.name,
+        region=site.region,
+        fitted=site.fitted,
+        position_mm=point.tolist(),
+        axis=unit.tolist(),
+        off_skin_mm=round(float(off), 3),
+        marker=evidence,
+    )

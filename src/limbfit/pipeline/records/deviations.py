@@ -56,12 +56,12 @@ def _estimate_curve_noise(study: Study, record: SiteRecord, force_N: Array) -> S
     A stated force has corners of its own: there it is by what regularising took away.
     """
     trace, smooth, facts = read_record(study, record.record)
-    since = trace.time_s - facts["touch_down_s"]
+    since = trace.time_s - facts.touch_down_s
     inside = (since >= 0) & (since <= smooth.time_s[-1])
     force = np.interp(since, smooth.time_s, smooth.force_N)
     residual, scatter = (trace.force_N - force)[inside], None
     if record.record.forced:
-        moved = trace.displacement_mm[inside] - facts["touch_down_mm"]
+        moved = trace.displacement_mm[inside] - facts.touch_down_mm
         residual = moved - np.interp(since[inside], smooth.time_s, smooth.displacement_mm)
     else:
         pressed = inside & (force > _PRESSED_SHARE * smooth.peak_force_N)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
-from typing import Any
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,13 +15,23 @@ from ...identify.checks.plausibility import explain_warnings
 from ...identify.fit.correction import MeshCorrection
 from ...identify.fit.objective import SiteResponse
 from ...indentation import SimulationJob
+from ...results.identification import LeftOutRecord
+from ...results.records import RecordFlag
 from ..engine.context import Context
 from ..simulation.simulations import SimulationCache
 from .record_checks import read_record_warnings
 from .records import SiteRecord, to_response
 
 
-def outliers_to_dict(
+class RecordChecks(NamedTuple):
+    """What ``predict.json`` holds of the checks of the records."""
+
+    flags: list[RecordFlag]
+    left_out: list[LeftOutRecord]
+    failed: list[str]
+
+
+def check_records(
     context: Context,
     cache: SimulationCache,
     records: Sequence[SiteRecord],
@@ -30,8 +40,8 @@ def outliers_to_dict(
     one: Array,
     searched: Sequence[SiteRecord],
     correction: MeshCorrection | None,
-) -> dict[str, Any]:
-    """What ``predict.json`` holds of flags: on the records themselves, and on those that the model misses.
+) -> RecordChecks:
+    """Warnings about the records themselves, and about those that the model misses.
 
     Parameters
     ----------
@@ -69,11 +79,11 @@ def outliers_to_dict(
         exactly,
         one,
     )
-    left_out = [{**asdict(entry), "standardised": entry.standardised} for entry in found.left_out]
-    flags = [flag.to_dict() | {"found": "in the record"} for flag in plain]
     against = explain_warnings(found.warnings, plain)
-    flags += [flag.to_dict() | {"found": "against the model"} for flag in against]
-    return {"flags": flags, "left_out": left_out, "failed": list(dict.fromkeys(failed))}
+    flags = [RecordFlag(**flag.to_dict(), found="in the record") for flag in plain]
+    flags += [RecordFlag(**flag.to_dict(), found="against the model") for flag in against]
+    left_out = [LeftOutRecord.model_validate(entry) for entry in found.left_out]
+    return RecordChecks(flags, left_out, list(dict.fromkeys(failed)))
 
 
 def _build_exchange(records: Sequence[SiteRecord]) -> Callable[[LogLinearModel], Exchange]:

@@ -10,6 +10,7 @@ from typing import Any
 import tomlkit
 
 from ...indentation import SiteModel
+from ...results.planning import ProtocolRecord
 
 # Standard deviations of what can be read beside the force, and how their files end.
 SEEN = {
@@ -58,21 +59,21 @@ def press(model: SiteModel, depth: float, speed: float, hold: float) -> SiteMode
     return replace(model, knots_s=times, knots_mm=depths)
 
 
-def write_records(file: Path, records: Sequence[Mapping[str, Any]], seen: Mapping[str, Any]) -> None:
+def write_records(file: Path, records: Sequence[ProtocolRecord], seen: Mapping[str, Any]) -> None:
     """The tables ``[[records]]`` of a study that makes them."""
-    tables, number = tomlkit.aot(), dict.fromkeys((row["site"] for row in records), 0)
+    tables, number = tomlkit.aot(), dict.fromkeys((row.site for row in records), 0)
     for row in records:
-        number[row["site"]] += 1
+        number[row.site] += 1
         table = tomlkit.table()
-        name = f"{number[row['site']]}"
-        table.update({"site": row["site"], "name": name, "trace": f"records/{row['site']}-{name}.csv"})
-        if row["indenter"] != "indenter":
-            table["indenter"] = row["indenter"]
+        name = f"{number[row.site]}"
+        table.update({"site": row.site, "name": name, "trace": f"records/{row.site}-{name}.csv"})
+        if row.indenter != "indenter":
+            table["indenter"] = row.indenter
         for key, end in SEEN.items():
             if seen[key] is not None:
-                table[key.partition("_sd")[0]] = f"records/{row['site']}-{name}-{end}.csv"
+                table[key.partition("_sd")[0]] = f"records/{row.site}-{name}-{end}.csv"
                 table[key] = seen[key]
-        table.update({key: round(row[key], 3) for key in ("depth_mm", "speed_mm_s", "hold_s")})
+        table.update({key: round(getattr(row, key), 3) for key in ("depth_mm", "speed_mm_s", "hold_s")})
         tables.append(table)
     document = tomlkit.document()
     document["records"] = tables

@@ -11,18 +11,18 @@ from ...anatomy.sites.sites import compute_indenter_axis, measure_tissue_under
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...identify.checks.plausibility import RecordFacts, RecordWarning, check_plausibility
 from ...indentation import compute_contact_radius
+from ...results.limb import PlacedSite
+from ...results.records import RecordRemark, TraceFacts
 from ...study import Record, Study
 from ..engine.context import Context
 from ..engine.storage import read_curves
-
-Placed = Mapping[str, Mapping[str, Any]]
 
 
 def read_record_warnings(context: Context) -> tuple[RecordWarning, ...]:
     """Flags on all records from the stages ``surfaces``, ``sites`` and ``traces``."""
     study = context.study
-    traces = context.stored("traces", "traces.json")["sites"]
-    rows = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}
+    traces = context.results.traces.sites
+    rows = {row.site: row for row in context.results.sites.sites}
     steps = {
         name: _step(read_curves(context.store["traces"] / f"{name}-raw.csv")["time_s"]) for name in traces
     }
@@ -37,9 +37,9 @@ def tell_flags(context: Context) -> None:
 
 def record_flags(
     study: Study,
-    records: Mapping[str, Mapping[str, Any]],
+    records: Mapping[str, TraceFacts],
     steps_s: Mapping[str, float],
-    placed: Placed,
+    placed: Mapping[str, PlacedSite],
     anatomy: Anatomy | None,
 ) -> tuple[RecordWarning, ...]:
     """Flags on the records.
@@ -63,41 +63,41 @@ def record_flags(
         )
         for one in recorded
     ]
-    remarks = tuple(_flag(one.name, r) for one in recorded for r in records[one.name].get("remarks", ()))
+    remarks = tuple(_flag(one.name, r) for one in recorded for r in records[one.name].remarks)
     return (*remarks, *check_plausibility(facts))
 
 
-def _flag(site: str, remark: Mapping[str, Any]) -> RecordWarning:
+def _flag(site: str, remark: RecordRemark) -> RecordWarning:
     """What reading a record had to say about it."""
-    return RecordWarning((site,), **remark)
+    return RecordWarning((site,), **remark.to_plain())
 
 
 def _collect_facts(
     stated: Record,
-    record: Mapping[str, Any],
+    record: TraceFacts,
     step_s: float,
     radius: float,
-    row: Mapping[str, Any] | None,
+    row: PlacedSite | None,
     anatomy: Anatomy | None,
 ) -> RecordFacts:
     facts: dict[str, Any] = {}
     if row is not None and anatomy is not None:
         width = radius * np.sqrt(np.pi)
-        axis = np.array(row["axis"])
-        normal = compute_indenter_axis(anatomy.skin, row["position_mm"], width)
+        axis = np.array(row.axis)
+        normal = compute_indenter_axis(anatomy.skin, row.position_mm, width)
         facts = {
-            "position_mm": tuple(row["position_mm"]),
-            "thickness_mm": measure_tissue_under(anatomy, row["position_mm"], normal, width),
+            "position_mm": row.position_mm,
+            "thickness_mm": measure_tissue_under(anatomy, row.position_mm, normal, width),
             "axis_deg": float(np.degrees(np.arccos(np.clip(axis @ normal, -1, 1)))),
-            "off_skin_mm": row["off_skin_mm"] if row["marker"] is None else None,
-            "hint_mm": None if row["marker"] is None else row["marker"]["distance_to_hint_mm"],
+            "off_skin_mm": row.off_skin_mm if row.marker is None else None,
+            "hint_mm": None if row.marker is None else row.marker.distance_to_hint_mm,
         }
     return RecordFacts(
         site=stated.name,
         place=stated.site.name,
-        peak_N=record["peak_force_N"],
-        depth_mm=record["depth_mm"],
-        speed_mm_s=abs(record["speed_load_mm_s"]),
+        peak_N=record.peak_force_N,
+        depth_mm=record.depth_mm,
+        speed_mm_s=abs(record.speed_load_mm_s),
         step_s=step_s,
         radius_mm=radius,
         **facts,

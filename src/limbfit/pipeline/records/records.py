@@ -210,7 +210,7 @@ def load_site_record(context: Context, record: Record) -> SiteRecord:
         smoothing=stored.smoothing,
         nested_mm=study.within_mm if study.mesh.coarse is None else None,
         secondary=build_secondary_values(record, stored, points),
-        touch_down_sd_mm=stored.facts["touch_down_uncertainty_mm"],
+        touch_down_sd_mm=stored.facts.touch_down_uncertainty_mm,
         error_share=study.calibration.force_error_percent / 100.0,
     )
 
@@ -229,9 +229,9 @@ def _build_model(
 ) -> tuple[SiteModel, ChosenPoints | None]:
     """A site driven by one of its records, and the points of its surface that are compared, if any."""
     facts = stored.facts
-    force = facts["knots_N"] if record.forced else ()
-    model = build_site_model(context, record, facts["knots_s"], facts["knots_mm"], force, stored.tissues)
-    points, waves = None, facts.get("waves", [])
+    force = (facts.knots_N or ()) if record.forced else ()
+    model = build_site_model(context, record, facts.knots_s, facts.knots_mm, force, stored.tissues)
+    points, waves = None, facts.waves
     if stored.motion is None and not waves:
         return model, None
     mesh = read_vtu(model.mesh)

@@ -30,6 +30,7 @@ from ...indentation import (
     to_vector3,
 )
 from ...mesh import Mesh
+from ...results.records import LayerRecord, TraceFacts, WaveRecord
 from ...study import Record, Study, Vector
 from ...traces import SurfaceMotion, Thinning, WaveMeans
 from ..engine.storage import read_curves, write_curves
@@ -54,7 +55,7 @@ class StoredRecord:
     ``motion`` of the surface, where nothing of the kind is compared.
     """
 
-    facts: dict[str, Any]
+    facts: TraceFacts
     curves: dict[str, Array]
     smoothing: Array
     layers: dict[str, Array]
@@ -64,20 +65,20 @@ class StoredRecord:
     @property
     def tissues(self) -> list[str]:
         """The tissues whose compression is compared."""
-        return [name for name, facts in self.facts.get("layers", {}).items() if facts["compared"]]
+        return [name for name, layer in self.facts.layers.items() if layer.compared]
 
 
 def read_stored_record(store: Store, record: Record) -> StoredRecord:
     """What `run_traces` stored of a record."""
-    folder, facts = store["traces"], store.read("traces", "traces.json")["sites"][record.name]
-    layers = any(one["compared"] for one in facts.get("layers", {}).values())
+    folder, facts = store["traces"], store.results.traces.sites[record.name]
+    layers = any(layer.compared for layer in facts.layers.values())
     return StoredRecord(
         facts=facts,
         curves=read_curves(folder / f"{record.name}.csv"),
         smoothing=np.load(folder / SMOOTHING.format(record.name)),
         layers=read_curves(folder / LAYERS.format(record.name)) if layers else {},
-        waves=read_curves(folder / WAVES.format(record.name)) if facts.get("waves") else {},
-        motion=read_motion(folder, record) if facts.get("surface", {}).get("compared") else None,
+        waves=read_curves(folder / WAVES.format(record.name)) if facts.waves else {},
+        motion=read_motion(folder, record) if facts.surface is not None and facts.surface.compared else None,
     )
 
 
@@ -233,30 +234,30 @@ def build_secondary_values(
     """
     times_s, found = stored.curves["time_s"], list[SecondaryValues]()
     for number, tissue in enumerate(stored.tissues):
-        facts = stored.facts["layers"][tissue]
+        facts = stored.facts.layers[tissue]
         found.append(_build_layer_measurement(tissue, facts, stored.layers, number, times_s))
     first = len(found)
     if points is not None:
         assert stored.motion is not None
         found.append(_build_surface_measurement(record, points, stored.motion, first, times_s))
         first += 3 * len(points.points)
-    for number, place in enumerate(stored.facts.get("waves", [])):
+    for number, place in enumerate(stored.facts.waves):
         own = {name: values[stored.waves["place"] == number] for name, values in stored.waves.items()}
-        found.append(_build_wave_measurement(record, place["name"], own, first + number, times_s))
+        found.append(_build_wave_measurement(record, place.name, own, first + number, times_s))
     return tuple(found)
 
 
 def _build_layer_measurement(
-    tissue: str, stated: dict[str, Any], curves: dict[str, Array], number: int, times_s: Array
+    tissue: str, stated: LayerRecord, curves: dict[str, Array], number: int, times_s: Array
 ) -> LayerMeasurement:
     thinning = Thinning(
         tissue,
-        stated["thickness_mm"],
+        stated.thickness_mm,
         curves["time_s"],
         curves[f"{tissue}_mm"],
         curves["samples"],
-        stated["before"],
-        stated["sd_mm"],
+        stated.before,
+        stated.sd_mm,
     )
     n = len(thinning.time_s)
     return LayerMeasurement(
@@ -266,7 +267,7 @@ def _build_layer_measurement(
         np.full(n, number),
         _build_interpolation(times_s, thinning.time_s),
         thinning.covariance,
-        {"sd": stated["sd_mm"], "thickness_mm": stated["thickness_mm"], "compared": f"{n} times"},
+        {"sd": stated.sd_mm, "thickness_mm": stated.thickness_mm, "compared": f"{n} times"},
     )
 
 
@@ -432,7 +433,7 @@ def _spread(points: Array, first: int) -> Ints:
 
 
 def place_waves(
-    study: Study, record: Record, model: SiteModel, mesh: Mesh, waves: Sequence[Mapping[str, Any]]
+    study: Study, record: Record, model: SiteModel, mesh: Mesh, waves: Sequence[WaveRecord]
 ) -> tuple[WavePlace, ...]:
     """Where the shear waves of a record are, in the site's own mesh; ``waves`` as ``traces.json`` has them.
 
@@ -443,7 +444,7 @@ def place_waves(
     """
     assert record.shear_waves is not None
     try:
-        return place_waves_under(model, mesh, [(one["tissue"], one["depth_mm"]) for one in waves])
+        return place_waves_under(model, mesh, [(one.tissue, one.depth_mm) for one in waves])
     except ProblemError as error:
         file = study.path(record.shear_waves)
         what = f"site {record.site.name}: {error.what}"

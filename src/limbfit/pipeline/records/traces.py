@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,6 +10,15 @@ import numpy as np
 
 from ...errors import TraceError
 from ...phases import MotionPhase, describe_phases
+from ...results.records import (
+    LayerRecord,
+    RecordPhase,
+    RecordRemark,
+    SurfaceRecord,
+    TraceFacts,
+    TracesResult,
+    WaveRecord,
+)
 from ...study import Record, Study
 from ...traces import (
     Creep,
@@ -33,7 +41,7 @@ from ...traces import (
     select_frames_in_contact,
 )
 from ..engine.context import Context
-from ..engine.storage import write_curves, write_json
+from ..engine.storage import write_curves, write_result
 from ..limb.files import LAYERS, SMOOTHING, WAVES
 from ..simulation.simulations import CURVE_POINTS
 from .secondary_measurements import write_motion
@@ -50,7 +58,7 @@ class SecondaryMeasurement(NamedTuple):
     waves: tuple[tuple[WaveSpeeds, WaveMeans], ...] = ()
 
 
-def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, dict[str, Any]]:
+def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, TraceFacts]:
     """A record as it is used, its regularised curves and the facts that ``traces.json`` holds."""
     table = study.traces
     file = study.path(record.trace)
@@ -62,25 +70,27 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, dict[
         smooth = made(trace, touch, table.smoothing, record.peak_s)
     except TraceError as error:
         raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
-    facts = {
-        "site": record.site.name,
-        "control": record.control,
-        "touch_down_s": touch.time_s,
-        "touch_down_mm": touch.displacement_mm,
-        "touch_down_uncertainty_mm": touch.uncertainty_mm,
-        "peak_s": touch.time_s + smooth.peak_s,
-        "peak_force_N": smooth.peak_force_N,
-        "depth_mm": smooth.depth_mm,
-        "noise_N": smooth.noise_N,
-        "speed_load_mm_s": smooth.speed_load_mm_s,
-        "speed_unload_mm_s": None if np.isnan(smooth.speed_unload_mm_s) else smooth.speed_unload_mm_s,
-        "phases": _phases_to_rows(trace, smooth, touch),
-        "phases_in_words": describe_phases(smooth.phases),
-        "knots_s": smooth.knots_s.tolist(),
-        "knots_mm": smooth.knots_mm.tolist(),
-        "knots_N": smooth.knots_N.tolist() if isinstance(smooth, Creep) else None,
-        "remarks": [asdict(remark) for remark in (*_list_reading_remarks(trace), *known.remarks)],
-    }
+    facts = TraceFacts(
+        site=record.site.name,
+        control=record.control,
+        touch_down_s=touch.time_s,
+        touch_down_mm=touch.displacement_mm,
+        touch_down_uncertainty_mm=touch.uncertainty_mm,
+        peak_s=touch.time_s + smooth.peak_s,
+        peak_force_N=smooth.peak_force_N,
+        depth_mm=smooth.depth_mm,
+        noise_N=smooth.noise_N,
+        speed_load_mm_s=smooth.speed_load_mm_s,
+        speed_unload_mm_s=None if np.isnan(smooth.speed_unload_mm_s) else smooth.speed_unload_mm_s,
+        phases=_phases_to_rows(trace, smooth, touch),
+        phases_in_words=describe_phases(smooth.phases),
+        knots_s=smooth.knots_s.tolist(),
+        knots_mm=smooth.knots_mm.tolist(),
+        knots_N=smooth.knots_N.tolist() if isinstance(smooth, Creep) else None,
+        remarks=[
+            RecordRemark.model_validate(remark) for remark in (*_list_reading_remarks(trace), *known.remarks)
+        ],
+    )
     return trace, smooth, facts
 
 
@@ -92,13 +102,13 @@ def _list_reading_remarks(trace: Trace) -> tuple[Remark, ...]:
     return (Remark("reading", "; ".join(trace.notes), cause, remedy, {}),)
 
 
-def _phases_to_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[dict[str, Any]]:
+def _phases_to_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[RecordPhase]:
     """What the indenter does, in times of the record and in mm from touch-down."""
     first_s, first_mm = float(trace.time_s[0]), float(trace.displacement_mm[0]) - touch.displacement_mm
     phases = [phase.later(touch.time_s) for phase in smooth.phases]
     if touch.time_s > first_s:
         phases.insert(0, MotionPhase("approach", first_s, touch.time_s, first_mm, 0.0))
-    return [{**asdict(phase), "rate_mm_s": phase.rate_mm_s} for phase in phases]
+    return [RecordPhase.model_validate(phase) for phase in phases]
 
 
 def run_traces(context: Context, folder: Path) -> dict[str, Any]:
@@ -108,7 +118,6 @@ def run_traces(context: Context, folder: Path) -> dict[str, Any]:
     for i, record in enumerate(recorded):
         context.tell("traces", i, len(recorded), f"site {record.name}")
         trace, smooth, told = read_record(context.study, record)
-        facts[record.name] = told
         write_curves(
             folder / f"{record.name}-raw.csv",
             time_s=trace.time_s,
@@ -123,13 +132,13 @@ def run_traces(context: Context, folder: Path) -> dict[str, Any]:
             force_N=even.force_N,
         )
         np.save(folder / SMOOTHING.format(record.name), smooth.curve.response(even.time_s))
-        seen = read_observed(context.study, record, trace, told["touch_down_s"], smooth)
-        told |= observed_to_facts(record, seen)
+        seen = read_observed(context.study, record, trace, told.touch_down_s, smooth)
+        facts[record.name] = told = told.model_copy(update=observed_to_facts(record, seen))
         store_observed(folder, record, seen)
         for what in describe_still_values(told):
             words = f"site {record.name}, {what} hardly gives way, and is not compared"
             context.tell("traces", i, len(recorded), words)
-    write_json(folder / "traces.json", {"sites": facts})
+    write_result(folder / "traces.json", TracesResult(sites=facts))
     return {}
 
 
@@ -204,43 +213,43 @@ def observed_to_facts(record: Record, seen: SecondaryMeasurement) -> dict[str, A
     facts: dict[str, Any] = {}
     if seen.layers:
         facts["layers"] = {
-            one.tissue: {
-                "thickness_mm": one.thickness_mm,
-                "compression_mm": float(one.compression_mm.max()),
-                "before": one.before,
-                "sd_mm": one.sd_mm,
-                "compared": one.is_seen,
-            }
+            one.tissue: LayerRecord(
+                thickness_mm=one.thickness_mm,
+                compression_mm=float(one.compression_mm.max()),
+                before=one.before,
+                sd_mm=one.sd_mm,
+                compared=one.is_seen,
+            )
             for one in seen.layers
         }
     if (motion := seen.motion) is not None:
         frames, points, _ = motion.moved_mm.shape
-        facts["surface"] = {
-            "points": points,
-            "frames": frames,
-            "displacement_mm": motion.largest_mm,
-            "sd_mm": record.surface_sd_mm,
-            "compared": motion.largest_mm > SEEN * record.surface_sd_mm,
-        }
+        facts["surface"] = SurfaceRecord(
+            points=points,
+            frames=frames,
+            displacement_mm=motion.largest_mm,
+            sd_mm=record.surface_sd_mm,
+            compared=motion.largest_mm > SEEN * record.surface_sd_mm,
+        )
     if seen.waves:
         facts["waves"] = [
-            {
-                "name": place.name,
-                "tissue": place.tissue,
-                "depth_mm": place.depth_mm,
-                "readings": int(means.samples.sum()),
-                "from_m_s": float(means.speed_m_s.min()),
-                "to_m_s": float(means.speed_m_s.max()),
-            }
+            WaveRecord(
+                name=place.name,
+                tissue=place.tissue,
+                depth_mm=place.depth_mm,
+                readings=int(means.samples.sum()),
+                from_m_s=float(means.speed_m_s.min()),
+                to_m_s=float(means.speed_m_s.max()),
+            )
             for place, means in seen.waves
         ]
     return facts
 
 
-def describe_still_values(facts: dict[str, Any]) -> tuple[str, ...]:
+def describe_still_values(facts: TraceFacts) -> tuple[str, ...]:
     """What of the facts hardly moves, in words."""
-    layers = [f"ultrasound: {name}" for name, one in facts.get("layers", {}).items() if not one["compared"]]
-    still = "surface" in facts and not facts["surface"]["compared"]
+    layers = [f"ultrasound: {name}" for name, one in facts.layers.items() if not one.compared]
+    still = facts.surface is not None and not facts.surface.compared
     return (*layers, *(["surface: the skin"] if still else []))
 
 

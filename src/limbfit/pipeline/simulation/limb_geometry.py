@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
+from ...results.limb import PlacedSite
 from ...study import Site, Study, Vector
 from ..engine.store import Store
 from .simulations import count_pins_met
@@ -17,18 +18,17 @@ class LimbGeometry:
     """Surfaces, and by site its place on them as ``sites.json`` has it: none where sites are not placed."""
 
     anatomy: Anatomy
-    places: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    places: Mapping[str, PlacedSite] = field(default_factory=dict)
 
     @classmethod
     def stored(cls, store: Store) -> LimbGeometry:
         """That of the stages ``surfaces`` and ``sites``, which are done."""
-        rows = store.read("sites", "sites.json")["sites"]
-        return cls(load_anatomy(store["surfaces"]), {row["site"]: row for row in rows})
+        return cls(load_anatomy(store["surfaces"]), {row.site: row for row in store.results.sites.sites})
 
     def place(self, site: Site) -> tuple[Vector, Vector]:
         """Position, mm, and axis of the indenter at a site, LPS."""
         row = self.places[site.name]
-        return tuple(row["position_mm"]), tuple(row["axis"])
+        return row.position_mm, row.axis
 
     def clamping_pins(self, study: Study) -> dict[str, int]:
         """How many pins of ``[clamps]`` hold the limb at each site.

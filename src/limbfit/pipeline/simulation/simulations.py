@@ -170,7 +170,7 @@ def find_fibre_directions(context: Context) -> tuple[tuple[str, Direction], ...]
 
 def read_limb_axis(context: Context) -> Vector:
     """The limb's axis, proximally: the unit normal of its proximal cut."""
-    return _normalise(context.stored("surfaces", "surfaces.json")["cut_normal"])
+    return _normalise(context.results.surfaces.cut_normal)
 
 
 def _normalise(along: Sequence[float]) -> Vector:
@@ -197,7 +197,7 @@ def build_site_model(
     """
     study: Study = context.study
     site = one.site if isinstance(one, Record) else one
-    placed = {row["site"]: row for row in context.stored("sites", "sites.json")["sites"]}[site.name]
+    placed = {row.site: row for row in context.results.sites.sites}[site.name]
     mesh, indenter = context.store["mesh"] / f"{site.name}.vtu", study.indenter_of(one)
     clamped: dict[str, Any] = {}
     if study.clamps is not None:
@@ -208,8 +208,8 @@ def build_site_model(
         fibres=find_fibre_directions(context),
         mesh=mesh,
         mesh_digest=compute_file_digest(mesh),
-        position=tuple(placed["position_mm"]),
-        axis=tuple(placed["axis"]),
+        position=placed.position_mm,
+        axis=placed.axis,
         knots_s=tuple(knots_s),
         knots_mm=tuple(knots_mm),
         knots_N=tuple(knots_N),

@@ -25,6 +25,8 @@ from ...fe import Step
 from ...fe.materials import Material
 from ...indentation import Parameters, build_fibre_field
 from ...mesh import Mesh, write_vtu
+from ...results.limb import MeshMeasures
+from ...results.socket import SocketDesignResult
 from ...socket import Recipe, Socket, rectify_limb
 from ...socket.rays import compute_offsets, compute_profile
 from ...socket.rectify import reduce_to_volume
@@ -34,7 +36,7 @@ from ...study import Study
 from ..engine.context import Context
 from ..engine.partial_results import Made, ResultFiles
 from ..engine.sources import code_digest
-from ..engine.storage import compute_digest, write_json, write_table
+from ..engine.storage import compute_digest, write_result, write_table
 from ..simulation.limb_geometry import LimbGeometry
 from .limb import SocketLimb, SocketRun, run_sockets, simulate_socket
 from .shape import (
@@ -137,7 +139,7 @@ def run_socket_design(
         "balance_percent": max(one.facts["simulation"]["balance_percent"] for one in done.values()),
         "mesh": bench.mesh_facts,
     }
-    write_json(folder / f"{NAME}.json", content)
+    write_result(folder / f"{NAME}.json", SocketDesignResult(**content))
     for one in done.values():
         bench.write(folder, one)
     _write_tables(folder, content)
@@ -161,7 +163,7 @@ class _Bench:
     context: Context
     limb: SocketLimb
     mesh: Mesh
-    mesh_facts: dict[str, Any]
+    mesh_facts: MeshMeasures
     laws: Mapping[str, Material]
     recipe: Recipe
     plain: Socket

@@ -35,14 +35,15 @@ from ...fe import SimulationWarning
 from ...fe.materials import Material
 from ...indentation import Direction, Parameters, build_fibre_field, build_materials
 from ...mesh import Mesh, read_vtu
+from ...results.limb import MeshMeasures
 from ...socket import Socket
 from ...socket.landmarks import SkinRegion, find_directions, load_point
 from ...study import Study
 from ..engine.context import Context
 from ..engine.partial_results import Begun, Made, ResultFiles
 from ..engine.sources import code_digest
-from ..engine.storage import compute_digest, compute_file_digest, read_json
-from ..limb.mesh import is_meshed, keep_mesh, mesh_settings, read_stored_depth
+from ..engine.storage import compute_digest, compute_file_digest
+from ..limb.mesh import is_meshed, keep_mesh, mesh_settings, read_mesh_facts, read_stored_depth
 from ..simulation.simulations import find_fibre_directions
 from .intervals import ParameterSpread, SimulationSpread, spread_to_facts
 from .shape import build_regions, find_covered_regions, load_of, mesh_edge_mm
@@ -93,7 +94,7 @@ class SocketLimb:
         laws = build_materials(parameters, kappa, table.law, dict(self.fibres), table.relaxation_span_s)
         return laws | build_materials({LINER: liner.parameters}, kappa) if liner.thickness_mm else laws
 
-    def mesh(self, context: Context, name: str, folder: Path, brim: Socket) -> tuple[Mesh, dict[str, Any]]:
+    def mesh(self, context: Context, name: str, folder: Path, brim: Socket) -> tuple[Mesh, MeshMeasures]:
         """The whole limb's mesh and its facts; that of an interrupted run is kept."""
         self.fit(brim)  # a load that is not known is refused before anything is meshed
         file = folder / MESH
@@ -103,7 +104,7 @@ class SocketLimb:
             settings = self._settings(mesh_edge_mm(self.study, brim))
             mesh, report = mesh_limb(self.outer, settings, max(fine, 0.0), self.depth)
             keep_mesh(mesh, report, settings, file)
-        return read_vtu(file), read_json(file.with_suffix(".json"))
+        return read_vtu(file), read_mesh_facts(file)
 
     def _settings(self, edge_mm: float) -> MeshSettings:
         table, settings = self.study.socket, mesh_settings(self.study)

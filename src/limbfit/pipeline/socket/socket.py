@@ -17,13 +17,15 @@ from ...identify.checks.domain import Extent, RecordedRange, describe_outside
 from ...identify.fit.prediction import RelaxationSpread
 from ...indentation import Parameters
 from ...mesh import Mesh, write_vtu
+from ...results.identification import RecordedExtents, RelaxationBeyond
+from ...results.socket import SocketResult
 from ...socket import Socket
 from ...socket.landmarks import find_bone
 from ...socket.published import select_published_findings
 from ...study import Study
 from ..engine.context import Context
 from ..engine.partial_results import Begun, ResultFiles
-from ..engine.storage import write_json, write_table
+from ..engine.storage import write_result, write_table
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import NEAR_MM, LimbAxis, describe_socket_load, name_load, time_socket_loads
 from .intervals import CHANGE_PERCENT, FRICTION, ParameterSpread, draw_step, store_change, widen_intervals
@@ -68,7 +70,7 @@ def run_socket(
     covariance_log : (p, p) that of the parameters' logarithms, where they were identified.
     most_probable : parameters that intervals cover too; none: those that are simulated.
     recorded_range : what the fitted records did to the tissue, from ``predict.json``; None: not known.
-    relaxation : of `RelaxationSpread.to_dict`; intervals cover what it leaves of the moduli when the socket
+    relaxation : ``beyond`` of the calibration's; intervals cover what it leaves of the moduli when the socket
         has been worn for ``socket.worn_s``.
     samples : draws from it that are simulated too, and more friction; the intervals then count what
         derivatives miss.
@@ -89,7 +91,7 @@ def run_socket(
         at, probable = (context.study.vector(one) for one in (parameters, most_probable or parameters))
         known = ParameterSpread(covariance, np.log(probable / at))
         if relaxation is not None:
-            spread = RelaxationSpread.from_dict(relaxation)
+            spread = RelaxationSpread.from_stored(RelaxationBeyond.model_validate(relaxation))
             known = known.relax(spread.own_weight, *spread.interpolate(context.study.socket.worn_s))
     content = limb.facts(found, socket, known) | {
         "parameters": parameters,
@@ -110,7 +112,7 @@ def run_socket(
     if covariance is not None and samples:
         steps = [draw_step(covariance, number) for number in range(samples)]
         content["samples"] = _simulate_samples(context, folder, (limb, mesh, socket), content, steps)
-    write_json(folder / "socket.json", content)
+    write_result(folder / "socket.json", SocketResult(**content))
     _write_fields(folder, mesh, found)
     _write_tables(folder, content)
     begun.drop()
@@ -126,7 +128,8 @@ def _compare_with_records(
     """
     if stored is None:
         return {name: {"loading": None, "outside_records": None} for name in found.held}
-    tested, axis, before = RecordedRange.from_dict(stored), LimbAxis(limb.anatomy), list[Extent]()
+    tested = RecordedRange.from_stored(RecordedExtents.model_validate(stored))
+    axis, before = LimbAxis(limb.anatomy), list[Extent]()
     near_mm = NEAR_MM + limb.study.socket.liner.thickness_mm
     compared, histories = {}, time_socket_loads(limb.study.socket)
     for name, held in found.held.items():
@@ -135,7 +138,7 @@ def _compare_with_records(
             tested,
         )  # fmt: skip
         compared[name] = {
-            "loading": [one.to_dict() for one in before],
+            "loading": before,
             "outside_records": tested.find_outside(before),
         }
     return compared

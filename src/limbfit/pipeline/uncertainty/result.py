@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from ...identify.fit.parameters import Unknowns
 from ...identify.uncertainty.emulator import Emulator
 from ...identify.uncertainty.estimator import FitSensitivity
 from ...identify.uncertainty.exploration import Exploration
-from ...identify.uncertainty.model_comparison import ModelComparison
 from ...identify.uncertainty.noise import SiteNoise
 from ...identify.uncertainty.posterior import compute_principal_axes
 from ...identify.uncertainty.uncertainty import (
@@ -29,7 +28,20 @@ from ...identify.uncertainty.uncertainty import (
     choose_verdict,
     format_product,
 )
-from ..engine.storage import write_atomically, write_curves, write_json, write_table
+from ...results.base import ResultPart
+from ...results.identification import CorrelationMatrix
+from ...results.uncertainty import (
+    EmulatorSummary,
+    EvidenceComparison,
+    IntervalParts,
+    IntervalSummary,
+    LikelihoodProfile,
+    ParameterCombination,
+    ParameterUncertainty,
+    SourceEffect,
+    UncertaintyResult,
+)
+from ..engine.storage import write_atomically, write_curves, write_result, write_rows, write_table
 from ..records.records import SiteRecord
 from .sources import Change
 
@@ -81,7 +93,7 @@ class Found:
 
     known: Uncertainty
     explored: Exploration
-    evidence: ModelComparison | None
+    evidence: EvidenceComparison | None
     gain: FitSensitivity
     changes: tuple[Change, ...]
     unknowns: Unknowns
@@ -107,32 +119,32 @@ class Predicted:
 def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) -> None:
     """``uncertainty.json``, and CSV: parameters, draws, profiles, sources, predictions."""
     (folder / "predictions").mkdir(exist_ok=True)
-    parameters, combinations = _parameters_to_rows(found), _combinations_to_rows(found)
+    parameters, combinations = _summarise_parameters(found), _summarise_combinations(found)
     rows = [_write_prediction(folder, found, one) for one in predicted]
     explored, posterior = found.explored, found.explored.posterior
-    content = {
-        "parameters": parameters,
-        "combinations": combinations,
-        "correlation": {
-            "names": list(found.known.names),
-            "matrix": _compute_correlation(posterior.covariance).tolist(),
-        },
-        "covariance_log": posterior.covariance.tolist(),
-        "covariance_sources_log": found.source_covariance.tolist(),
-        "residuals": found.known.residual_model.to_dict(),
-        "emulator": _emulator_to_dict(found),
-        "posterior": posterior.to_dict(),
-        "profiles": {one.name: one.to_dict() for one in explored.profiles},
-        "checks": [asdict(check) for check in explored.checks],
-        "evidence": None if found.evidence is None else found.evidence.to_dict(),
-        "sources": [_source_to_row(found, change) for change in found.changes],
-        "predictions": {"sites": rows, **_compute_coverage(rows)},
-        "verdict": _describe_verdict(found, parameters, combinations, rows),
-    }
-    write_json(folder / "uncertainty.json", content)
+    predictions = IntervalSummary(sites=rows, **_compute_coverage(rows))
+    content = UncertaintyResult(
+        parameters=parameters,
+        combinations=combinations,
+        correlation=CorrelationMatrix(
+            names=found.known.names, matrix=_compute_correlation(posterior.covariance).tolist()
+        ),
+        covariance_log=posterior.covariance.tolist(),
+        covariance_sources_log=found.source_covariance.tolist(),
+        residuals=found.known.residual_model.summarise(),
+        emulator=_summarise_emulator(found),
+        posterior=posterior.summarise(),
+        profiles={one.name: LikelihoodProfile.model_validate(one) for one in explored.profiles},
+        checks=explored.checks,
+        evidence=found.evidence,
+        sources=[_summarise_source(found, change) for change in found.changes],
+        predictions=predictions,
+        verdict=_describe_verdict(found, parameters, combinations, predictions),
+    )
+    write_result(folder / "uncertainty.json", content)
     _write_table(folder / "parameters.csv", [_flatten_row(row) for row in parameters])
-    _write_table(folder / "sources.csv", [_flatten_row(row) for row in content["sources"]])
-    _write_table(folder / "predictions.csv", rows)
+    _write_table(folder / "sources.csv", [_flatten_row(row) for row in content.sources])
+    write_rows(folder / "predictions.csv", rows)
     write_runs(folder / EMULATOR, found.known.names, explored.emulator.points, explored.runs)
     draws = posterior.samples[:: max(len(posterior.samples) // _DRAWS, 1)]
     write_curves(folder / "draws.csv", **dict(zip(found.known.names, draws.T)))
@@ -146,7 +158,7 @@ def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) ->
     )
 
 
-def _parameters_to_rows(found: Found) -> list[dict[str, Any]]:
+def _summarise_parameters(found: Found) -> list[ParameterUncertainty]:
     """One row for every parameter: calibrated, its interval by every method, the verdict on all sources."""
     known, explored = found.known, found.explored
     posterior = explored.posterior
@@ -159,31 +171,31 @@ def _parameters_to_rows(found: Found) -> list[dict[str, Any]]:
         wider = more[i] / max(ours[i], 1e-300)
         bounds = found.unknowns.lower[i], found.unknowns.upper[i]
         with_sources = (
-            max(median * (low / median) ** wider, bounds[0]),
-            min(median * (high / median) ** wider, bounds[1]),
+            float(max(median * (low / median) ** wider, bounds[0])),
+            float(min(median * (high / median) ** wider, bounds[1])),
         )
         profile = profiles.get(name)
         prior_sd = np.log(bounds[1] / bounds[0]) / np.sqrt(12.0)
         given = known.verdicts[i] == GIVEN
         factor = np.sqrt(with_sources[1] / with_sources[0])
         rows.append(
-            {
-                "name": name,
-                "calibrated": float(known.parameters[i]),
-                "median": float(median),
-                "linearised_95": known.intervals_95[i].tolist(),
-                "posterior_95": [float(low), float(high)],
-                "profile_95": None if profile is None else list(profile.interval_95),
-                "profile_verdict": None if profile is None else profile.verdict,
-                "profile_extrapolated": None if profile is None else list(profile.ends_extrapolated),
-                "with_sources_95": list(map(float, with_sources)),
-                "verdict": GIVEN if given else choose_verdict(float(factor), more[i] / prior_sd),
-            }
+            ParameterUncertainty(
+                name=name,
+                calibrated=float(known.parameters[i]),
+                median=float(median),
+                linearised_95=known.intervals_95[i].tolist(),
+                posterior_95=(float(low), float(high)),
+                profile_95=None if profile is None else profile.interval_95,
+                profile_verdict=None if profile is None else profile.verdict,
+                profile_extrapolated=None if profile is None else profile.ends_extrapolated,
+                with_sources_95=with_sources,
+                verdict=GIVEN if given else choose_verdict(float(factor), more[i] / prior_sd),
+            )
         )
     return rows
 
 
-def _combinations_to_rows(found: Found) -> list[dict[str, Any]]:
+def _summarise_combinations(found: Found) -> list[ParameterCombination]:
     """The principal axes of the posterior, as its draws, the linearisation and the sources see them."""
     known, explored = found.known, found.explored
     logs = np.log(explored.posterior.samples)
@@ -199,34 +211,34 @@ def _combinations_to_rows(found: Found) -> list[dict[str, Any]]:
         total = float(np.hypot(sd, sources))
         wider = float(factor ** (total / max(sd, 1e-300)))
         rows.append(
-            {
-                "text": format_product(weights, known.names),
-                "weights": weights.tolist(),
-                "linearised_factor_95": float(np.exp(min(NORMAL_95 * linear, 50.0))),
-                "posterior_factor_95": factor,
-                "with_sources_factor_95": wider,
-                "verdict": choose_verdict(wider, total / float(np.linalg.norm(weights * prior_sd))),
-            }
+            ParameterCombination(
+                text=format_product(weights, known.names),
+                weights=weights.tolist(),
+                linearised_factor_95=float(np.exp(min(NORMAL_95 * linear, 50.0))),
+                posterior_factor_95=factor,
+                with_sources_factor_95=wider,
+                verdict=choose_verdict(wider, total / float(np.linalg.norm(weights * prior_sd))),
+            )
         )
     return rows
 
 
-def _emulator_to_dict(found: Found) -> dict[str, Any]:
+def _summarise_emulator(found: Found) -> EmulatorSummary:
     explored = found.explored
     emulator = explored.emulator
-    return {
-        "runs": len(emulator.points),
-        "needed_percent": list(explored.needed_percent),
-        "good_enough": explored.good_enough,
-        "rounds": explored.rounds_to_dicts(),
-        "lower": emulator.lower.tolist(),
-        "upper": emulator.upper.tolist(),
-        "kernel_length": emulator.length,
-        "nugget": emulator.nugget,
-    }
+    return EmulatorSummary(
+        runs=len(emulator.points),
+        needed_percent=explored.needed_percent,
+        good_enough=explored.good_enough,
+        rounds=explored.rounds,
+        lower=emulator.lower.tolist(),
+        upper=emulator.upper.tolist(),
+        kernel_length=emulator.length,
+        nugget=emulator.nugget,
+    )
 
 
-def _source_to_row(found: Found, change: Change) -> dict[str, Any]:
+def _summarise_source(found: Found, change: Change) -> SourceEffect:
     """One line of the table: change of force in percent of the largest, change of parameters in percent.
 
     A source of each site's own changes parameters by the root of the sum of squares over sites.
@@ -238,31 +250,32 @@ def _source_to_row(found: Found, change: Change) -> dict[str, Any]:
         shift = found.gain.compute_shift(change.force_N)
     else:
         shift = np.sqrt(np.diag(found.gain.compute_covariance(change.force_N, False, variant.sites)))
-    return {
-        "source": variant.source,
-        "change": variant.change,
-        "shared": variant.shared,
-        "counted": variant.counted,
-        "failed": list(change.failed),
-        "force_percent": dict(zip(names, forces)),
-        "parameters_percent": dict(zip(found.known.names, (100 * np.expm1(shift)).tolist())),
-    }
+    return SourceEffect(
+        source=variant.source,
+        change=variant.change,
+        shared=variant.shared,
+        counted=variant.counted,
+        failed=change.failed,
+        force_percent=dict(zip(names, forces)),
+        parameters_percent=dict(zip(found.known.names, (100 * np.expm1(shift)).tolist())),
+    )
 
 
-def _write_prediction(folder: Path, found: Found, one: Predicted) -> dict[str, Any]:
+def _write_prediction(folder: Path, found: Found, one: Predicted) -> IntervalParts:
     """A site's interval as CSV, and its row: how wide, why, and how much of the record lies inside.
 
     Of a site whose prediction failed there is the reason only.
     """
     model, record = found.known.residual_model, one.record
-    facts = {
+    facts: dict[str, Any] = {
         "site": record.site.name,
         "record": record.name,
         "fitted": record.site.fitted,
         "reason": one.response.reason,
     }
     if one.noise is None:
-        return facts | dict.fromkeys(("inside_percent", "half_width_percent", *_SHARES.values()))
+        missing = ("inside_percent", "half_width_percent", *_SHARES.values())
+        return IntervalParts(**facts | dict.fromkeys(missing))
     parameters = found.known.parameters
     force, measured = one.response.force_N, record.compared
     what, unit = ("displacement" if record.record.forced else "force"), record.record.unit
@@ -290,43 +303,44 @@ def _write_prediction(folder: Path, found: Found, one: Predicted) -> dict[str, A
         },
     )
     inside = (measured >= low) & (measured <= high)
-    return facts | {
-        "inside_percent": 100 * float(inside.mean()),
-        "half_width_percent": 100 * float(half.mean()) / peak,
-        **{_SHARES[k]: 100 * float(np.sqrt(v.mean())) / peak for k, v in variances.items()},
-    }
+    facts |= {_SHARES[k]: 100 * float(np.sqrt(v.mean())) / peak for k, v in variances.items()}
+    return IntervalParts(
+        **facts,
+        inside_percent=100 * float(inside.mean()),
+        half_width_percent=100 * float(half.mean()) / peak,
+    )
 
 
-def _compute_coverage(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+def _compute_coverage(rows: Sequence[IntervalParts]) -> dict[str, float | None]:
     """Mean share of the records inside their intervals, in percent."""
     found: dict[str, float | None] = {}
     for kind, fitted in (("fitted", True), ("heldout", False)):
-        shares = [row["inside_percent"] for row in rows if row["fitted"] == fitted and not row["reason"]]
+        shares = [
+            row.inside_percent for row in rows if row.fitted == fitted and row.inside_percent is not None
+        ]
         found[f"coverage_{kind}_percent"] = float(np.mean(shares)) if shares else None
     return found
 
 
 def _describe_verdict(
     found: Found,
-    parameters: Sequence[dict[str, Any]],
-    combinations: Sequence[dict[str, Any]],
-    rows: Sequence[dict[str, Any]],
+    parameters: Sequence[ParameterUncertainty],
+    combinations: Sequence[ParameterCombination],
+    predictions: IntervalSummary,
 ) -> list[str]:
     """The answer in sentences."""
     words = []
     for word in (DETERMINED, "weakly determined", UNDETERMINED):
-        names = [row["name"] for row in parameters if row["verdict"] == word]
+        names = [row.name for row in parameters if row.verdict == word]
         if names:
             words.append(f"{word.capitalize()}: {', '.join(names)}.")
-    told = [row for row in combinations if row["verdict"] == DETERMINED]
+    told = [row for row in combinations if row.verdict == DETERMINED]
     words.append(
         f"{len(told)} of {len(combinations)} independent combinations are determined to within "
-        "-20 to +25 %" + (f"; the best is {told[0]['text']}." if told else ".")
+        "-20 to +25 %" + (f"; the best is {told[0].text}." if told else ".")
     )
     beyond = [
-        row["name"]
-        for row in parameters
-        if not row["posterior_95"][0] <= row["calibrated"] <= row["posterior_95"][1]
+        row.name for row in parameters if not row.posterior_95[0] <= row.calibrated <= row.posterior_95[1]
     ]
     if beyond:
         words.append(
@@ -347,10 +361,10 @@ def _describe_verdict(
             f"Beyond the records, {largest.variant.source} ({largest.variant.change}) would change the "
             "parameters most."
         )
-    coverage = _compute_coverage(rows)["coverage_heldout_percent"]
+    coverage = predictions.coverage_heldout_percent
     if coverage is not None:
         words.append(f"{coverage:.0f} % of the held-out records lies inside the 95 % prediction intervals.")
-    words += [f"Site {row['record']} is not predicted: {row['reason']}." for row in rows if row["reason"]]
+    words += [f"Site {row.record} is not predicted: {row.reason}." for row in predictions.sites if row.reason]
     words += _describe_profiles(found.explored)
     if not found.explored.good_enough:
         words.append("The emulator is less accurate than the records: raise uncertainty.runs.")
@@ -388,10 +402,10 @@ def _compute_correlation(covariance: Array) -> Array:
     return covariance / np.outer(sd, sd)
 
 
-def _flatten_row(row: dict[str, Any]) -> dict[str, Any]:
+def _flatten_row(row: ResultPart) -> dict[str, Any]:
     """Lists and dictionaries of a row as columns."""
     flat: dict[str, Any] = {}
-    for key, value in row.items():
+    for key, value in row.to_plain().items():
         if isinstance(value, dict):
             flat |= {f"{key}.{name}": number for name, number in value.items()}
         elif isinstance(value, list) and len(value) == 2 and not isinstance(value[0], str):

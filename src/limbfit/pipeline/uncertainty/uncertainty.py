@@ -18,7 +18,9 @@ from ...identify.uncertainty.discrepancy import ResidualModel
 from ...identify.uncertainty.estimator import FitSensitivity
 from ...identify.uncertainty.exploration import Exploration, ExplorationSettings, explore_posterior
 from ...identify.uncertainty.likelihood import Likelihood
-from ...identify.uncertainty.model_comparison import ModelComparison, compare_models, fit_alternative
+from ...identify.uncertainty.model_comparison import compare_models, fit_alternative
+from ...results.identification import CalibrationResult, RecordPrediction
+from ...results.uncertainty import EvidenceComparison
 from ...study import Study
 from ..engine.context import Context
 from ..identification.fine_meshes import FineMeshCorrection, correct_to_fine_meshes
@@ -39,8 +41,8 @@ NAME = "uncertainty"
 def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     """Posterior, profiles, evidence, further sources and prediction intervals (see docs/uncertainty.md)."""
     study, report = context.study, partial(context.tell, NAME, 0, 0)
-    calibration = context.stored("calibrate", "calibration.json")
-    best = study.vector(calibration["stages"][-1]["parameters"])
+    calibration = context.results.calibration
+    best = study.vector(calibration.parameters)
     earlier = _select_earlier_points(study, calibration)
     problem, table = build_problem(study), study.uncertainty
     records = load_records(context, study.records_at(*study.fitted), secondary=True)
@@ -60,7 +62,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     )
     evidence = None
     if len(study.tissues) > 1:
-        predicted = context.stored("predict", "predict.json")["sites"]
+        predicted = context.results.predict.sites
         evidence = _compare_groupings(study, problem, explored, known.residual_model, calibration, predicted)
     gain = FitSensitivity.linearise(
         best, correction.responses, known.residual_model, problem.unknowns, problem.space
@@ -102,15 +104,15 @@ def _simulate_points(
 
 
 def _select_earlier_points(
-    study: Study, calibration: dict[str, Any]
+    study: Study, calibration: CalibrationResult
 ) -> dict[tuple[float, ...], Sequence[Array]]:
     """Parameters of the calibration's iterates that came near the records, and where it started them from."""
-    iterates = [iterate for stage in calibration["stages"] for iterate in stage["iterations"]]
-    least = min(iterate["error_percent"] for iterate in iterates)
+    iterates = [iterate for stage in calibration.stages for iterate in stage.iterations]
+    least = min(iterate.error_percent for iterate in iterates)
     return {
-        tuple(study.vector(one["parameters"]).tolist()): [study.vector(s) for s in one["starts"]]
+        tuple(study.vector(one.parameters).tolist()): [study.vector(s) for s in one.starts]
         for one in iterates
-        if one["error_percent"] <= _NEAR * least + 3.0
+        if one.error_percent <= _NEAR * least + 3.0
     }
 
 
@@ -119,29 +121,33 @@ def _compare_groupings(
     problem: CalibrationProblem,
     explored: Exploration,
     model: ResidualModel,
-    calibration: dict[str, Any],
-    predicted: Sequence[dict[str, Any]],
-) -> ModelComparison:
+    calibration: CalibrationResult,
+    predicted: Sequence[RecordPrediction],
+) -> EvidenceComparison:
     """One material against the study's own, on one emulator and covariance, and where nothing was fitted.
 
-    ``calibration`` is the content of ``calibration.json``, ``predicted`` the sites of ``predict.json``.
+    ``predicted`` are the records of ``predict.json``.
     """
     unknowns, titles, likelihood = problem.unknowns, problem.titles, explored.likelihood
     space = build_space(unknowns, group_by_kind(unknowns.names))
     single = Likelihood(explored.emulator, likelihood.measured, model, unknowns, space)
-    start = study.vector(calibration["stages"][0]["parameters"])
+    start = study.vector(calibration.stages[0].parameters)
     one, _ = fit_alternative(titles[0], single, space.reduce(np.log(start)))
     several, _ = fit_alternative(titles[1], likelihood, explored.best.z)
-    rows = [row for row in predicted if not row["fitted"]]
-    columns = ("error_one_material_percent", "error_percent")
-    held = [row for row in rows if all(row[column] is not None for column in columns)]
-    return compare_models(one, several, *([row[column] for row in held] for column in columns))
+    errors = [
+        (row.error_one_material_percent, row.error_percent)
+        for row in predicted
+        if not row.fitted and row.error_one_material_percent is not None and row.error_percent is not None
+    ]
+    return compare_models(one, several, [first for first, _ in errors], [second for _, second in errors])
 
 
-def _predict_sites(context: Context, cache: SimulationCache, calibration: dict[str, Any]) -> list[Predicted]:
+def _predict_sites(
+    context: Context, cache: SimulationCache, calibration: CalibrationResult
+) -> list[Predicted]:
     """Every recorded site at the identified parameters, from what the stage ``predict`` has simulated."""
     study, records = context.study, load_records(context, context.study.recorded)
-    jobs = build_answer_jobs(records, Answer.of(calibration["stages"][-1], study))
+    jobs = build_answer_jobs(records, Answer.of(calibration.stages[-1], study))
     responses = [to_response(simulation) for simulation in cache.run(jobs, context.executor)]
     if records.is_coarsened:
         n = len(records.own)

@@ -25,9 +25,10 @@ from ...laws import KPA, LAWS, OGDEN
 from ...mesh import Mesh
 from ...mesh.boxes import HEX, build_boxes
 from ...relaxation import DEFAULT_SPAN_S
+from ...results.variants import CubeResult, CubeTissue
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import read_json, write_json
+from ..engine.storage import write_result
 from ..simulation.limb_geometry import LimbGeometry
 
 
@@ -179,20 +180,20 @@ def compress_cube(
     for specimen in _build_specimens(parameters or {}, own, law):
         stress, least, most = compress(specimen.material, times, compression_percent)
         stresses[specimen.name] = stress
-        rows.append(specimen.row | _summarise(times, stress) | {"J_min": least, "J_max": most})
-    content = {
-        "side_mm": SIDE_MM,
-        "compression_percent": compression_percent,
-        "ramp_s": RAMP_S,
-        "hold_s": HOLD_S,
-        "element": "hex8",
-        "tissues": rows,
-        "time_s": times.tolist(),
-        "stress_kPa": {name: stress.tolist() for name, stress in stresses.items()},
-    }
+        rows.append(CubeTissue(**specimen.row, **_summarise(times, stress), J_min=least, J_max=most))
+    content = CubeResult(
+        side_mm=SIDE_MM,
+        compression_percent=compression_percent,
+        ramp_s=RAMP_S,
+        hold_s=HOLD_S,
+        element="hex8",
+        tissues=rows,
+        time_s=times.tolist(),
+        stress_kPa={name: stress.tolist() for name, stress in stresses.items()},
+    )
     if output is not None:
         _write(output, content)
-    return content
+    return content.to_plain()
 
 
 def check_compression(percent: float) -> None:
@@ -221,10 +222,9 @@ def check_cube(study: Study, limb: LimbGeometry | None, options: Mapping[str, An
 def run_cube(context: Context, folder: Path, *, compression_percent: float) -> dict[str, Any]:
     """The experiment: this study's identified tissues beside the published ones."""
     context.tell("cube", 0, 1, "compressing")
-    stages = context.stored("calibrate", "calibration.json")["stages"]
     compress_cube(
         folder,
-        parameters=stages[-1]["parameters"],
+        parameters=context.results.calibration.parameters,
         kappa_ratio=context.study.material.kappa_ratio,
         law=context.study.material.law,
         relaxation_span_s=context.study.material.relaxation_span_s,
@@ -315,7 +315,7 @@ def compress(material: Material, times: Array, compression_percent: float) -> tu
     return stress / KPA, float(volume.min()), float(volume.max())
 
 
-def _summarise(times: Array, stress: Array) -> dict[str, float]:
+def _summarise(times: Array, stress: Array) -> dict[str, Any]:
     """Peak, and the tension that stays when the cube is back at its height, at once and at the end."""
     back = int(np.argmin(np.abs(times - 2 * RAMP_S)))
     return {
@@ -325,16 +325,15 @@ def _summarise(times: Array, stress: Array) -> dict[str, float]:
     }
 
 
-def _write(folder: Path, content: dict[str, Any]) -> None:
+def _write(folder: Path, content: CubeResult) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "cube.json", content)
-    stored = read_json(folder / "cube.json")
-    columns = [np.array([0.0, *content["time_s"]])]
-    columns += [np.array([0.0, *values]) for values in content["stress_kPa"].values()]
-    heads = ["time_s", *(_format_column(name) for name in content["stress_kPa"])]
+    write_result(folder / "cube.json", content)
+    columns = [np.array([0.0, *content.time_s])]
+    columns += [np.array([0.0, *values]) for values in content.stress_kPa.values()]
+    heads = ["time_s", *(_format_column(name) for name in content.stress_kPa)]
     table = np.column_stack(columns)
     np.savetxt(folder / "cube.csv", table, fmt="%.9g", delimiter=",", header=",".join(heads), comments="")
-    (folder / "cube.svg").write_text(report.draw_cube(stored), encoding="utf-8")
+    (folder / "cube.svg").write_text(report.draw_cube(content.to_plain()), encoding="utf-8")
 
 
 def _format_column(name: str) -> str:

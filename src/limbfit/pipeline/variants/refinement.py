@@ -9,10 +9,11 @@ from typing import Any
 
 from ...errors import InputError
 from ...indentation import Simulation
+from ...results.variants import RefinedSite, RefinementResult, RefinementRun
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import compute_file_digest, read_json
-from ..limb.mesh import make_mesh, mesh_job, mesh_settings
+from ..engine.storage import compute_file_digest
+from ..limb.mesh import make_mesh, mesh_job, mesh_settings, read_mesh_facts
 from ..simulation.extrapolation import MESH_ORDERS, extrapolate_richardson
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import open_experiment_cache
@@ -72,12 +73,12 @@ def run_refinement(
     ]
     simulations = run_variants(context, "sensitivity-mesh", open_experiment_cache(context, folder), variants)
     write_variants(folder, variants, simulations)
-    content = {
-        "sites": [one.facts | _limit(one, variants, simulations) for one in chosen],
-        "runs": compare_variants(variants, simulations),
-        "parameters": parameters,
-    }
-    store_runs(folder, "sensitivity-mesh", content)
+    content = RefinementResult(
+        sites=[RefinedSite(**dict(one.summary), **_find_limit(one, variants, simulations)) for one in chosen],
+        runs=compare_variants(variants, simulations, RefinementRun),
+        parameters=parameters,
+    )
+    store_runs(folder, content, content.runs)
     return {}
 
 
@@ -89,7 +90,7 @@ def _make_meshes(
     context: Context, folder: Path, chosen: Sequence[ChosenSite], factors: Sequence[float]
 ) -> dict[tuple[str, float], dict[str, Any]]:
     """Make the meshes that are not there yet; what is told of each, by site and factor."""
-    study, stored = context.study, context.stored("mesh", "mesh.json")["sites"]
+    study, stored = context.study, context.results.mesh.sites
     settings = mesh_settings(study)
     pairs = [(one, factor) for one in chosen for factor in factors]
     jobs = {
@@ -110,22 +111,24 @@ def _make_meshes(
     }
     missing = [job for job in dict.fromkeys(jobs.values()) if not job.file.with_suffix(".json").is_file()]
     for i, made in enumerate(context.executor.map(make_mesh, missing)):
-        context.tell("sensitivity-mesh", i + 1, len(missing), f"mesh of {made['nodes']} nodes")
+        context.tell("sensitivity-mesh", i + 1, len(missing), f"mesh of {made.nodes} nodes")
     found = {}
     for one, factor in pairs:
         job = jobs.get((one.name, factor))
-        known = stored[one.site.name] if job is None else read_json(job.file.with_suffix(".json"))
+        known = stored[one.site.name] if job is None else read_mesh_facts(job.file)
         found[one.name, factor] = {
             "factor": factor,
             "edge_near_mm": factor * settings.edge_near_mm,
             "element": settings.element,
-            "nodes": known["nodes"],
-            "cells": known["cells"],
+            "nodes": known.nodes,
+            "cells": known.cells,
         }
     return found
 
 
-def _limit(one: ChosenSite, variants: Sequence[Variant], simulations: Sequence[Simulation]) -> dict[str, Any]:
+def _find_limit(
+    one: ChosenSite, variants: Sequence[Variant], simulations: Sequence[Simulation]
+) -> dict[str, Any]:
     """The largest force that the meshes of a site tend to, and how far the study's mesh is from it.
 
     Nothing where they do not tend to anything yet. With an element whose forces do not change in one

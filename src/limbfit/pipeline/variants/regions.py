@@ -13,9 +13,11 @@ from ...identify.checks.crossvalidation import RegionFit, RegionRecords, average
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
 from ...identify.fit.state import Calibration
+from ...results.uncertainty import RegionFitted, RegionsResult, WholeLimbFit
 from ...study import Site, Study
 from ..engine.context import Context
-from ..engine.storage import write_json, write_table
+from ..engine.storage import write_result, write_table
+from ..identification.calibrate import group_intervals
 from ..identification.fine_meshes import correct_answer
 from ..identification.intervals import sample_intervals
 from ..identification.problem import CalibrationProblem, build_problem
@@ -36,8 +38,8 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]
     """
     study = context.study
     members = _group_by_region(context, sites)
-    stages = context.stored("calibrate", "calibration.json")["stages"]
-    whole = study.vector(stages[-1]["parameters"])
+    stages = context.results.calibration.stages
+    whole = study.vector(stages[-1].parameters)
     cache = open_experiment_cache(context, folder)
     report, problem = partial(context.tell, "regions", 0, 0), build_problem(study)
     simulators = {}
@@ -49,22 +51,22 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]
     }
     found = fit_regions(regions, problem.unknowns, whole)
     rows = [
-        _to_row(context, problem, simulators[name], name, members[name], fit, folder)
+        _summarise_region(context, problem, simulators[name], name, members[name], fit, folder)
         for name, fit in found.items()
     ]
-    content = {
-        "sites_used": sites,
-        "left_out": _describe_left_out(context, members),
-        "whole": {
-            "name": stages[-1]["name"],
-            "start": stages[0]["start"],
-            "parameters": stages[-1]["parameters"],
-            "fitted_sites": [site.name for site in study.fitted],
-        },
-        "regions": rows,
+    content = RegionsResult(
+        sites_used=sites,
+        left_out=_describe_left_out(context, members),
+        whole=WholeLimbFit(
+            name=stages[-1].name,
+            start=stages[0].start,
+            parameters=stages[-1].parameters,
+            fitted_sites=[site.name for site in study.fitted],
+        ),
+        regions=rows,
         **_compute_means(rows),
-    }
-    write_json(folder / "regions.json", content)
+    )
+    write_result(folder / "regions.json", content)
     _write_tables(folder, content)
     return {}
 
@@ -134,7 +136,7 @@ def _simulate_forces(
     return [to_response(one) for one in cache.run(jobs, context.executor)]
 
 
-def _to_row(
+def _summarise_region(
     context: Context,
     problem: CalibrationProblem,
     simulator: RecordSimulator,
@@ -142,57 +144,54 @@ def _to_row(
     chosen: tuple[list[Site], list[Site]],
     fit: RegionFit,
     folder: Path,
-) -> dict[str, Any]:
+) -> RegionFitted:
     """What ``regions.json`` holds of a region."""
     study, found = context.study, fit.calibration
     fitted, mine = chosen
     responses = list(found.responses)
     correction, spent = correct_answer(context, simulator, found.parameters, responses, folder / "coarser")
     _, known = sample_intervals(context, problem, simulator, found, correction, spent, moves=False)
-    intervals: dict[str, dict[str, list[float]]] = {tissue: {} for tissue in study.tissues}
-    for (tissue, key), limits in zip(study.parameters, known.intervals_95.tolist(), strict=True):
-        intervals[tissue][key] = limits
-    return {
-        "region": name,
-        "sites": [site.name for site in mine],
-        "fitted_sites": [site.name for site in fitted],
-        "parameters": study.by_tissue(found.parameters),
-        "intervals_95": intervals,
-        "verdict": dict(zip(known.names, known.verdicts, strict=True)),
-        "evaluations": found.evaluations,
-        "converged": found.converged,
-        "reason": found.reason,
-        "own_error_percent": average_errors(fit.own_percent),
-        "whole_error_percent": average_errors(fit.whole_percent),
-        "own_error_percent_by_site": fit.own_percent,
-        "whole_error_percent_by_site": fit.whole_percent,
-    }
+    return RegionFitted(
+        region=name,
+        sites=[site.name for site in mine],
+        fitted_sites=[site.name for site in fitted],
+        parameters=study.by_tissue(found.parameters),
+        intervals_95=group_intervals(known, study),
+        verdict=dict(zip(known.names, known.verdicts, strict=True)),
+        evaluations=found.evaluations,
+        converged=found.converged,
+        reason=found.reason,
+        own_error_percent=average_errors(fit.own_percent),
+        whole_error_percent=average_errors(fit.whole_percent),
+        own_error_percent_by_site=fit.own_percent,
+        whole_error_percent_by_site=fit.whole_percent,
+    )
 
 
-def _compute_means(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+def _compute_means(rows: Sequence[RegionFitted]) -> dict[str, float | None]:
     """Mean error over all sites, each with its own region's model and with the whole limb's."""
+    own = {site: error for row in rows for site, error in row.own_error_percent_by_site.items()}
+    whole = {site: error for row in rows for site, error in row.whole_error_percent_by_site.items()}
     return {
-        f"mean_{which}_error_percent": average_errors(
-            {site: error for row in rows for site, error in row[f"{which}_error_percent_by_site"].items()}
-        )
-        for which in ("own", "whole")
+        "mean_own_error_percent": average_errors(own),
+        "mean_whole_error_percent": average_errors(whole),
     }
 
 
-def _write_tables(folder: Path, content: dict[str, Any]) -> None:
+def _write_tables(folder: Path, content: RegionsResult) -> None:
     """Table 3 as CSV: parameters by region, and errors by site."""
-    whole, rows = content["whole"], content["regions"]
+    whole, rows = content.whole, content.regions
     heads = ["tissue", "parameter", "start", "whole_limb"]
     lines = []
-    for tissue, values in whole["parameters"].items():
+    for tissue, values in whole.parameters.items():
         for key, value in values.items():
-            cells = [tissue, key, whole["start"][tissue][key], value]
-            lines.append([*cells, *(row["parameters"][tissue][key] for row in rows)])
-    write_table(folder / "parameters.csv", [*heads, *(row["region"] for row in rows)], lines)
+            cells = [tissue, key, whole.start[tissue][key], value]
+            lines.append([*cells, *(row.parameters[tissue][key] for row in rows)])
+    write_table(folder / "parameters.csv", [*heads, *(row.region for row in rows)], lines)
     errors = [
-        [row["region"], site, site in row["fitted_sites"], own, row["whole_error_percent_by_site"][site]]
+        [row.region, site, site in row.fitted_sites, own, row.whole_error_percent_by_site[site]]
         for row in rows
-        for site, own in row["own_error_percent_by_site"].items()
+        for site, own in row.own_error_percent_by_site.items()
     ]
     heads = ["region", "site", "fitted", "own_error_percent", "whole_limb_error_percent"]
     write_table(folder / "errors.csv", heads, errors)

@@ -27,10 +27,23 @@ from ...indentation import (
     to_parameters,
 )
 from ...mesh import read_vtu
+from ...results.base import StoredResult
+from ...results.variants import (
+    ForceDerivative,
+    FrictionResult,
+    FrictionRun,
+    IndenterResult,
+    IndenterRun,
+    StiffnessResult,
+    StiffnessRun,
+    VariantRun,
+    VolumeResult,
+    VolumeRun,
+)
 from ...shapes import OWN, SHAPES
 from ...study import IndenterTable
 from ..engine.context import Context
-from ..engine.storage import write_json, write_table
+from ..engine.storage import write_result, write_rows, write_table
 from ..records.records import load_records
 from ..simulation.simulations import SimulationCache, open_experiment_cache
 from .variants import (
@@ -117,14 +130,19 @@ def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str]) -> di
         equal = {tissue: values | {"m": m} for tissue, values in identified.items()}
     chosen = choose_sites(context, sites)
     variants = [variant for one in chosen for variant in _build_stiffer(one, equal, law.moduli)]
-    content = _run(context, folder, "sensitivity-c", chosen, variants)
-    content |= {"parameters": identified, "equal_m": m, "factors": list(FACTORS)}
-    content["local"] = _collect_derivatives(context, folder, identified)
-    store_runs(folder, "sensitivity-c", content)
+    simulations = _simulate(context, folder, "sensitivity-c", variants)
+    content = StiffnessResult(
+        sites=[one.summary for one in chosen],
+        runs=compare_variants(variants, simulations, StiffnessRun),
+        parameters=identified,
+        equal_m=m,
+        factors=FACTORS,
+        local=_collect_derivatives(context, folder, identified),
+    )
+    store_runs(folder, content, content.runs)
     heads = ["site", "region", "tissue_mm", *(f"{tissue}_c" for tissue in identified)]
     rows = [
-        [row["site"], row["region"], row["tissue_mm"], *row["peak_percent_per_percent"].values()]
-        for row in content["local"]
+        [row.site, row.region, row.tissue_mm, *row.peak_percent_per_percent.values()] for row in content.local
     ]
     write_table(folder / "derivatives.csv", heads, rows)
     return {}
@@ -146,7 +164,7 @@ def _build_stiffer(chosen: ChosenSite, equal: Parameters, moduli: Sequence[str])
     return [base, *changed]
 
 
-def _collect_derivatives(context: Context, folder: Path, identified: Parameters) -> list[dict[str, Any]]:
+def _collect_derivatives(context: Context, folder: Path, identified: Parameters) -> list[ForceDerivative]:
     """Of every record of a force: change of the largest one in percent for one percent more of a modulus.
 
     It is each tissue's first.  They are of where parameters are searched, as those of the prediction.
@@ -155,7 +173,7 @@ def _collect_derivatives(context: Context, folder: Path, identified: Parameters)
     records = load_records(context, [record for record in study.recorded if not record.forced]).searched
     best = study.vector(identified)
     cache = open_experiment_cache(context, folder)
-    rows: list[dict[str, Any]] = []
+    rows: list[ForceDerivative] = []
     for record, found in zip(
         records, cache.run([record.job(best) for record in records], context.executor), strict=True
     ):
@@ -164,17 +182,17 @@ def _collect_derivatives(context: Context, folder: Path, identified: Parameters)
         peak = int(np.argmax(found.force_N))
         relative = found.jacobian[peak] * best / found.force_N[peak]
         rows.append(
-            {
-                "site": record.name,
-                "region": record.site.region,
-                "tissue_mm": measure_tissue_over_bone(record.model),
-                "completed": found.completed,
-                "peak_percent_per_percent": {
+            ForceDerivative(
+                site=record.name,
+                region=record.site.region,
+                tissue_mm=measure_tissue_over_bone(record.model),
+                completed=found.completed,
+                peak_percent_per_percent={
                     tissue: float(value) if found.completed else None
                     for (tissue, name), value in zip(study.parameters, relative, strict=True)
                     if name == study.law.moduli[0]
                 },
-            }
+            )
         )
     return rows
 
@@ -197,9 +215,19 @@ def run_kappa(
         for one in chosen
         for ratio in sorted({own, *map(float, ratios)})
     ]
-    content = _run(context, folder, "sensitivity-kappa", chosen, variants, volumes=True)
-    content |= {"parameters": identified, "kappa_ratio": own}
-    store_runs(folder, "sensitivity-kappa", content)
+    simulations = run_variants(context, "sensitivity-kappa", open_volume_cache(folder), variants)
+    write_variants(folder, variants, simulations)
+    measured = [
+        replace(variant, facts=variant.facts | simulation.facts.get("volume", NO_VOLUME))
+        for variant, simulation in zip(variants, simulations, strict=True)
+    ]
+    content = VolumeResult(
+        sites=[one.summary for one in chosen],
+        runs=compare_variants(measured, simulations, VolumeRun),
+        parameters=identified,
+        kappa_ratio=own,
+    )
+    store_runs(folder, content, content.runs)
     return {}
 
 
@@ -218,12 +246,14 @@ def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> dict
         for one in chosen
         for friction in dict.fromkeys((one.model.indenter.friction, "frictionless", "sticky"))
     ]
-    content = _run(context, folder, "sensitivity-contact", chosen, variants)
-    store_runs(
-        folder,
-        "sensitivity-contact",
-        content | {"parameters": identified, "friction": chosen[0].model.indenter.friction},
+    simulations = _simulate(context, folder, "sensitivity-contact", variants)
+    content = FrictionResult(
+        sites=[one.summary for one in chosen],
+        runs=compare_variants(variants, simulations, FrictionRun),
+        parameters=identified,
+        friction=chosen[0].model.indenter.friction,
     )
+    store_runs(folder, content, content.runs)
     return {}
 
 
@@ -242,8 +272,13 @@ def run_indenter(context: Context, folder: Path, *, sites: Sequence[str]) -> dic
         for one in chosen
         for label, table, base in list_other_indenters(one.model.indenter)
     ]
-    content = _run(context, folder, "sensitivity-indenter", chosen, variants)
-    store_runs(folder, "sensitivity-indenter", content | {"parameters": identified})
+    simulations = _simulate(context, folder, "sensitivity-indenter", variants)
+    content = IndenterResult(
+        sites=[one.summary for one in chosen],
+        runs=compare_variants(variants, simulations, IndenterRun),
+        parameters=identified,
+    )
+    store_runs(folder, content, content.runs)
     return {}
 
 
@@ -263,30 +298,17 @@ def list_other_indenters(own: IndenterTable) -> list[tuple[str, IndenterTable, b
 
 def read_identified_parameters(context: Context) -> Parameters:
     """The last stage of the calibration."""
-    return context.stored("calibrate", "calibration.json")["stages"][-1]["parameters"]
+    return context.results.calibration.parameters
 
 
-def _run(
-    context: Context,
-    folder: Path,
-    name: str,
-    chosen: Sequence[ChosenSite],
-    variants: Sequence[Variant],
-    volumes: bool = False,
-) -> dict[str, Any]:
-    """Simulate the variants, write their curves, and what all experiments of sensitivity store."""
-    cache = open_volume_cache(folder) if volumes else open_experiment_cache(context, folder)
-    simulations = run_variants(context, name, cache, variants)
+def _simulate(context: Context, folder: Path, name: str, variants: Sequence[Variant]) -> list[Simulation]:
+    """Simulate the variants and write their curves."""
+    simulations = run_variants(context, name, open_experiment_cache(context, folder), variants)
     write_variants(folder, variants, simulations)
-    rows = compare_variants(variants, simulations)
-    if volumes:
-        for row, simulation in zip(rows, simulations, strict=True):
-            row |= simulation.facts.get("volume", NO_VOLUME)
-    return {"sites": [one.facts for one in chosen], "runs": rows}
+    return simulations
 
 
-def store_runs(folder: Path, name: str, content: dict[str, Any]) -> None:
-    """``<name>.json``, and its runs as ``runs.csv``."""
-    write_json(folder / f"{name}.json", content)
-    keys = [key for key in content["runs"][0] if key not in ("warnings", "label", "base")]
-    write_table(folder / "runs.csv", keys, [[row[key] for key in keys] for row in content["runs"]])
+def store_runs(folder: Path, content: StoredResult, runs: Sequence[VariantRun]) -> None:
+    """The result as JSON, and its runs as ``runs.csv``."""
+    write_result(folder / Path(content.FILE).name, content)
+    write_rows(folder / "runs.csv", runs, leave_out=("warnings", "label", "base"))

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ...arrays import Array
 from ...errors import InputError
 from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
+from ...results.variants import VariantRun, VariedSite
 from ...study import Indentation, Record, Site, Study
 from ..engine.context import Context
 from ..engine.storage import write_curves
@@ -19,6 +20,8 @@ from ..records.deviations import measure_bone_distance_mm
 from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import CURVE_POINTS, SimulationCache
+
+Run = TypeVar("Run", bound=VariantRun)
 
 
 @dataclass(frozen=True)
@@ -36,15 +39,15 @@ class ChosenSite:
         return self.model.name
 
     @property
-    def facts(self) -> dict[str, Any]:
+    def summary(self) -> VariedSite:
         """What is stored of it."""
-        return {
-            "site": self.name,
-            "region": self.site.region,
-            "role": self.role,
-            "tissue_mm": self.tissue_mm,
-            "indentation_mm": max(self.model.knots_mm),
-        }
+        return VariedSite(
+            site=self.name,
+            region=self.site.region,
+            role=self.role,
+            tissue_mm=self.tissue_mm,
+            indentation_mm=max(self.model.knots_mm),
+        )
 
 
 @dataclass(frozen=True)
@@ -151,11 +154,13 @@ def run_variants(
     return done
 
 
-def compare_variants(variants: Sequence[Variant], simulations: Sequence[Simulation]) -> list[dict[str, Any]]:
+def compare_variants(
+    variants: Sequence[Variant], simulations: Sequence[Simulation], run: type[Run]
+) -> list[Run]:
     """A row of each: what was changed, its largest force, and how it differs from its site's base.
 
     Changes are in percent of the base's largest force: of the largest force, and the mean over the trace.
-    They are None where a simulation is partial.
+    They are None where a simulation is partial. ``run`` is the model of a row.
     """
     base = {
         variant.chosen.name: simulation
@@ -163,21 +168,21 @@ def compare_variants(variants: Sequence[Variant], simulations: Sequence[Simulati
         if variant.base
     }
     return [
-        {
-            "site": variant.chosen.name,
-            "label": variant.label,
-            "base": variant.base,
+        run(
+            site=variant.chosen.name,
+            label=variant.label,
+            base=variant.base,
             **variant.facts,
-            "peak_force_N": float(simulation.force_N.max()) if simulation.completed else None,
+            peak_force_N=float(simulation.force_N.max()) if simulation.completed else None,
             **_change(simulation, base[variant.chosen.name]),
-            "penetration_mm": simulation.penetration_mm,
-            "steps": simulation.facts.get("steps"),
-            "newton_iterations": simulation.facts.get("newton_iterations"),
-            "cuts": simulation.facts.get("cuts"),
-            "completed": simulation.completed,
-            "reason": simulation.reason,
-            "warnings": list(simulation.warnings),
-        }
+            penetration_mm=simulation.penetration_mm,
+            steps=simulation.facts.get("steps"),
+            newton_iterations=simulation.facts.get("newton_iterations"),
+            cuts=simulation.facts.get("cuts"),
+            completed=simulation.completed,
+            reason=simulation.reason,
+            warnings=simulation.warnings,
+        )
         for variant, simulation in zip(variants, simulations, strict=True)
     ]
 
