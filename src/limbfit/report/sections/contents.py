@@ -13,7 +13,6 @@ from .cube import make_cube_section
 from .design import make_design_section, make_protocol_section
 from .methods import make_method_section
 from .model import make_mesh_section, make_model_section
-from .models import make_models_section
 from .parameters import make_parameter_section
 from .prediction import make_domain_section, make_fit_section, make_prediction_section
 from .provenance import make_provenance_section, make_settings_section, make_timing_section
@@ -25,7 +24,7 @@ from .simulations import make_comparison_section, make_simulated_section, make_s
 from .socket import make_socket_section
 from .socket_design import make_socket_design_section
 from .summary import build_summary, list_key_numbers
-from .uncertainty import make_uncertainty_section
+from .uncertainty import make_models_section, make_uncertainty_section
 
 Maker = Callable[[Results, Json], Section]
 # By the name of the experiment, in the order of the page; a maker is given the store and what
