@@ -19,8 +19,8 @@ dilate divide do don draw drive drop edit embed end ensure equilibrate erode est
 exclude expand explain explore export extend extract extrapolate extrude factor fail fill find finish
 fit flag flatten follow format from generate get grade group grow guess halve has head hide hold
 identify ignore import impose improve insert integrate interpolate interpret interrupt intersect invert
-is iterate join judge keep kill label lead level limit list listen load locate lock log lump main make
- mark mask match measure mend merge mesh minimise move multiply mute name normalise number observe offset
+is iterate join judge keep kill label lead level limit link list listen load locate lock log lump main make
+ mark mask match measure mend merge mesh minimise mix move multiply mute name normalise number observe offset
  open optimise order orient outline own pack page paint pair parse place plan plot pool position post
  predict prefetch prepare prepend press preview print prioritise project prolong promote prompt pull put
  rank rasterise read rebuild record recover rectify redact reduce refactor refine refit refuse register
