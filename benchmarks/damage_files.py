@@ -46,9 +46,9 @@ def ras_nrrd(random: Random, whole: Whole, folder: Path) -> Inputs:
 @kind("file", "same", within_mm=1.0)
 def axes_permuted(random: Random, whole: Whole, folder: Path) -> Inputs:
     """The same body with other index axes: found bones and bias field see other slices."""
-    turned = whole.image.turned(random.permutation(3).tolist())
+    turned = whole.image.permute_axes(random.permutation(3).tolist())
     backward = np.flatnonzero(random.random(3) < 0.5).tolist()
-    return written(folder, turned.reversed(backward), drawn(random))
+    return written(folder, turned.reverse_axes(backward), drawn(random))
 
 
 @kind("file", "refused")

@@ -129,8 +129,10 @@ def labels_cropped(random: Random, whole: Whole, folder: Path) -> Inputs:
 
 @kind("labels", "same")
 def labels_turned(random: Random, whole: Whole, folder: Path) -> Inputs:
-    turned = whole.labels.turned(random.permutation(3).tolist())
-    return written(random, whole, folder, turned.reversed(np.flatnonzero(random.random(3) < 0.5).tolist()))
+    turned = whole.labels.permute_axes(random.permutation(3).tolist())
+    return written(
+        random, whole, folder, turned.reverse_axes(np.flatnonzero(random.random(3) < 0.5).tolist())
+    )
 
 
 @kind("labels", "refused", "two limbs")

@@ -36,14 +36,14 @@ def test_what_is_proximal_is_untouched(leg, plane, stump):
     before = [leg.array[tuple(np.rint(leg.point_to_index(p)).astype(int)[::-1])] for p in kept]
     after = [stump.array[tuple(np.rint(stump.point_to_index(p)).astype(int)[::-1])] for p in kept]
     assert before == after == [1, 2, 3, 0]
-    high = leg.heights(*plane) > 0
-    assert (stump.array[stump.heights(*plane) > 0] > 0).sum() * stump.voxel_mm3 == pytest.approx(
+    high = leg.compute_heights(*plane) > 0
+    assert (stump.array[stump.compute_heights(*plane) > 0] > 0).sum() * stump.voxel_mm3 == pytest.approx(
         (leg.limb & high).sum() * leg.voxel_mm3, rel=0.01
     )
 
 
 def test_bones_end_at_the_plane_and_the_pad_beyond(plane, stump):
-    height = stump.heights(*plane)
+    height = stump.compute_heights(*plane)
     for name in ("tibia", "fibula"):
         assert 0 <= height[stump.mask(name)].min() < 2.5
     assert -PAD <= height[stump.limb].min() < -PAD + 2.5
@@ -51,7 +51,7 @@ def test_bones_end_at_the_plane_and_the_pad_beyond(plane, stump):
 
 def test_the_end_is_rounded(plane, stump):
     """Sections shrink distally, ever faster."""
-    height = stump.heights(*plane)
+    height = stump.compute_heights(*plane)
     areas = [(stump.limb & (np.abs(height + d) < 1.0)).sum() for d in (1.0, 5.0, 9.0, 13.0)]
     drops = -np.diff(areas)
     assert (drops > 0).all()
@@ -98,7 +98,7 @@ def test_a_plane_along_the_limb_is_refused(leg, plane):
 
 def test_a_plane_that_cuts_nothing_off_is_refused(stump):
     """The stump's bones end at its plane; a plane in the pad below them leaves all of them."""
-    low = stump.heights(*_below(stump)) < 0
+    low = stump.compute_heights(*_below(stump)) < 0
     assert low.any()
     with pytest.raises(LabelError, match="cuts nothing off"):
         amputate_limb(stump, *_below(stump), 4.0)

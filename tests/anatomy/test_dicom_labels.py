@@ -22,7 +22,7 @@ def test_labels_land_on_the_voxels_they_were_drawn_on(tmp_path, direction, write
     labels = labels_on(volume(direction))
     write(tmp_path / "labels.dcm", labels)
     back = read_labels(tmp_path / "labels.dcm", volume(direction))
-    assert back.same_grid(labels)
+    assert back.has_same_grid(labels)
     for name in (SOFT_TISSUE, "tibia", "bone-1"):
         assert np.array_equal(back.mask(name), labels.mask(name)), name
 
@@ -75,7 +75,7 @@ def test_segments_as_highdicom_writes_them(tmp_path):
     )
     segmentation.save_as(tmp_path / "labels.dcm")
     back = read_labels(tmp_path / "labels.dcm", image)
-    assert back.same_grid(image)
+    assert back.has_same_grid(image)
     assert np.array_equal(back.limb, labels.limb)
     assert np.array_equal(back.mask("tibia"), labels.mask("tibia"))
 

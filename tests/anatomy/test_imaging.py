@@ -24,7 +24,7 @@ def test_affine_agrees_with_simpleitk(direction):
         assert np.allclose(image.index_to_point(index), foreign.TransformIndexToPhysicalPoint(index))
         assert np.allclose(image.affine @ [*index, 1], [*image.index_to_point(index), 1])
         assert image.array[index[::-1]] == foreign[index]
-    assert Volume.from_sitk(foreign).same_grid(image)
+    assert Volume.from_sitk(foreign).has_same_grid(image)
 
 
 def test_point_to_index_is_the_inverse():
@@ -42,7 +42,7 @@ def test_round_trip_through_files(tmp_path, suffix, direction):
     corner = np.array(image.size) - 1
     assert np.array_equal(back.array, image.array)
     assert np.abs(back.index_to_point(corner) - image.index_to_point(corner)).max() < TOLERANCE_MM
-    assert back.same_grid(image)
+    assert back.has_same_grid(image)
 
 
 def test_nifti_is_turned_from_ras_to_lps(tmp_path):
@@ -173,9 +173,9 @@ def test_colour_and_flat_images_are_refused(tmp_path):
 def test_grids_differ_by_shape_and_by_place():
     image = volume(DIRECTIONS["oblique"])
     place = (image.spacing, image.origin, image.direction)
-    assert not image.same_grid(Volume(image.array[:-1], *place))
+    assert not image.has_same_grid(Volume(image.array[:-1], *place))
     moved = Volume(image.array, image.spacing, image.origin + np.array([0, 0.02, 0]), image.direction)
-    assert not image.same_grid(moved)
+    assert not image.has_same_grid(moved)
 
 
 @pytest.mark.parametrize("bad", [[1, 1], [1, 1, 0], [1, 1, np.nan]])

@@ -86,9 +86,9 @@ def beside_itself(image: Volume, gap: int) -> Volume:
 @pytest.mark.parametrize("gap", [12, 0, -8])
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
 def test_two_limbs_in_one_image_are_refused(leg, gap, order):
-    check_one_limb(leg[0].turned(order))
+    check_one_limb(leg[0].permute_axes(order))
     with pytest.raises(ImageError, match="crop the image to one limb"):
-        check_one_limb(beside_itself(leg[0], gap).turned(order))
+        check_one_limb(beside_itself(leg[0], gap).permute_axes(order))
 
 
 @pytest.mark.skipif(not CALF.is_dir(), reason="the calf MRI of shared/ is missing")

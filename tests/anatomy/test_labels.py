@@ -30,7 +30,7 @@ def test_round_trip_keeps_geometry_values_and_names(tmp_path, suffix, direction)
     labels = labels_on(image)
     write_labels(tmp_path / f"labels{suffix}", labels)
     back = read_labels(tmp_path / f"labels{suffix}", image)
-    assert back.same_grid(labels)
+    assert back.has_same_grid(labels)
     assert back.bone_names == ("tibia", "bone-1")
     for name in (SOFT_TISSUE, "tibia", "bone-1"):
         assert np.array_equal(back.mask(name), labels.mask(name))

@@ -38,8 +38,8 @@ def test_columns_of_any_steps_fill_the_layers_and_conform() -> None:
     shuffled = random.permutation(faces)
     stack = build_columns(np.arange(len(points)), steps, len(points))
     shares = np.tile([[0.0], [0.7], [1.0]], len(points))
-    mesh_points = np.vstack([points, stack.placed(points, points + np.array([0, 0, 2.0]), shares)])
-    tets, layer = stack.tets(shuffled)
+    mesh_points = np.vstack([points, stack.place_nodes(points, points + np.array([0, 0, 2.0]), shares)])
+    tets, layer = stack.build_tets(shuffled)
     size = compute_volumes(mesh_points, tets)
     assert size.min() > 0
     assert size[layer == 0].sum() == pytest.approx(25 * 1.4)

@@ -19,7 +19,7 @@ from limbfit.anatomy.meshing.curving import curve_diagonals
 from limbfit.anatomy.meshing.extrusion import build_columns
 from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, compute_signed_distance
 from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
-from limbfit.anatomy.meshing.meshreport import mesh_warnings
+from limbfit.anatomy.meshing.meshreport import check_quality
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, read_surface
 from limbfit.errors import MeshingError, SurfaceError
 from limbfit.mesh import Mesh, boundary_faces, measure_quality, to_tet10
@@ -82,13 +82,13 @@ def test_a_flat_element_is_told_where_it_matters(meshed: tuple) -> None:
         foot = points[[a, b, c]].mean(axis=0)
         points[top] = foot + height * (points[top] - foot)
         flat = mesh.with_points(points)
-        return mesh_warnings(flat, measure_quality(flat), 0.0, (position, 20.0))
+        return check_quality(flat, measure_quality(flat), 0.0, (position, 20.0))
 
     near, far = int(distance.argmin()), int(distance.argmax())
-    assert mesh_warnings(mesh, measure_quality(mesh), 0.01, (position, 20.0)) == ()
+    assert check_quality(mesh, measure_quality(mesh), 0.01, (position, 20.0)) == ()
     assert [text.startswith("smallest dihedral angle within 20 mm") for text in told(near, 0.06)] == [True]
     assert told(far, 0.001)[0].startswith("smallest dihedral angle 0.")
-    assert "volume differs by 3.0 %" in mesh_warnings(mesh, measure_quality(mesh), 0.03)[0]
+    assert "volume differs by 3.0 %" in check_quality(mesh, measure_quality(mesh), 0.03)[0]
 
 
 def test_nodes_of_the_skin_stay_on_a_rough_one(oblique: Anatomy) -> None:
@@ -250,7 +250,7 @@ def test_a_skin_that_does_not_reach_the_cut_is_refused(oblique: Anatomy) -> None
 def test_diagonals_follow_the_curved_edges_above_and_below() -> None:
     stack = build_columns(np.array([0, 1, 2]), np.ones((1, 3), int), 3)
     points = np.array([[0.0, 0, 0], [6, 0, 0], [0, 6, 0], [0, 0, 1], [6, 0, 1], [0, 6, 1]])
-    tets, _ = stack.tets(np.array([[0, 1, 2]]))
+    tets, _ = stack.build_tets(np.array([[0, 1, 2]]))
     mesh = to_tet10(Mesh(points, tets, "tet4", np.zeros(3, np.int64), ("skin",)))
     flat = np.isin(mesh.points[:, 2], [0.0, 1.0]) & (np.arange(len(mesh.points)) >= 6)
     target = mesh.points + np.where(flat, 2.0, 0.0)[:, None] * np.array([0, 0, 1.0])

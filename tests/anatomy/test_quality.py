@@ -78,7 +78,7 @@ def test_pieces_and_holes_are_counted(leg):
 def test_slices_are_counted_along_the_limb_whatever_the_axis(leg):
     labels, array = leg[1], leg[1].array.copy()
     _emptied(array, labels, 31)
-    turned = labels.with_array(array).turned([2, 0, 1])
+    turned = labels.with_array(array).permute_axes([2, 0, 1])
     quality = assess_labels(turned)
     assert quality.summarise().axis == "i"
     assert [s.slice for s in quality.suspects if "missing" in s.what] == [31]

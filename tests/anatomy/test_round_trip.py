@@ -57,7 +57,7 @@ def write_ras_segmentation(file: Path, labels: LabelMap) -> None:
 
 
 def turned(image: Volume) -> Volume:
-    return image.turned((1, 2, 0)).reversed([0, 2])
+    return image.permute_axes((1, 2, 0)).reverse_axes([0, 2])
 
 
 IMAGES: dict[str, Callable[[Path, Volume], None]] = {

@@ -26,7 +26,7 @@ def dice(a: np.ndarray, b: np.ndarray) -> float:
 def test_synthetic_leg(direction):
     image, truth = leg_image(SPACING, SHAPE, direction)
     labels = segment(image)
-    assert labels.same_grid(image)
+    assert labels.has_same_grid(image)
     assert dice(labels.limb, truth.limb) > 0.99
     for name in ("tibia", "fibula"):
         assert dice(labels.mask(name), truth.mask(name)) > 0.92

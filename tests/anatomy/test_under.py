@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from limbfit.anatomy.sites.sites import DEEPEST_MM, measure_tissue_under
+from limbfit.anatomy.sites.sites import MAX_DEPTH_MM, measure_tissue_under
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface
 
 
@@ -39,5 +39,5 @@ def test_the_thinnest_place_under_the_footprint_counts(limb):
 
 
 def test_without_bone_below_it_is_deep(limb):
-    assert measure_tissue_under(limb, (0, 50, 0), (0, -1, 0), 20.0) == DEEPEST_MM
-    assert measure_tissue_under(limb, (-50, 0, 0), (1, 0, 0), 20.0) == DEEPEST_MM
+    assert measure_tissue_under(limb, (0, 50, 0), (0, -1, 0), 20.0) == MAX_DEPTH_MM
+    assert measure_tissue_under(limb, (-50, 0, 0), (1, 0, 0), 20.0) == MAX_DEPTH_MM

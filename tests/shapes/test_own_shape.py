@@ -21,7 +21,7 @@ from limbfit.indentation import SiteModel
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.simulation.simulations import SimulationJob, compute_job_digest
 from limbfit.pipeline.variants.sensitivity import list_other_indenters
-from limbfit.shapes import SHAPES, TAKEN, Shape
+from limbfit.shapes import RESERVED_KEYS, SHAPES, Shape
 from limbfit.study import IndenterTable
 
 FRAME = {"centre": (0.4, -0.3, 1.0), "axis": (0.05, 0.1, -1.0)}
@@ -112,7 +112,7 @@ def test_impossible_shapes_are_refused(shape):
         tapered(measures={"angle": 3.0})
     with pytest.raises(ProblemError, match=r"taper_deg = 60 of .* is not between 0 and 20"):
         tapered(measures={"taper_deg": 60.0})
-    assert set(IndenterTable.model_fields) == set(TAKEN)
+    assert set(IndenterTable.model_fields) == set(RESERVED_KEYS)
     for measure, what in ((Measure("width_mm", 1.0, 0.0, 2.0), "is a key of every shape"),
                           (Measure("a_mm", 3.0, 0.0, 2.0), "needs lower <= value <= upper")):  # fmt: skip
 
@@ -207,7 +207,9 @@ def test_the_experiment_compares_it_with_the_others(study):
 
 def test_reports_call_it_by_its_words(shape):
     settings = {"shape": "tapered", "width_mm": 18.0, "edge_radius_mm": 2.0, "taper_deg": 10.0}
-    assert shape.said(settings) == "tapered indenter of 18.0 mm (edge radius 2.0 mm, taper in degrees 10.0)"
+    assert (
+        shape.describe(settings) == "tapered indenter of 18.0 mm (edge radius 2.0 mm, taper in degrees 10.0)"
+    )
 
 
 STATED = """

@@ -49,7 +49,7 @@ def limb(segmented, tmp_path):
 
 def in_page_order(labels) -> np.ndarray:
     """Flat, counted to the right, then to the front, then up."""
-    return labels.along(np.diag([-1.0, -1.0, 1.0])).array.ravel()
+    return labels.align_axes(np.diag([-1.0, -1.0, 1.0])).array.ravel()
 
 
 def test_painted_voxels_and_no_others_change(limb):
@@ -66,7 +66,7 @@ def test_painted_voxels_and_no_others_change(limb):
     after = read_labels(file)
     assert np.array_equal(in_page_order(after), expected)
     assert answer["changed_voxels"] == (expected != in_page_order(before)).sum() > 0
-    assert after.same_grid(before)
+    assert after.has_same_grid(before)
     assert after.names == before.names
     assert states(limb)["segment"] == "stale"
     assert client.get("/api/stages").json()["stages"][0]["state"] == "stale"
@@ -121,11 +121,11 @@ def test_image_and_labels_lie_where_the_study_has_them(limb, tmp_path):
         (tmp_path / f"{what}.nii").write_bytes(client.get(f"/api/image/{what}").content)
     shown = read_labels(tmp_path / "labels.nii")
     stored = read_labels(limb / "results" / "segment" / "labels.seg.nrrd")
-    assert np.array_equal(shown.array, stored.along(np.diag([-1.0, -1.0, 1.0])).array)
+    assert np.array_equal(shown.array, stored.align_axes(np.diag([-1.0, -1.0, 1.0])).array)
     corner = [0.0, 0.0, 0.0]
     assert np.allclose(
         shown.index_to_point(corner),
-        stored.along(np.diag([-1.0, -1.0, 1.0])).index_to_point(corner),
+        stored.align_axes(np.diag([-1.0, -1.0, 1.0])).index_to_point(corner),
         atol=1e-3,
     )
     header = nrrd.read_header(str(limb / "image.nrrd"))

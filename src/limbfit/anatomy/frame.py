@@ -56,7 +56,7 @@ class ProximalEnd:
         """(3,) unit vector, proximal, LPS."""
         return self.side * grid.direction[:, self.axis]
 
-    def along(self, array: NDArray) -> NDArray:
+    def order_distal_first(self, array: NDArray) -> NDArray:
         """A view of ``[k, j, i]`` whose first axis runs along the limb from distal to proximal."""
         view = np.moveaxis(array, 2 - self.axis, 0)
         return view[::-1] if self.side < 0 else view

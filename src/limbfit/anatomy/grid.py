@@ -108,14 +108,14 @@ class Grid:
         """(..., 3) LPS mm to continuous indices (i, j, k)."""
         return (np.asarray(point, dtype=float) - self.origin) @ (self.direction / self.spacing)
 
-    def heights(self, point: ArrayLike, normal: ArrayLike) -> Array:
+    def compute_heights(self, point: ArrayLike, normal: ArrayLike) -> Array:
         """``[k, j, i]`` distance of each voxel beyond a plane (LPS mm, unit normal), mm."""
         i, j, k = (np.arange(n, dtype=float) for n in self.size)
         steps = (self.direction * self.spacing).T @ np.asarray(normal)
         start = float((self.origin - np.asarray(point)) @ np.asarray(normal))
         return start + k[:, None, None] * steps[2] + j[:, None] * steps[1] + i * steps[0]
 
-    def turned(self, order: Sequence[int]) -> Self:
+    def permute_axes(self, order: Sequence[int]) -> Self:
         """The same samples with other index axes: ``order[n]`` is the present axis that becomes axis n."""
         axes = tuple(2 - order[2 - n] for n in range(3))
         return replace(
@@ -125,7 +125,7 @@ class Grid:
             direction=self.direction[:, list(order)],
         )
 
-    def reversed(self, axes: Sequence[int]) -> Self:
+    def reverse_axes(self, axes: Sequence[int]) -> Self:
         """The same samples with some index axes (0, 1, 2 for i, j, k) running the other way."""
         last = np.zeros(3)
         last[list(axes)] = [self.size[axis] - 1 for axis in axes]
@@ -134,12 +134,12 @@ class Grid:
         array = np.flip(self.array, tuple(2 - axis for axis in axes))
         return replace(self, array=array, origin=self.index_to_point(last), direction=direction)
 
-    def cropped(self, box: Sequence[slice]) -> Self:
+    def crop(self, box: Sequence[slice]) -> Self:
         """The samples in a box of array indices ``[k, j, i]``."""
         start = [part.start for part in box][::-1]
         return replace(self, array=self.array[tuple(box)], origin=self.index_to_point(start))
 
-    def nearest_lps(self) -> Self:
+    def align_with_lps(self) -> Self:
         """The same samples with right-handed index axes in the order and sense nearest to x, y, z.
 
         What is computed from them then does not depend on how the file stored them.
@@ -152,23 +152,23 @@ class Grid:
                 signs[np.argmin(np.abs(np.diag(axes)))] *= -1
             if np.trace(axes * signs) > nearness + 1e-6:
                 best, nearness = axes * signs, float(np.trace(axes * signs))
-        return self.along(best)
+        return self.align_axes(best)
 
-    def in_own_frame(self) -> Self:
+    def move_to_own_frame(self) -> Self:
         """The same samples with the first voxel at zero and axes along x, y, z; spacing to 1e-5 mm.
 
         Rounding in files moves voxels by less than that, but remeshing turns it into other triangles.
         """
         return replace(self, spacing=np.round(self.spacing, 5), origin=np.zeros(3), direction=np.eye(3))
 
-    def along(self, axes: Array) -> Self:
+    def align_axes(self, axes: Array) -> Self:
         """The same samples with index axes in the order and sense nearest to the columns of ``axes``."""
         across = np.asarray(axes).T @ self.direction
         order = max(permutations(range(3)), key=lambda p: sum(abs(across[n, p[n]]) for n in range(3)))
-        turned = self.turned(order)
-        return turned.reversed([n for n in range(3) if across[n, order[n]] < 0])
+        turned = self.permute_axes(order)
+        return turned.reverse_axes([n for n in range(3) if across[n, order[n]] < 0])
 
-    def same_grid(self, other: Grid) -> bool:
+    def has_same_grid(self, other: Grid) -> bool:
         """Whether both sample the same points: every corner voxel within 0.01 mm."""
         if self.array.shape != other.array.shape:
             return False

@@ -16,10 +16,10 @@ from ..errors import ProblemError
 from .cells import linear_simplex, quadratic_simplex
 from .volume import Mesh
 
-NEAREST = 24  # cells that are looked at, by their middles
+MAX_CANDIDATES = 24  # cells that are looked at, by their middles
 _STEPS = 8  # of Newton's iteration; one is enough where edges are straight and cells are tetrahedra
-_FARTHEST = 4.0  # local coordinates that mean nothing any more
-_ON_EDGE = 1e-9  # of a triangle's own coordinates: a line through an edge meets the faces on both sides
+_MAX_LOCAL = 4.0  # local coordinates that mean nothing any more
+_ON_EDGE = 1e-9  # in local coordinates: a line through an edge meets the faces on both sides
 _SAME_MM = 1e-6
 
 
@@ -37,18 +37,18 @@ def locate(mesh: Mesh, points: Array, region: int) -> tuple[Indices, Array, Arra
     ProblemError
         Where no cell is of that region.
     """
-    own = np.flatnonzero(mesh.regions == region)
-    if not len(own):
+    candidates = np.flatnonzero(mesh.regions == region)
+    if not len(candidates):
         what = f"the mesh has no cell of {mesh.region_names[region]}"
         raise ProblemError(what, remedy="mesh the site anew")
-    middles = mesh.points[mesh.corners[own]].mean(axis=1)
+    middles = mesh.points[mesh.corners[candidates]].mean(axis=1)
     cells, local, off = (
         np.empty(len(points), dtype=np.int64),
         np.empty((len(points), 3)),
         np.empty(len(points)),
     )
     for k, point in enumerate(points):
-        near = own[np.argsort(np.linalg.norm(middles - point, axis=1))[:NEAREST]]
+        near = candidates[np.argsort(np.linalg.norm(middles - point, axis=1))[:MAX_CANDIDATES]]
         inside = _clip_into_cell(mesh, _find_local_coordinates(mesh, near, point))
         values, _ = mesh.kind.shape(inside)
         away = np.linalg.norm(np.einsum("mk,mki->mi", values, mesh.points[mesh.cells[near]]) - point, axis=1)
@@ -66,7 +66,7 @@ def _find_local_coordinates(mesh: Mesh, cells: Indices, point: Array) -> Array:
         values, slopes = mesh.kind.shape(x)
         missed = point - np.einsum("mk,mki->mi", values, corners)
         x = x + np.linalg.solve(np.einsum("mki,mkj->mij", corners, slopes), missed[..., None])[..., 0]
-        x = np.clip(x, -_FARTHEST, _FARTHEST)
+        x = np.clip(x, -_MAX_LOCAL, _MAX_LOCAL)
     return x
 
 
@@ -134,7 +134,7 @@ def find_gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[LayerGaug
     """
     axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     crossings = _find_crossings(mesh, np.asarray(origin, dtype=float), axis)
-    entries = [k for k, one in enumerate(crossings) if one.above < 0]
+    entries = [k for k, crossing in enumerate(crossings) if crossing.above < 0]
     if not entries:
         raise ProblemError("no tissue lies under the indenter's axis", remedy="check the site's position")
     first = min(entries, key=lambda k: abs(crossings[k].along_mm))
@@ -149,9 +149,9 @@ def find_gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[LayerGaug
 
 def _build_gauge(region: str, axis: Array, top: _Crossing, bottom: _Crossing) -> LayerGauge:
     weights: Array = np.concatenate([top.weights, -bottom.weights])
-    kept, place = np.unique(np.concatenate([top.nodes, bottom.nodes]), return_inverse=True)
+    nodes, place = np.unique(np.concatenate([top.nodes, bottom.nodes]), return_inverse=True)
     thickness = bottom.along_mm - top.along_mm
-    return LayerGauge(kept, np.bincount(place, weights).astype(np.float64), axis, region, thickness)
+    return LayerGauge(nodes, np.bincount(place, weights).astype(np.float64), axis, region, thickness)
 
 
 def _find_crossings(mesh: Mesh, origin: Array, axis: Array) -> list[_Crossing]:
@@ -166,19 +166,23 @@ def _find_crossings(mesh: Mesh, origin: Array, axis: Array) -> list[_Crossing]:
     )
     last = np.empty(len(first), dtype=np.int64)
     last[place.ravel()] = np.arange(len(faces))
-    found: list[_Crossing] = []
-    for one, other, count in zip(first, last, counts):
-        here, there = mesh.regions[owners[one]], mesh.regions[owners[other]]
+    crossings: list[_Crossing] = []
+    for first_face, last_face, count in zip(first, last, counts):
+        here, there = mesh.regions[owners[first_face]], mesh.regions[owners[last_face]]
         if count == 1 or here != there:
             outside = -1 if count == 1 else int(there)
-            found += _intersect_face(mesh, faces[one], origin, axis, int(here), outside)
-    found.sort(key=lambda c: c.along_mm)
-    kept: list[_Crossing] = []
-    for one in found:
-        doubled = kept and one.along_mm - kept[-1].along_mm < _SAME_MM and one.below == kept[-1].below
-        if not doubled:
-            kept.append(one)
-    return kept
+            crossings += _intersect_face(mesh, faces[first_face], origin, axis, int(here), outside)
+    crossings.sort(key=lambda c: c.along_mm)
+    distinct: list[_Crossing] = []
+    for crossing in crossings:
+        previous = distinct[-1] if distinct else None
+        if (
+            previous is None
+            or crossing.along_mm - previous.along_mm >= _SAME_MM
+            or crossing.below != previous.below
+        ):
+            distinct.append(crossing)
+    return distinct
 
 
 def _find_cells_at(mesh: Mesh, origin: Array, axis: Array) -> Indices:

@@ -13,16 +13,16 @@ from .facets import Facets, revolved, steps
 from .rigid_surface import RigidSurface
 from .shape import SHARP_EDGE, Measure, Revolution, Shape, Size
 
-OWN: tuple[type[Shape], ...] = (Square, Sphere, Cylinder, Stl)
-SHAPES: Registry[type[Shape]] = Registry("indenter shape", {shape.name: shape for shape in OWN})
+BUILTIN_SHAPES: tuple[type[Shape], ...] = (Square, Sphere, Cylinder, Stl)
+SHAPES: Registry[type[Shape]] = Registry("indenter shape", {shape.name: shape for shape in BUILTIN_SHAPES})
 # Keys of a study's [indenter], which measures cannot have.
-TAKEN = ("shape", "file", "width_mm", "edge_radius_mm", "friction")
+RESERVED_KEYS = ("shape", "file", "width_mm", "edge_radius_mm", "friction")
 
 __all__ = [
-    "OWN",
+    "BUILTIN_SHAPES",
+    "RESERVED_KEYS",
     "SHAPES",
     "SHARP_EDGE",
-    "TAKEN",
     "Facets",
     "Measure",
     "Revolution",
@@ -44,7 +44,7 @@ def register_shape(shape: type[Shape]) -> None:
         Where the name is taken, or a measure is not within its bounds or has the name of another key.
     """
     for measure in shape.measures:
-        if measure.key in TAKEN:
+        if measure.key in RESERVED_KEYS:
             raise InputError(f"{measure.key} is a key of every shape", place=shape.name, remedy="rename it")
         if not measure.lower <= measure.value <= measure.upper:
             raise InputError(f"{measure.key} needs lower <= value <= upper", place=shape.name)

@@ -85,7 +85,7 @@ class Cylinder(Revolution):
 
     def meridian(self, rho: Array, z: Array) -> Distance:
         """See `Revolution.meridian`."""
-        return _rounded(rho, z, self.flat, self.radius)
+        return _compute_rod_distances(rho, z, self.flat, self.radius)
 
     def facets(self) -> Facets:
         """A disk and its rounding."""
@@ -100,7 +100,7 @@ class Cylinder(Revolution):
 
 
 @njit(cache=True)
-def _rounded(rho, z, flat, radius):  # type: ignore[no-untyped-def]
+def _compute_rod_distances(rho, z, flat, radius):  # type: ignore[no-untyped-def]
     """A rod shrunk by its rounding, grown again."""
     n = len(rho)
     values, slopes, bends = np.empty(n), np.zeros((n, 2)), np.zeros((n, 3))
@@ -160,13 +160,13 @@ class Stl(Shape):
         """See `Shape.of`."""
         if size.surface is None:
             raise ProblemError("an indenter of shape 'stl' needs a surface")
-        cls.measured(size.measures or {})
-        radius, body = size.surface.rounded(size.radius, size.edge_radius >= size.least_radius)
+        cls.complete_measures(size.measures or {})
+        radius, body = size.surface.round_edges(size.radius, size.edge_radius >= size.least_radius)
         return cls(size.width, radius, size.surface, body)
 
     @classmethod
-    def said(cls, settings: Mapping[str, Any]) -> str:
-        """See `Shape.said`; the width of the settings is not its own."""
+    def describe(cls, settings: Mapping[str, Any]) -> str:
+        """See `Shape.describe`; the width of the settings is not its own."""
         return f"{cls.words} (edge radius {settings.get('edge_radius_mm')} mm)"
 
     def distance(self, points: Array) -> Distance:

@@ -32,9 +32,9 @@ from .triangles import (
 Body = tuple[Array, Array, Array, Array, Array, Tree, Tree]
 
 SMALLEST_MM, LARGEST_MM = 0.5, 500.0  # of an indenter's width: beyond, the file is not in mm
-FRONT = 0.1  # faces whose unit normal leans at least so much towards the tissue
-STRAIGHT = 1e-8  # squared sine below which normals or edges count as parallel
-SPREAD = 2.5e-3  # squared sine of a spread of normals that a moved corner need not follow
+MIN_FRONT_COSINE = 0.1  # faces whose unit normal leans at least so much towards the tissue
+PARALLEL = 1e-8  # squared sine below which normals or edges count as parallel
+FLAT_SPREAD = 2.5e-3  # squared sine of a spread of normals that a moved corner need not follow
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class RigidSurface:
         """Twice the largest distance from the axis along x or y, mm."""
         return 2.0 * float(np.abs(self.points[self.faces][..., :2]).max())
 
-    def rounded(self, radius: float, exact: bool) -> tuple[float, Body]:
+    def round_edges(self, radius: float, exact: bool) -> tuple[float, Body]:
         """The body whose edges are rounded by ``radius`` mm, as the kernels read it, and the radius.
 
         Where the surface has details that such a radius would swallow, it is halved; or refused, with
@@ -92,7 +92,7 @@ class RigidSurface:
     def _round(self, radius: float, halvings: int) -> tuple[float, Body]:
         for k in range(halvings + 1):
             r = radius / 2**k
-            moved = self._shrunk(r)
+            moved = self._shrink(r)
             if moved is not None:
                 return r, _build_body(moved, self.faces)
         raise ProblemError(
@@ -100,12 +100,12 @@ class RigidSurface:
             remedy="give a smaller edge radius or a coarser surface",
         )
 
-    def _shrunk(self, radius: float) -> Array | None:
+    def _shrink(self, radius: float) -> Array | None:
         """Points (n, 3) of the surface whose faces moved in by ``radius``; None where a face turns over."""
         normals, areas = compute_triangle_normals(self.points[self.faces])
         spread, along = compute_normal_spread(self.points, self.faces, normals)
         values, axes = np.linalg.eigh(spread)
-        keep = values > SPREAD * values[:, -1:]
+        keep = values > FLAT_SPREAD * values[:, -1:]
         inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)
         moved = self.points - radius * np.einsum("nij,nj,nkj,nk->ni", axes, inverse, axes, along)
         after, left = compute_triangle_normals(moved[self.faces])
@@ -148,10 +148,10 @@ def _build_body(points: Array, faces: Indices) -> Body:
     normals, areas = compute_triangle_normals(corners)
     spread, sums = compute_normal_spread(points, faces, normals)
     values, axes = np.linalg.eigh(spread)
-    on_edge = (values[:, 0] < STRAIGHT * values[:, 2]) & (values[:, 1] > STRAIGHT * values[:, 2])
+    on_edge = (values[:, 0] < PARALLEL * values[:, 2]) & (values[:, 1] > PARALLEL * values[:, 2])
     along = np.where(on_edge[:, None], axes[:, :, 0], 0.0)
     solid = np.flatnonzero(areas > 1e-12 * areas.max())
-    facing = normals[solid, 2] > min(FRONT, 0.5 * normals[solid, 2].max())
+    facing = normals[solid, 2] > min(MIN_FRONT_COSINE, 0.5 * normals[solid, 2].max())
     trees = build_tree(corners, solid), build_tree(corners, solid[facing])
     return (
         corners,

@@ -112,10 +112,10 @@ class Shape(ABC):
         """
         if size.surface is not None:
             raise ProblemError(f"an indenter of shape {cls.name!r} has no surface")
-        return cls(size.width, size.radius, **cls.measured(size.measures or {}))
+        return cls(size.width, size.radius, **cls.complete_measures(size.measures or {}))
 
     @classmethod
-    def measured(cls, given: Mapping[str, float]) -> dict[str, float]:
+    def complete_measures(cls, given: Mapping[str, float]) -> dict[str, float]:
         """Its measures by key; what is not given has its usual value.
 
         Raises
@@ -139,7 +139,7 @@ class Shape(ABC):
         return values
 
     @classmethod
-    def said(cls, settings: Mapping[str, Any]) -> str:
+    def describe(cls, settings: Mapping[str, Any]) -> str:
         """The ``[indenter]`` of a study in words."""
         edge = f"edge radius {settings.get('edge_radius_mm')} mm"
         own = [f"{measure.words or measure.key} {settings.get(measure.key)}" for measure in cls.measures]
@@ -189,11 +189,11 @@ class Revolution(Shape):
         """See `Shape.distance`."""
         rho = np.hypot(points[:, 0], points[:, 1])
         values, slopes, bends = self.meridian(rho, points[:, 2])
-        return values, *_turned(points, rho, slopes, bends)
+        return values, *_rotate_about_axis(points, rho, slopes, bends)
 
 
 @njit(cache=True)
-def _turned(points, rho, slopes, bends):  # type: ignore[no-untyped-def]
+def _rotate_about_axis(points, rho, slopes, bends):  # type: ignore[no-untyped-def]
     """Gradients and hessians in space; on the axis, where nothing depends on the direction, by symmetry."""
     n = len(points)
     gradients, hessians = np.empty((n, 3)), np.empty((n, 3, 3))

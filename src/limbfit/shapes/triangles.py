@@ -15,7 +15,7 @@ from ..arrays import Array, Indices
 from ..errors import ProblemError
 
 Tree = tuple[Array, Indices, Indices]
-LEAF = 4
+LEAF_SIZE = 4
 INSIDE = 0  # features of a triangle: 0 its inside, 1 + i the edge from corner i, 4 + i corner i
 
 
@@ -80,7 +80,7 @@ def build_tree(corners: Array, faces: Indices) -> Tree:
         of = order[start:stop]
         box = np.concatenate([low[of].min(axis=0), high[of].max(axis=0)])
         boxes.append(box)
-        if stop - start <= LEAF:
+        if stop - start <= LEAF_SIZE:
             links.append([-1 - start, stop])
             continue
         middle = (stop - start) // 2

@@ -62,7 +62,7 @@ def get_facts(folder: Folder) -> dict[str, Any]:
 @router.get("/volume")
 def get_volume(folder: Folder) -> Response:
     """The image as NIfTI, its voxels in the page's order."""
-    return _respond_nifti(_read_study_volume(folder.load()).along(PAGE_AXES))
+    return _respond_nifti(_read_study_volume(folder.load()).align_axes(PAGE_AXES))
 
 
 @router.get("/labels")
@@ -71,7 +71,7 @@ def get_labels(folder: Folder) -> Response:
     shown = find_shown_labels(folder)
     if shown is None:
         raise FileNotFoundError(LABELS)
-    answer = _respond_nifti(read_shown_labels(shown).along(PAGE_AXES))
+    answer = _respond_nifti(read_shown_labels(shown).align_axes(PAGE_AXES))
     answer.headers["X-Base"] = shown.digest
     return answer
 
@@ -120,7 +120,7 @@ def paint(labels: LabelMap, runs: list[tuple[int, int, int]]) -> LabelMap:
     InputError
         For voxels outside of the map and for labels that it does not have.
     """
-    turned = labels.along(PAGE_AXES)
+    turned = labels.align_axes(PAGE_AXES)
     flat = turned.array.ravel().copy()
     table = np.array(runs, dtype=np.int64)
     if (table[:, 0] + table[:, 1]).max() > flat.size:
@@ -130,7 +130,7 @@ def paint(labels: LabelMap, runs: list[tuple[int, int, int]]) -> LabelMap:
         raise InputError(f"the label map has no label {unknown[0]}")
     for first, count, value in table.tolist():
         flat[first : first + count] = value
-    return turned.with_array(flat.reshape(turned.array.shape)).along(labels.direction)
+    return turned.with_array(flat.reshape(turned.array.shape)).align_axes(labels.direction)
 
 
 def _read_study_volume(study: Study) -> Volume:

@@ -200,7 +200,7 @@ def stack_slices(slices: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Arra
             )
     rows, columns = _compute_axes(first)
     normal = np.cross(rows, columns)
-    heights = np.array([one.position @ normal for one in slices])  # type: ignore[operator]
+    heights = np.array([header.position @ normal for header in slices])  # type: ignore[operator]
     ordered = [slices[n] for n in np.argsort(heights, kind="stable")]
     spacing = _slice_spacing(ordered, normal)
     assert first.pixel_spacing is not None
@@ -226,31 +226,31 @@ def _close(a: Array | None, b: Array | None) -> bool:
 
 
 def _check_kind(slices: Sequence[SliceHeader]) -> None:
-    for one in slices:
-        if one.modality not in _VOLUMES:
+    for header in slices:
+        if header.modality not in _VOLUMES:
             raise ImageError(
-                f"images of modality {_redact_modality(one.modality)} are not slices of a volume",
+                f"images of modality {_redact_modality(header.modality)} are not slices of a volume",
                 remedy="give an MR or CT series",
             )
-        if one.position is None or one.orientation is None or one.pixel_spacing is None:
+        if header.position is None or header.orientation is None or header.pixel_spacing is None:
             raise ImageError(
                 "images do not say where they lie in the patient (position, orientation, pixel spacing)",
                 remedy="export the original series, not screen captures",
             )
-        if np.any(one.pixel_spacing <= 0):
+        if np.any(header.pixel_spacing <= 0):
             raise ImageError("the pixel spacing is not positive", remedy="export the original series again")
-        if np.any(one.pixel_spacing < _FINEST_MM):
+        if np.any(header.pixel_spacing < _FINEST_MM):
             raise ImageError(
-                f"a pixel spacing of {one.pixel_spacing.min():.3g} mm",
+                f"a pixel spacing of {header.pixel_spacing.min():.3g} mm",
                 remedy="it must be in millimetres; export the original series again",
             )
-        if not np.all(np.isfinite(one.rescale)) or one.rescale[0] == 0:
+        if not np.all(np.isfinite(header.rescale)) or header.rescale[0] == 0:
             raise ImageError(
                 "a rescale slope or intercept that is no usable number", remedy="export the series again"
             )
-        if one.samples != 1:
+        if header.samples != 1:
             raise ImageError("colour images", remedy="give the original grey-value series")
-        if one.photometric == "MONOCHROME1":
+        if header.photometric == "MONOCHROME1":
             raise ImageError("inverted grey values (MONOCHROME1)", remedy="export the series as MONOCHROME2")
     if len(slices) < 3:
         raise ImageError(
@@ -281,7 +281,7 @@ def _compute_axes(header: SliceHeader) -> tuple[Array, Array]:
 
 def _slice_spacing(slices: list[SliceHeader], normal: Array) -> float:
     """The uniform distance between slices sorted along the normal."""
-    places = np.array([one.position for one in slices])
+    places = np.array([header.position for header in slices])
     gaps = np.diff(places @ normal)
     usual = float(np.median(gaps))
     tolerance = _PLACE_TOLERANCE * max(usual, 0.1)
@@ -338,7 +338,7 @@ def read_pixels(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
         except ImageError:
             raise
         except Exception:  # its text may hold file names and tag values
-            raise _build_decoding_error({one.syntax for one in slices}) from None
+            raise _build_decoding_error({header.syntax for header in slices}) from None
     if array.shape != (len(slices), slices[0].rows, slices[0].columns):
         raise ImageError("the pixels do not match the headers", remedy="export the series again")
     return array
@@ -347,7 +347,7 @@ def read_pixels(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
 def _read_files(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
     """GDCM applies each image's own slope and intercept."""
     reader = sitk.ImageSeriesReader()
-    reader.SetFileNames([str(one.path) for one in slices])
+    reader.SetFileNames([str(header.path) for header in slices])
     reader.SetOutputPixelType(sitk.sitkFloat32)
     with mute_libraries():
         return sitk.GetArrayFromImage(reader.Execute())
@@ -372,12 +372,12 @@ def mute_libraries() -> Iterator[None]:
 
 
 def _read_frames(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
-    files = {one.path: pydicom.dcmread(one.path).pixel_array for one in slices}
+    files = {header.path: pydicom.dcmread(header.path).pixel_array for header in slices}
     planes = []
-    for one in slices:
-        stored = files[one.path]
-        plane = stored if stored.ndim == 2 else stored[one.frame]
-        slope, intercept = one.rescale
+    for header in slices:
+        stored = files[header.path]
+        plane = stored if stored.ndim == 2 else stored[header.frame]
+        slope, intercept = header.rescale
         planes.append(plane.astype(np.float32) * np.float32(slope) + np.float32(intercept))
     return np.stack(planes)
 

@@ -95,12 +95,12 @@ def _read_nrrd(path: Path) -> sitk.Image:
     return _read_itk(path, lambda reader: "NRRD_space" in reader.GetMetaDataKeys())
 
 
-_OWN = (
+_BUILTIN = (
     ImageFormat("NIfTI", (".nii", ".nii.gz"), _read_nifti, is_written=True),
     ImageFormat("NRRD", (".nrrd", ".nhdr"), _read_nrrd, is_written=True),
     ImageFormat("MetaImage", (".mha", ".mhd"), _read_itk, is_written=True),
 )
-IMAGE_FORMATS = Registry("image format", {one.name: one for one in _OWN})
+IMAGE_FORMATS = Registry("image format", {known.name: known for known in _BUILTIN})
 
 
 def register_image_format(name: str, suffixes: tuple[str, ...], read: Read) -> None:
@@ -117,10 +117,10 @@ def register_image_format(name: str, suffixes: tuple[str, ...], read: Read) -> N
     InputError
         Where the name or a suffix is taken.
     """
-    for one in IMAGE_FORMATS:
-        taken = sorted(set(one.suffixes) & set(suffixes))
-        if taken and one.name != name:
-            raise InputError(f"images {taken[0]} are {one.name} already", place=name, remedy="rename them")
+    for known in IMAGE_FORMATS:
+        taken = sorted(set(known.suffixes) & set(suffixes))
+        if taken and known.name != name:
+            raise InputError(f"images {taken[0]} are {known.name} already", place=name, remedy="rename them")
     IMAGE_FORMATS.add(name, ImageFormat(name, suffixes, read))
 
 
@@ -132,11 +132,11 @@ def format_of(path: Path, written: bool = False) -> ImageFormat:
     ImageError
         For a suffix that no format has.
     """
-    known = [one for one in IMAGE_FORMATS if one.is_written or not written]
-    for one in known:
-        if path.name.lower().endswith(one.suffixes):
-            return one
-    suffixes = " ".join(suffix for one in known for suffix in one.suffixes)
+    formats = [known for known in IMAGE_FORMATS if known.is_written or not written]
+    for known in formats:
+        if path.name.lower().endswith(known.suffixes):
+            return known
+    suffixes = " ".join(suffix for known in formats for suffix in known.suffixes)
     raise ImageError(f"unknown kind of image {path.suffix!r}", file=path, remedy=f"use one of {suffixes}")
 
 

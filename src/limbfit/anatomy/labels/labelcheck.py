@@ -15,8 +15,8 @@ from ..grid import SOFT_NAMES, Grid, LabelMap, Volume
 from ..morphology import find_box
 
 # A second piece this large beside the largest is no stray: another limb, or another bone.
-_ISLAND = 0.2
-_MOSTLY_BONE = 0.8
+_MAX_STRAY_SHARE = 0.2
+_MAX_BONE_SHARE = 0.8
 _ON_GRID = 0.01  # voxels
 
 
@@ -54,7 +54,7 @@ def _check_names(labels: LabelMap) -> None:
 
 def _keep_one_limb(labels: LabelMap) -> tuple[LabelMap, list[str]]:
     parts, sizes = _number_pieces(labels.limb)
-    if len(sizes) > 1 and np.sort(sizes)[-2] > _ISLAND * sizes.max():
+    if len(sizes) > 1 and np.sort(sizes)[-2] > _MAX_STRAY_SHARE * sizes.max():
         raise LabelError(
             "two limbs, or a limb in two pieces, in one label map",
             remedy="keep the labels of one limb, in one piece",
@@ -76,24 +76,24 @@ def _keep_one_limb(labels: LabelMap) -> tuple[LabelMap, list[str]]:
 
 def _keep_one_piece(labels: LabelMap, name: str) -> tuple[LabelMap, list[str]]:
     mask = labels.mask(name)
-    if mask.sum() > _MOSTLY_BONE * labels.limb.sum():
+    if mask.sum() > _MAX_BONE_SHARE * labels.limb.sum():
         raise LabelError(
-            f"{name!r} takes up more than {_MOSTLY_BONE:.0%} of the limb",
+            f"{name!r} takes up more than {_MAX_BONE_SHARE:.0%} of the limb",
             remedy="if it is the soft tissue, name it 'soft tissue'",
         )
     parts, sizes = _number_pieces(mask)
     if len(sizes) < 2:
         return labels, []
-    if np.sort(sizes)[-2] > _ISLAND * sizes.max():
+    if np.sort(sizes)[-2] > _MAX_STRAY_SHARE * sizes.max():
         raise LabelError(
-            f"{name!r} lies in {int((sizes > _ISLAND * sizes.max()).sum())} large pieces",
+            f"{name!r} lies in {int((sizes > _MAX_STRAY_SHARE * sizes.max()).sum())} large pieces",
             remedy="give each bone its own name, or join the pieces",
         )
     stray = mask & (parts != int(np.argmax(sizes)) + 1)
     array = np.where(stray, labels.soft_value, labels.array)
     pieces = _describe_pieces(len(sizes) - 1, stray, labels)
-    said = f"{pieces} of {name!r} apart from the bone became soft tissue"
-    return labels.with_array(array), [said]
+    note = f"{pieces} of {name!r} apart from the bone became soft tissue"
+    return labels.with_array(array), [note]
 
 
 def _number_pieces(mask: Mask) -> tuple[NDArray[np.int32], Indices]:
@@ -115,15 +115,15 @@ def place_on_grid(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
     LabelError
         Where the voxels of the two do not coincide, or labelled ones lie outside the image.
     """
-    if labels.same_grid(like):
+    if labels.has_same_grid(like):
         return labels
-    given, labels = labels, _crop_labels(labels.along(like.direction))
+    original, labels = labels, _crop_labels(labels.align_axes(like.direction))
     offset = _find_offset(labels, like)
     if offset is None:
         raise LabelError(
             "the label map is on a different grid from the image",
             file=path,
-            remedy=f"image {_format_shape(like)}, labels {_format_shape(given)}: "
+            remedy=f"image {_format_shape(like)}, labels {_format_shape(original)}: "
             "export it with the image as reference geometry",
         )
     last = offset + np.array(labels.size)
@@ -142,7 +142,7 @@ def _crop_labels(labels: LabelMap) -> LabelMap:
     """Without the empty layers around what is labelled; a margin of zeros may lie outside the image."""
     if not labels.array.any():
         return labels
-    return labels.cropped(find_box(labels.limb))
+    return labels.crop(find_box(labels.limb))
 
 
 def _find_offset(labels: Grid, like: Grid) -> Indices | None:

@@ -16,7 +16,7 @@ from ..morphology import find_box
 
 LIMB = "limb"
 _OUTLIER = 6.0  # robust standard deviations (1.4826 times the median absolute deviation)
-_AREA, _JUMP = 0.08, 0.25  # smaller parts of a slice's area are never odd
+_MIN_AREA_CHANGE, _MIN_AREA_JUMP = 0.08, 0.25  # smaller parts of a slice's area are never odd
 _CENTRE_MM = 1.5  # smaller distances of a slice's centroid are never odd
 _END_MM = 12.0  # a bone's end is round: its first and last slices may change quickly
 
@@ -48,7 +48,7 @@ def assess_labels(labels: LabelMap) -> LabelQuality:
     """Measure every label and the limb as a whole, and name the slices that do not fit their neighbours."""
     axis = find_longest_axis(labels.limb, labels)
     order = [*(n for n in range(3) if n != axis), axis]
-    turned = labels.turned(order)
+    turned = labels.permute_axes(order)
     masks = {LIMB: turned.limb} | {
         name: turned.mask(name) for _, name in sorted(labels.names.items()) if turned.mask(name).any()
     }
@@ -113,7 +113,7 @@ def _find_outlying_slices(name: str, area: Array, centre: Array, inner: Mask) ->
     off = np.pad((area[1:-1] - expected) / expected, 1)
     aside = np.pad(np.linalg.norm(centre[1:-1] - (centre[:-2] + centre[2:]) / 2, axis=1), 1)
     found = []
-    for k in _find_peaks(np.abs(off), np.maximum(_AREA, _OUTLIER * _spread(off[inner])), inner):
+    for k in _find_peaks(np.abs(off), np.maximum(_MIN_AREA_CHANGE, _OUTLIER * _spread(off[inner])), inner):
         found.append(SliceWarning(name, k, f"area {off[k]:+.0%} of what its neighbours have"))
     for k in _find_peaks(aside, max(_CENTRE_MM, _OUTLIER * _spread(aside[inner])), inner):
         found.append(SliceWarning(name, k, f"{aside[k]:.1f} mm beside its neighbours"))
@@ -123,7 +123,7 @@ def _find_outlying_slices(name: str, area: Array, centre: Array, inner: Mask) ->
 def _find_area_jumps(name: str, area: Array, inner: Mask) -> list[SliceWarning]:
     """Slices at which the area changes for good."""
     change = np.pad(np.diff(area) / np.maximum(area[1:], area[:-1]), (1, 0))
-    limit = max(_JUMP, _OUTLIER * _spread(change[inner]))
+    limit = max(_MIN_AREA_JUMP, _OUTLIER * _spread(change[inner]))
     return [
         SliceWarning(name, k, f"area jumps by {change[k]:+.0%}")
         for k in _find_peaks(np.abs(change), limit, inner)

@@ -43,7 +43,7 @@ class TetGrid:
     spacing: float
     regions: Indices
 
-    def kept(self, keep: Mask) -> TetGrid:
+    def select(self, keep: Mask) -> TetGrid:
         """The grid of the chosen tetrahedra with its unused points dropped."""
         used, tets = np.unique(self.tets[keep], return_inverse=True)
         tets = tets.reshape(-1, 4)
@@ -106,14 +106,14 @@ def cut(
     The cut grid and, per tetrahedron that was to be cut, whether it lies where the field is positive.
     """
     values = compute_in_band(field, grid.points, LONGEST_EDGE * grid.spacing, grid.spacing, slack)
-    wanted = grid.tets if region is None else grid.tets[grid.regions == region]
-    edges = _find_crossed_edges(wanted, values)
+    chosen = grid.tets if region is None else grid.tets[grid.regions == region]
+    edges = _find_crossed_edges(chosen, values)
     t = _find_roots(grid.points, edges, values, field)
     grid, snapped = _snap_vertices(grid, edges, t, bit)
     values = np.where(snapped, 0.0, values)
     crossed = ~snapped[edges].any(axis=1)
     edges, t = edges[crossed], t[crossed]
-    on_level = np.isin(np.arange(len(values)), wanted) & (values == 0)
+    on_level = np.isin(np.arange(len(values)), chosen) & (values == 0)
     grid = _divide_edges(replace(grid, mask=np.where(on_level, grid.mask | bit, grid.mask)), edges, t, bit)
     values = np.concatenate([values, np.zeros(len(edges))])
     return grid, values[grid.tets].sum(axis=1) > 0

@@ -137,12 +137,12 @@ def balance_bone_faces(mesh: Mesh, fields: LimbFields, straight: Array) -> Mesh:
     return mesh
 
 
-def _move_mid_nodes(mesh: Mesh, moves: Array, stated: Indices) -> Array:
-    """Moves (n, 3) in which mid-edge nodes other than those ``stated`` go with the ends of their edges."""
+def _move_mid_nodes(mesh: Mesh, moves: Array, chosen: Indices) -> Array:
+    """Moves (n, 3) in which mid-edge nodes other than those ``chosen`` go with the ends of their edges."""
     found = moves.copy()
     middles, ends = mesh.cells[:, 4:].ravel(), mesh.cells[:, TET10_EDGES].reshape(-1, 2)
     found[middles] = moves[ends].mean(axis=1)
-    found[stated] = moves[stated]
+    found[chosen] = moves[chosen]
     return found
 
 

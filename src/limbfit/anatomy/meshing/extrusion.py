@@ -27,8 +27,8 @@ from .projection import project_to_level
 from .regions import find_same_faces, mesh_numbers
 
 RIM_LAYERS = 3.0  # depth below the cut plane, in thicknesses, over which the extrusion turns sideways
-MOST_STEPS = 8  # elements across one layer
-TALLEST = 1.3  # step over edge length
+MAX_STEPS = 8  # elements across one layer
+MAX_ASPECT_RATIO = 1.3  # step over edge length
 
 
 def build_core_mesh(points: Array, tets: Indices) -> Mesh:
@@ -52,11 +52,11 @@ def extrude_layers(core: VolumeMesh, fields: LimbFields, regions: tuple[str, ...
     across = _choose_steps(np.searchsorted(base, interface), low, depths)
     stack = build_columns(base, across, count)
     shares = (depths[-1] - np.vstack([depths[::-1], np.zeros(len(base))])) / depths[-1]
-    tets, layer = stack.tets(interface)
+    tets, layer = stack.build_tets(interface)
     innermost = len(fields.depths) - 1
     numbers = mesh_numbers(core.regions, len(fields.depths), len(fields.regions))
     mesh = Mesh(
-        points=np.vstack([core.points, stack.placed(low, high, shares)]),
+        points=np.vstack([core.points, stack.place_nodes(low, high, shares)]),
         cells=np.vstack([tets, core.tets]),
         cell_type="tet4",
         regions=np.concatenate([innermost - layer, numbers]),
@@ -73,7 +73,7 @@ def _choose_steps(interface: Indices, low: Array, depths: Array) -> Indices:
     degree = np.bincount(edges.ravel(), minlength=len(low))
     mean = np.bincount(edges.ravel(), np.repeat(length, 2), minlength=len(low)) / degree
     thickness = np.diff(np.vstack([np.zeros(len(low)), depths]), axis=0)[::-1]
-    return np.array([choose_even_steps(part, mean, edges, MOST_STEPS) for part in thickness])
+    return np.array([choose_even_steps(part, mean, edges, MAX_STEPS) for part in thickness])
 
 
 def _mark_sets(mesh: Mesh, core: VolumeMesh, stack: Columns) -> Mesh:
@@ -125,7 +125,7 @@ class Columns:
     height: Array
     steps: Indices
 
-    def placed(self, low: Array, high: Array, floors: Array) -> Array:
+    def place_nodes(self, low: Array, high: Array, floors: Array) -> Array:
         """Points (k, 3) of the new nodes on the lines from ``low`` to ``high`` (b, 3).
 
         ``floors`` (layers + 1, b) are the distances of the layers' faces from the base, zero first, as
@@ -136,9 +136,9 @@ class Columns:
         share = below + (self.height - layer) * (above - below)
         return low[self.owner] + share[:, None] * (high - low)[self.owner]
 
-    def tets(self, triangles: Indices) -> tuple[Indices, Indices]:
+    def build_tets(self, triangles: Indices) -> tuple[Indices, Indices]:
         """Tetrahedra (m, 4) over outward triangles (t, 3) of base nodes, and the layer (m,) of each."""
-        nodes, height = self._stacked()
+        nodes, height = self._stack_nodes()
         column = np.searchsorted(self.base, triangles)
         total = self.steps.sum(axis=0)[column]
         at = np.zeros_like(column)
@@ -161,7 +161,7 @@ class Columns:
             at[row, side] += 1
         return np.concatenate(done), np.concatenate(layers)
 
-    def _stacked(self) -> tuple[Indices, Array]:
+    def _stack_nodes(self) -> tuple[Indices, Array]:
         """Node numbers and heights (b, most steps + 1) of each column from its base up."""
         total = self.steps.sum(axis=0)
         nodes = np.full((len(self.base), total.max() + 1), -1, dtype=np.int64)
@@ -196,7 +196,7 @@ def choose_even_steps(thickness: Array, edge: Array, edges: Indices, most: int) 
 
     Neighbours along ``edges`` (e, 2) differ by one at most.
     """
-    steps = np.clip(np.ceil(thickness / (TALLEST * edge)), 1, most).astype(np.int64)
+    steps = np.clip(np.ceil(thickness / (MAX_ASPECT_RATIO * edge)), 1, most).astype(np.int64)
     for _ in range(most):
         allowed = np.full(len(steps), most, dtype=np.int64)
         np.minimum.at(allowed, edges[:, 0], steps[edges[:, 1]] + 1)

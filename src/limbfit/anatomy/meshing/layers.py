@@ -36,7 +36,7 @@ SEAM_MM = 3.0  # below the cut, where surfaces are prolonged from
 END_TOLERANCE_MM = 0.5  # a surface that ends this close to the cut is meant to be cut there
 NORMAL_WITHIN_MM = 1e-3  # of a surface, where its normal stands for the gradient of the distance
 TRIM_SAMPLES = 60_000
-THINNEST = 1 / 3  # of the layers' thickness, below which ``thin-skin`` trims bone instead
+MIN_LAYER_SHARE = 1 / 3  # of the layers' thickness, below which ``thin-skin`` trims bone instead
 
 BonePolicy = Literal["trim-bone", "thin-skin"]
 
@@ -84,7 +84,7 @@ class LimbFields:
     regions: Mapping[str, Surface] = field(default_factory=dict)
 
     @property
-    def uniform(self) -> bool:
+    def is_uniform(self) -> bool:
         return self.depths.shape[1] == 1
 
     @property
@@ -99,7 +99,7 @@ class LimbFields:
 
     def layer_depths(self, points: Array) -> Array:
         """Depths (layers, n) of the layers' inner faces below the skin points nearest to points (n, 3)."""
-        if self.uniform:
+        if self.is_uniform:
             return np.repeat(self.depths, len(points), axis=1)
         return transfer_values(self.skin, self.depths, points)
 
@@ -137,11 +137,11 @@ class LimbFields:
             value[candidates[nearer]], gradient[candidates[nearer]] = distance[nearer], slope[nearer]
         return value, gradient
 
-    def trimmed(self) -> dict[str, TrimmedBone]:
+    def measure_trimmed_bones(self) -> dict[str, TrimmedBone]:
         """What trimming took from each bone."""
-        return {name: self._trimmed(bone) for name, bone in self.bones.items()}
+        return {name: self._measure_trimmed_bone(bone) for name, bone in self.bones.items()}
 
-    def _trimmed(self, bone: Surface) -> TrimmedBone:
+    def _measure_trimmed_bone(self, bone: Surface) -> TrimmedBone:
         below = bone.points[bone.points[:, 2] <= 0.0]
         excess = self.bone_clearance_mm - self.layer(below)[0] if len(below) else np.zeros(0)
         shallow = below[excess > 0]
@@ -228,9 +228,9 @@ def _compute_layer_depths(
 def _thin_layers(fields: LimbFields) -> LimbFields:
     """Layers thinned in proportion where bone comes nearer to the skin than they and the clearance do."""
     skin = fields.skin
-    depths = np.repeat(fields.depths, len(skin.points), axis=1) if fields.uniform else fields.depths
+    depths = np.repeat(fields.depths, len(skin.points), axis=1) if fields.is_uniform else fields.depths
     whole = depths[-1]
-    room = np.maximum(fields._bone(skin.points)[0] - fields.bone_clearance_mm, THINNEST * whole)
+    room = np.maximum(fields._bone(skin.points)[0] - fields.bone_clearance_mm, MIN_LAYER_SHARE * whole)
     left = np.minimum(whole, limit_slope(skin, np.minimum(whole, room), SLOPE))
     if (left == whole).all():
         return replace(fields, thinned=ThinnedSkin(0.0, float(whole.min())))

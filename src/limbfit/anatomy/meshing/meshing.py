@@ -33,7 +33,7 @@ from .curving import balance_bone_faces, compute_curved_target, curve_diagonals,
 from .engines import ENGINES, MesherError, VolumeMesh, VolumeTask
 from .extrusion import build_core_mesh, extrude_layers
 from .layers import BonePolicy, LayerSpec, LimbFields, TrimmedBone, build_limb_fields, compute_signed_distance
-from .meshreport import GOOD_DIHEDRAL_DEG, MeshReport, compute_enclosed_volume, mesh_report
+from .meshreport import GOOD_DIHEDRAL_DEG, MeshReport, compute_enclosed_volume, measure_mesh
 from .projection import project_safely, project_to_level
 from .regions import (
     build_region_level,
@@ -59,10 +59,10 @@ HAUSDORFF_RADIUS_MM = 250.0  # MMG takes edges of sqrt(9/2 hausdorff R) on a sur
 LAYER_RATIO = 5.0  # greatest edge over thickness of the skin layer: about 13 degrees in an even prism
 SHEET_RATIO = 3.0  # greatest edge over thickness where muscle is a thin sheet over bone
 REGION_RATIO = 0.6  # greatest edge over thickness in a region inside the core
-STRAY = 0.5  # of the layers' thickness: a node of their inner face so far outside it is put back
+MAX_STRAY_SHARE = 0.5  # of the layers' thickness: a node of their inner face so far outside it is put back
 NEAR_RADII = 2.0  # of the fine zone: within them elements have to be good
-PROBE = 1.4  # of the spacing: how far below a bone's surface the depth is measured
-FLANK = 0.4  # of that way: a lesser depth is that below the bone's far side; with PROBE, bone thinner than 2
+PROBE_SPACINGS = 1.4  # of the spacing: how far below a bone's surface the depth is measured
+THIN_DEPTH_SHARE = 0.4  # of that way: a lesser depth is that below the bone's far side, two spacings off
 MAX_HALVINGS = 2  # of the grid: tips and edges of a bone are thin at every spacing
 DEPTH_RATIO = 1.5  # the fine zone is an ellipsoid, shallower than wide by this ratio
 
@@ -146,12 +146,12 @@ def build_base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Arra
     grid = refine_at_bones(refine_at_regions(grid, fields), fields)
     for level, bit in ((fields.layer, LAYER), (fields.void, BONE)):
         grid, positive = background.cut(grid, level, bit, fields.floor_range_mm)
-        grid = grid.kept(positive)
+        grid = grid.select(positive)
         if not len(grid.tets):
             raise MeshingError(f"no {settings.core} is left under the layers; choose thinner layers")
     grid = cut_at_regions(grid, fields)
-    trimmed = fields.trimmed()
-    limit = size_limit(fields, grid, settings)
+    trimmed = fields.measure_trimmed_bones()
+    limit = compute_size_limit(fields, grid, settings)
     enclosed = compute_enclosed_volume(anatomy, fields, trimmed)
     return BaseMesh(fields, grid, limit, trimmed, enclosed, compute_region_volumes(fields))
 
@@ -177,9 +177,10 @@ def find_thin_bone(fields: LimbFields, spacing: float) -> Array:
     """Vertices (k, 3) of bones, in the limb frame, where they are thinner than about two spacings (mm)."""
     found = [np.zeros((0, 3))]
     for bone in fields.bones.values():
-        depth = -compute_signed_distance(bone, bone.points - PROBE * spacing * bone.vertex_normals)[0]
+        probe = PROBE_SPACINGS * spacing
+        depth = -compute_signed_distance(bone, bone.points - probe * bone.vertex_normals)[0]
         below = bone.points[:, 2] < 0.0
-        found.append(bone.points[below & (depth < FLANK * PROBE * spacing)])
+        found.append(bone.points[below & (depth < THIN_DEPTH_SHARE * PROBE_SPACINGS * spacing)])
     return np.vstack(found)
 
 
@@ -241,7 +242,7 @@ def _mesh_base(
     base: BaseMesh, size: Array, settings: MeshSettings, near: tuple[Array, float] | None = None
 ) -> tuple[Mesh, MeshReport]:
     """The mesh of a base in patient space, graded by the edge length (n,) at its grid's points; ``near``: as
-    for `mesh_report`."""
+    for `measure_mesh`."""
     start = time.perf_counter()
     fields = base.fields
     task = _build_task(base.grid, size, settings)
@@ -260,7 +261,7 @@ def _mesh_base(
             mesh = balance_bone_faces(mesh, fields, straight)
     _check_usable(mesh, fields)
     seconds = time.perf_counter() - start
-    report = mesh_report(
+    report = measure_mesh(
         mesh, fields, base.trimmed, base.enclosed_mm3, base.regions_mm3, seconds, settings.engine, near
     )
     return mesh.with_points(fields.frame.to_patient(mesh.points)), replace(report, repairs=repairs)
@@ -308,7 +309,7 @@ def _grade_size(beyond: Array, limit: Array, settings: MeshSettings) -> Array:
     return np.minimum(size, limit)
 
 
-def size_limit(fields: LimbFields, grid: TetGrid, settings: MeshSettings) -> Array:
+def compute_size_limit(fields: LimbFields, grid: TetGrid, settings: MeshSettings) -> Array:
     """Edge length (n,) at which layers, sheets of core over bone and regions keep their shape."""
     far, points, slack = settings.edge_far_mm, grid.points, fields.floor_range_mm
     under_layers = np.maximum(background.compute_in_band(fields.layer, points, far, grid.spacing, slack), 0.0)
@@ -371,7 +372,7 @@ def _recover_interface(points: Array, target: Array, core: VolumeMesh, fields: L
     Bending its triangles over a ridge, MMG may put a node almost on the skin; inner nodes make room for it.
     """
     layer = np.flatnonzero(_find_nodes_on(core, LAYER))
-    stray = layer[fields.layer(points[layer])[0] < -STRAY * fields.floor(points[layer])]
+    stray = layer[fields.layer(points[layer])[0] < -MAX_STRAY_SHARE * fields.floor(points[layer])]
     if not len(stray):
         return points
     inner = np.ones(len(points), dtype=bool)

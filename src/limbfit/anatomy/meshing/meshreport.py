@@ -59,7 +59,7 @@ class MeshReport:
     repairs: tuple[Repair, ...] = field(default_factory=tuple)
 
 
-def mesh_report(
+def measure_mesh(
     mesh: Mesh,
     fields: LimbFields,
     trimmed: Mapping[str, TrimmedBone],
@@ -74,8 +74,8 @@ def mesh_report(
 
     ``near``: the place (3,) and radius (mm) within which elements have to be good.
     """
-    found = measure_quality(mesh)
-    volume_error = found.volume_mm3 / enclosed_mm3 - 1.0
+    quality = measure_quality(mesh)
+    volume_error = quality.volume_mm3 / enclosed_mm3 - 1.0
     layers = len(fields.depths)
     faces = [
         _split_into_facets(mesh.face_sets["skin"]),
@@ -91,11 +91,11 @@ def mesh_report(
         nodes=len(mesh.points),
         cells=len(mesh.cells),
         region_cells={name: int((mesh.regions == i).sum()) for i, name in enumerate(mesh.region_names)},
-        min_dihedral_deg=found.min_dihedral_deg,
-        dihedral_percentiles_deg=found.dihedral_percentiles_deg,
-        min_scaled_jacobian=found.min_scaled_jacobian,
-        volume_mm3=found.volume_mm3,
-        region_volumes_mm3=found.region_volumes_mm3,
+        min_dihedral_deg=quality.min_dihedral_deg,
+        dihedral_percentiles_deg=quality.dihedral_percentiles_deg,
+        min_scaled_jacobian=quality.min_scaled_jacobian,
+        volume_mm3=quality.volume_mm3,
+        region_volumes_mm3=quality.region_volumes_mm3,
         volume_error=volume_error,
         layer_mean_mm=float(whole.mean()),
         layer_std_mm=float(whole.std()),
@@ -106,7 +106,7 @@ def mesh_report(
         thinned_skin=fields.thinned,
         seconds=seconds,
         engine=engine,
-        warnings=mesh_warnings(mesh, found, volume_error, near) + warn_of_lost_bone(mesh, fields, near),
+        warnings=check_quality(mesh, quality, volume_error, near) + warn_of_lost_bone(mesh, fields, near),
     )
 
 
@@ -125,12 +125,12 @@ def _measure_regions(
     return found
 
 
-def mesh_warnings(
-    mesh: Mesh, found: MeshQuality, volume_error: float, near: tuple[Array, float] | None = None
+def check_quality(
+    mesh: Mesh, quality: MeshQuality, volume_error: float, near: tuple[Array, float] | None = None
 ) -> tuple[str, ...]:
-    """What is wrong with a mesh of this quality for its purpose; ``near`` is as for `mesh_report`."""
+    """What is wrong with a mesh of this quality for its purpose; ``near`` is as for `measure_mesh`."""
     warnings = []
-    smallest, least, where = found.min_dihedral_deg, SOUND_DIHEDRAL_DEG, ""
+    smallest, least, where = quality.min_dihedral_deg, SOUND_DIHEDRAL_DEG, ""
     if near is not None and smallest >= SOUND_DIHEDRAL_DEG:
         place, radius = near
         inside = np.linalg.norm(mesh.points[mesh.corners].mean(axis=1) - place, axis=1) < radius

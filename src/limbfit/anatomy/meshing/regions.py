@@ -24,11 +24,11 @@ from .background import LONGEST_EDGE, REGION, Field, TetGrid, cut, refine_grid
 from .layers import Level, LimbFields, compute_box_distance, compute_signed_distance, sample_box
 
 FAR_MM = 15.0  # of a region's box: a bound of the distance does there
-GENTLEST = 0.2  # slope of a region's level, below which it does not tell a distance
+MIN_SLOPE = 0.2  # slope of a region's level, below which it does not tell a distance
 WALL_REACHES = 2.0  # from a region before, where it may be a wall: it may itself be continued by one
 SAMPLES = 20_000  # all over a region's box
 CELLS_ACROSS = 3.0  # of the grid over a region's thickness, before it is cut
-THINNEST_EDGES = 0.5  # of the edge near the site: a thinner region is refused
+MIN_EDGES_ACROSS = 0.5  # of the edge near the site: a thinner region is refused
 
 
 def build_region_level(fields: LimbFields, number: int) -> Field:
@@ -61,7 +61,7 @@ def _measure_to_wall(fields: LimbFields, number: int, points: Array) -> Level:
     for before, surface in enumerate(list(fields.regions.values())[:number]):
         close = everywhere[_is_near(surface, WALL_REACHES * fields.bone_clearance_mm, points)]
         value, slope = build_region_level(fields, before)(points[close])
-        steep = np.maximum(np.linalg.norm(slope, axis=1), GENTLEST)
+        steep = np.maximum(np.linalg.norm(slope, axis=1), MIN_SLOPE)
         walls.append((close, value / steep, slope / steep[:, None]))
     for place, value, slope in walls:
         nearer = value < distance[place]
@@ -98,11 +98,11 @@ def check_regions(fields: LimbFields, edge_near_mm: float) -> None:
     """
     for number, name in enumerate(fields.regions):
         thick = measure_thickness(fields, number)
-        if thick < THINNEST_EDGES * edge_near_mm:
+        if thick < MIN_EDGES_ACROSS * edge_near_mm:
             raise SurfaceError(
                 f"the region is {thick:.1f} mm thick at most, too thin for edges of {edge_near_mm:g} mm",
                 place=f"geometry.regions.{name}",
-                remedy=f"choose edges of {thick / THINNEST_EDGES:.1f} mm or less, or leave the region out",
+                remedy=f"choose edges of {thick / MIN_EDGES_ACROSS:.1f} mm or less, or leave the region out",
             )
 
 

@@ -16,7 +16,7 @@ from .projection import project_safely, project_to_level
 from .regions import build_region_level, find_interfaces
 
 GOOD_DEG = 9.0
-WORKED_BELOW_DEG = 11.0
+IMPROVED_BELOW_DEG = 11.0
 SWEEPS = 6
 STEPS = (0.3, 0.15, 0.05)  # of the shortest edge at the node
 DIRECTIONS = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
@@ -49,7 +49,7 @@ class SmoothingMoves:
         depth[in_layers] = np.sqrt(fields.skin.search.nearest(points[in_layers])[0])
         return cls(normals, depth, fields.skin)
 
-    def places(self, node: int, here: Array, moves: Array) -> Array:
+    def propose_places(self, node: int, here: Array, moves: Array) -> Array:
         """Places (k, 3) of a node after ``moves`` (k, 3) from ``here``."""
         normal, depth = self.normals[node], self.depth[node]
         places = here + moves - (moves @ normal)[:, None] * normal
@@ -67,12 +67,12 @@ def smooth_elements(mesh: Mesh, fields: LimbFields, stack: Columns) -> Mesh:
     two of them not at all. Where the limb was cut off about the site, the boundary has no shape to keep.
     """
     normals, movable = find_constraints(mesh, fields, stack)
-    ways = SmoothingMoves.of(mesh.points, normals, _find_places(mesh, stack)[1], fields)
-    points = improve_angles(mesh.points, mesh.cells, WORKED_BELOW_DEG, ways, movable)
-    return mesh.with_points(put_back(points, mesh, fields, stack))
+    allowed = SmoothingMoves.of(mesh.points, normals, _find_places(mesh, stack)[1], fields)
+    points = improve_angles(mesh.points, mesh.cells, IMPROVED_BELOW_DEG, allowed, movable)
+    return mesh.with_points(project_nodes(points, mesh, fields, stack))
 
 
-def put_back(points: Array, mesh: Mesh, fields: LimbFields, stack: Columns) -> Array:
+def project_nodes(points: Array, mesh: Mesh, fields: LimbFields, stack: Columns) -> Array:
     """Moved points (n, 3) of a mesh, those of surfaces put on them as far as cells allow."""
     on_plane, in_layers, on_bone = _find_places(mesh, stack)
     walls = _find_region_walls(mesh, fields)
@@ -116,7 +116,7 @@ def _find_places(mesh: Mesh, stack: Columns) -> Mask:
 
 
 def improve_angles(
-    points: Array, tets: Indices, goal_deg: float, ways: SmoothingMoves, movable: Mask
+    points: Array, tets: Indices, goal_deg: float, allowed: SmoothingMoves, movable: Mask
 ) -> Array:
     """Points (n, 3) with nodes of poor tetrahedra moved so that the smallest dihedral angle about each grows.
 
@@ -124,7 +124,7 @@ def improve_angles(
     ----------
     points, tets : the mesh.
     goal_deg : tetrahedra below it are worked on.
-    ways : where nodes may go.
+    allowed : where nodes may go.
     movable : (n,) nodes that may move.
     """
     points = points.copy()
@@ -138,14 +138,14 @@ def improve_angles(
             at = order[starts[node] : starts[node + 1]]
             star, corner = at // 4, at % 4
             opposite = np.take_along_axis(tets[star], OPPOSITE[corner], axis=1)
-            points[node], worst[star] = _find_best_place(points, opposite, node, ways)
+            points[node], worst[star] = _find_best_place(points, opposite, node, allowed)
         if np.array_equal(before, points):
             break
     return points
 
 
 def _find_best_place(
-    points: Array, opposite: Indices, node: int, ways: SmoothingMoves
+    points: Array, opposite: Indices, node: int, allowed: SmoothingMoves
 ) -> tuple[Array, Array]:
     """Where the smallest angle of the tetrahedra about a node is greatest, among a pattern of places.
 
@@ -154,7 +154,7 @@ def _find_best_place(
     here, others = points[node], points[opposite]
     reach = np.linalg.norm(others - here, axis=2).min()
     moves = np.concatenate([step * reach * DIRECTIONS for step in STEPS])
-    places = np.vstack([here, ways.places(node, here, moves)])
+    places = np.vstack([here, allowed.propose_places(node, here, moves)])
     angles = compute_worst_angles(places, others)
     best = int(np.argmax(angles.min(axis=0)))
     return places[best], angles[:, best]

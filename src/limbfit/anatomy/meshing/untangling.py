@@ -17,13 +17,13 @@ from ..frame import Frame
 from .background import compute_volumes
 from .extrusion import Columns
 from .layers import LimbFields, compute_signed_distance
-from .smoothing import DIRECTIONS, find_constraints, put_back
+from .smoothing import DIRECTIONS, find_constraints, project_nodes
 
-SOUND = 0.03  # volume over that of a regular tetrahedron of the same edges; worked on below it
+MIN_ROUNDNESS = 0.03  # volume over that of a regular tetrahedron of the same edges; worked on below it
 SWEEPS = 12
-FARTHEST = 1.0  # that a node goes, over the mean edge at it
+MAX_SHIFT = 1.0  # that a node goes, over the mean edge at it
 STEPS = (0.6, 0.3, 0.15, 0.05)  # of the mean edge at the node
-THINNER = 0.5  # what a layer keeps of its thickness at first, and again the second time
+THINNING_FACTOR = 0.5  # what a layer keeps of its thickness at first, and again the second time
 _REGULAR = 6.0 * np.sqrt(2.0)  # cube of the edge over volume
 
 
@@ -52,7 +52,7 @@ def repair_mesh(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Mesh, t
     attempts: tuple[tuple[str, Callable[[Array], Array]], ...] = (
         (
             "nodes moved along their surfaces",
-            lambda p: put_back(untangle_cells(p, mesh.cells, normals, movable), mesh, fields, stack),
+            lambda p: project_nodes(untangle_cells(p, mesh.cells, normals, movable), mesh, fields, stack),
         ),
         ("layers thinned", lambda p: thin_inverted_layers(p, mesh, stack, normals, movable)),
         (
@@ -101,7 +101,7 @@ def untangle_cells(points: Array, tets: Indices, normals: Array, movable: Mask) 
     starts = np.searchsorted(tets.ravel()[order], np.arange(len(points) + 1))
     about = tets[np.isin(tets, tets[compute_volumes(points, tets) <= 0.0]).any(axis=1)]
     for _ in range(SWEEPS):
-        poor = _compute_roundness(points[about]) < SOUND
+        poor = _compute_roundness(points[about]) < MIN_ROUNDNESS
         if not poor.any():
             break
         nodes = np.unique(about[poor])
@@ -123,7 +123,7 @@ def _find_best_place(points: Array, star: Indices, node: int, normal: Array, bef
         [np.zeros(3), around.mean(axis=0) - here, *(step * reach * DIRECTIONS for step in STEPS)]
     )
     places = here + moves - (moves @ normal)[:, None] * normal
-    places = places[(np.linalg.norm(places - before[node], axis=1) <= FARTHEST * reach) | ~moves.any(axis=1)]
+    places = places[(np.linalg.norm(places - before[node], axis=1) <= MAX_SHIFT * reach) | ~moves.any(axis=1)]
     trial = np.where(mine[None, :, :, None], places[:, None, None, :], corners[None])
     worst = _compute_roundness(trial.reshape(-1, 4, 3)).reshape(len(places), -1).min(axis=1)
     return np.asarray(places[int(np.argmax(worst))])
@@ -148,8 +148,8 @@ def thin_inverted_layers(points: Array, mesh: Mesh, stack: Columns, normals: Arr
             break
         head = points[stack.top]
         feet, between = stack.base[chosen], chosen[stack.owner]
-        points[feet] = head[chosen] + THINNER * (points[feet] - head[chosen])
-        points[own[between]] = head[stack.owner[between]] + THINNER * (
+        points[feet] = head[chosen] + THINNING_FACTOR * (points[feet] - head[chosen])
+        points[own[between]] = head[stack.owner[between]] + THINNING_FACTOR * (
             points[own[between]] - head[stack.owner[between]]
         )
         inner = movable.copy()

@@ -62,7 +62,7 @@ def amputate_limb(
         raise LabelError(f"the pad of soft tissue must be thicker than {pad_mm} mm")
     _check_direction(labels, normal)
     labels = _divide_slices(labels)
-    height = labels.heights(point, normal)
+    height = labels.compute_heights(point, normal)
     section = _cut_section(labels, point, normal)
     _check_bones(labels, height)
     array = np.where(height >= 0, labels.array, 0).astype(np.uint8)

@@ -37,7 +37,7 @@ from ..morphology import (
 )
 
 _SMOOTH_MM = 0.6
-_TISSUE = 0.45  # of the median of the tissue: between the noise of air and muscle
+_TISSUE_SHARE = 0.45  # of the median of the tissue: between the noise of air and muscle
 _CLOSE_MM = 3.5
 _OPEN_MM = 1.5
 _RIM_MM = 2.5  # the outline is at half of the brightest tissue this near
@@ -46,15 +46,15 @@ _BIAS_ITERATIONS = [25, 20, 15]
 _SMALLEST_LIMB_MM3 = 5.0e4
 BALL_MM = 20.0  # half the thickness of the thickest slab
 _REACH_MM = 15.0  # a support sticks out of the limb by more
-_SHARE = 0.15  # of the limb's length, along which it does
-_BITE_MM = 10.0  # how deep the strip under the limb may be
+_WING_SHARE = 0.15  # of the limb's length, along which it does
+_STRIP_MM = 10.0  # how deep the strip under the limb may be
 _STEP_MM = 2.0
 _COARSE_MM = 4.0
-_OTHER = 0.3  # of the largest cross-section of the slice: less is a table, a coil or a marker
+_MIN_SECTION_SHARE = 0.3  # of the largest cross-section of the slice: less is a table, a coil or a marker
 _SMALLEST_MM2 = 700.0
-_LONGEST = 2.5  # a cross-section is rounder than this; a limb cut lengthwise is not
+_MAX_ELONGATION = 2.5  # a cross-section is rounder than this; a limb cut lengthwise is not
 _TWO_LIMBS_SHARE = 0.3  # of the slices with a cross-section
-_FEWEST = 8  # slices
+_MIN_SLICES = 8  # slices
 
 
 def smooth_image(volume: Volume) -> Field:
@@ -78,7 +78,7 @@ def find_limb_mask(volume: Volume, smooth: Field) -> Mask:
     outline is then put where the signal falls to half of the tissue beside it, so that bright fat does not
     push it outward by partial volume.
     """
-    darkest = _TISSUE * float(np.median(smooth[smooth > _compute_otsu_threshold(smooth)]))
+    darkest = _TISSUE_SHARE * float(np.median(smooth[smooth > _compute_otsu_threshold(smooth)]))
     body = find_largest_piece(smooth > darkest)
     box = find_box(body, np.ceil(_CLOSE_MM / volume.spacing[::-1]).astype(int))
     limb = np.zeros(body.shape, dtype=bool)
@@ -142,7 +142,7 @@ def remove_supports(mask: Mask, grid: Grid) -> Mask:
     wings = _find_wings(coarse & ~body, body, sampling)
     if not wings.any():
         return mask
-    strip = _compute_hulls(wings) & (distance_transform_edt(body, sampling=sampling) < _BITE_MM)
+    strip = _compute_hulls(wings) & (distance_transform_edt(body, sampling=sampling) < _STRIP_MM)
     support = wings | strip
     for axis, step in enumerate(steps):
         support = np.repeat(support, step, axis=axis)
@@ -169,7 +169,7 @@ def _find_wings(residue: Mask, body: Mask, sampling: Array) -> Mask:
         piece = parts[box] == value
         far = piece & (away[box] > _REACH_MM)
         beside = far.any(axis=(1, 2)) & body[box[0]].any(axis=(1, 2))  # else it is a thin end of the limb
-        if beside.sum() > _SHARE * length:
+        if beside.sum() > _WING_SHARE * length:
             wings[box] |= piece
     return wings
 
@@ -200,7 +200,7 @@ def check_one_limb(volume: Volume) -> None:
     tissue, step = _find_tissue(volume)
     for axis in range(3):
         counts = np.array([_count_sections(plane, step) for plane in np.moveaxis(tissue, axis, 0)])
-        if (counts > 0).sum() >= _FEWEST and (counts > 1).sum() > _TWO_LIMBS_SHARE * (counts > 0).sum():
+        if (counts > 0).sum() >= _MIN_SLICES and (counts > 1).sum() > _TWO_LIMBS_SHARE * (counts > 0).sum():
             raise ImageError(
                 "two limbs in one image",
                 remedy="crop the image to one limb, or give its labels (segmentation.labels in study.toml)",
@@ -235,7 +235,7 @@ def _count_sections(plane: Mask, step: float) -> int:
     if count == 0:
         return 0
     areas = np.bincount(parts.ravel())[1:]
-    large = (areas > _OTHER * areas.max()) & (areas * step**2 > _SMALLEST_MM2)
+    large = (areas > _MIN_SECTION_SHARE * areas.max()) & (areas * step**2 > _SMALLEST_MM2)
     extents = [[part.stop - part.start for part in box] for box in find_objects(parts)]
-    round_ = np.array([max(sides) <= _LONGEST * min(sides) for sides in extents])
+    round_ = np.array([max(sides) <= _MAX_ELONGATION * min(sides) for sides in extents])
     return int((large & round_).sum())

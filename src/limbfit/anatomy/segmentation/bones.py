@@ -26,15 +26,15 @@ from ..grid import Grid
 from ..morphology import Field, compute_depth, dilate_mask, erode_mask, fill_slices, find_box, open_mask
 from ..surfaces.extraction import compute_signed_distance_to
 
-_BRIGHT = 1.15  # marrow is brighter
-_ESCAPE = 0.78  # and cannot get out without crossing something darker
-_DARK = 0.65  # cortex: half-way between muscle (1) and cortical bone (0.2 to 0.3 with partial volume)
+_MARROW_LEVEL = 1.15  # marrow is brighter
+_MAX_ESCAPE_LEVEL = 0.78  # and cannot get out without crossing something darker
+_CORTEX_LEVEL = 0.65  # cortex: half-way between muscle (1) and cortical bone (0.2 to 0.3 with partial volume)
 _SKIN_MM = 2.0  # no bone this near to the outline, where partial volume with air is dark too
 _CORTEX_MM = 9.0  # thickest cortex: the anterior crest of the tibia
 _TAIL_MM = 2.0  # dark fascia and vessels thinner than twice this are taken off the bone
 _SEED_PART = 0.15  # of the smallest bone's volume, for its marrow to count
 _STEP_IN_MM, _STEP_OUT_MM = 2.0, 6.0  # how far a bone's outline may move from slice to slice
-_GROWTH = (0.6, 1.8)
+_AREA_RATIOS = (0.6, 1.8)
 _NEAR_MM = 3.0  # a seed this near to a bone is in it
 
 
@@ -49,12 +49,12 @@ def find_bones(levels: Field, limb: Mask, spacing: Array, smallest_mm3: float) -
     smallest_mm3 : bones smaller than this are left out.
     """
     deep = compute_depth(limb, spacing) > _SKIN_MM
-    marrow = deep & (levels > _BRIGHT) & (compute_escape_level(levels, limb) < _ESCAPE)
+    marrow = deep & (levels > _MARROW_LEVEL) & (compute_escape_level(levels, limb) < _MAX_ESCAPE_LEVEL)
     parts = _number_cavities(marrow, _SEED_PART * smallest_mm3 / float(np.prod(spacing)))
     if parts.max() == 0:
         return []
     for value, place in enumerate(find_objects(parts), start=1):
-        _follow(parts, value, place[0], levels, deep, spacing)
+        _continue_cavity(parts, value, place[0], levels, deep, spacing)
     parts = _join_cavities(parts)
     box = find_box(parts > 0, np.ceil(_CORTEX_MM / spacing[::-1]).astype(int) + 1)
     owned = np.zeros_like(parts)
@@ -86,7 +86,7 @@ def _number_cavities(marrow: Mask, smallest: float) -> NDArray[np.int32]:
     return number[found]
 
 
-def _follow(
+def _continue_cavity(
     parts: NDArray[np.int32], value: int, slices: slice, levels: Field, deep: Mask, spacing: Array
 ) -> None:
     """Go on beyond a part's slices where the cortex is too thin to enclose the marrow, as near a joint.
@@ -118,10 +118,10 @@ def _find_next_section(previous: Mask, plane: Field, free: Mask, spacing: Array)
     basins = sitk.MorphologicalWatershedFromMarkers(
         sitk.GetImageFromArray(-plane), sitk.GetImageFromArray(markers), False, True
     )
-    section = (sitk.GetArrayFromImage(basins) == 1) & (plane > _BRIGHT)
+    section = (sitk.GetArrayFromImage(basins) == 1) & (plane > _MARROW_LEVEL)
     section = open_mask(section, _STEP_IN_MM, spacing)
     ratio = section.sum() / previous.sum()
-    return section if _GROWTH[0] <= ratio <= _GROWTH[1] else None
+    return section if _AREA_RATIOS[0] <= ratio <= _AREA_RATIOS[1] else None
 
 
 def _join_cavities(parts: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -140,7 +140,7 @@ def _add_cortex(parts: NDArray[np.int32], levels: Field, deep: Mask, spacing: Ar
     """Each cavity with the dark cortex around it, without the fascia and vessels that hang on."""
     marrow = parts > 0
     distance, nearest = distance_transform_edt(~marrow, sampling=spacing[::-1], return_indices=True)
-    dark = deep & (levels < _DARK) & (distance < _CORTEX_MM)
+    dark = deep & (levels < _CORTEX_LEVEL) & (distance < _CORTEX_MM)
     bone = binary_propagation(marrow, mask=fill_slices(marrow | dark))
     bone = open_mask(bone, _TAIL_MM, spacing) | marrow
     bone = binary_propagation(marrow, mask=fill_slices(bone))

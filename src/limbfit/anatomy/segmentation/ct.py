@@ -25,21 +25,21 @@ _AIR_WIDTH_HU = 100.0  # half the width of its peak in the histogram
 _AIR_SHARE = 0.03  # of the voxels: fewer are an artefact of resampling
 _TOP_HU = 100.0  # the outline does not tell bone from soft tissue
 _DENSE_HU = 200.0  # cancellous bone is denser, muscle and contrast-free vessels are not
-_COMPACT_HU = 1200.0  # denser than this counts as this, so that metal does not move outlines
+_MAX_BONE_HU = 1200.0  # denser than this counts as this, so that metal does not move outlines
 _RIM_MM = 2.5  # the outline is at half of the densest bone this near
 _CLOSE_MM = 2.0  # gaps in thin cortex
 _SMOOTH_MM = 1.0
 
 
-def is_ct(volume: Volume, stated: Contrast = "auto") -> bool:
+def is_ct(volume: Volume, expected: Contrast = "auto") -> bool:
     """Whether an image has Hounsfield units: by its DICOM modality, else by the peak of air in its histogram.
 
-    Without a modality a stated ``CT`` needs no such peak, only grey values below those of fat.
+    Without a modality an expected ``CT`` needs no such peak, only grey values below those of fat.
 
     Raises
     ------
     ImageError
-        For a constant image, a CT without Hounsfield units, or a stated contrast that the image contradicts.
+        For a constant image, a CT without Hounsfield units, or one that contradicts ``expected``.
     """
     low, high = float(volume.array.min()), float(volume.array.max())
     if high <= low:
@@ -47,11 +47,11 @@ def is_ct(volume: Volume, stated: Contrast = "auto") -> bool:
     if volume.modality in ("CT", "MR"):
         found, evidence = volume.modality == "CT", f"the DICOM modality {volume.modality} does"
     else:
-        found = _has_air_peak(volume, low) or (stated == "CT" and low < _LIGHTEST_HU)
+        found = _has_air_peak(volume, low) or (expected == "CT" and low < _LIGHTEST_HU)
         evidence = f"the grey values, {low:.0f} to {high:.0f}, do"
-    if stated != "auto" and found != (stated == "CT"):
+    if expected != "auto" and found != (expected == "CT"):
         raise ImageError(
-            f"{evidence} not fit {stated}",
+            f"{evidence} not fit {expected}",
             remedy='check the series, or give segmentation.contrast = "auto"',
         )
     if found and low > _LIGHTEST_HU:
@@ -88,7 +88,7 @@ def find_dense_bones(hounsfield: Field, limb: Mask, spacing: Array, smallest_mm3
     spacing : mm along i, j, k.
     smallest_mm3 : bones smaller than this are left out.
     """
-    compact = np.minimum(hounsfield, _COMPACT_HU)
+    compact = np.minimum(hounsfield, _MAX_BONE_HU)
     half = (find_local_maximum(compact, _RIM_MM, spacing) + MUSCLE_HU) / 2
     dense = limb & (compact > _DENSE_HU)
     sharp = dense & (compact > half)

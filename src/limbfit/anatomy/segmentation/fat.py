@@ -17,13 +17,13 @@ SKIN_MM = 1.5  # skin is darker than fat; so deep everything counts as skin
 SEPTUM_MM = 1.5  # sheets of fat thinner than twice this are septa
 _VESSEL_MM2 = 60.0  # cross-section of the largest vessel in the fat
 FAT_HU = (-200.0, -25.0)
-_FAINTEST = 1.5  # of muscle: fat is at least this bright
-_BRIGHTEST = 2.0  # where nothing tells how bright fat is
+_MIN_FAT_LEVEL = 1.5  # of muscle: fat is at least this bright
+_USUAL_FAT_LEVEL = 2.0  # where nothing tells how bright fat is
 _RIND_MM = 20.0  # tissue so near to the skin shows both fat and muscle
 _NEAR_MM, _STEP_MM = 14.0, 8.0  # half the edge of a neighbourhood, and how far apart they are
 _LOW, _HIGH = 25, 93  # percentiles between which the level is looked for
 _ROUNDS = 10
-_FEWEST = 50  # samples in a neighbourhood
+_MIN_SAMPLES = 50  # samples in a neighbourhood
 _SAMPLE_MM = 2.5
 _NOISE_MM = 0.9
 
@@ -61,13 +61,13 @@ def _compute_half_way_level(levels: Field, rind: Mask, spacing: Array) -> Field:
         middle = [int(c[n]) for c, n in zip(centres, place)]
         box = tuple(slice(max(m - h, 0), m + h + 1) for m, h in zip(middle, half))
         near = values[box][inside[box]]
-        if len(near) >= _FEWEST:
+        if len(near) >= _MIN_SAMPLES:
             found[place] = _compute_isodata_level(near)
     if np.isfinite(found).any():
         nearest = distance_transform_edt(np.isnan(found), return_distances=False, return_indices=True)
         found = found[tuple(nearest)]
     else:
-        found[:] = (1 + _BRIGHTEST) / 2
+        found[:] = (1 + _USUAL_FAT_LEVEL) / 2
     k, j, i = (
         _interpolate_places(np.interp(np.arange(n) / e, c, np.arange(len(c))), len(c))
         for n, e, c in zip(levels.shape, every, centres)
@@ -84,7 +84,7 @@ def _compute_isodata_level(values: Field) -> float:
             return np.nan
         low, high = float(values[~above].mean()), float(values[above].mean())
         level = (low + high) / 2
-    return level if high > _FAINTEST * low else np.nan
+    return level if high > _MIN_FAT_LEVEL * low else np.nan
 
 
 def _compute_centres(count: int, step: float) -> Array:

@@ -59,8 +59,8 @@ def segment(
     axis = find_limb_axis(visible)
     del visible
     order = [*(n for n in range(3) if n != axis), axis]
-    found = _segment(volume.turned(order), ct, bias_correction, min_bone_volume_mm3, seeds)
-    return found.turned([order.index(n) for n in range(3)])
+    found = _segment(volume.permute_axes(order), ct, bias_correction, min_bone_volume_mm3, seeds)
+    return found.permute_axes([order.index(n) for n in range(3)])
 
 
 def _segment(
@@ -81,7 +81,8 @@ def _segment(
         if bias_correction:
             smooth /= estimate_bias_field(volume, whole)
         levels = smooth[box] / np.float32(estimate_muscle_level(smooth[box], limb))
-        pieces = [end.along(p) for p in find_bones(end.along(levels), end.along(limb), spacing, smallest)]
+        along = end.order_distal_first
+        pieces = [along(piece) for piece in find_bones(along(levels), along(limb), spacing, smallest)]
     del smooth
     if not pieces:
         raise ImageError(
@@ -90,9 +91,9 @@ def _segment(
         )
     bones = [_fill_piece(piece) for piece in pieces]
     if seeds:
-        bones, names = grow_from_seeds(bones, seeds, volume.cropped(box))
+        bones, names = grow_from_seeds(bones, seeds, volume.crop(box))
     else:
-        names = name_bones([end.along(bone) for bone in bones], spacing)
+        names = name_bones([end.order_distal_first(bone) for bone in bones], spacing)
     fat = _find_fat(levels, limb, np.any(pieces, axis=0), ct, spacing)
     return _build_labels(limb, fat, bones, names, volume, box)
 

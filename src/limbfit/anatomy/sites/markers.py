@@ -57,7 +57,7 @@ def find_markers(
     ----------
     skin_with, skin_without : closed outward surfaces of the limb in one place (``registration`` lays the
         images of two scans onto each other).
-    min_height_mm : the least height of a marker; half of it is where bumps are told apart.
+    min_height_mm : the least height of a marker; half of it is where bumps are separated.
     max_area_mm2 : what is larger is no marker (a cushion, a fold, a bandage).
 
     Returns
@@ -146,11 +146,11 @@ def _compute_distances(markers: Sequence[Marker], hints: Array) -> Array:
 def _describe_missing(names: list[str], pairs: Mapping[int, int], distance: Array, reach: float) -> str:
     """What to say of places without a marker; empty where there are none."""
     missing = [r for r in range(len(names)) if r not in pairs]
-    told = [
+    places = [
         f"{names[r]} (nearest at {distance[r].min():.1f} mm)" if distance.shape[1] else names[r]
         for r in missing
     ]
-    return f"no marker of its own within {reach:g} mm for {', '.join(told)}" if told else ""
+    return f"no marker of its own within {reach:g} mm for {', '.join(places)}" if places else ""
 
 
 def _describe_spare(names: list[str], pairs: Mapping[int, int], distance: Array, reach: float) -> str:

@@ -26,8 +26,8 @@ _FINEST_MM = 1.0  # of voxels: finer ones are joined, as the smoothing does not 
 _SAMPLES = 20000
 _BORDER_MM = 10.0  # of the image: what is nearer may have no partner in the other
 _ARM_MM = 50.0  # a turn of 1 / _ARM_MM rad counts as much as a shift of 1 mm
-_SOFT = 0.2  # of the median grey value: differences beyond it pull less (soft L1)
-_SAME_LIMB = 0.7  # least correlation of two images of one limb
+_SOFT_SHARE = 0.2  # of the median grey value: differences beyond it pull less (soft L1)
+_MIN_CORRELATION = 0.7  # least correlation of two images of one limb
 
 
 @dataclass(frozen=True)
@@ -76,16 +76,16 @@ def register_limb(image: Volume, moved: Volume, limb: Mask) -> LimbMotion:
     centre = points.mean(axis=0)
     unknowns = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     for sigma in _LEVELS_MM:
-        wanted = _build_interpolator(image, sigma)(points)
+        target = _build_interpolator(image, sigma)(points)
         value = _build_interpolator(moved, sigma)
-        scale = _SOFT * float(np.median(wanted))
+        scale = _SOFT_SHARE * float(np.median(target))
 
-        def misfit(x: Array, wanted: Array = wanted, value: Callable[[Array], Array] = value) -> Array:
-            return (x[6] * value(_move_points(points, centre, x)) - wanted) / scale  # noqa: B023 - used at once
+        def misfit(x: Array, target: Array = target, value: Callable[[Array], Array] = value) -> Array:
+            return (x[6] * value(_move_points(points, centre, x)) - target) / scale  # noqa: B023 - used at once
 
         unknowns = least_squares(misfit, unknowns, loss="soft_l1", diff_step=0.02, xtol=1e-4, ftol=1e-6).x
-    correlation = float(np.corrcoef(wanted, value(_move_points(points, centre, unknowns)))[0, 1])
-    if not correlation >= _SAME_LIMB:
+    correlation = float(np.corrcoef(target, value(_move_points(points, centre, unknowns)))[0, 1])
+    if not correlation >= _MIN_CORRELATION:
         raise ImageError(
             f"the images with and without markers do not match (correlation {correlation:.2f})",
             remedy="give two scans of the same limb, place and contrast, or use the one with markers alone "

@@ -11,11 +11,11 @@ from ...errors import SiteError
 from ..surfaces.surfaces import Anatomy
 from ..surfaces.triangles import Surface
 
-FARTHEST_MM = 5.0
+MAX_OFF_SKIN_MM = 5.0
 SAMPLE_EDGE_MM = 1.0
 AXIS_STEPS = 4
 _ON_CUT_MM = 0.01
-DEEPEST_MM = 40.0  # beyond it, bone no longer stiffens what is felt
+MAX_DEPTH_MM = 40.0  # beyond it, bone no longer stiffens what is felt
 _TICKS = np.linspace(-0.5, 0.5, 5)
 
 
@@ -33,7 +33,7 @@ def project_to_skin(anatomy: Anatomy, position: ArrayLike, name: str | None = No
     skin = anatomy.skin
     squared, _, nearest = skin.search.nearest(query[None])
     distance = float(np.sqrt(squared[0]))
-    if distance > FARTHEST_MM:
+    if distance > MAX_OFF_SKIN_MM:
         raise SiteError(
             f"lies {distance:.1f} mm off the skin",
             place=name,
@@ -143,7 +143,7 @@ def measure_tissue_under(anatomy: Anatomy, position: ArrayLike, axis: ArrayLike,
     # From outside: at its edges the footprint may lie off a curved skin.
     starts = centre + u.reshape(-1, 1) * along + v.reshape(-1, 1) * across - width * direction
     skin = _find_first_hits(starts, direction, anatomy.skin.points[anatomy.skin.faces])
-    least = DEEPEST_MM
+    least = MAX_DEPTH_MM
     for bone in anatomy.bones.values():
         hits = _find_first_hits(starts, direction, bone.points[bone.faces])
         through = np.isfinite(hits) & np.isfinite(skin) & (hits > skin)

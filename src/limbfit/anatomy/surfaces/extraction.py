@@ -87,9 +87,9 @@ def smooth_field(body: Mask, grid: Grid, edge_mm: float) -> tuple[Volume, float]
         gaussian_filter(distance, _SIGMA_VOXELS, mode="nearest"), grid.spacing, grid.origin, grid.direction
     )
     cubic = _resample_cubic(smooth, edge_mm)
-    wanted = round(float(body.sum()) * grid.voxel_mm3 / cubic.voxel_mm3)
+    count = round(float(body.sum()) * grid.voxel_mm3 / cubic.voxel_mm3)
     values = cubic.array.ravel()
-    place = len(values) - min(wanted, len(values) - 1)
+    place = len(values) - min(count, len(values) - 1)
     return cubic, float(np.partition(values, place)[place])
 
 

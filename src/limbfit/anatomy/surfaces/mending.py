@@ -32,16 +32,19 @@ from .triangles import (
     number_components,
 )
 
-SMALL_MM = 10.0  # a hole that is no wider is filled
-FEW_EDGES, FEW_SHARE = 6, 0.02  # so is one of few edges that is a small share of the surface
-MOST_TURNED = 0.75  # of the faces: a surface of which more look inward is inverted, as one that is mirrored
-LOOSE_SHARE = 0.01  # of the faces: open pieces that hold less are left out
-MOST_CROSSING, MOST_SMOOTHED_MM = 200, 4.0  # pairs of faces that are smoothed until they do not cross
-GENTLE, FIRM = 0.1, 0.5  # of the way to the neighbours' mean, each time; long triangles need little
+SMALL_HOLE_MM = 10.0  # a hole that is no wider is filled
+SMALL_HOLE_EDGES, SMALL_HOLE_SHARE = 6, 0.02  # so is one of few edges that is a small share of the surface
+MAX_TURNED_SHARE = 0.75  # of the faces: a surface of which more look inward is inverted, as a mirrored one
+MAX_LOOSE_SHARE = 0.01  # of the faces: open pieces that hold less are left out
+MAX_CROSSINGS, MAX_SMOOTHING_MM = 200, 4.0  # pairs of faces that are smoothed until they do not cross
+GENTLE_SHARE, FIRM_SHARE = (
+    0.1,
+    0.5,
+)  # of the way to the neighbours' mean, each time
 END_SHARE = 0.03  # of the skin's area: a smaller opening, or flat part, is not its proximal end
 FLAT_MM = 0.05  # within which a flat end lies in its plane
 LEVEL_RAD = 3e-3  # between neighbours in it
-WIDENED = 2.0  # a cap so much larger than the opening cuts through the body
+MAX_CAP_RATIO = 2.0  # a cap so much larger than the opening cuts through the body
 INSIDE_MM = 0.5  # of the loop's lowest point, where the cap lies
 JOIN_MM = 1e-6
 BELOW_MM = 2.0  # the lowest cap of the proximal end, where the default cut is
@@ -179,9 +182,9 @@ def find_flat_ends(surface: Surface) -> list[tuple[Array, Array]]:
     edges = np.sort(find_half_edges(surface.faces), axis=1)
     order = np.lexsort(edges.T)
     same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
-    one, other = order[:-1][same] % len(areas), order[1:][same] % len(areas)
-    level = np.einsum("ij,ij->i", normals[one], normals[other]) > np.cos(LEVEL_RAD)
-    patch = number_components(np.column_stack([one[level], other[level]]), len(areas))
+    first, second = order[:-1][same] % len(areas), order[1:][same] % len(areas)
+    level = np.einsum("ij,ij->i", normals[first], normals[second]) > np.cos(LEVEL_RAD)
+    patch = number_components(np.column_stack([first[level], second[level]]), len(areas))
     ends = []
     for which in np.flatnonzero(np.bincount(patch, areas) > END_SHARE * surface.area):
         weights = areas * (patch == which)
@@ -198,7 +201,7 @@ def orient_outward(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...
     alike = orient_faces(surface)
     outward = alike if alike.volume > 0.0 else alike.flipped
     count = count_turned(surface, outward)
-    if alike is surface or count > MOST_TURNED * len(surface.faces):
+    if alike is surface or count > MAX_TURNED_SHARE * len(surface.faces):
         return surface, ()
     return outward, (f"{name}: {count} of {len(surface.faces)} triangles looked inward and were turned",)
 
@@ -223,7 +226,7 @@ def _place(point: Array) -> str:
 def _remove_loose_pieces(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
     """Without small open pieces beside the largest body; a small closed one may be meant and stays."""
     main, *others = find_bodies(surface)
-    few = LOOSE_SHARE * len(surface.faces)
+    few = MAX_LOOSE_SHARE * len(surface.faces)
     loose = [part for part in others if len(part.faces) < few and len(find_open_edges(part.faces))]
     if not loose:
         return surface, ()
@@ -259,9 +262,9 @@ def open_loops(surface: Surface) -> list[Indices]:
 
 def _is_small(surface: Surface, loop: Indices) -> bool:
     points = surface.points[loop]
-    if np.linalg.norm(np.ptp(points, axis=0)) <= SMALL_MM:
+    if np.linalg.norm(np.ptp(points, axis=0)) <= SMALL_HOLE_MM:
         return True
-    return len(loop) <= FEW_EDGES and _compute_area(points) < FEW_SHARE * surface.area
+    return len(loop) <= SMALL_HOLE_EDGES and _compute_area(points) < SMALL_HOLE_SHARE * surface.area
 
 
 def _compute_area_vector(loop: Array) -> Array:
@@ -300,7 +303,7 @@ def _cap_open_end(surface: Surface, rim: Array, name: str, file: Path | None) ->
     ]
     loops = open_loops(body)
     flat = _triangulate_polygon(body.points[loops[0]][::-1], normal) if len(loops) == 1 else None
-    if flat is None or Surface(body.points, loops[0][::-1][flat]).area > WIDENED * _compute_area(rim):
+    if flat is None or Surface(body.points, loops[0][::-1][flat]).area > MAX_CAP_RATIO * _compute_area(rim):
         raise SurfaceError(
             f"{name}: its open end at {_place(rim.mean(axis=0))} cannot be closed by a plane",
             file=file,
@@ -326,12 +329,12 @@ def _triangulate_polygon(polygon: Array, normal: Array) -> Indices | None:
 def _smooth_crossings(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
     """A few crossing faces smoothed apart; a surface that crosses itself more is left as it is."""
     crossing = surface.self_intersections
-    if not 0 < len(crossing) <= MOST_CROSSING:
+    if not 0 < len(crossing) <= MAX_CROSSINGS:
         return surface, ()
-    for share in (GENTLE, FIRM):
+    for share in (GENTLE_SHARE, FIRM_SHARE):
         smooth = untangle_surface(surface, share)
         moved = np.linalg.norm(smooth.points - surface.points, axis=1).max()
-        if moved <= MOST_SMOOTHED_MM and not len(smooth.self_intersections):
+        if moved <= MAX_SMOOTHING_MM and not len(smooth.self_intersections):
             break
     else:
         return surface, ()

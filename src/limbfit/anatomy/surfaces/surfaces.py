@@ -104,7 +104,7 @@ def build_anatomy(
     SurfaceError
         For a cut that misses the limb.
     """
-    labels = labels.nearest_lps()
+    labels = labels.align_with_lps()
     if proximal_cut is None:
         end = find_proximal_end(labels.limb, labels)
         point, normal = _choose_default_cut(labels, end)
@@ -116,7 +116,7 @@ def build_anatomy(
     own_point = np.round(labels.direction.T @ (point - labels.origin), 4)
     own_normal = np.round(labels.direction.T @ normal, 6)
     built = _build_anatomy(
-        labels.in_own_frame(), end, edge_mm, own_point, own_normal / np.linalg.norm(own_normal)
+        labels.move_to_own_frame(), end, edge_mm, own_point, own_normal / np.linalg.norm(own_normal)
     )
 
     def to_patient(body: Surface) -> Surface:
@@ -135,10 +135,10 @@ def _build_anatomy(
     labels: LabelMap, end: ProximalEnd, edge_mm: float, point: Array, normal: Array
 ) -> Anatomy:
     extended = _extend_labels(labels, end, _STICK_OUT_MM + _CUT_INSIDE_MM + 2 * edge_mm)
-    distal = labels.heights(point, normal) < 0
+    distal = labels.compute_heights(point, normal) < 0
     _check_sides(labels.limb & distal, end)
     skin = cut_and_cap(extract_fine_surface(extended, None, edge_mm), point, normal, edge_mm)
-    beyond = extended.heights(point + _STICK_OUT_MM * normal, normal) > 0
+    beyond = extended.compute_heights(point + _STICK_OUT_MM * normal, normal) > 0
     reach = extended.with_array(np.where(beyond, 0, extended.array))
     bones = {}
     for name in labels.bone_names:

@@ -23,8 +23,8 @@ from ...errors import SurfaceError
 _SMALLEST_MM = {"skin": 60.0, "tibia": 30.0, "fibula": 30.0, "femur": 30.0}
 _SMALLEST_OTHER_MM = 15.0
 _LARGEST_MM = 3000.0
-_LARGE = 4.0  # of the median face's size: larger ones are looked for in pieces
-_AT_ONCE = 20_000  # faces whose neighbours are held in memory
+_LARGE_RATIO = 4.0  # of the median face's size: larger ones are looked for in pieces
+_BATCH = 20_000  # faces whose neighbours are held in memory
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ def _find_near_pairs(surface: Surface) -> Indices:
     trees = [cKDTree(centre[group]) for group in groups]
     found = []
     for n, group in enumerate(groups):
-        for part in np.array_split(group, -(-len(group) // _AT_ONCE)):
+        for part in np.array_split(group, -(-len(group) // _BATCH)):
             tree = cKDTree(centre[part])
             for other, larger in zip(groups[n:], trees[n:]):
                 reach = float(radius[part].max() + radius[other].max())
@@ -300,7 +300,7 @@ def _split_large(triangles: Array) -> tuple[Indices, Array]:
     The flat caps of scans consist of long slivers, to each of which thousands of small faces are near.
     """
     owner = np.arange(len(triangles))
-    usual = _LARGE * float(np.median(_compute_radii(triangles)))
+    usual = _LARGE_RATIO * float(np.median(_compute_radii(triangles)))
     owners, pieces = [], []
     while len(owner):
         large = _compute_radii(triangles) > usual

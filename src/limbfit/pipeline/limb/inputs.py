@@ -70,10 +70,10 @@ def segment_automatically(study: Study, volume: Volume) -> LabelMap:
     """
     assert study.image is not None
     path, table = study.path(study.image.path), study.segmentation
-    near = volume.nearest_lps()
+    near = volume.align_with_lps()
     with name_file_in_errors(path):
         found = segment(
-            near.in_own_frame(),
+            near.move_to_own_frame(),
             bias_correction=table.bias_correction,
             min_bone_volume_mm3=table.min_bone_volume_mm3,
             contrast=table.contrast,

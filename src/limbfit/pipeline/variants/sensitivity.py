@@ -40,7 +40,7 @@ from ...results.variants import (
     VolumeResult,
     VolumeRun,
 )
-from ...shapes import OWN, SHAPES
+from ...shapes import BUILTIN_SHAPES, SHAPES
 from ...study import IndenterTable
 from ..engine.context import Context
 from ..engine.storage import write_result, write_rows, write_table
@@ -286,7 +286,7 @@ def list_other_indenters(own: IndenterTable) -> list[tuple[str, IndenterTable, b
     """(label, indenter, is the study's): its own, and those of its width that it is not."""
     width = own.width_mm
     found = [(f"{own.shape} of the study", own, True)]
-    for shape in dict.fromkeys((*OWN, SHAPES[own.shape])):
+    for shape in dict.fromkeys((*BUILTIN_SHAPES, SHAPES[own.shape])):
         for label, rounding in shape.variants.items():
             table = IndenterTable(
                 shape=shape.name, width_mm=width, edge_radius_mm=rounding * width, friction=own.friction

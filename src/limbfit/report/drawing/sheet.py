@@ -28,7 +28,7 @@ _MARGIN = 4  # voxels around the limb
 def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: LabelQuality) -> None:
     """Write the picture (PNG): slices from end to end, below them the suspects of the measures."""
     order = [*(n for n in range(3) if n != quality.axis), quality.axis]
-    image, turned = volume.turned(order), labels.turned(order)
+    image, turned = volume.permute_axes(order), labels.permute_axes(order)
     window = _find_window(turned.limb)
     masks = {LIMB: turned.limb} | {
         name: turned.mask(name) for name in turned.names.values() if name != SOFT_TISSUE

@@ -89,7 +89,7 @@ def write_method_parts(store: Results) -> tuple[Part, ...]:
             "span": _format_span,
             "pairs": _format_pairs,
         },
-        describe_indenter=lambda one: SHAPES[one["shape"]].said(one),
+        describe_indenter=lambda one: SHAPES[one["shape"]].describe(one),
         describe_preload=describe_preload,
         describe_constraints=describe_constraints,
         describe_residuals=describe_residuals,
