@@ -214,7 +214,7 @@ def smooth(field: Array, stations: Array, radius: float, size_mm: float) -> Arra
     return np.asarray(padded[pad:], dtype=float)
 
 
-SMOOTH_MM = 5.0  # half of an edge of the limb's mesh: what is shorter is that of its faces
+OFFSET_SMOOTH_MM = 5.0  # half of an edge of the limb's mesh: what is shorter is that of its faces
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,4 +259,4 @@ def compute_offsets(limb: LimbProfile, before: Surface, after: Surface, frame: F
             "the moved surface does not surround the limb's middle line", remedy="lower the pressure"
         )
     radial[known[-1] + 1 :] = radial[known[-1]]
-    return Offsets(limb, smooth(radial, limb.stations, float(np.median(first[known])), SMOOTH_MM))
+    return Offsets(limb, smooth(radial, limb.stations, float(np.median(first[known])), OFFSET_SMOOTH_MM))
