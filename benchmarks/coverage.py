@@ -136,7 +136,7 @@ class Robot:
     def response(self, record: SiteRecord, force: Array, smoothing: float) -> Array:
         """What smoothing makes of forces (n, n); it depends on the times and the penalty alone."""
         smooth, _ = self.regularised(np.random.default_rng(self.seed), record, force, smoothing)
-        return smooth.curve.response(record.times_s)
+        return smooth.curve.compute_response(record.times_s)
 
     def _noise(self, random: np.random.Generator, n: int) -> Array:
         white = random.standard_normal(n)

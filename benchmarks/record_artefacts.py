@@ -409,7 +409,7 @@ def read(case: Case, wrong: str | None) -> Reading:
         found = interpret_record(case.trace)
     except TraceError as error:
         return Reading((), error.what, told=True)
-    kinds = tuple(sorted({remark.kind for remark in found.remarks}))
+    kinds = tuple(sorted({remark.kind for remark in found.warnings}))
     told = bool(kinds) if wrong is None else wrong in kinds
     touch = found.touch_down
     return Reading(kinds, None, told, touch.displacement_mm - case.touch_down_mm, touch.uncertainty_mm)

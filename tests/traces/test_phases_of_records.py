@@ -83,7 +83,7 @@ def test_the_start_of_a_relaxation_is_smoothed_alike_in_record_and_simulation():
     start = even.phases[1].start_s
     early = (even.time_s > start) & (even.time_s < start + 2.0)
     assert early.sum() >= 5
-    simulated = even.curve.response(even.time_s) @ true
+    simulated = even.curve.compute_response(even.time_s) @ true
     assert np.abs(even.force_N - true)[early].max() < 0.003 * true.max()
     assert np.abs(simulated - even.force_N)[early].max() < 0.003 * true.max()
 
@@ -92,7 +92,7 @@ def test_the_response_of_the_smoothing_follows_every_phase():
     trace, _ = path_record(*PROTOCOLS["cycles in contact"][:2])
     curve = regularise(trace, find_touch_down(trace))
     times = curve.resample(81).time_s
-    matrix = curve.curve.response(times)
+    matrix = curve.curve.compute_response(times)
     force = np.interp(times, curve.knots_s, curve.knots_mm)
     assert matrix @ force == pytest.approx(force, abs=0.03 * force.max())
 

@@ -30,7 +30,7 @@ def noisy(force, seed=1):
 
 def only(found, kind):
     """The one remark on a record, which is of this kind."""
-    (remark,) = found.remarks
+    (remark,) = found.warnings
     assert remark.kind == kind, remark
     return remark
 
@@ -73,7 +73,7 @@ def test_lost_samples(sound, start_s, end_s):
 
 def test_samples_lost_where_the_skin_is_met(sound):
     found = interpret_record(without(sound[0], 0.2, 0.8))
-    assert "gap" in [remark.kind for remark in found.remarks]
+    assert "gap" in [remark.kind for remark in found.warnings]
     assert_within(found)
 
 
@@ -165,7 +165,7 @@ def test_a_force_that_jumps_does_not_drift(sound, size):
 def test_a_jump_off_the_skin_is_adhesion():
     trace, _ = path_record([0.0, 5.4, 10.8, 11.8], [0.0, 5.4, 0.0, 0.0])
     sticks = (trace.time_s > 10.2) & (trace.time_s < 10.45)  # from 0.2 mm below the skin
-    assert interpret_record(replace(trace, force_N=trace.force_N - 0.4 * sticks)).remarks == ()
+    assert interpret_record(replace(trace, force_N=trace.force_N - 0.4 * sticks)).warnings == ()
 
 
 @pytest.mark.parametrize("share", [0.1, -0.1])
@@ -222,7 +222,7 @@ def test_rounded_times_are_spread(sound, tmp_path):
 def test_rounded_times_with_a_gap_stay_where_they_are(sound):
     gapped = without(sound[0], 2.0, 3.0)
     found = interpret_record(replace(gapped, time_s=np.round(gapped.time_s, 2)))
-    assert [remark.kind for remark in found.remarks] == ["times", "gap"]
+    assert [remark.kind for remark in found.warnings] == ["times", "gap"]
     assert np.abs(found.trace.time_s - gapped.time_s).max() < 0.011
     assert (np.diff(found.trace.time_s) > 0.0).all()
 
@@ -265,7 +265,7 @@ def test_a_record_of_few_different_times_is_refused(sound):
     ids=str,
 )
 def test_sound_records_have_no_remarks(changes):
-    assert interpret_record(record(**changes)[0]).remarks == ()
+    assert interpret_record(record(**changes)[0]).warnings == ()
 
 
 MOVEMENTS = {
@@ -280,13 +280,13 @@ MOVEMENTS = {
 
 @pytest.mark.parametrize("movement", MOVEMENTS)
 def test_other_movements_have_no_remarks(movement):
-    assert interpret_record(path_record(*MOVEMENTS[movement], rate=100.0)[0]).remarks == ()
+    assert interpret_record(path_record(*MOVEMENTS[movement], rate=100.0)[0]).warnings == ()
 
 
 def test_samples_that_are_missing_at_random_are_no_gap(sound):
     trace, _ = sound
     kept = np.random.default_rng(0).random(len(trace.time_s)) > 0.3
     assert (
-        interpret_record(Trace(trace.time_s[kept], trace.displacement_mm[kept], trace.force_N[kept])).remarks
+        interpret_record(Trace(trace.time_s[kept], trace.displacement_mm[kept], trace.force_N[kept])).warnings
         == ()
     )

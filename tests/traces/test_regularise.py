@@ -76,7 +76,7 @@ def test_what_smoothing_does_to_another_force_is_known():
     def force(at):
         return 8 * np.sin(np.pi * np.clip(at / times[-1], 0, 1)) ** 1.5
 
-    smoothed = smooth.curve.response(times) @ force(times)
+    smoothed = smooth.curve.compute_response(times) @ force(times)
     raw = force(noisy.time_s - touch.time_s)
     other, clean = dataclasses.replace(noisy, force_N=raw), dataclasses.replace(touch, baseline_N=0.0)
     again = regularise(other, clean, 0.1)
@@ -93,7 +93,7 @@ def test_smoothing_a_simulated_force_does_not_make_it_stiffer():
     times = smooth.resample(80).time_s
     inside = times < 5.4 / 0.96
     exact = np.interp(times, smooth.time_s, smooth.force_N)
-    error = smooth.curve.response(times) @ truth(times + touch.time_s) - exact
+    error = smooth.curve.compute_response(times) @ truth(times + touch.time_s) - exact
     assert abs(error[inside].mean()) < 1e-4 * exact.max()
 
 

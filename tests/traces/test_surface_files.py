@@ -40,7 +40,7 @@ def test_one_component_will_do(tmp_path: Path) -> None:
     found = read_surface_motion(file, "time_s")
     assert np.isnan(found.moved_mm[..., :2]).all()
     assert found.moved_mm[0, :, 2].tolist() == [-0.2, -0.5]
-    means = found.means(np.array([0, 1]))
+    means = found.average(np.array([0, 1]))
     assert means.component.tolist() == [2, 2]
 
 
@@ -108,7 +108,7 @@ def test_means_are_of_the_frames_that_show_a_point() -> None:
     seen = motion(times)
     seen.moved_mm[::3, 1] = np.nan
     seen.moved_mm[40:, 1, 0] = np.nan
-    found = seen.means(np.array([1, 0]))
+    found = seen.average(np.array([1, 0]))
     of_point = np.array(AT)[[1, 0]][found.point]
     assert len(np.unique(found.time_s.round(6))) > 8  # other frames, other times
     assert len(found.moved_mm) < 8 * 2 * 3
@@ -122,6 +122,6 @@ def test_means_are_of_the_frames_that_show_a_point() -> None:
 
 
 def test_one_scan_is_one_time() -> None:
-    found = motion(np.array([3.0])).means(np.array([0, 1]))
+    found = motion(np.array([3.0])).average(np.array([0, 1]))
     assert len(found.moved_mm) == 6
     assert found.samples.tolist() == [1.0] * 6

@@ -12,7 +12,7 @@ import pytest
 from scipy.signal import lfilter
 
 from limbfit.traces import Trace, find_touch_down
-from limbfit.traces.numerics import Scatter, estimate_scatter
+from limbfit.traces.numerics import SampleNoise, estimate_noise
 
 NOISE_N, RATE_HZ = 0.05, 500.0
 
@@ -81,18 +81,18 @@ def test_the_noise_is_known_by_its_correlation(lag):
     """On a curve, whose own bends are no noise; the deviation of a long mean is what counts."""
     curve = 5 * np.linspace(0, 1, 4000) ** 2
     parts = [curve + NOISE_N * autoregressive(np.random.default_rng(k), 4000, lag) for k in range(8)]
-    found = [estimate_scatter(part) for part in parts]
+    found = [estimate_noise(part) for part in parts]
     assert np.mean([one.lag for one in found]) == pytest.approx(lag, abs=0.02)
-    long = np.mean([one.of_means(200) for one in found])
-    assert long == pytest.approx(Scatter(NOISE_N, lag).of_means(200), rel=0.1)
+    long = np.mean([one.compute_mean_sd(200) for one in found])
+    assert long == pytest.approx(SampleNoise(NOISE_N, lag).compute_mean_sd(200), rel=0.1)
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.3, 0.95])
 def test_the_deviation_of_means(lag):
-    random, true = np.random.default_rng(4), Scatter(1.0, lag)
+    random, true = np.random.default_rng(4), SampleNoise(1.0, lag)
     means = autoregressive(random, 400_000, lag).reshape(-1, 20).mean(axis=1)
-    assert true.of_means(20) == pytest.approx(means.std(), rel=0.03)
-    assert true.of_means(1) == pytest.approx(1.0)
+    assert true.compute_mean_sd(20) == pytest.approx(means.std(), rel=0.03)
+    assert true.compute_mean_sd(1) == pytest.approx(1.0)
 
 
 def test_a_record_that_starts_on_the_skin_says_so():

@@ -29,7 +29,7 @@ def record(seed=0, clear=0.5, depth=6.0, speed=1.0, peak=8.0, after=1.0):
 
 
 def kinds(found):
-    return [remark.kind for remark in found.remarks]
+    return [remark.kind for remark in found.warnings]
 
 
 def test_a_sound_record_is_left_alone():
@@ -37,7 +37,7 @@ def test_a_sound_record_is_left_alone():
         trace, _ = record(seed)
         found = interpret_record(trace)
         assert found.trace is trace
-        assert found.remarks == ()
+        assert found.warnings == ()
         assert found.touch_down == find_touch_down(trace)
 
 
@@ -49,8 +49,8 @@ def test_a_force_that_drifts_is_set_straight(drift):
     trace, clean = record()
     found = interpret_record(replace(trace, force_N=trace.force_N + drift * trace.time_s))
     assert kinds(found) == ["drift"]
-    assert found.remarks[0].evidence["drift_N_per_s"] == pytest.approx(drift, rel=0.05)
-    assert f"{drift:+.2g} N/s" in found.remarks[0].what
+    assert found.warnings[0].evidence["drift_N_per_s"] == pytest.approx(drift, rel=0.05)
+    assert f"{drift:+.2g} N/s" in found.warnings[0].what
     mended = found.trace.force_N - found.touch_down.baseline_N
     assert np.abs(np.mean((mended - clean)[-400:])) < 0.02
     assert found.touch_down.displacement_mm == pytest.approx(0.5, abs=3 * found.touch_down.uncertainty_mm)
@@ -81,8 +81,8 @@ def test_spikes_are_taken_out_and_counted(size):
     force, places = spiked(trace.force_N, size)
     found = interpret_record(replace(trace, force_N=force))
     assert kinds(found) == ["spikes"]
-    assert found.remarks[0].evidence["spikes"] == len(places)
-    assert f"{len(places)} of {len(force)} samples of the force" in found.remarks[0].what
+    assert found.warnings[0].evidence["spikes"] == len(places)
+    assert f"{len(places)} of {len(force)} samples of the force" in found.warnings[0].what
     assert np.abs(found.trace.force_N - clean).max() < 6 * NOISE_N
     changed = found.trace.force_N != force
     assert np.array_equal(np.flatnonzero(changed), np.sort(places))
@@ -92,7 +92,7 @@ def test_spikes_of_the_displacement_are_taken_out():
     trace, _ = record()
     moved, _ = spiked(trace.displacement_mm, 2.0)
     found = interpret_record(replace(trace, displacement_mm=moved))
-    assert "displacement" in found.remarks[0].what
+    assert "displacement" in found.warnings[0].what
     assert np.abs(found.trace.displacement_mm - trace.displacement_mm).max() < 0.05
 
 
@@ -144,13 +144,13 @@ def test_a_sensor_that_was_zeroed_in_contact_is_refused():
 def test_a_record_that_starts_on_the_skin_is_taken_with_a_remark():
     found = interpret_record(record(clear=0.0)[0])
     assert kinds(found) == ["start"]
-    assert "no approach" in found.remarks[0].what
+    assert "no approach" in found.warnings[0].what
 
 
 def test_a_sensor_with_an_offset_is_no_contact():
     trace, _ = record()
     found = interpret_record(replace(trace, force_N=trace.force_N + 0.6))
-    assert found.remarks == ()
+    assert found.warnings == ()
     assert found.touch_down.baseline_N == pytest.approx(0.6, abs=0.02)
 
 

@@ -30,7 +30,7 @@ def test_means_before_touch_down_are_at_rest(tmp_path: Path) -> None:
     """Two of what comes before, then at most 20; what all share does not shrink with their number."""
     rows = [f"{0.1 * i:.1f},{4.0 + 0.01 * i:.2f}" for i in range(100)]
     (skin,) = read_wave_speeds(table(tmp_path, "time_s,skin_m_s", rows), "time_s")
-    means = skin.means(2.0, 8.0)
+    means = skin.average(2.0, 8.0)
     assert means.time_s[:2].tolist() == [0.0, 0.0]
     assert len(means.time_s) == 2 + 20
     assert means.speed_m_s[:2] == pytest.approx([4.045, 4.145])
@@ -63,4 +63,4 @@ def test_what_is_wrong_with_a_file_is_told(tmp_path: Path, head: str, rows: list
 def test_one_reading_is_not_enough(tmp_path: Path) -> None:
     (skin,) = read_wave_speeds(table(tmp_path, "time_s,skin_m_s", ["0,4.9", "60,5.1"]), "time_s")
     with pytest.raises(TraceError, match=r"1 readings until the indenter lets go .*; give two or more"):
-        skin.means(2.0, 8.0)
+        skin.average(2.0, 8.0)

@@ -1,20 +1,21 @@
 """Indentation records: read them, find the touch-down, regularise them.
 
-A record starts clear of the skin (or on it); the indenter is pushed in along a line, held, drawn back, in any
-order, at any rates and in several cycles (see `phases`). ``read_trace`` checks it, ``understand`` mends
-or refuses it, ``find_touch_down`` tells where the skin was met, and ``regularise`` gives curves counted from
-there: piecewise straight for the displacement, a cubic smoothing spline for the force, each phase by itself
-so that the peak is not smoothed away (paper, section 2.1 and figure 3). Under a stated force it is the other
-way round (``regularise_creep``). Where ultrasound looked through the indenter, ``thinnings`` tell how the
-tissues under it gave way, and ``read_wave_speeds`` how fast shear waves ran in them; where cameras looked
-beside it, ``read_surface_motion`` tells how the skin there moved.
+A record starts clear of the skin (or on it). The indenter is pushed in along a line, held and drawn back, in
+any order, at any rates and in several cycles (see `phases`). `read_trace` reads and checks the record,
+`interpret_record` mends or refuses it, `find_touch_down` finds where the skin was met, and `regularise` makes
+curves that are counted from there: piecewise straight for the displacement, a cubic smoothing spline for the
+force, each phase by itself so that the peak is not smoothed away (paper, section 2.1 and figure 3). Under a
+stated force it is the other way round (`regularise_creep`).
+
+`compute_thinnings` says how tissues under the indenter gave way in ultrasound, `read_wave_speeds` how fast
+shear waves ran in them, and `read_surface_motion` how the skin beside the indenter moved.
 
 Units: s, mm, N; force positive when pushing, displacement positive into the limb.
 """
 
 from .interpretation import InterpretedRecord, interpret_record
 from .reading import read_trace
-from .record import COLUMNS, Remark, Trace, check_trace
+from .record import COLUMNS, Trace, TraceWarning, check_trace
 from .regularise import Creep, Regularised, regularise, regularise_creep
 from .secondary_measurements import (
     Layers,
@@ -37,12 +38,12 @@ __all__ = [
     "InterpretedRecord",
     "Layers",
     "Regularised",
-    "Remark",
     "SurfaceMeans",
     "SurfaceMotion",
     "Thinning",
     "TouchDown",
     "Trace",
+    "TraceWarning",
     "WaveMeans",
     "WaveSpeeds",
     "check_trace",

@@ -18,8 +18,10 @@ from .numerics import (
     find_resolution,
 )
 
-_MAX_KNOTS = 41
-_STEPS = 0.7  # of a step in which the displacement comes: half of one is rounded, and corners are off too
+_MAX_CORNERS = 41
+_STEP_SHARE = (
+    0.7  # of a step in which the displacement comes: half of one is rounded, and corners are off too
+)
 
 
 @dataclass(frozen=True)
@@ -51,11 +53,11 @@ class BrokenLine:
         """When the indenter starts to move in."""
         return next((phase.start_s for phase in self.phases if phase.kind == "load"), float(self.times[0]))
 
-    def path(self, at: Array) -> Array:
+    def compute_path_mm(self, at: Array) -> Array:
         """The way that the indenter has gone, in and out, since the first corner, at times (n,) s; mm."""
         return np.interp(at, self.times, np.r_[0.0, np.cumsum(np.abs(np.diff(self.values)))])
 
-    def time_at(self, displacement: float, back: bool = False) -> float:
+    def find_time_at(self, displacement: float, back: bool = False) -> float:
         """When the line passes a displacement on the first way in, or for the last time ``back`` out (the
         end where it stays beyond)."""
         if back:
@@ -92,7 +94,7 @@ def fit_broken_line(
     at, coarse, n = average_in_bins(t, u, 300)
     travel = float(np.ptp(coarse))
     noise = 4 * estimate_noise_level(u) / np.sqrt(float(n.mean()))
-    tolerance = max(0.003 * travel, noise, _STEPS * find_resolution(displacement))
+    tolerance = max(0.003 * travel, noise, _STEP_SHARE * find_resolution(displacement))
     knots = np.array([time[0], time[-1]])
     while True:
         knots, values = _place_knots(t, u, knots)
@@ -101,7 +103,7 @@ def fit_broken_line(
         miss[np.searchsorted(at, knots[1:-1]).clip(1, len(at) - 1)[:, None] - [0, 1]] = 0.0
         if miss.max() <= tolerance:
             break
-        if len(knots) >= _MAX_KNOTS:
+        if len(knots) >= _MAX_CORNERS:
             worst = float(at[np.argmax(miss)])
             raise TraceError(
                 f"the {quantity} wanders: {len(knots) - 1} straight pieces leave {miss.max():.2g} {unit} at "
@@ -125,9 +127,9 @@ def _fit_line_turning_at(peak_s: float, line: BrokenLine, t: Array, u: Array) ->
     knots = line.times.copy()
     knots[turn] = peak_s
     if low < peak_s < high:
-        moved = BrokenLine(knots, _fit_values(t, u, knots)[0], line.tolerance)
-        if moved.peak_s == peak_s:
-            return moved
+        line_at_peak = BrokenLine(knots, _fit_values(t, u, knots)[0], line.tolerance)
+        if line_at_peak.peak_s == peak_s:
+            return line_at_peak
     raise TraceError(
         f"the way in cannot end at {peak_s:g} s",
         place="peak_s",
@@ -169,8 +171,8 @@ def _place_knots(t: Array, u: Array, knots: Array) -> tuple[Array, Array]:
         values, hats = _fit_values(t, u, corners)
         piece = np.clip(np.searchsorted(corners, t) - 1, 0, len(corners) - 2)
         speed = (np.diff(values) / np.diff(corners))[piece]
-        moved = -speed[:, None] * hats[:, 1:-1]
-        return np.asarray(moved - hats @ _project_on_hats(hats, moved))
+        line_at_peak = -speed[:, None] * hats[:, 1:-1]
+        return np.asarray(line_at_peak - hats @ _project_on_hats(hats, line_at_peak))
 
     inner = knots[1:-1]
     if inner.size:

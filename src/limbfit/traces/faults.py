@@ -1,8 +1,8 @@
-"""What goes wrong in the instrument.
+"""Faults of the instrument.
 
 Times are rounded, samples lost; a force is frozen, at the end of its range, jumps, or comes in coarse steps.
 
-What is certain is mended (times); of the rest a remark says what, where and how much.
+What is certain is mended (times); for the rest a warning says what happened, where and how much.
 """
 
 from __future__ import annotations
@@ -13,61 +13,61 @@ import numpy as np
 
 from .displacement import BrokenLine
 from .numerics import Array, Bools, average_in_bins, estimate_noise_level, find_resolution, find_runs
-from .record import Remark, Trace
+from .record import Trace, TraceWarning
 from .touchdown import TouchDown, find_depth_at
 
-_FEW_DOUBLED = 0.2  # of the samples: more of them share a time because times are rounded
-_ROUNDED = 0.75  # of the resolution that an even clock may be off the times that are stated
+_MAX_REPEATED = 0.2  # of the samples: more of them share a time because times are rounded
+_CLOCK_SHARE = 0.75  # of the resolution that an even clock may be off the times that are stated
 _GAP_STEPS = 3.0  # times nearly all steps between samples
-_MOVED = 0.01  # of the travel: where the indenter moves less, nothing is missed
+_MIN_MOTION = 0.01  # of the travel: where the indenter moves less, nothing is missed
 _FROZEN_SAMPLES = 15
 _JUMP_NOISE = 6.0  # standard deviations
-_CONTACT = 0.05  # of the rise
-_COARSE_FORCE, _COARSE_TRAVEL = 0.01, 0.005  # of the rise, of the travel
-_DITHERED = 0.6  # of a step: where neighbours scatter by more, means of them know better than a step
-_BINS = 400
-_TOP_NOISE = 4.0  # standard deviations
-_FLAT = 4.0  # times the way that noise would keep a turning force near its top
+_CONTACT_SHARE = 0.05  # of the rise
+_FORCE_STEP, _TRAVEL_STEP = 0.01, 0.005  # of the rise, of the travel
+_MAX_DITHER = 0.6  # of a step: where neighbours scatter by more, means of them know better than a step
+_MAX_BINS = 400
+_TOP_SD = 4.0  # standard deviations
+_FLAT_RATIO = 4.0  # times the way that noise would keep a turning force near its top
 _FLAT_SHARE = 0.02  # of the travel
 _FLAT_BINS = 4
 _STEP_S = 0.08  # on either side of a step
 _STEP_SAMPLES = (6, 40)
 _STEP_SD, _STEP_SHARE = 8.0, 0.02  # standard deviations; of the rise
-_STEP_STEPS = 2.5  # times the resolution
-_PULLED = 0.1  # of the rise: what lets go of the skin may jump
-_SHARP = 0.25  # of a step that shorter windows may find more or less: a kink halves with them
+_STEP_RESOLUTIONS = 2.5  # times the resolution
+_ADHESION_SHARE = 0.1  # of the rise: what lets go of the skin may jump
+_KINK_SHARE = 0.25  # of a step that shorter windows may find more or less: a kink halves with them
 
 
-def mend_times(trace: Trace) -> tuple[Trace, list[Remark]]:
-    """Rows that are there twice are left out, samples that share a rounded time are spread evenly."""
+def mend_times(trace: Trace) -> tuple[Trace, list[TraceWarning]]:
+    """Leave out rows that are there twice; spread samples that share a rounded time evenly."""
     time = trace.time_s
     same = np.r_[False, np.diff(time) == 0.0]
     count, n = int(same.sum()), len(time)
     if not count:
         return trace, []
     twice = same & np.r_[False, (np.diff(trace.displacement_mm) == 0.0) & (np.diff(trace.force_N) == 0.0)]
-    if np.array_equal(twice, same) and count < _FEW_DOUBLED * n:
+    if np.array_equal(twice, same) and count < _MAX_REPEATED * n:
         kept = Trace(time[~same], trace.displacement_mm[~same], trace.force_N[~same])
         what = f"{count} of {n} rows are there twice and were left out once"
         cause = "an export that repeats rows"
-        return kept, [Remark("rows", what, cause, "check the export", {"doubled_rows": float(count)})]
+        return kept, [TraceWarning("rows", what, cause, "check the export", {"doubled_rows": float(count)})]
     size = float(np.median(np.diff(time[~same])))
-    spread = replace(trace, time_s=_spread(time, same, size))
+    spread = replace(trace, time_s=_spread_times(time, same, size))
     what = (
         f"{count} of {n} samples have the time of the sample before; they were spread over {size:.3g} s each"
     )
     numbers = {"doubled_times": float(count), "time_step_s": size}
     return spread, [
-        Remark("times", what, "times that are rounded in the export", "export more digits", numbers)
+        TraceWarning("times", what, "times that are rounded in the export", "export more digits", numbers)
     ]
 
 
-def _spread(time: Array, same: Bools, size: float) -> Array:
+def _spread_times(time: Array, same: Bools, size: float) -> Array:
     """Even times (n,) where an even clock fits the stated ones; else those of each time over its step."""
     index = np.arange(len(time), dtype=float)
     start, step = np.polynomial.polynomial.polyfit(index, time, 1)
     even = start + step * index
-    if np.abs(even - time).max() <= _ROUNDED * size:
+    if np.abs(even - time).max() <= _CLOCK_SHARE * size:
         return np.asarray(even)
     first = np.flatnonzero(~same)
     count = np.diff(np.r_[first, len(time)])
@@ -76,48 +76,48 @@ def _spread(time: Array, same: Bools, size: float) -> Array:
 
 
 def find_gaps(trace: Trace, line: BrokenLine) -> list[tuple[float, float]]:
-    """From when to when (s) samples are lost while the indenter moves."""
+    """Find the spans of time, s, in which samples are lost while the indenter moves."""
     steps = np.diff(trace.time_s)
     long = np.flatnonzero(steps > _GAP_STEPS * np.percentile(steps, 99))
     travel = float(np.ptp(line.values))
     spans = [(float(trace.time_s[i]), float(trace.time_s[i + 1])) for i in long]
-    return [(a, b) for a, b in spans if np.ptp(line.path(np.array([a, b]))) > _MOVED * travel]
+    return [(a, b) for a, b in spans if np.ptp(line.compute_path_mm(np.array([a, b]))) > _MIN_MOTION * travel]
 
 
-def find_gaps_without_force(gaps: list[tuple[float, float]], line: BrokenLine, met_s: float) -> list[Remark]:
-    """One remark for each gap; where the skin is met in one, anywhere in it."""
-    remarks = []
+def report_gaps(gaps: list[tuple[float, float]], line: BrokenLine, met_s: float) -> list[TraceWarning]:
+    """Warn of each gap; a skin that is met in one may be met anywhere in it."""
+    warnings = []
     for start, end in gaps:
-        moved = float(np.ptp(line.path(np.array([start, end]))))
+        moved = float(np.ptp(line.compute_path_mm(np.array([start, end]))))
         what = f"no samples from {start:.2f} s to {end:.2f} s, while the indenter moves by {moved:.2g} mm"
         numbers = {"start_s": start, "end_s": end, "moved_mm": moved} | _compute_added_deviation(
             start, end, line, met_s
         )
         cause = "samples that the logger lost"
-        remarks.append(Remark("gap", what, cause, "record again: the force there is a guess", numbers))
-    return remarks
+        warnings.append(TraceWarning("gap", what, cause, "record again: the force there is a guess", numbers))
+    return warnings
 
 
 def _compute_added_deviation(start: float, end: float, line: BrokenLine, met_s: float) -> dict[str, float]:
-    """What a span without a force adds to the deviation of a touch-down in it or next to it."""
+    """Compute what a span without a force adds to the deviation of a touch-down in it or next to it."""
     if not start - (end - start) <= met_s <= end + (end - start):
         return {}
     return {"adds_sd_mm": float(np.ptp(line(np.array([start, end])))) / float(np.sqrt(12.0))}
 
 
 def find_frozen(trace: Trace, line: BrokenLine, rise_N: float) -> list[slice]:
-    """Runs of samples of one and the same force, while the indenter moves.
+    """Find runs of samples of one and the same force while the indenter moves.
 
     The force jumps at their end, or is at no level at which a force that scatters could stay.
     """
-    force, path = trace.force_N, line.path(trace.time_s)
+    force, path = trace.force_N, line.compute_path_mm(trace.time_s)
     noise, size = estimate_noise_level(force), find_resolution(force)
-    jump = max(2.5 * size, _JUMP_NOISE * noise, _MOVED * rise_N)
-    in_contact = force > np.percentile(force, 2) + _CONTACT * rise_N
+    jump = max(2.5 * size, _JUMP_NOISE * noise, _MIN_MOTION * rise_N)
+    in_contact = force > np.percentile(force, 2) + _CONTACT_SHARE * rise_N
     found = []
     for start, end in find_runs(np.diff(force) == 0.0):
         last = end  # of the equal samples start..end
-        if last - start + 1 < _FROZEN_SAMPLES or path[last] - path[start] < _MOVED * float(
+        if last - start + 1 < _FROZEN_SAMPLES or path[last] - path[start] < _MIN_MOTION * float(
             np.ptp(line.values)
         ):
             continue
@@ -128,37 +128,46 @@ def find_frozen(trace: Trace, line: BrokenLine, rise_N: float) -> list[slice]:
     return found
 
 
-def find_frozen_force(trace: Trace, frozen: list[slice], line: BrokenLine, met_s: float) -> list[Remark]:
-    remarks = []
+def report_frozen_force(
+    trace: Trace, frozen: list[slice], line: BrokenLine, met_s: float
+) -> list[TraceWarning]:
+    warnings = []
     for run in frozen:
         start, end = float(trace.time_s[run.start]), float(trace.time_s[run.stop - 1])
-        moved, force = float(np.ptp(line.path(np.array([start, end])))), float(trace.force_N[run.start])
+        moved, force = (
+            float(np.ptp(line.compute_path_mm(np.array([start, end])))),
+            float(trace.force_N[run.start]),
+        )
         what = (
             f"the force stays at exactly {force:.3g} N from {start:.2f} s to {end:.2f} s, while the indenter "
             f"moves by {moved:.2g} mm"
         )
         numbers = {"start_s": start, "end_s": end, "force_N": force, "moved_mm": moved}
         numbers |= _compute_added_deviation(start, end, line, met_s)
-        remarks.append(Remark("frozen", what, "a sensor that froze", "check it, and record again", numbers))
-    return remarks
+        warnings.append(
+            TraceWarning("frozen", what, "a sensor that froze", "check it, and record again", numbers)
+        )
+    return warnings
 
 
 def find_saturation(
     trace: Trace, line: BrokenLine, rise_N: float, spans: list[tuple[float, float]]
-) -> list[Remark]:
-    """A force that stays at its top, while the indenter moves, for longer than noise at a turn explains; not
-    where ``spans`` of time lack a force."""
+) -> list[TraceWarning]:
+    """Find a force that stays at its top while the indenter moves, longer than noise at a turn explains.
+
+    Not where ``spans`` of time lack a force.
+    """
     near = trace.time_s < 2 * line.peak_s - line.start_s  # a slow way out would have few bins for the turn
-    time, force, _ = average_in_bins(trace.time_s[near], trace.force_N[near], _BINS)
+    time, force, _ = average_in_bins(trace.time_s[near], trace.force_N[near], _MAX_BINS)
     noise = max(estimate_noise_level(force), 1e-3 * rise_N, find_resolution(trace.force_N) / 4)
-    top = float(np.median(force[force > force.max() - _TOP_NOISE * noise]))
-    low = np.flatnonzero(force < top - _TOP_NOISE * noise)
+    top = float(np.median(force[force > force.max() - _TOP_SD * noise]))
+    low = np.flatnonzero(force < top - _TOP_SD * noise)
     peak = int(np.argmax(force))
     before, after = low[low < peak], low[low > peak]
     if not before.size:
         return []
     a, b = int(before[-1]), int(after[0]) if after.size else len(force)
-    path = line.path(time)
+    path = line.compute_path_mm(time)
     if any(start < time[b - 1] and end > time[a] for start, end in spans):
         return []
     flat, by_noise, wide = float(path[b - 1] - path[a + 1]), 0.0, max((b - a) // 4, 2)
@@ -167,19 +176,19 @@ def find_saturation(
         *([(b, min(b + wide, len(force) - 1))] if after.size else []),
     ):
         steep = (force[edge] - force[beyond]) / max(abs(path[edge] - path[beyond]), 1e-12)
-        by_noise += _TOP_NOISE * noise / steep if steep > 0.0 else np.inf
-    if b - a <= _FLAT_BINS or flat < max(_FLAT * by_noise, _FLAT_SHARE * float(np.ptp(line.values))):
+        by_noise += _TOP_SD * noise / steep if steep > 0.0 else np.inf
+    if b - a <= _FLAT_BINS or flat < max(_FLAT_RATIO * by_noise, _FLAT_SHARE * float(np.ptp(line.values))):
         return []
     what = f"the force stays at {top:.3g} N while the indenter moves by {flat:.2g} mm"
     numbers = {"limit_N": top, "start_s": float(time[a + 1]), "end_s": float(time[b - 1]), "moved_mm": flat}
     cause = "a sensor or an amplifier at the end of its range"
-    return [Remark("saturation", what, cause, "choose a larger range and record again", numbers)]
+    return [TraceWarning("saturation", what, cause, "choose a larger range and record again", numbers)]
 
 
 def find_steps(
     trace: Trace, line: BrokenLine, rise_N: float, spans: list[tuple[float, float]]
 ) -> list[tuple[float, float]]:
-    """When (s) the force jumps from one sample to the next and stays there, and by how much (N).
+    """Find when (s) the force jumps from one sample to the next and stays there, and by how much (N).
 
     Not looked at: corners of the displacement, ``spans`` of time, and what lets go of the skin.
     """
@@ -190,14 +199,14 @@ def find_steps(
         return []
     whole, half = _compute_jumps(force, m), _compute_jumps(force, m // 2)
     sd = 1.4826 * float(np.median(np.abs(whole)))
-    least = max(_STEP_SD * sd, _STEP_SHARE * rise_N, _STEP_STEPS * find_resolution(force))
-    sharp = np.abs(half - whole) < _SHARP * np.abs(whole) + sd
+    least = max(_STEP_SD * sd, _STEP_SHARE * rise_N, _STEP_RESOLUTIONS * find_resolution(force))
+    sharp = np.abs(half - whole) < _KINK_SHARE * np.abs(whole) + sd
     steps = (np.abs(whole) > least) & sharp
     near = (m + 1) / rate
     for start, end in [(t, t) for t in line.times] + spans:
         steps[(time > start - near) & (time < end + near)] = False
     base = float(np.percentile(force, 2))
-    steps[(time > line.peak_s) & (force < base + _PULLED * rise_N)] = False
+    steps[(time > line.peak_s) & (force < base + _ADHESION_SHARE * rise_N)] = False
     found = []
     while steps.any():
         k = int(np.argmax(np.where(steps, np.abs(whole), 0.0)))
@@ -207,8 +216,11 @@ def find_steps(
 
 
 def _compute_jumps(force: Array, m: int) -> Array:
-    """How far the straight line through the ``m`` samples from each on starts above the end of that through
-    the ``m`` before it, (n,) N; none at the ends."""
+    """Compute the jump at each sample, (n,) N; 0 at the ends.
+
+    It is how far the straight line through the ``m`` samples from there on starts above the end of the line
+    through the ``m`` samples before.
+    """
     x = np.arange(m) + 0.5
     weights = np.linalg.pinv(np.stack([np.ones(m), x], axis=1))[0]  # of the line's value at 0
     inside = np.convolve(force, np.r_[weights[::-1], -weights], mode="valid")
@@ -217,34 +229,38 @@ def _compute_jumps(force: Array, m: int) -> Array:
     return jumps
 
 
-def step_remarks(steps: list[tuple[float, float]]) -> list[Remark]:
-    remarks = []
+def report_steps(steps: list[tuple[float, float]]) -> list[TraceWarning]:
+    warnings = []
     for at, size in steps:
         what = f"the force jumps by {size:+.2g} N from one sample to the next, at {at:.2f} s"
         cause = "a slip of the limb, a knock at the sensor or its amplifier's range"
         numbers = {"time_s": at, "step_N": size}
-        remarks.append(Remark("step", what, cause, "record again: nobody knows which part is right", numbers))
-    return remarks
+        warnings.append(
+            TraceWarning("step", what, cause, "record again: nobody knows which part is right", numbers)
+        )
+    return warnings
 
 
-def find_coarse_steps(trace: Trace, line: BrokenLine, touch: TouchDown, rise_N: float) -> list[Remark]:
-    """Remarks on a force or a displacement whose steps are larger than what its neighbours scatter by.
+def find_coarse_steps(trace: Trace, line: BrokenLine, touch: TouchDown, rise_N: float) -> list[TraceWarning]:
+    """Warn of a force or a displacement whose steps are larger than its neighbours scatter.
 
     A touch-down is then known to where the force reaches the standard deviation of what is rounded.
     """
-    remarks = []
+    warnings = []
     for kind, values, unit, least in (
-        ("force", trace.force_N, "N", _COARSE_FORCE * rise_N),
-        ("displacement", trace.displacement_mm, "mm", _COARSE_TRAVEL * float(np.ptp(line.values))),
+        ("force", trace.force_N, "N", _FORCE_STEP * rise_N),
+        ("displacement", trace.displacement_mm, "mm", _TRAVEL_STEP * float(np.ptp(line.values))),
     ):
         size = find_resolution(values)
-        scatter = float(np.sqrt(np.mean(np.diff(values, 2) ** 2) / 6.0))
-        if size < least or scatter > _DITHERED * size:
+        sample_noise = float(np.sqrt(np.mean(np.diff(values, 2) ** 2) / 6.0))
+        if size < least or sample_noise > _MAX_DITHER * size:
             continue
         what = f"the {kind} comes in steps of {size:.3g} {unit}"
         cause = f"a sensor or an export that rounds the {kind}"
         numbers = {f"step_{unit}": size}
         if unit == "N":
             numbers["adds_sd_mm"] = find_depth_at(trace, line, touch, size / float(np.sqrt(12.0)))
-        remarks.append(Remark("resolution", what, cause, "record with a finer range or more digits", numbers))
-    return remarks
+        warnings.append(
+            TraceWarning("resolution", what, cause, "record with a finer range or more digits", numbers)
+        )
+    return warnings

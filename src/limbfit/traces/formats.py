@@ -249,9 +249,8 @@ def _read_tdms(file: Path, columns: Names) -> ColumnTable:
     """The group that holds the columns, its times by their channel or by the waveform's increment."""
     nptdms = _import("nptdms", "npTDMS", "tdms", file)
     try:
-        groups = [
-            [_read_channel(one) for one in group.channels()] for group in nptdms.TdmsFile.read(file).groups()
-        ]
+        read = nptdms.TdmsFile.read(file)
+        groups = [[_Channel.from_tdms(one) for one in group.channels()] for group in read.groups()]
     except Exception as error:  # a broken file can fail anywhere in the parser
         raise TraceError(f"not a readable TDMS file ({type(error).__name__})", file=file) from None
     others = {name for key, name in columns.items() if key != TIME} or {columns[TIME]}
@@ -282,11 +281,11 @@ class _Channel(NamedTuple):
     values: Any
     time_s: Any
 
-
-def _read_channel(channel: Any) -> _Channel:
-    unit = str(channel.properties.get("unit_string", ""))
-    has_waveform = "wf_increment" in channel.properties
-    return _Channel(channel.name, unit, channel[:], channel.time_track() if has_waveform else None)
+    @classmethod
+    def from_tdms(cls, channel: Any) -> _Channel:
+        unit = str(channel.properties.get("unit_string", ""))
+        has_waveform = "wf_increment" in channel.properties
+        return cls(channel.name, unit, channel[:], channel.time_track() if has_waveform else None)
 
 
 def _read_excel(file: Path, columns: Names) -> ColumnTable:
@@ -298,8 +297,8 @@ def _read_excel(file: Path, columns: Names) -> ColumnTable:
         book.close()
     except Exception as error:  # a broken file can fail anywhere in the parser
         raise TraceError(f"not a readable Excel file ({type(error).__name__})", file=file) from None
-    wanted = set(columns.values())
-    fitting = [name for name, rows in sheets.items() if any(wanted <= set(row) for _, row in rows)]
+    needed = set(columns.values())
+    fitting = [name for name, rows in sheets.items() if any(needed <= set(row) for _, row in rows)]
     if len(fitting) > 1:
         shown = ", ".join(fitting)
         raise TraceError(f"the sheets {shown} all hold these columns", file=file, remedy="keep one of them")
@@ -310,10 +309,8 @@ def _read_excel(file: Path, columns: Names) -> ColumnTable:
 
 
 def _read_sheet_rows(sheet: Any) -> list[Row]:
-    rows = [
-        (i, [_format_cell(value) for value in row])
-        for i, row in enumerate(sheet.iter_rows(values_only=True), 1)
-    ]
+    numbered = enumerate(sheet.iter_rows(values_only=True), 1)
+    rows = [(i, [_format_cell(value) for value in row]) for i, row in numbered]
     return [row for row in rows if any(row[1])]
 
 

@@ -1,9 +1,9 @@
-"""What a record is before it is regularised: mended where that is safe, refused where it cannot be used.
+"""A record is mended where that is safe, and refused where it cannot be used, before it is regularised.
 
 Rows that are there twice are left out, rounded times are spread, single samples that stick out are replaced
 by their neighbours' line, a force that drifts is set straight by what the sensor says clear of the skin, and
-a record that begins in contact is refused: where its skin was met nobody knows.  What was done, and what
-someone should know (`faults`, `passivity`), stands in ``remarks``; the touch-down's deviation counts it.
+a record that begins in contact is refused, because nobody knows where its skin was met. Warnings say what was
+done, and what the user should know (`faults`, `passivity`); the touch-down's deviation counts it.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from .displacement import BrokenLine, fit_broken_line
 from .faults import (
     find_coarse_steps,
     find_frozen,
-    find_frozen_force,
     find_gaps,
-    find_gaps_without_force,
     find_saturation,
     find_steps,
     mend_times,
-    step_remarks,
+    report_frozen_force,
+    report_gaps,
+    report_steps,
 )
 from .numerics import (
     Array,
     Bools,
     average_in_bins,
+    estimate_noise,
     estimate_noise_level,
-    estimate_scatter,
     find_resolution,
     find_runs,
 )
 from .passivity import find_lag, find_swings
-from .record import Remark, Trace
+from .record import Trace, TraceWarning
 from .touchdown import TouchDown, compute_deviation_before, find_depth_at, find_touch_down, touch_down_at
 
 _SPIKE_WIDTH = 2  # samples; what lasts longer may have happened
@@ -45,26 +45,26 @@ _SPIKE_NOISE = 8.0  # standard deviations
 _SPIKE_STEPS = 6.0  # times the usual step between the samples around it: a corner is no spike
 _SPIKE_RESOLUTION = 2.5  # steps in which the values come
 _SPIKE_SHARE = 0.02  # of the range: less does no harm
-_MOST_SPIKES = 0.01  # of the samples
-_AROUND = 4  # samples on either side
+_MAX_SPIKES = 0.01  # of the samples
+_NEIGHBOURS = 4  # samples on either side
 _CLEAR_MM = 0.1  # and two standard deviations of touch-down: off the skin
-_LEAST_CLEAR = 20  # samples
+_MIN_CLEAR = 20  # samples
 _DRIFT_SHARE = 0.01  # of the peak force, over the record: less does no harm
 _DRIFT_SD = 5.0
-_WARMING = (0.05, 0.1, 0.2, 0.4, 0.8)  # of the record: times with which a warming may fade
-_BENT = 16.0  # of squared misfit in variances, by which a straight drift is worse
+_FADING_TIMES = (0.05, 0.1, 0.2, 0.4, 0.8)  # of the record: times with which a warming may fade
+_MAX_EXCESS = 16.0  # of squared misfit in variances, by which a straight drift is worse
 _ONSET_S = 0.5
-_LASTS_S = 0.1
-_MOST_DRIFT = 0.3  # of the peak force: more is no sensor to correct
+_STEP_SPAN_S = 0.1
+_MAX_DRIFT = 0.3  # of the peak force: more is no sensor to correct
 _PRELOAD_SHARE = 0.05  # of the peak force
 _START_FORCE_SHARE = 0.25  # of the peak force, where there are too few samples for a slope
 _START_SHARES = (0.03, 0.06, 0.12, 0.25)  # of the travel
-_BY_CHANCE = 4.0  # standard deviations that the first and the least of all bins may be apart
+_CHANCE_SD = 4.0  # standard deviations that the first and the least of all bins may be apart
 _SLOPE_SD = 2.0  # standard deviations
 _START_SLOPE = 0.25  # of the mean slope of the way in
-_LEAST_START = 8  # samples
+_MIN_START = 8  # samples
 _RISE_SHARE = 0.5  # of the largest force: the rise in which a stated force meets the skin
-_BINS = 200
+_MAX_BINS = 200
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class InterpretedRecord:
 
     trace: Trace
     touch_down: TouchDown
-    remarks: tuple[Remark, ...]
+    warnings: tuple[TraceWarning, ...]
 
 
 def interpret_record(
@@ -100,24 +100,24 @@ def interpret_record(
     lost = gaps + [(float(trace.time_s[run.start]), float(trace.time_s[run.stop - 1])) for run in frozen]
     steps = [] if forced else find_steps(trace, line, rise, lost)
     level = _remove_steps(trace, steps) if steps else _level_ends(trace, line)
-    touch = _touch_down(level, line, touch_down_s, forced)
+    touch = _find_touch_down(level, line, touch_down_s, forced)
     straight, drift = (trace, []) if steps else _remove_drift(trace, level, line, touch)
     if straight is not level and not steps:
-        touch = _touch_down(straight, line, touch_down_s, forced)
-    remarks = [
+        touch = _find_touch_down(straight, line, touch_down_s, forced)
+    warnings = [
         *doubled,
         *spikes,
         *find_coarse_steps(trace, line, touch, rise),
-        *find_gaps_without_force(gaps, line, touch.time_s),
-        *find_frozen_force(trace, frozen, line, touch.time_s),
-        *step_remarks(steps),
+        *report_gaps(gaps, line, touch.time_s),
+        *report_frozen_force(trace, frozen, line, touch.time_s),
+        *report_steps(steps),
         *drift,
         *([] if forced else _find_impassive_force(straight, line, touch, rise, lost, steps)),
-        *([] if touch_down_s is not None else _start_remark(straight, line, touch, forced)),
+        *([] if touch_down_s is not None else _report_start(straight, line, touch, forced)),
     ]
-    added = [remark.evidence.get("adds_sd_mm", 0.0) for remark in remarks]
+    added = [warning.evidence.get("adds_sd_mm", 0.0) for warning in warnings]
     wide = float(np.linalg.norm([touch.uncertainty_mm, *added]))
-    return InterpretedRecord(straight, replace(touch, uncertainty_mm=wide), tuple(remarks))
+    return InterpretedRecord(straight, replace(touch, uncertainty_mm=wide), tuple(warnings))
 
 
 def _find_impassive_force(
@@ -127,37 +127,37 @@ def _find_impassive_force(
     rise_N: float,
     lost: list[tuple[float, float]],
     steps: list[tuple[float, float]],
-) -> list[Remark]:
-    """Remarks on a force that no passive tissue gives, each looked for where no other explains it."""
+) -> list[TraceWarning]:
+    """Warn of forces that no passive tissue gives, each sought where no other warning explains it."""
     at_top = find_saturation(trace, line, rise_N, lost)
     if at_top:
         return at_top
     way_in = (trace.time_s <= line.peak_s) & (trace.time_s >= touch.time_s)
-    scatter = estimate_scatter(trace.force_N[trace.time_s < touch.time_s], trace.force_N[way_in])
-    swing = [] if lost else find_swings(trace, line, touch, scatter, rise_N, [at for at, _ in steps])
+    sample_noise = estimate_noise(trace.force_N[trace.time_s < touch.time_s], trace.force_N[way_in])
+    swing = [] if lost else find_swings(trace, line, touch, sample_noise, rise_N, [at for at, _ in steps])
     odd = [*lost, *((at, at) for at, _ in steps)]
-    return [*swing, *find_lag(trace, line, touch, scatter, odd)]
+    return [*swing, *find_lag(trace, line, touch, sample_noise, odd)]
 
 
-def _touch_down(trace: Trace, line: BrokenLine, stated_s: float | None, forced: bool) -> TouchDown:
-    """Under a stated force from its rise alone: it turns where the skin is met, and creeps far beyond."""
-    if stated_s is not None:
-        return touch_down_at(trace, stated_s)
+def _find_touch_down(trace: Trace, line: BrokenLine, touch_down_s: float | None, forced: bool) -> TouchDown:
+    """Find the touch-down; under a stated force from the rise alone, as depths creep far beyond the skin."""
+    if touch_down_s is not None:
+        return touch_down_at(trace, touch_down_s)
     if not forced:
         return find_touch_down(trace, line)
     most = int(np.argmax(trace.force_N >= _RISE_SHARE * trace.force_N.max()))
     return find_touch_down(Trace(trace.time_s[:most], trace.displacement_mm[:most], trace.force_N[:most]))
 
 
-def _remove_spikes(trace: Trace) -> tuple[Trace, list[Remark]]:
-    remarks = []
+def _remove_spikes(trace: Trace) -> tuple[Trace, list[TraceWarning]]:
+    warnings = []
     for column, quantity, unit in (("force_N", "force", "N"), ("displacement_mm", "displacement", "mm")):
         values: Array = getattr(trace, column)
         spikes = _find_spikes(values)
         count = int(spikes.sum())
         if not count:
             continue
-        if count > _MOST_SPIKES * len(values):
+        if count > _MAX_SPIKES * len(values):
             raise TraceError(
                 f"{count} of {len(values)} samples stick out from their neighbours",
                 place=column,
@@ -173,19 +173,21 @@ def _remove_spikes(trace: Trace) -> tuple[Trace, list[Remark]]:
             "were replaced"
         )
         numbers = {"spikes": float(count), f"largest_{unit}": largest}
-        remarks.append(Remark("spikes", what, "a loose contact or a disturbance", "check the cable", numbers))
-    return trace, remarks
+        warnings.append(
+            TraceWarning("spikes", what, "a loose contact or a disturbance", "check the cable", numbers)
+        )
+    return trace, warnings
 
 
 def _find_spikes(values: Array) -> Bools:
-    """Which samples (n,) stick out from the median of their neighbours, one or two in a row."""
+    """Find the samples (n,) that stick out from the median of their neighbours, one or two in a row."""
     off = values - median_filter(values, 2 * _SPIKE_WIDTH + 1, mode="nearest")
     noise = max(1.4826 * float(np.median(np.abs(off))), estimate_noise_level(values))
     share = _SPIKE_SHARE * float(np.ptp(np.percentile(values, [1, 99])))
     out = np.abs(off) > max(_SPIKE_NOISE * noise, share, _SPIKE_RESOLUTION * find_resolution(values))
     steps = np.abs(np.diff(values))
     for i in np.flatnonzero(out):
-        before, after = steps[max(i - 1 - _AROUND, 0) : max(i - 1, 0)], steps[i + 2 : i + 2 + _AROUND]
+        before, after = steps[max(i - 1 - _NEIGHBOURS, 0) : max(i - 1, 0)], steps[i + 2 : i + 2 + _NEIGHBOURS]
         out[i] = abs(off[i]) > _SPIKE_STEPS * np.median(np.r_[before, after])
     for start, end in find_runs(out):
         if end - start > _SPIKE_WIDTH:
@@ -194,28 +196,28 @@ def _find_spikes(values: Array) -> Bools:
 
 
 def _remove_steps(trace: Trace, steps: list[tuple[float, float]]) -> Trace:
-    """The record without the jumps of its force: the onset is seen in it, whichever side of one is right."""
+    """Remove the jumps of the force, so that the onset is seen whichever side of a jump is right."""
     force = trace.force_N.copy()
     for at, size in steps:
-        change = np.diff(np.interp([at - _LASTS_S, at + _LASTS_S], trace.time_s, trace.force_N))[0]
+        change = np.diff(np.interp([at - _STEP_SPAN_S, at + _STEP_SPAN_S], trace.time_s, trace.force_N))[0]
         if change / size > 0.5:  # one that lasts, not a dropout
             force -= size * (trace.time_s >= at)
     return replace(trace, force_N=force)
 
 
 def _find_ends(trace: Trace, line: BrokenLine) -> tuple[Bools, Bools]:
-    """Samples (n,) before the way in and after the last way out, with the indenter where it began."""
+    """Find samples (n,) before the way in and after the last way out, with the indenter where it began."""
     back = line(trace.time_s) < line.values[0] + _CLEAR_MM
-    return back & (trace.time_s < line.peak_s), back & (trace.time_s > _release_s(line))
+    return back & (trace.time_s < line.peak_s), back & (trace.time_s > _find_release_s(line))
 
 
 def _level_ends(trace: Trace, line: BrokenLine) -> Trace:
-    """The record without the line from its start to its end, where the indenter is back where it began.
+    """Remove the straight line from start to end of a record whose indenter is back where it began.
 
     Only there a drift shows before the touch-down is known: near the skin it looks like an onset.
     """
     before, after = _find_ends(trace, line)
-    if min(before.sum(), after.sum()) < _LEAST_CLEAR:
+    if min(before.sum(), after.sum()) < _MIN_CLEAR:
         return trace
     change = float(np.median(trace.force_N[after]) - np.median(trace.force_N[before]))
     if abs(change) < _DRIFT_SHARE * _compute_rise(trace):
@@ -224,41 +226,37 @@ def _level_ends(trace: Trace, line: BrokenLine) -> Trace:
     return replace(trace, force_N=trace.force_N - slope * (trace.time_s - trace.time_s[0]))
 
 
-def _release_s(line: BrokenLine) -> float:
-    """When the last way out begins; infinite where there is none."""
+def _find_release_s(line: BrokenLine) -> float:
+    """Find when the last way out begins, s; infinite if there is none."""
     return max((phase.start_s for phase in line.phases if phase.kind == "unload"), default=float("inf"))
-
-
-def _clear(trace: Trace, line: BrokenLine, touch: TouchDown) -> Bools:
-    """Samples surely off the skin: the approach, the end, and what is between cycles."""
-    margin = max(_CLEAR_MM, 2 * touch.uncertainty_mm)
-    return np.asarray(line(trace.time_s) < touch.displacement_mm - margin)
 
 
 def _remove_drift(
     trace: Trace, level: Trace, line: BrokenLine, touch: TouchDown
-) -> tuple[Trace, list[Remark]]:
-    """The record without its drift: a straight line, or what warms up where a straight one is not it."""
-    clear = _clear(trace, line, touch)
+) -> tuple[Trace, list[TraceWarning]]:
+    """Remove the drift of the force: a straight line, or a warming that fades where no straight line fits."""
+    margin = max(_CLEAR_MM, 2 * touch.uncertainty_mm)
+    # Surely off the skin: the approach, the end, and what is between cycles.
+    clear = np.asarray(line(trace.time_s) < touch.displacement_mm - margin)
     fallen = level.force_N[-1] > trace.force_N[-1]
-    if level is not trace and not (
-        touch.in_contact_at_start and fallen
-    ):  # that shows what it was zeroed under
+    # A record that starts in contact and has fallen shows what it was zeroed under.
+    if level is not trace and not (touch.in_contact_at_start and fallen):
         clear |= np.logical_or(*_find_ends(trace, line))
-    if clear.sum() < _LEAST_CLEAR:
+    if clear.sum() < _MIN_CLEAR:
         return trace, []
     time, force = trace.time_s[clear], trace.force_N[clear]
-    slope, residual = _fit_line(time, force)
-    scatter = estimate_scatter(*np.split(residual, np.flatnonzero(np.diff(np.flatnonzero(clear)) > 1) + 1))
+    start_force, slope = map(float, np.polynomial.polynomial.polyfit(time - time[0], force, 1))
+    residual = force - start_force - slope * (time - time[0])
+    sample_noise = estimate_noise(*np.split(residual, np.flatnonzero(np.diff(np.flatnonzero(clear)) > 1) + 1))
     spread = float(np.sqrt(np.sum((time - time.mean()) ** 2)))
-    noise = scatter.sd_N * float(np.sqrt((1 + scatter.lag) / (1 - scatter.lag)))
+    noise = sample_noise.sd_N * float(np.sqrt((1 + sample_noise.lag) / (1 - sample_noise.lag)))
     sd = noise / spread
     peak = _compute_rise(trace)
     total = slope * float(np.ptp(trace.time_s))
     if abs(slope) < _DRIFT_SD * sd or abs(total) < _DRIFT_SHARE * peak:
         return trace, []
     what = f"the force drifts by {slope:+.2g} N/s clear of the skin, {total:+.2g} N over the record"
-    if abs(total) > _MOST_DRIFT * peak:
+    if abs(total) > _MAX_DRIFT * peak:
         raise TraceError(
             f"{what}, against a peak of {peak:.3g} N",
             place="force_N",
@@ -269,7 +267,7 @@ def _remove_drift(
     excess = (misfits - misfits.min()) / noise**2
     weights = np.exp(-0.5 * excess) / np.exp(-0.5 * excess).sum()
     drift = shapes[0]
-    if excess[0] > _BENT:
+    if excess[0] > _MAX_EXCESS:
         drift = shapes[int(np.argmin(misfits))]
         first, last = np.diff(drift)[[0, -1]] / np.diff(trace.time_s)[[0, -1]]
         what += f", and not along a straight line ({first:+.2g} N/s at its start, {last:+.2g} at its end)"
@@ -277,15 +275,17 @@ def _remove_drift(
     numbers["adds_sd_mm"] = _compute_drift_sd(trace, line, touch, shapes - drift, weights)
     straight = replace(trace, force_N=trace.force_N - (drift - drift[0]))
     remedy = "let the sensor warm up before recording"
-    return straight, [Remark("drift", what + "; taken off", "a sensor that warms up", remedy, numbers)]
+    return straight, [TraceWarning("drift", what + "; taken off", "a sensor that warms up", remedy, numbers)]
 
 
 def _fit_drifts(time: Array, force: Array, at: Array) -> tuple[Array, Array]:
-    """A straight drift and those that fade with `_WARMING` of the record, at times (n,) s: forces (k, n) that
-    fit what is clear of the skin, and their squared misfits (k,)."""
+    """Fit a straight drift, and drifts that fade with each of `_FADING_TIMES`, to what is clear of the skin.
+
+    Returns their forces (k, n) at times (n,) s, and their squared misfits (k,).
+    """
     shapes, misfits = [], []
     whole = float(np.ptp(at))
-    for fading in (np.inf, *(share * whole for share in _WARMING)):
+    for fading in (np.inf, *(share * whole for share in _FADING_TIMES)):
 
         def shape(t: Array, fading: float = fading) -> Array:
             return t - at[0] if np.isinf(fading) else -np.expm1(-(t - at[0]) / fading)
@@ -300,9 +300,10 @@ def _fit_drifts(time: Array, force: Array, at: Array) -> tuple[Array, Array]:
 def _compute_drift_sd(
     trace: Trace, line: BrokenLine, touch: TouchDown, others: Array, weights: Array
 ) -> float:
-    """What drifts of other shapes (k, n), as likely as their weights (k,), make of the touch-down, mm.
+    """Compute the deviation of the touch-down, mm, if the drift has one of the other shapes (k, n).
 
-    By the force that they leave at the onset from its level before: where that is reached.
+    ``weights`` (k,) are their probabilities. The deviation is the depth at which the force reaches what these
+    shapes leave between the onset and the level before it.
     """
     met = int(np.searchsorted(trace.time_s, touch.time_s))
     deep = min(int(np.searchsorted(trace.time_s, touch.time_s + _ONSET_S)), len(trace.time_s) - 1)
@@ -311,25 +312,19 @@ def _compute_drift_sd(
     return max(find_depth_at(trace, line, touch, rms) - touch.uncertainty_mm, 0.0)
 
 
-def _fit_line(time: Array, force: Array) -> tuple[float, Array]:
-    """Slope of the straight line through (time, force), and what it leaves."""
-    level, slope = np.polynomial.polynomial.polyfit(time - time[0], force, 1)
-    return float(slope), force - level - slope * (time - time[0])
-
-
 def _compute_rise(trace: Trace) -> float:
-    _, force, _ = average_in_bins(trace.time_s, trace.force_N, _BINS)
+    _, force, _ = average_in_bins(trace.time_s, trace.force_N, _MAX_BINS)
     return float(np.ptp(force))
 
 
 def _check_start(trace: Trace, line: BrokenLine) -> None:
     """Refuse a record whose force is there from the first sample on, and rises at once."""
-    _, force, count = average_in_bins(trace.time_s, trace.force_N, _BINS)
+    _, force, count = average_in_bins(trace.time_s, trace.force_N, _MAX_BINS)
     peak, first, least = float(force.max()), float(force[0]), float(force.min())
     # Once released, the sensor says what its zero is; else it is taken to be zeroed.
-    released = np.isfinite(_release_s(line))
+    released = np.isfinite(_find_release_s(line))
     noise = estimate_noise_level(trace.force_N)
-    by_chance = _BY_CHANCE * noise / float(np.sqrt(count.min()))
+    by_chance = _CHANCE_SD * noise / float(np.sqrt(count.min()))
     preload = max(first, first - least if released else 0.0) - by_chance
     if preload < _PRELOAD_SHARE * peak or not _is_rising_at_once(trace, line, noise):
         return
@@ -342,7 +337,7 @@ def _check_start(trace: Trace, line: BrokenLine) -> None:
 
 
 def _is_rising_at_once(trace: Trace, line: BrokenLine, noise: float) -> bool:
-    """Whether the force rises over the first bit of travel about as it does on the whole way in.
+    """True if the force rises over the first bit of travel about as it does on the whole way in.
 
     The bit is longer where ``noise`` (N, of a sample) would hide that.
     """
@@ -350,7 +345,7 @@ def _is_rising_at_once(trace: Trace, line: BrokenLine, noise: float) -> bool:
     travel, force = line(trace.time_s[load]), trace.force_N[load]
     way = travel[-1] - travel[0]
     least = _START_SLOPE * (force[-1] - force[0]) / way
-    if (travel < travel[0] + _START_SHARES[0] * way).sum() < _LEAST_START:
+    if (travel < travel[0] + _START_SHARES[0] * way).sum() < _MIN_START:
         return bool(force[0] > _START_FORCE_SHARE * force.max())
     for share in _START_SHARES:
         bit = travel < travel[0] + share * way
@@ -361,8 +356,8 @@ def _is_rising_at_once(trace: Trace, line: BrokenLine, noise: float) -> bool:
     return slope - doubt > least
 
 
-def _start_remark(trace: Trace, line: BrokenLine, touch: TouchDown, forced: bool) -> list[Remark]:
-    """A record without an approach: the skin may have been met before it, and the sensor zeroed there."""
+def _report_start(trace: Trace, line: BrokenLine, touch: TouchDown, forced: bool) -> list[TraceWarning]:
+    """Warn of a record without an approach: its skin may have been met before, and the sensor zeroed."""
     if not touch.in_contact_at_start:
         return []
     what = (
@@ -370,9 +365,9 @@ def _start_remark(trace: Trace, line: BrokenLine, touch: TouchDown, forced: bool
         f"{touch.uncertainty_mm:.2f} mm: the touch-down rests on a sensor that was zero at the start"
     )
     numbers = {"touch_down_mm": touch.displacement_mm, "touch_down_sd_mm": touch.uncertainty_mm}
-    _, force, count = average_in_bins(trace.time_s, trace.force_N, _BINS)
+    _, force, count = average_in_bins(trace.time_s, trace.force_N, _MAX_BINS)
     preload = touch.baseline_N - float(force.min())
-    by_chance = _BY_CHANCE * estimate_noise_level(trace.force_N) / float(np.sqrt(count.min()))
+    by_chance = _CHANCE_SD * estimate_noise_level(trace.force_N) / float(np.sqrt(count.min()))
     pressed = preload > max(by_chance, _DRIFT_SHARE * _compute_rise(trace))
     if pressed:
         what += f"; drawn back it shows {preload:.2g} N less, as if it had been zeroed in contact"
@@ -380,4 +375,4 @@ def _start_remark(trace: Trace, line: BrokenLine, touch: TouchDown, forced: bool
     if not forced and (pressed or line.values[-1] > line.values[0] - _CLEAR_MM):
         numbers["adds_sd_mm"] = compute_deviation_before(trace, line, touch)
     cause = "a record that starts on the skin"
-    return [Remark("start", what, cause, "start some tenths of a millimetre clear of it", numbers)]
+    return [TraceWarning("start", what, cause, "start some tenths of a millimetre clear of it", numbers)]

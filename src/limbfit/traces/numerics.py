@@ -14,9 +14,9 @@ from ..autoregressive import clip_lag
 
 Bools = NDArray[np.bool_]
 
-_GAP = 10.0  # usual steps in time
-_COARSE = 0.75  # of the samples: so many have a value that another one has too
-_RESTED = 0.2  # of the changes: so many come after two samples alike
+_GAP_STEPS = 10.0  # usual steps in time
+_REPEATED_SHARE = 0.75  # of the samples: so many have a value that another one has too
+_REST_SHARE = 0.2  # of the changes: so many come after two samples alike
 
 
 def estimate_noise_level(values: Array) -> float:
@@ -31,32 +31,36 @@ def find_resolution(values: Array) -> float:
     repeated = counts > 1
     changes = np.diff(values) != 0.0
     rested = np.count_nonzero(changes[1:] & ~changes[:-1])
-    if repeated.sum() < 2 or counts[repeated].sum() < _COARSE * len(values):
+    if repeated.sum() < 2 or counts[repeated].sum() < _REPEATED_SHARE * len(values):
         return 0.0
-    return float(np.median(np.diff(levels[repeated]))) if rested > _RESTED * changes.sum() else 0.0
+    return float(np.median(np.diff(levels[repeated]))) if rested > _REST_SHARE * changes.sum() else 0.0
 
 
 def split_at_gaps(time: Array, values: Array) -> list[Array]:
     """Values (n,) at times (n,) in parts without gaps of more than ten usual steps between them."""
     steps = np.diff(time)
-    return np.split(values, np.flatnonzero(steps > _GAP * np.median(steps)) + 1) if len(steps) else [values]
+    return (
+        np.split(values, np.flatnonzero(steps > _GAP_STEPS * np.median(steps)) + 1)
+        if len(steps)
+        else [values]
+    )
 
 
-def find_runs(true: Bools) -> NDArray[np.int64]:
+def find_runs(mask: Bools) -> NDArray[np.int64]:
     """First and one beyond the last (k, 2) of every run of what is true (n,)."""
-    return np.flatnonzero(np.diff(np.r_[False, true, False])).reshape(-1, 2)
+    return np.flatnonzero(np.diff(np.r_[False, mask, False])).reshape(-1, 2)
 
 
 def compute_rms(residual: Array) -> float:
     return float(np.sqrt(np.mean(residual**2)))
 
 
-def average_in_bins(x: Array, y: Array, most: int, power: float = 1.0) -> tuple[Array, Array, Array]:
-    """Averages of x and y over at most ``most`` runs of samples, and how many samples are in each.
+def average_in_bins(x: Array, y: Array, max_bins: int, power: float = 1.0) -> tuple[Array, Array, Array]:
+    """Averages of x and y over at most ``max_bins`` runs of samples, and how many samples are in each.
 
     Runs are as long, or with a ``power`` the shorter the nearer to the start.
     """
-    edges = np.unique((len(x) * np.linspace(0, 1, min(most, len(x)) + 1) ** power).astype(int))
+    edges = np.unique((len(x) * np.linspace(0, 1, min(max_bins, len(x)) + 1) ** power).astype(int))
     n = np.diff(edges).astype(float)
     return np.add.reduceat(x, edges[:-1]) / n, np.add.reduceat(y, edges[:-1]) / n, n
 
@@ -75,34 +79,36 @@ def build_cubic_interpolation(at: Array, knots: Array) -> Array:
     return np.asarray(make_interp_spline(knots, np.eye(len(knots)), k=min(3, len(knots) - 1))(at))
 
 
-_PIECES = 10  # of a cubic spline along the way in: follows any onset, and no noise faster than a tenth of it
-_CLOSER = 2.0  # power by which they crowd at its start, where an onset bends most
-_LEAST_PER_PIECE = 8  # samples
+_MAX_PIECES = (
+    10  # of a cubic spline along the way in: follows any onset, and no noise faster than a tenth of it
+)
+_KNOT_POWER = 2.0  # power by which they crowd at its start, where an onset bends most
+_MIN_SAMPLES = 8  # samples
 
 
 @dataclass(frozen=True)
-class Scatter:
+class SampleNoise:
     """Noise of single samples: standard deviation, N, and correlation of neighbours (0: white)."""
 
     sd_N: float
     lag: float
 
-    def of_means(self, samples: int) -> float:
+    def compute_mean_sd(self, samples: int) -> float:
         """Standard deviation of means of so many neighbours, N."""
         alike = self.lag / (1.0 - self.lag)
         longer = samples + 2 * alike * (samples - (1.0 - self.lag**samples) / (1.0 - self.lag))
         return self.sd_N * float(np.sqrt(longer)) / samples
 
 
-def estimate_scatter(*parts: Array) -> Scatter:
+def estimate_noise(*parts: Array) -> SampleNoise:
     """The noise of forces on a smooth curve, in parts (n,) that are smooth each, evenly sampled.
 
     A spline through each part takes slow noise with it. Restricted maximum likelihood (Patterson and Thompson
     1971) of first-order autoregressive noise on such splines gives it back.
     """
-    long = [part for part in parts if len(part) > 2 * _LEAST_PER_PIECE]
+    long = [part for part in parts if len(part) > 2 * _MIN_SAMPLES]
     if not long:
-        return Scatter(float(np.sqrt(np.mean(np.diff(np.concatenate(parts), 2) ** 2) / 6.0)), 0.0)
+        return SampleNoise(float(np.sqrt(np.mean(np.diff(np.concatenate(parts), 2) ** 2) / 6.0)), 0.0)
     rows = [np.column_stack([_build_spline_basis(len(part)), part]) for part in long]
     n = sum(map(len, rows))
     found = minimize_scalar(
@@ -114,7 +120,7 @@ def estimate_scatter(*parts: Array) -> Scatter:
     lag = float(1.0 - np.exp(found.x))
     lag = lag if lag > 2.0 / np.sqrt(n) else 0.0
     innovation = _compute_restricted_likelihood(rows, lag)[1]
-    return Scatter(float(np.sqrt(innovation / (1.0 - lag**2))), lag)
+    return SampleNoise(float(np.sqrt(innovation / (1.0 - lag**2))), lag)
 
 
 def _compute_restricted_likelihood(rows: list[Array], lag: float) -> tuple[float, float]:
@@ -133,6 +139,6 @@ def _compute_restricted_likelihood(rows: list[Array], lag: float) -> tuple[float
 
 def _build_spline_basis(n: int) -> Array:
     """A cubic spline's basis (n, k) along n samples."""
-    pieces = int(np.clip(n // _LEAST_PER_PIECE, 1, _PIECES))
-    knots = np.r_[[0.0] * 4, np.linspace(0, 1, pieces + 1)[1:-1] ** _CLOSER, [1.0] * 4]
+    pieces = int(np.clip(n // _MIN_SAMPLES, 1, _MAX_PIECES))
+    knots = np.r_[[0.0] * 4, np.linspace(0, 1, pieces + 1)[1:-1] ** _KNOT_POWER, [1.0] * 4]
     return np.asarray(BSpline.design_matrix(np.linspace(0.0, 1.0, n), knots, 3).toarray())

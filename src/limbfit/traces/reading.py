@@ -73,10 +73,10 @@ def read_trace(path: str | Path, columns: tuple[str, str, str] = COLUMNS) -> Tra
 def read_columns(
     file: Path,
     columns: Mapping[str, str],
-    wanted: Callable[[str], bool] = lambda name: False,
+    select: Callable[[str], bool] = lambda name: False,
     gaps: bool = False,
 ) -> dict[str, Array]:
-    """Columns of a file that `read_trace` could read, by their keys, and all others that are ``wanted``.
+    """Columns of a file that `read_trace` could read, by their keys, and all others that are ``select``.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def read_columns(
     """
     table = read_table(file, columns)
     named = {name: key for key, name in columns.items()}
-    named |= {name: name for name in table.names if wanted(name) and name not in named}
+    named |= {name: name for name in table.names if select(name) and name not in named}
     empty = "nan" if gaps else ""
     return {name: _read_column(table, key, name, file, empty, []) for name, key in named.items()}
 
@@ -109,7 +109,9 @@ def _read_column(table: ColumnTable, key: str, name: str, file: Path, empty: str
         found = [_to_vector(table.vectors[i], name, file) for i in places]
     else:
         found = [_read_numbers(table.rows, i, name, file, empty) for i in places]
-    found = [values * _factor(table.units[i], key, name, file, notes) for i, values in zip(places, found)]
+    found = [
+        values * _find_factor(table.units[i], key, name, file, notes) for i, values in zip(places, found)
+    ]
     if any(not np.array_equal(values, found[0], equal_nan=True) for values in found):
         raise TraceError(
             f"{len(places)} columns are named {name!r}",
@@ -120,8 +122,8 @@ def _read_column(table: ColumnTable, key: str, name: str, file: Path, empty: str
     return found[0]
 
 
-def _factor(unit: str, key: str, name: str, file: Path, notes: list[str]) -> float:
-    """What values of a column are multiplied with; 1 where no unit is stated.
+def _find_factor(unit: str, key: str, name: str, file: Path, notes: list[str]) -> float:
+    """Find the factor that converts the values of a column; 1 if no unit is stated.
 
     Raises
     ------
@@ -131,30 +133,30 @@ def _factor(unit: str, key: str, name: str, file: Path, notes: list[str]) -> flo
     known = next(units for end, units in _UNITS.items() if key.endswith(f"_{end}"))
     beside = _BRACKETED.fullmatch(name)
     below = _BRACKETED.fullmatch(unit)
-    stated = [below["unit"] if below else unit] if unit else []
-    if beside and _find_unit(known, beside["unit"]):  # other brackets hold other things than units
-        stated.append(beside["unit"])
-    factors = {_find_unit(known, one) for one in stated} or {1.0}
+    units = [below["unit"] if below else unit] if unit else []
+    if beside and _get_factor(known, beside["unit"]):  # other brackets hold other things than units
+        units.append(beside["unit"])
+    factors = {_get_factor(known, one) for one in units} or {1.0}
     factor = factors.pop()
     if not factor or factors:
         raise TraceError(
-            f"the unit {' and '.join(stated)!r} of column {name!r} is none of {', '.join(known)}",
+            f"the unit {' and '.join(units)!r} of column {name!r} is none of {', '.join(known)}",
             file=file,
             place="units",
             remedy=f'convert the column, or name another in the study: [traces] {key} = "..."',
         )
     if factor != 1.0:
-        notes.append(f"column {name!r} is converted from {stated[0]} to {next(iter(known))}")
+        notes.append(f"column {name!r} is converted from {units[0]} to {next(iter(known))}")
     return factor
 
 
-def _find_unit(known: Mapping[str, float], unit: str) -> float:
+def _get_factor(known: Mapping[str, float], unit: str) -> float:
     """The factor of a unit, words in any case; 0 where it is not known."""
     unit = unit.replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     return known.get(unit, known.get(unit.lower() if len(unit) > 3 else "", 0.0))
 
 
-def _get(row: Row, place: int, file: Path, name: str) -> str:
+def _get_cell(row: Row, place: int, file: Path, name: str) -> str:
     line, cells = row
     if place >= len(cells):
         raise TraceError("the row is too short", file=file, place=f"line {line}, column {name}")
@@ -166,7 +168,7 @@ def _read_numbers(rows: Sequence[Row], place: int, name: str, file: Path, empty:
         return np.array([float(cells[place] or empty) for _, cells in rows])
     except (ValueError, IndexError):
         for row in rows:
-            cell = _get(row, place, file, name) or empty
+            cell = _get_cell(row, place, file, name) or empty
             if not is_number(cell) or "," in cell:
                 where = f"line {row[0]}, column {name}"
                 raise TraceError(f"{cell[:40]!r} is not a number", file=file, place=where) from None
@@ -185,18 +187,18 @@ def _read_clock(table: ColumnTable, name: str, file: Path, notes: list[str]) -> 
             return None
         notes.append(f"the time stamps in column {name!r} are counted from the first")
         return np.asarray((stamps - stamps[0]) / np.timedelta64(1, "s"))
-    if not table.rows or not _CLOCK.fullmatch(_get(table.rows[0], place, file, name)):
+    if not table.rows or not _CLOCK.fullmatch(_get_cell(table.rows[0], place, file, name)):
         return None
     notes.append(f"the times of day in column {name!r} are counted from the first")
     times = np.array(
-        [_parse_time_of_day(_get(row, place, file, name), row[0], name, file) for row in table.rows]
+        [_parse_time_of_day(_get_cell(row, place, file, name), row[0], name, file) for row in table.rows]
     )
     midnights = np.cumsum(np.diff(times, prepend=times[0]) < -_DAY_S / 2)
     return np.asarray(times - times[0] + _DAY_S * midnights)
 
 
 def _parse_time_of_day(cell: str, line: int, name: str, file: Path) -> float:
-    """Of a time of day since midnight."""
+    """Return the seconds from midnight to a time of day."""
     clock = _CLOCK.fullmatch(cell)
     if clock is None:
         where = f"line {line}, column {name}"

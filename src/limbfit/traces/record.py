@@ -14,11 +14,11 @@ from .numerics import Array, average_in_bins, estimate_noise_level
 COLUMNS = ("time_s", "displacement_mm", "force_N")
 MIN_SAMPLES = 20
 MAX_SAMPLES = 20_000_000
-SPEED_MM_S = (0.05, 50.0)
-TRAVEL_MM = (0.2, 60.0)
-PEAK_N = (0.05, 200.0)
-_RUNS = 200  # of samples whose mean force is looked at
-_FIRST, _STILL = 5, 0.02  # samples at the least that tell the force at the start; of the travel
+SPEED_RANGE = (0.05, 50.0)
+TRAVEL_RANGE = (0.2, 60.0)
+PEAK_RANGE = (0.05, 200.0)
+_MAX_BINS = 200  # of samples whose mean force is looked at
+_START_SAMPLES, _REST_SHARE = 5, 0.02  # samples at the least that tell the force at the start; of the travel
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Trace:
 
 
 @dataclass(frozen=True)
-class Remark:
+class TraceWarning:
     """Something to know about a record: its kind, what, its likely cause, the remedy, and the numbers.
 
     ``adds_sd_mm`` among the numbers is the standard deviation of the touch-down that it alone makes.
@@ -43,6 +43,14 @@ class Remark:
     cause: str
     remedy: str
     evidence: Mapping[str, float]
+
+
+def check_finite(values: Array, name: str, file: str | Path | None, remedy: str | None = None) -> None:
+    """Raise `TraceError` at the first of the values (n,) of a column that is not finite."""
+    bad = np.flatnonzero(~np.isfinite(values))
+    if bad.size:
+        what = f"{values[bad[0]]} in sample {bad[0] + 1}"
+        raise TraceError(what, file=file, place=name, remedy=remedy)
 
 
 def check_trace(
@@ -60,9 +68,7 @@ def check_trace(
     for values, name in zip(series, columns, strict=True):
         if values.shape != trace.time_s.shape or values.ndim != 1:
             raise TraceError(f"{values.size} values for {trace.time_s.size} times", file=file, place=name)
-        bad = np.flatnonzero(~np.isfinite(values))
-        if bad.size:
-            raise TraceError(f"{values[bad[0]]} in sample {bad[0] + 1}", file=file, place=name)
+        check_finite(values, name, file)
     if len(trace.time_s) < MIN_SAMPLES:
         what = f"only {len(trace.time_s)} samples"
         raise TraceError(what, file=file, remedy=f"a record needs at least {MIN_SAMPLES}")
@@ -80,10 +86,10 @@ def check_trace(
 
 def _check_contact(trace: Trace, columns: tuple[str, str, str], file: str | Path | None) -> None:
     noise = estimate_noise_level(trace.force_N)
-    _, force, _ = average_in_bins(trace.time_s, trace.force_N, _RUNS)
-    travel = np.abs(trace.displacement_mm - np.median(trace.displacement_mm[:_FIRST]))
-    moving = np.flatnonzero(travel > _STILL * travel.max())  # before a fast ramp there are few samples
-    start = float(np.median(trace.force_N[: max(int(moving[0]) if moving.size else 0, _FIRST)]))
+    _, force, _ = average_in_bins(trace.time_s, trace.force_N, _MAX_BINS)
+    travel = np.abs(trace.displacement_mm - np.median(trace.displacement_mm[:_START_SAMPLES]))
+    moving = np.flatnonzero(travel > _REST_SHARE * travel.max())  # before a fast ramp there are few samples
+    start = float(np.median(trace.force_N[: max(int(moving[0]) if moving.size else 0, _START_SAMPLES)]))
     rise, fall = float(force.max()) - start, start - float(force.min())
     if rise <= 5 * noise and fall > 5 * noise and fall > 2 * rise:
         remedy = "pushing must be positive: change the sign"
@@ -101,13 +107,13 @@ def _check_units(trace: Trace, columns: tuple[str, str, str], file: str | Path |
     if inward <= 0.5 * (start - float(trace.displacement_mm.min())):
         remedy = "displacement into the limb must be positive: change the sign"
         raise TraceError("the displacement falls", file=file, place=columns[1], remedy=remedy)
-    _check_range(inward, TRAVEL_MM, "travel", "mm", {1e3: "metres", 1e-3: "micrometres"}, columns[1], file)
+    _check_range(inward, TRAVEL_RANGE, "travel", "mm", {1e3: "metres", 1e-3: "micrometres"}, columns[1], file)
     speed = _compute_typical_speed(trace)
     guesses = {1e3: "milliseconds", 1e6: "microseconds", 1 / 60: "minutes"}
-    _check_range(speed, SPEED_MM_S, "speed", "mm/s", guesses, columns[0], file)
+    _check_range(speed, SPEED_RANGE, "speed", "mm/s", guesses, columns[0], file)
     peak = float(trace.force_N.max())
     guesses = {1e3: "kilonewtons", 1e-3: "millinewtons", 9.81e-3: "grams"}
-    _check_range(peak, PEAK_N, "peak force", "N", guesses, columns[2], file)
+    _check_range(peak, PEAK_RANGE, "peak force", "N", guesses, columns[2], file)
 
 
 def _compute_typical_speed(trace: Trace) -> float:

@@ -62,12 +62,12 @@ class Regularised:
 
     @property
     def speed_load_mm_s(self) -> float:
-        """Of the first loading."""
+        """Speed of the first loading."""
         return self._speed("load")
 
     @property
     def speed_unload_mm_s(self) -> float:
-        """Of the first unloading; nan where nothing was unloaded."""
+        """Speed of the first unloading; nan if nothing was unloaded."""
         return self._speed("unload")
 
     def _speed(self, kind: str) -> float:
@@ -84,10 +84,10 @@ class Regularised:
         )
 
 
-_LEAST_SAMPLES = 5  # of a part
-_BINS = 200  # per part: a smoothing spline of so many averages equals that of all samples
-_SAME_S = 1e-9  # of a corner and a point there
-_PINNED = 1e3  # weight of a shared end point, in weights of its whole part
+_MIN_SAMPLES = 5  # of a part
+_MAX_BINS = 200  # per part: a smoothing spline of so many averages equals that of all samples
+_TIME_TOLERANCE = 1e-9  # of a corner and a point there
+_END_WEIGHT = 1e3  # weight of a shared end point, in weights of its whole part
 
 
 def regularise(
@@ -109,7 +109,7 @@ def regularise(
         the way in cannot end where it is stated to.
     """
     line = fit_broken_line(trace.time_s, trace.displacement_mm, peak_s)
-    start, end = touch_down.time_s, line.time_at(touch_down.displacement_mm, back=True)
+    start, end = touch_down.time_s, line.find_time_at(touch_down.displacement_mm, back=True)
     knots = np.r_[start, line.times[(line.times > start) & (line.times < end)], end]
     knots_mm = line(knots) - touch_down.displacement_mm
     phases = find_phases(knots - start, knots_mm)
@@ -139,7 +139,7 @@ def select_sampled_corners(corners: Array, time: Array) -> Array:
     kept = list(corners)
     k = 0
     while len(kept) > 2 and k < len(kept) - 1:
-        if ((time >= kept[k]) & (time <= kept[k + 1])).sum() >= _LEAST_SAMPLES:
+        if ((time >= kept[k]) & (time <= kept[k + 1])).sum() >= _MIN_SAMPLES:
             k += 1
         else:
             del kept[k + 1 if k + 2 < len(kept) else k]
@@ -148,14 +148,14 @@ def select_sampled_corners(corners: Array, time: Array) -> Array:
 
 
 def find_holds(corners: Array, phases: Sequence[MotionPhase]) -> tuple[bool, ...]:
-    """Whether each part between the corners is a hold."""
+    """True for each part between the corners that is a hold."""
     middles = (corners[1:] + corners[:-1]) / 2
     return tuple(any(p.kind == "hold" and p.start_s < middle < p.end_s for p in phases) for middle in middles)
 
 
 @dataclass(frozen=True)
-class _Clock:
-    """Time since a part's start, as it goes for the part: in a hold slower and slower, as what relaxes."""
+class _PhaseClock:
+    """Time since a part's start as the part counts it: in a hold slower and slower, as relaxation goes."""
 
     start_s: float
     end_s: float
@@ -170,51 +170,53 @@ class _Clock:
 class SmoothCurve:
     """Force over time: smoothing splines per part that meet at the corners; the first starts from zero.
 
-    In parts that are ``held`` they are splines of a power of the time since its start, in which a relaxation
-    is as smooth there as later on.  Called with times (n,) s from touch-down on it gives forces (n,) N.  Once
-    the penalties are chosen it is linear in the record: ``response`` says what the same smoothing makes of
+    In holds they are splines of a power of the time since the start of the hold, in which a relaxation is as
+    smooth there as later on. Called with times (n,) s from touch-down on, the curve gives forces (n,) N. Once
+    the penalties are chosen it is linear in the record: `compute_response` applies the same smoothing to
     another force.
     """
 
     def __init__(
-        self, time: Array, force: Array, corners: Array, smoothing: float | None, held: Sequence[bool]
+        self, time: Array, force: Array, corners: Array, smoothing: float | None, holds: Sequence[bool]
     ) -> None:
-        powers = [DENSER if hold else 1.0 for hold in held]
-        self._clocks = [_Clock(a, b, p) for (a, b), p in zip(pairwise(corners), powers, strict=True)]
+        powers = [DENSER if hold else 1.0 for hold in holds]
+        self._clocks = [_PhaseClock(a, b, p) for (a, b), p in zip(pairwise(corners), powers, strict=True)]
         parts = [(time >= clock.start_s) & (time <= clock.end_s) for clock in self._clocks]
         self._bins = [
-            average_in_bins(clock(time[part]), force[part], _BINS, clock.power)
+            average_in_bins(clock(time[part]), force[part], _MAX_BINS, clock.power)
             for clock, part in zip(self._clocks, parts)
         ]
         self._corners = corners
         given = [(smoothing, smoothing)] * len(self._bins)
-        self._splines, self._penalties = self._fitted([averages for _, averages, _ in self._bins], given)
+        self._splines, self._penalties = self._fit_splines([averages for _, averages, _ in self._bins], given)
 
     def __call__(self, at: Array) -> Array:
-        return self._joined(self._splines, at)
+        return self._evaluate(self._splines, at)
 
-    def response(self, at: Array) -> Array:
-        """What smoothing makes of a force given at times (n,) s, a cubic in each part: a matrix (n, n).
+    def compute_response(self, at: Array) -> Array:
+        """Compute the matrix (n, n) that smooths a force given at times (n,) s, a cubic in each part.
 
         That force is averaged over the same times as the samples of the record, and smoothed by as much.
         Straight between, a convex force would be too large everywhere.
         """
         given = []
         for (x, _, _), clock in zip(self._bins, self._clocks):
-            near = np.flatnonzero((at >= clock.start_s - _SAME_S) & (at <= clock.end_s + _SAME_S))
+            near = np.flatnonzero(
+                (at >= clock.start_s - _TIME_TOLERANCE) & (at <= clock.end_s + _TIME_TOLERANCE)
+            )
             matrix = np.zeros((len(x), len(at)))
             matrix[:, near] = build_cubic_interpolation(x, clock(at[near]))
             given.append(matrix)
-        splines, _ = self._fitted(given, self._penalties)
-        return self._joined(splines, at)
+        splines, _ = self._fit_splines(given, self._penalties)
+        return self._evaluate(splines, at)
 
-    def _joined(self, splines: Sequence[BSpline], at: Array) -> Array:
+    def _evaluate(self, splines: Sequence[BSpline], at: Array) -> Array:
         """At each of the times (n,) the spline of its part (n, ...)."""
         part = np.clip(np.searchsorted(self._corners, at, side="left") - 1, 0, len(splines) - 1)
         values: Array = np.stack([spline(clock(at)) for spline, clock in zip(splines, self._clocks)])
         return values[part, np.arange(len(at))]
 
-    def _fitted(
+    def _fit_splines(
         self, values: list[Array], penalties: Sequence[tuple[float | None, float | None]]
     ) -> tuple[list[BSpline], list[tuple[float, float]]]:
         """Splines of averages (bins of a part, ...) per part; their penalties, free and with ends given."""
@@ -238,7 +240,7 @@ def _fit_spline(
     keep = ~np.isin(time, list(pinned))
     x = np.r_[time[keep], list(pinned)]
     y = np.concatenate([values[keep], *(np.asarray(v)[None] for v in pinned.values())])
-    w = np.r_[weight[keep], np.full(len(pinned), _PINNED * weight.sum())]
+    w = np.r_[weight[keep], np.full(len(pinned), _END_WEIGHT * weight.sum())]
     order = np.argsort(x)
     x, y, w = x[order], y[order], w[order]
     try:
@@ -304,7 +306,7 @@ def regularise_creep(
     since = trace.time_s - touch_down.time_s
     force = trace.force_N - touch_down.baseline_N
     line = fit_broken_line(trace.time_s, force, peak_s, quantity="force", unit="N")
-    end = line.time_at(END_SHARE * float(line.values.max()), back=True) - touch_down.time_s
+    end = line.find_time_at(END_SHARE * float(line.values.max()), back=True) - touch_down.time_s
     corners = line.times - touch_down.time_s
     knots = np.r_[0.0, corners[(corners > 0.0) & (corners < end)], end]
     knots_N = np.maximum(line(knots + touch_down.time_s), 0.0)

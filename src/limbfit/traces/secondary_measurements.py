@@ -18,6 +18,7 @@ from ..errors import TraceError
 from .formats import TIME
 from .numerics import Array
 from .reading import read_columns
+from .record import check_finite
 
 _LAYER_SUFFIX = "_mm"
 MIN_LAYER_READINGS = 5
@@ -51,13 +52,13 @@ class Thinning:
 
     @property
     def covariance(self) -> Array:
-        """Of the compressions (n, n) by the readings' noise, mm^2."""
+        """Covariance of the compressions (n, n) by the readings' noise, mm^2."""
         variance = self.sd_mm**2
         return np.diag(variance / self.samples) + variance / self.before
 
     @property
-    def is_seen(self) -> bool:
-        """Whether the tissue gives way by more than three deviations of what is compared."""
+    def is_detectable(self) -> bool:
+        """True if the tissue gives way by more than three deviations of what is compared."""
         return bool(self.compression_mm.max() > 3.0 * np.sqrt(np.diag(self.covariance).mean()))
 
 
@@ -70,7 +71,7 @@ def read_layers(path: str | Path, time_name: str) -> Layers:
         With the file, the column and the remedy.
     """
     file = Path(path)
-    columns = read_columns(file, {TIME: time_name}, wanted=lambda name: name.endswith(_LAYER_SUFFIX))
+    columns = read_columns(file, {TIME: time_name}, select=lambda name: name.endswith(_LAYER_SUFFIX))
     time = columns.pop(time_name)
     if not columns:
         raise TraceError(
@@ -79,9 +80,7 @@ def read_layers(path: str | Path, time_name: str) -> Layers:
     if np.any(np.diff(time) <= 0.0):
         raise TraceError("time does not increase", file=file, place=time_name, remedy="sort the samples")
     for name, values in columns.items():
-        bad = np.flatnonzero(~np.isfinite(values))
-        if bad.size:
-            raise TraceError(f"{values[bad[0]]} in sample {bad[0] + 1}", file=file, place=name)
+        check_finite(values, name, file)
         low, high = THICKNESS_MM
         if values.min() < low or values.max() > high:
             what = f"{values.min():.3g} to {values.max():.3g} mm is no tissue's thickness"
@@ -94,7 +93,7 @@ def read_layers(path: str | Path, time_name: str) -> Layers:
 def compute_thinnings(
     layers: Layers, touch_down_s: float, end_s: float, sd_mm: float
 ) -> tuple[Thinning, ...]:
-    """How each tissue gives way between touch-down and ``end_s``, times of the record.
+    """Compute how each tissue gives way between touch-down and ``end_s``, times of the record.
 
     The thickness at rest is the mean of all readings before touch-down.
 
@@ -147,10 +146,10 @@ class WaveSpeeds:
 
     @property
     def name(self) -> str:
-        """Of the place, in files and tables."""
+        """Name of the place in files and tables."""
         return self.column.removesuffix("_m_s")
 
-    def means(self, touch_down_s: float, end_s: float) -> WaveMeans:
+    def average(self, touch_down_s: float, end_s: float) -> WaveMeans:
         """Means over at most `MAX_WAVE_POINTS` spans of time until ``end_s``, and over two before touch-down.
 
         Raises
@@ -182,7 +181,7 @@ class WaveMeans:
     samples: Array
 
     def covariance(self, sd_m_s: float, bias_m_s: float) -> Array:
-        """Of the means (n, n), m^2/s^2: each reading is off by itself, and all of the place together."""
+        """Covariance of the means (n, n), m^2/s^2: each reading errs, and all of the place together."""
         return np.diag(sd_m_s**2 / self.samples) + bias_m_s**2
 
 
@@ -197,7 +196,7 @@ def read_wave_speeds(path: str | Path, time_name: str) -> tuple[WaveSpeeds, ...]
         With the file, the column and the remedy.
     """
     file = Path(path)
-    columns = read_columns(file, {TIME: time_name}, wanted=lambda name: name.endswith("_m_s"), gaps=True)
+    columns = read_columns(file, {TIME: time_name}, select=lambda name: name.endswith("_m_s"), gaps=True)
     time = columns.pop(time_name)
     if not columns:
         raise TraceError(
@@ -209,20 +208,22 @@ def read_wave_speeds(path: str | Path, time_name: str) -> tuple[WaveSpeeds, ...]
 
 
 def _read_place(file: Path, name: str, time: Array, values: Array) -> WaveSpeeds:
-    known = _WAVE_COLUMN.fullmatch(name)
-    seen = ~np.isnan(values)
+    match = _WAVE_COLUMN.fullmatch(name)
+    is_known = ~np.isnan(values)
     low, high = WAVE_SPEED_M_S
-    if known is None or not seen.any():
+    if match is None or not is_known.any():
         raise TraceError(
             "no speed is given", file=file, place=name, remedy="fill some of its cells, or take it out"
         )
-    if values[seen].min() < low or values[seen].max() > high:
-        what = f"{values[seen].min():.3g} to {values[seen].max():.3g} m/s is no soft tissue's speed"
+    if values[is_known].min() < low or values[is_known].max() > high:
+        what = f"{values[is_known].min():.3g} to {values[is_known].max():.3g} m/s is no soft tissue's speed"
         raise TraceError(
             f"{what} ({low:g} to {high:g})", file=file, place=name, remedy="give metres per second"
         )
-    depth = known["depth"]
-    return WaveSpeeds(name, known["tissue"], float(depth) if depth else None, time[seen], values[seen])
+    depth = match["depth"]
+    return WaveSpeeds(
+        name, match["tissue"], float(depth) if depth else None, time[is_known], values[is_known]
+    )
 
 
 _POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
@@ -244,7 +245,7 @@ class SurfaceMotion:
     moved_mm: Array
 
     @classmethod
-    def of_rows(cls, time_s: Array, place_mm: Array, moved_mm: Array) -> SurfaceMotion:
+    def from_rows(cls, time_s: Array, place_mm: Array, moved_mm: Array) -> SurfaceMotion:
         """From rows (r, ...), one for each point at each time; rows of one place are of one point."""
         frames, frame = np.unique(time_s, return_inverse=True)
         points, point = _find_points(place_mm)
@@ -254,12 +255,12 @@ class SurfaceMotion:
 
     @property
     def rows(self) -> tuple[Array, Array, Array]:
-        """What `of_rows` takes: of every point at every time, seen or not."""
+        """What `from_rows` takes: of every point at every time, seen or not."""
         f, k, _ = self.moved_mm.shape
         return np.repeat(self.time_s, k), np.tile(self.points, (f, 1)), self.moved_mm.reshape(-1, 3)
 
     @property
-    def largest_mm(self) -> float:
+    def max_motion_mm(self) -> float:
         """The largest component of all."""
         return float(np.nanmax(np.abs(self.moved_mm)))
 
@@ -267,15 +268,15 @@ class SurfaceMotion:
         """Some of the frames (f,)."""
         return SurfaceMotion(self.points, self.time_s[which], self.moved_mm[which])
 
-    def means(self, points: NDArray[np.int64]) -> SurfaceMeans:
+    def average(self, points: NDArray[np.int64]) -> SurfaceMeans:
         """Means over at most `MAX_SURFACE_TIMES` spans of time, each of the frames that show the point."""
         spans = np.array_split(np.arange(len(self.time_s)), min(len(self.time_s), MAX_SURFACE_TIMES))
-        seen = np.isfinite(self.moved_mm[:, points])
+        is_known = np.isfinite(self.moved_mm[:, points])
         found: list[tuple[Array, int, int]] = []
         for span in spans:
-            for k, i in zip(*np.nonzero(seen[span].any(axis=0))):
+            for k, i in zip(*np.nonzero(is_known[span].any(axis=0))):
                 shown = np.zeros(len(self.time_s))
-                shown[span] = seen[span, k, i]
+                shown[span] = is_known[span, k, i]
                 found.append((shown / shown.sum(), int(k), int(i)))
         frames = np.array([share for share, _, _ in found])
         point, component = (np.array([one[j] for one in found], dtype=np.int64) for j in (1, 2))
@@ -299,7 +300,7 @@ class SurfaceMeans:
 
     @property
     def samples(self) -> Array:
-        """How many frames (n,) each is the mean of."""
+        """The number of frames (n,) that each is the mean of."""
         return np.asarray((self.frames > 0.0).sum(axis=1), dtype=np.float64)
 
 
@@ -316,31 +317,32 @@ def read_surface_motion(path: str | Path, time_name: str) -> SurfaceMotion:
     """
     file = Path(path)
     named = {TIME: time_name} | {name: name for name in _POSITION_COLUMNS}
-    columns = read_columns(file, named, wanted=lambda name: name in _MOTION_COLUMNS, gaps=True)
+    columns = read_columns(file, named, select=lambda name: name in _MOTION_COLUMNS, gaps=True)
     given = [name for name in _MOTION_COLUMNS if name in columns]
     if not given:
         raise TraceError(
             "no displacement of a point", file=file, place="header", remedy="name columns ux_mm, uy_mm, uz_mm"
         )
     for name, values in columns.items():
-        bad = np.flatnonzero(np.isinf(values) if name in _MOTION_COLUMNS else ~np.isfinite(values))
-        if bad.size:
-            raise TraceError(
-                f"{values[bad[0]]} in sample {bad[0] + 1}",
-                file=file,
-                place=name,
-                remedy="give a number" + (", or leave the cell empty" if name in _MOTION_COLUMNS else ""),
+        if name in _MOTION_COLUMNS:  # whose empty cells are nan
+            check_finite(
+                np.nan_to_num(values, posinf=np.inf, neginf=-np.inf),
+                name,
+                file,
+                "give a number, or leave the cell empty",
             )
+        else:
+            check_finite(values, name, file, "give a number")
     place = np.column_stack([columns[name] for name in _POSITION_COLUMNS])
     nothing = np.full(len(place), np.nan)
     moved = np.column_stack([columns.get(name, nothing) for name in _MOTION_COLUMNS])
     _check_sizes(file, place, moved, ", ".join(given))
-    _check_once(file, time_name, columns[time_name], place)
-    return SurfaceMotion.of_rows(columns[time_name], place, moved)
+    _check_unique_rows(file, time_name, columns[time_name], place)
+    return SurfaceMotion.from_rows(columns[time_name], place, moved)
 
 
 def _check_sizes(file: Path, place: Array, moved: Array, given: str) -> None:
-    """Whether positions and displacements can be millimetres."""
+    """Refuse positions and displacements that cannot be millimetres."""
     if not np.isfinite(moved).any():
         raise TraceError("no displacement is given", file=file, place=given, remedy="fill some of its cells")
     extent, largest = float(np.ptp(place, axis=0).max()), float(np.nanmax(np.abs(moved)))
@@ -368,8 +370,8 @@ def _find_points(place: Array) -> tuple[Array, NDArray[np.int64]]:
     return place[first], point.ravel()
 
 
-def _check_once(file: Path, time_name: str, time: Array, place: Array) -> None:
-    """Whether no point has two rows at one time."""
+def _check_unique_rows(file: Path, time_name: str, time: Array, place: Array) -> None:
+    """Refuse a point that has two rows at one time."""
     rows = np.column_stack([time, _find_points(place)[1]])
     _, once = np.unique(rows, axis=0, return_index=True)
     if len(once) < len(rows):

@@ -17,7 +17,7 @@ import numpy as np
 from ..autoregressive import compute_block_covariance
 from ..errors import TraceError
 from .displacement import BrokenLine, fit_broken_line
-from .numerics import Array, Scatter, average_in_bins, estimate_scatter, split_at_gaps
+from .numerics import Array, SampleNoise, average_in_bins, estimate_noise, split_at_gaps
 from .record import MIN_SAMPLES, Trace
 
 
@@ -40,17 +40,16 @@ class TouchDown:
 
 
 _ONSET_LEVEL = 0.05  # of the peak force: more of the onset is no power law, where a punch comes full on
-_LEAST_LEVEL_NOISE = 45.0  # and never less than this many standard deviations of what means of it scatter
-_LEAST_TRAVEL = 0.03  # of the way in: a force that jumps before the indenter moves is no onset
-_MEANS = 120  # that part as so many means
+_MIN_LEVEL_SD = 45.0  # and never less than this many standard deviations of what means of it scatter
+_MIN_TRAVEL = 0.03  # of the way in: a force that jumps before the indenter moves is no onset
+_MAX_MEANS = 120  # that part as so many means
 _BEFORE_SHARE, _BEFORE_MM = 0.2, 1.0  # of the way in; how far before the record the skin may have been met
 _BINS = 200
-_APPROACH_MM = 0.1  # less of it before the skin is none
-_APPROACH = 3.0  # times the onset: more of what came before it says nothing more about it
+_MIN_APPROACH_MM = 0.1  # less of it before the skin is none
 
 
 def find_touch_down(trace: Trace, line: BrokenLine | None = None) -> TouchDown:
-    """Where the skin is met, from the shape of the onset of force.
+    """Find where the skin is met, from the shape of the onset of force.
 
     A flat punch meets a curved limb at a corner first, so the force starts like a power of the depth and any
     threshold is late. Every onset of a power law with memory is compared with the low-force part of loading,
@@ -62,17 +61,14 @@ def find_touch_down(trace: Trace, line: BrokenLine | None = None) -> TouchDown:
     TraceError
         Where the force does not rise on the way in.
     """
-    return _from_onset(trace, line or fit_broken_line(trace.time_s, trace.displacement_mm))
-
-
-def _from_onset(trace: Trace, line: BrokenLine) -> TouchDown:
+    line = line or fit_broken_line(trace.time_s, trace.displacement_mm)
     time, travel, force = _select_way_in(trace, line)
     moving = int(np.searchsorted(time, line.start_s))
-    scatter = estimate_scatter(*split_at_gaps(time, force))
-    part = _select_low_force_part(time, travel, force, moving, scatter)
-    rough = find_onset(part, scatter)
-    scatter, part = _estimate_near(rough.place_mm, time, travel, force, moving)
-    onset = find_onset(part, scatter, rough)
+    sample_noise = estimate_noise(*split_at_gaps(time, force))
+    part = _select_low_force_part(time, travel, force, moving, sample_noise)
+    rough = find_onset(part, sample_noise)
+    sample_noise, part = _estimate_noise_near(rough.place_mm, time, travel, force, moving)
+    onset = find_onset(part, sample_noise, rough)
     return TouchDown(
         time_s=float(np.interp(onset.place_mm, np.maximum.accumulate(travel), time)),
         displacement_mm=onset.place_mm,
@@ -80,30 +76,32 @@ def _from_onset(trace: Trace, line: BrokenLine) -> TouchDown:
         exponent=onset.exponent,
         baseline_N=onset.baseline_N,
         in_contact_at_start=bool(
-            onset.place_mm - travel[0] < max(2 * onset.sd, _APPROACH_MM) and moving < MIN_SAMPLES
+            onset.place_mm - travel[0] < max(2 * onset.sd, _MIN_APPROACH_MM) and moving < MIN_SAMPLES
         ),
     )
 
 
 def compute_deviation_before(trace: Trace, line: BrokenLine, touch: TouchDown) -> float:
-    """How far off (mm, root mean square) a touch-down is that may lie before the start of the record, with a
-    sensor that was zeroed in contact."""
+    """Compute the root-mean-square error, mm, of a touch-down that may lie before the start of the record.
+
+    The sensor was then zeroed in contact.
+    """
     time, travel, force = _select_way_in(trace, line)
     moving = int(np.searchsorted(time, line.start_s))
-    scatter, part = _estimate_near(touch.displacement_mm, time, travel, force, moving)
+    sample_noise, part = _estimate_noise_near(touch.displacement_mm, time, travel, force, moving)
     before = min(_BEFORE_SHARE * float(travel[-1] - travel[0]), _BEFORE_MM)
-    onset = find_onset(part, scatter, before_mm=before)
+    onset = find_onset(part, sample_noise, before_mm=before)
     return float(np.hypot(onset.sd, onset.place_mm - touch.displacement_mm))
 
 
-def _estimate_near(
+def _estimate_noise_near(
     place_mm: float, time: Array, travel: Array, force: Array, moving: int
-) -> tuple[Scatter, OnsetPart]:
+) -> tuple[SampleNoise, OnsetPart]:
     """The noise on either side of a touch-down, as the kink in between is none, and the part to look at."""
     met = int(np.searchsorted(travel, place_mm))
     parts = (split_at_gaps(time[side], force[side]) for side in (slice(met), slice(met, None)))
-    scatter = estimate_scatter(*(part for side in parts for part in side))
-    return scatter, _select_low_force_part(time, travel, force, moving, scatter)
+    sample_noise = estimate_noise(*(part for side in parts for part in side))
+    return sample_noise, _select_low_force_part(time, travel, force, moving, sample_noise)
 
 
 def _select_way_in(trace: Trace, line: BrokenLine) -> tuple[Array, Array, Array]:
@@ -116,7 +114,7 @@ def _select_way_in(trace: Trace, line: BrokenLine) -> tuple[Array, Array, Array]
 
 
 def _select_low_force_part(
-    time: Array, travel: Array, force: Array, moving: int, scatter: Scatter
+    time: Array, travel: Array, force: Array, moving: int, sample_noise: SampleNoise
 ) -> OnsetPart:
     """The low-force part of a way in, as means."""
     at, smooth, _ = average_in_bins(np.arange(len(force), dtype=float), force, _BINS)
@@ -124,12 +122,12 @@ def _select_low_force_part(
     rise = float(smooth.max()) - base
     if rise <= 0.1 * float(np.ptp(smooth)):
         raise TraceError("the force does not rise while the indenter goes in", remedy="check the record")
-    noise = scatter.of_means(max(len(force) // len(smooth), 1))
-    below = np.flatnonzero(smooth - base < max(_ONSET_LEVEL * rise, _LEAST_LEVEL_NOISE * noise))
+    noise = sample_noise.compute_mean_sd(max(len(force) // len(smooth), 1))
+    below = np.flatnonzero(smooth - base < max(_ONSET_LEVEL * rise, _MIN_LEVEL_SD * noise))
     end = min(int(at[below[-1]]) + 1, len(force)) if below.size else MIN_SAMPLES
-    goes = int(np.searchsorted(travel, travel[0] + _LEAST_TRAVEL * (travel[-1] - travel[0]), side="right"))
+    goes = int(np.searchsorted(travel, travel[0] + _MIN_TRAVEL * (travel[-1] - travel[0]), side="right"))
     end = min(max(end, goes, 8), len(force))
-    samples = max(end // _MEANS, 1)
+    samples = max(end // _MAX_MEANS, 1)
     start = end % samples
     t, u, f = (column[start:end].reshape(-1, samples).mean(axis=1) for column in (time, travel, force))
     return OnsetPart(t, u, f, samples, rise)
@@ -151,11 +149,11 @@ def touch_down_at(trace: Trace, time_s: float) -> TouchDown:
             place="touch_down_s",
             remedy=f"give a time from {first:.3f} s to before {last:.3f} s",
         )
-    return replace(_from_onset(trace, line), time_s=time_s, displacement_mm=float(line(np.array(time_s))))
+    return replace(find_touch_down(trace, line), time_s=time_s, displacement_mm=float(line(np.array(time_s))))
 
 
 def find_depth_at(trace: Trace, line: BrokenLine, touch: TouchDown, force_N: float) -> float:
-    """How deep the indenter is when the force first reaches so much, mm."""
+    """Find the depth at which the force first reaches ``force_N``, mm."""
     way = (trace.time_s >= touch.time_s) & (trace.time_s <= line.peak_s)
     time, force, _ = average_in_bins(trace.time_s[way], trace.force_N[way] - touch.baseline_N, _BINS)
     first = int(np.argmax(force >= min(force_N, float(force.max()))))
@@ -164,13 +162,13 @@ def find_depth_at(trace: Trace, line: BrokenLine, touch: TouchDown, force_N: flo
 
 EXPONENTS = np.linspace(1.0, 2.5, 13)  # flat punch full on: 1; sphere: 1.5; cone, or an edge coming in: 2
 STIFFENING = ((1.0, 2.5), (4.0, 2.5), (2.0, 2.0), (8.0, 2.0))  # a and q
-STARTS = np.r_[EXPONENTS, np.ones(len(STIFFENING))]  # exponents at the very start
+INITIAL_EXPONENTS = np.r_[EXPONENTS, np.ones(len(STIFFENING))]  # exponents at the very start
 TAU_S = (0.1, 0.3, 1.0, 3.0)
 GAMMA = (0.5, 1.5, 4.0)
-_PLACES = 60  # of touch-down
-_AROUND = 5.0  # standard deviations
-_ZEROED = 0.02  # of the rise: how well a sensor is zeroed, loosely
-_LEAST_NOISE = 1e-4  # of the rise
+_PLACE_COUNT = 60  # of touch-down
+_SEARCH_SD = 5.0  # standard deviations
+_ZERO_SHARE = 0.02  # of the rise: how well a sensor is zeroed, loosely
+_MIN_NOISE = 1e-4  # of the rise
 
 
 @dataclass(frozen=True)
@@ -202,7 +200,7 @@ class Onset:
 
 
 def find_onset(
-    part: OnsetPart, scatter: Scatter, around: Onset | None = None, before_mm: float = 0.0
+    part: OnsetPart, sample_noise: SampleNoise, around: Onset | None = None, before_mm: float = 0.0
 ) -> Onset:
     """The mean place over its likelihood, the noise's correlation known and the shape of the onset not.
 
@@ -211,19 +209,23 @@ def find_onset(
     what was found so.  With ``before_mm`` it may lie by so much before the part, and the sensor was zeroed
     wherever the part begins.
     """
-    covariance = compute_block_covariance(scatter.sd_N, scatter.lag, np.full(len(part.time_s), part.samples))
-    covariance += (_LEAST_NOISE * part.rise_N) ** 2 * np.eye(len(part.time_s))
+    covariance = compute_block_covariance(
+        sample_noise.sd_N, sample_noise.lag, np.full(len(part.time_s), part.samples)
+    )
+    covariance += (_MIN_NOISE * part.rise_N) ** 2 * np.eye(len(part.time_s))
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     low, high = part.travel_mm[0], part.travel_mm[-1]
     high -= 0.05 * (high - low)
     if around is not None:
-        reach = _AROUND * around.sd
+        reach = _SEARCH_SD * around.sd
         low, high = max(around.place_mm - reach, low), min(around.place_mm + reach, high)
-    return _weigh_onsets(part, whiten, np.linspace(low - before_mm, high, _PLACES), zeroed=before_mm == 0.0)
+    return _weigh_onsets(
+        part, whiten, np.linspace(low - before_mm, high, _PLACE_COUNT), zeroed=before_mm == 0.0
+    )
 
 
 def _weigh_onsets(part: OnsetPart, whiten: Array, places: Array, zeroed: bool) -> Onset:
-    """Every onset that starts at one of the places (m,), weighed by its likelihood."""
+    """Weigh every onset that starts at one of the places (m,) by its likelihood."""
     shapes = _build_shapes(part, places) @ whiten.T
     one, force = whiten.sum(axis=1), whiten @ part.force_N
     # Normal equations of baseline and stiffness, for all shapes (memories, m, forms) together.
@@ -237,7 +239,7 @@ def _weigh_onsets(part: OnsetPart, whiten: Array, places: Array, zeroed: bool) -
     # loosely, and not where it is far from zero.
     weight = -0.5 * np.log(determinant)
     if zeroed:
-        weight -= np.log1p((baseline / (_ZEROED * part.rise_N)) ** 2)
+        weight -= np.log1p((baseline / (_ZERO_SHARE * part.rise_N)) ** 2)
     least, free = float(misfit.min()), max(len(force) - 5, 1)
     weight -= 0.5 * misfit / max(1.0, least / free)
     share = np.exp(weight - weight.max())
@@ -245,7 +247,7 @@ def _weigh_onsets(part: OnsetPart, whiten: Array, places: Array, zeroed: bool) -
     along = share.sum(axis=(0, 2))
     mean, step = float(along @ places), places[1] - places[0]
     sd = float(np.sqrt(along @ (places - mean) ** 2 + step**2 / 12))
-    exponent = float(share.sum(axis=(0, 1)) @ STARTS)
+    exponent = float(share.sum(axis=(0, 1)) @ INITIAL_EXPONENTS)
     return Onset(mean, sd, exponent, float((share * baseline).sum()), least / free)
 
 
@@ -264,7 +266,7 @@ def _build_shapes(part: OnsetPart, places: Array) -> Array:
 
 
 def compute_memory(time: Array, elastic: Array, tau: float) -> Array:
-    """What relaxes with ``tau`` of an elastic force (..., n) that is straight between the times (n,)."""
+    """Compute what relaxes with ``tau`` of an elastic force (..., n), straight between the times (n,)."""
     step = np.diff(time)
     decay = np.exp(-step / tau)
     gain = (1.0 - decay) * tau / step

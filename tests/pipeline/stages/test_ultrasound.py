@@ -108,8 +108,8 @@ def test_readings_become_compressions_with_their_noise(tmp_path: Path) -> None:
     layers = read_layers(table(tmp_path, "time_s,muscle_mm,skin_mm", rows), "time_s")
     muscle, skin = compute_thinnings(layers, 1.0, 9.0, 0.1)
     assert (muscle.tissue, skin.tissue) == ("muscle", "skin")
-    assert muscle.is_seen
-    assert not skin.is_seen
+    assert muscle.is_detectable
+    assert not skin.is_detectable
     assert muscle.thickness_mm == pytest.approx(20.0, abs=0.05)
     assert len(muscle.time_s) <= 81
     assert muscle.samples.sum() == np.sum((time >= 1.0) & (time <= 9.0))

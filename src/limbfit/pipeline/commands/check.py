@@ -180,7 +180,7 @@ def _describe_surface_motion(
             continue
         said = (
             f"site {record.name}: surface of {len(motion.points)} points at {len(motion.time_s)} times in "
-            f"contact, up to {motion.largest_mm:.2f} mm"
+            f"contact, up to {motion.max_motion_mm:.2f} mm"
         )
         if record.name in chosen:
             said += f"; {chosen[record.name].words}"

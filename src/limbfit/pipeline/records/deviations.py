@@ -22,7 +22,7 @@ from ...identify.uncertainty.noise import SiteNoise, estimate_record_noise
 from ...indentation import SiteModel, compute_contact_radius
 from ...mesh import read_vtu
 from ...study import Study
-from ...traces.numerics import estimate_scatter
+from ...traces.numerics import estimate_noise
 from ..engine.context import Context
 from .records import SiteRecord
 from .traces import read_record
@@ -66,7 +66,7 @@ def _estimate_curve_noise(study: Study, record: SiteRecord, force_N: Array) -> S
     else:
         pressed = inside & (force > _PRESSED_SHARE * smooth.peak_force_N)
         parts = [pressed & (since >= phase.start_s) & (since <= phase.end_s) for phase in smooth.phases]
-        found = estimate_scatter(*(trace.force_N[part] for part in parts))
+        found = estimate_noise(*(trace.force_N[part] for part in parts))
         scatter = found.sd_N, found.lag
     return estimate_record_noise(
         record.name,

@@ -274,7 +274,7 @@ def _build_layer_measurement(
 def _build_surface_measurement(
     record: Record, points: ChosenPoints, motion: SurfaceMotion, first: int, times_s: Array
 ) -> SurfaceMeasurement:
-    means = motion.means(points.which)
+    means = motion.average(points.which)
     sd, words = record.surface_sd_mm, ("x", "y", "z")
     if record.surface_frame == "site":
         words = ("along the edge", "across it", "along the axis")
@@ -349,7 +349,7 @@ def read_motion(folder: Path, record: Record) -> SurfaceMotion:
     """What `write_motion` stored."""
     columns = read_curves(folder / f"{CURVES.format(record.name)}.csv")
     rows = np.column_stack([columns[name] for name in _COLUMNS])
-    return SurfaceMotion.of_rows(columns["time_s"], rows[:, :3], rows[:, 3:])
+    return SurfaceMotion.from_rows(columns["time_s"], rows[:, :3], rows[:, 3:])
 
 
 def choose_points(

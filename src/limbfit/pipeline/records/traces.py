@@ -23,11 +23,11 @@ from ...study import Record, Study
 from ...traces import (
     Creep,
     Regularised,
-    Remark,
     SurfaceMotion,
     Thinning,
     TouchDown,
     Trace,
+    TraceWarning,
     WaveMeans,
     WaveSpeeds,
     compute_thinnings,
@@ -88,18 +88,19 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, Trace
         knots_mm=smooth.knots_mm.tolist(),
         knots_N=smooth.knots_N.tolist() if isinstance(smooth, Creep) else None,
         remarks=[
-            RecordRemark.model_validate(remark) for remark in (*_list_reading_remarks(trace), *known.remarks)
+            RecordRemark.model_validate(remark)
+            for remark in (*_list_reading_warnings(trace), *known.warnings)
         ],
     )
     return trace, smooth, facts
 
 
-def _list_reading_remarks(trace: Trace) -> tuple[Remark, ...]:
+def _list_reading_warnings(trace: Trace) -> tuple[TraceWarning, ...]:
     """What was done to read a file that is no plain table in s, mm and N."""
     if not trace.notes:
         return ()
     cause, remedy = "the format of the rig's export", "compare the phases with what the rig did"
-    return (Remark("reading", "; ".join(trace.notes), cause, remedy, {}),)
+    return (TraceWarning("reading", "; ".join(trace.notes), cause, remedy, {}),)
 
 
 def _phases_to_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[RecordPhase]:
@@ -131,7 +132,7 @@ def run_traces(context: Context, folder: Path) -> dict[str, Any]:
             displacement_mm=even.displacement_mm,
             force_N=even.force_N,
         )
-        np.save(folder / SMOOTHING.format(record.name), smooth.curve.response(even.time_s))
+        np.save(folder / SMOOTHING.format(record.name), smooth.curve.compute_response(even.time_s))
         seen = read_observed(context.study, record, trace, told.touch_down_s, smooth)
         facts[record.name] = told = told.model_copy(update=observed_to_facts(record, seen))
         store_observed(folder, record, seen)
@@ -178,7 +179,7 @@ def _read_waves(
     found = read_wave_speeds(file, study.traces.time_s)
     _check_tissues(study, file, "m_s", [one.tissue for one in found])
     try:
-        return tuple((one, one.means(touch_down_s, end_s)) for one in found)
+        return tuple((one, one.average(touch_down_s, end_s)) for one in found)
     except TraceError as error:
         raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
 
@@ -218,7 +219,7 @@ def observed_to_facts(record: Record, seen: SecondaryMeasurement) -> dict[str, A
                 compression_mm=float(one.compression_mm.max()),
                 before=one.before,
                 sd_mm=one.sd_mm,
-                compared=one.is_seen,
+                compared=one.is_detectable,
             )
             for one in seen.layers
         }
@@ -227,9 +228,9 @@ def observed_to_facts(record: Record, seen: SecondaryMeasurement) -> dict[str, A
         facts["surface"] = SurfaceRecord(
             points=points,
             frames=frames,
-            displacement_mm=motion.largest_mm,
+            displacement_mm=motion.max_motion_mm,
             sd_mm=record.surface_sd_mm,
-            compared=motion.largest_mm > SEEN * record.surface_sd_mm,
+            compared=motion.max_motion_mm > SEEN * record.surface_sd_mm,
         )
     if seen.waves:
         facts["waves"] = [
