@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import Motion, Problem
-from .reading.rigid import find_straight_line, has_same_rotation
+from .reading.rigid import FREEDOMS, find_straight_line, has_same_rotation
 
-AXES, TURNS = "xyz", "uvw"
 FIXED_SET = "held"
 FRAME_BODY = "frame"  # the rigid body that rails are fixed to
 
@@ -163,17 +162,17 @@ def _format_step_conditions(
     moving = np.asarray(values.any(axis=0))
     free = forced | moving
     if not free.all():
-        held = "".join(f"<R{x}_dof>{int(not free[i])}</R{x}_dof>" for i, x in enumerate(AXES + TURNS))
+        held = "".join(f"<R{x}_dof>{int(not free[i])}</R{x}_dof>" for i, x in enumerate(FREEDOMS))
         yield f'<rigid_bc name="{label}_guide" type="rigid_fixed"><rb>{name}</rb>{held}</rigid_bc>'
     on_line = None if forced.any() else find_straight_line(Motion(times - times[0], values))
     if on_line is not None:  # one curve, and its share along each axis
         direction, advance = on_line
         number = curves.add(f"{label}_advance", np.column_stack([times, advance]))
         for i in np.flatnonzero(direction):
-            yield _format_drive(label, name, "rigid_displacement", AXES[i], number, direction[i])
+            yield _format_drive(label, name, "rigid_displacement", FREEDOMS[i], number, direction[i])
         return
     for i in np.flatnonzero(moving):
-        turn, letter = i > 2, (AXES + TURNS)[i]
+        turn, letter = i > 2, FREEDOMS[i]
         kind = ("rigid_displacement", "rigid_rotation", "rigid_force", "rigid_moment")[2 * forced[i] + turn]
         number = curves.add(f"{label}_{kind[6:]}_{letter}", np.column_stack([times, values[:, i]]))
         yield _format_drive(label, name, kind, letter, number, 1.0)
@@ -182,7 +181,7 @@ def _format_step_conditions(
 def _format_drive(label: str, name: str, kind: str, letter: str, curve: int, factor: float) -> str:
     force = kind in ("rigid_force", "rigid_moment")
     tag, dof = (
-        ("rigid_load", f"R{letter}") if force else ("rigid_bc", letter if letter in AXES else f"R{letter}")
+        ("rigid_load", f"R{letter}") if force else ("rigid_bc", letter if letter in "xyz" else f"R{letter}")
     )
     more = "<load_type>LOAD</load_type>" if force else ""
     return (
@@ -200,11 +199,11 @@ def format_boundary(problem: Problem, curves: CurveList) -> Iterator[str]:
     for i, support in enumerate(problem.supports, 1):
         named = f'name="support_{i}" node_set="support_{i}"'
         if support.factor == 0.0:
-            held = "".join(f"<{x}_dof>{support.component == k:d}</{x}_dof>" for k, x in enumerate(AXES))
+            held = "".join(f"<{x}_dof>{support.component == k:d}</{x}_dof>" for k, x in enumerate("xyz"))
             yield f'<bc {named} type="zero displacement">{held}</bc>'
             continue
         number = number or curves.add("history", np.column_stack([history.times, history.driver]))
-        yield f'<bc {named} type="prescribed displacement"><dof>{AXES[support.component]}</dof>'
+        yield f'<bc {named} type="prescribed displacement"><dof>{FREEDOMS[support.component]}</dof>'
         yield f'<value lc="{number}">{support.factor!r}</value><relative>0</relative></bc>'
 
 

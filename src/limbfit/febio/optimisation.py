@@ -112,7 +112,9 @@ def _format_file(
     yield "</Parameters><Constraints>"
     counts = [tissue.count for tissue in tissues.values()]
     for first, tissue in zip(np.cumsum([0, *counts]), tissues.values()):
-        for ties in _list_ties(tissue):
+        ratio = tissue.kappa_ratio
+        # c1 = c2, k = ratio c1 and m1 = -m2
+        for ties in ((1.0, -1.0, 0.0, 0.0, 0.0), (ratio, 0.0, -1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0, 1.0)):
             row = np.zeros(sum(counts) + 1)
             row[first : first + len(ties)] = ties
             yield f"<constraint>{','.join(f'{value:.17g}' for value in row)}</constraint>"
@@ -138,12 +140,3 @@ def _list_parameters(tissue: ParameterRange) -> Iterator[tuple[str, float, float
     for path, name, scale in paths:
         low, high = sorted((scale * tissue.lower[name], scale * tissue.upper[name]))
         yield path, scale * tissue.start[name], low, high
-
-
-def _list_ties(tissue: ParameterRange) -> tuple[tuple[float, ...], ...]:
-    """List the constraints c1 = c2, k = ratio c1 and m1 = -m2."""
-    return (
-        (1.0, -1.0, 0.0, 0.0, 0.0),
-        (tissue.kappa_ratio, 0.0, -1.0, 0.0, 0.0),
-        (0.0, 0.0, 0.0, 1.0, 1.0),
-    )

@@ -29,18 +29,16 @@ MAX_SMOOTH_ANGLE = 0.3
 MIN_HOLLOWNESS = 0.02  # how far facets look at each other in the mean, over the size of all
 
 
-def _find_contact_faces(model: FebModel, contact: Contact, tissue: TissueMesh) -> Indices:
-    """Return the deformable one of the two surfaces in contact, in the numbers of the tissue's nodes."""
-    for name in contact.surfaces:
-        faces = tissue.node_index[model.geometry.surfaces[name]]
-        if (faces >= 0).all():
-            return np.asarray(faces)
-    raise ProblemError("neither surface lies on tissue", place=f"line {contact.line}, <contact>")
-
-
 def find_touched_faces(model: FebModel, contacts: Sequence[Contact], tissue: TissueMesh) -> Indices:
     """Return the faces (f, k) of tissue in contacts, each once, in the numbers of the tissue's nodes."""
-    return _merge_faces([_find_contact_faces(model, contact, tissue) for contact in contacts])
+    groups: list[Indices] = []
+    for contact in contacts:
+        sides = [tissue.node_index[model.geometry.surfaces[name]] for name in contact.surfaces]
+        on_tissue = [side for side in sides if (side >= 0).all()]
+        if not on_tissue:
+            raise ProblemError("neither surface lies on tissue", place=f"line {contact.line}, <contact>")
+        groups.append(on_tissue[0])
+    return _merge_faces(groups)
 
 
 def is_hollow(model: FebModel, name: str, contacts: Sequence[Contact]) -> bool:
@@ -63,18 +61,9 @@ def is_hollow(model: FebModel, name: str, contacts: Sequence[Contact]) -> bool:
 
 def _find_front(model: FebModel, name: str, contacts: Sequence[Contact]) -> Indices:
     """Return the triangles (m, 3) of a rigid body's faces that touch, in the numbers of the model's nodes."""
-    own = np.concatenate([part.cells.ravel() for part in model.select_parts({name: None}).values()])
+    own = np.concatenate([part.cells.ravel() for part in model.select_body_parts(name)])
     sides = [model.geometry.surfaces[side] for contact in contacts for side in contact.surfaces]
     return split_into_triangles(_merge_faces([side for side in sides if np.isin(side, own).all()]))
-
-
-def find_rigid_corners(model: FebModel, name: str) -> Array:
-    """Return the corners (m, 3, 3) of the triangles around a rigid body, mm."""
-    return np.asarray(
-        model.geometry.points[
-            split_into_triangles(find_boundary_faces(model.select_parts({name: None}).values()))
-        ]
-    )
 
 
 def build_indenter(
@@ -84,9 +73,7 @@ def build_indenter(
 
     Its sharp edges are rounded by no more than the depth of the elements that it touches (``depth``, mm).
     """
-    faces = split_convexly(
-        model.geometry.points, find_boundary_faces(model.select_parts({name: None}).values())
-    )
+    faces = split_convexly(model.geometry.points, find_boundary_faces(model.select_body_parts(name)))
     used, faces = np.unique(faces, return_inverse=True)
     frame = Indenter("sphere", axis=axis, edge=edge).frame
     points = model.geometry.points[used] @ frame.T
@@ -113,7 +100,7 @@ def build_rigid_body(
     front = _find_front(model, name, contacts)
     smooth = is_hollow(model, name, contacts)
     shape: Indenter | OpenSurface | SmoothSurface
-    if is_closed(find_boundary_faces(model.select_parts({name: None}).values())) and not smooth:
+    if is_closed(find_boundary_faces(model.select_body_parts(name))) and not smooth:
         a, b, c = (model.geometry.points[front[:, i]] for i in range(3))
         towards = np.cross(b - a, c - a).sum(axis=0)
         main = int(np.abs(towards).argmax())
@@ -204,9 +191,9 @@ def build_tissue(model: FebModel) -> TissueMesh:
     number = np.full(len(model.geometry.points), -1)
     number[nodes] = np.arange(len(nodes))
     points = model.geometry.points[nodes]
-    mesh = Mesh(
-        points, number[cells], first.cell_type, regions, tuple(parts), _select_node_sets(model, number)
-    )
+    sets = {name: number[nodes] for name, nodes in model.geometry.node_sets.items()}
+    sets = {name: nodes for name, nodes in sets.items() if (nodes >= 0).all()}
+    mesh = Mesh(points, number[cells], first.cell_type, regions, tuple(parts), sets)
     _, weights = compute_reference_gradients(ELEMENTS[first.element], points, mesh.cells)
     bad = np.flatnonzero((weights <= 0.0).any(axis=1))
     if len(bad):
@@ -214,8 +201,3 @@ def build_tissue(model: FebModel) -> TissueMesh:
         what = f"{len(bad)} elements are inverted or flat, the first is element {ids[bad[0]]}"
         raise build_part_error(parts[part_name], part_name, what)
     return TissueMesh(mesh, nodes, number)
-
-
-def _select_node_sets(model: FebModel, number: Indices) -> dict[str, Indices]:
-    sets = {name: number[nodes] for name, nodes in model.geometry.node_sets.items()}
-    return {name: nodes for name, nodes in sets.items() if (nodes >= 0).all()}

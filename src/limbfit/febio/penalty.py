@@ -54,7 +54,7 @@ def compute_mean_stiffness(contact: Contact, problem: Problem, dt: float) -> flo
     if not contact.automatic:
         return contact.penalty
     faces = _find_covered_faces(problem)
-    area = _compute_areas(problem, faces).sum(axis=1)
+    area = _compute_areas(problem, faces, problem.mesh.points).sum(axis=1)
     return contact.penalty * float(np.average(compute_automatic_penalties(problem, faces, dt), weights=area))
 
 
@@ -108,7 +108,7 @@ class _BodyFaces:
         self.share = (
             stiffness[:, None] / mean_stiffness * (1.0 if self.current or not elastic else CURRENT_AREA)
         )
-        self.areas = self._compute_areas_at(problem.mesh.points)
+        self.areas = _compute_areas(problem, self.all, problem.mesh.points)
         self.coordinates = body.stated.motion.at(0.0)[0]
         self._weigh(self.areas)
 
@@ -116,17 +116,13 @@ class _BodyFaces:
         """Extrapolate the areas to the time ``ahead``, s, from where the body is and what moves it."""
         if not self.current:
             return
-        areas = self._compute_areas_at(self.problem.mesh.points + step.state.u)
+        areas = _compute_areas(self.problem, self.all, self.problem.mesh.points + step.state.u)
         there, forced, _ = self.body.stated.motion.at(ahead)
         gone, way = coordinates - self.coordinates, np.where(forced, 0.0, there - coordinates)
         moved = float(gone[:3] @ gone[:3])
         ratio = float(np.clip(way[:3] @ gone[:3] / moved, -2.0, 2.0)) if moved else 0.0
         self._weigh(np.maximum(areas + ratio * (areas - self.areas), 0.5 * areas))
         self.areas, self.coordinates = areas, coordinates
-
-    def _compute_areas_at(self, points: Array) -> Array:
-        problem = self.problem
-        return build_face_quadrature(problem.formulation, points, self.all, problem.contact_rule)[1]
 
     def _weigh(self, areas: Array) -> None:
         self.body.surface = replace(self.body.surface, areas=self.share * areas)
@@ -149,7 +145,8 @@ def compute_automatic_penalties(problem: Problem, faces: Indices, dt: float) -> 
     between = 0.5 * (1.0 - (squared**2).sum(axis=1))  # n1^2 n2^2 + .., as the squares add up to one
     compliance = (3.0 * kappa + mu) / (9.0 * kappa * mu) + 3.0 * between / mu
     _, weights = compute_reference_gradients(problem.formulation, mesh.points, mesh.cells[behind])
-    return np.asarray(_compute_areas(problem, faces).sum(axis=1) / weights.sum(axis=1) / compliance)
+    areas = _compute_areas(problem, faces, mesh.points).sum(axis=1)
+    return np.asarray(areas / weights.sum(axis=1) / compliance)
 
 
 def find_smallest_depth(mesh: Mesh, faces: Indices) -> float:
@@ -167,8 +164,9 @@ def _compute_mean_modulus(problem: Problem) -> float:
     return float(np.mean([problem.materials[name].instantaneous_modulus for name in names]))
 
 
-def _compute_areas(problem: Problem, faces: Indices) -> Array:
-    return build_face_quadrature(problem.formulation, problem.mesh.points, faces, problem.contact_rule)[1]
+def _compute_areas(problem: Problem, faces: Indices, points: Array) -> Array:
+    """Return the areas (f, q) of the quadrature points of faces (f, k), mm^2."""
+    return build_face_quadrature(problem.formulation, points, faces, problem.contact_rule)[1]
 
 
 def _compute_normals(points: Array, faces: Indices) -> Array:

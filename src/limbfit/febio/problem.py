@@ -21,7 +21,6 @@ from .parts import (
     build_indenter,
     build_rigid_body,
     build_tissue,
-    find_rigid_corners,
     find_touched_faces,
     is_hollow,
 )
@@ -29,11 +28,10 @@ from .penalty import compute_mean_penalty, find_smallest_depth
 from .reading.geometry import find_boundary_faces, is_closed
 from .reading.model import Contact, FebModel
 from .reading.rigid import (
+    FREEDOMS,
     build_motion,
     find_straight_line,
-    has_rotation,
     merge_knots,
-    name_free,
     restrict_to_rail,
 )
 
@@ -151,8 +149,10 @@ def _choose_contact_rule(model: FebModel, tissue: TissueMesh) -> str:
 
 
 def _place_indenter(model: FebModel, axis: Array, name: str, indenter: Indenter) -> Indenter:
+    """Put an indenter where the foremost point of a rigid body is."""
     centre = model.rigid[name].centre
-    foremost = float(((find_rigid_corners(model, name) - centre) @ axis).max())
+    nodes = np.concatenate(find_boundary_faces(model.select_body_parts(name)))
+    foremost = float(((model.geometry.points[nodes] - centre) @ axis).max())
     return replace(indenter, centre=centre + foremost * axis, axis=axis)
 
 
@@ -292,7 +292,7 @@ def find_touching_body(model: FebModel, contact: Contact) -> str:
     """Find the rigid body that one of the surfaces in contact lies on."""
     surfaces = [model.geometry.surfaces[name] for name in contact.surfaces]
     for name in model.rigid:
-        parts = model.select_parts({name: None}).values()
+        parts = model.select_body_parts(name)
         nodes = np.concatenate([np.zeros(0, np.int64), *(part.cells.ravel() for part in parts)])
         if any(np.isin(surface, nodes).all() for surface in surfaces):
             return name
@@ -319,7 +319,7 @@ def find_drive(model: FebModel, shaped: bool = False) -> Drive:
     if len(bodies) == 1:
         (name,) = bodies
         line = find_straight_line(bodies[name])
-        around = find_boundary_faces(model.select_parts({name: None}).values())
+        around = find_boundary_faces(model.select_body_parts(name))
         if line is not None and (
             shaped or (is_closed(around) and not is_hollow(model, name, touching[name]))
         ):
@@ -331,12 +331,6 @@ def find_drive(model: FebModel, shaped: bool = False) -> Drive:
                 return _scale_to_history(model, courses, times, base, name, direction, {})
             except ProblemError:  # nodes go their own way: the body has a motion of its own
                 pass
-    return _drive_without_indenter(model, courses, bodies)
-
-
-def _drive_without_indenter(
-    model: FebModel, courses: Mapping[tuple[str, int], _FollowingCurve], bodies: Mapping[str, Motion]
-) -> Drive:
     moving = list(courses.values())
     driven = any(motion.values.any() for motion in bodies.values())
     times = _merge_times(model, moving)
@@ -373,7 +367,7 @@ def _read_body_motions(model: FebModel) -> dict[str, Motion]:
     """Return the motions of all rigid bodies that have parts, checked for what they carry."""
     found, touching, rails = {}, group_contacts(model), {rail.body: rail for rail in model.rails}
     for name, body in model.rigid.items():
-        if not model.select_parts({name: None}) and name not in model.carried_nodes:
+        if not model.select_body_parts(name) and name not in model.carried_nodes:
             continue
         motion = build_motion(name, model.conditions, model.curves, model.phases)
         if name in rails:
@@ -381,13 +375,14 @@ def _read_body_motions(model: FebModel) -> dict[str, Motion]:
         found[name] = motion
         place = f"line {body.line}, <material>"
         if name in model.carried_nodes and motion.free.any():
+            freedoms = ", ".join(f"R{letter}" for letter, free in zip(FREEDOMS, motion.free) if free)
             raise ProblemError(
-                f"the rigid body {name!r} is neither fixed nor displaced in {name_free(motion)}",
+                f"the rigid body {name!r} is neither fixed nor displaced in {freedoms}",
                 place=place,
                 remedy="limbfit solves only for bodies that carry no tissue: fix it there with rigid_fixed",
             )
         lines = [c.line for c in model.conditions if c.body == name and c.kind != "fixed" and c.curve]
-        if name in model.carried_nodes and has_rotation(motion):
+        if name in model.carried_nodes and motion.values[:, 3:].any():
             what = f"the rigid body {name!r} carries tissue, and turns: that is not supported"
             raise ProblemError(what, place=f"line {lines[0]}")
         if name not in model.carried_nodes and name not in touching and motion.values.any():

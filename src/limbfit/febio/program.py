@@ -63,10 +63,8 @@ def find_febio(program: str | Path | None = None) -> Path:
                     "is not a program that can be run", file=given, place=name, remedy=INSTALL_REMEDY
                 )
             return Path(found)
-    for candidate in PROGRAM_NAMES:
-        found = shutil.which(candidate)
-        if found is not None:
-            return Path(found)
+    for candidate in filter(None, map(shutil.which, PROGRAM_NAMES)):
+        return Path(candidate)
     raise InputError("FEBio is not installed here", remedy=INSTALL_REMEDY)
 
 
@@ -135,15 +133,11 @@ def _run_process(program: Path, folder: Path, stream: Any, threads: int, limit_s
         return -signal.SIGKILL, True
     finally:
         if process.poll() is None:
-            _kill_process(process)
-
-
-def _kill_process(process: subprocess.Popen) -> None:
-    if hasattr(os, "killpg"):
-        os.killpg(process.pid, signal.SIGKILL)
-    else:  # Windows has no process groups of this kind
-        process.kill()
-    process.wait()
+            if hasattr(os, "killpg"):
+                os.killpg(process.pid, signal.SIGKILL)
+            else:  # Windows has no process groups of this kind
+                process.kill()
+            process.wait()
 
 
 def build_result(problem: Problem, log: FebioLog | None, verdict: RunVerdict, seconds: float = 0.0) -> Result:

@@ -23,7 +23,6 @@ import numpy as np
 from ..arrays import Array
 from ..errors import ProblemError, RunError
 from ..fe import Indenter, Material, Motion, Problem, StepControl
-from ..fe.materials import LawTable
 from ..fe.solution.control import schedule_steps
 from .conditions import (
     FIXED_SET,
@@ -51,6 +50,7 @@ from .meshes import (
 )
 from .penalty import compute_explicit_penalty, compute_mean_stiffness
 from .preparation import PRESTRAIN_S, Preparation, prepare_problem
+from .reading.materials import ACTIVE, FIBRE, GRADIENT, MIXTURE, PRESTRAINED, RELAXED
 from .reading.model import Contact
 
 REST = Motion(np.array([0.0, 1.0]), np.zeros((2, 6)))
@@ -109,7 +109,7 @@ def _check_bodies(problem: Problem) -> list[FebBody]:
         If FEBio cannot be given the problem.
     """
     check_element(problem, "FEBio")
-    find_prestrains(problem)
+    _find_prestrains(problem)
     if problem.touch_down_s and any(support.factor for support in problem.supports):
         raise ProblemError("nodes that move with an indenter which touches later are not written for FEBio")
     tenses = problem.activation is not None and any(m.table().active for m in problem.materials.values())
@@ -138,7 +138,8 @@ def describe_differences(problem: Problem, settings: FebSettings) -> tuple[str, 
     """Describe, a line each, what FEBio still does differently with the input."""
     own, automatic = compute_explicit_penalty(problem, settings.steps), settings.penalty is not None
     if automatic:
-        mean = compute_mean_stiffness(build_contact(problem, settings), problem, compute_first_step(problem))
+        first_step_s = _divide_evenly(float(problem.history.times[-1]), 0.25 * _compute_largest_step(problem))
+        mean = compute_mean_stiffness(build_contact(problem, settings), problem, first_step_s)
         contact = (
             f"contact: {settings.penalty:g} times FEBio's automatic penalty, {mean:.3g} MPa/mm in the mean, "
             f"where {own:.3g} were as stiff as limbfit's: the indenter sinks in further and the force is "
@@ -218,15 +219,12 @@ def check_simple_indentation(problem: Problem, program: str) -> None:
 def _format_file(
     problem: Problem, prepared: Problem, bodies: list[FebBody], settings: FebSettings
 ) -> Iterator[str]:
-    """Write the file of a problem, which is ``there`` in the file's own time."""
+    """Write the file of a problem; ``prepared`` is the problem in the file's own time."""
     yield '<?xml version="1.0" encoding="UTF-8"?>'
     for remark in (f"limbfit: {settings.title}; mm, N, s, MPa", *describe_differences(problem, settings)):
         yield f"<!-- {escape(' '.join(remark.replace('--', '-').split()))} -->"
-    curves, regions, settled = (
-        CurveList(),
-        problem.mesh.region_names,
-        Preparation.from_problem(problem).settling_s,
-    )
+    curves, regions = CurveList(), problem.mesh.region_names
+    settled = Preparation.from_problem(problem).settling_s
     ends = find_step_ends([body.motion for body in bodies], float(prepared.history.times[-1]), settled)
     rigid = [format_conditions(body.name, body.motion, ends, curves) for body in bodies]
     by_step = [[line for body in rigid for line in body[k]] for k in range(len(ends))]
@@ -255,7 +253,7 @@ def _format_file(
     meshes = {body.name: body.tool for body in bodies} | ({} if frame is None else {FRAME_BODY: frame})
     yield from format_mesh(problem, bodies, meshes)
     yield from format_domains(problem, meshes)
-    data = [*format_cell_axes(problem), *format_cell_prestrains(find_prestrains(problem))]
+    data = list(_format_cell_data(problem))
     if data:
         yield from ("<MeshData>", *data, "</MeshData>")
     yield from ("<Boundary>", *boundary, "</Boundary>")
@@ -283,7 +281,7 @@ def _find_must_points(problem: Problem, settings: FebSettings) -> Array:
     """Return the times (k,) that FEBio must meet and the largest step up to each, s."""
     preparation = Preparation.from_problem(problem)
     own = preparation.seconds + schedule_steps(problem.history, settings.steps, problem.turns)
-    times, largest = np.append(0.0, own), np.full(len(own) + 1, compute_largest_step(problem))
+    times, largest = np.append(0.0, own), np.full(len(own) + 1, _compute_largest_step(problem))
     if preparation.settling_s:
         rest = preparation.settling_s - PRESTRAIN_S
         settling = [PRESTRAIN_S, preparation.settling_s] if rest else [PRESTRAIN_S]
@@ -295,18 +293,22 @@ def _find_must_points(problem: Problem, settings: FebSettings) -> Array:
 
 def _format_materials(problem: Problem, curves: CurveList, settled: float) -> Iterator[str]:
     """Write the tissues, with the curves of their contraction and of their pre-strain."""
-    axes, strained, course = find_fibre_directions(problem), find_prestrains(problem), 0
+    axes, strained, course = _find_fibre_directions(problem), _find_prestrains(problem), 0
     if problem.activation is not None:
-        points = np.column_stack(
-            [np.asarray(problem.activation.times), np.asarray(problem.activation.shares)]
+        course = curves.add(
+            "activation", np.column_stack([problem.activation.times, problem.activation.shares])
         )
-        course = curves.add("activation", points)
     ramp = curves.add("prestrain", np.array([[0.0, 0.0], [PRESTRAIN_S, 1.0]])) if settled else 0
     for i, name in enumerate(problem.mesh.region_names, 1):
-        prestrain = format_prestrain(name, strained.get(name), ramp)
-        yield from format_material(
-            i, name, problem.materials[name], format_axis(axes.get(name)), course, prestrain
-        )
+        axis = prestrain = ""
+        if name in axes and len(axes[name]) == 1:
+            axis = f'<mat_axis type="vector">{_format_axes(axes[name][0])}</mat_axis>'
+        if name in strained:
+            F0 = f"<F0>{format_row(strained[name][0].ravel())}</F0>"
+            if len(strained[name]) > 1:
+                F0 = f'<F0 type="map">{_name_prestrain_map(name)}</F0>'
+            prestrain = f'<prestrain type="{GRADIENT}"><ramp lc="{ramp}">1</ramp>{F0}</prestrain>'
+        yield from _format_material(i, name, problem.materials[name], axis, course, prestrain)
 
 
 def _format_control(
@@ -318,7 +320,7 @@ def _format_control(
     """
     settles = end <= Preparation.from_problem(problem).settling_s
     size = _divide_evenly(
-        end - begin, 0.25 * (PRESTRAIN_S / 10.0 if settles else compute_largest_step(problem))
+        end - begin, 0.25 * (PRESTRAIN_S / 10.0 if settles else _compute_largest_step(problem))
     )
     updates, reformations = (0, 60) if settings.penalty is None else (10, 25)
     yield f"<Control><analysis>STATIC</analysis><time_steps>{round((end - begin) / size)}</time_steps>"
@@ -340,7 +342,7 @@ def _has_friction(friction: str | float) -> bool:
     return friction not in ("frictionless", 0.0)
 
 
-def compute_largest_step(problem: Problem) -> float:
+def _compute_largest_step(problem: Problem) -> float:
     """Return the largest step, s: a sixteenth of the first way in, half of that under sharp edges."""
     ways = [] if problem.indenter is None else [problem.history.loading_s - problem.touch_down_s]
     for body in problem.bodies:
@@ -349,11 +351,6 @@ def compute_largest_step(problem: Problem) -> float:
     shapes = [body.shape for body in problem.rigid_bodies]
     round_enough = all(has_round_edges(shape) for shape in shapes if isinstance(shape, Indenter))
     return min(ways, default=float(problem.history.times[-1])) / (16.0 if round_enough else 32.0)
-
-
-def compute_first_step(problem: Problem) -> float:
-    """Return the first step, s: at most a quarter of the largest, and a whole fraction of the time."""
-    return _divide_evenly(float(problem.history.times[-1]), 0.25 * compute_largest_step(problem))
 
 
 def _divide_evenly(span: float, size: float) -> float:
@@ -389,14 +386,9 @@ def _format_output(numbers: Iterable[int], settings: FebSettings) -> Iterator[st
 
 PRESSURE_MODELS = {0: "default", 1: "NIKE3D", 2: "Abaqus"}
 MAX_TERMS = 6  # of Ogden and of Prony in FEBio
-MIXTURE, RELAXING, PRESTRAINED = (
-    "uncoupled solid mixture", "uncoupled viscoelastic", "uncoupled prestrain elastic",
-)  # fmt: skip
-FIBRE, ACTIVE = "fiber-exp-pow-uncoupled", "uncoupled active fiber stress"
-GRADIENT = "prestrain gradient"
 
 
-def format_material(
+def _format_material(
     number: int, name: str, material: Material, axis: str = "", course: int = 0, prestrain: str = ""
 ) -> Iterator[str]:
     """Write a tissue with its axis of fibres.
@@ -404,7 +396,7 @@ def format_material(
     Parameters
     ----------
     course : number of the load curve of its contraction.
-    prestrain : its pre-strain (see `format_prestrain`).
+    prestrain : its pre-strain, as it is written.
 
     Raises
     ------
@@ -415,12 +407,17 @@ def format_material(
     prony = [(float(g), float(tau)) for g, tau in table.prony if g != 0.0]
     if max(len(prony), len(table.terms)) > MAX_TERMS:
         raise ProblemError(f"tissue {name!r} has more than {MAX_TERMS} terms, which FEBio does not take")
-    solids = _format_passive(table)
+    terms = "".join(
+        f"<c{i}>{float(c)!r}</c{i}><m{i}>{float(m)!r}</m{i}>" for i, (c, m) in enumerate(table.terms, 1)
+    )
+    solids = [("Ogden", terms)]
+    if table.fibre[0] > 0.0:
+        k1, k2 = map(float, table.fibre)
+        solids.append((FIBRE, f"<ksi>{k1!r}</ksi><alpha>{k2!r}</alpha><beta>2</beta>"))
     if prony:
         kind, content = _combine_solids(solids)
-        solids = [
-            (RELAXING, f'{_format_relaxation(prony)}<elastic type="{kind}"><k>0</k>{content}</elastic>')
-        ]
+        terms = "".join(f"<g{i}>{g!r}</g{i}><t{i}>{tau!r}</t{i}>" for i, (g, tau) in enumerate(prony, 1))
+        solids = [(RELAXED, f'<g0>1</g0>{terms}<elastic type="{kind}"><k>0</k>{content}</elastic>')]
     if table.active > 0.0:
         active = f'<smax>{float(table.active)!r}</smax><activation lc="{course}">1</activation>'
         solids.append((ACTIVE, active))
@@ -434,18 +431,6 @@ def format_material(
     yield f"{head}{axis}{shared}{content}</material>"
 
 
-def _format_passive(table: LawTable) -> list[tuple[str, str]]:
-    """Return kinds and contents of what the tissue bears at rest."""
-    terms = "".join(
-        f"<c{i}>{float(c)!r}</c{i}><m{i}>{float(m)!r}</m{i}>" for i, (c, m) in enumerate(table.terms, 1)
-    )
-    solids = [("Ogden", terms)]
-    if table.fibre[0] > 0.0:
-        k1, k2 = map(float, table.fibre)
-        solids.append((FIBRE, f"<ksi>{k1!r}</ksi><alpha>{k2!r}</alpha><beta>2</beta>"))
-    return solids
-
-
 def _combine_solids(solids: list[tuple[str, str]]) -> tuple[str, str]:
     """Return kind and content of one solid, or of a mixture of several."""
     if len(solids) == 1:
@@ -453,12 +438,7 @@ def _combine_solids(solids: list[tuple[str, str]]) -> tuple[str, str]:
     return MIXTURE, "".join(f'<solid type="{kind}">{content}</solid>' for kind, content in solids)
 
 
-def _format_relaxation(prony: list[tuple[float, float]]) -> str:
-    terms = (f"<g{i}>{g!r}</g{i}><t{i}>{tau!r}</t{i}>" for i, (g, tau) in enumerate(prony, 1))
-    return f"<g0>1</g0>{''.join(terms)}"
-
-
-def find_prestrains(problem: Problem) -> dict[str, Array]:
+def _find_prestrains(problem: Problem) -> dict[str, Array]:
     """Return the pre-stretches of each region that has some: (1, 3, 3), or one for each of its cells.
 
     Raises
@@ -482,34 +462,27 @@ def find_prestrains(problem: Problem) -> dict[str, Array]:
     return found
 
 
-def format_prestrain(name: str, gradients: Array | None, ramp: int) -> str:
-    """Write the pre-strain of a tissue, which grows with the load curve ``ramp``."""
-    if gradients is None:
-        return ""
-    value = (
-        f"<F0>{format_row(gradients[0].ravel())}</F0>"
-        if len(gradients) == 1
-        else f'<F0 type="map">{name_prestrain_map(name)}</F0>'
-    )
-    return f'<prestrain type="{GRADIENT}"><ramp lc="{ramp}">1</ramp>{value}</prestrain>'
-
-
-def name_prestrain_map(name: str) -> str:
+def _name_prestrain_map(name: str) -> str:
     """Return the name of a tissue's map of pre-strains."""
     return f"prestrain_of_{''.join(c if c.isalnum() else '_' for c in name)}"
 
 
-def format_cell_prestrains(prestrains: dict[str, Array]) -> Iterator[str]:
-    """Write the pre-strains that differ from cell to cell."""
-    for name, gradients in prestrains.items():
+def _format_cell_data(problem: Problem) -> Iterator[str]:
+    """Write the axes and the pre-strains that differ from cell to cell."""
+    for name, directions in _find_fibre_directions(problem).items():
+        if len(directions) > 1:
+            yield f'<ElementData type="mat_axis" elem_set={quoteattr(name)}>'
+            yield from (f'<elem lid="{i}">{_format_axes(a)}</elem>' for i, a in enumerate(directions, 1))
+            yield "</ElementData>"
+    for name, gradients in _find_prestrains(problem).items():
         if len(gradients) > 1:
-            map_name = name_prestrain_map(name)
+            map_name = _name_prestrain_map(name)
             yield f'<ElementData name="{map_name}" data_type="mat3" elem_set={quoteattr(name)}>'
             yield from (f'<elem lid="{i}">{format_row(G.ravel())}</elem>' for i, G in enumerate(gradients, 1))
             yield "</ElementData>"
 
 
-def find_fibre_directions(problem: Problem) -> dict[str, Array]:
+def _find_fibre_directions(problem: Problem) -> dict[str, Array]:
     """Return the fibre directions of each region that has some: (1, 3), or one for each of its cells."""
     mesh, found = problem.mesh, {}
     for r, name in enumerate(mesh.region_names):
@@ -518,26 +491,6 @@ def find_fibre_directions(problem: Problem) -> dict[str, Array]:
             own = given[mesh.regions == r]
             found[name] = own[:1] if (own == own[0]).all() else own
     return found
-
-
-def format_axis(directions: Array | None) -> str:
-    """Write the axis of a material whose cells have one direction."""
-    return (
-        ""
-        if directions is None or len(directions) != 1
-        else f'<mat_axis type="vector">{_format_axes(directions[0])}</mat_axis>'
-    )
-
-
-def format_cell_axes(problem: Problem) -> Iterator[str]:
-    """Write the axes that differ from cell to cell."""
-    for name, directions in find_fibre_directions(problem).items():
-        if len(directions) == 1:
-            continue
-        yield f'<ElementData type="mat_axis" elem_set={quoteattr(name)}>'
-        for i, direction in enumerate(directions, 1):
-            yield f'<elem lid="{i}">{_format_axes(direction)}</elem>'
-        yield "</ElementData>"
 
 
 def _format_axes(direction: Array) -> str:

@@ -93,7 +93,11 @@ def read_geometry(root: XmlNode, materials: Iterable[str]) -> Geometry:
             if surface not in surfaces:
                 raise pair.error(f"there is no surface {surface!r}")
         pairs[name] = both
-    sets = {name: _read_node_set(group, numbers) for name, group in _find_named(mesh, "NodeSet")}
+    most = len(numbers.ids)
+    sets = {
+        name: np.array(numbers.of(group, _read_ids(group, most)), dtype=np.int64)
+        for name, group in _find_named(mesh, "NodeSet")
+    }
     named = [group for group in mesh.all("Nodes") if group.attributes.get("name")]
     blocks = {
         group.attributes["name"]: np.array(numbers.of(group, _read_identities(group))) for group in named
@@ -101,7 +105,12 @@ def read_geometry(root: XmlNode, materials: Iterable[str]) -> Geometry:
     elements = {name: part.ids for name, part in parts.items()}
     elements |= {name: np.array(_read_ids(group)) for name, group in _find_named(mesh, "ElementSet")}
     points = np.array([node.numbers(3) for node in nodes])
-    lists = _read_part_lists(mesh, parts)
+    lists = {}
+    for name, group in _find_named(mesh, "PartList"):
+        lists[name] = tuple(part.strip() for part in group.text.split(","))
+        for part in lists[name]:
+            if part not in parts:
+                raise group.error(f"there is no part {part!r}")
     return Geometry(points, numbers.ids, parts, sets, elements, surfaces, pairs, blocks, lists)
 
 
@@ -130,16 +139,6 @@ def _find_named(mesh: XmlNode, tag: str) -> list[tuple[str, XmlNode]]:
             raise group.error(f"{name!r} is there twice")
         found[name] = group
     return list(found.items())
-
-
-def _read_part_lists(mesh: XmlNode, parts: Mapping[str, Part]) -> dict[str, tuple[str, ...]]:
-    lists = {}
-    for name, group in _find_named(mesh, "PartList"):
-        lists[name] = tuple(part.strip() for part in group.text.split(","))
-        for part in lists[name]:
-            if part not in parts:
-                raise group.error(f"there is no part {part!r}")
-    return lists
 
 
 def _read_domains(section: XmlNode, materials: Iterable[str]) -> dict[str, XmlNode]:
@@ -211,10 +210,6 @@ def _read_faces(group: XmlNode, numbers: _NodeNumbers) -> Indices:
             raise face.error(f"has {len(corners)} nodes, not {count}")
         faces.append(numbers.of(face, corners))
     return np.array(faces)
-
-
-def _read_node_set(group: XmlNode, numbers: _NodeNumbers) -> Indices:
-    return np.array(numbers.of(group, _read_ids(group, len(numbers.ids))), dtype=np.int64)
 
 
 def _read_ids(group: XmlNode, most: int = 10**7) -> list[int]:

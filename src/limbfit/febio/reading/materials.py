@@ -29,8 +29,8 @@ ELASTIC = {
     "incomp neo-Hookean": {"G"},
 }
 _SHARED = {"k", "density", "pressure_model", "laugon", "atol", "mat_axis"}
-_MIXTURE, _RELAXED = "uncoupled solid mixture", "uncoupled viscoelastic"
-_FIBRE, ACTIVE, PRESTRAINED = (
+MIXTURE, RELAXED = "uncoupled solid mixture", "uncoupled viscoelastic"
+FIBRE, ACTIVE, PRESTRAINED = (
     "fiber-exp-pow-uncoupled", "uncoupled active fiber stress", "uncoupled prestrain elastic",
 )  # fmt: skip
 _RELAXING = {"g0", "elastic"} | {f"{letter}{i}" for letter in "gt" for i in range(1, 7)}
@@ -101,11 +101,11 @@ def _read_law(node: XmlNode) -> Material:
 def _read_uncoupled(node: XmlNode, k: float, law: str) -> Material:
     """Read the law of a material with bulk modulus ``k`` (MPa)."""
     kind = node.attribute("type")
-    if kind == _RELAXED:
+    if kind == RELAXED:
         return _read_relaxing(node, k, law)
-    if kind not in (*ELASTIC, _MIXTURE):
+    if kind not in (*ELASTIC, MIXTURE):
         raise _build_kind_error(node, kind)
-    if kind == _MIXTURE:
+    if kind == MIXTURE:
         active = [one for one in node.all("solid") if one.attribute("type") == ACTIVE]
         if active:
             return _read_contractile(node, active, k, law)
@@ -114,7 +114,7 @@ def _read_uncoupled(node: XmlNode, k: float, law: str) -> Material:
 
 def _read_relaxing(node: XmlNode, k: float, law: str) -> Material:
     elastic = node.child("elastic")
-    if elastic.attribute("type") not in (*ELASTIC, _MIXTURE):
+    if elastic.attribute("type") not in (*ELASTIC, MIXTURE):
         raise _build_kind_error(elastic, elastic.attribute("type"))
     _check_parameters(node, _RELAXING | _SHARED)
     g0 = node.number("g0", 1.0)
@@ -139,10 +139,10 @@ def _read_contractile(node: XmlNode, active: list[XmlNode], k: float, law: str) 
     if len(active) > 1:
         raise active[1].error("a mixture is read with one contraction")
     _check_parameters(node, {"solid"} | _SHARED)
-    (pull,) = active
-    _check_parameters(pull, {"smax", "activation", "k", "density"})
-    rest = [one for one in node.all("solid") if one is not pull]
-    if [one.attribute("type") for one in rest] == [_RELAXED]:
+    (active_stress,) = active
+    _check_parameters(active_stress, {"smax", "activation", "k", "density"})
+    rest = [one for one in node.all("solid") if one is not active_stress]
+    if [one.attribute("type") for one in rest] == [RELAXED]:
         passive = _read_relaxing(rest[0], k, _check_volumetric(rest[0], law))
     elif len(rest) == 1 and rest[0].attribute("type") in ELASTIC:
         passive = _read_hyperelastic(rest[0], 1.0, (), k, law)
@@ -151,14 +151,14 @@ def _read_contractile(node: XmlNode, active: list[XmlNode], k: float, law: str) 
     if not isinstance(passive, Fibred):
         assert isinstance(passive, Uncoupled)
         passive = Fibred(passive, 0.0, 1.0)
-    return Contractile(passive, pull.number("smax") * pull.number("activation"))
+    return Contractile(passive, active_stress.number("smax") * active_stress.number("activation"))
 
 
 def _read_hyperelastic(
     node: XmlNode, scale: float, prony: tuple[tuple[float, float], ...], k: float, law: str
 ) -> Material:
     """Read an elastic law, and the fibres beside it if it is a mixture."""
-    if node.attribute("type") != _MIXTURE:
+    if node.attribute("type") != MIXTURE:
         return _read_elastic(node, scale, prony, k, law)
     _check_parameters(node, {"solid"} | _SHARED)
     return _read_mixture(node, node.all("solid"), scale, prony, k, law)
@@ -173,12 +173,12 @@ def _read_mixture(
     law: str,
 ) -> Fibred:
     """Read the ground and the fibres among the ``solids`` of a mixture."""
-    fibres = [one for one in solids if one.attribute("type") == _FIBRE]
+    fibres = [one for one in solids if one.attribute("type") == FIBRE]
     grounds = [one for one in solids if one.attribute("type") in ELASTIC]
     if not len(fibres) == len(grounds) == 1 or len(solids) != 2:
         if any(one.attribute("type") == ACTIVE for one in solids):
-            raise node.error("an active stress that relaxes is not read", f"put {ACTIVE} beside {_RELAXED}")
-        raise node.error(f"a mixture is read of one {_FIBRE} and one of {', '.join(ELASTIC)}")
+            raise node.error("an active stress that relaxes is not read", f"put {ACTIVE} beside {RELAXED}")
+        raise node.error(f"a mixture is read of one {FIBRE} and one of {', '.join(ELASTIC)}")
     (fibre,), (ground,) = fibres, grounds
     for one in solids:
         if one.number("k", 0.0) != 0.0:
@@ -248,7 +248,7 @@ def _check_modulus(node: XmlNode, mu: float) -> float:
 
 
 GRADIENT, MATRIX = "prestrain gradient", "mat3"
-_FIRST = (1.0, 0.0, 0.0)  # FEBio's, where nothing is said
+_DEFAULT_AXIS = (1.0, 0.0, 0.0)  # FEBio's, where nothing is said
 
 
 @dataclass(frozen=True)
@@ -311,7 +311,8 @@ def read_prestrains(
         For generators other than a gradient, and for gradients that change the volume, which FEBio's pressure
         does not see and limbfit's does.
     """
-    maps = {(data.attribute("name"), data.attribute("elem_set")): data for data in _find_matrices(root)}
+    matrices = [d for d in root.find("MeshData") or () if d.attributes.get("data_type") == MATRIX]
+    maps = {(data.attribute("name"), data.attribute("elem_set")): data for data in matrices}
     nodes = {node.attribute("name"): node for node in root.child("Material")}
     found = {}
     for name, part in parts.items():
@@ -328,12 +329,6 @@ def read_prestrains(
         curve, factor = (0, 1.0) if ramp is None else (_read_curve_number(ramp, curves), ramp.scalar())
         found[name] = Prestrain(gradient, curve, factor, prestrain.line)
     return found
-
-
-def _find_matrices(root: XmlNode) -> list[XmlNode]:
-    """Return the matrices of elements in the section of mesh data."""
-    section = root.find("MeshData") or ()
-    return [data for data in section if data.attributes.get("data_type") == MATRIX]
 
 
 def _read_gradient(value: XmlNode, maps: Mapping[tuple[str, str], XmlNode], part: str, count: int) -> Array:
@@ -374,22 +369,18 @@ def read_fibres(
         if name not in parts:
             raise data.error(f"there is no part {name!r}")
         if name in found:
-            _read_element_axes(data, found[name])
+            for element in data:
+                found[name][_find_cell(element, len(found[name]))] = _read_vector(element)
     return found
 
 
 def _read_material_axis(node: XmlNode) -> Array:
     axis = node.find("mat_axis")
     if axis is None:
-        return np.array(_FIRST)
+        return np.array(_DEFAULT_AXIS)
     if axis.attribute("type") != "vector":
         raise axis.error("is not given by vectors", 'use type="vector" with <a> and <d>')
     return _read_vector(axis)
-
-
-def _read_element_axes(data: XmlNode, out: Array) -> None:
-    for element in data:
-        out[_find_cell(element, len(out))] = _read_vector(element)
 
 
 def _find_cell(element: XmlNode, count: int) -> int:

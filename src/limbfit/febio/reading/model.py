@@ -50,7 +50,7 @@ _KNOWN_SECTIONS = (
     "Loads", "LoadData", "MeshData", "Step", "Output",
 )  # fmt: skip
 MIN_RELAXATION_TIMES = 20.0  # longest relaxation times after which no more than 2e-9 of a stress is left
-# Read by `_find_tied_sets`, and what only shells have.
+# Sets that are tied to rigid bodies, and what only shells have.
 _OTHER_CONDITIONS = ("rigid", "zero rotation", "zero shell displacement")
 # What none of limbfit's contact rules does; the rest of a contact is how FEBio gets there.
 _UNSUPPORTED_IN_CONTACT = ("tension", "offset", "node_reloc")
@@ -147,6 +147,10 @@ class FebModel:
         """Times (k,) s of FEBio's steps."""
         return compute_step_times(self.phases, self.curves)
 
+    def select_body_parts(self, body: str) -> list[Part]:
+        """Return the parts of a rigid body."""
+        return [part for part in self.geometry.parts.values() if part.material == body]
+
     def select_parts(self, materials: Mapping[str, object]) -> dict[str, Part]:
         """Return the parts made of any of these materials."""
         return {name: part for name, part in self.geometry.parts.items() if part.material in materials}
@@ -188,16 +192,17 @@ def _read_model(root: XmlNode) -> FebModel:
         if np.isnan(body.centre).any():
             parts = [part for part in geometry.parts.values() if part.material == name]
             rigid[name] = replace(body, centre=compute_centre_of_mass(geometry.points, parts))
-    load = root.find("LoadData")
-    curves = read_curves(load)
+    curves = read_curves(root.find("LoadData"))
+    boundary = root.find("Boundary")
+    tied_sets = [(find_body(bc, rigid), bc) for bc in boundary or () if bc.attributes.get("type") == "rigid"]
     requests, notes = read_requests(root.find("Output"), geometry)
     model = FebModel(
         geometry,
         materials,
         rigid,
-        tuple(_read_node_motions(root.find("Boundary"), geometry, curves)),
+        tuple(_read_node_motions(boundary, geometry, curves)),
         read_conditions(root, rigid, curves),
-        find_carried_nodes(geometry, materials, rigid, _find_tied_sets(root.find("Boundary"), rigid)),
+        find_carried_nodes(geometry, materials, rigid, tied_sets),
         tuple(_read_contact(node, geometry) for node in root.find("Contact") or ()),
         tuple(_read_pressures(root.find("Loads"), geometry, curves)),
         curves,
@@ -349,11 +354,6 @@ def _read_pressures(
         factor, curve = read_factor(load.child("pressure"), curves)
         if factor != 0.0:
             yield PressureLoad(name, factor, curve, load.line)
-
-
-def _find_tied_sets(section: XmlNode | None, rigid: Mapping[str, RigidMaterial]) -> list[tuple[str, XmlNode]]:
-    """Return the sets of nodes that are tied to a rigid body: its name, and the condition."""
-    return [(find_body(bc, rigid), bc) for bc in section or () if bc.attributes.get("type") == "rigid"]
 
 
 def _read_contact(node: XmlNode, geometry: Geometry) -> Contact:

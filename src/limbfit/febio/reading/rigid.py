@@ -174,8 +174,10 @@ def _read_condition(
         raise node.error(f"rigid condition {kind!r} is not supported")
     name = find_body(node, rigid)
     if kind in _FIXED:
-        for letter in sorted(_read_fixed(node)):
-            yield RigidCondition(name, FREEDOMS.index(letter), "fixed", 0.0, 0, step, node.line)
+        listed = [dof.strip().lower().removeprefix("r") for dof in node.string("dofs", "").split(",")]
+        for letter in sorted(FREEDOMS):  # FEBio 3 lists what is fixed, FEBio 4 has a flag for each freedom
+            if letter in listed or node.flag(f"R{letter}_dof"):
+                yield RigidCondition(name, FREEDOMS.index(letter), "fixed", 0.0, 0, step, node.line)
         return
     dof = node.string("dof").lower().removeprefix("r")  # Rx, ..; FEBio 3 has a number for a load's
     if dof not in tuple(FREEDOMS):
@@ -197,12 +199,6 @@ def find_body(condition: XmlNode, rigid: Mapping[str, RigidMaterial], tag: str =
     if name not in rigid:
         raise condition.error(f"there is no rigid body {name!r}")
     return name
-
-
-def _read_fixed(condition: XmlNode) -> set[str]:
-    """Read what a ``rigid_fixed`` (FEBio 3: ``fix``) holds, of `FREEDOMS`."""
-    listed = [dof.strip().lower().removeprefix("r") for dof in condition.string("dofs", "").split(",")]
-    return {letter for letter in FREEDOMS if letter in listed or condition.flag(f"R{letter}_dof")}
 
 
 def find_value(condition: XmlNode) -> XmlNode:
@@ -332,13 +328,3 @@ def find_straight_line(motion: Motion) -> tuple[Array, Array] | None:
     advance = motion.values[:, :3] @ direction
     off = np.abs(motion.values[:, :3] - advance[:, None] * direction).max()
     return (direction, advance) if off <= 1e-12 * lengths.max() else None
-
-
-def name_free(motion: Motion) -> str:
-    """Return FEBio's names of the freedoms that nothing holds at some time."""
-    return ", ".join(f"R{letter}" for letter, free in zip(FREEDOMS, motion.free) if free)
-
-
-def has_rotation(motion: Motion) -> bool:
-    """True if a motion turns its body by a given angle."""
-    return any(values.any() for values in motion.values[:, 3:].T)
