@@ -15,10 +15,10 @@ assess assign average balance batch begin bench bisect build bump calibrate call
 choose clamp classify clean clear clip close coarsen code collect colour combine compare compile
 compress compute connect constrain continue convolve copy correct count couple create crop cross curve
 cut decode deconvolve deform delay demo derive describe design diagnose die difference differentiate
-dilate divide do don draw drive drop edit embed end ensure equilibrate erode estimate evaluate exchange
+ dilate divide do don draw drive drop edit embed end ensure equilibrate erode estimate evaluate exchange
  exclude expand explain explore export extend extract extrapolate extrude factor fail fill find finish
  fit flag flatten follow format from gather generate get grade group grow guess halve has head hide hold
-identify ignore import impose improve insert integrate interpolate interpret interrupt intersect invert
+ identify ignore import impose improve insert integrate interpolate interpret interrupt intersect invert
  is iterate join judge keep kill label lead level limit link list listen load locate lock log lump main
  make mark mask match measure mend merge mesh minimise mix move multiply mute name normalise number
  observe offset open optimise order orient outline own pack page paint pair parse place plan plot pool

@@ -22,7 +22,7 @@ from keyed_studies import (
 from test_study_docs import KEYS
 
 from limbfit.errors import StudyError
-from limbfit.study.unused_keys import VAIN, VAIN_OF_SITE
+from limbfit.study.unused_keys import UNUSED_KEYS, UNUSED_SITE_KEYS
 
 # Studies that state a key in vain: what is set in which study, and the key that is refused.
 AMPUTATED = ("geometry.amputation", {"point": [0.0, 0.0, 0.0]})
@@ -209,9 +209,9 @@ def test_a_key_without_effect_is_refused(folder: Path, content: Any, changes: An
 
 def test_every_refusal_is_tried() -> None:
     tried = {key for _, _, key in IN_VAIN}
-    stated = {key for rule in VAIN for key in rule.keys}
+    stated = {key for rule in UNUSED_KEYS for key in rule.keys}
     by_name = {"mesh.accuracy", "indenters.ball.edge_radius_mm"}
-    assert stated | {f"sites.{rule.key}" for rule in VAIN_OF_SITE} | by_name == tried
+    assert stated | {f"sites.{rule.key}" for rule in UNUSED_SITE_KEYS} | by_name == tried
 
 
 def test_what_an_amputation_takes_is_not_in_vain(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Reading a study; what is wrong with it is told with file, key and remedy."""
+"""Reading a study; errors name the file, the key and the remedy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..anatomy.sites.markups import read_markups
 from ..errors import StudyError
 from ..extensions import load_extensions
 from .study import Study
-from .unused_keys import refuse_vain
+from .unused_keys import check_unused_keys
 
 
 def load_study(path: str | Path, *, recorded: bool = True) -> Study:
@@ -41,13 +41,16 @@ def load_study(path: str | Path, *, recorded: bool = True) -> Study:
     _load_extensions(content, file)
     try:
         study = Study(**content, file=file, notes=notes)
-        idle = [name for name in study.indenters if name not in study.used_indenters]
-        told = [f"indenters.{name}: no record names it; only limbfit design --protocol does" for name in idle]
-        study = study.model_copy(update={"notes": (*notes, *told)})
+        unused = [name for name in study.indenters if name not in study.used_indenters]
+        what = "no record names it; only limbfit design --protocol does"
+        notes = (*notes, *(f"indenters.{name}: {what}" for name in unused))
+        study = study.model_copy(update={"notes": notes})
     except ValidationError as error:
         raise _build_study_error(error, file) from None
-    _check_paths(study, recorded)
-    refuse_vain(study, content)
+    for place, path in study.inputs.items():
+        if (recorded or not place.startswith(("sites.", "records."))) and not study.path(path).exists():
+            raise StudyError(f"{path} does not exist", file=file, place=place)
+    check_unused_keys(study, content)
     return study
 
 
@@ -90,25 +93,15 @@ def _load_extensions(content: dict[str, Any], file: Path) -> None:
     """Run the study's own Python files; what is malformed is left for the check of the types to refuse."""
     table = content.get("study")
     named = table.get("extensions", []) if isinstance(table, dict) else []
-    if isinstance(named, list) and all(isinstance(one, str) for one in named):
-        load_extensions(file.parent / one for one in named)
+    if isinstance(named, list) and all(isinstance(name, str) for name in named):
+        load_extensions(file.parent / name for name in named)
 
 
 def _build_study_error(error: ValidationError, file: Path) -> StudyError:
     first = error.errors()[0]
     place = ".".join(str(part) for part in first["loc"]) or None
     more = len(error.errors()) - 1
-    what = first["msg"].removeprefix("Value error, ")
+    what, remedy = first["msg"].removeprefix("Value error, "), None
     if first["type"] == "extra_forbidden":
-        what = "unknown key"
-    remedy = "see docs/study.md for the keys" if first["type"] == "extra_forbidden" else None
+        what, remedy = "unknown key", "see docs/study.md for the keys"
     return StudyError(what + (f" (and {more} more)" if more else ""), file=file, place=place, remedy=remedy)
-
-
-def _check_paths(study: Study, recorded: bool) -> None:
-    """Every input that the study names must exist before anything runs."""
-    for place, path in study.inputs.items():
-        if not recorded and place.startswith(("sites.", "records.")):
-            continue
-        if not study.path(path).exists():
-            raise StudyError(f"{path} does not exist", file=study.file, place=place)

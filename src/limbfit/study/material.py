@@ -19,7 +19,7 @@ _ENDS: tuple[End, ...] = ("lower", "start", "upper")
 
 
 class TissueRange(TomlTable):
-    """Where one tissue's start or bounds differ from those of all; what is not named here stays."""
+    """Start and bounds of one tissue that differ from those of all tissues."""
 
     start: dict[str, Positive] = Field(default={})
     lower: dict[str, Positive] = Field(default={})
@@ -33,7 +33,7 @@ class ActivationTable(TomlTable):
     share: tuple[Annotated[float, Field(ge=0)], ...]
 
     @model_validator(mode="after")
-    def _in_order(self) -> ActivationTable:
+    def _check_order(self) -> ActivationTable:
         times = self.time_s
         if len(times) < 2 or len(times) != len(self.share):
             raise ValueError("give two or more times in time_s, and as many shares")
@@ -91,8 +91,8 @@ class MaterialTable(TomlTable):
 
     @model_validator(mode="before")
     @classmethod
-    def _filled(cls, content: Any) -> Any:
-        """What the law says where the study says nothing; what is malformed is left to be refused."""
+    def _fill_from_law(cls, content: Any) -> Any:
+        """Fill in what the law says and the study leaves out; what is malformed is refused later."""
         name = content.get("law", OGDEN) if isinstance(content, dict) else None
         if not isinstance(name, str):
             return content
@@ -107,7 +107,7 @@ class MaterialTable(TomlTable):
 
     @field_validator("fibres")
     @classmethod
-    def _directed(cls, fibres: dict[str, Any]) -> dict[str, Any]:
+    def _check_directions(cls, fibres: dict[str, Any]) -> dict[str, Any]:
         for tissue, direction in fibres.items():
             if not any(direction):
                 raise ValueError(f'{tissue}: a direction of no length; give [x, y, z], "axis" or "flow"')
@@ -115,7 +115,7 @@ class MaterialTable(TomlTable):
 
     @field_validator("relaxation_span_s")
     @classmethod
-    def _spanned(cls, span: tuple[float, float]) -> tuple[float, float]:
+    def _check_span(cls, span: tuple[float, float]) -> tuple[float, float]:
         try:
             choose_relaxation_times(*span)
         except InputError as error:
@@ -124,7 +124,7 @@ class MaterialTable(TomlTable):
 
     @field_validator("kappa_ratio")
     @classmethod
-    def _nearly_incompressible(cls, ratio: float) -> float:
+    def _check_kappa_ratio(cls, ratio: float) -> float:
         low, high = KAPPA_RATIO
         if ratio < low:
             raise ValueError(
@@ -139,7 +139,7 @@ class MaterialTable(TomlTable):
         return ratio
 
     @model_validator(mode="after")
-    def _ordered(self) -> MaterialTable:
+    def _check_bounds(self) -> MaterialTable:
         for tissue in ("", *self.tissues):
             lower, start, upper = (self.of(tissue, which) for which in _ENDS)
             place = f"tissues.{tissue}." if tissue else ""
@@ -159,16 +159,11 @@ class MaterialTable(TomlTable):
     def check_tissues(self, tissues: tuple[str, ...], stretched: tuple[str, ...]) -> None:
         """Raise `ValueError` where a tissue is named that the model has not, or that cannot
         be ``stretched`` at rest, or where bounds do not meet."""
-        unknown = [tissue for tissue in self.tissues if tissue not in tissues]
-        if unknown:
-            known = ", ".join(tissues)
-            raise ValueError(
-                f"material.tissues.{unknown[0]}: the model has no such tissue; its tissues are {known}"
-            )
-        for tissue in self.fibres:
-            if tissue not in tissues:
-                known = ", ".join(tissues)
-                raise ValueError(f"material.fibres.{tissue}: no such tissue; the tissues are {known}")
+        for key, named in (("tissues", self.tissues), ("fibres", self.fibres)):
+            for tissue in named:
+                if tissue not in tissues:
+                    what = f"material.{key}.{tissue}: no such tissue"
+                    raise ValueError(f"{what}; its tissues are {', '.join(tissues)}")
         for tissue in self.prestretch:
             if tissue not in stretched:
                 raise ValueError(

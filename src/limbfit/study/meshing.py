@@ -10,73 +10,70 @@ from pydantic import Field, model_validator
 
 from .tables import Positive, TomlTable
 
-MOST_CELLS = 3e6  # some 4 million nodes: more than a workstation solves
-_LIMB_MM = 80.0  # the farthest tissue from a site that counts
+MAX_CELLS = 3e6  # some 4 million nodes: more than a workstation solves
+_MAX_DISTANCE_MM = 80.0  # the farthest tissue from a site that counts
 _DEPTH_RATIO = 1.5  # the fine zone is an ellipsoid, shallower than wide by this ratio
 _CELLS_PER_CUBE = 6.0 * np.sqrt(2.0)  # regular tetrahedra in the cube of their edge
 
 
 def estimate_cells(edge_near_mm: float, edge_far_mm: float, near_radius_mm: float, growth: float) -> float:
-    """About how many tetrahedra the mesh of a site has: those that fill half an ellipsoid around it."""
-    radius = np.linspace(0.0, _LIMB_MM, 2001)
+    """Estimate how many tetrahedra the mesh of a site has: those that fill half an ellipsoid around it."""
+    radius = np.linspace(0.0, _MAX_DISTANCE_MM, 2001)
     edge = np.minimum(edge_near_mm + growth * np.maximum(radius - near_radius_mm, 0.0), edge_far_mm)
     volume = np.diff(2.0 / 3.0 * np.pi * radius**3 / _DEPTH_RATIO)
     return float(np.sum(volume * _CELLS_PER_CUBE / ((edge[1:] + edge[:-1]) / 2) ** 3))
 
 
 def find_smallest_edge_mm(edge_far_mm: float, near_radius_mm: float, growth: float) -> float:
-    """The shortest ``edge_near_mm`` that keeps a mesh within ``MOST_CELLS``; the far edge follows it down."""
+    """Find the shortest ``edge_near_mm`` that keeps a mesh within `MAX_CELLS`; the far edge follows."""
     edges = np.geomspace(0.01, 20.0, 400)
     cells = [estimate_cells(e, max(edge_far_mm, e), near_radius_mm, growth) for e in edges]
-    return float(edges[np.argmax(np.array(cells) <= MOST_CELLS)])
+    return float(edges[np.argmax(np.array(cells) <= MAX_CELLS)])
 
 
-def _refuse_too_many(table: CoarseMeshTable | MeshTable) -> None:
+def _check_cell_count(table: CoarseMeshTable | MeshTable) -> None:
+    """Refuse edge lengths that make more than `MAX_CELLS` cells per site."""
     far, radius, growth = table.edge_far_mm, table.near_radius_mm, table.growth
     cells = estimate_cells(table.edge_near_mm, far, radius, growth)
-    if cells <= MOST_CELLS:
+    if cells <= MAX_CELLS:
         return
     counted = f"{cells / 1e9:.2g} billion" if cells > 5e8 else f"{cells / 1e6:.2g} million"
     where = f"edge_near_mm = {table.edge_near_mm:g} with edge_far_mm = {far:g}"
     least = find_smallest_edge_mm(far, radius, growth)
     finest = np.ceil(100 * least) / 100
     raise ValueError(
-        f"{where} makes about {counted} cells per site, and {MOST_CELLS / 1e6:g} million are the most; give "
+        f"{where} makes about {counted} cells per site, and {MAX_CELLS / 1e6:g} million are the most; give "
         f"edge_near_mm of {finest:g} or more (edge_far_mm no less), or a smaller near_radius_mm"
     )
 
 
-def _list_edges(near: float, far: float, radius: float, growth: float, flatness: float) -> dict[str, float]:
-    return {
-        "edge_near_mm": near,
-        "edge_far_mm": far,
-        "near_radius_mm": radius,
-        "growth": growth,
-        "flatness": flatness,
-    }
+def _to_edges(*values: float) -> dict[str, float]:
+    return dict(zip(("edge_near_mm", "edge_far_mm", "near_radius_mm", "growth", "flatness"), values))
 
 
 # What ``mesh.accuracy`` stands for: a site's own mesh, and a coarse one where that is much cheaper. Edges far
 # from the indenter, where tissue hardly strains, cost unknowns and change the force little
 # (docs/convergence.md).
 ACCURACIES: Mapping[str, tuple[dict[str, float], dict[str, float] | None]] = {
-    "fast": (_list_edges(4.5, 30.0, 12.0, 0.9, 1.6), None),
-    "standard": (_list_edges(3.5, 30.0, 14.0, 0.6, 1.6), None),
-    "fine": (_list_edges(3.0, 24.0, 14.0, 0.6, 1.6), _list_edges(5.5, 30.0, 12.0, 0.9, 1.6)),
+    "fast": (_to_edges(4.5, 30.0, 12.0, 0.9, 1.6), None),
+    "standard": (_to_edges(3.5, 30.0, 14.0, 0.6, 1.6), None),
+    "fine": (_to_edges(3.0, 24.0, 14.0, 0.6, 1.6), _to_edges(5.5, 30.0, 12.0, 0.9, 1.6)),
 }
-_OWN = ACCURACIES["standard"][0]
-USUAL_MM = 20.0  # width of the indenter for which those edges are made
+_DEFAULT_EDGES = ACCURACIES["standard"][0]
+REFERENCE_WIDTH_MM = 20.0  # width of the indenter for which those edges are made
 
 
-def list_stated_widths(content: Mapping[str, Any]) -> list[float]:
-    """Widths of the indenters of a study file's ``content``, mm; its tables refuse those that are none."""
+def list_indenter_widths(content: Mapping[str, Any]) -> list[float]:
+    """List the indenter widths, mm, in a study file's ``content``; its tables refuse malformed ones."""
     more = content.get("indenters", {})
     tables = [content.get("indenter", {}), *(more.values() if isinstance(more, Mapping) else ())]
-    widths = [table.get("width_mm", USUAL_MM) for table in tables if isinstance(table, Mapping)]
-    return [float(width) for width in widths if isinstance(width, int | float) and width > 0] or [USUAL_MM]
+    widths = [table.get("width_mm", REFERENCE_WIDTH_MM) for table in tables if isinstance(table, Mapping)]
+    return [float(width) for width in widths if isinstance(width, int | float) and width > 0] or [
+        REFERENCE_WIDTH_MM
+    ]
 
 
-def replace_edges(mesh: Any, widths_mm: Sequence[float] = (USUAL_MM,)) -> Any:
+def replace_edges(mesh: Any, widths_mm: Sequence[float] = (REFERENCE_WIDTH_MM,)) -> Any:
     """The table ``mesh`` as stated, with the edge lengths that it leaves open.
 
     They are those of its accuracy. Near a site they are as much shorter as the narrowest of ``widths_mm`` is
@@ -84,18 +81,18 @@ def replace_edges(mesh: Any, widths_mm: Sequence[float] = (USUAL_MM,)) -> Any:
     """
     if not isinstance(mesh, Mapping):  # a table already, or nothing that could be one
         return mesh
-    narrow, wide = (min(1.0, width / USUAL_MM) for width in (min(widths_mm), max(widths_mm)))
+    narrow, wide = (min(1.0, width / REFERENCE_WIDTH_MM) for width in (min(widths_mm), max(widths_mm)))
 
     def suited(edges: Mapping[str, float]) -> dict[str, float]:
         near, radius = narrow * edges["edge_near_mm"], wide * edges["near_radius_mm"]
         return {**edges, "edge_near_mm": round(near, 3), "near_radius_mm": round(radius, 3)}
 
-    own, second = ACCURACIES.get(str(mesh.get("accuracy", "standard")), ACCURACIES["standard"])
+    fine, second = ACCURACIES.get(str(mesh.get("accuracy", "standard")), ACCURACIES["standard"])
     coarse = None if second is None else suited(second)
     near = mesh.get("edge_near_mm", 0.0)
     if coarse and isinstance(near, int | float) and near >= coarse["edge_near_mm"]:
         coarse = None  # it would be no coarser
-    return {**suited(own), "coarse": coarse, **mesh}
+    return {**suited(fine), "coarse": coarse, **mesh}
 
 
 class CoarseMeshTable(TomlTable):
@@ -108,8 +105,8 @@ class CoarseMeshTable(TomlTable):
     flatness: Annotated[float, Field(ge=1, le=2)] = 1.6
 
     @model_validator(mode="after")
-    def _few_enough(self) -> CoarseMeshTable:
-        _refuse_too_many(self)
+    def _check_size(self) -> CoarseMeshTable:
+        _check_cell_count(self)
         return self
 
 
@@ -124,27 +121,27 @@ class MeshTable(TomlTable):
     accuracy: Literal["fast", "standard", "fine"] = Field(default="standard", exclude=True)  # edges say it
 
     element: Literal["tet4", "tet10", "tet10p0"] = "tet10p0"
-    edge_near_mm: Positive = _OWN["edge_near_mm"]
-    edge_far_mm: Positive = _OWN["edge_far_mm"]
-    near_radius_mm: Positive = _OWN["near_radius_mm"]
-    growth: Positive = _OWN["growth"]
-    flatness: Annotated[float, Field(ge=1, le=2)] = _OWN["flatness"]
+    edge_near_mm: Positive = _DEFAULT_EDGES["edge_near_mm"]
+    edge_far_mm: Positive = _DEFAULT_EDGES["edge_far_mm"]
+    near_radius_mm: Positive = _DEFAULT_EDGES["near_radius_mm"]
+    growth: Positive = _DEFAULT_EDGES["growth"]
+    flatness: Annotated[float, Field(ge=1, le=2)] = _DEFAULT_EDGES["flatness"]
     engine: Literal["mmg", "netgen"] = "mmg"
     time_limit_s: Positive = 600.0
     coarse: CoarseMeshTable | None = None
 
     @model_validator(mode="before")
     @classmethod
-    def _from_accuracy(cls, given: Any) -> Any:
+    def _fill_edges(cls, given: Any) -> Any:
         return replace_edges(given)
 
     @model_validator(mode="after")
-    def _few_enough(self) -> MeshTable:
-        _refuse_too_many(self)
+    def _check_size(self) -> MeshTable:
+        _check_cell_count(self)
         return self
 
-    def stands_for(self, widths_mm: Sequence[float]) -> str | None:
-        """The ``accuracy`` whose edges for such indenters these are; none where the study states others."""
+    def find_accuracy(self, widths_mm: Sequence[float]) -> str | None:
+        """Find the ``accuracy`` that has these edges for such indenters; None if the study states others."""
         apart = {"element", "engine", "time_limit_s"}
         edges = self.model_dump(exclude=apart)
         for name in ACCURACIES:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -16,8 +16,8 @@ RECORDED = ("trace", "ultrasound", "surface", "shear_waves")  # files of a recor
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$"
 
 
-class _Stated(TomlTable):
-    """What is stated of a record, at its site or in a table of its own.
+class _RecordKeys(TomlTable):
+    """The keys of a record, stated at its site or in a table of its own.
 
     ``touch_down_s`` and ``peak_s`` are times of the record, where it is not to be left to limbfit to find
     them. ``indenter`` is a name in ``[indenters]``; None: the one of ``[indenter]``. ``control`` is what was
@@ -45,13 +45,13 @@ class _Stated(TomlTable):
     shear_waves_bias_m_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.1
 
     @model_validator(mode="after")
-    def _in_order(self) -> _Stated:
+    def _check_order(self) -> _RecordKeys:
         if None not in (self.touch_down_s, self.peak_s) and self.touch_down_s >= self.peak_s:  # type: ignore[operator]
             raise ValueError("touch_down_s must come before peak_s")
         return self
 
 
-class Site(_Stated):
+class Site(_RecordKeys):
     """An indentation site, with its record where it has one only; more are `RecordTable`.
 
     ``position`` is a point on the skin (LPS mm); ``near`` is a rough one that is matched to a marker.
@@ -71,7 +71,7 @@ class Site(_Stated):
     edge: Vector | None = None
 
     @model_validator(mode="after")
-    def _one_place(self) -> Site:
+    def _check_place(self) -> Site:
         if (self.position is None) == (self.near is None):
             raise ValueError("give either position (on the skin) or near (to be matched to a marker)")
         for key in ("touch_down_s", "peak_s", "ultrasound", "surface", "shear_waves"):
@@ -80,7 +80,7 @@ class Site(_Stated):
         return self
 
 
-class RecordTable(_Stated):
+class RecordTable(_RecordKeys):
     """A record of ``site``, beside others there; ``name`` is its own among those.
 
     ``depth_mm``, ``speed_mm_s`` and ``hold_s`` are how it is to be made, where not as `AcquireTable` states.
@@ -94,7 +94,7 @@ class RecordTable(_Stated):
 
     @field_validator("name")
     @classmethod
-    def _free(cls, name: str) -> str:
+    def _check_name(cls, name: str) -> str:
         if name == "raw":
             raise ValueError("'raw' is what limbfit calls a record as it was recorded; give another name")
         return name
@@ -131,23 +131,23 @@ class Record:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """What was recorded: the trace, and what was seen meanwhile."""
+        """The files of the record: the trace, and those measured beside it."""
         return tuple(file for key in RECORDED if (file := getattr(self, key)) is not None)
 
     @property
     def observed(self) -> str:
-        """What there is beside the force, in a word; empty where there is nothing."""
+        """The kind of measurement beside the force; empty if there is none."""
         kinds = {"ultrasound": "ultrasound", "surface": "surface displacement", "shear_waves": "shear waves"}
         return next((word for key, word in kinds.items() if getattr(self, key) is not None), "")
 
     @property
     def forced(self) -> bool:
-        """Whether a force drove the indenter, so that depths are compared."""
+        """True if a force drove the indenter, so that depths are compared."""
         return self.control == "force"
 
     @property
     def unit(self) -> Literal["N", "mm"]:
-        """Of what is compared."""
+        """The unit of what is compared."""
         return "mm" if self.forced else "N"
 
     @property
@@ -168,38 +168,19 @@ Indentation = Record | Site  # a site is one where it plans an indentation
 
 
 def list_records(site: Site, tables: tuple[RecordTable, ...]) -> tuple[Record, ...]:
-    """The records of a site: its own, then those of the study's tables that name it."""
-    stated: list[tuple[str, str, _Stated | RecordTable]] = []
+    """List the records of a site: its own, then those of the study's tables that name it."""
+    sources: list[tuple[str, str, _RecordKeys]] = []
     if site.trace is not None:
-        stated.append((site.name, f"sites.{site.name}", site))
+        sources.append((site.name, f"sites.{site.name}", site))
     for table in tables:
         if table.site == site.name:
             name = f"{site.name}-{table.name}"
-            stated.append((name, f"records.{name}", table))
-    found = []
-    for name, key, one in stated:
-        if one.trace is not None:
-            record = Record(
-                name,
-                site,
-                one.trace,
-                key,
-                one.touch_down_s,
-                one.peak_s,
-                one.indenter,
-                one.control,
-                len(stated),
-                ultrasound=one.ultrasound,
-                ultrasound_sd_mm=one.ultrasound_sd_mm,
-                surface=one.surface,
-                surface_sd_mm=one.surface_sd_mm,
-                surface_frame=one.surface_frame,
-                shear_waves=one.shear_waves,
-                shear_waves_sd_m_s=one.shear_waves_sd_m_s,
-                shear_waves_bias_m_s=one.shear_waves_bias_m_s,
-            )
-            if isinstance(one, RecordTable):
-                depth, speed, hold = one.depth_mm, one.speed_mm_s, one.hold_s
-                record = replace(record, depth_mm=depth, speed_mm_s=speed, hold_s=hold)
-            found.append(record)
-    return tuple(found)
+            sources.append((name, f"records.{name}", table))
+    records = []
+    for name, key, source in sources:
+        fields = [field for field in _RecordKeys.model_fields if field != "name"]
+        if isinstance(source, RecordTable):  # of a site they plan an indentation without a record
+            fields += ["depth_mm", "speed_mm_s", "hold_s"]
+        values: dict[str, Any] = {field: getattr(source, field) for field in fields}
+        records.append(Record(name, site, key=key, of_site=len(sources), **values))
+    return tuple(records)

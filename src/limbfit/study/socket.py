@@ -18,7 +18,7 @@ class DesignRegionTable(TomlTable):
     limit_kPa: Positive | None = None
 
     @model_validator(mode="after")
-    def _says_something(self) -> DesignRegionTable:
+    def _check_content(self) -> DesignRegionTable:
         if self.pressure_kPa is None and self.limit_kPa is None:
             raise ValueError("give pressure_kPa, limit_kPa or both")
         return self
@@ -37,7 +37,7 @@ class SocketDesignTable(TomlTable):
     adapter_mm: Annotated[float, Field(ge=1, le=60)] = 8.0
 
     @model_validator(mode="after")
-    def _regions_differ(self) -> SocketDesignTable:
+    def _check_regions(self) -> SocketDesignTable:
         names = [one.region for one in self.regions]
         doubled = sorted({name for name in names if names.count(name) > 1})
         if doubled:
@@ -84,7 +84,7 @@ class SocketAreaTable(TomlTable):
     depth_mm: Annotated[float, Field(ge=-20, le=20)]
 
     @model_validator(mode="after")
-    def _one_place(self) -> SocketAreaTable:
+    def _check_place(self) -> SocketAreaTable:
         if (self.position is None) == (self.region is None):
             raise ValueError("give either position (LPS, mm) or region")
         return self
@@ -110,7 +110,7 @@ class SocketLoadTable(TomlTable):
     hold_s: Length = 2.0
 
     @model_validator(mode="after")
-    def _one_kind(self) -> SocketLoadTable:
+    def _check_kind(self) -> SocketLoadTable:
         if (self.preset is None) == (self.force_N is None):
             raise ValueError(f"give either preset ({', '.join(get_args(Preset))}) or force_N")
         if self.preset is not None and "moment_Nmm" in self.model_fields_set:
@@ -153,7 +153,7 @@ class SocketTable(TomlTable):
     design: SocketDesignTable = SocketDesignTable()
 
     @model_validator(mode="after")
-    def _trimmed_once(self) -> SocketTable:
+    def _check_trim(self) -> SocketTable:
         stated = [
             key for key in ("trim_mm", "trim_planes", "trimline") if getattr(self, key) not in (None, ())
         ]
@@ -164,7 +164,7 @@ class SocketTable(TomlTable):
         return self
 
     @model_validator(mode="after")
-    def _names_differ(self) -> SocketTable:
+    def _check_names(self) -> SocketTable:
         for kind in ("areas", "loads", "regions"):
             names = [one.name for one in getattr(self, kind)]
             doubled = sorted({name for name in names if names.count(name) > 1})
@@ -173,7 +173,7 @@ class SocketTable(TomlTable):
         return self
 
     @model_validator(mode="after")
-    def _mesh_is_no_finer_than_the_face(self) -> SocketTable:
+    def _check_edge_length(self) -> SocketTable:
         if self.edge_mm is not None and self.edge_mm < 0.5 * self.face_edge_mm:
             raise ValueError("edge_mm is shorter than half of face_edge_mm: the face would show its facets")
         return self

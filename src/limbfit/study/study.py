@@ -24,7 +24,7 @@ from ..laws import (
 )
 from ..priors import of_tissues
 from .material import MaterialTable
-from .meshing import MeshTable, list_stated_widths, replace_edges
+from .meshing import MeshTable, list_indenter_widths, replace_edges
 from .records import RECORDED, Indentation, Record, RecordTable, Site, list_records
 from .socket import SocketTable
 from .tables import (
@@ -78,8 +78,8 @@ class Study(TomlTable):
 
     @model_validator(mode="before")
     @classmethod
-    def _suit_the_mesh(cls, given: dict[str, Any]) -> dict[str, Any]:
-        return {**given, "mesh": replace_edges(given.get("mesh", {}), list_stated_widths(given))}
+    def _fill_mesh_edges(cls, content: dict[str, Any]) -> dict[str, Any]:
+        return {**content, "mesh": replace_edges(content.get("mesh", {}), list_indenter_widths(content))}
 
     @property
     def folder(self) -> Path:
@@ -155,12 +155,12 @@ class Study(TomlTable):
 
     @property
     def used_indenters(self) -> dict[str | None, IndenterTable]:
-        """Of `all_indenters` those that touch somewhere."""
+        """Those of `all_indenters` that touch somewhere."""
         used = {one.indenter for one in self.indentations}
         return {name: one for name, one in self.all_indenters.items() if name in used}
 
     def indenters_at(self, site: Site) -> tuple[IndenterTable, ...]:
-        """All that touch at a site."""
+        """The indenters that touch at a site."""
         return tuple(self.all_indenters[one.indenter] for one in self.records_at(site) or (site,))
 
     def width_at(self, site: Site) -> float:
@@ -182,7 +182,7 @@ class Study(TomlTable):
 
     @property
     def priors(self) -> dict[str, PriorTable]:
-        """What is known of parameters beforehand, by name: what is stated, else what people are like."""
+        """The priors of parameters by name: those stated, else those of people."""
         table, people = self.calibration, {}
         if table.priors is not None:
             known = of_tissues(self.tissues, table.prior_tissues)
@@ -195,13 +195,13 @@ class Study(TomlTable):
 
     @property
     def within_mm(self) -> float | None:
-        """How far from a site its mesh counts where parameters are searched; None: as far as it goes."""
+        """Radius, mm, of the mesh around a site on which parameters are searched; None: the whole mesh."""
         whole = self.clamps is not None or self.material.prestretch  # of which parts do not keep what it is
         return None if whole else self.calibration.search_radius_mm or None
 
     @property
     def is_searched_apart(self) -> bool:
-        """Whether parameters are searched on something smaller than the study's own meshes."""
+        """True if parameters are searched on coarser or smaller meshes than the final answer's."""
         return self.mesh.coarse is not None or self.within_mm is not None
 
     @property
@@ -231,7 +231,7 @@ class Study(TomlTable):
         return self.folder / relative
 
     def is_recorded(self, site: Site) -> bool:
-        """Whether all records that a site names have been made."""
+        """True if all records that a site names have been made."""
         records = self.records_at(site)
         return bool(records) and all(self.path(record.trace).is_file() for record in records)
 
@@ -264,7 +264,7 @@ class Study(TomlTable):
 
     @field_validator("sites")
     @classmethod
-    def _sites(cls, sites: tuple[Site, ...]) -> tuple[Site, ...]:
+    def _check_sites(cls, sites: tuple[Site, ...]) -> tuple[Site, ...]:
         names = [site.name for site in sites]
         if not names:
             raise ValueError("the study has no site")
@@ -274,7 +274,7 @@ class Study(TomlTable):
         return sites
 
     @model_validator(mode="after")
-    def _records_of_sites(self) -> Study:
+    def _check_records(self) -> Study:
         names = [site.name for site in self.sites]
         for table in self.records:
             if table.site not in names:
@@ -299,7 +299,7 @@ class Study(TomlTable):
         return self
 
     @model_validator(mode="after")
-    def _forces_beside_depths(self) -> Study:
+    def _check_objective(self) -> Study:
         if self.calibration.objective != "paper":
             return self
         for record in self.recorded:
@@ -309,7 +309,7 @@ class Study(TomlTable):
         return self
 
     @model_validator(mode="after")
-    def _held_under_displacement(self) -> Study:
+    def _check_control(self) -> Study:
         forced = [record.name for record in self.recorded if record.forced]
         material = self.material
         states = {"clamps": self.clamps, "contraction": material.course, "pre-stretch": material.prestretch}
@@ -319,7 +319,7 @@ class Study(TomlTable):
         return self
 
     @model_validator(mode="after")
-    def _strained_unseen(self) -> Study:
+    def _check_secondary_measurements(self) -> Study:
         taut, tense = self.material.prestretch, self.material.course
         for one in self.recorded:
             if (taut and one.observed) or (tense and one.shear_waves):
@@ -329,7 +329,7 @@ class Study(TomlTable):
         return self
 
     @model_validator(mode="after")
-    def _indenters_of_records(self) -> Study:
+    def _check_indenters(self) -> Study:
         named = [(f"sites.{site.name}", site.indenter) for site in self.sites]
         named += [(f"records.{table.site}-{table.name}", table.indenter) for table in self.records]
         for place, name in named:
@@ -339,13 +339,13 @@ class Study(TomlTable):
         return self
 
     @model_validator(mode="after")
-    def _materials_of_tissues(self) -> Study:
+    def _check_materials(self) -> Study:
         layers = [layer.name for layer in self.geometry.model_layers]
         self.material.check_tissues(self.tissues, tuple(dict.fromkeys((*layers, *self.fibres))))
         return self
 
     @model_validator(mode="after")
-    def _parameters_of_tissues(self) -> Study:
+    def _check_parameters(self) -> Study:
         known = [f"{tissue}.{name}" for tissue, name in self.parameters]
         for name in self.calibration.named:
             if name not in known:
@@ -353,7 +353,7 @@ class Study(TomlTable):
         return self
 
     @model_validator(mode="after")
-    def _priors_of_people(self) -> Study:
+    def _check_priors(self) -> Study:
         if self.calibration.priors is None:
             return self
         if not is_ogden(self.material.law):
@@ -368,7 +368,7 @@ class Study(TomlTable):
         return self
 
     @model_validator(mode="after")
-    def _mesher_of_regions(self) -> Study:
+    def _check_mesher(self) -> Study:
         if self.geometry.regions and self.mesh.engine != "mmg":
             raise ValueError(
                 f'mesh.engine = "{self.mesh.engine}" cannot mesh geometry.regions; choose "mmg", or leave '
@@ -377,7 +377,7 @@ class Study(TomlTable):
         return self
 
     @model_validator(mode="after")
-    def _one_door(self) -> Study:
+    def _check_source(self) -> Study:
         if (self.image is None) == (self.surfaces is None):
             raise ValueError("give either [image] or [surfaces], not both")
         if self.surfaces is not None and any(layer.thickness for layer in self.geometry.layers):

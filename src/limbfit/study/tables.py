@@ -21,15 +21,15 @@ from ..errors import InputError
 from ..shapes import SHAPES, Size
 
 
-def _check(value: Any) -> Any:
-    """One line for all that it cannot be, instead of one for each kind of value."""
+def _check_friction(value: Any) -> Any:
+    """Refuse a value in one line, instead of one for each type that it might have."""
     number = isinstance(value, int | float) and not isinstance(value, bool) and 0.0 <= value < math.inf
     if not number and value not in ("frictionless", "sticky"):
         raise ValueError(f'{value!r} is not "frictionless", "sticky" or a coefficient from 0 on')
     return value
 
 
-Friction = Annotated[Literal["frictionless", "sticky"] | float, BeforeValidator(_check)]
+Friction = Annotated[Literal["frictionless", "sticky"] | float, BeforeValidator(_check_friction)]
 
 
 Vector = tuple[float, float, float]
@@ -64,7 +64,7 @@ class ImageTable(TomlTable):
     markers_series: str | None = None
 
     @model_validator(mode="after")
-    def _series_of_an_image(self) -> ImageTable:
+    def _check_series(self) -> ImageTable:
         if self.markers_series is not None and self.marked is None:
             raise ValueError("markers_series belongs to a second image: give its folder as markers")
         return self
@@ -89,7 +89,7 @@ class SegmentationTable(TomlTable):
     min_bone_volume_mm3: Positive = 1000.0
 
     @model_validator(mode="after")
-    def _one_source(self) -> SegmentationTable:
+    def _check_source(self) -> SegmentationTable:
         if self.labels is not None and self.contours is not None:
             raise ValueError("give either labels or contours")
         empty = [name for name, points in self.seeds.items() if not points]
@@ -99,7 +99,7 @@ class SegmentationTable(TomlTable):
 
     @property
     def is_given(self) -> bool:
-        """Whether the study brings its own labels."""
+        """True if the study brings its own labels."""
         return self.labels is not None or self.contours is not None
 
 
@@ -142,7 +142,7 @@ class Layer(TomlTable):
     min_thickness_mm: Positive = 1.0
 
     @model_validator(mode="after")
-    def _one_thickness(self) -> Layer:
+    def _check_thickness(self) -> Layer:
         if (self.thickness_mm is None) == (self.thickness is None):
             raise ValueError('give either thickness_mm or thickness = "map"')
         if self.thickness is None and "min_thickness_mm" in self.model_fields_set:
@@ -162,7 +162,7 @@ class RegionTable(TomlTable):
     surface: Path | None = None
 
     @model_validator(mode="after")
-    def _one_source(self) -> RegionTable:
+    def _check_source(self) -> RegionTable:
         if (self.label is None) == (self.surface is None):
             raise ValueError("give either label (of the label map) or surface (a file)")
         return self
@@ -186,7 +186,7 @@ class GeometryTable(TomlTable):
     surface_edge_mm: Positive = 3.0
 
     @model_validator(mode="after")
-    def _layers(self) -> GeometryTable:
+    def _check_layers(self) -> GeometryTable:
         if "layers" in self.model_fields_set and not self.layers:
             raise ValueError("layers is empty; a model has one layer of tissue or more over its core")
         if self.layers and "skin_layer_mm" in self.model_fields_set:
@@ -228,7 +228,7 @@ class IndenterTable(TomlTable):
 
     @field_validator("shape")
     @classmethod
-    def _known(cls, name: str) -> str:
+    def _check_shape(cls, name: str) -> str:
         try:
             return SHAPES[name].name
         except InputError as error:
@@ -236,8 +236,8 @@ class IndenterTable(TomlTable):
 
     @model_validator(mode="before")
     @classmethod
-    def _measured(cls, content: Any) -> Any:
-        """With the measures that are left out; a key that is none of the shape's is refused."""
+    def _fill_measures(cls, content: Any) -> Any:
+        """Fill in the measures that are left out; refuse a key that is none of the shape's."""
         name = content.get("shape", cls.model_fields["shape"].default) if isinstance(content, dict) else None
         if name not in SHAPES.names:
             return content
@@ -249,7 +249,7 @@ class IndenterTable(TomlTable):
         return usual | content
 
     @model_validator(mode="after")
-    def _edge_fits(self) -> IndenterTable:
+    def _check_edge(self) -> IndenterTable:
         shape = SHAPES[self.shape]
         if (self.file is not None) != shape.needs_file:
             those = " or ".join(f'"{one.name}"' for one in SHAPES if one.needs_file)
@@ -313,7 +313,7 @@ class CalibrationTable(TomlTable):
     correction_tolerance_percent: Positive = 0.1
 
     @model_validator(mode="after")
-    def _constraints(self) -> CalibrationTable:
+    def _check_constraints(self) -> CalibrationTable:
         if self.answer == "most probable" and self.is_papers:
             raise ValueError('answer = "most probable" is not the paper\'s; leave objective and stopping out')
         names = [name for group in self.tied for name in group]
@@ -329,7 +329,7 @@ class CalibrationTable(TomlTable):
 
     @property
     def is_papers(self) -> bool:
-        """Whether anything of it is the paper's method."""
+        """True if any part of the calibration is the paper's method."""
         return "paper" in (self.objective, self.stopping)
 
     @property
@@ -428,7 +428,7 @@ class AcquireTable(TomlTable):
     key_gap_ms: Annotated[float, Field(ge=30, le=1000)] = 120.0
 
     @model_validator(mode="after")
-    def _below_the_limits(self) -> AcquireTable:
+    def _check_limits(self) -> AcquireTable:
         for name in ("clamp", "approach", "search", "ramp"):
             if getattr(self, f"{name}_speed_mm_s") > self.speed_limit_mm_s:
                 raise ValueError(f"{name}_speed_mm_s is over speed_limit_mm_s")
@@ -449,8 +449,8 @@ class AcquireTable(TomlTable):
         return self
 
 
-RING = 14  # pins of the device of the source paper (section 2.1), the test pin among them
-CLEAR = 1  # on either side of the test pin, off the skin, so that tissue can bulge
+RING_PINS = 14  # pins of the device of the source paper (section 2.1), the test pin among them
+FREE_NEIGHBOURS = 1  # on either side of the test pin, off the skin, so that tissue can bulge
 Angle = Annotated[float, Field(ge=-180.0, le=180.0)]
 
 
@@ -470,7 +470,7 @@ class ClampsTable(TomlTable):
 
     @field_validator("angles_degrees")
     @classmethod
-    def _apart(cls, angles: tuple[float, ...]) -> tuple[float, ...]:
+    def _check_angles(cls, angles: tuple[float, ...]) -> tuple[float, ...]:
         if len(set(angles)) < len(angles):
             raise ValueError("two pins are at one angle; give each angle once")
         if 0.0 in angles:
@@ -478,7 +478,7 @@ class ClampsTable(TomlTable):
         return angles
 
     @model_validator(mode="after")
-    def _one_level_each(self) -> ClampsTable:
+    def _check_levels(self) -> ClampsTable:
         if len(self.levels_mm) not in (1, len(self.angles)):
             raise ValueError(
                 f"levels_mm has {len(self.levels_mm)} levels for {len(self.angles)} pins; "
@@ -489,7 +489,7 @@ class ClampsTable(TomlTable):
     @property
     def angles(self) -> tuple[float, ...]:
         """Degrees of each pin, those stated or the paper's."""
-        usual = tuple(360.0 * k / RING for k in range(CLEAR + 1, RING - CLEAR))
+        usual = tuple(360.0 * k / RING_PINS for k in range(FREE_NEIGHBOURS + 1, RING_PINS - FREE_NEIGHBOURS))
         return self.angles_degrees or usual
 
     @property

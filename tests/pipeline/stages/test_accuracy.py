@@ -91,7 +91,7 @@ def test_a_finer_accuracy_has_more_cells(stated: Any) -> None:
     counts = []
     for name in ("fast", "standard", "fine"):
         table = stated(f'[mesh]\naccuracy = "{name}"\n').mesh
-        assert table.stands_for([20.0]) == name
+        assert table.find_accuracy([20.0]) == name
         counts.append(
             estimate_cells(table.edge_near_mm, table.edge_far_mm, table.near_radius_mm, table.growth)
         )

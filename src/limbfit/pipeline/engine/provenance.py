@@ -102,7 +102,7 @@ def record_settings(study: Study, digests: Mapping[str, str]) -> dict[str, Any]:
         if record["image"] and record["image"][key]:
             record["image"][key] = f"sha256:{compute_digest(record['image'][key])}"
     widths_mm = [indenter.width_mm for indenter in study.all_indenters.values()]
-    record["mesh"]["accuracy"] = study.mesh.stands_for(widths_mm)
+    record["mesh"]["accuracy"] = study.mesh.find_accuracy(widths_mm)
     control = StepControl()
     record["solver"] |= {key: getattr(control, key) for key in ("tolerance", "max_cuts", "penetration")}
     return record
