@@ -1,4 +1,4 @@
-"""What is pressed into a socket's face, or relieved, besides its reduction: round areas and whole regions."""
+"""Round areas and whole regions that are pressed into a socket's face, or relieved, besides its reduction."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError
 
-STEEPEST_SIDE = 1.717  # slope of (1 - r^2/R^2)^3, over depth and radius, at 1/sqrt(5) of the radius
-OFF_FACE_MM = 25.0  # the thickest liner between skin and socket, and some
-BESIDE_MM = 5.0  # a place so far beside the face is not on it
+MAX_SIDE_SLOPE = 1.717  # slope of (1 - r^2/R^2)^3, over depth and radius, at 1/sqrt(5) of the radius
+MAX_OFF_FACE_MM = 25.0  # the thickest liner between skin and socket, and some
+MAX_BESIDE_MM = 5.0  # a place so far beside the face is not on it
 
 
 def compute_area_weight(apart: Array, reach: float) -> Array:
@@ -52,8 +52,8 @@ class Area:
         apart = np.linalg.norm(points - np.asarray(self.position, dtype=float), axis=1)
         return self.depth_mm * compute_area_weight(apart, self.radius_mm)
 
-    def on(self, face: Surface) -> Area:
-        """With its middle on the drawn face (LPS), which a liner keeps off the skin.
+    def project_to(self, face: Surface) -> Area:
+        """Put its middle on the drawn face (LPS), which a liner keeps off the skin.
 
         Raises
         ------
@@ -62,14 +62,14 @@ class Area:
         """
         position = np.asarray(self.position, dtype=float)
         foot, beside, off = _project_to_face(position[None], face)
-        if beside[0] > max(BESIDE_MM, 0.25 * self.radius_mm) or off[0] > OFF_FACE_MM:
+        if beside[0] > max(MAX_BESIDE_MM, 0.25 * self.radius_mm) or off[0] > MAX_OFF_FACE_MM:
             raise SurfaceError(
                 f"area {self.name!r} lies {np.linalg.norm(position - foot[0]):.0f} mm off the socket's face",
                 remedy="give a position on the limb below the brim (LPS, mm), or move the trimline up",
             )
         return replace(self, position=foot[0])
 
-    def nearness(self, point: Array) -> float:
+    def compute_relative_distance(self, point: Array) -> float:
         """Distance of a point (3,) from its middle over its radius."""
         return float(np.linalg.norm(point - np.asarray(self.position)) / self.radius_mm)
 
@@ -110,8 +110,8 @@ class Zone:
         """(n,) of its depth at points (n, 3): 1 on the region, 0 beyond its reach."""
         return compute_area_weight(self._tree.query(points)[0], self.reach_mm)
 
-    def on(self, face: Surface) -> Zone:
-        """With its points on the drawn face (LPS); those beyond the brim are left out.
+    def project_to(self, face: Surface) -> Zone:
+        """Put its points on the drawn face (LPS); leave out those beyond the brim.
 
         Raises
         ------
@@ -119,7 +119,7 @@ class Zone:
             Where the whole region lies off the face.
         """
         feet, beside, off = _project_to_face(self.points, face)
-        under = (beside <= BESIDE_MM) & (off <= OFF_FACE_MM)
+        under = (beside <= MAX_BESIDE_MM) & (off <= MAX_OFF_FACE_MM)
         if not under.any():
             raise SurfaceError(
                 f"region {self.name!r} lies off the socket's face",
@@ -127,13 +127,13 @@ class Zone:
             )
         return replace(self, points=feet[under])
 
-    def nearness(self, point: Array) -> float:
+    def compute_relative_distance(self, point: Array) -> float:
         """Distance of a point (3,) from the region over its reach."""
         return float(self._tree.query(point)[0] / self.reach_mm)
 
 
 def _check_sides(name: str, width: str, depth_mm: float, reach_mm: float) -> None:
-    least = STEEPEST_SIDE * abs(depth_mm)
+    least = MAX_SIDE_SLOPE * abs(depth_mm)
     if least > reach_mm:
         raise SurfaceError(
             f"the sides of {name} would be steeper than 45 degrees",

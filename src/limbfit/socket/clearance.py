@@ -20,12 +20,12 @@ from .shape import close_by_fans
 Ints = NDArray[np.int64]
 
 CLEAR_MM = 0.5  # what is promised
-AIM_MM = 0.8  # what is aimed at where it is measured
-ROUNDS = 12
+TARGET_MM = 0.8  # what is aimed at where it is measured
+MAX_ROUNDS = 12
 
 
 def apply_clearance(points: Array, faces: Ints, limb: LimbProfile, outer: Surface, frame: Frame) -> Array:
-    """The points of a face (limb frame) where the face is clear of the limb by ``CLEAR_MM`` or more.
+    """Move the points of a face (limb frame) until it is clear of the limb by ``CLEAR_MM`` or more.
 
     Each stays on its ray and moves outwards only. What is measured are the face's points, middles of edges
     and faces, and the limb's points.
@@ -33,16 +33,18 @@ def apply_clearance(points: Array, faces: Ints, limb: LimbProfile, outer: Surfac
     Raises
     ------
     SurfaceError
-        Where that takes more than ``ROUNDS`` rounds.
+        Where that takes more than ``MAX_ROUNDS`` rounds.
     """
     local = Surface(frame.to_limb(outer.points), outer.faces)
     angle, station, radius = limb.rays.coordinates(points)
-    neighbours = _build_neighbours(faces, len(points))
-    radius = np.maximum(radius, limb.at(angle, station) + AIM_MM)
-    for _ in range(ROUNDS):
+    edges = find_half_edges(faces)
+    both = np.vstack([edges, edges[:, ::-1]])
+    neighbours = csr_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(len(points), len(points)))
+    radius = np.maximum(radius, limb.at(angle, station) + TARGET_MM)
+    for _ in range(MAX_ROUNDS):
         moved = limb.rays.points(angle, station, radius)
         need = _compute_moves(moved, faces, local)
-        if need.max() <= AIM_MM - CLEAR_MM:
+        if need.max() <= TARGET_MM - CLEAR_MM:
             return moved
         # A point's neighbours go with it, so that the face stays smooth.
         beside = neighbours.multiply(need[None, :]).max(axis=1).toarray().ravel()
@@ -53,28 +55,22 @@ def apply_clearance(points: Array, faces: Ints, limb: LimbProfile, outer: Surfac
     )
 
 
-def _build_neighbours(faces: Ints, count: int) -> csr_array:
-    edges = find_half_edges(faces)
-    both = np.vstack([edges, edges[:, ::-1]])
-    return csr_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count))
-
-
 def _compute_moves(points: Array, faces: Ints, limb: Surface) -> Array:
-    """(n,) by how much each point should move out so that all that is measured near it is clear, mm."""
-    need = np.maximum(AIM_MM - compute_signed_distance(limb, points), 0.0)
+    """Compute by how much each point (n,) should move out so that all measured near it is clear, mm."""
+    need = np.maximum(TARGET_MM - compute_signed_distance(limb, points), 0.0)
     for corners in ((0, 1), (1, 2), (2, 0), (0, 1, 2)):
         ends = faces[:, list(corners)]
-        short = np.maximum(AIM_MM - compute_signed_distance(limb, points[ends].mean(axis=1)), 0.0)
+        short = np.maximum(TARGET_MM - compute_signed_distance(limb, points[ends].mean(axis=1)), 0.0)
         for end in ends.T:
             np.maximum.at(need, end, short)
     squared, nearest, _ = igl.point_mesh_squared_distance(limb.points, points, faces)
-    short = np.maximum(AIM_MM - np.sqrt(squared), 0.0)
+    short = np.maximum(TARGET_MM - np.sqrt(squared), 0.0)
     for end in faces[nearest].T:
         np.maximum.at(need, end, short)
     return need
 
 
-INTO_BONE_MM = 0.5  # by which a bone may reach through the face: roughness
+BONE_ROUGHNESS_MM = 0.5  # by which a bone may reach through the face: roughness
 
 
 def refuse_bones(
@@ -106,9 +102,9 @@ def refuse_bones(
     lowest = float(face.points[brim, 2].min())
     for name, bone in bones.items():
         local = frame.to_limb(bone.points)
-        below = local[local[:, 2] < lowest - INTO_BONE_MM]
+        below = local[local[:, 2] < lowest - BONE_ROUGHNESS_MM]
         if not len(below):
             continue
         out = float(compute_signed_distance(closed, below).max()) - spare_mm
-        if out > INTO_BONE_MM:
+        if out > BONE_ROUGHNESS_MM:
             raise SurfaceError(f"the socket cuts {out:.1f} mm into the bone {name}", remedy=remedy)

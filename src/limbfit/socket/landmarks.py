@@ -49,7 +49,7 @@ class Directions:
 
 
 def find_directions(anatomy: Anatomy, side: Literal["left", "right"] | None = None) -> Directions:
-    """The directions of a limb: proximal by its cut, anterior by patient space, lateral by fibula or side.
+    """Find a limb's directions: proximal by its cut, anterior by patient space, lateral by fibula or side.
 
     Parameters
     ----------
@@ -74,13 +74,13 @@ def find_directions(anatomy: Anatomy, side: Literal["left", "right"] | None = No
         tibia, fibula = find_bone(anatomy, "tibia"), find_bone(anatomy, "fibula")
         if tibia is None or fibula is None:
             return Directions(proximal, anterior, None)
-        apart = float((fibula.points.mean(axis=0) - tibia.points.mean(axis=0)) @ across)
-        return Directions(proximal, anterior, across if apart > 0.0 else -across)
+        distance = float((fibula.points.mean(axis=0) - tibia.points.mean(axis=0)) @ across)
+        return Directions(proximal, anterior, across if distance > 0.0 else -across)
     return Directions(proximal, anterior, across if side == "left" else -across)
 
 
 def find_bone(anatomy: Anatomy, name: str) -> Surface | None:
-    """The bone of that name, however it is spelled: ``Tibia left`` is a tibia."""
+    """Find the bone of a name, however it is spelled: ``Tibia left`` is a tibia."""
     return next((b for key, b in anatomy.bones.items() if name in key.lower()), None)
 
 
@@ -94,8 +94,8 @@ def find_knee_centre(anatomy: Anatomy) -> Array | None:
     return np.asarray((top.min(axis=0) + top.max(axis=0)) / 2)
 
 
-def load_point(anatomy: Anatomy, brim: Array) -> Array:
-    """(3,) LPS mm, the point about which loads are meant where none is stated.
+def find_load_point(anatomy: Anatomy, brim: Array) -> Array:
+    """Find the point (3,), LPS mm, about which loads act where none is stated.
 
     It is the knee centre; where that is not known, the centre of the limb's section at the height of the
     brim, whose points are ``brim`` (k, 3).
@@ -117,8 +117,8 @@ CREST_MM = 12.0  # half the width of the strip over the tibial crest
 CREST_SHARE = (0.15, 0.85)  # of the tibia's length, from its top
 BONE_END_MM = 15.0  # of a bone's end that its prominence belongs to
 PROMINENCE_MM = 20.0  # radius of the regions over ends of bones
-FACING = 0.3  # cosine: what a round region holds looks its way
-FAR_MM = 20.0  # a stated position so far off the skin is a mistake
+MIN_FACING = 0.3  # cosine: what a round region holds looks its way
+MAX_OFFSET_MM = 20.0  # a stated position so far off the skin is a mistake
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,9 +131,9 @@ class SkinRegion:
 
 
 def build_default_regions(
-    anatomy: Anatomy, known: Directions, below: float | None = None
+    anatomy: Anatomy, directions: Directions, below: float | None = None
 ) -> dict[str, SkinRegion]:
-    """The regions of a limb by name, where nothing is stated.
+    """Build the regions of a limb by name, where nothing is stated.
 
     Four sides in three levels between ``below`` and the distal end; over the bones that have these names, the
     tibial crest, the fibular head, the ends of tibia and fibula and the patellar tendon.
@@ -146,7 +146,7 @@ def build_default_regions(
     """
     knee = find_knee_centre(anatomy)
     top = below if below is not None else float(anatomy.height(knee)) if knee is not None else -30.0
-    masks = _select_levels(anatomy, known, top) | _select_skin_over_bones(anatomy, known)
+    masks = _select_levels(anatomy, directions, top) | _select_skin_over_bones(anatomy, directions)
     skin, middles = anatomy.skin, anatomy.skin.triangles.mean(axis=1)
     regions = {}
     for name, mask in masks.items():
@@ -158,7 +158,7 @@ def build_default_regions(
 
 
 def build_stated_region(anatomy: Anatomy, name: str, position: Array, radius_mm: float) -> SkinRegion:
-    """The round region of a name: faces of the skin within a radius that look the way of the middle.
+    """Build a round region: faces of the skin within a radius that look the way of the middle.
 
     Raises
     ------
@@ -167,7 +167,7 @@ def build_stated_region(anatomy: Anatomy, name: str, position: Array, radius_mm:
     """
     skin = anatomy.skin
     squared, face, foot = igl.point_mesh_squared_distance(np.atleast_2d(position), skin.points, skin.faces)
-    if squared[0] > FAR_MM**2:
+    if squared[0] > MAX_OFFSET_MM**2:
         raise SurfaceError(
             f"region {name!r} lies {np.sqrt(squared[0]):.0f} mm off the skin",
             remedy="give a position on the skin (LPS, mm)",
@@ -176,33 +176,30 @@ def build_stated_region(anatomy: Anatomy, name: str, position: Array, radius_mm:
 
 
 def _select_disc(skin: Surface, middle: Array, radius_mm: float, outward: Array) -> Mask:
-    near = np.linalg.norm(skin.triangles.mean(axis=1) - middle, axis=1) <= radius_mm
-    near[np.linalg.norm(skin.triangles.mean(axis=1) - middle, axis=1).argmin()] = True
-    return near & (skin.face_normals @ outward > FACING)
+    """Select the faces within a radius that look outward, the nearest face among them."""
+    distance = np.linalg.norm(skin.triangles.mean(axis=1) - middle, axis=1)
+    near = distance <= radius_mm
+    near[distance.argmin()] = True
+    return near & (skin.face_normals @ outward > MIN_FACING)
 
 
-def _select_levels(anatomy: Anatomy, known: Directions, top: float) -> dict[str, Mask]:
+def _select_levels(anatomy: Anatomy, directions: Directions, top: float) -> dict[str, Mask]:
     middles = anatomy.skin.triangles.mean(axis=1)
     height = anatomy.height(middles)
     bottom = float(height.min())
     level = np.floor(3.0 * (top - height) / (top - bottom + 1e-9)).astype(int)
-    left = np.cross(known.proximal, known.anterior)
-    ahead, beside = np.zeros(len(middles)), np.zeros(len(middles))
+    left = np.cross(directions.proximal, directions.anterior)
+    forwards, towards_left = np.zeros(len(middles)), np.zeros(len(middles))
     for k in range(len(LEVELS)):  # sides are told from the middle of their level
         here = level == k
         spokes = middles[here] - middles[here].mean(axis=0) if here.any() else middles[here]
-        ahead[here], beside[here] = spokes @ known.anterior, spokes @ left
-    if known.lateral is None:
+        forwards[here], towards_left[here] = spokes @ directions.anterior, spokes @ left
+    if directions.lateral is None:
         names = ("anterior", "left", "posterior", "right")
     else:
-        outside = float(known.lateral @ left) > 0.0
-        names = (
-            "anterior",
-            "lateral" if outside else "medial",
-            "posterior",
-            "medial" if outside else "lateral",
-        )
-    quarter = np.round(np.arctan2(beside, ahead) / (np.pi / 2)).astype(int) % 4
+        sides = ("lateral", "medial") if float(directions.lateral @ left) > 0.0 else ("medial", "lateral")
+        names = ("anterior", sides[0], "posterior", sides[1])
+    quarter = np.round(np.arctan2(towards_left, forwards) / (np.pi / 2)).astype(int) % 4
     return {
         f"{side} {word}": (quarter == q) & (level == k)
         for q, side in enumerate(names)
@@ -210,14 +207,14 @@ def _select_levels(anatomy: Anatomy, known: Directions, top: float) -> dict[str,
     }
 
 
-def _select_skin_over_bones(anatomy: Anatomy, known: Directions) -> dict[str, Mask]:
+def _select_skin_over_bones(anatomy: Anatomy, directions: Directions) -> dict[str, Mask]:
     found: dict[str, Mask] = {}
     tibia, fibula, patella = (find_bone(anatomy, name) for name in ("tibia", "fibula", "patella"))
     if tibia is not None:
-        found["tibial crest"] = _select_crest(anatomy, known, tibia)
+        found["tibial crest"] = _select_crest(anatomy, directions, tibia)
         found["distal tibia"] = _select_skin_over_end(anatomy, tibia, distal=True)
         if patella is not None:
-            found["patellar tendon"] = _select_tendon(anatomy, known, patella, tibia)
+            found["patellar tendon"] = _select_tendon(anatomy, directions, patella, tibia)
     if fibula is not None:
         found["fibular head"] = _select_skin_over_end(anatomy, fibula, distal=False)
         found["distal fibula"] = _select_skin_over_end(anatomy, fibula, distal=True)
@@ -225,16 +222,16 @@ def _select_skin_over_bones(anatomy: Anatomy, known: Directions) -> dict[str, Ma
 
 
 def _find_thinnest_tissue(skin: Surface, ends: Array, allowed: Mask) -> tuple[Array, Array]:
-    """The point (3,) of the skin with the least tissue over bone points (n, 3), and its normal."""
+    """Find the point (3,) of the skin with the least tissue over bone points (n, 3), and its normal."""
     faces = np.flatnonzero(allowed)
     middles = skin.triangles[faces].mean(axis=1)
-    apart = np.linalg.norm(middles[:, None] - ends[None], axis=2).min(axis=1)
-    best = faces[apart.argmin()]
+    distance = np.linalg.norm(middles[:, None] - ends[None], axis=2).min(axis=1)
+    best = faces[distance.argmin()]
     return skin.triangles[best].mean(axis=0), skin.face_normals[best]
 
 
 def _select_skin_over_end(anatomy: Anatomy, surface: Surface, *, distal: bool) -> Mask:
-    """Round about the place with the least tissue over an end of a bone."""
+    """Select the skin around the place with the least tissue over an end of a bone."""
     skin, height = anatomy.skin, anatomy.height(surface.points)
     near = height < height.min() + BONE_END_MM if distal else height > height.max() - BONE_END_MM
     below_cut = anatomy.height(skin.triangles.mean(axis=1)) < -1.0
@@ -242,14 +239,14 @@ def _select_skin_over_end(anatomy: Anatomy, surface: Surface, *, distal: bool) -
     return _select_disc(skin, middle, PROMINENCE_MM, outward)
 
 
-def _select_crest(anatomy: Anatomy, known: Directions, tibia: Surface) -> Mask:
-    """Faces near the line along which the tissue ahead of the tibia's shaft is thinnest."""
+def _select_crest(anatomy: Anatomy, directions: Directions, tibia: Surface) -> Mask:
+    """Select faces near the line along which the tissue ahead of the tibia's shaft is thinnest."""
     middles = anatomy.skin.triangles.mean(axis=1)
     height, ends = anatomy.height(middles), anatomy.height(tibia.points)
     length = float(np.ptp(ends))
     upper, lower = (ends.max() - share * length for share in CREST_SHARE)
     axis = tibia.points.mean(axis=0)
-    front = (middles - axis) @ known.anterior > 0.0
+    front = (middles - axis) @ directions.anterior > 0.0
     shaft = front & (height < upper) & (height > lower)
     if not shaft.any():
         return shaft
@@ -262,17 +259,17 @@ def _select_crest(anatomy: Anatomy, known: Directions, tibia: Surface) -> Mask:
         here = np.flatnonzero(shaft & (height >= low) & (height <= high))
         if len(here):
             line.append(middles[here[depth[here].argmin()]])
-    apart = np.linalg.norm(middles[:, None] - np.array(line)[None], axis=2).min(axis=1)
-    return shaft & (apart <= CREST_MM)
+    distance = np.linalg.norm(middles[:, None] - np.array(line)[None], axis=2).min(axis=1)
+    return shaft & (distance <= CREST_MM)
 
 
-def _select_tendon(anatomy: Anatomy, known: Directions, patella: Surface, tibia: Surface) -> Mask:
-    """Faces ahead of the gap between the patella's lower pole and the tibia's upper fifth."""
+def _select_tendon(anatomy: Anatomy, directions: Directions, patella: Surface, tibia: Surface) -> Mask:
+    """Select faces ahead of the gap between the patella's lower pole and the tibia's upper fifth."""
     middles = anatomy.skin.triangles.mean(axis=1)
     pole = patella.points[anatomy.height(patella.points).argmin()]
     ends = anatomy.height(tibia.points)
     tuberosity = ends.max() - 0.2 * float(np.ptp(ends))
     height = anatomy.height(middles)
-    across = np.abs((middles - pole) @ np.cross(known.proximal, known.anterior))
-    ahead = (middles - pole) @ known.anterior > -15.0
-    return ahead & (across < 15.0) & (height < anatomy.height(pole)) & (height > tuberosity)
+    across = np.abs((middles - pole) @ np.cross(directions.proximal, directions.anterior))
+    forwards = (middles - pole) @ directions.anterior > -15.0
+    return forwards & (across < 15.0) & (height < anatomy.height(pole)) & (height > tuberosity)

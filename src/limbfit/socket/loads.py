@@ -38,7 +38,7 @@ class StandardLoad:
 
     @property
     def beside_knee(self) -> bool:
-        """Whether its line passes beside the knee centre, which then must be known."""
+        """True if its line passes beside the knee centre, which then must be known."""
         return bool(self.ahead_mm or self.inside_mm)
 
     def force(self, body_weight: float, directions: Directions) -> Array:

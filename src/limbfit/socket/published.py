@@ -96,7 +96,7 @@ def select_published_findings(regions: Collection[str]) -> list[PublishedFinding
     """The findings over any of the ``regions``, or over the whole limb, as they are stored."""
     rows = []
     for finding in FINDINGS:
-        here = [name for name in finding.regions if name in regions or name == WHOLE]
-        if here:
-            rows.append(PublishedFindings.model_validate(replace(finding, regions=tuple(here))))
+        covered = [name for name in finding.regions if name in regions or name == WHOLE]
+        if covered:
+            rows.append(PublishedFindings.model_validate(replace(finding, regions=tuple(covered))))
     return rows

@@ -123,7 +123,7 @@ class LimbProfile:
 
 
 def compute_profile(outer: Surface, frame: Frame) -> LimbProfile:
-    """The radii of a limb's closed outer surface (LPS mm) in its frame.
+    """Compute the radii of a limb's closed outer surface (LPS mm) in its frame.
 
     Raises
     ------
@@ -139,17 +139,13 @@ def compute_profile(outer: Surface, frame: Frame) -> LimbProfile:
     radius, folds = compute_radii(local, rays, stations, angles)
     if np.isnan(radius).any():
         k = int(np.isnan(radius).any(axis=1).argmax())
-        place = frame.to_patient(rays.middle(stations[k]))
+        place = ", ".join(f"{x:.0f}" for x in frame.to_patient(rays.middle(stations[k])))
         raise SurfaceError(
-            f"a ray from the limb's middle line at ({_format_point(place)}) mm never meets the limb",
+            f"a ray from the limb's middle line at ({place}) mm never meets the limb",
             remedy="close the surface, or move the proximal cut nearer to the knee",
         )
     radius = smooth(radius, stations, float(np.median(radius)), SMOOTH_MM)
     return LimbProfile(rays, stations, angles, radius, folds)
-
-
-def _format_point(point: Array) -> str:
-    return ", ".join(f"{x:.0f}" for x in point)
 
 
 def _build_rays(local: Surface) -> Rays:
@@ -170,7 +166,7 @@ def _build_rays(local: Surface) -> Rays:
 
 
 def find_ray_hits(surface: Surface, starts: Array, ways: Array) -> list[Array]:
-    """Distances, ascending, at which rays from points (n, 3) along unit vectors (n, 3) meet a surface."""
+    """Find the distances, ascending, at which rays from points (n, 3) along unit vectors meet a surface."""
     locator = vtkStaticCellLocator()
     locator.SetDataSet(surface.to_pyvista())
     locator.BuildLocator()
@@ -185,7 +181,7 @@ def find_ray_hits(surface: Surface, starts: Array, ways: Array) -> list[Array]:
 
 
 def compute_radii(local: Surface, rays: Rays, stations: Array, angles: Array) -> tuple[Array, Array]:
-    """Where each ray leaves a surface (limb frame) for good, and how far in it left it before.
+    """Compute where each ray leaves a surface (limb frame) for good, and how far in it left it before.
 
     Returns
     -------
@@ -201,7 +197,7 @@ def compute_radii(local: Surface, rays: Rays, stations: Array, angles: Array) ->
 
 
 def smooth(field: Array, stations: Array, radius: float, size_mm: float) -> Array:
-    """A field (stations, angles) around a limb of a ``radius``, without what is shorter than ``size_mm``.
+    """Smooth a field (stations, angles) around a limb of a ``radius``, over ``size_mm``.
 
     Across the pole a ray goes on at the other side.
     """
@@ -238,7 +234,7 @@ class Offsets:
 
 
 def compute_offsets(limb: LimbProfile, before: Surface, after: Surface, frame: Frame) -> Offsets:
-    """By how much a limb's outer surface (LPS mm) moves along each ray of the limb.
+    """Compute by how much a limb's outer surface (LPS mm) moves along each ray of the limb.
 
     Both surfaces have the same triangles, open at the proximal cut, so that their facets cancel.
 

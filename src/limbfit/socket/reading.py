@@ -28,9 +28,9 @@ from .shape import Socket
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-SMALLEST, LARGEST = 0.25, 3.0  # of the limb's length, end to end: otherwise another unit
+MIN_SIZE_RATIO, MAX_SIZE_RATIO = 0.25, 3.0  # of the limb's length, end to end: otherwise another unit
 LOOSE_SHARE = 0.01  # of the faces: pieces that hold less are left out
-DECIDED = 0.5  # mean cosine between normals and rays from which a side is certain
+MIN_COSINE = 0.5  # mean cosine between normals and rays from which a side is certain
 WALL_SHARE = 0.15  # of the faces that another face hides, from which a closed surface is a wall
 
 
@@ -64,12 +64,12 @@ def read_socket(
     file = Path(file)
     surface = read_surface(file, space, unit, key="socket.space")
     try:
-        return _read(surface, outer, frame, bones or {})
+        return _build_socket(surface, outer, frame, bones or {})
     except SurfaceError as error:
         raise SurfaceError(error.what, file=error.file or file, remedy=error.remedy) from None
 
 
-def _read(surface: Surface, outer: Surface, frame: Frame, bones: Mapping[str, Surface]) -> Socket:
+def _build_socket(surface: Surface, outer: Surface, frame: Frame, bones: Mapping[str, Surface]) -> Socket:
     _check_size(surface, outer)
     limb = compute_profile(outer, frame)
     piece, notes = _keep_largest_piece(surface)
@@ -112,7 +112,7 @@ def _read(surface: Surface, outer: Surface, frame: Frame, bones: Mapping[str, Su
 
 def _check_size(surface: Surface, outer: Surface) -> None:
     size, limb = (float(np.linalg.norm(np.ptp(s.points, axis=0))) for s in (surface, outer))
-    if not SMALLEST * limb <= size <= LARGEST * limb:
+    if not MIN_SIZE_RATIO * limb <= size <= MAX_SIZE_RATIO * limb:
         unit = "metres, centimetres or inches" if size < limb else "another unit"
         raise SurfaceError(
             f"the socket is {size:.3g} mm from end to end, the limb {limb:.0f} mm",
@@ -146,11 +146,11 @@ def _check_place(face: Surface, rays: Rays, top: float) -> None:
 
 
 def _compute_facing(face: Surface, rays: Rays) -> float:
-    """Mean cosine between the faces' normals and the rays through them, by area."""
+    """Compute the mean cosine between the faces' normals and the rays through them, by area."""
     angle, station, _ = rays.coordinates(face.triangles.mean(axis=1))
     cosine = np.einsum("ij,ij->i", face.face_normals, rays.direction(angle, station))
     mean = float(np.average(cosine, weights=face.face_areas))
-    if abs(mean) < DECIDED:
+    if abs(mean) < MIN_COSINE:
         raise SurfaceError(
             "the socket's triangles look both at the limb and away from it",
             remedy="keep the inner face alone, its normals all on one side",
@@ -159,20 +159,20 @@ def _compute_facing(face: Surface, rays: Rays) -> float:
 
 
 def _count_windings(loop: Array, rays: Rays) -> int:
-    """How often a closed line (k, 3) goes around the middle line."""
+    """Count how often a closed line (k, 3) goes around the middle line."""
     angle = rays.coordinates(loop)[0]
     steps = np.mod(np.diff(angle, append=angle[0]) + np.pi, 2 * np.pi) - np.pi
     return round(float(steps.sum()) / (2 * np.pi))
 
 
 def _find_brim(face: Surface, rays: Rays) -> tuple[Ints, bool]:
-    """The proximal edge, and whether the distal end is open too."""
+    """Find the proximal edge, and whether the distal end is open too."""
     loops = open_loops(face)
     around = [loop for loop in loops if _count_windings(face.points[loop], rays)]
-    if len(around) < len(loops):
-        hole = next(loop for loop in loops if not _count_windings(face.points[loop], rays))
+    holes = [loop for loop in loops if not _count_windings(face.points[loop], rays)]
+    if holes:
         raise SurfaceError(
-            f"the socket has a hole of {len(hole)} edges in its side",
+            f"the socket has a hole of {len(holes[0])} edges in its side",
             remedy="close it; only brim and end may be open",
         )
     if not around or len(around) > 2:
@@ -189,21 +189,21 @@ def _find_brim(face: Surface, rays: Rays) -> tuple[Ints, bool]:
 
 
 def _select_inner_face(wall: Surface, rays: Rays) -> tuple[Surface, float]:
-    """The faces of a closed wall that the middle line sees, and the wall's median thickness, mm."""
+    """Select the faces of a closed wall that the middle line sees; also return its median thickness, mm."""
     middles = wall.triangles.mean(axis=1)
     angle, station, radius = rays.coordinates(middles)
     hits = find_ray_hits(wall, rays.middle(station), rays.direction(angle, station))
     first = np.array([met[0] if len(met) else np.inf for met in hits])
     facing = np.einsum("ij,ij->i", wall.face_normals, rays.direction(angle, station)) < 0.0
-    seen = facing & (np.abs(first - radius) < 1e-2)
-    if seen.sum() < WALL_SHARE * len(seen) or (~seen).sum() < WALL_SHARE * len(seen):
+    is_inner = facing & (np.abs(first - radius) < 1e-2)
+    if is_inner.sum() < WALL_SHARE * len(is_inner) or (~is_inner).sum() < WALL_SHARE * len(is_inner):
         raise SurfaceError(
             "the socket is closed: it has no opening for the limb", remedy="cut it open at the brim"
         )
-    thick = float(np.median([met[1] - met[0] for met, s in zip(hits, seen) if s and len(met) > 1]))
-    inner = find_bodies(remove_unused_points(Surface(wall.points, wall.faces[seen])))[0]
+    thick = float(np.median([met[1] - met[0] for met, s in zip(hits, is_inner) if s and len(met) > 1]))
+    inner = find_bodies(remove_unused_points(Surface(wall.points, wall.faces[is_inner])))[0]
     inner = _remove_ears(inner)
-    if len(inner.faces) < 0.9 * seen.sum():
+    if len(inner.faces) < 0.9 * is_inner.sum():
         raise SurfaceError(
             "which of the socket's faces are its inner side cannot be told",
             remedy="delete the outer side of its wall, and give the inner face alone",
@@ -212,7 +212,7 @@ def _select_inner_face(wall: Surface, rays: Rays) -> tuple[Surface, float]:
 
 
 def _remove_ears(surface: Surface) -> Surface:
-    """Without faces that hang on by one edge or a corner, so that its edge is one clean line."""
+    """Remove faces that hang on by one edge or a corner, so that the edge is one clean line."""
     faces = surface.faces
     while True:
         edges = np.sort(find_half_edges(faces), axis=1)

@@ -27,10 +27,12 @@ Ints = NDArray[np.int64]
 
 FLARE_DEGREES = 60.0  # how far the brim turns outwards
 FLARE_ROWS = 3
-FEWEST_AROUND = 6
+MIN_RING_POINTS = 6
 DISTAL_SHARE = 1.0  # of the end's radius: over what height the clearance at the distal end fades out
 MATCHING_ROUNDS, VOLUME_SHARE = 5, 1e-3  # of finding the reduction that leaves a volume
-STEEPEST = 0.75  # of that height: the largest clearance, so that no part of the face moves past another
+MAX_CLEARANCE_SHARE = (
+    0.75  # of that height: the largest clearance, so that no part of the face moves past another
+)
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class SocketSurface:
 
 
 def rectify_limb(outer: Surface, frame: Frame, recipe: Recipe) -> Socket:
-    """The inner face of a socket for a limb.
+    """Make the inner face of a socket for a limb.
 
     Parameters
     ----------
@@ -87,17 +89,17 @@ def rectify_limb(outer: Surface, frame: Frame, recipe: Recipe) -> Socket:
     limb = compute_profile(outer, frame)
     lines = trim_limb(limb, frame, recipe.trim)
     _refuse_folds(limb, lines, frame)
-    drawn = _draw_surface(lines, recipe)
-    face = Surface(frame.to_patient(drawn.points), drawn.faces)
-    recipe = replace(recipe, areas=[area.on(face) for area in recipe.areas])
-    points = frame.to_patient(_rectify_points(drawn, limb, frame, recipe))
-    _refuse_crossing(Surface(points, drawn.faces), recipe)
-    clear = frame.to_patient(apply_clearance(frame.to_limb(points), drawn.faces, limb, outer, frame))
-    return Socket(points, drawn.faces, clear, drawn.brim)
+    surface = _draw_surface(lines, recipe)
+    face = Surface(frame.to_patient(surface.points), surface.faces)
+    recipe = replace(recipe, areas=[area.project_to(face) for area in recipe.areas])
+    points = frame.to_patient(_rectify_points(surface, limb, frame, recipe))
+    _refuse_crossing(Surface(points, surface.faces), recipe)
+    clear = frame.to_patient(apply_clearance(frame.to_limb(points), surface.faces, limb, outer, frame))
+    return Socket(points, surface.faces, clear, surface.brim)
 
 
 def reduce_to_volume(volume_mm3: float, outer: Surface, frame: Frame, recipe: Recipe) -> tuple[Socket, float]:
-    """The face without areas whose uniform reduction leaves a volume, and that reduction in percent.
+    """Find the face without areas whose uniform reduction leaves a volume, and that reduction in percent.
 
     The volume is met within ``VOLUME_SHARE``.
 
@@ -138,7 +140,7 @@ def _refuse_folds(limb: LimbProfile, lines: TrimmedLimb, frame: Frame) -> None:
 
 
 def _draw_surface(lines: TrimmedLimb, recipe: Recipe) -> SocketSurface:
-    """Rings of even triangles between the distal pole and the brim; the last rows are the flare's."""
+    """Draw rings of even triangles between the distal pole and the brim; the last rows are the flare's."""
     flare = np.radians(FLARE_DEGREES) * recipe.flare_mm
     lengths = lines.length
     rows = max(4, round(float(lengths.mean() - flare) / recipe.edge_mm))
@@ -152,7 +154,7 @@ def _draw_surface(lines: TrimmedLimb, recipe: Recipe) -> SocketSurface:
     for number, way in enumerate(shares):
         dense = lines.along(way)
         around = float(np.linalg.norm(dense - np.roll(dense, 1, axis=0), axis=1).sum())
-        count = max(FEWEST_AROUND, round(around / recipe.edge_mm))
+        count = max(MIN_RING_POINTS, round(around / recipe.edge_mm))
         points, where = resample_ring(dense, count, 0.5 * (number % 2))
         rings.append(points)
         at.append(where)
@@ -166,7 +168,7 @@ def _draw_surface(lines: TrimmedLimb, recipe: Recipe) -> SocketSurface:
 
 
 def _interpolate_along_ring(dense: Array, values: Array, shares: Array) -> Array:
-    """Values (n, d) at the points of a dense ring, at shares of its length."""
+    """Interpolate values (n, d) at the points of a dense ring at shares of its length."""
     closed = np.vstack([dense, dense[:1]])
     length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1)))
     length /= length[-1]
@@ -174,10 +176,10 @@ def _interpolate_along_ring(dense: Array, values: Array, shares: Array) -> Array
     return np.column_stack([np.interp(shares, length, column) for column in around.T])
 
 
-def _rectify_points(drawn: SocketSurface, limb: LimbProfile, frame: Frame, recipe: Recipe) -> Array:
-    """The drawn points (limb frame), rectified; distances add up along the limb's own normals."""
-    points = drawn.points
-    normals = -Surface(points, drawn.faces).vertex_normals
+def _rectify_points(surface: SocketSurface, limb: LimbProfile, frame: Frame, recipe: Recipe) -> Array:
+    """Rectify the drawn points (limb frame); distances add up along the limb's own normals."""
+    points = surface.points
+    normals = -Surface(points, surface.faces).vertex_normals
     middle = limb.rays.middle(points[:, 2] - limb.rays.centre_z)
     middle[:, 2] = points[:, 2]
     moves = -0.01 * recipe.reduction_percent * (points - middle)
@@ -188,32 +190,32 @@ def _rectify_points(drawn: SocketSurface, limb: LimbProfile, frame: Frame, recip
         moves -= area.depth(in_patient)[:, None] * normals
     if recipe.distal == "clearance":
         moves[:, 2] -= recipe.distal_clearance_mm * _compute_distal_share(points[:, 2], limb, recipe)
-    return points + moves + _compute_flare(drawn, normals, recipe.flare_mm)
+    return points + moves + _compute_flare(surface, normals, recipe.flare_mm)
 
 
 def _compute_distal_share(z: Array, limb: LimbProfile, recipe: Recipe) -> Array:
     """(n,) share of the distal clearance at heights: 1 at the pole, 0 from the end's height on, smooth."""
     height = DISTAL_SHARE * limb.rays.end_radius
-    if recipe.distal_clearance_mm > STEEPEST * height / 1.875:
+    if recipe.distal_clearance_mm > MAX_CLEARANCE_SHARE * height / 1.875:
         raise SurfaceError(
             f"a distal clearance of {recipe.distal_clearance_mm:g} mm is too much at this end of the limb",
-            remedy=f"state {STEEPEST * height / 1.875:.0f} mm or less",
+            remedy=f"state {MAX_CLEARANCE_SHARE * height / 1.875:.0f} mm or less",
         )
     t = np.clip((z - z.min()) / height, 0.0, 1.0)
     return 1.0 - t**3 * (10.0 - 15.0 * t + 6.0 * t**2)  # slope and curvature are zero at both ends
 
 
-def _compute_flare(drawn: SocketSurface, normals: Array, radius: float) -> Array:
+def _compute_flare(surface: SocketSurface, normals: Array, radius: float) -> Array:
     """Moves (n, 3) that bend what is near the brim along an arc outwards; lengths along it stay."""
     if radius == 0.0:
         return np.zeros_like(normals)
-    into = np.maximum(np.radians(FLARE_DEGREES) * radius - drawn.below_brim, 0.0)
-    turned = into / radius
-    out = normals - np.einsum("ij,ij->i", normals, drawn.upwards)[:, None] * drawn.upwards
+    beyond_brim = np.maximum(np.radians(FLARE_DEGREES) * radius - surface.below_brim, 0.0)
+    turned = beyond_brim / radius
+    out = normals - np.einsum("ij,ij->i", normals, surface.upwards)[:, None] * surface.upwards
     length = np.linalg.norm(out, axis=1, keepdims=True)
     out = np.divide(out, length, out=np.zeros_like(out), where=length > 0)
     return radius * (
-        (1.0 - np.cos(turned))[:, None] * out + (np.sin(turned) - turned)[:, None] * drawn.upwards
+        (1.0 - np.cos(turned))[:, None] * out + (np.sin(turned) - turned)[:, None] * surface.upwards
     )
 
 
@@ -222,18 +224,12 @@ def _refuse_crossing(face: Surface, recipe: Recipe) -> None:
     if not len(crossing):
         return
     place = face.triangles[crossing[0, 0]].mean(axis=0)
-    near = min(
-        recipe.areas,
-        key=lambda area: area.nearness(place),
-        default=None,
-    )
+    near = min(recipe.areas, key=lambda area: area.compute_relative_distance(place), default=None)
+    remedy = "lower reduction_percent or flare_mm"
+    if near is not None:
+        remedy = f"lower the depth of {near.name!r} or make it wider"
     words = ", ".join(f"{x:.0f}" for x in place)
-    raise SurfaceError(
-        f"the socket's face would cross itself at ({words}) mm",
-        remedy="lower reduction_percent or flare_mm"
-        if near is None
-        else f"lower the depth of {near.name!r} or make it wider",
-    )
+    raise SurfaceError(f"the socket's face would cross itself at ({words}) mm", remedy=remedy)
 
 
 def resample_ring(ring: Array, count: int, turn: float) -> tuple[Array, Array]:

@@ -19,7 +19,7 @@ from .shape import Socket
 PROMINENCES = ("tibial crest", "fibular head", "distal tibia", "distal fibula")
 REACH_MM = 18.0  # beyond a region: over what its pressure, or depth, goes over into what is beside it
 BRIM_MM = 20.0  # below the brim: over what the pressure comes on
-DEEP_MM = 20.0  # of tissue over bone: deeper tissue bears as much
+FULL_DEPTH_MM = 20.0  # of tissue over bone: deeper tissue bears as much
 
 TISSUE_DEPTH = "tissue depth"
 
@@ -90,7 +90,7 @@ class Target:
 
 
 def build_zone(name: str, anatomy: Anatomy, regions: Mapping[str, SkinRegion], depth_mm: float) -> Zone:
-    """A region of the limb as what is pressed into a face by a depth, or relieved.
+    """Build the zone of a region of the limb that is pressed into a face by a depth, or relieved.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def build_zone(name: str, anatomy: Anatomy, regions: Mapping[str, SkinRegion], d
 
 
 def _compute_depth_share(points: Array, anatomy: Anatomy) -> Array:
-    """Depth (n,) of points of the skin over the nearest bone, as a share of ``DEEP_MM``, at most 1."""
+    """Compute the depth (n,) of points of the skin over the nearest bone, as a share of ``FULL_DEPTH_MM``."""
     if not anatomy.bones:
         raise SurfaceError(
             "the depth of tissue is not known: the limb has no bones",
@@ -113,11 +113,11 @@ def _compute_depth_share(points: Array, anatomy: Anatomy) -> Array:
     squared = [
         igl.point_mesh_squared_distance(points, bone.points, bone.faces)[0] for bone in anatomy.bones.values()
     ]
-    return np.asarray(np.clip(np.sqrt(np.min(squared, axis=0)) / DEEP_MM, 0.0, 1.0))
+    return np.asarray(np.clip(np.sqrt(np.min(squared, axis=0)) / FULL_DEPTH_MM, 0.0, 1.0))
 
 
 def _compute_brim_share(points: Array, socket: Socket) -> Array:
-    """Share (n,) of the pressure at points: 0 beyond the brim, growing smoothly below it."""
+    """Compute the share (n,) of the pressure at points: 0 beyond the brim, growing smoothly below it."""
     nearest = igl.point_mesh_squared_distance(points, socket.points, socket.faces)[1]
     covered = ~np.isin(socket.faces[nearest], socket.brim).any(axis=1)
     t = np.clip(KDTree(socket.points[socket.brim]).query(points)[0] / BRIM_MM, 0.0, 1.0)

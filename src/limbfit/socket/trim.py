@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -14,8 +13,8 @@ from ..arrays import Array
 from ..errors import SurfaceError
 from .rays import LimbProfile
 
-LEAST_MM = 30.0  # of face between the distal end and the brim, along the limb
-OFF_LIMB_MM = 30.0  # how far a point of a trimline may lie off the limb
+MIN_FACE_MM = 30.0  # of face between the distal end and the brim, along the limb
+MAX_OFF_LIMB_MM = 30.0  # how far a point of a trimline may lie off the limb
 
 
 @dataclass(frozen=True)
@@ -71,21 +70,8 @@ class TrimmedLimb:
         return np.asarray(step / np.linalg.norm(step, axis=1, keepdims=True))
 
 
-@dataclass(frozen=True, eq=False)
-class _Line:
-    """A closed line as a height over the angle around the limb."""
-
-    angles: Array
-    heights: Array
-
-    @cached_property
-    def height(self) -> PchipInterpolator:
-        turns = np.concatenate([self.angles + turn for turn in (-2 * np.pi, 0.0, 2 * np.pi)])
-        return PchipInterpolator(turns, np.tile(self.heights, 3))
-
-
 def trim_limb(limb: LimbProfile, frame: Frame, trim: Trim) -> TrimmedLimb:
-    """The meridians of a limb up to its trimline.
+    """Cut the meridians of a limb at its trimline.
 
     Raises
     ------
@@ -96,11 +82,8 @@ def trim_limb(limb: LimbProfile, frame: Frame, trim: Trim) -> TrimmedLimb:
     stations, angles = limb.stations, limb.angles
     points = limb.rays.points(angles[:, None], stations[None, :], limb.radius.T)
     points[:, 0] = points[:, 0].mean(axis=0)  # one pole
-    ways = np.append(
-        np.zeros((len(angles), 1)),
-        np.cumsum(np.linalg.norm(np.diff(points, axis=1), axis=2), axis=1),
-        axis=1,
-    )
+    lengths = np.linalg.norm(np.diff(points, axis=1), axis=2)
+    ways = np.append(np.zeros((len(angles), 1)), np.cumsum(lengths, axis=1), axis=1)
     over = np.max(_measure_above_trimline(points, angles, limb, frame, trim), axis=0)
     after = np.argmax(over > 0.0, axis=1)
     rows = np.arange(len(angles))
@@ -113,11 +96,11 @@ def trim_limb(limb: LimbProfile, frame: Frame, trim: Trim) -> TrimmedLimb:
     low, high = over[rows, after - 1], over[rows, after]
     share = np.where(after > 0, -low / (high - low), 0.0)
     length = ways[rows, after - 1] + share * (ways[rows, after] - ways[rows, after - 1])
-    short = (after == 0) | (length < LEAST_MM)
+    short = (after == 0) | (length < MIN_FACE_MM)
     if short.any():
         raise SurfaceError(
             f"the brim comes within {max(float(length[short].min()), 0.0):.0f} mm of the distal end, "
-            f"and a socket needs {LEAST_MM:g} mm of face",
+            f"and a socket needs {MIN_FACE_MM:g} mm of face",
             remedy="move the trimline up"
             + ("; the normals of its planes point proximally" * bool(trim.planes)),
         )
@@ -126,16 +109,16 @@ def trim_limb(limb: LimbProfile, frame: Frame, trim: Trim) -> TrimmedLimb:
 
 
 def find_brim(limb: LimbProfile, frame: Frame, trim: Trim, count: int) -> Array:
-    """Points (count, 3) of the limb where the brim runs, evenly around it, LPS mm.
+    """Find points (count, 3) of the limb where the brim runs, evenly around it, LPS mm.
 
     Errors are those of `trim_limb`.
     """
-    found = trim_limb(limb, frame, trim)
-    return frame.to_patient(found.along(found.length)[np.arange(count) * len(limb.angles) // count])
+    trimmed = trim_limb(limb, frame, trim)
+    return frame.to_patient(trimmed.along(trimmed.length)[np.arange(count) * len(limb.angles) // count])
 
 
 def wrap_trimline(limb: LimbProfile, frame: Frame, points: Array) -> Array:
-    """The points (k, 3) of the limb on the rays through others, LPS mm, such as those of a trimline."""
+    """Put points (k, 3), such as those of a trimline, on the limb along their rays, LPS mm."""
     angle, station, _ = limb.rays.coordinates(frame.to_limb(points))
     return frame.to_patient(limb.rays.points(angle, station, limb.at(angle, station)))
 
@@ -143,25 +126,26 @@ def wrap_trimline(limb: LimbProfile, frame: Frame, points: Array) -> Array:
 def _measure_above_trimline(
     points: Array, angles: Array, limb: LimbProfile, frame: Frame, trim: Trim
 ) -> list[Array]:
-    """How far points (angles, k, 3) lie over each part of the trimline, mm."""
-    found = []
+    """Measure how far points (angles, k, 3) lie over each part of the trimline, mm."""
+    heights = []
     for point, normal in trim.planes:
         direction = frame.rotation @ np.asarray(normal, dtype=float)
         if direction[2] <= 0.0:
             raise SurfaceError(
                 "the normal of a trim plane points distally", remedy="turn it so that it points proximally"
             )
-        found.append((points - frame.to_limb(point)) @ (direction / np.linalg.norm(direction)))
+        heights.append((points - frame.to_limb(point)) @ (direction / np.linalg.norm(direction)))
     if trim.line is not None:
-        line = _build_line(frame.to_limb(trim.line), limb)
-        found.append(points[..., 2] - line.height(angles)[:, None])
-    return found
+        height = _interpolate_line(frame.to_limb(trim.line), limb)
+        heights.append(points[..., 2] - height(angles)[:, None])
+    return heights
 
 
-def _build_line(points: Array, limb: LimbProfile) -> _Line:
+def _interpolate_line(points: Array, limb: LimbProfile) -> PchipInterpolator:
+    """Interpolate the height of a closed line (k, 3) over the angle around the limb."""
     angle, station, radius = limb.rays.coordinates(points)
     off = np.abs(radius - limb.at(angle, station))
-    if off.max() > OFF_LIMB_MM:
+    if off.max() > MAX_OFF_LIMB_MM:
         raise SurfaceError(
             f"point {int(off.argmax()) + 1} of the trimline lies {off.max():.0f} mm off the limb",
             remedy="give points on the limb (LPS, mm)",
@@ -173,4 +157,5 @@ def _build_line(points: Array, limb: LimbProfile) -> _Line:
             "the trimline does not go once around the limb", remedy="give its points in order around the limb"
         )
     order = np.argsort(angle)
-    return _Line(angle[order], points[order, 2])
+    turns = np.concatenate([angle[order] + turn for turn in (-2 * np.pi, 0.0, 2 * np.pi)])
+    return PchipInterpolator(turns, np.tile(points[order, 2], 3))

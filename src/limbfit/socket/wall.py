@@ -18,10 +18,12 @@ from .shape import Socket
 Ints = NDArray[np.int64]
 
 BRIM_STEPS = 6  # of the half circle between the two sides
-THINNEST = 0.9  # of the thickness that was asked for
-AROUND = 96  # edges of the adapter's cylinder
+MIN_THICKNESS_SHARE = 0.9  # of the thickness that was asked for
+ADAPTER_EDGES = 96  # edges of the adapter's cylinder
 SLIVER_MM = 0.005  # what is shorter where adapter and wall meet would collapse in an STL file
-BEHIND_MM = 10 * SLIVER_MM  # the face, which may have moved by that much: where measuring its wall begins
+START_BEHIND_MM = (
+    10 * SLIVER_MM
+)  # the face, which may have moved by that much: where measuring its wall begins
 
 
 def build_wall(
@@ -32,7 +34,7 @@ def build_wall(
     adapter_diameter_mm: float = 60.0,
     adapter_mm: float = 8.0,
 ) -> Surface:
-    """The socket as a closed body, LPS mm, outward.
+    """Build the socket as a closed body, LPS mm, outward.
 
     Its inner side is the socket's face; the outer side lies ``thickness_mm`` outside it along its normals.
 
@@ -61,25 +63,25 @@ def build_wall(
 
 
 def measure_thickness(body: Surface, socket: Socket) -> Array:
-    """How thick the wall is behind each triangle (m,) of a socket's face, along its normal, mm.
+    """Measure the wall behind each triangle (m,) of a socket's face, along its normal, mm.
 
     Parameters
     ----------
     body : of `build_wall`, LPS mm.
     """
     outwards = -socket.surface.face_normals
-    starts = socket.surface.triangles.mean(axis=1) + BEHIND_MM * outwards
-    return np.array([met[0] for met in find_ray_hits(body, starts, outwards)]) + BEHIND_MM
+    starts = socket.surface.triangles.mean(axis=1) + START_BEHIND_MM * outwards
+    return np.array([met[0] for met in find_ray_hits(body, starts, outwards)]) + START_BEHIND_MM
 
 
 def _build_shell(socket: Socket, thickness: float) -> Surface:
-    """Both sides and the half circle that joins them along the brim."""
+    """Build both sides and the half circle that joins them along the brim."""
     inner, outwards = socket.points, -socket.surface.vertex_normals
     outer = inner + thickness * outwards
     squared = igl.point_mesh_squared_distance(outer, inner, socket.faces)[0]
     least = float(np.sqrt(squared.min()))
     body = _build_sides(socket, outer, outwards, thickness)
-    if least < THINNEST * thickness or len(body.self_intersections):
+    if least < MIN_THICKNESS_SHARE * thickness or len(body.self_intersections):
         raise SurfaceError(
             f"a wall of {thickness:g} mm would fold outside the socket's narrow places ({least:.1f} mm)",
             remedy="make it thinner, the flare larger, or the areas of the socket wider or less deep",
@@ -95,10 +97,9 @@ def _build_sides(socket: Socket, outer: Array, outwards: Array, thickness: float
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     if np.einsum("ij,ij->i", up, points - socket.points.mean(axis=0)).mean() < 0.0:
         up = -up
-    rings = [brim]
-    added = []
+    rings, added = [brim], []
+    middle = points + thickness / 2 * out
     for turn in np.pi * np.arange(1, BRIM_STEPS) / BRIM_STEPS:
-        middle = points + thickness / 2 * out
         added.append(middle + thickness / 2 * (np.sin(turn) * up - np.cos(turn) * out))
         rings.append(2 * count + (len(added) - 1) * len(brim) + np.arange(len(brim)))
     rings.append(brim + count)
@@ -111,7 +112,7 @@ def _build_sides(socket: Socket, outer: Array, outwards: Array, thickness: float
 
 
 def _build_adapter(socket: Socket, axis: Array, diameter: float, below: float) -> Surface:
-    """The adapter's cylinder under the middle of the distal end, up into the wall around it."""
+    """Build the adapter's cylinder under the middle of the distal end, up into the wall around it."""
     height = socket.points @ axis
     bottom, length = float(height.min()), float(np.ptp(height))
     end = socket.points[height < bottom + min(diameter / 2, 0.25 * length)]
@@ -130,31 +131,27 @@ def _build_adapter(socket: Socket, axis: Array, diameter: float, below: float) -
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
     second = np.cross(axis, first)
-    angle = 2 * np.pi * np.arange(AROUND) / AROUND
+    angle = 2 * np.pi * np.arange(ADAPTER_EDGES) / ADAPTER_EDGES
     ring = diameter / 2 * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
     foot, head = lowest - below * axis, lowest + (top - bottom) * axis
     points = np.vstack([foot + ring, head + ring, foot, head])
-    here, there = np.arange(AROUND), np.roll(np.arange(AROUND), -1)
-    base, lid = np.full(AROUND, 2 * AROUND), np.full(AROUND, 2 * AROUND + 1)
-    faces = np.vstack(
-        [
-            np.column_stack([here, there, there + AROUND]),
-            np.column_stack([here, there + AROUND, here + AROUND]),
-            np.column_stack([there, here, base]),
-            np.column_stack([here + AROUND, there + AROUND, lid]),
-        ]
+    here, there = np.arange(ADAPTER_EDGES), np.roll(np.arange(ADAPTER_EDGES), -1)
+    base, lid = np.full(ADAPTER_EDGES, 2 * ADAPTER_EDGES), np.full(ADAPTER_EDGES, 2 * ADAPTER_EDGES + 1)
+    corners = (
+        (here, there, there + ADAPTER_EDGES),
+        (here, there + ADAPTER_EDGES, here + ADAPTER_EDGES),
+        (there, here, base),
+        (here + ADAPTER_EDGES, there + ADAPTER_EDGES, lid),
     )
-    return Surface(points, faces)
+    return Surface(points, np.vstack([np.column_stack(columns) for columns in corners]))
 
 
 def _to_manifold(surface: Surface, name: str) -> manifold3d.Manifold:
     mesh = manifold3d.Mesh64(surface.points, surface.faces.astype(np.uint64))
     body = manifold3d.Manifold(mesh)
     if body.status() != manifold3d.Error.NoError:
-        raise SurfaceError(
-            f"the socket's {name} is no closed body ({body.status().name})",
-            remedy="remesh the socket",
-        )
+        what = f"the socket's {name} is no closed body ({body.status().name})"
+        raise SurfaceError(what, remedy="remesh the socket")
     return body
 
 

@@ -37,7 +37,7 @@ from ...indentation import Direction, Parameters, build_fibre_field, build_mater
 from ...mesh import Mesh, read_vtu
 from ...results.limb import MeshMeasures
 from ...socket import Socket
-from ...socket.landmarks import SkinRegion, find_directions, load_point
+from ...socket.landmarks import SkinRegion, find_directions, find_load_point
 from ...study import Study
 from ..engine.context import Context
 from ..engine.partial_results import Begun, Made, ResultFiles
@@ -130,7 +130,7 @@ class SocketLimb:
             loads.append(Load(load.name, force, moment, point, load.duration_s, load.hold_s))
         depth = float(np.ptp(socket.points @ known.proximal))
         return SocketFit(
-            pivot=load_point(self.anatomy, socket.points[socket.brim]),
+            pivot=find_load_point(self.anatomy, socket.points[socket.brim]),
             proximal=known.proximal,
             anterior=known.anterior,
             friction=table.friction,

@@ -25,7 +25,7 @@ from ...socket.landmarks import (
     find_bone,
     find_directions,
     find_knee_centre,
-    load_point,
+    find_load_point,
 )
 from ...socket.loads import STANDARD_LOADS
 from ...socket.targets import Target
@@ -164,7 +164,7 @@ def load_of(
     """
     check_load(study, load, anatomy.bones)
     brim = socket.points[socket.brim]
-    point = load_point(anatomy, brim) if load.point is None else np.array(load.point)
+    point = find_load_point(anatomy, brim) if load.point is None else np.array(load.point)
     if load.preset is None:
         return np.array(load.force_N), np.array(load.moment_Nmm), point
     standard, weight = STANDARD_LOADS[load.preset], study.socket.body_weight_N
