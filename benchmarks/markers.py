@@ -42,7 +42,7 @@ def moved(limb: Limb, seed: int) -> Limb:
     random = np.random.default_rng([seed, 10])
     axis, way = random.normal(size=3), random.normal(size=3)
     turn, shift = np.cbrt(random.uniform(size=2)) * (np.deg2rad(TURN_DEG), SHIFT_MM)
-    return limb.moved(build_rotation(axis, turn), shift * way / np.linalg.norm(way))
+    return limb.move(build_rotation(axis, turn), shift * way / np.linalg.norm(way))
 
 
 def coarser(grid: ScanGrid, factor: float) -> ScanGrid:

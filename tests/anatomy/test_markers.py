@@ -35,7 +35,7 @@ def scans(seed: int):
     """The limb, the limb after a motion, and images of the first without and the second with markers."""
     limb = make_limb(seed)
     turn = build_rotation(np.array([0.3, 0.2, 1.0]), np.deg2rad(TURN_DEG))
-    moved = limb.moved(turn, SHIFT_MM)
+    moved = limb.move(turn, SHIFT_MM)
     grid = make_grid(limb, "coarse", seed)
     marked = build_image(moved, grid, build_markers(build_true_sites(moved, seed)), seed=seed)
     return limb, moved, build_image(limb, grid, seed=seed), marked

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from limbfit.anatomy.surfaces.surfaces import save_anatomy
-from limbfit.phantom.build import _build_ramp, _to_triple, draw_true_parameters
+from limbfit.phantom.build import _to_triple, draw_true_parameters
 from limbfit.phantom.forces import (
     DISCRETISATIONS,
     ForceJob,
@@ -40,9 +40,7 @@ def test_site_is_simulated_to_its_end(phantom, name):
     made, at, axis = DISCRETISATIONS["coarse"], _to_triple(site.position), _to_triple(site.axis)
     mesh = mesh_true_site(TruthMeshJob(name, folder, at, axis, made.mesh, made.within_mm))
     steps = made.steps(site.thickness)
-    found = simulate_true_force(
-        ForceJob(name, mesh, at, axis, _build_ramp(site), steps, draw_true_parameters(0))
-    )
+    found = simulate_true_force(ForceJob(name, mesh, at, axis, site.ramp, steps, draw_true_parameters(0)))
     peak = int(np.argmax(found.force))
     assert 2.0 < found.force[peak] < 20.0
     assert found.times[peak] == pytest.approx(site.depth / site.speed, rel=0.02)
@@ -58,7 +56,7 @@ def test_a_site_shows_what_is_asked_for_and_no_more(phantom):
     settings = replace(made.mesh, edge_near_mm=7.0)
     mesh = mesh_true_site(TruthMeshJob("05", folder, at, axis, settings, 45.0))
     steps = replace(made.steps(site.thickness), load_steps=4, unload_steps=3)
-    job = ForceJob("05", mesh, at, axis, _build_ramp(site), steps, draw_true_parameters(0))
+    job = ForceJob("05", mesh, at, axis, site.ramp, steps, draw_true_parameters(0))
     plain, found = (
         simulate_true_force(job),
         simulate_true_force(replace(job, seen=SecondaryMeasurements(True, True, True))),

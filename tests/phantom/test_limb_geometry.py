@@ -113,7 +113,7 @@ def test_the_femur_sticks_out_of_the_flat_cut_and_nothing_else_does(anatomy) -> 
 def test_a_moved_limb_is_the_same_limb_elsewhere() -> None:
     limb = make_limb(0)
     turn, shift = build_rotation(np.array([1.0, 2.0, 3.0]), 0.05), np.array([1.0, -2.0, 0.5])
-    moved = limb.moved(turn, shift)
+    moved = limb.move(turn, shift)
     middle = limb.to_patient(np.array([0.0, 0.0, 125.0]))
     point = limb.skin_point(1.0, 100.0)
     there = turn @ (point - middle) + middle + shift

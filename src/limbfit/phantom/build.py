@@ -37,7 +37,7 @@ from .forces import (
 )
 from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, make_limb
 from .mri import DETAIL_GRIDS, make_grid, write_series, write_true_labels
-from .record import Ramp, SecondaryMeasurements, record, write_surface, write_ultrasound, write_waves
+from .record import SecondaryMeasurements, record, write_surface, write_ultrasound, write_waves
 from .sites import DETAIL_SITES, INDENTER_MM, TrueSite, build_markers, build_true_sites, select_sites
 from .socket import write_socket
 from .studyfile import format_study
@@ -57,7 +57,7 @@ KAPPA_RATIO = 100.0
 
 
 def draw_true_parameters(seed: int, fat: bool = False, tendon: bool = False) -> Parameters:
-    """The tissues of a seed, with or without fat and tendon: within 15 % of the base, three digits.
+    """Draw the tissues of a seed, with or without fat and tendon: within 15 % of the base, three digits.
 
     The tendon is a stiffer muscle.
     """
@@ -128,7 +128,7 @@ def make_phantom(
     if detail not in DETAIL_GRIDS:
         raise InputError(f"unknown detail {detail!r}", remedy=f"use one of {', '.join(DETAIL_GRIDS)}")
     patient = make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER, tendon, limb)
-    seen = SecondaryMeasurements(ultrasound, surface, shear_waves)
+    measurements = SecondaryMeasurements(ultrasound, surface, shear_waves)
     parameters = draw_true_parameters(seed, fat, tendon)
     everywhere = build_true_sites(patient, seed)
     indented = select_sites(everywhere, DETAIL_SITES[detail] if sites is None else sites)
@@ -139,9 +139,9 @@ def make_phantom(
             truth["socket"] = write_socket(work, patient, anatomy)
         _write_images(work, patient, everywhere, detail, seed, tell)
         truth["sites"] = _write_traces(
-            work, patient, anatomy, indented, detail, seed, parameters, mapping, tell, seen
+            work, patient, anatomy, indented, detail, seed, parameters, mapping, tell, measurements
         )
-        text = format_study(indented, detail, seed, patient, seen, socket)
+        text = format_study(indented, detail, seed, patient, measurements, socket)
         (work / "study.toml").write_text(text, encoding="utf-8")
         (work / "truth.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
     return truth
@@ -149,7 +149,7 @@ def make_phantom(
 
 @contextmanager
 def _open_hidden_folder(folder: Path) -> Iterator[Path]:
-    """A hidden folder beside ``folder`` that takes its name when the block ends well."""
+    """Open a hidden folder beside ``folder`` that takes its name when the block ends well."""
     if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
         raise InputError("there is something already", file=folder, remedy="give a new or an empty folder")
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -195,9 +195,9 @@ def _write_traces(
     parameters: Parameters,
     mapping: Mapping,
     tell: Listener,
-    seen: SecondaryMeasurements,
+    measurements: SecondaryMeasurements,
 ) -> list[dict[str, Any]]:
-    """Simulate and record every site; what is true of each, for ``truth.json``."""
+    """Simulate and record every site; return what is true of each, for ``truth.json``."""
     truth, traces = work / "truth", work / "traces"
     truth.mkdir()
     traces.mkdir()
@@ -205,24 +205,26 @@ def _write_traces(
     made = choose_discretisation(detail, limb.kind)
     settings = replace(made.mesh, layers=limb.layers)
     places = [(site.name, _to_triple(site.position), _to_triple(site.axis)) for site in indented]
-    wanted = [TruthMeshJob(name, truth, at, axis, settings, made.within_mm) for name, at, axis in places]
+    mesh_jobs = [TruthMeshJob(name, truth, at, axis, settings, made.within_mm) for name, at, axis in places]
     jobs = []
-    tell("meshes", 0, len(wanted))
-    for (name, at, axis), site, mesh in zip(places, indented, mapping(mesh_true_site, wanted), strict=True):
+    tell("meshes", 0, len(mesh_jobs))
+    for (name, at, axis), site, mesh in zip(
+        places, indented, mapping(mesh_true_site, mesh_jobs), strict=True
+    ):
         steps = made.steps(site.thickness)
-        jobs.append(ForceJob(name, mesh, at, axis, _build_ramp(site), steps, parameters, seen))
-        tell("meshes", len(jobs), len(wanted))
+        jobs.append(ForceJob(name, mesh, at, axis, site.ramp, steps, parameters, measurements))
+        tell("meshes", len(jobs), len(mesh_jobs))
     tell("forces", 0, len(jobs))
-    told = []
+    facts = []
     for i, (site, found) in enumerate(zip(indented, mapping(simulate_true_force, jobs), strict=True)):
-        told.append(_record_site(traces, site, found, seed))
+        facts.append(_record_site(traces, site, found, seed))
         tell("forces", i + 1, len(jobs))
-    return told
+    return facts
 
 
 def _record_site(traces: Path, site: TrueSite, found: TrueForce, seed: int) -> dict[str, Any]:
     random = np.random.default_rng([seed, 8, int(site.name)])
-    made = record(_build_ramp(site), lambda t: np.interp(t, found.times, found.force), random)
+    made = record(site.ramp, lambda t: np.interp(t, found.times, found.force), random)
     made.write(traces / f"site-{site.name}.csv")
     if found.layers:
         write_ultrasound(
@@ -263,10 +265,6 @@ def _record_site(traces: Path, site: TrueSite, found: TrueForce, seed: int) -> d
         "force_noise_N": made.force_noise,
         "simulation": found.facts,
     }
-
-
-def _build_ramp(site: TrueSite) -> Ramp:
-    return Ramp(site.depth, site.speed)
 
 
 def _to_triple(vector: Any) -> tuple[float, float, float]:

@@ -81,7 +81,7 @@ DISCRETISATIONS = {
 
 
 def choose_discretisation(detail: str, kind: str) -> Discretisation:
-    """How the true forces of a kind of limb are made, for images of a detail."""
+    """Choose how the true forces of a kind of limb are made, for images of a detail."""
     made = DISCRETISATIONS[detail]
     return made if kind == "transtibial" else replace(made, within_mm=None)
 
@@ -109,12 +109,12 @@ class ForceJob:
     ramp: Ramp
     steps: StepControl
     parameters: Parameters
-    seen: SecondaryMeasurements = NOTHING
+    measurements: SecondaryMeasurements = NOTHING
 
 
 @dataclass(frozen=True)
 class TrueForce:
-    """What came back: force (n,) N at times (n,) s from touch-down, and facts for ``truth.json``.
+    """The simulated force (n,) N at times (n,) s from touch-down, and facts for ``truth.json``.
 
     ``layers``: of each tissue on the axis its thickness at rest, mm, and its compression (n,) mm, where
     ultrasound was wanted. ``skin_points`` (k, 3) mm around the indenter and their ``skin_moves`` (k, 3, n),
@@ -133,7 +133,7 @@ class TrueForce:
 
 @lru_cache(maxsize=1)
 def _build_base(folder: Path, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
-    """What all sites of a phantom share; a worker makes it once."""
+    """Build what all sites of a phantom share; a worker does so once."""
     anatomy = load_anatomy(folder)
     return anatomy, build_base_mesh(anatomy, settings)
 
@@ -166,7 +166,7 @@ def simulate_true_force(job: ForceJob) -> TrueForce:
         indenter=IndenterTable(width_mm=INDENTER_MM, edge_radius_mm=INDENTER_EDGE_MM),
     )
     problem = replace(build_problem(model, job.mesh, job.parameters), element=ELEMENT)
-    result = solve(problem, steps=job.steps, store="all" if any(job.seen) else "peak")
+    result = solve(problem, steps=job.steps, store="all" if any(job.measurements) else "peak")
     if not result.completed:
         raise RunError(f"the phantom's site {job.site} could not be simulated: {result.reason}")
     times = np.linspace(0.0, knots_s[-1], 401)
@@ -178,14 +178,16 @@ def simulate_true_force(job: ForceJob) -> TrueForce:
         "penalty_per_mm": float(result.statistics["penalty_per_mm"]),
     }
     found = TrueForce(job.site, times, result.force_at(times), facts)
-    if not any(job.seen):
+    if not any(job.measurements):
         return found
     gauges = (
-        find_gauges_along(job.mesh, np.array(job.position), np.array(job.axis)) if job.seen.ultrasound else ()
+        find_gauges_along(job.mesh, np.array(job.position), np.array(job.axis))
+        if job.measurements.ultrasound
+        else ()
     )
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
-    around = choose_points_around(job.mesh, indenter) if job.seen.surface else np.zeros((0, 3))
-    waves = place_waves_under(model, job.mesh) if job.seen.shear_waves else ()
+    around = choose_points_around(job.mesh, indenter) if job.measurements.surface else np.zeros((0, 3))
+    waves = place_waves_under(model, job.mesh) if job.measurements.shear_waves else ()
     layers = tuple(gauge.region for gauge in gauges)
     model = replace(model, layers=layers, skin_points=tuple(map(tuple, around)), waves=waves)
     values, _ = observe_result(result, model, times)

@@ -101,7 +101,7 @@ class Limb:
         inside = self.bones(point + along[:, None] * axis) < 0
         return float(along[inside.argmax()]) if inside.any() else limit
 
-    def moved(self, rotation: Array, translation: Array) -> Limb:
+    def move(self, rotation: Array, translation: Array) -> Limb:
         """The limb after a rigid motion about its own middle (LPS)."""
         middle = self.to_patient(np.array([0.0, 0.0, PROXIMAL_CUT_MM / 2]))
         origin = rotation @ (self.origin - middle) + middle + translation

@@ -53,7 +53,7 @@ class LimbShape(ABC):
 
 
 def vary(base: LimbShape, seed: int) -> LimbShape:
-    """The shape of a seed; each size is uniform around its default."""
+    """Draw the shape of a seed; each size is uniform around its default."""
     random = np.random.default_rng([seed, 1])
     drawn = {
         name: getattr(base, name) + span * random.uniform(-1, 1) for name, span in base.variation.items()
@@ -77,7 +77,7 @@ def _compute_dome(shape: LimbShape, z: Array) -> Array:
 
 
 def compute_skin_field(shape: LimbShape, points: Array) -> Array:
-    """Skin field at points (..., 3) of the limb frame: star-shaped sections on an ellipsoidal end."""
+    """Compute the skin field at limb points (..., 3): star-shaped sections on an ellipsoidal end."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     radius = shape.section_radius(np.arctan2(x, -y), z)
     level = np.sqrt((x * x + y * y) / radius**2 + _compute_dome(shape, z) ** 2)
@@ -124,7 +124,7 @@ def compute_ellipsoid_distance(
 
 
 def join_fields(a: Array, b: Array, blend: float) -> Array:
-    """Smooth union of two fields."""
+    """Join two fields smoothly."""
     h = np.clip(blend - np.abs(a - b), 0, None) / blend
     return np.minimum(a, b) - h * h * blend / 4
 

@@ -86,7 +86,7 @@ DETAIL_GRIDS = {
 
 
 def make_grid(limb: Limb, detail: str, seed: int) -> ScanGrid:
-    """The scanner's oblique box around a limb: a few degrees off the limb's own frame."""
+    """Make the scanner's oblique box around a limb: a few degrees off the limb's own frame."""
     shape, spacing = DETAIL_GRIDS[detail]
     random = np.random.default_rng([seed, 3])
     tilt = build_rotation(random.normal(size=3), np.deg2rad(random.uniform(2, 4)))
@@ -117,7 +117,7 @@ class SkinMarker:
 def _compute_occupancy(
     field: NDArray[np.floating], spacing: tuple[float, float, float], offsets: Sequence[float]
 ) -> list[NDArray[np.floating]]:
-    """Share of each voxel that lies deeper than ``offset`` inside, for each offset (mm)."""
+    """Compute the share of each voxel that lies deeper than ``offset`` inside, for each offset (mm)."""
     steps = [np.gradient(field, axis=axis) for axis in range(3)]
     per_voxel = np.sqrt(sum(g * g for g in steps))
     per_mm = np.sqrt(sum((g / h) ** 2 for g, h in zip(steps, spacing[::-1], strict=True)))
@@ -129,7 +129,7 @@ def _compute_occupancy(
 def _compute_tissue(
     limb: Limb, points: NDArray[np.floating], spacing: tuple[float, float, float], levels: Contrast
 ) -> tuple:
-    """Noise-free signal of a block and the share of each voxel inside the skin."""
+    """Compute the noise-free signal of a block and the share of each voxel inside the skin."""
     skin, inner = _compute_occupancy(limb.skin(points), spacing, (0.0, limb.layers_mm))
     signal = levels.air + (levels.fat - levels.air) * skin + (levels.muscle - levels.fat) * inner
     if limb.has_tendon:
@@ -161,7 +161,7 @@ def _add_marker(
 
 
 def _find_limb_window(grid: ScanGrid, limb: Limb, k: slice) -> tuple[slice, slice]:
-    """Rows and columns of a slab that can hold tissue."""
+    """Find the rows and columns of a slab that can hold tissue."""
     heights = np.array([-10.0, PROXIMAL_CUT_MM + 40.0])
     axis = limb.to_patient(np.stack([0 * heights, 0 * heights, heights], axis=-1))
     index = (axis - grid.origin) @ grid.direction / np.array(grid.spacing)
@@ -176,7 +176,7 @@ def _find_limb_window(grid: ScanGrid, limb: Limb, k: slice) -> tuple[slice, slic
 
 
 def _build_bias_field(seed: int, amplitude: float) -> Callable[[ScanGrid, slice], NDArray[np.float32]]:
-    """A smooth receive profile within 1 +- ``amplitude`` over the whole image."""
+    """Build a smooth receive profile within 1 +- ``amplitude`` over the whole image."""
     random = np.random.default_rng([seed, 4])
     linear, quadratic = random.uniform(-1, 1, 3), random.uniform(-1, 1, 3)
     scale = amplitude / (np.abs(linear).sum() + np.abs(quadratic).sum())
@@ -200,7 +200,7 @@ def generate_slabs(
     noise: float | None = None,
     levels: Contrast = UTE,
 ) -> Iterator[tuple[slice, NDArray[np.float32]]]:
-    """The image slab by slab: slices and signal (nk, nj, ni), with bias and noise (None: the contrast's)."""
+    """Generate slices and signal (nk, nj, ni) slab by slab, with bias and noise (None: the contrast's)."""
     random = np.random.default_rng([seed, 5, len(markers)])
     bias = _build_bias_field(seed, levels.bias)
     deviation = levels.noise if noise is None else noise
@@ -253,7 +253,7 @@ def write_series(
     for k, signal in generate_slabs(limb, grid, markers, seed):
         stored = np.clip(np.rint(signal * (FULL_SCALE / RESCALE_SLOPE)), 0, 65535).astype(np.uint16)
         for index, pixels in zip(range(k.start, k.stop), stored, strict=True):
-            slice_ = _slice_dataset(grid, index, pixels, seed, number, series)
+            slice_ = _build_slice(grid, index, pixels, seed, number, series)
             slice_.SeriesDescription = description
             slice_.save_as(folder / f"IM{index + 1:04d}.dcm", enforce_file_format=True)
         if progress is not None:
@@ -261,7 +261,7 @@ def write_series(
 
 
 def _build_uid(seed: int, *names: object) -> UID:
-    """The same seed gives the same identifiers, so that a phantom is reproduced to the byte."""
+    """Build the identifier of a seed, the same each time, so that a phantom is reproduced to the byte."""
     return generate_uid(entropy_srcs=["limbfit phantom", str(seed), *map(str, names)])
 
 
@@ -269,7 +269,7 @@ def _format_decimals(values: Sequence[float] | NDArray[np.float64]) -> list[str]
     return [format_number_as_ds(float(value)) for value in values]
 
 
-def _slice_dataset(
+def _build_slice(
     grid: ScanGrid, index: int, pixels: NDArray[np.uint16], seed: int, number: int, series: UID
 ) -> FileDataset:
     meta = FileMetaDataset()
@@ -277,8 +277,8 @@ def _slice_dataset(
     meta.MediaStorageSOPInstanceUID = _build_uid(seed, "image", number, index)
     meta.TransferSyntaxUID = ExplicitVRLittleEndian
     data = FileDataset(None, {}, file_meta=meta, preamble=b"\0" * 128)  # type: ignore[arg-type]
-    _identify(data, meta, seed, number, series)
-    _place(data, grid, index)
+    _write_identity_tags(data, meta, seed, number, series)
+    _write_geometry_tags(data, grid, index)
     data.InstanceNumber = index + 1
     data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
     data.Rows, data.Columns = pixels.shape
@@ -288,8 +288,10 @@ def _slice_dataset(
     return data
 
 
-def _identify(data: FileDataset, meta: FileMetaDataset, seed: int, number: int, series: UID) -> None:
-    """Tags of a made-up scan; nobody is behind them."""
+def _write_identity_tags(
+    data: FileDataset, meta: FileMetaDataset, seed: int, number: int, series: UID
+) -> None:
+    """Write the tags of a made-up scan; nobody is behind them."""
     data.SOPClassUID, data.SOPInstanceUID = meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID
     data.StudyInstanceUID, data.SeriesInstanceUID = _build_uid(seed, "study"), series
     data.FrameOfReferenceUID, data.PositionReferenceIndicator = _build_uid(seed, "frame"), ""
@@ -306,8 +308,8 @@ def _identify(data: FileDataset, meta: FileMetaDataset, seed: int, number: int, 
     data.MagneticFieldStrength, data.FlipAngle, data.EchoTrainLength = "3", "10", "1"
 
 
-def _place(data: FileDataset, grid: ScanGrid, index: int) -> None:
-    """Image plane tags: the row cosines point along i, the column cosines along j."""
+def _write_geometry_tags(data: FileDataset, grid: ScanGrid, index: int) -> None:
+    """Write image plane tags: the row cosines point along i, the column cosines along j."""
     position = grid.origin + index * grid.spacing[2] * grid.direction[:, 2]
     data.ImagePositionPatient = _format_decimals(position)
     data.ImageOrientationPatient = _format_decimals(
@@ -323,7 +325,7 @@ TENDON_LABEL, TENDON_VALUE = "patellar tendon", 7
 
 
 def build_true_labels(limb: Limb, grid: ScanGrid) -> LabelMap:
-    """Soft tissue, bones and, where the limb has one, the patellar tendon, voxel by voxel."""
+    """Label soft tissue, bones and, where the limb has one, the patellar tendon, voxel by voxel."""
     values = {name: value for value, name in DEFAULT_NAMES.items()}
     array = np.zeros(grid.shape, dtype=np.uint8)
     for start in range(0, grid.shape[0], SLAB):

@@ -1,4 +1,4 @@
-"""What the indentation robot writes down: a clean force history as a noisy 500 Hz record with slack.
+"""The record of the indentation robot: a clean force history becomes a noisy 500 Hz record with slack.
 
 The robot starts clear of the skin, moves at constant speed to its depth, straight back to where it started,
 and records a little longer. Its displacement counts from the start, not from touch-down.
@@ -28,7 +28,7 @@ HEADER = "time_s,displacement_mm,force_N"
 
 
 class SecondaryMeasurements(NamedTuple):
-    """What is seen of an indentation beside its force."""
+    """What is measured of an indentation beside its force."""
 
     ultrasound: bool = False
     surface: bool = False

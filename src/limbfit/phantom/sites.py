@@ -17,6 +17,7 @@ from ..errors import SiteError
 from .geometry import Limb
 from .limb_shapes import Shank
 from .mri import SkinMarker
+from .record import Ramp
 
 INDENTER_MM, INDENTER_EDGE_MM = 20.0, 2.0
 SAFE_SHARE = 0.4  # of the thinnest soft tissue under the indenter
@@ -82,9 +83,14 @@ class TrueSite:
     thickness: float
     hint: NDArray[np.float64]
 
+    @property
+    def ramp(self) -> Ramp:
+        """The indentation that the robot makes there."""
+        return Ramp(self.depth, self.speed)
+
 
 def build_true_sites(limb: Limb, seed: int) -> tuple[TrueSite, ...]:
-    """All 18 sites of a limb."""
+    """Build all 18 sites of a limb."""
     places = SHANK_PLACES if isinstance(limb.shape, Shank) else THIGH_PLACES
     return tuple(
         _build_true_site(limb, place, np.random.default_rng([seed, 6, i])) for i, place in enumerate(places)
@@ -92,24 +98,24 @@ def build_true_sites(limb: Limb, seed: int) -> tuple[TrueSite, ...]:
 
 
 def select_sites(sites: Sequence[TrueSite], names: Sequence[str]) -> tuple[TrueSite, ...]:
-    """The named sites, in the order of the limb's list.
+    """Select the named sites, in the order of the limb's list.
 
     Raises
     ------
     SiteError
         When a name is not among them.
     """
-    known = {site.name for site in sites}
-    unknown = [name for name in names if name not in known]
+    available = {site.name for site in sites}
+    unknown = [name for name in names if name not in available]
     if unknown:
         raise SiteError(
-            f"the phantom has no site {unknown[0]!r}", remedy=f"choose from {', '.join(sorted(known))}"
+            f"the phantom has no site {unknown[0]!r}", remedy=f"choose from {', '.join(sorted(available))}"
         )
     return tuple(site for site in sites if site.name in set(names))
 
 
 def build_markers(sites: Sequence[TrueSite]) -> tuple[SkinMarker, ...]:
-    """A skin marker on every site."""
+    """Put a skin marker on every site."""
     return tuple(SkinMarker(site.position, -site.axis) for site in sites)
 
 
@@ -135,7 +141,7 @@ def _build_true_site(limb: Limb, place: Place, random: np.random.Generator) -> T
 
 
 def _sample_footprint(limb: Limb, position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Skin points (25, 3) under a square indenter at a position, found along its normal."""
+    """Find skin points (25, 3) under a square indenter at a position, along its normal."""
     normal = -limb.inward(position[None])[0]
     proximal = limb.proximal_normal - normal * (limb.proximal_normal @ normal)
     proximal /= np.linalg.norm(proximal)

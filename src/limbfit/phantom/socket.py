@@ -42,7 +42,7 @@ AREAS = {
 
 
 def make_socket(anatomy: Anatomy, outer: Surface, kind: str = "transtibial") -> tuple[Socket, list[Area]]:
-    """The socket around a limb in a liner, and its areas: a shank's bears on the patellar tendon.
+    """Make the socket around a limb in a liner, and its areas: a shank's bears on the patellar tendon.
 
     Parameters
     ----------
@@ -55,29 +55,28 @@ def make_socket(anatomy: Anatomy, outer: Surface, kind: str = "transtibial") -> 
     SurfaceError
         Where the limb has no place for it.
     """
-    known = find_directions(anatomy, "right")
-    regions = build_default_regions(anatomy, known)
+    directions = find_directions(anatomy, "right")
+    regions = build_default_regions(anatomy, directions)
     areas = [Area(name, regions[name].position, radius, depth) for name, radius, depth in AREAS[kind]]
     knee, frame = find_knee_centre(anatomy), build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
-    trim = _trim_below_cut(anatomy) if knee is None else _trim_around_tendon(anatomy, known, knee)
+    if knee is None:
+        trim = Trim([(anatomy.cut_point - BELOW_CUT_MM * anatomy.cut_normal, anatomy.cut_normal)])
+    else:
+        trim = _trim_around_tendon(anatomy, directions, knee)
     return rectify_limb(outer, frame, Recipe(trim, REDUCTION_PERCENT, areas)), areas
 
 
-def _trim_below_cut(anatomy: Anatomy) -> Trim:
-    return Trim([(anatomy.cut_point - BELOW_CUT_MM * anatomy.cut_normal, anatomy.cut_normal)])
-
-
-def _trim_around_tendon(anatomy: Anatomy, known: Directions, knee: Array) -> Trim:
-    """As of a patellar-tendon-bearing socket: from the patella's middle to below the knee at the back.
+def _trim_around_tendon(anatomy: Anatomy, directions: Directions, knee: Array) -> Trim:
+    """Trim as a patellar-tendon-bearing socket is: from the patella's middle to below the knee at the back.
 
     A brim below the knee all around would cut through the bar on the tendon, half of which lies above it.
     """
     front, skin = anatomy.bones["patella"].points.mean(axis=0), anatomy.skin.points
     near = np.abs(anatomy.height(skin) - anatomy.height(knee) + BELOW_KNEE_MM) < BAND_MM
-    behind = ((skin[near] - knee) @ known.anterior).min()
-    back = knee + behind * known.anterior - BELOW_KNEE_MM * known.proximal
-    slope = (front - back) @ known.proximal / ((front - back) @ known.anterior)
-    return Trim([(front, known.proximal - slope * known.anterior)])
+    behind = ((skin[near] - knee) @ directions.anterior).min()
+    back = knee + behind * directions.anterior - BELOW_KNEE_MM * directions.proximal
+    slope = (front - back) @ directions.proximal / ((front - back) @ directions.anterior)
+    return Trim([(front, directions.proximal - slope * directions.anterior)])
 
 
 def write_socket(folder: Path, limb: Limb, anatomy: Anatomy) -> dict[str, Any]:

@@ -99,10 +99,10 @@ def format_study(
     detail: str,
     seed: int,
     limb: Limb,
-    seen: SecondaryMeasurements = NOTHING,
+    measurements: SecondaryMeasurements = NOTHING,
     socket: bool = False,
 ) -> str:
-    """The content of ``study.toml`` for some sites of a limb."""
+    """Write the content of ``study.toml`` for some sites of a limb."""
     head = _HEAD.format(
         seed=seed,
         detail=detail,
@@ -121,15 +121,10 @@ def format_study(
         x, y, z = site.hint
         fitted = "true" if site.fitted else "false"
         parts.append(_SITE.format(name=site.name, region=site.region, fitted=fitted, x=x, y=y, z=z))
-        for one, line in zip(seen, (_ULTRASOUND, _SURFACE, _WAVES), strict=True):
-            parts += [line.format(name=site.name)] if one else []
-    return "".join([*parts, *_format_socket(limb, socket)])
-
-
-def _format_socket(limb: Limb, made: bool) -> list[str]:
-    """The table of the socket, where it says anything."""
-    lines = [_SIDE] * (not isinstance(limb.shape, Shank)) + [_FILE] * made
-    return ["\n[socket]\n", *lines] if lines else []
+        for is_measured, line in zip(measurements, (_ULTRASOUND, _SURFACE, _WAVES), strict=True):
+            parts += [line.format(name=site.name)] if is_measured else []
+    table = [_SIDE] * (not isinstance(limb.shape, Shank)) + [_FILE] * socket
+    return "".join([*parts, *(["\n[socket]\n", *table] if table else [])])
 
 
 def _format_layers(layers: Sequence[LayerSpec]) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
 from ..anatomy.surfaces.triangles import find_bodies, find_half_edges, from_pyvista
-from .geometry import TENDON, Limb
+from .geometry import TENDON, Limb, compute_gradient
 from .limb_shapes import PROXIMAL_CUT_MM, compute_skin_field
 
 Array = NDArray[np.floating]
@@ -31,7 +31,7 @@ STICK_OUT_MM = 6.0  # of the femur beyond the cut, so that the void it leaves is
 
 
 def build_true_anatomy(limb: Limb, spacing: float = 2.4) -> Anatomy:
-    """Skin, bones and tendon of a limb (LPS mm); the skin is closed by the flat proximal cut.
+    """Build skin, bones and tendon of a limb (LPS mm); the flat proximal cut closes the skin.
 
     Parameters
     ----------
@@ -41,8 +41,18 @@ def build_true_anatomy(limb: Limb, spacing: float = 2.4) -> Anatomy:
     shape = limb.shape
     box = Box((-80.0, -85.0, -4.0), (80.0, 85.0, PROXIMAL_CUT_MM), spacing)
     skin = extract_contour(lambda p: compute_skin_field(shape, p), box)
-    bones = {name: _build_bone(limb, name, spacing / 1.5) for name in limb.bone_names}
-    regions = {TENDON: _to_patient_space(limb, _build_tendon(limb, spacing / 2))} if limb.has_tendon else {}
+    low, high = (-62.0, -66.0, 10.0), (62.0, 62.0, PROXIMAL_CUT_MM + STICK_OUT_MM)
+    bone_box = Box(low, high, spacing / 1.5)
+    bones = {
+        name: extract_contour(lambda p, name=name: shape.bone_field(name, p), bone_box)  # type: ignore[misc]
+        for name in limb.bone_names
+    }
+    regions = {}
+    if limb.has_tendon:
+        z = shape.datum - 12.0
+        tendon_box = Box((-24.0, -66.0, z - 36.0), (24.0, -22.0, z + 36.0), spacing / 2)
+        tendon = extract_contour(lambda p: limb.tendon(limb.to_patient(p)), tendon_box)
+        regions[TENDON] = _to_patient_space(limb, tendon)
     return Anatomy(
         skin=_to_patient_space(limb, skin),
         bones={name: _to_patient_space(limb, bone) for name, bone in bones.items()},
@@ -53,7 +63,7 @@ def build_true_anatomy(limb: Limb, spacing: float = 2.4) -> Anatomy:
 
 
 def build_outer_surface(limb: Limb, thickness_mm: float, spacing: float = 2.4) -> Surface:
-    """The closed surface (LPS mm) about ``thickness_mm`` outside the skin: that of a liner."""
+    """Build the closed surface (LPS mm) about ``thickness_mm`` outside the skin: that of a liner."""
     reach = thickness_mm + 4.0
     box = Box((-80.0 - reach, -85.0 - reach, -reach), (80.0 + reach, 85.0 + reach, PROXIMAL_CUT_MM), spacing)
     return _to_patient_space(
@@ -61,23 +71,12 @@ def build_outer_surface(limb: Limb, thickness_mm: float, spacing: float = 2.4) -
     )
 
 
-def _build_bone(limb: Limb, name: str, spacing: float) -> Surface:
-    box = Box((-62.0, -66.0, 10.0), (62.0, 62.0, PROXIMAL_CUT_MM + STICK_OUT_MM), spacing)
-    return extract_contour(lambda p: limb.shape.bone_field(name, p), box)
-
-
-def _build_tendon(limb: Limb, spacing: float) -> Surface:
-    middle = limb.shape.datum - 12.0
-    box = Box((-24.0, -66.0, middle - 36.0), (24.0, -22.0, middle + 36.0), spacing)
-    return extract_contour(lambda p: limb.tendon(limb.to_patient(p)), box)
-
-
 def _to_patient_space(limb: Limb, surface: Surface) -> Surface:
     return Surface(limb.to_patient(surface.points), surface.faces)
 
 
 def extract_contour(field: Field, box: Box) -> Surface:
-    """The closed zero surface of a field (limb frame), capped flat where it leaves the box at the top."""
+    """Extract the closed zero surface of a field (limb frame), capped flat where it leaves the box's top."""
     size = [round((h - l) / box.spacing) + 1 for l, h in zip(box.low, box.high, strict=True)]
     axes = [np.linspace(l, h, n) for l, h, n in zip(box.low, box.high, size, strict=True)]
     z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
@@ -91,20 +90,19 @@ def extract_contour(field: Field, box: Box) -> Surface:
 
 
 def _project_to_surface(field: Field, surface: Surface, top: float) -> Surface:
-    """Points moved onto the zero of the field by Newton steps; those of the rim stay in the top plane."""
+    """Move points onto the zero of the field by Newton steps; those of the rim stay in the top plane."""
     points = surface.points.copy()
     rim = np.abs(points[:, 2] - top) < 1e-3
     points[rim, 2] = top
     for _ in range(3):
-        steps = np.eye(3) * 0.02
-        gradient = np.stack([(field(points + d) - field(points - d)) / 0.04 for d in steps], axis=-1)
+        gradient = compute_gradient(field, points, step=0.02)
         gradient[rim, 2] = 0.0
         points -= (field(points) / (gradient * gradient).sum(axis=1))[:, None] * gradient
     return Surface(points, surface.faces)
 
 
 def _cap_rim(surface: Surface, top: float) -> Surface:
-    """Closed with a fan around the middle of its open rim, which lies in the plane z = ``top``."""
+    """Close a surface with a fan around the middle of its open rim, in the plane z = ``top``."""
     edges = find_half_edges(surface.faces)
     n = len(surface.points)
     keys, back = edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0]

@@ -34,7 +34,7 @@ def scans(tmp_path_factory):
     """A folder with both series; the sites of the first, and of the second, moved one."""
     folder = tmp_path_factory.mktemp("marked")
     limb = make_limb(SEED)
-    moved = limb.moved(build_rotation(np.array([0.2, 0.4, 1.0]), np.deg2rad(2.5)), np.array([3.0, -2.0, 2.0]))
+    moved = limb.move(build_rotation(np.array([0.2, 0.4, 1.0]), np.deg2rad(2.5)), np.array([3.0, -2.0, 2.0]))
     grid = make_grid(limb, "coarse", SEED)
     plain, marked = build_true_sites(limb, SEED), build_true_sites(moved, SEED)
     write_series(folder / "plain", limb, grid, seed=SEED, number=1)
