@@ -54,6 +54,11 @@ with suppress(ImportError):  # Windows
     import termios
 
     _PORT_ERRORS = (*_PORT_ERRORS, termios.error)
+GREETING_S = 3.0
+GREETING_INTERVAL_S = 0.5  # between greetings: a device on a serial port may still be coming home
+ANSWER_S = 0.006  # a command is answered at once: after so long it is sent again
+PACED_ANSWER_S = 0.5  # where the device's clock, which runs ahead of its ears, is the one that counts
+MAX_ATTEMPTS = 6
 
 
 class Link(Protocol):
@@ -184,13 +189,6 @@ def connect(address: str, timeout_s: float = 5.0) -> Link:
         place="--device",
         remedy=f"give tcp://HOST:PORT ({DEFAULT_ADDRESS}) or serial:PATH@BAUD (serial:/dev/ttyUSB0@{BAUD})",
     )
-
-
-GREETING_S = 3.0
-GREETING_INTERVAL_S = 0.5  # between greetings: a device on a serial port may still be coming home
-ANSWER_S = 0.006  # a command is answered at once: after so long it is sent again
-PACED_ANSWER_S = 0.5  # where the device's clock, which runs ahead of its ears, is the one that counts
-MAX_ATTEMPTS = 6
 
 
 class Device(Protocol):

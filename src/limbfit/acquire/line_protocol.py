@@ -25,6 +25,14 @@ HOST_LINE = 128  # bytes, newline included: the longest that a device must take
 DEVICE_LINE = 768  # the longest that limbfit takes
 MAX_NUMBER = 2**31 - 1
 _LINE = re.compile(rb"([0-9]{1,10}) ([\x20-\x29\x2b-\x7e]+)\*([0-9A-F]{8})\Z")
+WORD = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,39}"
+_WORD = re.compile(rf"{WORD}\Z", re.ASCII)
+_INTEGER = re.compile(r"-?[0-9]{1,9}\Z", re.ASCII)
+_NONCE = re.compile(r"[0-9a-f]{16}\Z")
+_SAMPLE = re.compile(
+    rf"S ([0-9]{{1,15}}),([0-9]{{1,4}}),([0-9]{{1,5}})((?:,-?[0-9]{{1,8}}){{{3 * PINS}}})\Z", re.ASCII
+)
+MAX_VALUE = 1_000_000  # no length, speed or force of this device is larger (um, um/s, mN)
 
 
 def derive_salt(host_nonce: str, device_nonce: str) -> int:
@@ -135,16 +143,6 @@ class Decoder:
         self.refused.missing += count - self.last - 1
         self.last = count
         return Line(count, body.decode("ascii"))
-
-
-WORD = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,39}"
-_WORD = re.compile(rf"{WORD}\Z", re.ASCII)
-_INTEGER = re.compile(r"-?[0-9]{1,9}\Z", re.ASCII)
-_NONCE = re.compile(r"[0-9a-f]{16}\Z")
-_SAMPLE = re.compile(
-    rf"S ([0-9]{{1,15}}),([0-9]{{1,4}}),([0-9]{{1,5}})((?:,-?[0-9]{{1,8}}){{{3 * PINS}}})\Z", re.ASCII
-)
-MAX_VALUE = 1_000_000  # no length, speed or force of this device is larger (um, um/s, mN)
 
 
 class Message:

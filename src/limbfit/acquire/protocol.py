@@ -31,6 +31,12 @@ from .events import (
 from .line_protocol import Identity
 from .safety import ClampWatch, Guard, Violation, check_device_flags, check_sensitivity, make_session_limits
 
+COMMAND_DELAY_S = 0.05  # a pin may stand still for so long before a command reaches it
+ARRIVAL_TOLERANCE_UM = 60  # a pin that is so near to its target has arrived
+MAX_CLAMP_ROUNDS = 30
+MAX_SILENCE_S = 5.0  # a device that says nothing for so long after a stop is out of reach
+MAX_STOP_S = 15.0  # and so is one that has not come home by then
+
 
 class Phase(StrEnum):
     """Where a session is."""
@@ -126,13 +132,6 @@ _PROTOCOL_STEPS: dict[tuple[Phase, Outcome], Phase] = {
 TRANSITIONS = _PROTOCOL_STEPS | {
     (phase, Outcome.STOP): Phase.STOPPING for phase in Phase if phase not in FINAL | {Phase.STOPPING}
 }
-
-
-COMMAND_DELAY_S = 0.05  # a pin may stand still for so long before a command reaches it
-ARRIVAL_TOLERANCE_UM = 60  # a pin that is so near to its target has arrived
-MAX_CLAMP_ROUNDS = 30
-MAX_SILENCE_S = 5.0  # a device that says nothing for so long after a stop is out of reach
-MAX_STOP_S = 15.0  # and so is one that has not come home by then
 
 
 class Protocol:

@@ -49,6 +49,7 @@ COLUMNS = (
         for pin in range(1, PINS + 1)
     ),
 )
+_CLOSING = re.compile(rb"#block ([0-9]{1,9}) ([0-9]{1,9}) ([0-9A-F]{8})\n")
 
 
 class Recorder:
@@ -210,9 +211,6 @@ class _WholeBlocks:
     crc: int
     next: int
     is_damaged: bool = False  # what follows is closed, and yet not whole
-
-
-_CLOSING = re.compile(rb"#block ([0-9]{1,9}) ([0-9]{1,9}) ([0-9A-F]{8})\n")
 
 
 def _read_first_block(data: bytes, path: Path) -> _WholeBlocks:

@@ -54,6 +54,8 @@ from .reading.materials import ACTIVE, FIBRE, GRADIENT, MIXTURE, PRESTRAINED, RE
 from .reading.model import Contact
 
 REST = Motion(np.array([0.0, 1.0]), np.zeros((2, 6)))
+PRESSURE_MODELS = {0: "default", 1: "NIKE3D", 2: "Abaqus"}
+MAX_TERMS = 6  # of Ogden and of Prony in FEBio
 
 
 @dataclass(frozen=True)
@@ -382,10 +384,6 @@ def _format_output(numbers: Iterable[int], settings: FebSettings) -> Iterator[st
     table = f'data="Fx;Fy;Fz;x;y;z" file={quoteattr(settings.force_file)} delim=","'
     rigid = f"<logfile><rigid_body_data {table}>{items}</rigid_body_data></logfile>"
     yield f"</plotfile>{rigid if items else ''}</Output>"
-
-
-PRESSURE_MODELS = {0: "default", 1: "NIKE3D", 2: "Abaqus"}
-MAX_TERMS = 6  # of Ogden and of Prony in FEBio
 
 
 def _format_material(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
 PROXIMAL_CUT_MM = 250.0
+TENDON_MM = 24.0, 6.0  # width and thickness of the patellar tendon
 
 
 @dataclass(frozen=True)
@@ -127,9 +128,6 @@ def join_fields(a: Array, b: Array, blend: float) -> Array:
     """Join two fields smoothly."""
     h = np.clip(blend - np.abs(a - b), 0, None) / blend
     return np.minimum(a, b) - h * h * blend / 4
-
-
-TENDON_MM = 24.0, 6.0  # width and thickness of the patellar tendon
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,12 @@ BIAS = 0.2
 FULL_SCALE, RESCALE_SLOPE = 1200.0, 0.5
 SLAB = 12
 REACH_MM = 85.0  # no tissue or marker lies further from the limb's axis
+DETAIL_GRIDS = {
+    "coarse": ((130, 76, 76), (2.36, 2.30, 2.00)),
+    "paper": ((256, 256, 256), (1.18, 1.15, 1.00)),
+}
+LABELS_FILE = Path("labels") / "labels.seg.nrrd"
+TENDON_LABEL, TENDON_VALUE = "patellar tendon", 7
 
 
 @dataclass(frozen=True)
@@ -77,12 +83,6 @@ class ScanGrid:
         out = self.origin + kk[:, None, None, None] * steps[:, 2]
         out = out + jj[None, :, None, None] * steps[:, 1] + ii[None, None, :, None] * steps[:, 0]
         return out.astype(np.float32)
-
-
-DETAIL_GRIDS = {
-    "coarse": ((130, 76, 76), (2.36, 2.30, 2.00)),
-    "paper": ((256, 256, 256), (1.18, 1.15, 1.00)),
-}
 
 
 def make_grid(limb: Limb, detail: str, seed: int) -> ScanGrid:
@@ -318,10 +318,6 @@ def _write_geometry_tags(data: FileDataset, grid: ScanGrid, index: int) -> None:
     data.PixelSpacing = _format_decimals([grid.spacing[1], grid.spacing[0]])
     data.SliceThickness = data.SpacingBetweenSlices = _format_decimals([grid.spacing[2]])[0]
     data.SliceLocation = _format_decimals([float(position @ grid.direction[:, 2])])[0]
-
-
-LABELS_FILE = Path("labels") / "labels.seg.nrrd"
-TENDON_LABEL, TENDON_VALUE = "patellar tendon", 7
 
 
 def build_true_labels(limb: Limb, grid: ScanGrid) -> LabelMap:

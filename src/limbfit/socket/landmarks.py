@@ -21,6 +21,14 @@ from ..errors import SurfaceError
 from .shape import cut_section, measure_section
 
 PLATEAU_MM = 8.0  # of the tibia's top: its mean is the knee centre
+Mask = NDArray[np.bool_]
+LEVELS = ("proximal", "middle", "distal")
+CREST_MM = 12.0  # half the width of the strip over the tibial crest
+CREST_SHARE = (0.15, 0.85)  # of the tibia's length, from its top
+BONE_END_MM = 15.0  # of a bone's end that its prominence belongs to
+PROMINENCE_MM = 20.0  # radius of the regions over ends of bones
+MIN_FACING = 0.3  # cosine: what a round region holds looks its way
+MAX_OFFSET_MM = 20.0  # a stated position so far off the skin is a mistake
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,17 +116,6 @@ def find_load_point(anatomy: Anatomy, brim: Array) -> Array:
     local = Surface(frame.to_limb(skin.points), skin.faces)
     x, y, _ = measure_section(cut_section(local, (0.0, 0.0, z), (0.0, 0.0, 1.0)))
     return frame.to_patient(np.array([x, y, z]))
-
-
-Mask = NDArray[np.bool_]
-
-LEVELS = ("proximal", "middle", "distal")
-CREST_MM = 12.0  # half the width of the strip over the tibial crest
-CREST_SHARE = (0.15, 0.85)  # of the tibia's length, from its top
-BONE_END_MM = 15.0  # of a bone's end that its prominence belongs to
-PROMINENCE_MM = 20.0  # radius of the regions over ends of bones
-MIN_FACING = 0.3  # cosine: what a round region holds looks its way
-MAX_OFFSET_MM = 20.0  # a stated position so far off the skin is a mistake
 
 
 @dataclass(frozen=True, eq=False)

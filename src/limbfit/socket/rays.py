@@ -31,6 +31,7 @@ DEGREE = 3  # of the middle line
 LEVELS = 60
 SMOOTH_MM = 1.5  # roughness that is shorter is not the limb's shape
 FOLD_MM = 1.0  # a ray that meets the surface again so much farther out meets a fold
+OFFSET_SMOOTH_MM = 5.0  # half of an edge of the limb's mesh: what is shorter is that of its faces
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,9 +209,6 @@ def smooth(field: Array, stations: Array, radius: float, size_mm: float) -> Arra
         np.vstack([beyond, field]), (size_mm / STEP_MM, across), mode=("nearest", "wrap")
     )
     return np.asarray(padded[pad:], dtype=float)
-
-
-OFFSET_SMOOTH_MM = 5.0  # half of an edge of the limb's mesh: what is shorter is that of its faces
 
 
 @dataclass(frozen=True, eq=False)

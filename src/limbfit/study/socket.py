@@ -9,6 +9,16 @@ from pydantic import Field, model_validator
 
 from .tables import Friction, Plane, Positive, TomlTable, Vector
 
+NAME = r"^[A-Za-z0-9][A-Za-z0-9 ().,_-]{0,39}$"
+Length = Annotated[float, Field(ge=0)]
+Preset = Literal["double stance", "single stance", "heel strike", "mid-stance", "toe-off"]
+# Round figures, not fitted to a product: only that silicone elastomers are stiffer than gels is from a source
+# (Sanders et al., J Rehabil Res Dev 2004, 41:175). With m = 2 the law is a Mooney-Rivlin solid's.
+LINERS: dict[str, dict[str, float]] = {
+    "silicone": {"c_kPa": 100.0, "m": 2.0, "gamma": 0.1, "tau_s": 1.0},
+    "gel": {"c_kPa": 40.0, "m": 2.0, "gamma": 0.3, "tau_s": 1.0},
+}
+
 
 class DesignRegionTable(TomlTable):
     """A region with a pressure of its own, or a limit that ``--optimise`` keeps to."""
@@ -43,18 +53,6 @@ class SocketDesignTable(TomlTable):
         if doubled:
             raise ValueError(f"regions: {doubled[0]!r} is given twice")
         return self
-
-
-NAME = r"^[A-Za-z0-9][A-Za-z0-9 ().,_-]{0,39}$"
-Length = Annotated[float, Field(ge=0)]
-Preset = Literal["double stance", "single stance", "heel strike", "mid-stance", "toe-off"]
-
-# Round figures, not fitted to a product: only that silicone elastomers are stiffer than gels is from a source
-# (Sanders et al., J Rehabil Res Dev 2004, 41:175). With m = 2 the law is a Mooney-Rivlin solid's.
-LINERS: dict[str, dict[str, float]] = {
-    "silicone": {"c_kPa": 100.0, "m": 2.0, "gamma": 0.1, "tau_s": 1.0},
-    "gel": {"c_kPa": 40.0, "m": 2.0, "gamma": 0.3, "tau_s": 1.0},
-}
 
 
 class LinerTable(TomlTable):

@@ -20,6 +20,14 @@ from pydantic_core import InitErrorDetails
 from ..errors import InputError
 from ..shapes import SHAPES, Size
 
+Vector = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+BoneName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ().+_-]{0,39}$")]
+TISSUE_NAME = r"^[A-Za-z][A-Za-z0-9_]{0,29}$"
+RING_PINS = 14  # pins of the device of the source paper (section 2.1), the test pin among them
+FREE_NEIGHBOURS = 1  # on either side of the test pin, off the skin, so that tissue can bulge
+Angle = Annotated[float, Field(ge=-180.0, le=180.0)]
+
 
 def _check_friction(value: Any) -> Any:
     """Refuse a value in one line, instead of one for each type that it might have."""
@@ -30,12 +38,6 @@ def _check_friction(value: Any) -> Any:
 
 
 Friction = Annotated[Literal["frictionless", "sticky"] | float, BeforeValidator(_check_friction)]
-
-
-Vector = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-BoneName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ().+_-]{0,39}$")]
-TISSUE_NAME = r"^[A-Za-z][A-Za-z0-9_]{0,29}$"
 
 
 class TomlTable(BaseModel):
@@ -447,11 +449,6 @@ class AcquireTable(TomlTable):
         if self.clamp_tolerance_N >= self.clamp_N:
             raise ValueError("clamp_tolerance_N is not below clamp_N")
         return self
-
-
-RING_PINS = 14  # pins of the device of the source paper (section 2.1), the test pin among them
-FREE_NEIGHBOURS = 1  # on either side of the test pin, off the skin, so that tissue can bulge
-Angle = Annotated[float, Field(ge=-180.0, le=180.0)]
 
 
 class ClampsTable(TomlTable):

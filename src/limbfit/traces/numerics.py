@@ -17,6 +17,11 @@ Bools = NDArray[np.bool_]
 _GAP_STEPS = 10.0  # usual steps in time
 _REPEATED_SHARE = 0.75  # of the samples: so many have a value that another one has too
 _REST_SHARE = 0.2  # of the changes: so many come after two samples alike
+_MAX_PIECES = (
+    10  # of a cubic spline along the way in: follows any onset, and no noise faster than a tenth of it
+)
+_KNOT_POWER = 2.0  # power by which they crowd at its start, where an onset bends most
+_MIN_SAMPLES = 8  # samples
 
 
 def estimate_noise_level(values: Array) -> float:
@@ -77,13 +82,6 @@ def build_linear_interpolation(at: Array, knots: Array) -> Array:
 def build_cubic_interpolation(at: Array, knots: Array) -> Array:
     """The matrix (m, n) that takes values at ``knots`` (n,) to those at ``at`` (m,) of their cubic."""
     return np.asarray(make_interp_spline(knots, np.eye(len(knots)), k=min(3, len(knots) - 1))(at))
-
-
-_MAX_PIECES = (
-    10  # of a cubic spline along the way in: follows any onset, and no noise faster than a tenth of it
-)
-_KNOT_POWER = 2.0  # power by which they crowd at its start, where an onset bends most
-_MIN_SAMPLES = 8  # samples
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,12 @@ from .numerics import Array, average_in_bins, build_cubic_interpolation, compute
 from .record import Trace
 from .touchdown import TouchDown
 
+_MIN_SAMPLES = 5  # of a part
+_MAX_BINS = 200  # per part: a smoothing spline of so many averages equals that of all samples
+_TIME_TOLERANCE = 1e-9  # of a corner and a point there
+_END_WEIGHT = 1e3  # weight of a shared end point, in weights of its whole part
+END_SHARE = 0.05  # of the largest force: an indenter that hardly pushes may be anywhere
+
 
 @dataclass(frozen=True)
 class Regularised:
@@ -82,12 +88,6 @@ class Regularised:
             displacement_mm=np.interp(time, self.knots_s, self.knots_mm),
             force_N=np.maximum(self.curve(time), 0.0),
         )
-
-
-_MIN_SAMPLES = 5  # of a part
-_MAX_BINS = 200  # per part: a smoothing spline of so many averages equals that of all samples
-_TIME_TOLERANCE = 1e-9  # of a corner and a point there
-_END_WEIGHT = 1e3  # weight of a shared end point, in weights of its whole part
 
 
 def regularise(
@@ -257,9 +257,6 @@ def _compute_penalty(spline: BSpline, x: Array, y: Array, w: Array) -> float:
     rough = float(np.sum(np.diff(x) * (bend[1:] ** 2 + bend[1:] * bend[:-1] + bend[:-1] ** 2))) / 3.0
     smooth = spline(x)
     return max(float(np.sum(w * smooth * (y - smooth))), 0.0) / max(rough, 1e-300)
-
-
-END_SHARE = 0.05  # of the largest force: an indenter that hardly pushes may be anywhere
 
 
 @dataclass(frozen=True)

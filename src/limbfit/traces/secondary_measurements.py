@@ -24,6 +24,14 @@ _LAYER_SUFFIX = "_mm"
 MIN_LAYER_READINGS = 5
 MAX_LAYER_POINTS = 81  # of comparison; more samples are averaged
 THICKNESS_MM = (0.2, 200.0)
+MAX_WAVE_POINTS = 20  # of comparison at a place; more readings are averaged
+WAVE_SPEED_M_S = (0.2, 30.0)
+_WAVE_COLUMN = re.compile(r"(?P<tissue>.+?)(?:_(?P<depth>\d+(?:\.\d+)?)mm)?_m_s")
+_POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
+_MOTION_COLUMNS = ("ux_mm", "uy_mm", "uz_mm")
+MAX_SURFACE_TIMES = 8  # of comparison; more frames are averaged
+MIN_EXTENT_MM, MIN_MOTION_MM, MAX_MOTION_MM = 1.0, 0.01, 100.0
+_POSITION_TOLERANCE_MM = 1e-3
 
 
 @dataclass(frozen=True)
@@ -125,11 +133,6 @@ def compute_thinnings(
     return tuple(found)
 
 
-MAX_WAVE_POINTS = 20  # of comparison at a place; more readings are averaged
-WAVE_SPEED_M_S = (0.2, 30.0)
-_WAVE_COLUMN = re.compile(r"(?P<tissue>.+?)(?:_(?P<depth>\d+(?:\.\d+)?)mm)?_m_s")
-
-
 @dataclass(frozen=True)
 class WaveSpeeds:
     """Speeds (n,) m/s of shear waves at one place, at times (n,) s of the record; as many as were read.
@@ -224,13 +227,6 @@ def _read_place(file: Path, name: str, time: Array, values: Array) -> WaveSpeeds
     return WaveSpeeds(
         name, match["tissue"], float(depth) if depth else None, time[is_known], values[is_known]
     )
-
-
-_POSITION_COLUMNS = ("x_mm", "y_mm", "z_mm")
-_MOTION_COLUMNS = ("ux_mm", "uy_mm", "uz_mm")
-MAX_SURFACE_TIMES = 8  # of comparison; more frames are averaged
-MIN_EXTENT_MM, MIN_MOTION_MM, MAX_MOTION_MM = 1.0, 0.01, 100.0
-_POSITION_TOLERANCE_MM = 1e-3
 
 
 @dataclass(frozen=True)

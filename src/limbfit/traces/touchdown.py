@@ -20,6 +20,23 @@ from .displacement import BrokenLine, fit_broken_line
 from .numerics import Array, SampleNoise, average_in_bins, estimate_noise, split_at_gaps
 from .record import MIN_SAMPLES, Trace
 
+_ONSET_LEVEL = 0.05  # of the peak force: more of the onset is no power law, where a punch comes full on
+_MIN_LEVEL_SD = 45.0  # and never less than this many standard deviations of what means of it scatter
+_MIN_TRAVEL = 0.03  # of the way in: a force that jumps before the indenter moves is no onset
+_MAX_MEANS = 120  # that part as so many means
+_BEFORE_SHARE, _BEFORE_MM = 0.2, 1.0  # of the way in; how far before the record the skin may have been met
+_BINS = 200
+_MIN_APPROACH_MM = 0.1  # less of it before the skin is none
+EXPONENTS = np.linspace(1.0, 2.5, 13)  # flat punch full on: 1; sphere: 1.5; cone, or an edge coming in: 2
+STIFFENING = ((1.0, 2.5), (4.0, 2.5), (2.0, 2.0), (8.0, 2.0))  # a and q
+INITIAL_EXPONENTS = np.r_[EXPONENTS, np.ones(len(STIFFENING))]  # exponents at the very start
+TAU_S = (0.1, 0.3, 1.0, 3.0)
+GAMMA = (0.5, 1.5, 4.0)
+_PLACE_COUNT = 60  # of touch-down
+_SEARCH_SD = 5.0  # standard deviations
+_ZERO_SHARE = 0.02  # of the rise: how well a sensor is zeroed, loosely
+_MIN_NOISE = 1e-4  # of the rise
+
 
 @dataclass(frozen=True)
 class TouchDown:
@@ -37,15 +54,6 @@ class TouchDown:
     exponent: float
     baseline_N: float
     in_contact_at_start: bool
-
-
-_ONSET_LEVEL = 0.05  # of the peak force: more of the onset is no power law, where a punch comes full on
-_MIN_LEVEL_SD = 45.0  # and never less than this many standard deviations of what means of it scatter
-_MIN_TRAVEL = 0.03  # of the way in: a force that jumps before the indenter moves is no onset
-_MAX_MEANS = 120  # that part as so many means
-_BEFORE_SHARE, _BEFORE_MM = 0.2, 1.0  # of the way in; how far before the record the skin may have been met
-_BINS = 200
-_MIN_APPROACH_MM = 0.1  # less of it before the skin is none
 
 
 def find_touch_down(trace: Trace, line: BrokenLine | None = None) -> TouchDown:
@@ -158,17 +166,6 @@ def find_depth_at(trace: Trace, line: BrokenLine, touch: TouchDown, force_N: flo
     time, force, _ = average_in_bins(trace.time_s[way], trace.force_N[way] - touch.baseline_N, _BINS)
     first = int(np.argmax(force >= min(force_N, float(force.max()))))
     return max(float(line(time[first])) - touch.displacement_mm, touch.uncertainty_mm)
-
-
-EXPONENTS = np.linspace(1.0, 2.5, 13)  # flat punch full on: 1; sphere: 1.5; cone, or an edge coming in: 2
-STIFFENING = ((1.0, 2.5), (4.0, 2.5), (2.0, 2.0), (8.0, 2.0))  # a and q
-INITIAL_EXPONENTS = np.r_[EXPONENTS, np.ones(len(STIFFENING))]  # exponents at the very start
-TAU_S = (0.1, 0.3, 1.0, 3.0)
-GAMMA = (0.5, 1.5, 4.0)
-_PLACE_COUNT = 60  # of touch-down
-_SEARCH_SD = 5.0  # standard deviations
-_ZERO_SHARE = 0.02  # of the rise: how well a sensor is zeroed, loosely
-_MIN_NOISE = 1e-4  # of the rise
 
 
 @dataclass(frozen=True)

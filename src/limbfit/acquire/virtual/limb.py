@@ -29,6 +29,11 @@ BULGE = 0.08  # of the test pin's depth, towards its neighbours
 ANGLES = 2 * np.pi * np.arange(PINS) / PINS
 _DIRECTIONS = np.stack([np.cos(ANGLES), np.sin(ANGLES)])
 _PIN_INDICES = np.arange(PINS)
+TAUS_S = np.array([0.03, 0.1, 0.3, 1.0, 3.0])
+PIECES = 16
+_FINE_STEPS = 2000
+_SMOOTHING_WEIGHT = 0.02  # weight on differences of neighbouring slopes
+_CONTACT_FORCE_SHARE = 1e-3  # of the largest force
 
 
 class VirtualLimb:
@@ -95,13 +100,6 @@ class VirtualLimb:
         force[depth == 0] = 0.0
         self.force_N = force + (force > 0) * (force[self._test_pin] * self._opposite_coupling)
         self.gap_mm = self._gap - near - depth[self._test_pin] * self._neighbour_bulge
-
-
-TAUS_S = np.array([0.03, 0.1, 0.3, 1.0, 3.0])
-PIECES = 16
-_FINE_STEPS = 2000
-_SMOOTHING_WEIGHT = 0.02  # weight on differences of neighbouring slopes
-_CONTACT_FORCE_SHARE = 1e-3  # of the largest force
 
 
 @dataclass(frozen=True)

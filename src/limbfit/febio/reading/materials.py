@@ -40,6 +40,8 @@ _VOLUMETRIC = {
     "Abaqus": "abaqus", "2": "abaqus",
     "Abaqus (GOH)": "abaqus-goh", "3": "abaqus-goh",
 }  # fmt: skip
+GRADIENT, MATRIX = "prestrain gradient", "mat3"
+_DEFAULT_AXIS = (1.0, 0.0, 0.0)  # FEBio's, where nothing is said
 
 
 @dataclass(frozen=True)
@@ -245,10 +247,6 @@ def _check_modulus(node: XmlNode, mu: float) -> float:
     if not mu > 0.0:
         raise node.error(f"the shear modulus of small strains is {mu:.4g} MPa, not positive")
     return mu
-
-
-GRADIENT, MATRIX = "prestrain gradient", "mat3"
-_DEFAULT_AXIS = (1.0, 0.0, 0.0)  # FEBio's, where nothing is said
 
 
 @dataclass(frozen=True)

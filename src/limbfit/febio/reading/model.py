@@ -54,6 +54,11 @@ MIN_RELAXATION_TIMES = 20.0  # longest relaxation times after which no more than
 _OTHER_CONDITIONS = ("rigid", "zero rotation", "zero shell displacement")
 # What none of limbfit's contact rules does; the rest of a contact is how FEBio gets there.
 _UNSUPPORTED_IN_CONTACT = ("tension", "offset", "node_reloc")
+KNOWN_DATA = {
+    "node_data": ("x", "y", "z", "ux", "uy", "uz"),
+    "element_data": ("x", "y", "z", "sx", "sy", "sz", "sxy", "syz", "sxz", "s1", "s2", "s3", "J"),
+    "rigid_body_data": ("x", "y", "z", "thx", "thy", "thz", "Fx", "Fy", "Fz", "Mx", "My", "Mz"),
+}
 
 
 @dataclass(frozen=True)
@@ -374,13 +379,6 @@ def _read_contact(node: XmlNode, geometry: Geometry) -> Contact:
         raise node.child("fric_coeff").error("is negative")
     automatic = node.flag("auto_penalty")
     return Contact(rule, geometry.pairs[pair], penalty, automatic, augmented, node.line, friction)
-
-
-KNOWN_DATA = {
-    "node_data": ("x", "y", "z", "ux", "uy", "uz"),
-    "element_data": ("x", "y", "z", "sx", "sy", "sz", "sxy", "syz", "sxz", "s1", "s2", "s3", "J"),
-    "rigid_body_data": ("x", "y", "z", "thx", "thy", "thz", "Fx", "Fy", "Fz", "Mx", "My", "Mz"),
-}
 
 
 @dataclass(frozen=True)

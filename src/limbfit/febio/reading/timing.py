@@ -21,6 +21,19 @@ from .tree import XmlNode
 INTERPOLATIONS = ("LINEAR", "STEP", "SMOOTH", "SMOOTH STEP")
 EXTENSIONS = ("CONSTANT", "EXTRAPOLATE", "REPEAT", "REPEAT OFFSET")
 MAX_EXPRESSION_LENGTH = 400  # characters of an expression
+_OPERATORS: dict[type, Callable[[Array, Array], Array]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: np.power,
+}
+_FUNCTIONS: dict[str, Callable[[Array], Array]] = {
+    "sin": np.sin, "cos": np.cos, "tan": np.tan, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan,
+    "sinh": np.sinh, "cosh": np.cosh, "tanh": np.tanh, "exp": np.exp, "ln": np.log, "sqrt": np.sqrt,
+    "abs": np.abs,
+}  # fmt: skip
+MAX_STEPS = 20_000
 
 
 @dataclass(frozen=True)
@@ -146,20 +159,6 @@ def _read_curve(node: XmlNode) -> LoadCurve:
     return LoadCurve(points, chosen["interpolate"], node.line, chosen["extend"])
 
 
-_OPERATORS: dict[type, Callable[[Array, Array], Array]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.Pow: np.power,
-}
-_FUNCTIONS: dict[str, Callable[[Array], Array]] = {
-    "sin": np.sin, "cos": np.cos, "tan": np.tan, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan,
-    "sinh": np.sinh, "cosh": np.cosh, "tanh": np.tanh, "exp": np.exp, "ln": np.log, "sqrt": np.sqrt,
-    "abs": np.abs,
-}  # fmt: skip
-
-
 def _read_formula(node: XmlNode) -> Callable[[Array], Array]:
     """Read an element's expression of the time ``t``; only arithmetic is read, nothing is run."""
     text = node.text.strip()
@@ -202,9 +201,6 @@ def _evaluate(tree: ast.expr, t: Array) -> Array:
             with np.errstate(all="ignore"):
                 return _FUNCTIONS[name](_evaluate(argument, t))
     raise ValueError("not known")
-
-
-MAX_STEPS = 20_000
 
 
 @dataclass(frozen=True)
