@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from ..arrays import Indices
-from ..errors import ProblemError, RunError
+from ..errors import ProblemError
 from ..fe import Material, Problem, System
 from ..mesh import Mesh
-from .conditions import FIXED_SET, format_row
+from .conditions import FIXED_SET, format_row, write_lines
 from .meshes import FRONT, INDENTER, PATCH, RigidMesh, build_indenter_mesh
 from .writing import FebSettings, check_simple_indentation
 
@@ -50,11 +50,7 @@ def write_inp(problem: Problem, path: str | Path, program: str, settings: FebSet
     tool = build_indenter_mesh(system.indenter)
     if tool.cell_type != "hex8":
         raise ProblemError(f"indenters of shape {system.indenter.shape!r} are written for FEBio only")
-    try:
-        with Path(path).open("w", encoding="utf-8") as stream:
-            stream.writelines(f"{line}\n" for line in _format_file(problem, system, tool, program, settings))
-    except OSError as error:
-        raise RunError(f"{path}: {error.strerror or error}") from error
+    write_lines(path, _format_file(problem, system, tool, program, settings))
     return tool
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..errors import ProblemError
+from ..errors import ProblemError, RunError
 from ..fe import Motion, Problem
 from .reading.rigid import FREEDOMS, find_straight_line, has_same_rotation
 
@@ -43,6 +44,15 @@ class CurveList:
 def format_row(values: Iterable[float], separator: str = ",") -> str:
     """Write numbers with commas, so that they are read back exactly."""
     return separator.join(repr(float(value)) for value in values)
+
+
+def write_lines(path: str | Path, lines: Iterable[str]) -> None:
+    """Write lines into a file; raise `RunError` if it cannot be written."""
+    try:
+        with Path(path).open("w", encoding="utf-8") as stream:
+            stream.writelines(f"{line}\n" for line in lines)
+    except OSError as error:
+        raise RunError(f"{path}: {error.strerror or error}") from error
 
 
 def to_space(name: str, motion: Motion, frame: Array) -> Motion:

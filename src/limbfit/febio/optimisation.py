@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from ..arrays import Array
-from ..errors import ProblemError, RunError
+from ..errors import ProblemError
 from ..fe import Indenter, Problem
+from .conditions import write_lines
 from .meshes import INDENTER
 
 MAX_PARAMETERS = 64  # parameters, in FEBio
@@ -89,11 +90,7 @@ def write_optimisation(
         raise ProblemError(
             f"FEBio fits at most {MAX_PARAMETERS} parameters, but {len(tissues)} tissues have {count} there"
         )
-    try:
-        with Path(path).open("w", encoding="utf-8") as stream:
-            stream.writelines(f"{line}\n" for line in _format_file(tissues, times, force, iterations))
-    except OSError as error:
-        raise RunError(f"{path}: {error.strerror or error}") from error
+    write_lines(path, _format_file(tissues, times, force, iterations))
 
 
 def _format_file(

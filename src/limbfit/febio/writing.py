@@ -21,7 +21,7 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 
 from ..arrays import Array
-from ..errors import ProblemError, RunError
+from ..errors import ProblemError
 from ..fe import Indenter, Material, Motion, Problem, StepControl
 from ..fe.solution.control import schedule_steps
 from .conditions import (
@@ -34,6 +34,7 @@ from .conditions import (
     format_pressures,
     format_rail,
     format_row,
+    write_lines,
 )
 from .meshes import (
     FRONT,
@@ -94,11 +95,7 @@ def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None =
     if forced or Preparation.from_problem(problem).seconds or problem.touch_down_s:
         prepared, motions = prepare_problem(problem, settings.steps)
         bodies = build_bodies(prepared, motions)
-    try:
-        with Path(path).open("w", encoding="utf-8") as stream:
-            stream.writelines(f"{line}\n" for line in _format_file(problem, prepared, bodies, settings))
-    except OSError as error:
-        raise RunError(f"{path}: {error.strerror or error}") from error
+    write_lines(path, _format_file(problem, prepared, bodies, settings))
     return bodies[0].tool if bodies else None
 
 

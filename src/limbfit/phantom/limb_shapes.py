@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar
 
 import numpy as np
@@ -29,11 +29,9 @@ class LimbShape(ABC):
     ----------
     dome : height of the rounding of the distal end.
     cortex_mm : thickness of the cortex of each bone.
-    variation : how far a seed may move each size from its default.
     """
 
     cortex_mm: ClassVar[Mapping[str, float]]
-    variation: ClassVar[Mapping[str, float]]
 
     radius_distal: float
     radius_proximal: float
@@ -53,11 +51,17 @@ class LimbShape(ABC):
         """Field of a bone at points (..., 3) of the limb frame; a bone at the cut is unbounded proximally."""
 
 
+def make_size(default: float, variation: float) -> float:
+    """Make a size of a shape, which a seed may move by ``variation`` from its default."""
+    return field(default=default, metadata={"variation": variation})
+
+
 def vary(base: LimbShape, seed: int) -> LimbShape:
     """Draw the shape of a seed; each size is uniform around its default."""
     random = np.random.default_rng([seed, 1])
     drawn = {
-        name: getattr(base, name) + span * random.uniform(-1, 1) for name, span in base.variation.items()
+        size.name: getattr(base, size.name) + size.metadata["variation"] * random.uniform(-1, 1)
+        for size in fields(base)
     }
     return replace(base, **drawn)
 
@@ -135,39 +139,22 @@ class Shank(LimbShape):
     """Sizes of a transtibial residuum, mm and radians."""
 
     cortex_mm: ClassVar[Mapping[str, float]] = {"tibia": 3.2, "fibula": 2.4, "patella": 2.4, "femur": 2.8}
-    variation: ClassVar[Mapping[str, float]] = {
-        "radius_distal": 2.0,
-        "radius_proximal": 2.0,
-        "dome": 3.0,
-        "flattening": 0.8,
-        "calf": 1.5,
-        "joint": 5.0,
-        "joint_gap": 0.4,
-        "pad": 2.0,
-        "crest_depth": 0.5,
-        "crest_angle": 0.05,
-        "medial_depth": 0.7,
-        "fibula_cut": 2.0,
-        "fibula_radius": 0.4,
-        "condyle": 1.0,
-        "patella": 1.0,
-    }
 
-    radius_distal: float = 43.0
-    radius_proximal: float = 61.0
-    dome: float = 38.0
-    flattening: float = 6.5
-    calf: float = 7.0
-    joint: float = 168.0
-    joint_gap: float = 6.0
-    pad: float = 22.5
-    crest_depth: float = 4.0
-    crest_angle: float = 0.12
-    medial_depth: float = 8.5
-    fibula_cut: float = 33.0
-    fibula_radius: float = 6.5
-    condyle: float = 23.0
-    patella: float = 20.0
+    radius_distal: float = make_size(43.0, 2.0)
+    radius_proximal: float = make_size(61.0, 2.0)
+    dome: float = make_size(38.0, 3.0)
+    flattening: float = make_size(6.5, 0.8)
+    calf: float = make_size(7.0, 1.5)
+    joint: float = make_size(168.0, 5.0)
+    joint_gap: float = make_size(6.0, 0.4)
+    pad: float = make_size(22.5, 2.0)
+    crest_depth: float = make_size(4.0, 0.5)
+    crest_angle: float = make_size(0.12, 0.05)
+    medial_depth: float = make_size(8.5, 0.7)
+    fibula_cut: float = make_size(33.0, 2.0)
+    fibula_radius: float = make_size(6.5, 0.4)
+    condyle: float = make_size(23.0, 1.0)
+    patella: float = make_size(20.0, 1.0)
 
     @property
     def datum(self) -> float:
@@ -271,31 +258,18 @@ class Thigh(LimbShape):
     """Sizes of a transfemoral residuum, mm and radians."""
 
     cortex_mm: ClassVar[Mapping[str, float]] = {"femur": 5.0}
-    variation: ClassVar[Mapping[str, float]] = {
-        "radius_distal": 2.0,
-        "radius_proximal": 2.0,
-        "dome": 3.0,
-        "quadriceps": 1.0,
-        "adductors": 1.0,
-        "flattening": 0.8,
-        "femur_cut": 3.0,
-        "femur_radius": 0.6,
-        "lateral": 1.5,
-        "anterior": 1.5,
-        "bow": 1.0,
-    }
 
-    radius_distal: float = 50.0
-    radius_proximal: float = 65.0
-    dome: float = 42.0
-    quadriceps: float = 4.0
-    adductors: float = 5.0
-    flattening: float = 4.0
-    femur_cut: float = 40.0
-    femur_radius: float = 13.5
-    lateral: float = 10.0
-    anterior: float = 5.0
-    bow: float = 4.0
+    radius_distal: float = make_size(50.0, 2.0)
+    radius_proximal: float = make_size(65.0, 2.0)
+    dome: float = make_size(42.0, 3.0)
+    quadriceps: float = make_size(4.0, 1.0)
+    adductors: float = make_size(5.0, 1.0)
+    flattening: float = make_size(4.0, 0.8)
+    femur_cut: float = make_size(40.0, 3.0)
+    femur_radius: float = make_size(13.5, 0.6)
+    lateral: float = make_size(10.0, 1.5)
+    anterior: float = make_size(5.0, 1.5)
+    bow: float = make_size(4.0, 1.0)
 
     @property
     def datum(self) -> float:
