@@ -56,7 +56,7 @@ def compare(site: TrueSite, mesh: Mesh, along: Any, force: float) -> dict[str, A
     bare = solve(problem, control)
     table = ClampsTable(force_N=force)
     begun = table.begun_s
-    later = replace(problem, history=problem.history.later(begun), touch_down_s=begun)
+    later = replace(problem, history=problem.history.delay(begun), touch_down_s=begun)
     found = solve(clamp_problem(later, along, table), control)
     for result in (bare, found):
         if not result.completed:

@@ -76,8 +76,8 @@ def test_forces_and_stiffness_of_a_free_body_are_derivatives_of_its_energy(mu, t
     drives, grips = Drives(loads, np.ones((1, 6), dtype=bool), np.ones(1)), ()
     if mu:
         before = u - 0.05 * d
-        grip = Coulomb.none(mu, system.surface).after(system.bodies.tools(before, drives)[0], None)
-        grips = (grip.renewed(system.bodies.tools(u, drives)[0]),)
+        grip = Coulomb.none(mu, system.surface).advance(system.bodies.tools(before, drives)[0], None)
+        grips = (grip.renew(system.bodies.tools(u, drives)[0]),)
         assert grips[0].held.any()
 
     def at(u):

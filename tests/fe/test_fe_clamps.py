@@ -100,7 +100,7 @@ def clamped_pipe() -> Problem:
     """Pins of 8 N on stiff tissue, before the test pin touches it."""
     table = ClampsTable(force_N=8.0)
     problem = site(pipe())
-    later = replace(problem, history=problem.history.later(table.begun_s), touch_down_s=table.begun_s)
+    later = replace(problem, history=problem.history.delay(table.begun_s), touch_down_s=table.begun_s)
     return clamp_problem(later, UP, table)
 
 
@@ -114,7 +114,7 @@ def test_a_direction_is_taken_as_far_as_its_contact_is_foreseen():
         for row in (-2, 0):  # the last pin, and a node
             for way, share in ((0.5, 1.0), (-4.0, 0.25), (160.0, 1.0 / 160.0)):
                 direction[row, 1] = way
-                found = system.bodies.trusted_share(direction)
+                found = system.bodies.compute_trusted_share(direction)
                 assert found == pytest.approx(share if bounded else 1.0)
             direction[:] = 0.0
 
@@ -123,7 +123,7 @@ def test_the_bound_of_a_step_changes_no_equilibrium(monkeypatch):
     problem = clamped_pipe()
     control = StepControl(times=(1.0, 2.0), tolerance=1e-6, penalty=300.0, hold_penalty=True)
     bounded = solve(problem, control, store="none")
-    monkeypatch.setattr("limbfit.fe.bodies.TRUSTED", np.inf)
+    monkeypatch.setattr("limbfit.fe.bodies.TRUSTED_MOVE", np.inf)
     free = solve(problem, control, store="none")
     assert bounded.completed
     assert free.completed
@@ -138,7 +138,7 @@ def test_a_clamped_limb_bulges_between_the_pins_and_is_indented_from_there():
     bare = solve(problem, control)
     table = ClampsTable(force_N=8.0, settling_s=2.0)
     begun = table.begun_s
-    later = replace(problem, history=problem.history.later(begun), touch_down_s=begun)
+    later = replace(problem, history=problem.history.delay(begun), touch_down_s=begun)
     found = solve(clamp_problem(later, UP, table), control)
     assert found.completed, found.reason
     after = found.times > begun * (1 + 1e-9)

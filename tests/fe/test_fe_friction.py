@@ -39,18 +39,18 @@ class Dragged:
         self.rng = np.random.default_rng(1)
         self.u = self.field(0.01)
         start = self.system.bodies.tools(self.u, drive(3.2))[0]
-        grip = Coulomb.none(mu, self.system.surface).after(start, None)
+        grip = Coulomb.none(mu, self.system.surface).advance(start, None)
         self.u = self.u + self.field(0.05)
-        self.grip = self.renewed(grip, self.u)
+        self.grip = self.renew(grip, self.u)
 
     def field(self, size: float) -> np.ndarray:
         return size * self.rng.normal(size=self.system.points.shape) * ~self.system.supported
 
-    def increment(self, advance: float, grip: Coulomb) -> Increment:
+    def build_increment(self, advance: float, grip: Coulomb) -> Increment:
         return Increment(0.0, advance, np.zeros(2), self.rest, 0.5, drive(advance, 0.03, 0.02), (grip,))
 
-    def renewed(self, grip: Coulomb, u: np.ndarray) -> Coulomb:
-        return grip.renewed(self.tool(u))
+    def renew(self, grip: Coulomb, u: np.ndarray) -> Coulomb:
+        return grip.renew(self.tool(u))
 
     def tool(self, u: np.ndarray) -> Tool:
         return self.system.bodies.tools(u, drive(3.3, 0.03, 0.02))[0]
@@ -84,16 +84,16 @@ def test_coupling_is_what_a_step_holds_constant(mu):
     system, u, h = one.system, one.u, 1e-6
     d = one.field(1.0)
     ahead, back = (
-        system.contact_force(v, one.increment(3.3, one.renewed(one.grip, v))) for v in (u + h * d, u - h * d)
+        system.contact_force(v, one.increment(3.3, one.renew(one.grip, v))) for v in (u + h * d, u - h * d)
     )
     change = ((ahead - back) / (2 * h)).reshape(-1, 1)[system.free]
     tool, bodies = one.tool(u), system.bodies
     coupling = (0.5 * tool.surface.areas)[..., None, None] * one.grip.coupling(tool)
     coupling = (tool.body.frame.T @ coupling @ tool.body.frame).reshape(-1, 3, 3)
-    moved = bodies.springs_of(d.reshape(-1, 1)[system.free])
-    lagged = bodies.at_springs(coupling @ moved)
+    moved = bodies.move_springs(d.reshape(-1, 1)[system.free])
+    lagged = bodies.spread_forces(coupling @ moved)
     assert np.abs(lagged).max() > (0.0 if mu > 1.0 else 0.02) * np.abs(change).max()  # little where all stick
-    found = bodies.at_springs(one.at(u).touch.blocks @ moved) + lagged
+    found = bodies.spread_forces(one.at(u).touch.blocks @ moved) + lagged
     np.testing.assert_allclose(found, change, atol=1e-5 * np.abs(change).max())
 
 
@@ -299,9 +299,9 @@ def test_the_dual_foreseen_is_the_slip_that_comes():
     d = one.field(1.0)
 
     def missed(h: float) -> float:
-        come = one.grip.foreseen(one.tool(one.u + h * d), 0.0 * d).pulls
-        return float(np.abs(one.grip.foreseen(one.tool(one.u), h * d).pulls - come).max())
+        come = one.grip.predict(one.tool(one.u + h * d), 0.0 * d).pulls
+        return float(np.abs(one.grip.predict(one.tool(one.u), h * d).pulls - come).max())
 
     assert missed(1e-5) < 0.02 * missed(1e-4)
-    far = one.grip.foreseen(one.tool(one.u), d)
+    far = one.grip.predict(one.tool(one.u), d)
     assert (np.linalg.norm(far.pulls, axis=-1) <= far.bounds * (1.0 + 1e-12)).all()

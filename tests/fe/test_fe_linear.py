@@ -82,7 +82,7 @@ def test_springs_under_the_indenter_and_beside_it_are_taken_in_exactly():
     problem = build_punched_block("tet10", 6)
     system = System(problem)
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    increment = Memory.rest(system, laws).increment(
+    increment = Memory.rest(system, laws).build_increment(
         system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus, drive(0.0)
     )
     data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
@@ -102,10 +102,10 @@ def test_springs_under_the_indenter_and_beside_it_are_taken_in_exactly():
         blocks[picked] = stiff * np.array([[2.0, 0.3, 0.0], [0.3, 1.0, 0.1], [0.0, 0.1, 3.0]])
         changed = bodies.with_springs(data, blocks)
         normals = np.tile([0.0, 0.0, 1.0], (bodies.count, 1))
-        springs = factor.springs(blocks.any(axis=(1, 2)), normals, blocks)
+        springs = factor.change_springs(blocks.any(axis=(1, 2)), normals, blocks)
         x = factor.precondition(b, springs)
-        assert np.linalg.norm(factor.product(changed, x) - b) <= 1e-3 * np.linalg.norm(b)
-        assert np.linalg.norm(factor.product(changed, factor.apply(b)) - b) > 0.1 * np.linalg.norm(b)
+        assert np.linalg.norm(factor.multiply(changed, x) - b) <= 1e-3 * np.linalg.norm(b)
+        assert np.linalg.norm(factor.multiply(changed, factor.apply(b)) - b) > 0.1 * np.linalg.norm(b)
 
 
 def test_springs_on_held_nodes_are_no_columns_of_unknowns_that_go_last():
@@ -147,7 +147,7 @@ def test_a_tangent_with_negative_eigenvalues_is_solved_all_the_same():
     problem = punch("tet10", 4, 1)
     system = System(problem)
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    increment = Memory.rest(system, laws).increment(
+    increment = Memory.rest(system, laws).build_increment(
         system, laws, 0.3, 0.3, 0.1, 100.0 * laws.modulus, drive(0.1)
     )
     data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
@@ -157,7 +157,7 @@ def test_a_tangent_with_negative_eigenvalues_is_solved_all_the_same():
     b = np.random.default_rng(0).standard_normal((system.unknowns, 2))
     assert not factor.solve(data, b, None, 1e-6).convex
     x = factor.solve_indefinite(data, b, 1e-6, np.zeros_like(b))
-    off = np.linalg.norm(b - factor.product(data, x), axis=0)
+    off = np.linalg.norm(b - factor.multiply(data, x), axis=0)
     assert (off <= 1e-6 * np.linalg.norm(b, axis=0)).all()
     assert factor.counts["inexact"] == 0
 
@@ -174,16 +174,16 @@ def iterations(divisions: int) -> int:
     problem = build_punched_block("tet10", divisions)
     system = System(problem)
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    increment = Memory.rest(system, laws).increment(
+    increment = Memory.rest(system, laws).build_increment(
         system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus, drive(0.0)
     )
     data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
     factor = Factor(system, laws.moduli, "multigrid")
     factor.factorise(data)
-    b = system.bodies.at_springs(np.ones((system.surface.areas.size, 3, 1)))
+    b = system.bodies.spread_forces(np.ones((system.surface.areas.size, 3, 1)))
     found = factor.solve(data, b, None, 1e-3)
     assert found.converged
-    assert np.linalg.norm(b - factor.product(data, found.x)) <= 1.1e-3 * np.linalg.norm(b)
+    assert np.linalg.norm(b - factor.multiply(data, found.x)) <= 1.1e-3 * np.linalg.norm(b)
     return factor.counts["half_solves"] // 2
 
 
@@ -200,7 +200,7 @@ def test_multigrid_is_symmetric_and_positive():
     sides = np.flatnonzero(problem.mesh.points[:, 0] <= -30.0)
     system = System(replace(problem, supports=(Support(sides, 0),)))
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    increment = Memory.rest(system, laws).increment(
+    increment = Memory.rest(system, laws).build_increment(
         system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus, drive(0.0)
     )
     multigrid = Multigrid(system)
@@ -215,7 +215,7 @@ def test_where_multigrid_does_not_converge_a_factor_takes_over():
     problem = build_punched_block("tet10", 4)
     stiff = {name: replace(m, kappa_ratio=1e6) for name, m in problem.materials.items()}
     system, laws = System(problem), Laws.build([stiff[name] for name in problem.mesh.region_names])
-    increment = Memory.rest(system, laws).increment(
+    increment = Memory.rest(system, laws).build_increment(
         system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus, drive(0.0)
     )
     data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
@@ -225,7 +225,7 @@ def test_where_multigrid_does_not_converge_a_factor_takes_over():
     short = factor.solve(data, b, None, 1e-6)
     assert short.convex
     assert not short.converged
-    assert factor.solve_anew(data, b, None, 1e-6, short.x).converged
+    assert factor.refactor_and_solve(data, b, None, 1e-6, short.x).converged
     assert factor.lasting
 
 

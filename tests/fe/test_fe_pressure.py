@@ -25,7 +25,7 @@ from limbfit.fe import (
     solve,
 )
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.pressure import Pressed
+from limbfit.fe.pressure import PressedSurface
 from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.system import Increment
 from limbfit.mesh import Mesh
@@ -37,11 +37,11 @@ STILL = History(np.array([0.0, 1.0]), np.zeros(2))
 def test_volume_forces_and_their_derivatives(cell_type):
     lines = np.linspace(0.0, 1.0, 3)
     mesh = block(cell_type, lines, lines, lines, jitter=0.05)
-    pressed = Pressed(ELEMENTS[cell_type], mesh.points, boundary(mesh.cells, cell_type))
+    pressed = PressedSurface(ELEMENTS[cell_type], mesh.points, boundary(mesh.cells, cell_type))
     volume, gradient, forces = pressed.volume(mesh.points)
     assert volume == pytest.approx(1.0, rel=1e-12)
     np.testing.assert_allclose(gradient, forces, atol=1e-12)  # nothing differs where there is no rim
-    top = Pressed(ELEMENTS[cell_type], mesh.points, mesh.face_sets["top"])
+    top = PressedSurface(ELEMENTS[cell_type], mesh.points, mesh.face_sets["top"])
     rng, h = np.random.default_rng(0), 1e-5
     x = mesh.points + 0.05 * rng.normal(size=mesh.points.shape)
     d = rng.normal(size=x.shape)
@@ -59,7 +59,7 @@ def test_forces_and_tangent_of_a_pressed_block_are_derivatives_of_its_energy():
     system, laws = System(replace(problem, pressures=pressures)), Laws.build([SKIN, MUSCLE])
     rng, h = np.random.default_rng(1), 1e-6
     u, d = (size * rng.normal(size=system.points.shape) * ~system.supported for size in (0.05, 1.0))
-    rest, rims = np.zeros((*system.weights.shape, 6)), system.pressures.rims(u, (0.004,))
+    rest, rims = np.zeros((*system.weights.shape, 6)), system.pressures.compute_rims(u, (0.004,))
 
     def at(u):
         return system.evaluate(

@@ -132,7 +132,7 @@ def paced(hard: Callable[[float, float], int]) -> list[tuple[float, int, str]]:
         if needed > patience:
             pace.cut(now, t)
         else:
-            pace.done(now, t, needed)
+            pace.accept(now, t, needed)
             now = t
     return tried
 

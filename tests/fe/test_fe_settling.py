@@ -19,7 +19,7 @@ def test_renewals_ask_for_equilibrium_no_better_than_needed(monkeypatch):
     monkeypatch.setattr(simulation, "couple", lambda *given: (None, 0))
     problem, control = rounded(0.2), StepControl(times=(1.0, 2.0))
     found = solve(problem, control)
-    monkeypatch.setattr(simulation, "ENOUGH", 0.0)
+    monkeypatch.setattr(simulation, "RENEWAL_REDUCTION", 0.0)
     fine = solve(problem, control)
     assert found.completed
     assert fine.completed

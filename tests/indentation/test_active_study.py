@@ -54,7 +54,7 @@ def test_it_tenses_before_touch_down_and_as_stated_from_there(context):
     model = replace(build_model(context, context.study.recorded[0]), course=((0.0, 0.5), (2.0, 1.0)))
     problem = build_problem(model, read_vtu(model.mesh), TRUTH)
     assert problem.touch_down_s == model.waits_s == 7.0
-    shares = [problem.activated(t) for t in (0.0, 1.0, 2.0, 7.0, 8.0, 9.0, 12.0)]
+    shares = [problem.activation_at(t) for t in (0.0, 1.0, 2.0, 7.0, 8.0, 9.0, 12.0)]
     np.testing.assert_allclose(shares, [0.0, 0.25, 0.5, 0.5, 0.75, 1.0, 1.0])
     assert problem.history.at(8.0) == pytest.approx(model.history.at(1.0))
 

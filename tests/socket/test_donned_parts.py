@@ -18,7 +18,7 @@ from bodies import limb
 from limbfit.anatomy.frame import build_limb_frame
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
-from limbfit.donning import Load, SocketFit, build_socket_problem, don, pack, unpack
+from limbfit.donning import Load, SocketFit, build_socket_problem, pack, simulate_donning, unpack
 from limbfit.errors import ProblemError
 from limbfit.fe import Checkpoints, OgdenQLV, StepControl, solve
 from limbfit.pipeline.engine.partial_results import Begun, ResultFiles
@@ -54,7 +54,7 @@ def donned(tmp_path_factory):
         places.append(Begun(ResultFiles(folder), str(len(places))))
         places[-1].put(pack(part))
 
-    return given, don(*given, sensitivities=True, threads=1, keep=keep), places
+    return given, simulate_donning(*given, sensitivities=True, threads=1, keep=keep), places
 
 
 @pytest.mark.slow
@@ -65,7 +65,7 @@ def test_what_goes_on_from_a_part_is_what_went_through(donned, which):
     assert len(places) == 2
     told: list[float] = []
     begin = unpack(*places[which].latest())
-    found = don(
+    found = simulate_donning(
         *given,
         sensitivities=True,
         threads=1,

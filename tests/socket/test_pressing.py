@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from limbfit.donning import build_pressed_problem, extract_outer_surface, press
+from limbfit.donning import build_pressed_problem, extract_outer_surface, press_limb
 from limbfit.errors import ProblemError
 from limbfit.fe import NeoHookean
 from limbfit.mesh import TET10_EDGES, Mesh, boundary_faces, to_tet10
@@ -57,7 +57,7 @@ def test_a_ball_around_a_rigid_one_is_the_closed_form() -> None:
     problem = build_pressed_problem(
         mesh, {"muscle": NeoHookean(MU, kappa_ratio=RATIO)}, np.full(count, pressure), 1.0, 0.0
     )
-    result = press(problem)
+    result = press_limb(problem)
     assert result.completed, result.reason
     bulk = RATIO * MU
     a = -1e-3 * pressure / (3 * bulk + 4 * MU * (INNER / OUTER) ** 3)

@@ -11,7 +11,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "anatomy"))
 from bodies import limb
 
-from limbfit.donning import Held, Strains
+from limbfit.donning import LoadedState, Strains
 from limbfit.identify.checks.domain import ANGLE, LEVEL, PRESSURE, RATE, SHEAR, TIME, Extent, RecordedRange
 from limbfit.mesh import Mesh, boundary_faces, cell_volumes
 from limbfit.mesh.boxes import SIX_TETS, build_boxes, turn_upright
@@ -29,13 +29,13 @@ def mesh() -> Mesh:
     return Mesh.from_arrays(points, cells, regions=deep.astype(int), names={0: "top", 1: "deep"})
 
 
-def held(mesh: Mesh, shear: float, pressure_kPa: float) -> Held:
+def held(mesh: Mesh, shear: float, pressure_kPa: float) -> LoadedState:
     """A state in which the top is sheared twice as much as what is deep, and its upper side is pressed."""
     strain = np.where(mesh.regions == 0, 2 * shear, shear)
     pressed = mesh.points[:, 2] >= mesh.points[:, 2].max() - 1e-9
     strains = Strains(strain, 0.5 * strain, strain, cell_volumes(mesh))
     nothing = np.zeros_like(mesh.points)
-    return Held(None, np.where(pressed, pressure_kPa, 0.0), nothing, nothing, strains, {})  # type: ignore[arg-type]
+    return LoadedState(None, np.where(pressed, pressure_kPa, 0.0), nothing, nothing, strains, {})  # type: ignore[arg-type]
 
 
 def test_strain_rate_pressure_and_place_of_a_load(mesh):
@@ -45,7 +45,7 @@ def test_strain_rate_pressure_and_place_of_a_load(mesh):
     upper = faces[mesh.points[faces][:, :, 2].min(axis=1) >= mesh.points[:, 2].max() - 1e-9]
     tested = RecordedRange((Extent(PRESSURE, "kPa", 0.0, 20.0),), (0.0,))
 
-    def describe(state: Held, before: list[Extent], history: LoadHistory) -> dict:
+    def describe(state: LoadedState, before: list[Extent], history: LoadHistory) -> dict:
         found = describe_socket_load(mesh, upper, state, before, history, ("top", "deep"), 20.0, axis, tested)
         return {(one.quantity, one.tissue): one for one in found}
 

@@ -49,17 +49,17 @@ def solve_layer(
     while targets:
         t = targets.pop(0)
         dt, depth = t - times[-1], float(history.at(t))
-        increment = memory.increment(point, laws, t, dt, depth, 0.0, Drives.none())
+        increment = memory.build_increment(point, laws, t, dt, depth, 0.0, Drives.none())
         scale, kept = float(increment.scale[0]), float(increment.history[0, 0, 0])
         elastic = max(depth, 0.0) ** power
         force = scale * elastic + kept
         if force < 0.0:  # the indenter has left it
             elastic, force = max(-kept / scale, 0.0), 0.0
-        memory = memory.advanced(point, laws, np.full((1, 1, 6), elastic), dt)
+        memory = memory.advance(point, laws, np.full((1, 1, 6), elastic), dt)
         met = len(times) > 1 and (force > 0.0) != (forces[-1] > 0.0)
         kink = met or np.isclose(t, history.kinks, rtol=1e-9).any()
         if control.stress == "linear" or kink:
-            memory = memory.turned()
+            memory = memory.drop_past()
         times.append(t)
         forces.append(force)
         if control.times is None:

@@ -5,32 +5,32 @@ Or the other way round: under a stated pressure, whose shape is a socket's.
 
 from .model import Load, SocketFit, build_socket_problem, build_socket_steps
 from .outcome import (
-    RARE,
+    RARE_SHARE,
     SETTLING,
     SHEAR_LEVELS,
     WHOLE,
-    Donned,
-    DonnedPart,
-    Held,
+    DonningCheckpoint,
+    DonningResult,
+    LoadedState,
     Patch,
     SocketStep,
     Strains,
     TissueStrain,
-    don,
     pack,
+    simulate_donning,
     unpack,
 )
-from .pressing import build_pressed_problem, extract_outer_surface, press
+from .pressing import build_pressed_problem, extract_outer_surface, press_limb
 
 __all__ = [
-    "RARE",
+    "RARE_SHARE",
     "SETTLING",
     "SHEAR_LEVELS",
     "WHOLE",
-    "Donned",
-    "DonnedPart",
-    "Held",
+    "DonningCheckpoint",
+    "DonningResult",
     "Load",
+    "LoadedState",
     "Patch",
     "SocketFit",
     "SocketStep",
@@ -39,9 +39,9 @@ __all__ = [
     "build_pressed_problem",
     "build_socket_problem",
     "build_socket_steps",
-    "don",
     "extract_outer_surface",
     "pack",
-    "press",
+    "press_limb",
+    "simulate_donning",
     "unpack",
 ]

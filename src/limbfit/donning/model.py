@@ -19,11 +19,11 @@ from ..socket import Socket
 ELEMENT = "tet10p0"
 OUTER = "skin"  # the face set that the socket may touch, the liner's where there is one
 # Steps while the socket comes on, is held, is loaded and is held again; tissue relaxes fastest at first.
-COMING_ON, HELD, LOADING = 8, 6, 6
-RELAXING = 2.0  # power of the step's number that the time in a hold goes with
+RAMP_STEPS, HOLD_STEPS, LOAD_STEPS = 8, 6, 6
+HOLD_POWER = 2.0  # power of the step's number that the time in a hold goes with
 # The stiffness of contact, MPa/mm: where pressures are the largest, 0.2 MPa, the wall is met to 0.1 mm.
-STIFFNESS = 2.0
-MOST_THREADS = 4  # of one simulation; more wait for memory
+CONTACT_STIFFNESS = 2.0
+MAX_THREADS = 4  # of one simulation; more wait for memory
 
 
 @dataclass(frozen=True)
@@ -149,16 +149,24 @@ def build_socket_steps(fit: SocketFit, modulus: float, threads: int | None = Non
     """
     times: list[float] = []
     for i, (_, on, off) in enumerate(fit.ends):
-        start = times[-1] if times else 0.0
-        count = LOADING if i else COMING_ON
-        times += [start + (on - start) * k / count for k in range(1, count + 1)]
-        if off > on:
-            times += [on + (off - on) * (k / HELD) ** RELAXING for k in range(1, HELD + 1)]
+        ramp_steps = LOAD_STEPS if i else RAMP_STEPS
+        times += grade_ramp_and_hold(times[-1] if times else 0.0, on, off, ramp_steps, HOLD_STEPS)
     return StepControl(
-        times=tuple(times), penalty=STIFFNESS / modulus, hold_penalty=True, threads=choose_threads(threads)
+        times=tuple(times),
+        penalty=CONTACT_STIFFNESS / modulus,
+        hold_penalty=True,
+        threads=choose_threads(threads),
     )
 
 
-def choose_threads(given: int | None = None) -> int:
-    """Threads of one simulation, of those ``given``; by default it has the machine to itself."""
-    return min(given or count_usable_cores(), MOST_THREADS)
+def grade_ramp_and_hold(start: float, on: float, off: float, ramp_steps: int, hold_steps: int) -> list[float]:
+    """Times, s, of even steps from ``start`` to ``on``, and of a hold until ``off`` that begins densely."""
+    times = [start + (on - start) * k / ramp_steps for k in range(1, ramp_steps + 1)]
+    if off > on:
+        times += [on + (off - on) * (k / hold_steps) ** HOLD_POWER for k in range(1, hold_steps + 1)]
+    return times
+
+
+def choose_threads(available: int | None = None) -> int:
+    """Threads of one simulation, of those that are ``available``; by default all of the machine's."""
+    return min(available or count_usable_cores(), MAX_THREADS)

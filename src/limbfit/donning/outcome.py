@@ -1,4 +1,7 @@
-"""A socket's simulation: pressure and shear over regions of the limb, step by step, and its balance."""
+"""A socket's simulation: pressure and shear over regions of the limb, strain inside it, and its balance.
+
+What was found so far is packed as facts and arrays, so that a simulation that was killed goes on.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +31,188 @@ from ..fe.observables import compute_element_fields
 from .model import SocketFit, build_socket_steps
 
 Mask = NDArray[np.bool_]
+Facts = dict[str, Any]
 
-SHEAR_LEVELS = (0.25, 0.5, 0.75)  # of which the sheared volume is told
-RARE = 0.01  # of a tissue's volume: strained by more than the strain that is told beside the largest
+WHOLE, SETTLING = "the limb", "settling"
+SHEAR_LEVELS = (0.25, 0.5, 0.75)  # shear strains above which the sheared volume is reported
+RARE_SHARE = 0.01  # of a tissue's volume: the strain that it exceeds is reported beside the largest
+RELATIVE_STEP = 1e-4  # of a parameter: how far it is moved where pressures are differentiated
+# What is stored of a simulation that goes on later: the solver's arrays begin with the first.
+SOLVER = "solver."
+FIELDS = ("pressure", "shear", "displacement")
+STRAINS = ("shear", "compression", "energy_kPa", "volume_mm3")
+
+
+def simulate_donning(
+    problem: Problem,
+    fit: SocketFit,
+    regions: Mapping[str, Mask],
+    sensitivities: bool = False,
+    on_row: Callable[[SocketStep], None] | None = None,
+    steps: StepControl | None = None,
+    threads: int | None = None,
+    keep: Callable[[DonningCheckpoint], None] | None = None,
+    begin: DonningCheckpoint | None = None,
+) -> DonningResult:
+    """Simulate a socket's problem.
+
+    Parameters
+    ----------
+    problem : of `build_socket_problem`.
+    regions : masks (f,) of the faces of the socket's body.
+    sensitivities : also derivatives with respect to every material parameter.
+    on_row : called after every step.
+    steps : by default `build_socket_steps`. Derivatives are those at a contact stiffness over the mean
+        modulus, so that runs to be compared with them have the same steps.
+    threads : of those steps, as in `build_socket_steps`.
+    keep : called when donning and each load but the last have been held.
+    begin : of an earlier call of the same, which goes on from there.
+    """
+    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+    system = System(problem)
+    patches = {WHOLE: np.ones(len(problem.bodies[0].faces), dtype=bool), **regions}
+    rows = [] if begin is None else list(begin.rows)
+    held = {} if begin is None else dict(begin.held)
+
+    def record(step: Step) -> None:
+        found = compute_tractions(system, laws, step.state)
+        rows.append(_build_row(step, found, patches))
+        for name, _, off in fit.ends:
+            if np.isclose(step.time, off):
+                pressure, shear = found.at_nodes(len(problem.mesh.points))
+                slopes = _compute_slopes(problem, system, laws, step.state, patches) if sensitivities else {}
+                strains = Strains.of(system, laws, step.state)
+                held[name] = LoadedState(rows[-1], pressure, shear, step.state.u, strains, slopes)
+        if on_row is not None:
+            on_row(rows[-1])
+
+    control = steps or build_socket_steps(fit, laws.modulus, threads)
+    checkpoints = None
+    if keep is not None:
+        ends = [off for _, _, off in fit.ends[:-1]]
+        checkpoints = Checkpoints(ends, lambda now: keep(DonningCheckpoint(now, tuple(rows), dict(held))))
+    result = solve(
+        problem, control, sensitivities, on_step=record, store="none", system=system, checkpoints=checkpoints,
+        begin=None if begin is None else begin.snapshot,
+    )  # fmt: skip
+    shares = result.imbalance[1:, 0]
+    balanced = tuple(replace(row, imbalance=float(share)) for row, share in zip(rows, shares, strict=True))
+    return DonningResult(result, balanced, held)
+
+
+def _build_row(step: Step, found: Tractions, patches: Mapping[str, Mask]) -> SocketStep:
+    values = {name: Patch.of(found, mask) for name, mask in patches.items()}
+    return SocketStep(
+        time=step.time,
+        force=step.reactions[0, :3],
+        moment=step.reactions[0, 3:],
+        move=step.coordinates[0, :3],
+        turn=np.degrees(step.coordinates[0, 3:]),
+        contact_area_mm2=found.contact_area,
+        penetration_mm=step.penetration,
+        imbalance=0.0,
+        whole=values.pop(WHOLE),
+        regions=values,
+    )
+
+
+def _compute_slopes(
+    problem: Problem, system: System, laws: Laws, state: State, patches: Mapping[str, Mask]
+) -> dict[str, Array]:
+    """Derivatives (p,) of the mean pressures and of settling, from those of the state."""
+    found = {name: np.zeros(laws.count) for name in (*patches, SETTLING)}
+    assert state.sensitivity is not None
+    assert state.bodies is not None
+    for i, value in enumerate(problem.parameters):
+        ways = []
+        for step in (RELATIVE_STEP * value, -RELATIVE_STEP * value):
+            there = replace(
+                state,
+                u=state.u + step * state.sensitivity[..., i],
+                coordinates=state.coordinates + step * state.bodies[..., i],
+                penalty=state.penalty * (1.0 + step * laws.modulus_gradient[i] / laws.modulus),
+            )
+            at = compute_tractions(system, laws, there)
+            areas = at.areas.sum(axis=1)
+            ways.append({name: _compute_mean(at, areas, mask) for name, mask in patches.items()})
+        for name in patches:
+            found[name][i] = (ways[0][name] - ways[1][name]) / (2.0 * RELATIVE_STEP)
+        if len(state.bodies):
+            found[SETTLING][i] = value * state.bodies[0, 2, i]
+    return found
+
+
+def _compute_mean(found: Tractions, areas: Array, chosen: Mask) -> float:
+    return float(areas[chosen] @ found.face_pressure_kPa[chosen] / areas[chosen].sum())
+
+
+@dataclass(frozen=True)
+class SocketStep:
+    """One step: what the socket does, and what it does to the limb.
+
+    ``force (3,)`` N and ``moment (3,)`` N mm about the pivot, on the socket, and its ``move (3,)`` mm and
+    ``turn (3,)`` degrees, along anterior, the third axis and proximal (`SocketFit.frame`).
+    ``penetration_mm``: how far the limb is in the wall at most.  ``imbalance``: how far the contact is from
+    the stated force and moment, a share.
+    """
+
+    time: float
+    force: Array
+    moment: Array
+    move: Array
+    turn: Array
+    contact_area_mm2: float
+    penetration_mm: float
+    imbalance: float
+    whole: Patch
+    regions: Mapping[str, Patch]
+
+
+@dataclass(frozen=True)
+class Patch:
+    """Pressure and shear over a part of the outer surface.
+
+    ``mean_kPa``: normal force over area; ``peak_kPa``: the largest mean over one face; ``shear_kPa`` and
+    ``shear_peak_kPa`` likewise of the size of the shear.
+    """
+
+    mean_kPa: float
+    peak_kPa: float
+    shear_kPa: float
+    shear_peak_kPa: float
+
+    @classmethod
+    def of(cls, found: Tractions, chosen: Mask) -> Patch:
+        """Over the chosen (f,) faces."""
+        areas = found.areas.sum(axis=1)
+        shear = np.linalg.norm(found.face_shear_kPa[chosen], axis=1)
+        return cls(
+            mean_kPa=_compute_mean(found, areas, chosen),
+            peak_kPa=float(found.face_pressure_kPa[chosen].max()),
+            shear_kPa=float(areas[chosen] @ shear / areas[chosen].sum()),
+            shear_peak_kPa=float(shear.max()),
+        )
+
+
+@dataclass(frozen=True)
+class LoadedState:
+    """The limb when donning, or a load, has been held.
+
+    Parameters
+    ----------
+    row : what the socket does then.
+    pressure, shear, displacement : (n,) kPa, (n, 3) kPa and (n, 3) mm at the mesh's nodes.
+    strains : of the cells.
+    slopes : of the whole's and each region's mean pressure, kPa, and of ``settling``, mm, the derivatives
+        (p,) with respect to the logarithms of `Problem.parameter_names`; none where they were not asked for.
+    """
+
+    row: SocketStep
+    pressure: Array
+    shear: Array
+    displacement: Array
+    strains: Strains
+    slopes: Mapping[str, Array]
 
 
 @dataclass(frozen=True)
@@ -68,7 +250,7 @@ class Strains:
         }
 
     def within(self, cells: Mask) -> TissueStrain:
-        """What is told of the chosen cells (m,)."""
+        """The strain of the chosen cells (m,)."""
         volume, shear, compression = self.volume_mm3[cells], self.shear[cells], self.compression[cells]
         return TissueStrain(
             volume_mm3=float(volume.sum()),
@@ -101,214 +283,31 @@ class TissueStrain:
 
 
 def _compute_exceeded(values: Array, volume: Array) -> float:
-    """The value that ``RARE`` of the volume exceeds."""
+    """The value that ``RARE_SHARE`` of the volume exceeds."""
     order = np.argsort(values)[::-1]
     above = np.cumsum(volume[order])
-    return float(values[order][np.searchsorted(above, RARE * above[-1])])
-
-
-WHOLE, SETTLING = "the limb", "settling"
-LITTLE = 1e-4  # of a parameter: how far it is moved where pressures are differentiated
+    return float(values[order][np.searchsorted(above, RARE_SHARE * above[-1])])
 
 
 @dataclass(frozen=True)
-class Patch:
-    """Pressure and shear over a part of the outer surface.
-
-    ``mean_kPa``: normal force over area; ``peak_kPa``: the largest mean over one face; ``shear_kPa`` and
-    ``shear_peak_kPa`` likewise of the size of the shear.
-    """
-
-    mean_kPa: float
-    peak_kPa: float
-    shear_kPa: float
-    shear_peak_kPa: float
-
-    @classmethod
-    def of(cls, found: Tractions, chosen: Mask) -> Patch:
-        """Over the chosen (f,) faces."""
-        areas = found.areas.sum(axis=1)
-        shear = np.linalg.norm(found.face_shear_kPa[chosen], axis=1)
-        return cls(
-            mean_kPa=_compute_mean(found, areas, chosen),
-            peak_kPa=float(found.face_pressure_kPa[chosen].max()),
-            shear_kPa=float(areas[chosen] @ shear / areas[chosen].sum()),
-            shear_peak_kPa=float(shear.max()),
-        )
-
-
-@dataclass(frozen=True)
-class SocketStep:
-    """One step: what the socket does, and what it does to the limb.
-
-    ``force (3,)`` N and ``moment (3,)`` N mm about the pivot, on the socket, and its ``move (3,)`` mm and
-    ``turn (3,)`` degrees, along anterior, the third axis and proximal (`SocketFit.frame`).
-    ``penetration_mm``: how far the limb is in the wall at most.  ``imbalance``: how far the contact is from
-    the stated force and moment, a share.
-    """
-
-    time: float
-    force: Array
-    moment: Array
-    move: Array
-    turn: Array
-    contact_area_mm2: float
-    penetration_mm: float
-    imbalance: float
-    whole: Patch
-    regions: Mapping[str, Patch]
-
-
-@dataclass(frozen=True)
-class Held:
-    """The limb when donning, or a load, has been held.
-
-    Parameters
-    ----------
-    row : what the socket does then.
-    pressure, shear, displacement : (n,) kPa, (n, 3) kPa and (n, 3) mm at the mesh's nodes.
-    strains : of the cells.
-    slopes : of the whole's and each region's mean pressure, kPa, and of ``settling``, mm, the derivatives
-        (p,) with respect to the logarithms of `Problem.parameter_names`; none where they were not asked for.
-    """
-
-    row: SocketStep
-    pressure: Array
-    shear: Array
-    displacement: Array
-    strains: Strains
-    slopes: Mapping[str, Array]
-
-
-@dataclass(frozen=True)
-class Donned:
+class DonningResult:
     """A socket's simulation: its ``rows``, one for each step, and what was ``held``, by name."""
 
     result: Result
     rows: tuple[SocketStep, ...]
-    held: Mapping[str, Held]
+    held: Mapping[str, LoadedState]
 
 
 @dataclass(frozen=True, eq=False)
-class DonnedPart:
+class DonningCheckpoint:
     """A socket's simulation as far as donning, or a load, was held: ``snapshot`` is the solver's."""
 
     snapshot: Snapshot
     rows: tuple[SocketStep, ...]
-    held: Mapping[str, Held]
+    held: Mapping[str, LoadedState]
 
 
-def don(
-    problem: Problem,
-    fit: SocketFit,
-    regions: Mapping[str, Mask],
-    sensitivities: bool = False,
-    on_row: Callable[[SocketStep], None] | None = None,
-    steps: StepControl | None = None,
-    threads: int | None = None,
-    keep: Callable[[DonnedPart], None] | None = None,
-    begin: DonnedPart | None = None,
-) -> Donned:
-    """Simulate a socket's problem.
-
-    Parameters
-    ----------
-    problem : of `build_socket_problem`.
-    regions : masks (f,) of the faces of the socket's body.
-    sensitivities : also derivatives with respect to every material parameter.
-    on_row : called after every step.
-    steps : by default `build_socket_steps`. Derivatives are those at a contact stiffness over the mean
-        modulus, so that runs to be compared with them have the same steps.
-    threads : of those steps, as in `build_socket_steps`.
-    keep : called when donning and each load but the last have been held.
-    begin : of an earlier call of the same, which goes on from there.
-    """
-    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    system = System(problem)
-    patches = {WHOLE: np.ones(len(problem.bodies[0].faces), dtype=bool), **regions}
-    rows = [] if begin is None else list(begin.rows)
-    held = {} if begin is None else dict(begin.held)
-
-    def note(step: Step) -> None:
-        found = compute_tractions(system, laws, step.state)
-        rows.append(_build_row(step, found, patches))
-        for name, _, off in fit.ends:
-            if np.isclose(step.time, off):
-                pressure, shear = found.at_nodes(len(problem.mesh.points))
-                slopes = _compute_slopes(problem, system, laws, step.state, patches) if sensitivities else {}
-                strains = Strains.of(system, laws, step.state)
-                held[name] = Held(rows[-1], pressure, shear, step.state.u, strains, slopes)
-        if on_row is not None:
-            on_row(rows[-1])
-
-    control = steps or build_socket_steps(fit, laws.modulus, threads)
-    checkpoints = None
-    if keep is not None:
-        ends = [off for _, _, off in fit.ends[:-1]]
-        checkpoints = Checkpoints(ends, lambda now: keep(DonnedPart(now, tuple(rows), dict(held))))
-    result = solve(
-        problem, control, sensitivities, on_step=note, store="none", system=system, checkpoints=checkpoints,
-        begin=None if begin is None else begin.snapshot,
-    )  # fmt: skip
-    shares = result.imbalance[1:, 0]
-    told = tuple(replace(row, imbalance=float(share)) for row, share in zip(rows, shares, strict=True))
-    return Donned(result, told, held)
-
-
-def _build_row(step: Step, found: Tractions, patches: Mapping[str, Mask]) -> SocketStep:
-    values = {name: Patch.of(found, mask) for name, mask in patches.items()}
-    return SocketStep(
-        time=step.time,
-        force=step.reactions[0, :3],
-        moment=step.reactions[0, 3:],
-        move=step.coordinates[0, :3],
-        turn=np.degrees(step.coordinates[0, 3:]),
-        contact_area_mm2=found.contact_area,
-        penetration_mm=step.penetration,
-        imbalance=0.0,
-        whole=values.pop(WHOLE),
-        regions=values,
-    )
-
-
-def _compute_slopes(
-    problem: Problem, system: System, laws: Laws, state: State, patches: Mapping[str, Mask]
-) -> dict[str, Array]:
-    """Derivatives (p,) of what `Held` tells: the state's own carry them to the contact's pressure."""
-    found = {name: np.zeros(laws.count) for name in (*patches, SETTLING)}
-    assert state.sensitivity is not None
-    assert state.bodies is not None
-    for i, value in enumerate(problem.parameters):
-        ways = []
-        for step in (LITTLE * value, -LITTLE * value):
-            there = replace(
-                state,
-                u=state.u + step * state.sensitivity[..., i],
-                coordinates=state.coordinates + step * state.bodies[..., i],
-                penalty=state.penalty * (1.0 + step * laws.modulus_gradient[i] / laws.modulus),
-            )
-            at = compute_tractions(system, laws, there)
-            areas = at.areas.sum(axis=1)
-            ways.append({name: _compute_mean(at, areas, mask) for name, mask in patches.items()})
-        for name in patches:
-            found[name][i] = (ways[0][name] - ways[1][name]) / (2.0 * LITTLE)
-        if len(state.bodies):
-            found[SETTLING][i] = value * state.bodies[0, 2, i]
-    return found
-
-
-def _compute_mean(found: Tractions, areas: Array, chosen: Mask) -> float:
-    return float(areas[chosen] @ found.face_pressure_kPa[chosen] / areas[chosen].sum())
-
-
-Facts = dict[str, Any]
-
-SOLVER = "solver."  # its arrays begin with it
-FIELDS = ("pressure", "shear", "displacement")
-STRAINS = ("shear", "compression", "energy_kPa", "volume_mm3")
-
-
-def pack(part: DonnedPart) -> tuple[Facts, dict[str, Array]]:
+def pack(part: DonningCheckpoint) -> tuple[Facts, dict[str, Array]]:
     """As facts that JSON can hold, and arrays by name."""
     arrays = {f"{SOLVER}{name}": array for name, array in part.snapshot.arrays.items()}
     held: Facts = {}
@@ -321,7 +320,7 @@ def pack(part: DonnedPart) -> tuple[Facts, dict[str, Array]]:
     return {"solver": dict(part.snapshot.facts), "rows": rows, "held": held}, arrays
 
 
-def unpack(facts: Facts, arrays: Mapping[str, Array]) -> DonnedPart:
+def unpack(facts: Facts, arrays: Mapping[str, Array]) -> DonningCheckpoint:
     """From what `pack` gave."""
     own = {name.removeprefix(SOLVER): array for name, array in arrays.items() if name.startswith(SOLVER)}
     held = {}
@@ -329,11 +328,11 @@ def unpack(facts: Facts, arrays: Mapping[str, Array]) -> DonnedPart:
         slopes = {patch: arrays[f"{i}.slopes.{patch}"] for patch in one["slopes"]}
         strains = Strains(**{field: arrays[f"{i}.strains.{field}"] for field in STRAINS})
         fields = {field: arrays[f"{i}.{field}"] for field in FIELDS}
-        held[name] = Held(row=_to_row(one["row"]), strains=strains, slopes=slopes, **fields)
-    return DonnedPart(Snapshot(facts["solver"], own), tuple(map(_to_row, facts["rows"])), held)
+        held[name] = LoadedState(row=_to_row(one["row"]), strains=strains, slopes=slopes, **fields)
+    return DonningCheckpoint(Snapshot(facts["solver"], own), tuple(map(_to_row, facts["rows"])), held)
 
 
-def _to_row(told: Facts) -> SocketStep:
-    vectors = {name: np.array(told[name]) for name in ("force", "moment", "move", "turn")}
-    regions = {name: Patch(**patch) for name, patch in told["regions"].items()}
-    return SocketStep(**{**told, **vectors, "whole": Patch(**told["whole"]), "regions": regions})
+def _to_row(facts: Facts) -> SocketStep:
+    vectors = {name: np.array(facts[name]) for name in ("force", "moment", "move", "turn")}
+    regions = {name: Patch(**patch) for name, patch in facts["regions"].items()}
+    return SocketStep(**{**facts, **vectors, "whole": Patch(**facts["whole"]), "regions": regions})

@@ -12,11 +12,10 @@ from ..errors import ProblemError
 from ..fe import History, Pressure, Problem, Result, Step, StepControl, solve
 from ..fe.materials import Material
 from ..mesh import Mesh
-from .model import ELEMENT, OUTER, choose_threads
+from .model import ELEMENT, OUTER, choose_threads, grade_ramp_and_hold
 
-LEVELS = 32  # of pressure, up to the largest: what a face has is rounded to them
-COMING_ON, HELD = 6, 4  # steps
-RELAXING = 2.0  # power of the step's number that the time of the hold goes with
+PRESSURE_LEVELS = 32  # of pressure, up to the largest: what a face has is rounded to them
+RAMP_STEPS, HOLD_STEPS = 6, 4  # while the pressure comes on, and is held
 
 
 def build_pressed_problem(
@@ -28,7 +27,8 @@ def build_pressed_problem(
     ----------
     mesh : LPS mm, with the face set ``skin`` and node sets ``fixed_*``.
     materials : by region.
-    pressure_kPa : (f,) of the faces of that set, 0 or more; rounded to a part in ``LEVELS`` of the largest.
+    pressure_kPa : (f,) of the faces of that set, 0 or more; rounded to `PRESSURE_LEVELS`
+        parts of the largest.
     on_s, hold_s : how long the pressure comes on and then stays.
 
     Raises
@@ -39,11 +39,11 @@ def build_pressed_problem(
     top = float(pressure_kPa.max())
     if not top > 0.0:
         raise ProblemError("no pressure is stated anywhere on the limb", remedy="state one below the brim")
-    faces, levels = mesh.face_sets[OUTER], np.round(LEVELS * pressure_kPa / top)
+    faces, levels = mesh.face_sets[OUTER], np.round(PRESSURE_LEVELS * pressure_kPa / top)
     times = [0.0, on_s, on_s + hold_s] if hold_s > 0.0 else [0.0, on_s]
     pressures = []
     for level in np.unique(levels[levels > 0.0]):
-        value = 1e-3 * top * level / LEVELS
+        value = 1e-3 * top * level / PRESSURE_LEVELS
         pressures.append(Pressure(faces[levels == level], times, [0.0, *(value for _ in times[1:])]))
     return Problem(
         mesh=mesh,
@@ -57,13 +57,11 @@ def build_pressed_problem(
     )
 
 
-def press(problem: Problem, on_step: Callable[[Step], None] | None = None) -> Result:
+def press_limb(problem: Problem, on_step: Callable[[Step], None] | None = None) -> Result:
     """Simulate a problem of `build_pressed_problem`; the last state is kept."""
-    times = np.asarray(problem.pressures[0].times)
-    on = times[1] * np.arange(1, COMING_ON + 1) / COMING_ON
-    held = times[1] + (times[-1] - times[1]) * (np.arange(1, HELD + 1) / HELD) ** RELAXING
-    steps = np.concatenate([on, held]) if times[-1] > times[1] else on
-    control = StepControl(times=tuple(map(float, steps)), threads=choose_threads())
+    _, on, *hold = map(float, problem.pressures[0].times)
+    times = grade_ramp_and_hold(0.0, on, hold[-1] if hold else on, RAMP_STEPS, HOLD_STEPS)
+    control = StepControl(times=tuple(times), threads=choose_threads())
     return solve(problem, control, on_step=on_step, store="all")
 
 

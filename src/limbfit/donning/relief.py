@@ -16,18 +16,18 @@ from scipy.optimize import linprog
 
 from ..arrays import Array
 
-OWN_PER_MM = 0.15  # guess: by how much a region's own depth changes the logarithm of its pressure
-LEAST_KPA = 1.0  # pressures below this count as this
-DEEPEST_MM, RELIEF_MM = 4.0, -8.0  # bounds of the depths
-TRUST_MM, WIDEST_MM, NARROWEST_MM = 2.0, 4.0, 0.25
+GUESSED_SLOPE_PER_MM = 0.15  # guess: by how much a region's own depth changes the logarithm of its pressure
+MIN_PRESSURE_KPA = 1.0  # pressures below this count as this
+MAX_DEPTH_MM, MIN_DEPTH_MM = 4.0, -8.0  # bounds of the depths
+TRUST_MM, MAX_TRUST_MM, MIN_TRUST_MM = 2.0, 4.0, 0.25
 MEAN_WEIGHT = 0.1  # of the mean beside the worst, so that regions that are not the worst gain too
 LIMIT_WEIGHT = 5.0  # of what is beyond the limits
-WORTH = 0.01  # a foreseen gain that is less is not simulated for
+MIN_GAIN = 0.01  # a foreseen gain that is less is not simulated for
 GOOD, POOR = 0.5, 0.1  # share of the foreseen gain from, or below, which the trust region changes
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class SocketTrial:
     """A simulated design: depths (k,) mm, the largest pressures (r,) kPa of all regions, and its merit.
 
     ``pressures`` is None where it could not be made or simulated.
@@ -54,24 +54,24 @@ class Relief:
     reference: Array
     limits: Array
     start: Array
-    trials: list[Trial] = field(init=False)
+    trials: list[SocketTrial] = field(init=False)
     trust_mm: float = field(init=False, default=TRUST_MM)
 
     def __post_init__(self) -> None:
         depths = np.zeros(len(self.named))
-        self.trials = [Trial(depths, self.start, self.merit(self.start))]
+        self.trials = [SocketTrial(depths, self.start, self.merit(self.start))]
         self._slopes = np.zeros((len(self.start), len(self.named)))
-        self._slopes[list(self.named), np.arange(len(self.named))] = OWN_PER_MM
+        self._slopes[list(self.named), np.arange(len(self.named))] = GUESSED_SLOPE_PER_MM
 
     @property
-    def best(self) -> Trial:
+    def best(self) -> SocketTrial:
         return min(self.trials, key=lambda trial: trial.merit)
 
     def merit(self, pressures: Array) -> float:
         """The goal: the worst and the mean of the named over the control, and the excess, as logarithms."""
-        return self._merit(_log(pressures))
+        return self._compute_merit(_log(pressures))
 
-    def _merit(self, y: Array) -> float:
+    def _compute_merit(self, y: Array) -> float:
         named = list(self.named)
         gain = y[named] - _log(self.reference)[named]
         others = np.setdiff1d(np.arange(len(y)), named)
@@ -80,41 +80,41 @@ class Relief:
 
     def propose(self) -> Array | None:
         """Depths (k,) mm to be simulated next; None where no gain that is worth it is foreseen."""
-        if self.trust_mm < NARROWEST_MM:
+        if self.trust_mm < MIN_TRUST_MM:
             return None
-        depths = self._minimum()
-        foreseen = self._merit(self._foreseen(depths))
-        return None if foreseen > self.best.merit - WORTH else depths
+        depths = self._solve_linear_program()
+        foreseen = self._compute_merit(self._predict_pressures(depths))
+        return None if foreseen > self.best.merit - MIN_GAIN else depths
 
-    def tell(self, depths: Array, pressures: Array | None) -> Trial:
+    def tell(self, depths: Array, pressures: Array | None) -> SocketTrial:
         """What the proposed depths gave: pressures (r,) kPa, or None where they could not be simulated."""
         if pressures is None:
-            trial = Trial(depths, None, np.inf)
+            trial = SocketTrial(depths, None, np.inf)
             self.trust_mm /= 2.0
         else:
-            trial = Trial(depths, pressures, self.merit(pressures))
-            foreseen = self.best.merit - self._merit(self._foreseen(depths))
+            trial = SocketTrial(depths, pressures, self.merit(pressures))
+            foreseen = self.best.merit - self._compute_merit(self._predict_pressures(depths))
             share = (self.best.merit - trial.merit) / foreseen
             if share > GOOD:
-                self.trust_mm = min(2.0 * self.trust_mm, WIDEST_MM)
+                self.trust_mm = min(2.0 * self.trust_mm, MAX_TRUST_MM)
             elif share < POOR:
                 self.trust_mm /= 2.0
-            self._learn(depths, pressures)
+            self._update_slopes(depths, pressures)
         self.trials.append(trial)
         return trial
 
-    def _foreseen(self, depths: Array) -> Array:
+    def _predict_pressures(self, depths: Array) -> Array:
         """Logarithms (r,) of the pressures at depths (k,)."""
         best = self.best
         assert best.pressures is not None
         return np.asarray(_log(best.pressures) + self._slopes @ (depths - best.depths))
 
-    def _learn(self, depths: Array, pressures: Array) -> None:
+    def _update_slopes(self, depths: Array, pressures: Array) -> None:
         step = depths - self.best.depths
-        wrong = _log(pressures) - self._foreseen(depths)
+        wrong = _log(pressures) - self._predict_pressures(depths)
         self._slopes += np.outer(wrong, step) / (step @ step)
 
-    def _minimum(self) -> Array:
+    def _solve_linear_program(self) -> Array:
         """The linear program's depths: unknowns are the depths, the worst gain and the excess."""
         named, k = list(self.named), len(self.named)
         best = self.best
@@ -124,8 +124,8 @@ class Relief:
         gains = np.column_stack([self._slopes[named], -np.ones(k), np.zeros(k)])
         beyond = np.column_stack([self._slopes[others], np.zeros(len(others)), -np.ones(len(others))])
         cost = np.concatenate([MEAN_WEIGHT * self._slopes[named].mean(axis=0), [1.0, LIMIT_WEIGHT]])
-        low = np.maximum(best.depths - self.trust_mm, RELIEF_MM)
-        high = np.minimum(best.depths + self.trust_mm, DEEPEST_MM)
+        low = np.maximum(best.depths - self.trust_mm, MIN_DEPTH_MM)
+        high = np.minimum(best.depths + self.trust_mm, MAX_DEPTH_MM)
         found = linprog(
             cost,
             A_ub=np.vstack([gains, beyond]),
@@ -139,4 +139,4 @@ class Relief:
 
 
 def _log(pressures: Array) -> Array:
-    return np.log(np.maximum(pressures, LEAST_KPA))
+    return np.log(np.maximum(pressures, MIN_PRESSURE_KPA))

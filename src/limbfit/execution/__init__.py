@@ -6,7 +6,7 @@ order of the jobs whatever runs them, so a caller cannot tell one executor from 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -18,6 +18,7 @@ from .base import (
     NO_LIMITS,
     SAFE_PATH,
     THREAD_VARIABLES,
+    Batch,
     Executor,
     Limits,
     SerialExecutor,
@@ -126,15 +127,8 @@ class _SharedExecutor(Executor):
     def threads_for(self, jobs: int) -> int:
         return self._executor.threads_for(jobs)
 
-    def _run_jobs(
-        self,
-        function: Callable,
-        jobs: list,
-        keys: Sequence[str | None],
-        on_lost: Callable | None,
-        on_report: Callable | None,
-    ) -> Iterator[Any]:
-        return self._executor.map(function, jobs, keys, on_lost, on_report)
+    def _run_jobs(self, batch: Batch) -> Iterator[Any]:
+        return self._executor.map(batch.function, batch.jobs, batch.keys, batch.on_lost, batch.on_report)
 
 
 def __getattr__(name: str) -> Any:

@@ -59,6 +59,17 @@ def send_reports_to(listener: Callable[[Any], None] | None) -> Iterator[None]:
         _listener.reset(token)
 
 
+@dataclass(frozen=True)
+class Batch:
+    """One call of `Executor.map`: the jobs as a list, and the key of each; None if it has none."""
+
+    function: Callable
+    jobs: list
+    keys: Sequence[str | None]
+    on_lost: Callable | None
+    on_report: Callable | None
+
+
 class Executor(ABC):
     """Runs a function over jobs; use it as a context, which ends its workers."""
 
@@ -102,18 +113,11 @@ class Executor(ABC):
         if keys is not None and len(keys) != len(listed):
             raise ValueError(f"{len(keys)} keys for {len(listed)} jobs")
         every = [None] * len(listed) if keys is None else keys
-        return self._run_jobs(function, listed, every, on_lost, on_report)
+        return self._run_jobs(Batch(function, listed, every, on_lost, on_report))
 
     @abstractmethod
-    def _run_jobs(
-        self,
-        function: Callable,
-        jobs: list,
-        keys: Sequence[str | None],
-        on_lost: Callable | None,
-        on_report: Callable | None,
-    ) -> Iterator[Any]:
-        """`map` with the jobs as a list, and the key of each; None if it has none."""
+    def _run_jobs(self, batch: Batch) -> Iterator[Any]:
+        """Yield the answers of `map`."""
 
     def __enter__(self) -> Self:
         return self
@@ -142,16 +146,9 @@ class SerialExecutor(Executor):
     def threads_for(self, jobs: int) -> int:
         return count_usable_cores()
 
-    def _run_jobs(
-        self,
-        function: Callable,
-        jobs: list,
-        keys: Sequence[str | None],
-        on_lost: Callable | None,
-        on_report: Callable | None,
-    ) -> Iterator[Any]:
+    def _run_jobs(self, batch: Batch) -> Iterator[Any]:
         def done(job: Any) -> Any:
-            with send_reports_to(None if on_report is None else partial(on_report, job)):
-                return function(job)
+            with send_reports_to(None if batch.on_report is None else partial(batch.on_report, job)):
+                return batch.function(job)
 
-        return map(done, jobs)
+        return map(done, batch.jobs)

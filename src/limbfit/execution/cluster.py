@@ -11,7 +11,7 @@ import math
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from ..errors import InputError, RunError
-from .base import NO_LIMITS, Executor, Limits
+from .base import NO_LIMITS, Batch, Executor, Limits
 from .processes import ProcessExecutor
 
 QUEUES = {
@@ -149,63 +149,50 @@ class DaskExecutor(Executor):
     def threads_for(self, jobs: int) -> int:
         return 1
 
-    def _run_jobs(
-        self,
-        function: Callable,
-        jobs: list,
-        keys: Sequence[str | None],
-        on_lost: Callable | None,
-        on_report: Callable | None,
-    ) -> Iterator[Any]:
+    def _run_jobs(self, batch: Batch) -> Iterator[Any]:
         """Yield answers in order, with no more jobs at the scheduler than keep its workers busy.
 
         The scheduler blames a dead worker's jobs for the death, also those that only waited there. With a
         long queue, it would give up jobs that never began.
         """
-        name, contained = f"{function.__name__}-{uuid.uuid4().hex}", on_lost is not None
+        name, contained = f"{batch.function.__name__}-{uuid.uuid4().hex}", batch.on_lost is not None
         futures: dict[int, Any] = {}  # whose answers were not given yet
         news: SimpleQueue[Any] = SimpleQueue()  # None: a job has ended; else its number and what it reports
-        topic = "" if on_report is None else name
+        topic = "" if batch.on_report is None else name
         submitted, looked, present = 0, -math.inf, list[str]()
         if topic:
             self._client.subscribe_topic(topic, lambda event: news.put(event[1]))
         try:
-            for i, job in enumerate(jobs):
+            for i, job in enumerate(batch.jobs):
                 while True:
                     under_way = sum(not future.done() for future in futures.values())
                     if time.monotonic() > looked + _POLL_S:
                         present, looked = self._addresses(), time.monotonic()
                     room = _JOBS_PER_WORKER * max(len(present), self._requested, 1) - under_way
-                    for j in range(submitted, min(submitted + room, len(jobs))):
-                        futures[j] = self._submit(
-                            f"{name}-{j}", self._choose_workers(keys[j], present),
-                            function, jobs[j], self.limits, contained, j, topic,
+                    for j in range(submitted, min(submitted + room, len(batch.jobs))):
+                        place = self._choose_workers(batch.keys[j], present)
+                        futures[j] = self._client.submit(
+                            _run_contained, batch.function, batch.jobs[j], self.limits, contained, j, topic,
+                            key=f"{name}-{j}", pure=False, workers=place,
+                            allow_other_workers=place is not None,
                         )  # fmt: skip
                         futures[j].add_done_callback(lambda _: news.put(None))
                         submitted = j + 1
                     if futures[i].done():
                         break
                     with suppress(Empty):
-                        said = news.get(timeout=_POLL_S)
-                        if said is not None and on_report is not None:
-                            on_report(jobs[said[0]], said[1])
+                        report = news.get(timeout=_POLL_S)
+                        if report is not None and batch.on_report is not None:
+                            batch.on_report(batch.jobs[report[0]], report[1])
                 answer = self._result(futures.pop(i), contained)
-                yield on_lost(job, answer.reason) if isinstance(answer, _LostJob) and on_lost else answer
+                if isinstance(answer, _LostJob) and batch.on_lost is not None:
+                    answer = batch.on_lost(job, answer.reason)
+                yield answer
         finally:
             with suppress(Exception):  # the scheduler may be gone
                 self._client.cancel([future for future in futures.values() if not future.done()])
                 if topic:
                     self._client.unsubscribe_topic(topic)
-
-    def _submit(self, name: str, place: list[str] | None, *guarded: Any) -> Any:
-        return self._client.submit(
-            _run_contained,
-            *guarded,
-            key=name,
-            pure=False,
-            workers=place,
-            allow_other_workers=place is not None,
-        )
 
     def _choose_workers(self, key: str | None, present: list[str]) -> list[str] | None:
         """Where jobs of a key went before, if that worker lives; else the next worker in turn."""

@@ -19,7 +19,7 @@ from typing import Any
 import psutil
 
 from ..errors import RunError
-from .base import NO_LIMITS, SAFE_PATH, THREAD_VARIABLES, Executor, Limits, send_reports_to
+from .base import NO_LIMITS, SAFE_PATH, THREAD_VARIABLES, Batch, Executor, Limits, send_reports_to
 
 MAX_TRIES = 2
 _POLL_S = 0.25  # between two looks at what jobs take
@@ -48,41 +48,34 @@ class ProcessExecutor(Executor):
     def threads_for(self, jobs: int) -> int:
         return max(self.workers * self.threads // max(jobs, 1), self.threads)
 
-    def _run_jobs(
-        self,
-        function: Callable,
-        jobs: list,
-        keys: Sequence[str | None],
-        on_lost: Callable | None,
-        on_report: Callable | None,
-    ) -> Iterator[Any]:
+    def _run_jobs(self, batch: Batch) -> Iterator[Any]:
         if self._mapping:
             raise RuntimeError("the executor is already mapping: take all answers of one map before the next")
         self._mapping = True
-        waiting, busy, tries = list(range(len(jobs))), dict[int, int](), [0] * len(jobs)
-        limits = self.limits if on_lost is not None else NO_LIMITS
+        waiting, busy, tries = list(range(len(batch.jobs))), dict[int, int](), [0] * len(batch.jobs)
+        limits = self.limits if batch.on_lost is not None else NO_LIMITS
         answers: dict[int, JobOutcome] = {}
         try:
-            for index in range(len(jobs)):
+            for index in range(len(batch.jobs)):
                 while index not in answers:
-                    for seat, job in self._assign_jobs(waiting, busy, keys):
+                    for seat, job in self._assign_jobs(waiting, busy, batch.keys):
                         tries[job] += 1
                         busy[seat] = job
-                        self._get_worker(seat).send(function, jobs[job])
+                        self._get_worker(seat).send(batch.function, batch.jobs[job])
                     for seat, outcome in self._collect(busy, limits):
                         if isinstance(outcome, JobReport):
-                            if on_report is not None:
-                                on_report(jobs[busy[seat]], outcome.message)
+                            if batch.on_report is not None:
+                                batch.on_report(batch.jobs[busy[seat]], outcome.message)
                             continue
                         job = busy.pop(seat)
                         if isinstance(outcome, JobOutcome):
                             answers[job] = outcome
                         elif tries[job] < MAX_TRIES:
                             waiting.insert(0, job)
-                        elif on_lost is not None:
-                            answers[job] = JobOutcome(on_lost(jobs[job], f"{outcome}, twice"))
+                        elif batch.on_lost is not None:
+                            answers[job] = JobOutcome(batch.on_lost(batch.jobs[job], f"{outcome}, twice"))
                         else:
-                            raise RunError(_describe_death(function, job, keys[job]))
+                            raise RunError(_describe_death(batch.function, job, batch.keys[job]))
                 yield answers.pop(index).result()
         finally:
             self._mapping = False

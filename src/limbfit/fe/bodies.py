@@ -35,13 +35,13 @@ Index = NDArray[np.int32]
 
 # Stiffness that holds a coordinate while a displacement drives it which a force drives at other times, over
 # that of all its contact faces: it stays unknown, so that nothing is numbered anew.
-HOLDING = 100.0
+HOLDING_STIFFNESS = 100.0
 # Stiffness of a coordinate whose body touches nothing, over that of the tissue against a body of its width.
-GROUNDING = 0.1
+GROUNDING_STIFFNESS = 0.1
 # Move of a body that a force drives over its width, up to which a linear model foresees its contact.
-TRUSTED = 0.05
+TRUSTED_MOVE = 0.05
 # Gap over a body's width up to which it may touch what is beside its way.
-NEAR = 0.05
+NEAR_GAP = 0.05
 
 
 @dataclass(frozen=True)
@@ -63,14 +63,6 @@ class Contacts:
     turning: Array
     bending: Array
     tools: list[Tool]
-
-
-@dataclass(frozen=True)
-class Loads:
-    """Derivative (r, 3) of the energy of what drives bodies, and the norm of the forces among it, N."""
-
-    residual: Array
-    norm: float
 
 
 class _Body:
@@ -126,7 +118,7 @@ class Bodies:
             surface = ContactSurface.build(
                 element, points, np.asarray(stated.faces, dtype=np.int64), problem.contact_rule
             )
-            body = _Body(stated, surface, _start(problem, stated, surface), row)
+            body = _Body(stated, surface, _place_start(problem, stated, surface), row)
             body.points = slice(first, first + surface.areas.size)
             body.columns = slice(column, column + len(body.free))
             first, column = body.points.stop, body.columns.stop
@@ -140,12 +132,12 @@ class Bodies:
         self.frames = np.concatenate(
             [np.broadcast_to(b.frame, (b.surface.areas.size, 3, 3)) for b in self.all]
         )
-        self._spread = sp.hstack([self._share(body.surface) for body in self.all], format="csr")
+        self._spread = sp.hstack([self._build_shares(body.surface) for body in self.all], format="csr")
         self._positions = [find_positions(b.surface.faces, pattern.numbers, pattern.indptr, pattern.indices)
                            for b in self.all]  # fmt: skip
-        self._border()
+        self._locate_border()
 
-    def _share(self, surface: ContactSurface) -> sp.csr_matrix:
+    def _build_shares(self, surface: ContactSurface) -> sp.csr_matrix:
         """Shares (unknowns, 3 c) of the unknowns in the position of every contact point."""
         whole = sp.kron(surface.shares, sp.eye(3), format="csr")
         numbers = self.pattern.numbers[: self.nodes].ravel()
@@ -155,7 +147,7 @@ class Bodies:
         )
         return place @ whole
 
-    def _border(self) -> None:
+    def _locate_border(self) -> None:
         """Where the entries of the bodies' coordinates are in the matrix."""
         start = self.unknowns - self.free
         own = np.arange(start, self.unknowns)
@@ -183,13 +175,13 @@ class Bodies:
                 u = impose_coordinates(body, u, value, forced)
         return u
 
-    def trusted_share(self, direction: Array) -> float:
+    def compute_trusted_share(self, direction: Array) -> float:
         """The share, up to 1, of a change ``direction (r, 3)`` of ``u`` for which the linear model of contact
         is trusted; all of it where no force drives a body."""
         widths = [body.start.width for body in self.all if len(body.free)]
         if not widths:
             return 1.0
-        return 1.0 / max(1.0, float(np.abs(direction).max()) / (TRUSTED * min(widths)))
+        return 1.0 / max(1.0, float(np.abs(direction).max()) / (TRUSTED_MOVE * min(widths)))
 
     def evaluate(
         self,
@@ -223,7 +215,7 @@ class Bodies:
             places = tool.places.reshape(-1, 3)[pushed]
             levers = tool.pose.levers(places, np.arange(6))
             reactions[i] = np.einsum("cik,ci->k", levers, forces[at][pushed])
-            residual += tool.gathered(forces[at][..., None])[..., 0]
+            residual += tool.distribute_forces(forces[at][..., None])[..., 0]
             if tangent and len(body.free):
                 units, columns = tool.units, body.columns
                 self.levers[at, :, columns] = tool.levers
@@ -235,37 +227,41 @@ class Bodies:
         touch = Touch(gaps, normals, weights, blocks, stick, forces)
         return Contacts(energy, deepest, area, reactions, residual, touch, turning, bending, tools)
 
-    def tangent(self, found: Contacts, drives: Drives, penalty: float, modulus: float, data: Array) -> None:
+    def add_tangent(
+        self, found: Contacts, drives: Drives, penalty: float, modulus: float, data: Array
+    ) -> None:
         """Add the hessian of the contact energy, and of what holds bodies, to the entries ``data``.
 
         A body that a force drives and that touches nothing is given some: there must be a way to go.
         """
-        self._add(found.touch.blocks, data)
+        self._add_springs(found.touch.blocks, data)
         if self.free:
-            held = self.grounding(modulus)
+            held = self.compute_grounding(modulus)
             for body, forced in zip(self.all, drives.forced):
                 touching = (found.touch.gaps[body.points] < 0.0).any()
                 loose = np.where(touching, 0.0, held[body.columns])
-                held[body.columns] = np.where(forced[body.free], loose, self._holding(body, penalty))
+                held[body.columns] = np.where(
+                    forced[body.free], loose, self._holding_stiffness(body, penalty)
+                )
             self._add_border(found.turning, found.bending + np.diag(held), data)
 
-    def grounding(self, modulus: float) -> Array:
+    def compute_grounding(self, modulus: float) -> Array:
         """Stiffness (k,) of the free coordinates of bodies that touch nothing, N/mm, in tissue of a shear
         ``modulus``."""
         sizes = [np.full(len(body.free), body.start.width) for body in self.all]
-        return GROUNDING * modulus * np.concatenate(sizes)
+        return GROUNDING_STIFFNESS * modulus * np.concatenate(sizes)
 
-    def _holding(self, body: _Body, penalty: float) -> float:
+    def _holding_stiffness(self, body: _Body, penalty: float) -> float:
         """What holds a free coordinate where a displacement drives it, N/mm."""
-        return HOLDING * penalty * float(body.surface.areas.sum())
+        return HOLDING_STIFFNESS * penalty * float(body.surface.areas.sum())
 
     def with_springs(self, data: Array, blocks: Array) -> Array:
         """``data`` plus a stiffness (c, 3, 3) at every contact point."""
         data = data.copy()
-        self._add(np.ascontiguousarray(blocks), data)
+        self._add_springs(np.ascontiguousarray(blocks), data)
         return data
 
-    def _add(self, blocks: Array, data: Array) -> None:
+    def _add_springs(self, blocks: Array, data: Array) -> None:
         for body, places in zip(self.all, self._positions):
             shape = (*body.surface.areas.shape, 3, 3)
             add_springs(body.surface.N, blocks[body.points].reshape(shape), places, data)
@@ -281,26 +277,28 @@ class Bodies:
         pairs, places = self._corner
         data[places] += corner[pairs[:, 0], pairs[:, 1]]
 
-    def advance(self, found: Contacts) -> Array:
+    def differentiate_advance(self, found: Contacts) -> Array:
         """Mixed derivative (r, 3) with respect to displacement and advance of the first body, times -1."""
         body, axis = self.first, self.first.frame[2]
-        out = found.tools[0].gathered((found.touch.blocks[body.points] @ axis)[..., None])[..., 0]
+        out = found.tools[0].distribute_forces((found.touch.blocks[body.points] @ axis)[..., None])[..., 0]
         if len(body.free):
             turned = np.zeros(6)
             turned[body.free] = axis @ found.turning[body.points, :, body.columns].sum(axis=0)
             out[body.row : body.row + 2] += turned.reshape(2, 3)
         return out
 
-    def along(self, forces: Array) -> Array:
+    def project_on_axis(self, forces: Array) -> Array:
         """What forces (c, 3, p) on the points ask of the first body along its axis (p,), N."""
         return -np.einsum("i,cip->p", self.first.frame[2], forces[self.first.points])
 
-    def shares_of(self, unknowns: Index) -> sp.csr_matrix:
-        """Shares (m, 3 c) of some unknowns in the contact points, for `at_springs` and `springs_of`; where
-        bodies are free, their coordinates are the last of these unknowns."""
+    def select_shares(self, unknowns: Index) -> sp.csr_matrix:
+        """Shares (m, 3 c) of some unknowns in the contact points, for `spread_forces` and `move_springs`.
+
+        Where bodies are free, their coordinates are the last of these unknowns.
+        """
         return self._spread[unknowns]
 
-    def at_springs(self, forces: Array, shares: sp.csr_matrix | None = None) -> Array:
+    def spread_forces(self, forces: Array, shares: sp.csr_matrix | None = None) -> Array:
         """Forces (c, 3, ...) at the contact points as a vector (or matrix) of the unknowns, or of some."""
         shares = self._spread if shares is None else shares
         out = np.asarray(shares @ forces.reshape(-1, *forces.shape[2:]))
@@ -308,7 +306,7 @@ class Bodies:
             out[-self.free :] += np.einsum("cik,ci...->k...", self.levers, forces)
         return out
 
-    def springs_of(self, x: Array, shares: sp.csr_matrix | None = None) -> Array:
+    def move_springs(self, x: Array, shares: sp.csr_matrix | None = None) -> Array:
         """Values (c, 3, ...) of a vector (or matrix) of the unknowns, or of some, at the contact points,
         relative to the bodies."""
         shares = self._spread if shares is None else shares
@@ -317,27 +315,28 @@ class Bodies:
             out += np.einsum("cik,k...->ci...", self.levers, x[-self.free :])
         return out
 
-    def swept(self, motions: Sequence[Motion]) -> Index:
+    def find_swept_unknowns(self, motions: Sequence[Motion]) -> Index:
         """Unknowns at contact points that bodies driven by displacements come near to where they rest."""
         rest, under = np.zeros((self.rows, 3)), np.zeros(self.count, dtype=bool)
         for body, motion in zip(self.all, motions):
             for t in motion.times:
                 value, forced, growth = motion.at(t)
                 tool = body.tool(rest, np.where(forced, 0.0, value), growth)
-                under[body.points] |= tool.gaps.ravel() < NEAR * body.start.width
+                under[body.points] |= tool.gaps.ravel() < NEAR_GAP * body.start.width
         touched = np.diff(self._spread[:, np.repeat(under, 3)].indptr) > 0
         touched[self.unknowns - self.free :] = touched.any()
         return np.flatnonzero(touched).astype(np.int32)
 
-    def standing_on(self, unknowns: Index) -> NDArray[np.bool_]:
+    def find_points_on(self, unknowns: Index) -> NDArray[np.bool_]:
         """Contact points (c,) that move with these unknowns alone; none where there are none."""
         others = np.ones(self.unknowns)
         others[unknowns] = 0.0
         alone = (self._spread.T @ others).reshape(-1, 3) == 0.0
         return alone.all(axis=1) & (len(unknowns) > 0)
 
-    def driven(self, u: Array, drives: Drives, penalty: float) -> tuple[float, Loads]:
-        """Energy of what drives the free coordinates at ``u (r, 3)``, and its derivative."""
+    def evaluate_drives(self, u: Array, drives: Drives, penalty: float) -> tuple[float, Array, float]:
+        """Energy of what drives the free coordinates at ``u (r, 3)``, its derivative (r, 3), and the norm of
+        the forces among it, N."""
         energy, norm, residual = 0.0, 0.0, np.zeros_like(u)
         for body, value, forced in zip(self.all, drives.values, drives.forced):
             if not len(body.free):
@@ -345,13 +344,13 @@ class Bodies:
             now, scale = u[body.row : body.row + 2].ravel()[body.free], body.scale[body.free]
             pulls, off = value[body.free] / scale, now - value[body.free] * scale
             under = forced[body.free]
-            stiff = self._holding(body, penalty)
+            stiff = self._holding_stiffness(body, penalty)
             energy += float(np.where(under, -pulls * now, 0.5 * stiff * off**2).sum())
             out = np.zeros(6)
             out[body.free] = np.where(under, -pulls, stiff * off)
             residual[body.row : body.row + 2] = out.reshape(2, 3)
             norm += float((pulls[under] ** 2).sum())
-        return energy, Loads(residual, norm**0.5)
+        return energy, residual, norm**0.5
 
     @property
     def own_rows(self) -> tuple[slice, ...]:
@@ -359,7 +358,7 @@ class Bodies:
         first = [body.row - self.nodes for body in self.all]
         return tuple(slice(row, row + 2 * bool(len(body.free))) for row, body in zip(first, self.all))
 
-    def holding_slopes(self, drives: Drives, penalty: float, du: Array) -> Array:
+    def differentiate_holding_forces(self, drives: Drives, penalty: float, du: Array) -> Array:
         """Derivatives (r - n, 3, p) of what holds the free coordinates that displacements drive.
 
         As forces of `driven`, zero for the others; ``du (r - n, 3, p)`` are those of the coordinates, for
@@ -370,7 +369,7 @@ class Bodies:
             held = np.zeros(6, dtype=bool)
             held[body.free] = ~forced[body.free]
             if held.any():
-                out[rows] = -self._holding(body, penalty) * held.reshape(2, 3, 1) * du[rows]
+                out[rows] = -self._holding_stiffness(body, penalty) * held.reshape(2, 3, 1) * du[rows]
         return out
 
 
@@ -392,7 +391,7 @@ def _couple_moves_and_turns(moved: Array, free: NDArray[np.intp]) -> Array:
     return cross + cross.T
 
 
-def _start(problem: Problem, stated: RigidBody, surface: ContactSurface) -> RigidShape:
+def _place_start(problem: Problem, stated: RigidBody, surface: ContactSurface) -> RigidShape:
     """Where a body starts: the indenter just in touch, if the problem says so."""
     if stated.shape is not problem.indenter or problem.start != "touching":
         return stated.shape

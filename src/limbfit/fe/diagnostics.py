@@ -16,7 +16,7 @@ from ..mesh import Mesh, node_jacobians
 
 Kind = Literal["folded", "slipped", "sunk", "unbalanced", "unsettled", "inexact"]
 
-SLIP = 0.9  # force over the one before, in an advancing step, that is no relaxation
+RELAXATION_SHARE = 0.9  # force over the one before, in an advancing step, that is no relaxation
 # Share of the strain energy that folded elements may hold: their stiffness lost, the force would fall by
 # about as much, and less than by the error of the mesh.
 FOLDED_ENERGY = 0.01
@@ -89,7 +89,7 @@ def find_slip(displacement: Array, force: Array) -> tuple[SimulationWarning, ...
     The tissue has lost its equilibrium.
     """
     advancing = np.diff(displacement) > 1e-2 * displacement.max()
-    falls = np.flatnonzero(advancing & (force[1:] < SLIP * force[:-1]))
+    falls = np.flatnonzero(advancing & (force[1:] < RELAXATION_SHARE * force[:-1]))
     if not len(falls):
         return ()
     (before, after), (start, end) = force[falls[0] :][:2], displacement[falls[0] :][:2]
@@ -119,31 +119,31 @@ def find_penetration(
 
 
 def find_unbalanced_steps(
-    displacement: Array, found: Sequence[tuple[float, float]], tolerance: float
+    displacement: Array, steps: Sequence[tuple[float, float]], tolerance: float
 ) -> tuple[SimulationWarning, ...]:
     """Steps, as (mm, residual over reactions), that were accepted at more than the tolerance."""
-    if not found:
+    if not steps:
         return ()
-    worst = max(residual for _, residual in found)
+    worst = max(residual for _, residual in steps)
     text = (
-        f"{len(found)} steps are in equilibrium to {worst:.2g} of the reactions only, not to "
-        f"{tolerance:.2g}, first at {found[0][0]:.3g} mm: the force may be off by as much"
+        f"{len(steps)} steps are in equilibrium to {worst:.2g} of the reactions only, not to "
+        f"{tolerance:.2g}, first at {steps[0][0]:.3g} mm: the force may be off by as much"
     )
-    return _build_warning("unbalanced", text, len(found), found[0][0], displacement)
+    return _build_warning("unbalanced", text, len(steps), steps[0][0], displacement)
 
 
 def find_unconverged_friction(
-    displacement: Array, found: Sequence[tuple[float, float]]
+    displacement: Array, steps: Sequence[tuple[float, float]]
 ) -> tuple[SimulationWarning, ...]:
     """Steps, as (mm, residual over reactions), whose friction did not settle with the normal force."""
-    if not found:
+    if not steps:
         return ()
-    worst = max(residual for _, residual in found)
+    worst = max(residual for _, residual in steps)
     text = (
-        f"the friction of {len(found)} steps belongs to a normal force that is off by up to {worst:.2g} of "
-        f"the reactions, first at {found[0][0]:.3g} mm: use more steps"
+        f"the friction of {len(steps)} steps belongs to a normal force that is off by up to {worst:.2g} of "
+        f"the reactions, first at {steps[0][0]:.3g} mm: use more steps"
     )
-    return _build_warning("unsettled", text, len(found), found[0][0], displacement)
+    return _build_warning("unsettled", text, len(steps), steps[0][0], displacement)
 
 
 def find_inexact_sensitivities(displacement: Array, count: int) -> tuple[SimulationWarning, ...]:

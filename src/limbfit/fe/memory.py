@@ -38,11 +38,11 @@ class Memory:
         shape = (*points.weights.shape, 6)
         return cls(np.zeros(shape), np.zeros((laws.prony.shape[1], *shape)))
 
-    def turned(self) -> Memory:
+    def drop_past(self) -> Memory:
         """The same, with no smooth past: the next step takes the stress as linear in time."""
         return Memory(self.elastic, self.prony)
 
-    def increment(
+    def build_increment(
         self, points: Points, laws: Laws, time: float, dt: float, displacement: float, penalty: float,
         drives: Drives,
     ) -> Increment:  # fmt: skip
@@ -58,7 +58,7 @@ class Memory:
         scale = 1.0 + (gamma * ramp).sum(axis=1)
         return Increment(time, displacement, scale, K, penalty, drives)
 
-    def advanced(self, points: Points, laws: Laws, elastic: Array, dt: float) -> Memory:
+    def advance(self, points: Points, laws: Laws, elastic: Array, dt: float) -> Memory:
         """The memory at the end of a step of ``dt`` s that ended with the elastic stress ``elastic``."""
         decay, ramp, back, *_ = compute_prony_factors(dt, laws.prony[..., 1], self.duration)
         of = points.regions
@@ -80,7 +80,7 @@ def compute_elastic_stresses(system: System, laws: Laws, u: Array) -> Array:
         records = workspace(0, system.weights.shape[1], laws.numbers.shape[1])[:3]
         _compute_elastic_stresses(elements, laws.tables, u, records, stress[cells])
 
-    system.over_cells(part)
+    system.map_cells(part)
     return stress
 
 

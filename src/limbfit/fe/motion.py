@@ -98,7 +98,7 @@ class Motion:
             np.concatenate([np.asarray(self.growth), np.asarray(after.growth)]),
         )
 
-    def later(self, seconds: float) -> Motion:
+    def delay(self, seconds: float) -> Motion:
         """The same after so many seconds at its first values."""
         if not seconds:
             return self
@@ -106,14 +106,16 @@ class Motion:
         values, growth = np.vstack([self.values[:1], self.values]), np.asarray(self.growth)
         return Motion(times, values, np.vstack([forced[:1], forced]), np.append(growth[0], growth))
 
-    def taken_over(self, t: float, reaction: Array) -> Motion:
+    def take_over_forces(self, t: float, reaction: Array) -> Motion:
         """With forces (6,) where values begin to be forces at time ``t`` and are left open."""
         here = np.isclose(self.times, t, rtol=1e-9, atol=0.0)[:, None] & np.isnan(self.values)
         return replace(self, values=np.where(here, reaction, self.values)) if here.any() else self
 
-    def lasting(self, since: float, t: float) -> float:
-        """Share at time ``t`` of forces that were `taken_over` at time ``since``: they go over into the next
-        values.  Nothing where ``since`` is not a number."""
+    def remaining_share(self, since: float, t: float) -> float:
+        """Share that is left at time ``t`` of forces that were taken over at time ``since``.
+
+        They go over into the next values.  Nothing where ``since`` is not a number.
+        """
         if np.isnan(since):
             return 0.0
         i = int(np.searchsorted(self.times, since * (1.0 + 1e-9), side="right")) - 1

@@ -39,7 +39,7 @@ def compute_element_fields(system: System, laws: Laws, state: State) -> ElementF
     points, law, numbers, _, _, element, *_ = workspace(0, system.weights.shape[1], laws.numbers.shape[1])
     records = points, law, numbers, element
     mean, every = system.element.mean_dilatation, slice(0, len(system.cells))
-    tables = laws.acting(state.activation, np.ones(len(laws.prony)))
+    tables = laws.activate(state.activation, np.ones(len(laws.prony)))
     _compute_fields(system.elements(every), mean, tables, history, state.u, records, out)
     return ElementFields(out[:, :6], out[:, 6:9], out[:, 9], out[:, 10])
 
@@ -80,7 +80,13 @@ def compute_contact_pressure(system: System, laws: Laws, state: State) -> Array:
     pressure = np.zeros(len(system.points))
     if system.bodies is None:
         return pressure
-    force, faces = _compute_contact_forces(system, laws, state), _find_touched_faces(system)
+    nothing, penalty = np.zeros(0), state.penalty * laws.modulus
+    increment = Increment(
+        state.time, state.displacement, nothing, nothing, penalty, state.drives, state.grips
+    )
+    force = system.contact_force(state.rows, increment)[: system.nodes]
+    faces = np.concatenate([np.asarray(body.faces) for body in system.problem.rigid_bodies])
+    faces = faces[np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])]  # each once
     share = _compute_nodal_areas(system.element, system.points + state.u, faces)
     to_middles = _build_corner_mean(len(pressure), faces) if faces.shape[1] == 6 else None
     if to_middles is not None:
@@ -92,21 +98,6 @@ def compute_contact_pressure(system: System, laws: Laws, state: State) -> Array:
         corners = np.unique(faces[:, :3])
         pressure[corners] = (to_middles @ pressure)[corners]
     return pressure
-
-
-def _compute_contact_forces(system: System, laws: Laws, state: State) -> Array:
-    """Nodal forces (n, 3) of all contact, N."""
-    nothing, penalty = np.zeros(0), state.penalty * laws.modulus
-    increment = Increment(
-        state.time, state.displacement, nothing, nothing, penalty, state.drives, state.grips
-    )
-    return system.contact_force(state.rows, increment)[: system.nodes]
-
-
-def _find_touched_faces(system: System) -> NDArray[np.int64]:
-    """The faces that bodies may touch, each once."""
-    faces = np.concatenate([np.asarray(body.faces) for body in system.problem.rigid_bodies])
-    return faces[np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])]
 
 
 def _build_corner_mean(n: int, faces: NDArray[np.int64]) -> sp.csr_matrix:

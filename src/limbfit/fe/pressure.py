@@ -47,7 +47,7 @@ class Pressure:
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
 
-    def later(self, seconds: float) -> Pressure:
+    def delay(self, seconds: float) -> Pressure:
         """The same after so many seconds at its first value."""
         times, values = np.asarray(self.times), np.asarray(self.values)
         return Pressure(self.faces, np.append(0.0, times + seconds), np.append(values[0], values))
@@ -57,7 +57,7 @@ class Pressure:
         return float(np.interp(t, np.asarray(self.times), np.asarray(self.values)))
 
 
-class Pressed:
+class PressedSurface:
     """The faces of one pressure as volume, its derivatives, and the forces of a unit of pressure."""
 
     def __init__(self, element: Element, points: Array, faces: NDArray[np.int64]) -> None:
@@ -83,9 +83,9 @@ class Pressed:
         forces = np.einsum("q,qk,fqi->fki", self.weights, self.N, normal)
         gradient = forces + np.einsum("q,qk,fqi->fki", self.weights, self.dN[..., 0], across)
         gradient = (gradient + np.einsum("q,qk,fqi->fki", self.weights, self.dN[..., 1], along)) / 3.0
-        return volume, self._gathered(gradient, len(x)), self._gathered(forces, len(x))
+        return volume, self._sum_at_nodes(gradient, len(x)), self._sum_at_nodes(forces, len(x))
 
-    def _gathered(self, parts: Array, n: int) -> Array:
+    def _sum_at_nodes(self, parts: Array, n: int) -> Array:
         out = np.zeros((n, 3))
         np.add.at(out, self.faces, parts)
         return out
@@ -129,16 +129,20 @@ class Pressed:
 class Pressures:
     """All pressures of a discretised problem."""
 
-    def __init__(self, element: Element, points: Array, stated: Sequence[Pressure], pattern: Pattern) -> None:
+    def __init__(
+        self, element: Element, points: Array, pressures: Sequence[Pressure], pattern: Pattern
+    ) -> None:
         self._points, self._pattern = points, pattern
-        self.all = [Pressed(element, points, np.asarray(one.faces, dtype=np.int64)) for one in stated]
+        self.all = [
+            PressedSurface(element, points, np.asarray(one.faces, dtype=np.int64)) for one in pressures
+        ]
         self._positions = [
             find_positions(one.faces, pattern.numbers, pattern.indptr, pattern.indices) for one in self.all
         ]
 
     def evaluate(self, u: Array, values: Sequence[float], rims: Array | float) -> tuple[float, Array, float]:
         """Energy of the pressures ``values (k,)``, MPa, at ``u (r, 3)``, its derivative (r, 3), and the norm
-        of the forces, N; ``rims (n, 3)`` as `rims` gave them."""
+        of the forces, N; ``rims (n, 3)`` as `compute_rims` gave them."""
         x = self._at(u)
         residual, total, energy = np.zeros_like(u), np.zeros_like(x), 0.0
         residual[: len(x)] += rims
@@ -153,7 +157,7 @@ class Pressures:
     def _at(self, u: Array) -> Array:
         return self._points + u[: len(self._points)]
 
-    def rims(self, u: Array, values: Sequence[float]) -> Array:
+    def compute_rims(self, u: Array, values: Sequence[float]) -> Array:
         """Forces (n, 3) that the pressures have at ``u (r, 3)`` beyond the derivative of their energy, N."""
         x, out = self._at(u), np.zeros_like(self._points)
         for one, p in zip(self.all, values):
@@ -161,7 +165,7 @@ class Pressures:
             out += p * (forces - gradient)
         return out
 
-    def tangent(self, u: Array, values: Sequence[float], data: Array) -> None:
+    def add_tangent(self, u: Array, values: Sequence[float], data: Array) -> None:
         """Add the hessian of the energy to the entries ``data``."""
         x = self._at(u)
         for one, p, places in zip(self.all, values, self._positions):

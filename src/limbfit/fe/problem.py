@@ -99,7 +99,7 @@ class History:
         """What the indenter does: loads, holds, unloads, in any number."""
         return find_phases(self.times, self.driver)
 
-    def later(self, seconds: float) -> History:
+    def delay(self, seconds: float) -> History:
         """The same after a rest of so many seconds."""
         if not seconds:
             return self
@@ -216,25 +216,25 @@ class Problem:
         """What drives the rigid bodies at time ``t``."""
         return Drives.of([body.motion for body in self.rigid_bodies], t)
 
-    def taken_over(self, t: float, reactions: NDArray[np.float64]) -> Problem:
+    def take_over_forces(self, t: float, reactions: NDArray[np.float64]) -> Problem:
         """With the ``reactions (b, 6)`` of the bodies at time ``t`` as the forces that are left open then."""
         first = len(self.rigid_bodies) - len(self.bodies)
-        moved = [body.motion.taken_over(t, reactions[first + i]) for i, body in enumerate(self.bodies)]
+        moved = [body.motion.take_over_forces(t, reactions[first + i]) for i, body in enumerate(self.bodies)]
         if all(motion is body.motion for motion, body in zip(moved, self.bodies)):
             return self
         bodies = tuple(replace(body, motion=motion) for body, motion in zip(self.bodies, moved))
         return replace(self, bodies=bodies)
 
-    def later(self, seconds: float) -> Problem:
+    def delay(self, seconds: float) -> Problem:
         """The same after so many seconds in which whatever drives it rests."""
         if not seconds:
             return self
         return replace(
             self,
-            history=self.history.later(seconds),
-            bodies=tuple(replace(body, motion=body.motion.later(seconds)) for body in self.bodies),
-            pressures=tuple(pressure.later(seconds) for pressure in self.pressures),
-            activation=None if self.activation is None else self.activation.later(seconds),
+            history=self.history.delay(seconds),
+            bodies=tuple(replace(body, motion=body.motion.delay(seconds)) for body in self.bodies),
+            pressures=tuple(pressure.delay(seconds) for pressure in self.pressures),
+            activation=None if self.activation is None else self.activation.delay(seconds),
             touch_down_s=self.touch_down_s + seconds if self.touch_down_s else 0.0,
         )
 
@@ -243,7 +243,7 @@ class Problem:
         contracting = 0.0 if self.activation is None else self.activation.moving_s(t)
         return contracting + self.history.travel(t) + sum(b.motion.moving_s(t) for b in self.bodies)
 
-    def activated(self, t: float) -> float:
+    def activation_at(self, t: float) -> float:
         """Share of the active stress at time ``t``, s."""
         return 0.0 if self.activation is None else self.activation.at(t)
 
@@ -310,7 +310,7 @@ class Activation:
         """The share at time ``t``, s."""
         return float(np.interp(t, np.asarray(self.times), np.asarray(self.shares)))
 
-    def later(self, seconds: float) -> Activation:
+    def delay(self, seconds: float) -> Activation:
         """The same after so many seconds at its first share."""
         times, shares = np.asarray(self.times), np.asarray(self.shares)
         return Activation(np.append(0.0, times + seconds), np.append(shares[0], shares))

@@ -172,17 +172,17 @@ class Result:
     def _interpolate(self, values: Array, t: Array) -> Array:
         return interpolate(self.times, self.force, self.problem.history.kinks, values, t)
 
-    def _inside(self, t: Array) -> Array:
+    def _clip_times(self, t: Array) -> Array:
         return np.clip(t, self.times[0], self.times[-1])
 
     def force_at(self, t: Array) -> Array:
         """Force (k,) at times ``t (k,)``, N; interpolated between steps, never negative."""
-        at = self._inside(np.asarray(t, dtype=float))
+        at = self._clip_times(np.asarray(t, dtype=float))
         return self._interpolate(self.force, at)
 
     def displacement_at(self, t: Array) -> Array:
         """Displacement (k,) at times ``t (k,)``, mm, between steps as `force_at`."""
-        return self._interpolate(self.displacement, self._inside(np.asarray(t, dtype=float)))
+        return self._interpolate(self.displacement, self._clip_times(np.asarray(t, dtype=float)))
 
     def sensitivity_at(self, t: Array) -> Array:
         """Derivative (k, p) of `force_at` with respect to the parameters."""
@@ -200,7 +200,7 @@ class Result:
     def _slope_at(self, slopes: Array | None, t: Array) -> Array:
         if slopes is None:
             raise ValueError("the simulation ran without sensitivities")
-        return self._interpolate(slopes, self._inside(np.asarray(t, dtype=float)))
+        return self._interpolate(slopes, self._clip_times(np.asarray(t, dtype=float)))
 
 
 def interpolate(times: Array, force: Array, kinks: Array, values: Array, at: Array) -> Array:
@@ -216,7 +216,9 @@ def interpolate(times: Array, force: Array, kinks: Array, values: Array, at: Arr
         if not len(inside):
             continue
         start = float(kinks[kinks <= x[0] + 1e-9 * times[-1]].max(initial=times[0]))
-        power = _choose_power(times[times > start + 1e-9 * times[-1]] - start)
+        since = times[times > start + 1e-9 * times[-1]] - start
+        # A whole number: the force is smooth in time, and so remains smooth in the variable.
+        power = 2 if len(since) > 1 and since[1] > 3.0 * since[0] else 1
         x, t = ((np.maximum(s - start, 0.0)) ** (1.0 / power) for s in (x, at[inside]))
         nodes = len(x)
         if nodes > 2 and pushes[-1] <= 0.0:
@@ -248,14 +250,6 @@ def _find_stretches(times: Array, force: Array, kinks: Array) -> list[tuple[int,
             found.append((a, end))
             a = end
     return found
-
-
-def _choose_power(since: Array) -> int:
-    """The power of the spline's variable that the time since a kink is: 2 where steps grow fast after it.
-
-    A whole number: the force is smooth in time, and so remains smooth in the variable.
-    """
-    return 2 if len(since) > 1 and since[1] > 3.0 * since[0] else 1
 
 
 def _build_spline(x: Array, y: Array) -> BSpline:

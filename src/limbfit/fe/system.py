@@ -37,10 +37,10 @@ T = TypeVar("T")
 class Increment:
     """What is constant while one step is solved.
 
-    ``displacement`` is that of the history, mm, which drives the supports; ``scale (r,)`` and ``history
-    (m, q, 6)`` are s and K of `assembly`; ``penalty`` in MPa/mm; the ``grips`` hold points along the bodies;
-    points deeper than ``flat_from`` (mm) have the tangent of a flat body; the ``drives`` move the
-    rigid bodies.  The ``pressures (k,)`` in MPa act, with ``rims (n, 3)`` as `Pressures.rims` gave them.
+    ``displacement`` is that of the history, mm, which drives the supports; ``scale (r,)`` and ``history (m,
+    q, 6)`` are s and K of `assembly`; ``penalty`` in MPa/mm; the ``grips`` hold points along the bodies;
+    points deeper than ``flat_from`` (mm) have the tangent of a flat body; the ``drives`` move the rigid
+    bodies.  The ``pressures (k,)`` in MPa act, with ``rims (n, 3)`` as `Pressures.compute_rims` gave them.
     ``activation``: share of the active stress.
     """
 
@@ -61,11 +61,11 @@ class Increment:
         """Whether the step holds something constant that follows the displacement."""
         return bool(self.pressures) or any(grip is not None and grip.lags for grip in self.grips)
 
-    def foreseen(self, tools: Sequence[Tool], du: Array) -> Increment:
+    def predict(self, tools: Sequence[Tool], du: Array) -> Increment:
         """With the grips that their tangents foresee after a change ``du (r, 3)``; the ``tools`` as now."""
         if not any(self.grips):
             return self
-        return replace(self, grips=tuple(g and g.foreseen(tool, du) for g, tool in zip(self.grips, tools)))
+        return replace(self, grips=tuple(g and g.predict(tool, du) for g, tool in zip(self.grips, tools)))
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ class System:
         own = self.gradients[cells], self.weights[cells], self.regions[cells]
         return self.cells[cells], *own, self.fibres[cells], self.prestretch[cells]
 
-    def over_cells(self, work: Callable[[slice], T]) -> list[T]:
+    def map_cells(self, work: Callable[[slice], T]) -> list[T]:
         """``work`` done on as many parts of the cells as there are threads, side by side."""
         ends = np.linspace(0, len(self.cells), self.threads + 1).astype(int)
         parts = [slice(a, b) for a, b in pairwise(ends)]
@@ -232,10 +232,10 @@ class System:
 
     def evaluate(self, u: Array, laws: Laws, increment: Increment, tangent: bool = True) -> Evaluation:
         """Energy, residual (r, 3) and, if wanted, tangent entries at ``u (r, 3)``."""
-        if laws.fibred and not len(self.fibres):
+        if laws.has_fibres and not len(self.fibres):
             raise ProblemError("the fibres of a material have no direction", remedy="state Problem.fibres")
         size = len(self.indices) if tangent else 0
-        mean, tables = self.element.mean_dilatation, laws.acting(increment.activation, increment.scale)
+        mean, tables = self.element.mean_dilatation, laws.activate(increment.activation, increment.scale)
 
         def part(cells: slice) -> tuple[float, Array, Array]:
             residual, data = np.zeros_like(u), np.zeros(size)
@@ -245,40 +245,40 @@ class System:
             )  # fmt: skip
             return energy, residual, data
 
-        (energy, residual, data), *others = self.over_cells(part)
+        (energy, residual, data), *others = self.map_cells(part)
         for more in others:
             energy += more[0]
             residual += more[1]
             data += more[2]
-        load_norm = self._contracting(laws, increment.activation)
+        load_norm = self._compute_active_force(laws, increment.activation)
         if increment.pressures:
             pressing, pressed, pressure_norm = self.pressures.evaluate(u, increment.pressures, increment.rims)
             energy, residual = energy + pressing, residual + pressed
             load_norm = max(load_norm, pressure_norm)
             if tangent:
-                self.pressures.tangent(u, increment.pressures, data)
+                self.pressures.add_tangent(u, increment.pressures, data)
         if not np.isfinite(energy) or self.bodies is None:
             return Evaluation(energy, residual, data if tangent else None, load_norm=load_norm)
-        found = self._contact(u, increment, tangent)
-        driving, loads = self.bodies.driven(u, increment.drives, increment.penalty)
+        found = self._evaluate_contact(u, increment, tangent)
+        driving, loads, loads_norm = self.bodies.evaluate_drives(u, increment.drives, increment.penalty)
         if tangent:
-            self.bodies.tangent(found, increment.drives, increment.penalty, laws.modulus, data)
+            self.bodies.add_tangent(found, increment.drives, increment.penalty, laws.modulus, data)
         return Evaluation(
-            energy + found.energy + driving, residual + found.residual + loads.residual,
+            energy + found.energy + driving, residual + found.residual + loads,
             data if tangent else None, float(found.reactions[0, 2]), found.penetration, found.area,
-            self.bodies.advance(found) if tangent else None,
+            self.bodies.differentiate_advance(found) if tangent else None,
             float(np.linalg.norm(found.residual[: self.nodes])), found.touch, found.reactions,
-            max(loads.norm, load_norm),
+            max(loads_norm, load_norm),
         )  # fmt: skip
 
-    def _contracting(self, laws: Laws, share: float) -> float:
+    def _compute_active_force(self, laws: Laws, share: float) -> float:
         """The size of active forces, N: their stress on a section of the tissue that contracts."""
         if share == 0.0 or not laws.fibre[:, 2].any():
             return 0.0
         volumes = np.bincount(self.regions, self.weights.sum(axis=1), len(laws.kappa))
         return share * float((laws.fibre[:, 2] * volumes ** (2.0 / 3.0)).max())
 
-    def _contact(self, u: Array, increment: Increment, tangent: bool = False) -> Contacts:
+    def _evaluate_contact(self, u: Array, increment: Increment, tangent: bool = False) -> Contacts:
         assert self.bodies is not None
         return self.bodies.evaluate(
             u, increment.drives, increment.penalty, increment.flat_from, increment.grips, tangent
@@ -286,7 +286,7 @@ class System:
 
     def contact_force(self, u: Array, increment: Increment) -> Array:
         """The contact part of the residual (r, 3), N."""
-        return np.zeros_like(u) if self.bodies is None else self._contact(u, increment).residual
+        return np.zeros_like(u) if self.bodies is None else self._evaluate_contact(u, increment).residual
 
     def tools(self, u: Array, increment: Increment) -> list[Tool]:
         """The rigid bodies where they are at ``u (r, 3)``."""

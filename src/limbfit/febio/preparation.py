@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..fe import History, Motion, Problem, StepControl, System
-from ..fe.solution.start import CLEAR, IndenterStart
+from ..fe.solution.start import CLEARANCE_WIDTHS, IndenterStart
 from ..fe.solution.stepping import FirstStep, solve_until_onset
 
 PRESTRAIN_S = 1.0  # in which the pre-strain grows
@@ -72,15 +72,15 @@ def prepare_problem(problem: Problem, steps: StepControl) -> tuple[Problem, tupl
     preparation, waits = Preparation.from_problem(problem), IndenterStart.of(problem).waits
     motions = [body.motion for body in problem.rigid_bodies]
     if not (waits or any(np.asarray(motion.forced)[0].any() for motion in motions)):
-        return problem.later(preparation.settling_s), tuple(m.later(preparation.settling_s) for m in motions)
+        return problem.delay(preparation.settling_s), tuple(m.delay(preparation.settling_s) for m in motions)
     begun = solve_until_onset(problem, steps)
     moved = [_replace_first_force(motion, begun, i) for i, motion in enumerate(motions)]
-    moved = [motion.later(preparation.approach_s) for motion in moved]
+    moved = [motion.delay(preparation.approach_s) for motion in moved]
     if waits:
         problem = _approach_tissue(problem, begun.place, preparation.approach_s)
         moved[0] = problem.history.motion
     settled = [_delay_motion(motion, preparation.settling_s) for motion in moved]
-    return problem.later(preparation.settling_s), tuple(settled)
+    return problem.delay(preparation.settling_s), tuple(settled)
 
 
 def _replace_first_force(motion: Motion, begun: FirstStep, body: int) -> Motion:
@@ -102,7 +102,7 @@ def _replace_first_force(motion: Motion, begun: FirstStep, body: int) -> Motion:
 
 def _delay_motion(motion: Motion, seconds: float) -> Motion:
     """Return a motion so many seconds later, which goes to its beginning in the first of them."""
-    later = motion.later(seconds) if seconds else motion
+    later = motion.delay(seconds) if seconds else motion
     if not seconds or not motion.values[0].any() or np.asarray(motion.forced)[0].any():
         return later
     values, forced = np.asarray(later.values), np.asarray(later.forced)
@@ -120,8 +120,8 @@ def _approach_tissue(problem: Problem, place: float, wait_s: float) -> Problem:
     """
     start = System(problem).indenter
     assert start is not None
-    clear = CLEAR * start.width
-    later, history = problem.later(wait_s), problem.history.later(wait_s)
+    clear = CLEARANCE_WIDTHS * start.width
+    later, history = problem.delay(wait_s), problem.history.delay(wait_s)
     touch = problem.touch_down_s + wait_s
     last = max((float(t) for t in later.turns if t < touch * (1.0 - 1e-9)), default=0.0)
     off = touch - APPROACH_SHARE * (touch - last)

@@ -215,7 +215,7 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
         fixed=np.union1d(mesh.held, cut),
         contact_faces=faces[near],
         indenter=indenter,
-        history=model.history.later(model.waits_s),
+        history=model.history.delay(model.waits_s),
         friction=model.indenter.friction,
         element=model.element,
         fibres=fibres,

@@ -139,8 +139,8 @@ class _Regions:
         for u, dt, turn in zip(steps, seconds, turned, strict=True):
             stress, moduli, F = evaluate_elastic_at(self.points, laws, u)
             if dt > 0.0:
-                memory = memory.advanced(self.points, laws, stress[:, None], dt)
-                memory = memory.turned() if turn else memory
+                memory = memory.advance(self.points, laws, stress[:, None], dt)
+                memory = memory.drop_past() if turn else memory
             for l, prony in enumerate(memory.prony):
                 stress = stress + gamma[of, l, None] * prony[:, 0]
             A, N = (np.einsum("mij,mi->mj", F, along) for along in (self.motion, self.way))

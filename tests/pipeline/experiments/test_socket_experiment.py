@@ -20,7 +20,7 @@ from limbfit import fit_socket, load_study, report_study
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.cli.socket import show_socket
-from limbfit.donning import Load, SocketFit, build_socket_problem, build_socket_steps, don
+from limbfit.donning import Load, SocketFit, build_socket_problem, build_socket_steps, simulate_donning
 from limbfit.errors import InputError, RunError
 from limbfit.fe import OgdenQLV
 from limbfit.fe.kernel.laws import Laws
@@ -261,14 +261,14 @@ def test_slopes_of_pressure_and_settling_are_central_differences(folder):
     names = [f"{region}.{name}" for region, name in problem.parameter_names]
     laws = Laws.build([tissues[name] for name in mesh.region_names])
     steps = build_socket_steps(fit, laws.modulus)
-    whole = don(problem, fit, regions, sensitivities=True, steps=steps)
+    whole = simulate_donning(problem, fit, regions, sensitivities=True, steps=steps)
     centre = whole.held
     for tissue in ("muscle", "skin"):
         ways = []
         for sign in (1.0, -1.0):
             other = replace(tissues[tissue], c=tissues[tissue].c * np.exp(sign * 0.01))
             moved = problem.with_materials({**tissues, tissue: other})
-            ways.append(don(moved, fit, regions, steps=steps).held)
+            ways.append(simulate_donning(moved, fit, regions, steps=steps).held)
         for name in ("donning", "stance"):
             ahead, back = (way[name].row for way in ways)
             slope = centre[name].slopes["front"][names.index(f"{tissue}.c")]

@@ -71,29 +71,31 @@ class StickyContact(ABC):
         places, normals, pulls = (x.reshape(-1, 3) for x in (self.places, self.normals, self.pulls))
         return self.held.ravel(), places, normals, self.bounds.ravel(), pulls
 
-    def bare(self) -> Self:
-        """The grip without derivatives, to be kept."""
+    def without_derivatives(self) -> Self:
+        """The same points without derivatives, to be kept."""
         return replace(self, d_places=np.zeros((*self.held.shape, 3, 0)))
 
-    def begun(self, tool: Tool) -> StickyContact:
-        """The grip before the first step, with the tool where it starts."""
+    def start(self, tool: Tool) -> StickyContact:
+        """The points before the first step, with the body where it starts."""
         return self
 
-    def foreseen(self, tool: Tool, du: Array) -> Self:
-        """The grip with the pulls that its tangent foresees after a change ``du (r, 3)`` of ``u``."""
+    def predict(self, tool: Tool, du: Array) -> Self:
+        """The points with the pulls that their tangent predicts after a change ``du (r, 3)`` of ``u``."""
         return self
 
     @abstractmethod
-    def renewed(self, tool: Tool) -> StickyContact:
-        """The grip that an equilibrium with the tool where it is asks for; itself where it holds."""
+    def renew(self, tool: Tool) -> StickyContact:
+        """What an equilibrium with the body where it is asks for; itself where nothing changes."""
 
     @abstractmethod
-    def after(self, tool: Tool, du: Array | None) -> StickyContact:
-        """The grip after a step that ended there; ``du (r, 3, p)`` the derivative of the tool's ``u``, where
-        wanted."""
+    def advance(self, tool: Tool, du: Array | None) -> StickyContact:
+        """The points after a step that ended there.
+
+        ``du (r, 3, p)`` is the derivative of the tool's ``u``, where derivatives are wanted.
+        """
 
     @abstractmethod
-    def explicit(self, tool: Tool) -> Array:
+    def differentiate_anchors(self, tool: Tool) -> Array:
         """Derivative (f, q, 3, p) of the points' forces, over penalty and area, through the anchors alone."""
 
     @abstractmethod
@@ -115,21 +117,17 @@ class Anchors(StickyContact):
         held, bounds = np.zeros(shape, dtype=bool), np.full(shape, np.inf)
         return cls(held, vectors, vectors, bounds, slopes, vectors, slopes)
 
-    def bare(self) -> Self:
-        """The anchors without derivatives, to be kept."""
+    def without_derivatives(self) -> Self:
         nothing = np.zeros((*self.held.shape, 3, 0))
         return replace(self, d_places=nothing, d_normals=nothing)
 
-    def renewed(self, tool: Tool) -> Anchors:
+    def renew(self, tool: Tool) -> Anchors:
         """The anchors without those whose points left the indenter."""
         lost = self.held & (tool.gaps >= 0.0)
         return replace(self, held=self.held & ~lost) if lost.any() else self
 
-    def after(self, tool: Tool, du: Array | None) -> Anchors:
-        """The anchors at the end of a step: points that touch for the first time are held where they are.
-
-        ``du (r, 3, p)`` is the derivative of the tool's ``u``, where that is wanted.
-        """
+    def advance(self, tool: Tool, du: Array | None) -> Anchors:
+        """The anchors at the end of a step: points that touch for the first time are held where they are."""
         local = tool.local
         near = Distances.of(tool)
         closed, normals = np.zeros_like(self.held), np.zeros_like(self.normals)
@@ -138,7 +136,7 @@ class Anchors(StickyContact):
         new = (closed & ~self.held)[..., None]
         d_places, d_normals = self.d_places, self.d_normals
         if du is not None:
-            moved = tool.moved(du)
+            moved = tool.relative_motion(du)
             curvatures = np.zeros((*normals.shape, 3))
             curvatures.reshape(-1, 3, 3)[near.points] = near.tilts
             d_places = np.where(new[..., None], moved, d_places)
@@ -146,8 +144,7 @@ class Anchors(StickyContact):
         places, normals = np.where(new, local, self.places), np.where(new, normals, self.normals)
         return Anchors(closed, places, normals, self.bounds, d_places, self.pulls, d_normals)
 
-    def explicit(self, tool: Tool) -> Array:
-        """Derivative (f, q, 3, p) of the points' forces, over penalty and area, through the anchors alone."""
+    def differentiate_anchors(self, tool: Tool) -> Array:
         move = tool.local - self.places
         n, d_n, d_a = self.normals[..., None], self.d_normals, self.d_places
         across = np.einsum("fqi,fqi->fq", self.normals, move)[..., None, None]
@@ -156,7 +153,7 @@ class Anchors(StickyContact):
         return np.asarray(self.held[..., None, None] * change)
 
     def coupling(self, tool: Tool) -> None:
-        """Nothing: anchors and planes stay."""
+        """None: anchors and planes stay."""
 
 
 @dataclass(frozen=True)
@@ -175,15 +172,14 @@ class Coulomb(StickyContact):
         slopes = np.zeros((*shape, 3, parameters))
         return cls(nothing > 0.0, vectors, vectors, nothing, slopes, vectors, mu, hardness)
 
-    def renewed(self, tool: Tool) -> Self:
+    def renew(self, tool: Tool) -> Self:
         """Planes, bounds and pulls as they are where the tool is."""
         now = self._at(Distances.of(tool, self.held))
         return replace(now, pulls=_Slip.of(now, tool.local).elastic)
 
-    def foreseen(self, tool: Tool, du: Array) -> Self:
-        """The grip with the pulls that its tangent foresees after a change ``du (r, 3)`` of ``u``."""
+    def predict(self, tool: Tool, du: Array) -> Self:
         slip = _Slip.of(self, tool.local)
-        moved = tool.moved(du[..., None])[..., 0]
+        moved = tool.relative_motion(du[..., None])[..., 0]
         lead = (
             _shorten_to_bounds(self.pulls, self.bounds)
             / np.where(self.bounds > 0.0, self.bounds, 1.0)[..., None]
@@ -199,7 +195,7 @@ class Coulomb(StickyContact):
         bounds.ravel()[near.points] = self.mu / self.hardness * np.maximum(-near.gaps, 0.0) * near.steepness
         return replace(self, normals=normals, bounds=bounds)
 
-    def after(self, tool: Tool, du: Array | None) -> Coulomb:
+    def advance(self, tool: Tool, du: Array | None) -> Coulomb:
         """The anchors at the end of a step: those of new points where they are, those of slipping ones drawn
         along; planes and bounds are those that hold there."""
         near = Distances.of(tool, self.held)
@@ -210,7 +206,7 @@ class Coulomb(StickyContact):
         places = np.where(new, local, np.where(drawn, local - slip.elastic, self.places))
         d_places = self.d_places
         if du is not None:
-            moved = tool.moved(du)
+            moved = tool.relative_motion(du)
             tangent = slip.tangent + now._coupling(near, slip)
             d_elastic = tangent @ moved - slip.tangent @ d_places
             d_drawn = np.where(drawn[..., None], moved - d_elastic, d_places)
@@ -218,8 +214,7 @@ class Coulomb(StickyContact):
         pulls = np.where((closed & self.held)[..., None], slip.elastic, 0.0)
         return replace(now, held=closed, places=places, d_places=d_places, pulls=pulls)
 
-    def explicit(self, tool: Tool) -> Array:
-        """Derivative (f, q, 3, p) of the points' forces, over penalty and area, through the anchors alone."""
+    def differentiate_anchors(self, tool: Tool) -> Array:
         return np.asarray(-self.hardness * _Slip.of(self, tool.local).tangent @ self.d_places)
 
     def coupling(self, tool: Tool) -> Array:
@@ -253,14 +248,14 @@ class StepwiseCoulomb(Coulomb):
     ``FESlidingElasticInterface``).
     """
 
-    def begun(self, tool: Tool) -> StepwiseCoulomb:
+    def start(self, tool: Tool) -> StepwiseCoulomb:
         """Every point where it is at rest."""
-        return self.after(tool, None)
+        return self.advance(tool, None)
 
-    def after(self, tool: Tool, du: Array | None) -> StepwiseCoulomb:
+    def advance(self, tool: Tool, du: Array | None) -> StepwiseCoulomb:
         """Every point where it is at the end of a step."""
-        places, d_places = tool.local, self.d_places if du is None else tool.moved(du)
-        now = self.renewed(tool)
+        places, d_places = tool.local, self.d_places if du is None else tool.relative_motion(du)
+        now = self.renew(tool)
         return replace(now, held=np.ones_like(self.held), places=places, d_places=d_places)._at(
             Distances.of(tool, np.ones_like(self.held))
         )

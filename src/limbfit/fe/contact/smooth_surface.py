@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
@@ -55,12 +55,12 @@ class SmoothSurface(Wall):
     growth : 0: the clear shape, 1: the final one.
     """
 
-    clear: Array | None = None
-    start: Array | None = None
-    end: Array | None = None
-    grid: DistanceGrid | None = None
-    reach: float = 10.0
-    fade: float = 4.0
+    clear: Array | None = field(kw_only=True)
+    start: Array = field(kw_only=True)
+    end: Array = field(kw_only=True)
+    grid: DistanceGrid = field(kw_only=True)
+    reach: float = field(kw_only=True)
+    fade: float = field(kw_only=True)
     growth: float = 1.0
 
     @classmethod
@@ -89,7 +89,6 @@ class SmoothSurface(Wall):
         final, triangles = check_open_surface(points, faces, "the smooth surface")
         if not (spacing > 0.0 and reach > 0.0):
             raise ProblemError("the spacing and the reach of a smooth surface are not positive")
-        start = None
         both = used = final[np.unique(triangles)]
         if clear is not None:
             clear = np.asarray(clear, dtype=float)
@@ -100,10 +99,12 @@ class SmoothSurface(Wall):
             reach += float(np.linalg.norm(clear - final, axis=1)[np.unique(triangles)].max())
         grid = DistanceGrid.around(both, reach, spacing)
         end = fit_spline_coefficients(grid, final, triangles, reach)
-        if clear is not None:
-            start = fit_spline_coefficients(grid, clear, triangles, reach)
+        start = end if clear is None else fit_spline_coefficients(grid, clear, triangles, reach)
         fade = 2.0 * spacing if fade is None else fade
-        return cls(final, triangles, centre, axis, edge, clear, start, end, grid, reach, fade)
+        return cls(
+            final, triangles, centre, axis, edge, clear=clear, start=start, end=end, grid=grid, reach=reach,
+            fade=fade,
+        )  # fmt: skip
 
     @property
     def grows(self) -> bool:
@@ -115,16 +116,12 @@ class SmoothSurface(Wall):
         return other
 
     def near(self, points: Array) -> NDArray[np.bool_]:
-        assert self.grid is not None
         place = (points - self.grid.low) / self.grid.spacing
         return np.asarray(((place >= 1.0) & (place < np.array(self.grid.shape) - 2.0)).all(axis=1))
 
     def _distances(self, x: Array) -> tuple[Array, Array, Array]:
-        assert self.grid is not None
-        assert self.end is not None
-        start = self.end if self.start is None else self.start
         return smooth_distances(
-            x, start, self.end, self.growth, self.grid.low, self.grid.spacing, self.reach, self.fade
+            x, self.start, self.end, self.growth, self.grid.low, self.grid.spacing, self.reach, self.fade
         )
 
 

@@ -31,13 +31,13 @@ class Pose:
     coordinates: Array
 
     @property
-    def turned(self) -> bool:
+    def is_turned(self) -> bool:
         return bool(self.coordinates[3:].any())
 
     @cached_property
     def rotation(self) -> Array:
         """R (3, 3)."""
-        return np.asarray(expm(self._spin(self.coordinates[3:]))) if self.turned else np.eye(3)
+        return np.asarray(expm(self._spin(self.coordinates[3:]))) if self.is_turned else np.eye(3)
 
     @cached_property
     def slopes(self) -> Array:
@@ -60,7 +60,7 @@ class Pose:
         The upper right block of ``exp [[W, E], [0, W]]`` is the derivative along E; once more for the second
         (Najfeld and Havel 1995).
         """
-        if not self.turned:  # the series of the exponential at nothing, without an exponential
+        if not self.is_turned:  # the series of the exponential at nothing, without an exponential
             first, *others = (self._spin(direction) for direction in directions)
             return first if not others else 0.5 * (first @ others[0] + others[0] @ first)
         matrix = self._spin(self.coordinates[3:])
@@ -75,40 +75,40 @@ class Pose:
         """The body where it is."""
         frame, centre = self.start.frame, np.asarray(self.start.centre, dtype=float)
         shift = self.coordinates[:3] @ frame
-        if not self.turned:
+        if not self.is_turned:
             return self.start.placed(centre + shift, frame[2], frame[0])
         axes = frame @ self.rotation.T
         place = self.pivot + shift + self.rotation @ (centre - self.pivot)
         return self.start.placed(place, axes[2], axes[0])
 
-    def levers(self, points: Array, wanted: NDArray[np.intp]) -> Array:
-        """(c, 3, k): relative displacement of points (c, 3) per unit of the ``wanted (k,)`` coordinates."""
-        out = np.empty((len(points), 3, len(wanted)))
-        for column, i in enumerate(wanted):
-            out[:, :, column] = self._turn_lever(points, i - 3) if i > 2 else -self.start.frame[i]
+    def levers(self, points: Array, coordinates: NDArray[np.intp]) -> Array:
+        """(c, 3, k): relative displacement of points (c, 3) per unit of the ``coordinates (k,)``."""
+        out = np.empty((len(points), 3, len(coordinates)))
+        for column, i in enumerate(coordinates):
+            if i > 2:
+                out[:, :, column] = self._from_pivot(points) @ self.slopes[i - 3] @ self.rotation.T
+            else:
+                out[:, :, column] = -self.start.frame[i]
         return out
-
-    def _turn_lever(self, points: Array, k: int) -> Array:
-        return np.asarray(self._from_pivot(points) @ self.slopes[k] @ self.rotation.T)
 
     def _from_pivot(self, points: Array) -> Array:
         return np.asarray(points - self.pivot - self.coordinates[:3] @ self.start.frame)
 
-    def turning(self, forces: Array, wanted: NDArray[np.intp]) -> Array:
+    def turning(self, forces: Array, coordinates: NDArray[np.intp]) -> Array:
         """(c, 3, k): change of the forces (c, 3), which turn with the body, per unit of the coordinates."""
-        out = np.zeros((len(forces), 3, len(wanted)))
-        for column, i in enumerate(wanted):
+        out = np.zeros((len(forces), 3, len(coordinates)))
+        for column, i in enumerate(coordinates):
             if i > 2:
                 out[:, :, column] = forces @ self.rotation @ self.slopes[i - 3].T
         return out
 
-    def bending(self, points: Array, forces: Array, wanted: NDArray[np.intp]) -> Array:
+    def bending(self, points: Array, forces: Array, coordinates: NDArray[np.intp]) -> Array:
         """(k, k): second derivative of the energy through the rotation's own curvature, for the energy's
         derivatives ``forces (c, 3)`` with respect to the points (c, 3)."""
         moments = self._from_pivot(points).T @ forces
-        out = np.zeros((len(wanted), len(wanted)))
-        for a, i in enumerate(wanted):
-            for b, j in enumerate(wanted):
+        out = np.zeros((len(coordinates), len(coordinates)))
+        for a, i in enumerate(coordinates):
+            for b, j in enumerate(coordinates):
                 if i > 2 and j > 2:
                     out[a, b] = np.sum(moments * (self.bends[i - 3, j - 3] @ self.rotation.T))
         return out
@@ -164,7 +164,7 @@ class Tool:
         """(f q, 3, k): relative displacement in space of the points per mm of the free coordinates."""
         return self.pose.levers(self.places.reshape(-1, 3), self.free) * self.units
 
-    def moved(self, du: Array) -> Array:
+    def relative_motion(self, du: Array) -> Array:
         """What changes ``du (r, 3, p)`` do to the points in the body's frame (f, q, 3, p)."""
         surface = self.surface
         found = np.einsum("qk,fkjp->fqjp", surface.N, du[surface.faces], optimize=True)
@@ -173,12 +173,12 @@ class Tool:
             found += (self.levers @ change).reshape(found.shape)
         return np.einsum("ij,fqjp->fqip", self.body.frame, found, optimize=True)
 
-    def distributed(self, forces: Array) -> Array:
+    def distribute_body_forces(self, forces: Array) -> Array:
         """Forces (f, q, 3, p) at the points, in the body's frame, as those of ``u (r, 3, p)``."""
         in_space = np.einsum("ij,fqip->fqjp", self.body.frame, forces).reshape(-1, 3, forces.shape[-1])
-        return self.gathered(in_space)
+        return self.distribute_forces(in_space)
 
-    def gathered(self, forces: Array) -> Array:
+    def distribute_forces(self, forces: Array) -> Array:
         """Forces (f q, 3, p) at the points, in space, as those of ``u (r, 3, p)``."""
         n, p = len(self.surface.points), forces.shape[-1]
         out = np.zeros((len(self.u), 3, p))
@@ -208,10 +208,10 @@ class Distances:
     def of(cls, tool: Tool, also: NDArray[np.bool_] | None = None) -> Distances:
         """From the body where it is; ``also (f, q)`` points far away."""
         local = tool.local.reshape(-1, 3)
-        wanted = tool.body.near(local)
+        near = tool.body.near(local)
         if also is not None:
-            wanted |= also.ravel()
-        points = np.flatnonzero(wanted)
+            near |= also.ravel()
+        points = np.flatnonzero(near)
         return cls(points, local[points], *tool.body.local_distance(local[points]))
 
     @cached_property

@@ -41,9 +41,9 @@ class Laws:
     def tables(self) -> Tables:
         """``numbers (r, k), kappa (r,), law (r,), elastic (r, 2), fibre (r, 3)``, as kernels take them: of
         the elastic stress alone, with no active stress in the last column of ``fibre``."""
-        return self.acting(0.0, np.ones(len(self.kappa)))
+        return self.activate(0.0, np.ones(len(self.kappa)))
 
-    def acting(self, share: float, scale: Array) -> Tables:
+    def activate(self, share: float, scale: Array) -> Tables:
         """`tables` with a ``share`` of the active stress, which kernels multiply by ``scale (r,)``, as all
         that is elastic."""
         active = share * self.fibre[:, 2]
@@ -52,7 +52,7 @@ class Laws:
         return self.numbers, self.kappa, self.law, self.elastic, fibre
 
     @property
-    def fibred(self) -> bool:
+    def has_fibres(self) -> bool:
         """Whether a region has fibres."""
         return bool((self.fibre[:, ::2] > 0.0).any())
 

@@ -24,7 +24,7 @@ import numpy as np
 from .material import LawTable, Material, Uncoupled, check_not_negative, check_positive
 
 
-class _Extension:
+class _Extension(Material):
     """A `Material` that is another one, its first field, with parameters of its own, the other fields.
 
     These count for nothing in small, sudden strains.
@@ -45,7 +45,6 @@ class _Extension:
 
     @property
     def parameters(self) -> tuple[float, ...]:
-        """Their values."""
         return *self._base.parameters, *(getattr(self, name) for name in self._own_names)
 
     @property
@@ -55,11 +54,9 @@ class _Extension:
 
     @property
     def instantaneous_modulus_gradient(self) -> tuple[float, ...]:
-        """Its derivative with respect to each parameter."""
         return *self._base.instantaneous_modulus_gradient, *(0.0 for _ in self._own_names)
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
-        """The material with other values of some of its parameters, by name."""
         own: dict[str, Any] = {name: values[name] for name in self._own_names if name in values}
         own[fields(cast("Any", self))[0].name] = self._base.with_parameters(
             {name: value for name, value in values.items() if name not in own}
@@ -87,11 +84,9 @@ class Fibred(_Extension):
         check_positive("k2", self.k2)
 
     def table(self) -> LawTable:
-        """The material as the kernels read it."""
         return replace(self.ground.table(), fibre=(self.k1, self.k2))
 
     def derivatives(self) -> tuple[LawTable, ...]:
-        """Derivative of the table with respect to each parameter."""
         ground = self.ground.table()
         zero = LawTable(np.zeros_like(ground.numbers), 0.0, np.zeros_like(ground.prony))
         units = ((1.0, 0.0), (0.0, 1.0))
@@ -115,11 +110,9 @@ class Contractile(_Extension):
         check_not_negative("active", self.active)
 
     def table(self) -> LawTable:
-        """The material as the kernels read it."""
         return replace(self.passive.table(), active=self.active)
 
     def derivatives(self) -> tuple[LawTable, ...]:
-        """Derivative of the table with respect to each parameter."""
         passive = self.passive.derivatives()
         by_k2 = passive[-1]  # which holds nothing but fibres
         return *passive, replace(by_k2, fibre=(0.0, 0.0), active=1.0)

@@ -44,7 +44,6 @@ class OgdenSum(Uncoupled):
         return self.ogden_terms().ravel()
 
     def number_derivatives(self) -> Array:
-        """Derivative (p, 2 k) of `numbers`."""
         slopes = self.ogden_term_derivatives()
         return slopes.reshape(len(slopes), -1)
 
@@ -55,11 +54,9 @@ class OgdenSum(Uncoupled):
 
     @property
     def shear_modulus_gradient(self) -> Array:
-        """Its derivative (p,)."""
         return np.asarray(self.ogden_term_derivatives()[:, :, 0].sum(axis=1) / 2.0)
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
-        """The material with other values of some of its parameters, by name."""
         named = dict(zip(self.parameter_names, self.parameters, strict=True)) | dict(values)
         every = tuple(map(float, named.values()))
         elastic = len(self.elastic_parameters)
@@ -194,7 +191,6 @@ class OgdenPower(SymmetricOgden):
         return np.stack([amplitudes, np.zeros_like(amplitudes)], axis=-1)
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
-        """The material with other values of some of its parameters, by name."""
         return Uncoupled.with_parameters(self, values)
 
 

@@ -12,7 +12,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol, Self, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
@@ -67,39 +67,46 @@ class LawTable:
         return self.numbers.reshape(-1, 2)
 
 
-class Material(Protocol):
+class Material(ABC):
     """A material of a `Problem`.
 
     Sensitivities are with respect to ``parameters``, in their order; units mm, N, s, MPa.
     """
 
     @property
+    @abstractmethod
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters, unique within the material."""
 
     @property
+    @abstractmethod
     def parameters(self) -> tuple[float, ...]:
         """Their values."""
 
     @property
+    @abstractmethod
     def instantaneous_modulus(self) -> float:
         """Shear modulus of small, sudden strains, MPa."""
 
     @property
+    @abstractmethod
     def instantaneous_modulus_gradient(self) -> tuple[float, ...]:
         """Derivative of `instantaneous_modulus` with respect to each parameter."""
 
+    @abstractmethod
     def table(self) -> LawTable:
         """The material as the kernels read it."""
 
+    @abstractmethod
     def derivatives(self) -> tuple[LawTable, ...]:
         """Derivative of the table with respect to each parameter."""
 
+    @abstractmethod
     def with_parameters(self, values: Mapping[str, float]) -> Self:
         """The material with other values of some of its parameters, by name."""
 
 
-class Uncoupled(ABC):
+class Uncoupled(Material):
     """The tables of a law that says which numbers its `ElasticLaw` has, and its shear modulus.
 
     ``kappa_ratio`` is the bulk modulus over the long-term shear modulus of small strains: a law given by its
@@ -123,11 +130,6 @@ class Uncoupled(ABC):
     @abstractmethod
     def prony(self) -> PronyTerms:
         """Amplitude g_l and relaxation time tau_l (s) of each relaxation term."""
-
-    @property
-    @abstractmethod
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the `parameters`."""
 
     @property
     @abstractmethod
@@ -174,7 +176,6 @@ class Uncoupled(ABC):
 
     @property
     def instantaneous_modulus_gradient(self) -> tuple[float, ...]:
-        """Derivative of `instantaneous_modulus` with respect to each parameter."""
         elastic = [float(d) * self._relaxation for d in self.shear_modulus_gradient]
         amplitudes = self.prony_derivatives()[..., 0].sum(axis=1)
         return *elastic, *(self.shear_modulus * float(d) for d in amplitudes)
@@ -184,13 +185,11 @@ class Uncoupled(ABC):
         return 1.0 + sum(g for g, _ in self.prony)
 
     def table(self) -> LawTable:
-        """The material as the kernels read it."""
         prony = np.array(self.prony, dtype=float).reshape(-1, 2)
         law, kappa = VOLUMETRIC_LAWS[self.volumetric], self.kappa_ratio * self.shear_modulus
         return LawTable(self.numbers(), kappa, prony, law, self.elastic)
 
     def derivatives(self) -> tuple[LawTable, ...]:
-        """Derivative of the table with respect to each parameter."""
         still, slopes = np.zeros((len(self.prony), 2)), self.shear_modulus_gradient
         elastic = [
             LawTable(numbers, float(self.kappa_ratio * slope), still, fibre=(0.0, 0.0))
@@ -200,7 +199,6 @@ class Uncoupled(ABC):
         return *elastic, *(LawTable(rest, 0.0, prony, fibre=(0.0, 0.0)) for prony in relaxation)
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
-        """The material with other values of some of its parameters, by name; here fields of a dataclass."""
         return cast("Self", replace(cast("Any", self), **values))
 
     def _check_shared(self) -> None:

@@ -98,7 +98,7 @@ def schedule_steps(history: History, control: StepControl, turns: Sequence[float
 
 # Powers of the step's number that the time in a phase goes with: from rest, and after the indenter turned.
 FROM_REST, AFTER_TURN = 1.2, 3.0
-AT_REST = 0.05  # of the deepest: an indenter that comes from there hardly touches
+REST_SHARE = 0.05  # of the deepest: an indenter that comes from there hardly touches
 # The step put in before contact ends is at one of so many even places in the step that was planned, the last
 # that is short of this share of the way to where the force is foreseen to vanish: places that do not move
 # with the parameters.  What is foreseen a little beyond the next step may come before it.
@@ -122,7 +122,7 @@ def grade_steps(history: History, load_steps: int, unload_steps: int) -> Array:
         for phase in row:
             count = round(budget[kind] * phase.duration_s / whole)
             count = max(count, (budget[kind] + 1) // 2)
-            fresh = not times or (kind == "load" and phase.start_mm <= AT_REST * travel)
+            fresh = not times or (kind == "load" and phase.start_mm <= REST_SHARE * travel)
             power = FROM_REST if fresh else AFTER_TURN
             part = (np.arange(1, count + 1) / count) ** power
             times.append(phase.start_s + phase.duration_s * part)
@@ -220,7 +220,7 @@ class StepController:
         self.stride, self.until = CUT * (t - now), max(t, self.until)
         self.cuts += 1
 
-    def done(self, now: float, t: float, iterations: int) -> None:
+    def accept(self, now: float, t: float, iterations: int) -> None:
         """The step to ``t`` was made: beyond what had failed, steps grow again."""
         if iterations > self.usual:  # another equilibrium: what was hard before is behind
             self.stride, self.cuts = np.inf, 0

@@ -11,14 +11,12 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import scipy.sparse.linalg as spla
 
 from ...arrays import Array
-from ..contact.friction import StickyContact
 from ..kernel.laws import Laws
 from ..system import Evaluation, Increment, System
 from .direction import build_preconditioner, find_touching_bodies
@@ -31,10 +29,10 @@ from .sensitivity import solve_with_adjoint
 # derivatives, which no adjoint corrects.
 VECTORS, RESTARTS, FORCING, TOLERANCE = 40, 4, 1e-2, 2e-5
 # Newton's iterations, and cuts of its step where an element is inverted.
-MOST_ITERATIONS, MOST_CUTS = 25, 6
+MAX_ITERATIONS, MAX_CUTS = 25, 6
 # The share by which the residual falls where it gets closer, steps in a row that may bring it no closer, and
 # residual over reactions from which it does not come back.
-LOWERED, VAIN_STEPS, ASTRAY = 0.1, 5, 1.0
+MIN_REDUCTION, MAX_VAIN_STEPS, DIVERGED = 0.1, 5, 1.0
 
 
 class Coupling:
@@ -67,21 +65,21 @@ class Coupling:
         out = np.zeros_like(x) if self._rims is None else self._rims @ x
         if self._blocks is None or self._bodies is None:
             return np.asarray(out)
-        return np.asarray(out + self._bodies.at_springs(self._blocks @ self._bodies.springs_of(x)))
+        return np.asarray(out + self._bodies.spread_forces(self._blocks @ self._bodies.move_springs(x)))
 
-    def along(self, x: Array) -> Array:
+    def project_on_axis(self, x: Array) -> Array:
         """What ``C x`` changes the force of the first body along its axis by (p,), N."""
         if self._blocks is None or self._bodies is None:
             return np.zeros(x.shape[1])
-        return self._bodies.along(self._blocks @ self._bodies.springs_of(x))
+        return self._bodies.project_on_axis(self._blocks @ self._bodies.move_springs(x))
 
 
 def renew_increment(system: System, increment: Increment, u: Array) -> Increment:
     """The step with grips and rims as they are at ``u (r, 3)``; itself where nothing changes."""
-    grips = tuple(g and g.renewed(tool) for g, tool in zip(increment.grips, system.tools(u, increment)))
+    grips = tuple(g and g.renew(tool) for g, tool in zip(increment.grips, system.tools(u, increment)))
     if not increment.pressures and all(new is old for new, old in zip(grips, increment.grips)):
         return increment
-    rims = system.pressures.rims(u, increment.pressures) if increment.pressures else 0.0
+    rims = system.pressures.compute_rims(u, increment.pressures) if increment.pressures else 0.0
     return replace(increment, grips=grips, rims=rims)
 
 
@@ -94,7 +92,7 @@ def solve_coupled(
         x, advanced = solve_with_adjoint(at, factor, b, guess, advance)
         return x, -advanced
     x = _solve_gmres(at, factor, coupling, b, guess, TOLERANCE)
-    return x, coupling.along(x) - advance @ x
+    return x, coupling.project_on_axis(x) - advance @ x
 
 
 def _solve_gmres(
@@ -105,7 +103,7 @@ def _solve_gmres(
 
     def product(x: Array) -> Array:
         x = x.reshape(-1, 1)
-        return (factor.product(at.tangent, x) + coupling(x)).ravel()
+        return (factor.multiply(at.tangent, x) + coupling(x)).ravel()
 
     A = spla.LinearOperator(shape, matvec=product, dtype=float)
     M = spla.LinearOperator(shape, matvec=lambda r: apply(r.reshape(-1, 1)).ravel(), dtype=float)
@@ -129,25 +127,28 @@ def couple(
     semi-smooth Newton methods, Hueber, Stadler and Wohlmuth 2008), and given up where they lead nowhere.
     """
 
-    def look(x: Array, by: Increment | None = None) -> tuple[Increment, Evaluation]:
+    def evaluate_at(x: Array, by: Increment | None = None) -> tuple[Increment, Evaluation]:
         started = time.perf_counter()
         there = renew_increment(system, increment, x)
         if by is not None:
-            there = replace(there, grips=_lead_grips(there.grips, by.grips))
+            pairs = zip(there.grips, by.grips)
+            there = replace(there, grips=tuple(g and led and replace(g, pulls=led.pulls) for g, led in pairs))
         at = system.evaluate(x, laws, there)
         seconds["assembly"] += time.perf_counter() - started
         return there, at
 
     lowest, vain = np.inf, 0
-    now, here = look(u)
-    for iteration in range(MOST_ITERATIONS):
+    now, here = evaluate_at(u)
+    for iteration in range(MAX_ITERATIONS):
         norm, scale = compute_residual_norm(system, here), compute_reaction_scale(system, here, floor)
         if norm <= control.tolerance * scale:
-            now, here = look(u) if control.tangent else (now, here)  # derivatives take the slip as it is
+            now, here = (
+                evaluate_at(u) if control.tangent else (now, here)
+            )  # derivatives take the slip as it is
             return (Equilibrium(u, here, iteration, residual=norm / max(scale, 1e-300)), now), iteration
-        vain = 0 if norm <= (1.0 - LOWERED) * lowest else vain + 1
+        vain = 0 if norm <= (1.0 - MIN_REDUCTION) * lowest else vain + 1
         lowest = min(norm, lowest)
-        if vain > VAIN_STEPS or norm > ASTRAY * scale:
+        if vain > MAX_VAIN_STEPS or norm > DIVERGED * scale:
             return None, iteration
         b = -here.residual.ravel()[system.free][:, None]
         try:
@@ -157,20 +158,13 @@ def couple(
         direction = np.zeros(here.residual.size)
         direction[system.free] = d[:, 0]
         way, step = direction.reshape(u.shape), 1.0
-        foreseen = now.foreseen(system.tools(u, now), way)
-        for _ in range(MOST_CUTS):
-            there, at = look(u + step * way, foreseen)
+        foreseen = now.predict(system.tools(u, now), way)
+        for _ in range(MAX_CUTS):
+            there, at = evaluate_at(u + step * way, foreseen)
             if np.isfinite(at.energy):
                 break
             step *= 0.5
         else:
             return None, iteration + 1
         u, now, here = u + step * way, there, at
-    return None, MOST_ITERATIONS
-
-
-def _lead_grips(
-    grips: Sequence[StickyContact | None], by: Sequence[StickyContact | None]
-) -> tuple[StickyContact | None, ...]:
-    """The grips with the pulls of others."""
-    return tuple(g and other and replace(g, pulls=other.pulls) for g, other in zip(grips, by))
+    return None, MAX_ITERATIONS

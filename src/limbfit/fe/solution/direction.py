@@ -36,17 +36,18 @@ def find_newton_direction(
     if not factor.ready and factor.lasting:
         _begin(system, at, factor)
     if damping:
-        at = replace(at, data=factor.stiffened(at.tangent, damping))
+        at = replace(at, data=factor.stiffen(at.tangent, damping))
     if at.touch is None:
         if not factor.lasting:
             factor.factorise(at.tangent)
         found = factor.solve(at.tangent, b, None, tolerance)
         if not found.converged and found.convex:
-            found = factor.solve_anew(at.tangent, b, None, tolerance, found.x)
+            found = factor.refactor_and_solve(at.tangent, b, None, tolerance, found.x)
     else:
         found = _solve_with_contact(system, at, at.touch, factor, b, tolerance)
         if float(b[:, 0] @ found.x[:, 0]) <= 0.0:
-            found = _solve_plain(at, at.touch, factor, b, tolerance)
+            springs = _match_springs(factor, at, at.touch, at.touch.closed, at.tangent)
+            found = factor.solve(at.tangent, b, springs, tolerance)  # the closed points stay closed
     direction = np.zeros(at.residual.size)
     direction[system.free] = found.x[:, 0]
     return direction.reshape(at.residual.shape)
@@ -64,9 +65,9 @@ def _change(factor: Factor, at: Evaluation, touch: Touch, closed: Bools) -> Spri
     Where those of the present set already differ too much, there is a new factor.
     """
     still = np.zeros_like(touch.closed)
-    if factor.springs(still, touch.normals, touch.blocks) is None:
+    if factor.change_springs(still, touch.normals, touch.blocks) is None:
         factor.factorise(at.tangent, touch.blocks)
-    return factor.springs(closed != touch.closed, touch.normals, touch.under(closed)[0])
+    return factor.change_springs(closed != touch.closed, touch.normals, touch.under(closed)[0])
 
 
 def _match_springs(
@@ -77,11 +78,6 @@ def _match_springs(
         return _change(factor, at, touch, closed)
     factor.factorise(data, touch.under(closed)[0])
     return None
-
-
-def _solve_plain(at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: float) -> LinearSolution:
-    """Without foresight: the closed points stay closed."""
-    return factor.solve(at.tangent, b, _match_springs(factor, at, touch, touch.closed, at.tangent), tolerance)
 
 
 def _solve_with_contact(
@@ -96,13 +92,13 @@ def _solve_with_contact(
         blocks, change = touch.under(closed)
         data = bodies.with_springs(at.tangent, blocks - touch.blocks)
         springs = _match_springs(factor, at, touch, closed, data)
-        right = b - bodies.at_springs(change)[:, None]
+        right = b - bodies.spread_forces(change)[:, None]
         found = factor.solve(data, right, springs, tolerance, guess)
         if not found.converged and found.convex:
-            found = factor.solve_anew(data, right, blocks, tolerance, found.x)
+            found = factor.refactor_and_solve(data, right, blocks, tolerance, found.x)
         if not found.convex and factor.lasting:
             found = _solve_for_descent(factor, data, right, blocks, tolerance)
-        foreseen = _find_closed(touch, bodies.springs_of(found.x[:, 0]))
+        foreseen = _find_closed(touch, bodies.move_springs(found.x[:, 0]))
         if (foreseen == closed).all() or (factor.lasting and springs is None) or not found.convex:
             break
         closed = foreseen
@@ -133,13 +129,13 @@ def _predict_closed(
     if springs is None:
         return x, touch.closed
     bodies = find_touching_bodies(system)
-    before = bodies.springs_of(x[:, 0])
-    y = factor.forward(b - factor.product(at.tangent, x) if x.any() else b)
-    moved = factor.columns.moved(y, closed | touch.closed)
+    before = bodies.move_springs(x[:, 0])
+    y = factor.forward(b - factor.multiply(at.tangent, x) if x.any() else b)
+    moved = factor.columns.displace_points(y, closed | touch.closed)
     part = None
     for _ in range(SWEEPS):
         blocks, change = touch.under(closed)
-        springs = factor.springs(closed != touch.closed, touch.normals, blocks)
+        springs = factor.change_springs(closed != touch.closed, touch.normals, blocks)
         if springs is None:
             break
         forces = -change - np.einsum("cij,cj->ci", blocks - touch.blocks, before)
@@ -149,7 +145,7 @@ def _predict_closed(
             break
     if part is None:
         return x, touch.closed
-    return x + factor.backward(factor.columns.pushed(y, part[:, None])), kept
+    return x + factor.backward(factor.columns.add_to(y, part[:, None])), kept
 
 
 def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: float) -> Array:
@@ -158,7 +154,7 @@ def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: floa
     found = factor.solve(at.tangent, b, springs, tolerance, x)
     if not found.converged:
         blocks = None if at.touch is None else at.touch.blocks
-        found = factor.solve_anew(at.tangent, b, blocks, tolerance, found.x)
+        found = factor.refactor_and_solve(at.tangent, b, blocks, tolerance, found.x)
     if not found.convex:
         return factor.solve_indefinite(at.tangent, b, tolerance, x)
     return found.x

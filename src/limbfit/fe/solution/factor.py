@@ -24,7 +24,7 @@ import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
 from ...arrays import Array
-from ..bodies import GROUNDING
+from ..bodies import GROUNDING_STIFFNESS
 from ..system import System
 from .linear import (
     NONE,
@@ -39,11 +39,11 @@ from .multigrid import Multigrid
 from .springs import SpringChange, SpringColumns
 
 # A factor in single precision that needs more iterations at its own matrix has too few digits.
-MOST_REFINEMENTS = 12
-MOST_MINRES, MOST_RESTARTS = 100, 8
+MAX_REFINEMENTS = 12
+MAX_MINRES, MAX_RESTARTS = 100, 8
 # With fewer unknowns a factor costs no more than multigrid, with more of them in many steps, which a factor
 # outlasts as they are short; with more cycles than the last number multigrid is given up.
-FEWEST_MULTIGRID, FEWEST_IN_MANY_STEPS, MANY_STEPS, MOST_CYCLES = 33_000, 60_000, 25, 150
+MIN_MULTIGRID, MIN_IN_MANY_STEPS, MANY_STEPS, MAX_CYCLES = 33_000, 60_000, 25, 150
 # Smallest and largest shear stiffness added to a tangent that is not positive definite, as a share of each
 # tissue's own: tissues differ by up to a hundredfold, and a common one would freeze the softest.
 FIRST_SHIFT, LARGEST_SHIFT = 0.1, 1e6
@@ -74,7 +74,7 @@ class Factor:
         self._last = last
         moving = system.bodies is not None and system.bodies.free > 0
         suits = not moving and system.cells.shape[1] == 10
-        fewest = FEWEST_IN_MANY_STEPS if steps > MANY_STEPS else FEWEST_MULTIGRID
+        fewest = MIN_IN_MANY_STEPS if steps > MANY_STEPS else MIN_MULTIGRID
         many = system.unknowns >= fewest and not lasting
         if name == "auto" and suits and (many or prefers_multigrid()):
             self._choice = Multigrid.name
@@ -84,32 +84,27 @@ class Factor:
         self.counts: Counter[str] = Counter()
         self.seconds: defaultdict[str, float] = defaultdict(float)
         self._wanted = self._choice
-        self.begin_anew()
+        self.reset()
 
-    def begin_anew(self) -> None:
+    def reset(self) -> None:
         """Forget every matrix: what follows does not depend on those that there were."""
         self._choice, self._shift, self._next_shift, self._costs = self._wanted, 0.0, 0.0, [0.0]
         self.ready = False
-        self._use(single=True)
+        self._replace_solver(single=True)
 
-    def _use(self, single: bool) -> None:
+    def _replace_solver(self, single: bool) -> None:
         started = time.perf_counter()
-        self._solver = self._made(single)
+        system, threads = self._system, self._threads
+        if self._choice == Multigrid.name:
+            self._solver: LinearSolver = Multigrid(system, threads)
+        else:
+            self._solver = build_linear_solver(
+                system.indptr, system.indices, self._choice, threads, single, self._last
+            )
         self._single = single
         self.columns = SpringColumns(self._system, self)
         self.counts["double_precision"] = int(not single)
         self.seconds["factor"] += time.perf_counter() - started
-
-    def _made(self, single: bool) -> LinearSolver:
-        system, threads = self._system, self._threads
-        if self._choice == Multigrid.name:
-            return Multigrid(system, threads)
-        return build_linear_solver(system.indptr, system.indices, self._choice, threads, single, self._last)
-
-    def _give_up_multigrid(self) -> None:
-        """From here on with a factor."""
-        self._choice = "auto"
-        self._use(single=True)
 
     @property
     def name(self) -> str:
@@ -136,9 +131,9 @@ class Factor:
     @property
     def limit(self) -> int:
         """Products after which a new factorisation would have been cheaper."""
-        return int(self._solver.worth) if self.lasting else MOST_CYCLES
+        return int(self._solver.worth) if self.lasting else MAX_CYCLES
 
-    def worn(self) -> bool:
+    def is_worn(self) -> bool:
         """Whether another step with this factor costs more than the steps since it was made did on average.
 
         The optimal time to replace a machine whose running cost rises (Barlow and Proschan 1965).
@@ -146,7 +141,7 @@ class Factor:
         steps = self._costs
         return self.lasting and len(steps) > 1 and steps[-1] * len(steps) > self._solver.worth + sum(steps)
 
-    def next_step(self) -> None:
+    def start_step(self) -> None:
         """From here the cost counts for another step."""
         if self._costs != [0.0]:  # a factor made between steps has served none yet
             self._costs.append(0.0)
@@ -158,10 +153,10 @@ class Factor:
 
         ``blocks (c, 3, 3)``: the contact springs that are in ``data``.
         """
-        made = not self.ready and self.lasting and self._single_suffices(data)
+        made = not self.ready and self.lasting and self._is_single_enough(data)
         started = time.perf_counter()
         shift = self._next_shift
-        while not made and not self._factorised(data, shift):
+        while not made and not self._try_factorise(data, shift):
             shift = max(10.0 * shift, FIRST_SHIFT)
             if shift > LARGEST_SHIFT:
                 raise NotPositiveDefiniteError
@@ -174,15 +169,15 @@ class Factor:
         self._costs = [0.0]
         self.seconds["factor"] += time.perf_counter() - started
 
-    def stiffened(self, data: Array, share: float) -> Array:
+    def stiffen(self, data: Array, share: float) -> Array:
         """The entries ``data`` of a tangent with a share of each tissue's own shear stiffness added."""
         if self._shear is None:
             self._shear = compute_shear_stiffness(self._system, self._moduli)
         return data + share * self._shear
 
-    def _factorised(self, data: Array, shift: float) -> bool:
+    def _try_factorise(self, data: Array, shift: float) -> bool:
         self.counts["factorisations" if self.lasting else "multigrids"] += 1
-        data = self.stiffened(data, shift) if shift else data
+        data = self.stiffen(data, shift) if shift else data
         if len(self._ground[0]):  # a body that touches nothing yet is held by nothing
             data = data.copy()
             data[self._ground[0]] += self._ground[1]
@@ -192,15 +187,15 @@ class Factor:
             return False
         return True
 
-    def _single_suffices(self, data: Array) -> bool:
+    def _is_single_enough(self, data: Array) -> bool:
         """Factorise the first tangent (of the body at rest) in single precision, if that is enough."""
-        if self._single and self._factorised(data, 0.0):
+        if self._single and self._try_factorise(data, 0.0):
             self.columns.clear(None)
             self._costs = [0.0]
             b = data[self._diagonal][:, None]
-            if self.solve(data, b, None, 1e-8, limit=MOST_REFINEMENTS).converged:
+            if self.solve(data, b, None, 1e-8, limit=MAX_REFINEMENTS).converged:
                 return True
-        self._use(single=False)
+        self._replace_solver(single=False)
         return False
 
     def apply(self, b: Array) -> Array:
@@ -225,7 +220,7 @@ class Factor:
         self.seconds["solve"] += time.perf_counter() - started
         return x
 
-    def product(self, data: Array, x: Array) -> Array:
+    def multiply(self, data: Array, x: Array) -> Array:
         """``A x`` for the entries ``data`` of A."""
         started = time.perf_counter()
         self.counts["products"] += 1
@@ -233,7 +228,9 @@ class Factor:
         self.seconds["product"] += time.perf_counter() - started
         return y
 
-    def springs(self, touched: NDArray[np.bool_], normals: Array, blocks: Array) -> SpringChange | None:
+    def change_springs(
+        self, touched: NDArray[np.bool_], normals: Array, blocks: Array
+    ) -> SpringChange | None:
         """What springs that differ from the factor's do to its solutions; None: they are too many.
 
         ``touched (c,)``: springs that will be pushed although they may not differ.
@@ -255,7 +252,7 @@ class Factor:
         """
         target = tolerance * np.linalg.norm(b, axis=0)
         x = np.zeros_like(b) if x is None else x.copy()
-        r = b - self.product(data, x) if x.any() else b.copy()
+        r = b - self.multiply(data, x) if x.any() else b.copy()
         p, rz = np.zeros_like(b), np.ones(b.shape[1])
         for _ in range(self.limit if limit is None else limit):
             if (np.linalg.norm(r, axis=0) <= target).all():
@@ -268,7 +265,7 @@ class Factor:
                 # Multigrid of a matrix that is not positive definite need not be either; a factor that is
                 # not has too few digits.
                 return LinearSolution(x if x.any() else r, False, self.lasting)
-            Ap = self.product(data, p)
+            Ap = self.multiply(data, p)
             curvature = np.einsum("ij,ij->j", p, Ap)
             live = rz > 0.0
             if (curvature[live] <= 0.0).any():  # Steihaug 1983: stop at the edge of the convex region
@@ -278,7 +275,7 @@ class Factor:
             r -= step * Ap
         return LinearSolution(x, bool((np.linalg.norm(r, axis=0) <= target).all()), True)
 
-    def solve_anew(
+    def refactor_and_solve(
         self, data: Array, b: Array, blocks: Array | None, tolerance: float, x: Array
     ) -> LinearSolution:
         """`solve` with a factor of this very matrix, whose springs are ``blocks (c, 3, 3)``.
@@ -287,11 +284,12 @@ class Factor:
         Multigrid that has not converged is given up for a factor.
         """
         if not self.lasting:
-            self._give_up_multigrid()
+            self._choice = "auto"
+            self._replace_solver(single=True)
         self.factorise(data, blocks)
         found = self.solve(data, b, None, tolerance, x)
         if self._single and not self.shifted and found.convex and not found.converged:
-            self._use(single=False)
+            self._replace_solver(single=False)
             self.factorise(data, blocks)
             found = self.solve(data, b, None, tolerance, x, limit=10 * self.limit)
         return found
@@ -302,16 +300,16 @@ class Factor:
         Columns that do not get within ``tolerance`` are counted as ``inexact``.
         """
         shape = (len(b), len(b))
-        A = spla.LinearOperator(shape, matvec=lambda v: self.product(data, v.reshape(-1, 1)).ravel())
+        A = spla.LinearOperator(shape, matvec=lambda v: self.multiply(data, v.reshape(-1, 1)).ravel())
         M = spla.LinearOperator(shape, matvec=lambda v: self.apply(v.ravel()))
         out = x.copy()
         for i in range(b.shape[1]):
             target = tolerance * np.linalg.norm(b[:, i])
-            for _ in range(MOST_RESTARTS):  # MINRES judges the residual in the factor's norm
+            for _ in range(MAX_RESTARTS):  # MINRES judges the residual in the factor's norm
                 r = b[:, i] - A.matvec(out[:, i])
                 if np.linalg.norm(r) <= target:
                     break
-                out[:, i] += spla.minres(A, r, rtol=tolerance, maxiter=MOST_MINRES, M=M)[0]
+                out[:, i] += spla.minres(A, r, rtol=tolerance, maxiter=MAX_MINRES, M=M)[0]
             else:
                 self.counts["inexact"] += 1
         return out
@@ -345,7 +343,7 @@ def compute_shear_stiffness(system: System, moduli: Array) -> Array:
         held = places < 0
         data += np.bincount(places[~held], nodal[:, a, b][~held], minlength=len(data))
     places, stiffness = compute_body_stiffness(system, moduli)
-    data[places] += stiffness / GROUNDING
+    data[places] += stiffness / GROUNDING_STIFFNESS
     return data
 
 
@@ -354,4 +352,6 @@ def compute_body_stiffness(system: System, moduli: Array) -> tuple[NDArray[np.in
     that touch nothing (k,), N/mm."""
     if system.bodies is None or not system.bodies.free:
         return np.zeros(0, dtype=np.int32), np.zeros(0)
-    return system.indptr[-1 - system.bodies.free : -1], system.bodies.grounding(float(np.mean(moduli)))
+    return system.indptr[-1 - system.bodies.free : -1], system.bodies.compute_grounding(
+        float(np.mean(moduli))
+    )

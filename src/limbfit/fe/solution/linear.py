@@ -13,8 +13,9 @@ import importlib
 import importlib.metadata
 import os
 import weakref
+from abc import ABC, abstractmethod
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -43,12 +44,50 @@ class NotPositiveDefiniteError(ArithmeticError):
     """The matrix has no Cholesky factor."""
 
 
-class Halves(Protocol):
-    """The two halves of solutions.
+NONE: Index = np.zeros(0, dtype=np.int32)
 
-    ``transposed``: whether `backward` is the transpose of `forward`; ``last``: unknowns that are eliminated
-    last, so that halves among them alone cost next to nothing.
+
+class LinearSolver(ABC):
+    """Analyse once, factorise often, solve oftener.
+
+    ``lasting``: whether a factorisation is worth keeping for other matrices; ``dear``: whether multigrid wins
+    at any size; ``worth``: its cost over that of one solution and one product with the matrix, estimated from
+    the factor's entries (not timed: a run must be repeatable).
+
+    A solution is made in two halves.  ``transposed``: whether `backward` is the transpose of `forward`;
+    ``last``: unknowns that are eliminated last, so that halves among them alone cost next to nothing.  A
+    solver that knows no halves does all of it in the first.
     """
+
+    name: ClassVar[str]
+    lasting: ClassVar[bool]
+    dear: ClassVar[bool]
+    worth: float
+    transposed: ClassVar[bool] = False
+    last: Index = NONE
+
+    @abstractmethod
+    def factorise(self, data: Array) -> None:
+        """Factorise the matrix with these entries; raises `NotPositiveDefiniteError`."""
+
+    @abstractmethod
+    def solve(self, b: Array) -> Array:
+        """Solution (n,) or (n, r) for right-hand sides of that shape."""
+
+    def forward(self, b: Array, last: bool = False) -> Array:
+        """The first half of a solution (n, r).
+
+        ``last``: of the unknowns ``last`` only, beyond which ``b`` is zero.
+        """
+        return self.solve(b)
+
+    def backward(self, y: Array, last: bool = False) -> Array:
+        """The second half; ``last``: of the unknowns ``last`` only."""
+        return y
+
+
+class Halves(Protocol):
+    """What makes solutions in two halves: see `LinearSolver`."""
 
     @property
     def transposed(self) -> bool: ...
@@ -56,50 +95,12 @@ class Halves(Protocol):
     @property
     def last(self) -> Index: ...
 
-    def forward(self, b: Array, last: bool = False) -> Array:
-        """The first half of a solution (n, r); ``last``: of the unknowns ``last`` only, beyond which ``b`` is
-        zero."""
+    def forward(self, b: Array, last: bool = False) -> Array: ...
 
-    def backward(self, y: Array, last: bool = False) -> Array:
-        """The second half; ``last``: of the unknowns ``last`` only."""
+    def backward(self, y: Array, last: bool = False) -> Array: ...
 
 
-class LinearSolver(Halves, Protocol):
-    """Analyse once, factorise often, solve oftener.
-
-    ``lasting``: whether a factorisation is worth keeping for other matrices; ``dear``: whether multigrid wins
-    at any size; ``worth``: its cost over that of one solution and one product with the matrix, estimated from
-    the factor's entries (not timed: a run must be repeatable).
-    """
-
-    name: str
-    lasting: bool
-    dear: bool
-    worth: float
-
-    def factorise(self, data: Array) -> None:
-        """Factorise the matrix with these entries; raises `NotPositiveDefiniteError`."""
-
-    def solve(self, b: Array) -> Array:
-        """Solution (n,) or (n, r) for right-hand sides of that shape."""
-
-
-NONE: Index = np.zeros(0, dtype=np.int32)
-
-
-class SingleHalf(LinearSolver):
-    """Halves of solutions for solvers that know none: the first is all of it."""
-
-    transposed, last = False, NONE
-
-    def forward(self, b: Array, last: bool = False) -> Array:
-        return self.solve(b)
-
-    def backward(self, y: Array, last: bool = False) -> Array:
-        return y
-
-
-class Pardiso:
+class Pardiso(LinearSolver):
     """Cholesky by Intel MKL's PARDISO, in double or single precision.
 
     A factor in single precision takes half the time and half the memory; it is meant as a preconditioner.
@@ -186,8 +187,8 @@ class Pardiso:
     def _call(self, phase: int, b: Array, x: Array, count: int) -> int:
         self._mkl.MKL_Set_Num_Threads(self._threads)
         return _call_pardiso(
-            self._mkl, self._handle, self._parameters, self._n, phase,
-            self._data, self._indptr, self._indices, self._marks, b, x, count,
+            self._mkl, self._handle, self._parameters, self._n, phase, count,
+            self._data, self._indptr, self._indices, self._marks, b, x,
         )  # fmt: skip
 
 
@@ -205,19 +206,10 @@ def _load_mkl() -> Any:
 
 
 def _call_pardiso(
-    mkl: Any,
-    handle: NDArray[np.int64],
-    parameters: Index,
-    n: ctypes.c_int32,
-    phase: int,
-    data: NDArray,
-    indptr: Index,
-    indices: Index,
-    marks: Index,
-    b: Array,
-    x: Array,
-    count: int,
+    mkl: Any, handle: NDArray, parameters: Index, n: ctypes.c_int32, phase: int, count: int, *arrays: NDArray
 ) -> int:
+    """The error code of a call; ``arrays``: data, indptr, indices, marks, right-hand sides and solutions."""
+
     def number(value: int) -> Any:
         return ctypes.byref(ctypes.c_int32(value))
 
@@ -226,36 +218,47 @@ def _call_pardiso(
 
     error = ctypes.c_int32(0)
     positive_definite = 2
+    data, indptr, indices, marks, b, x = map(address, arrays)
     mkl["pardiso"](
         address(handle), number(1), number(1), number(positive_definite), number(phase), ctypes.byref(n),
-        address(data), address(indptr), address(indices), address(marks), number(count),
-        address(parameters), number(0), address(b), address(x), ctypes.byref(error),
+        data, indptr, indices, marks, number(count), address(parameters), number(0), b, x,
+        ctypes.byref(error),
     )  # fmt: skip
     return error.value
 
 
 def _release(mkl: Any, handle: NDArray[np.int64], parameters: Index, n: ctypes.c_int32) -> None:
     empty, none = np.zeros(1), np.zeros(1, dtype=np.int32)
-    _call_pardiso(mkl, handle, parameters, n, -1, empty, none, none, none, empty, empty, 1)
+    _call_pardiso(mkl, handle, parameters, n, -1, 1, empty, none, none, none, empty, empty)
 
 
-class Cholmod(SingleHalf):
-    """Supernodal Cholesky by CHOLMOD, through scikit-sparse."""
+class _ByPattern(LinearSolver):
+    """A solver that is given the matrix's pattern, and makes no use of the rest."""
 
-    name = "cholmod"
-    lasting, dear = True, False
-    worth = 20.0
+    lasting = True
 
     def __init__(
         self, indptr: Index, indices: Index, threads: int = 1, single: bool = False, last: Index = NONE
     ) -> None:
-        self._cholmod = importlib.import_module("sksparse.cholmod")
         self._pattern = (np.asarray(indices), np.asarray(indptr))
+        self._n = len(indptr) - 1
+
+
+class Cholmod(_ByPattern):
+    """Supernodal Cholesky by CHOLMOD, through scikit-sparse."""
+
+    name = "cholmod"
+    dear = False
+    worth = 20.0
+
+    def __init__(self, indptr: Index, indices: Index, *unused: Any) -> None:
+        super().__init__(indptr, indices)
+        self._cholmod = importlib.import_module("sksparse.cholmod")
         self._factor = self._cholmod.analyze(self._lower(np.ones(len(indices))), mode="supernodal")
 
     def _lower(self, data: Array) -> sp.csc_matrix:
-        n = len(self._pattern[1]) - 1  # the upper triangle's rows are the lower triangle's columns
-        return sp.csc_matrix((data, *self._pattern), shape=(n, n))
+        # The upper triangle's rows are the lower triangle's columns.
+        return sp.csc_matrix((data, *self._pattern), shape=(self._n, self._n))
 
     def factorise(self, data: Array) -> None:
         try:
@@ -267,22 +270,16 @@ class Cholmod(SingleHalf):
         return self._factor(b)
 
 
-class SuperLU(SingleHalf):
+class SuperLU(_ByPattern):
     """LU by SciPy's SuperLU: everywhere there is SciPy; slow, and blind to negative eigenvalues."""
 
     name = "superlu"
-    lasting, dear = True, True
+    dear = True
     worth = 40.0
-
-    def __init__(
-        self, indptr: Index, indices: Index, threads: int = 1, single: bool = False, last: Index = NONE
-    ) -> None:
-        self._pattern = (np.asarray(indices), np.asarray(indptr))
-        self._factor: Any = None
+    _factor: Any
 
     def factorise(self, data: Array) -> None:
-        n = len(self._pattern[1]) - 1
-        upper = sp.csr_matrix((data, *self._pattern), shape=(n, n))
+        upper = sp.csr_matrix((data, *self._pattern), shape=(self._n, self._n))
         full = (upper + sp.triu(upper, 1).T).tocsc()
         options = {"SymmetricMode": True, "DiagPivotThresh": 0.001}
         try:

@@ -19,13 +19,13 @@ from ...arrays import Array
 from ...mesh import TET10_EDGES
 from ..pattern import build_node_graph, build_upper_pattern, place_of
 from ..system import System
-from .linear import Index, NotPositiveDefiniteError, SingleHalf, build_linear_solver
+from .linear import Index, LinearSolver, NotPositiveDefiniteError, build_linear_solver
 
 # A block is added to the upper triangle turned where its parents are in reverse, both ways on the diagonal.
 _TURNED, _BOTH = 1, 2
 
 
-class Multigrid(SingleHalf):
+class Multigrid(LinearSolver):
     """A peer of the solvers in `linear`, but its solutions are only near: they have to be iterated upon.
 
     For any of the quadratic tetrahedra in the element table.

@@ -32,17 +32,17 @@ from .linear import NotPositiveDefiniteError
 # changed by a factor, and less than the smallest is none.
 SHORT_STEP, FIRST_DAMPING, DAMPING_CHANGE, LEAST_DAMPING = 0.3, 0.1, 4.0, 0.02
 # Times the tolerance: a residual that is taken where the line search finds no lower energy; it is told.
-LOOSE = 100.0
-NEAR = 0.1  # residual over reactions from which the tangent is the exact one
-TINY = 1e-300  # N; before the first touch there are no reactions
+LOOSE_FACTOR = 100.0
+NEAR_EQUILIBRIUM = 0.1  # residual over reactions from which the tangent is the exact one
+MIN_FORCE_N = 1e-300  # N; before the first touch there are no reactions
 
 
 @dataclass(frozen=True)
 class NewtonControl:
     """Tolerance of the residual relative to the reactions, limits, and the damping to begin with.
 
-    ``enough``: share of the first residual that will do instead of the tolerance.
-    ``bearable``: penetration (mm) that near equilibrium ends the search, for the penalty is too small.
+    ``reduction``: share of the first residual that will do instead of the tolerance.
+    ``max_penetration``: penetration (mm) that near equilibrium ends the search, for the penalty is too small.
     ``tangent``: whether the tangent is wanted at the equilibrium.
     """
 
@@ -50,8 +50,8 @@ class NewtonControl:
     max_iterations: int = 30
     max_backtracks: int = 12
     damping: float = 0.0
-    enough: float = 0.0
-    bearable: float = np.inf
+    reduction: float = 0.0
+    max_penetration: float = np.inf
     tangent: bool = True
 
 
@@ -91,11 +91,11 @@ def equilibrate(
     for iteration in range(control.max_iterations):
         norm = compute_residual_norm(system, here)
         scale = compute_reaction_scale(system, here, floor)
-        share = norm / max(scale, TINY)
+        share = norm / max(scale, MIN_FORCE_N)
         first = first if iteration else share
         rounding = norm > 0.3 * last and norm <= 1e-9 * scale  # no further digits to be had
-        unbearable = norm <= NEAR * scale and here.penetration > control.bearable
-        tolerance = max(control.tolerance, control.enough * first)
+        unbearable = norm <= NEAR_EQUILIBRIUM * scale and here.penetration > control.max_penetration
+        tolerance = max(control.tolerance, control.reduction * first)
         if norm <= tolerance * scale or rounding or unbearable:
             return Equilibrium(u, here, iteration, damped=damped, residual=share, first=first)
         if not np.isfinite(norm):
@@ -109,15 +109,15 @@ def equilibrate(
         except NotPositiveDefiniteError:
             return Equilibrium(u, here, iteration, "the tangent cannot be factorised")
         last = norm
-        if norm <= NEAR * scale:
-            evaluate.exactly()
+        if norm <= NEAR_EQUILIBRIUM * scale:
+            evaluate.use_exact_tangent()
         if system.bodies is not None:
-            direction = system.bodies.trusted_share(direction) * direction
-        evaluate.foresee(u, direction)
-        going_on = control.tangent or forcing > sufficient
-        found = _search_along_line(evaluate, u, here, direction, control.max_backtracks, going_on)
+            direction = system.bodies.compute_trusted_share(direction) * direction
+        evaluate.predict_friction(u, direction)
+        wants_tangent = control.tangent or forcing > sufficient
+        found = _search_along_line(evaluate, u, here, direction, control.max_backtracks, wants_tangent)
         if found is None:
-            if norm <= LOOSE * control.tolerance * scale:
+            if norm <= LOOSE_FACTOR * control.tolerance * scale:
                 return Equilibrium(u, here, iteration, damped=damped, residual=share, first=first)
             return Equilibrium(u, here, iteration, "the line search found no lower energy")
         u, here, step = found
@@ -165,14 +165,14 @@ class _Evaluator:
     ) -> None:
         self._system, self._laws, self._increment, self._seconds = system, laws, increment, seconds
 
-    def exactly(self) -> None:
+    def use_exact_tangent(self) -> None:
         """From here on with the indenter's curvature everywhere."""
         self._increment = replace(self._increment, flat_from=np.inf)
 
-    def foresee(self, u: Array, direction: Array) -> None:
+    def predict_friction(self, u: Array, direction: Array) -> None:
         """From here on with the pulls of friction that the tangent at ``u`` foresees for a full step."""
         now = self._increment
-        self._increment = now.foreseen(self._system.tools(u, now) if any(now.grips) else [], direction)
+        self._increment = now.predict(self._system.tools(u, now) if any(now.grips) else [], direction)
 
     def __call__(self, u: Array, tangent: bool = True) -> Evaluation:
         started = time.perf_counter()
@@ -182,12 +182,17 @@ class _Evaluator:
 
 
 def _search_along_line(
-    evaluate: _Evaluator, u: Array, here: Evaluation, direction: Array, max_backtracks: int, going_on: bool
+    evaluate: _Evaluator,
+    u: Array,
+    here: Evaluation,
+    direction: Array,
+    max_backtracks: int,
+    wants_tangent: bool,
 ) -> tuple[Array, Evaluation, float] | None:
     """Backtrack until the energy falls (Armijo), or nearly so where the slope does (Hager and Zhang 2005).
 
-    The displacement, its evaluation (with the tangent after a full step, if the search is ``going_on``) and
-    the step along ``direction``.
+    The displacement, its evaluation (with the tangent after a full step, if the search is ``wants_tangent``)
+    and the step along ``direction``.
     """
     slope = float((here.residual * direction).sum())
     if not slope < 0.0:
@@ -195,7 +200,7 @@ def _search_along_line(
     noise = 1e-11 * abs(here.energy)
     step = 1.0
     for _ in range(max_backtracks):
-        there = evaluate(u + step * direction, tangent=going_on and step == 1.0)
+        there = evaluate(u + step * direction, tangent=wants_tangent and step == 1.0)
         if not np.isfinite(there.energy):
             step *= 0.4
             continue

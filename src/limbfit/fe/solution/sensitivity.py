@@ -73,11 +73,11 @@ class MemoryDerivative:
         shape = (*system.weights.shape, 6, laws.count)
         return cls(np.zeros(shape), np.zeros((laws.prony.shape[1], *shape)))
 
-    def turned(self) -> MemoryDerivative:
-        """That of `Memory.turned`."""
+    def drop_past(self) -> MemoryDerivative:
+        """That of `Memory.drop_past`."""
         return MemoryDerivative(self.elastic, self.prony)
 
-    def explicit(
+    def differentiate_step(
         self, system: System, laws: Laws, memory: Memory, increment: Increment, u: Array, dt: float
     ) -> Explicit:
         """What the parameters change in the step of ``dt`` s that ended at displacement ``u (n, 3)``."""
@@ -108,9 +108,9 @@ class MemoryDerivative:
             )  # fmt: skip
             return forces
 
-        return Explicit(np.asarray(sum(system.over_cells(part))), elastic, stress, slopes)
+        return Explicit(np.asarray(sum(system.map_cells(part))), elastic, stress, slopes)
 
-    def advanced(
+    def advance(
         self, system: System, laws: Laws, before: Memory, step: Explicit, du: Array, dt: float
     ) -> MemoryDerivative:
         """The derivative of the memory after the step, given ``du (n, 3, p)``; uses up ``step.elastic``."""
@@ -123,7 +123,7 @@ class MemoryDerivative:
         prony = np.empty_like(self.prony)
 
         def part(cells: slice) -> None:
-            advance(
+            _advance_derivative(
                 system.cells[cells], system.gradients[cells], system.regions[cells], factors,
                 laws.parameter_index, step.moduli[cells], step.stress[cells] - before.elastic[cells],
                 before.elastic[cells] - past[cells], before.prony[:, cells], self.elastic[cells],
@@ -131,7 +131,7 @@ class MemoryDerivative:
                 step.elastic[cells], prony[:, cells],
             )  # fmt: skip
 
-        system.over_cells(part)
+        system.map_cells(part)
         return MemoryDerivative(step.elastic, prony, self.elastic)
 
 
@@ -149,7 +149,7 @@ def solve_with_adjoint(
     right = np.column_stack([b[:, kept], advance])
     found = solve_at(at, factor, right, np.column_stack([guess[:, kept], np.zeros(len(b))]), TOLERANCE)
     x, adjoint = found[:, :-1] @ weights, found[:, -1:].copy()
-    missed = advance - factor.product(at.tangent, adjoint)[:, 0]
+    missed = advance - factor.multiply(at.tangent, adjoint)[:, 0]
     return x, adjoint[:, 0] @ b + missed @ x
 
 
@@ -220,7 +220,7 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
     elements, mean, tables, d_tables, scale, coefficients, Se, past, H, dSe, d_past, dH, u,
     forces, elastic, stress, slopes, records
 ):  # fmt: skip
-    """The kernel of `MemoryDerivative.explicit`; adds to ``forces`` and to ``elastic``.
+    """The kernel of `MemoryDerivative.differentiate_step`; adds to ``forces`` and to ``elastic``.
 
     The forces are those of ``dS/dp = ds Se + s dSe/dp|_C + dp J C^-1 + dK``; ``past`` is Se one step
     earlier, ``d_past`` its derivative.  The elastic law is asked for `LANES` elements at once.  Rows of the
@@ -297,10 +297,10 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
 
 
 @njit(**_KERNEL)
-def advance(  # type: ignore[no-untyped-def]
+def _advance_derivative(  # type: ignore[no-untyped-def]
     cells, grads, regions, factors, index, moduli, change, earlier, H, dSe, d_past, dH, du, elastic, prony
 ):
-    """The kernel of `MemoryDerivative.advanced`: adds to ``elastic`` what ``du`` does, and fills ``prony``.
+    """The kernel of `MemoryDerivative.advance`: adds to ``elastic`` what ``du`` does, and fills ``prony``.
 
     ``change, earlier (m, q, 6)`` are those of Se in the step and in the one before.
     """
@@ -348,7 +348,7 @@ def advance(  # type: ignore[no-untyped-def]
 
 
 @dataclass(frozen=True)
-class Takeover:
+class ForceTakeover:
     """When each body's forces were taken over last, ``since (b,)`` s, not a number where never, and their
     derivatives ``slopes (r - n, 3, p)`` in the rows of `System`, N over mm."""
 
@@ -356,24 +356,24 @@ class Takeover:
     slopes: Array
 
     @classmethod
-    def never(cls, bodies: Sequence[RigidBody], slopes: Array) -> Takeover:
+    def none(cls, bodies: Sequence[RigidBody], slopes: Array) -> ForceTakeover:
         """Of bodies that took nothing over; ``slopes`` are zeros."""
         return cls(np.full(len(bodies), np.nan), slopes)
 
-    def after(self, took: Sequence[bool], bodies: Bodies, state: State, modulus: float) -> Takeover:
+    def update(self, took: Sequence[bool], bodies: Bodies, state: State, modulus: float) -> ForceTakeover:
         """When some bodies ``took (b,)`` over what held them in a state with derivatives; ``modulus`` is that
         of the contact's stiffness, MPa."""
         assert state.bodies is not None
         since, slopes = self.since.copy(), self.slopes.copy()
-        found = bodies.holding_slopes(state.drives, state.penalty * modulus, state.bodies)
+        slopes_here = bodies.differentiate_holding_forces(state.drives, state.penalty * modulus, state.bodies)
         for i, rows in enumerate(bodies.own_rows):
             if took[i]:
-                since[i], slopes[rows] = state.time, found[rows]
+                since[i], slopes[rows] = state.time, slopes_here[rows]
         return replace(self, since=since, slopes=slopes)
 
-    def left(self, stated: Sequence[RigidBody], bodies: Bodies, t: float) -> Array:
+    def remaining(self, rigid_bodies: Sequence[RigidBody], bodies: Bodies, t: float) -> Array:
         """Derivatives (r - n, 3, p) of the forces that are left at time ``t`` of those taken over."""
         shares = np.zeros(len(self.slopes))
-        for body, since, rows in zip(stated, self.since, bodies.own_rows, strict=True):
-            shares[rows] = body.motion.lasting(since, t)
+        for body, since, rows in zip(rigid_bodies, self.since, bodies.own_rows, strict=True):
+            shares[rows] = body.motion.remaining_share(since, t)
         return np.asarray(self.slopes * shares[:, None, None])

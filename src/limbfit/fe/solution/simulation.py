@@ -24,7 +24,7 @@ from .direction import refactor_at
 from .factor import Factor
 from .linear import prefers_multigrid
 from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, compute_reaction_scale, equilibrate
-from .sensitivity import Explicit, MemoryDerivative, Takeover
+from .sensitivity import Explicit, ForceTakeover, MemoryDerivative
 from .springs import find_touched_unknowns
 from .start import (
     IndenterStart,
@@ -36,25 +36,25 @@ from .start import (
 from .warm_start import WarmStart, compute_extrapolation
 
 # Penetration over the allowed one that a few more iterations will not mend; how often a penalty is raised.
-TOO_DEEP, MOST_RAISES = 1.2, 5
+UNBEARABLE_DEPTH, MAX_RAISES = 1.2, 5
 # Residual over reactions at which what a step holds constant is let go along.
-NEARLY = 0.1
+LOOSE_TOLERANCE = 0.1
 # How often the grip of a step is renewed; residual over reactions that is left then and is taken as it is.
-MOST_RENEWALS, UNSETTLED = 30, 1e-2
+MAX_RENEWALS, MAX_UNSETTLED = 30, 1e-2
 # Renewals in a row that may bring it no closer: then it goes round, or away.
-VAIN_RENEWALS, CLOSER = 6, 0.9
+MAX_VAIN_RENEWALS, CLOSER_SHARE = 6, 0.9
 # Share of the residual that renewing the grip causes which is left before it is renewed again.
-ENOUGH = 0.05
+RENEWAL_REDUCTION = 0.05
 # Force over the mean shear modulus and the square of a body's width against which a residual is judged before
 # anything is touched.
-NOTHING = 1e-6
+REST_FORCE_SHARE = 1e-6
 # Depth of a step over that of the last one, as far as a first guess counts on it.
-MOST_DEEPER = 3.0
+MAX_DEPTH_RATIO = 3.0
 # Contact pressure over the mean shear modulus from which a rounded edge is flat in the tangents far from
 # equilibrium: over the radius it is a negative stiffness, there beside that of the tissue.
 STEEP_PRESSURE = 3.0
 # How long ago tissue was strained before a simulation begins, s: by now it has relaxed.
-LONG_SINCE = 1e9
+PRESTRETCH_AGE_S = 1e9
 
 
 class SteppedRun:
@@ -91,22 +91,22 @@ class SteppedRun:
         self.warm = WarmStart.of(problem, warm_start)
         widths = [body.shape.width for body in problem.rigid_bodies]
         width = min(widths, default=1.0)
-        self.floor, self.pushing = NOTHING * self.laws.modulus * width**2, False
+        self.floor, self.pushing = REST_FORCE_SHARE * self.laws.modulus * width**2, False
         self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
         self.deepest = control.penetration * measure_indenter_travel(self.system, self.laws.modulus)
         self.touch = IndenterStart.of(problem)
-        rest, drives = np.zeros((self.system.rows, 3)), self.touch.drives(problem.drives(0.0))
+        rest, drives = np.zeros((self.system.rows, 3)), self.touch.shift_drives(problem.drives(0.0))
         if self.system.bodies is not None:
             rest = self.system.bodies.impose(rest, drives)
         still = np.zeros((*rest.shape, self.laws.count)) if sensitivities else None
-        self.rest = self._coordinates(rest, drives)
+        self.rest = self._read_coordinates(rest, drives)
         self.rested: Array | None = None  # the same where pre-strained tissue is in equilibrium
         start = problem.history.displacement_at(0.0)
         self.grips = start_grips(self.system, self.grips, rest, drives)
-        self.states = [self._state(0.0, start, rest, self.stiffness, still, None, drives, self.grips)]
+        self.states = [self._build_state(0.0, start, rest, self.stiffness, still, None, drives, self.grips)]
         self.takeover = None
         if still is not None:
-            self.takeover = Takeover.never(problem.rigid_bodies, still[self.system.nodes :])
+            self.takeover = ForceTakeover.none(problem.rigid_bodies, still[self.system.nodes :])
         self.reason, self.pace = "", StepController(control.max_iterations)
         self.unbalanced: list[tuple[float, float]] = []  # mm and residual of steps beyond the tolerance
         self.unsettled: list[tuple[float, float]] = []  # the same of steps whose grip goes on changing
@@ -116,11 +116,11 @@ class SteppedRun:
         """Yield accepted steps; afterwards ``reason`` says why it stopped early, if it did."""
         begun, pace, why = self.states[-1].time, self.pace, ""
         targets = [t for t in self.planned if t > begun * (1.0 + 1e-9)]
-        if not begun and len(self.system.prestretch) and not self._rested():
+        if not begun and len(self.system.prestretch) and not self._equilibrate_prestretch():
             return
         times, forces = [0.0], [0.0]
         while targets:
-            now, spent = self.states[-1].time, self._spent()
+            now, spent = self.states[-1].time, self._is_spent()
             if spent:
                 bound = f"no more than {self.control.most_iterations} Newton iterations were allowed"
                 why = f"{why}; {bound}" if why else bound
@@ -136,7 +136,7 @@ class SteppedRun:
                 pace.cut(now, t)
                 why = found
                 continue
-            pace.done(now, t, self.counts["newton_iterations"] - before)
+            pace.accept(now, t, self.counts["newton_iterations"] - before)
             why = ""
             self._take_over(found)
             times.append(t)
@@ -151,18 +151,18 @@ class SteppedRun:
 
     def _take_over(self, step: Step) -> None:
         """Forces that are left open from here on are those that held the bodies in a step."""
-        before, self.problem = self.problem, self.problem.taken_over(step.time, step.reactions)
+        before, self.problem = self.problem, self.problem.take_over_forces(step.time, step.reactions)
         bodies = zip(before.rigid_bodies, self.problem.rigid_bodies)
         took = [old.motion is not new.motion for old, new in bodies]
         if any(took) and self.takeover is not None and self.system.bodies is not None:
-            self.takeover = self.takeover.after(took, self.system.bodies, step.state, self.laws.modulus)
+            self.takeover = self.takeover.update(took, self.system.bodies, step.state, self.laws.modulus)
 
-    def _rested(self) -> bool:
+    def _equilibrate_prestretch(self) -> bool:
         """Whether pre-strained tissue is brought to the equilibrium that it has had long since."""
         strained = compute_elastic_residual(self.system, self.laws, self.states[0])
         self.floor = max(self.floor, 1e-2 * strained)  # it may be left without any stress
         with limit_numpy_threads():
-            found = self._attempt(0.0, self.control.max_iterations, LONG_SINCE)
+            found = self._attempt(0.0, self.control.max_iterations, PRESTRETCH_AGE_S)
         if isinstance(found, str):
             self.reason = f"the pre-strained tissue found no equilibrium: {found}"
         else:
@@ -178,22 +178,24 @@ class SteppedRun:
         """
         history = self.problem.history
         dt = t - self.states[-1].time if takes is None else takes
-        displacement, drives = history.displacement_at(t), self.touch.drives(self.problem.drives(t))
+        displacement, drives = history.displacement_at(t), self.touch.shift_drives(self.problem.drives(t))
         stiffness, u = self.stiffness, self._predict(t)
         pressures = tuple(pressure.at(t) for pressure in self.problem.pressures)
-        for raises in range(MOST_RAISES, -1, -1):
+        rims = self.system.pressures.compute_rims(self.states[-1].rows, pressures) if pressures else 0.0
+        for raises in range(MAX_RAISES, -1, -1):
             may_rise = raises > 0 and not self.control.hold_penalty
-            increment = self.memory.increment(
+            increment = self.memory.build_increment(
                 self.system, self.laws, t, dt, displacement, stiffness * self.laws.modulus, drives
             )
             increment = replace(
                 increment, grips=self.grips, flat_from=STEEP_PRESSURE / stiffness, pressures=pressures,
-                activation=self.problem.activated(t),
-                rims=self.system.pressures.rims(self.states[-1].rows, pressures) if pressures else 0.0,
+                activation=self.problem.activation_at(t),
+                rims=rims,
             )  # fmt: skip
             control = replace(
                 self.control.newton, damping=self.damping, max_iterations=patience,
-                bearable=TOO_DEEP * self.deepest if may_rise else np.inf, tangent=self.slope is not None,
+                max_penetration=UNBEARABLE_DEPTH * self.deepest if may_rise else np.inf,
+                tangent=self.slope is not None,
             )  # fmt: skip
             found, increment = self._settle(increment, u, control)
             if found.reason:
@@ -209,12 +211,12 @@ class SteppedRun:
         """An equilibrium, and the increment with the grips and the rims of pressures that hold there."""
         start = self.system.impose(u, increment)
         lags = increment.lags
-        loosely = replace(control, tolerance=max(control.tolerance, NEARLY)) if lags else control
-        roughly = replace(control, enough=ENOUGH) if lags else control
+        loosely = replace(control, tolerance=max(control.tolerance, LOOSE_TOLERANCE)) if lags else control
+        roughly = replace(control, reduction=RENEWAL_REDUCTION) if lags else control
         found = self._equilibrate(increment, start, loosely)
         closest, vain = np.inf, 0
-        for _ in range(MOST_RENEWALS):
-            if found.reason or found.at.penetration > control.bearable:
+        for _ in range(MAX_RENEWALS):
+            if found.reason or found.at.penetration > control.max_penetration:
                 return found, increment
             if lags:
                 settled, spent = couple(
@@ -231,17 +233,17 @@ class SteppedRun:
             found = self._equilibrate(increment, found.u, roughly)
             if not found.iterations:
                 return found, increment
-            vain = 0 if found.first < CLOSER * closest else vain + 1
+            vain = 0 if found.first < CLOSER_SHARE * closest else vain + 1
             closest = min(closest, found.first)
-            if vain > VAIN_RENEWALS or self._spent():
+            if vain > MAX_VAIN_RENEWALS or self._is_spent():
                 break
         unsettled = found.first
         if not found.reason:
             found = self._equilibrate(increment, found.u, control)
-        reason = "" if unsettled <= UNSETTLED else "friction, or the rim of a pressure, does not settle"
+        reason = "" if unsettled <= MAX_UNSETTLED else "friction, or the rim of a pressure, does not settle"
         return replace(found, reason=found.reason or reason, unsettled=unsettled), increment
 
-    def _spent(self) -> bool:
+    def _is_spent(self) -> bool:
         """Whether no more Newton iterations are allowed, those that led nowhere counted."""
         used = self.counts["newton_iterations"] + self.counts["vain_iterations"]
         return used >= self.control.most_iterations
@@ -263,16 +265,18 @@ class SteppedRun:
     def _predict(self, t: float) -> Array:
         warm, last = self.warm.at(t), self.warm.at(self.states[-1].time)
         if warm is not None:  # what it missed by in the step before, it will miss by in this one, by depth
-            return warm if last is None else warm + self._deeper(t) * (self.states[-1].rows - last)
-        weights = self._foreseen(t)
+            return (
+                warm if last is None else warm + self._compute_depth_ratio(t) * (self.states[-1].rows - last)
+            )
+        weights = self._compute_guess_weights(t)
         return np.asarray(sum(w * state.rows for w, state in zip(weights, self.states)))
 
-    def _deeper(self, t: float) -> float:
+    def _compute_depth_ratio(self, t: float) -> float:
         """The depth at time ``t`` over that of the last state; one where it says nothing."""
         now, then = self.problem.history.displacement_at(t), self.states[-1].displacement
-        return min(now / then, MOST_DEEPER) if now > 0.0 and then > 0.0 else 1.0
+        return min(now / then, MAX_DEPTH_RATIO) if now > 0.0 and then > 0.0 else 1.0
 
-    def _foreseen(self, t: float) -> Array:
+    def _compute_guess_weights(self, t: float) -> Array:
         """Weights of the last states in a guess of the one at time ``t``; those before a further body turned
         say nothing of it."""
         travel, little = self.problem.travel, 1e-9 * t
@@ -285,42 +289,52 @@ class SteppedRun:
     def _accept(self, found: Equilibrium, increment: Increment, dt: float, stiffness: float) -> Step:
         started = time.perf_counter()
         u, at = found.u, found.at
-        worn = self.slopes.worn()
+        worn = self.slopes.is_worn()
         inexact = at.data is None or at.penetration > increment.flat_from
         if inexact and (worn or self.slope is not None):
             at = self.system.evaluate(u, self.laws, replace(increment, flat_from=np.inf))
             found = replace(found, at=at)
         if worn:
             refactor_at(at, self.slopes)
-        self.slopes.next_step()
+        self.slopes.start_step()
         du = force_slope = None
         if self.slope is None:
             stress = compute_elastic_stresses(self.system, self.laws, u)
         else:
-            explicit = self.slope.explicit(self.system, self.laws, self.memory, increment, u, dt)
+            explicit = self.slope.differentiate_step(self.system, self.laws, self.memory, increment, u, dt)
             stress = explicit.stress
             du, force_slope = self._differentiate(explicit, found, increment)
-            self.slope = self.slope.advanced(self.system, self.laws, self.memory, explicit, du, dt)
-        after = self.memory.advanced(self.system, self.laws, stress, dt)
-        if self._turns(increment.time, at.force):
-            after, self.slope = after.turned(), None if self.slope is None else self.slope.turned()
+            self.slope = self.slope.advance(self.system, self.laws, self.memory, explicit, du, dt)
+        after = self.memory.advance(self.system, self.laws, stress, dt)
+        if self._has_turned(increment.time, at.force):
+            after, self.slope = (
+                after.drop_past(),
+                None if self.slope is None else self.slope.drop_past(),
+            )
         tools = self.system.tools(u, increment)
-        apart = [self.touch.beside(self.system, du), *[du] * len(tools)]
-        self.grips = tuple(g and g.after(tool, d) for g, tool, d in zip(increment.grips, tools, apart))
+        apart = [self.touch.relative_to_touch(self.system, du), *[du] * len(tools)]
+        self.grips = tuple(g and g.advance(tool, d) for g, tool, d in zip(increment.grips, tools, apart))
         self.memory, self.stiffness = after, stiffness
         self.damping = FIRST_DAMPING if found.damped else 0.0
         self.floor = max(self.floor, 1e-2 * compute_reaction_scale(self.system, at, 0.0))
-        coordinates, deepening = self._coordinates(u, increment.drives), None
+        coordinates, deepening = self._read_coordinates(u, increment.drives), None
         displacement = increment.displacement
         if self.problem.history.forced:
             displacement = float(coordinates[0, 2])
             deepening = None if du is None else du[self.system.nodes, 2]
-        state = self._state(
-            increment.time, displacement, u, stiffness, du, after.turned(), increment.drives, increment.grips
+        state = self._build_state(
+            increment.time,
+            displacement,
+            u,
+            stiffness,
+            du,
+            after.drop_past(),
+            increment.drives,
+            increment.grips,
         )
         self.states = [*self.states[-2:], state]
         if self.touch.waits and increment.time >= self.problem.touch_down_s * (1.0 - 1e-9):
-            self.touch = self.touch.after(self.system, u, self.problem.drives(increment.time), du)
+            self.touch = self.touch.touch_down(self.system, u, self.problem.drives(increment.time), du)
         if found.residual > self.control.tolerance:
             self.unbalanced.append((displacement, found.residual))
         if found.unsettled > self.control.tolerance:
@@ -333,24 +347,24 @@ class SteppedRun:
             state,
         )  # fmt: skip
 
-    def _coordinates(self, u: Array, drives: Drives) -> Array:
+    def _read_coordinates(self, u: Array, drives: Drives) -> Array:
         """Where the rigid bodies are (b, 6), mm and rad."""
         bodies = [] if self.system.bodies is None else self.system.bodies.tools(u, drives)
         return np.array([tool.pose.coordinates for tool in bodies]).reshape(-1, 6)
 
-    def _state(
+    def _build_state(
         self, time: float, displacement: float, u: Array, stiffness: float, du: Array | None,
         memory: Memory | None, drives: Drives, holding: Sequence[StickyContact | None],
     ) -> State:  # fmt: skip
         n = self.system.nodes
         slopes = (None, None) if du is None else (du[:n], du[n:])
-        grips = tuple(grip and grip.bare() for grip in holding)
+        grips = tuple(grip and grip.without_derivatives() for grip in holding)
         return State(
             time, displacement, u[:n], stiffness, slopes[0], memory, u[n:], slopes[1], drives, grips,
-            self.problem.activated(time),
+            self.problem.activation_at(time),
         )  # fmt: skip
 
-    def _turns(self, t: float, force: float) -> bool:
+    def _has_turned(self, t: float, force: float) -> bool:
         """Whether the stress after a step to ``t`` does not go on as it went before: the indenter turned, or
         contact began or ended."""
         met, self.pushing = (force > 0.0) != self.pushing, force > 0.0
@@ -371,21 +385,23 @@ class SteppedRun:
         for i, (grip, tool) in enumerate(zip(increment.grips, system.tools(u, increment))):
             if grip is None:
                 continue
-            held = (increment.penalty * tool.surface.areas)[..., None, None] * grip.explicit(tool)
-            change += tool.distributed(held)
+            held = (increment.penalty * tool.surface.areas)[..., None, None] * grip.differentiate_anchors(
+                tool
+            )
+            change += tool.distribute_body_forces(held)
             if i == 0:
                 d_reaction -= held[:, :, 2].sum(axis=(0, 1))
         if self.takeover is not None and system.bodies is not None:
-            change[system.nodes :] -= self.takeover.left(
+            change[system.nodes :] -= self.takeover.remaining(
                 self.problem.rigid_bodies, system.bodies, increment.time
             )
         coupling = Coupling(system, increment, u)
         b = -change.reshape(-1, laws.count)[system.free]
-        pushed = self.touch.pushed(system, at, coupling)
+        pushed = self.touch.differentiate_contact_forces(system, at, coupling)
         if pushed is not None and system.bodies is not None:
-            b -= system.bodies.at_springs(pushed)
-            d_reaction += system.bodies.along(pushed)
-        weights = self._foreseen(increment.time)
+            b -= system.bodies.spread_forces(pushed)
+            d_reaction += system.bodies.project_on_axis(pushed)
+        weights = self._compute_guess_weights(increment.time)
         guess = sum(w * s.slopes for w, s in zip(weights, self.states))
         x = np.asarray(guess).reshape(-1, laws.count)[system.free]
         du = np.zeros((u.size, laws.count))

@@ -22,19 +22,19 @@ from .linear import NONE, Halves, Index
 Single = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 # Smaller changes, relative to the stiffest spring, are left to the iteration.
-NOTABLE = 0.03
+NOTABLE_CHANGE = 0.03
 # More columns than this make the dense solutions dear.
-MOST_COLUMNS = 500
+MAX_COLUMNS = 500
 # Over the power 2/3 of all unknowns, as a cut across the body has: with more, the factor itself gets dear.
-MOST_LAST = 1.5
+MAX_LAST = 1.5
 
 
 def find_touched_unknowns(system: System, problem: Problem) -> Index:
     """Unknowns where bodies will touch, for the factor to eliminate last; none where they are too many."""
     if system.bodies is None:
         return NONE
-    found = system.bodies.swept([body.motion for body in problem.rigid_bodies])
-    return found if len(found) <= MOST_LAST * system.unknowns ** (2 / 3) else NONE
+    found = system.bodies.find_swept_unknowns([body.motion for body in problem.rigid_bodies])
+    return found if len(found) <= MAX_LAST * system.unknowns ** (2 / 3) else NONE
 
 
 class SpringColumns:
@@ -49,8 +49,8 @@ class SpringColumns:
         self._bodies, self._unknowns, self._halves = system.bodies, system.unknowns, halves
         self.inner = np.zeros(0, dtype=bool)
         if system.bodies is not None:
-            self.inner = system.bodies.standing_on(halves.last)
-            self._shares = system.bodies.shares_of(halves.last)
+            self.inner = system.bodies.find_points_on(halves.last)
+            self._shares = system.bodies.select_shares(halves.last)
         self.clear(None)
 
     def clear(self, blocks: Array | None) -> None:
@@ -76,25 +76,25 @@ class SpringColumns:
         frames = self._bodies.frames  # on a flat face only the last axis is stiff
         change = frames @ (blocks - self.blocks) @ frames.transpose(0, 2, 1)
         typical = max(float(np.abs(blocks).max()), float(np.abs(self.blocks).max()), 1e-300)
-        wanted = np.abs(change).max(axis=2) > NOTABLE * typical
+        wanted = np.abs(change).max(axis=2) > NOTABLE_CHANGE * typical
         wanted |= touched[:, None] & (np.abs(np.einsum("cij,cj->ci", frames, normals)) > 0.2)
         if not self._complete(wanted, most):
             return None
         return SpringChange(self, np.array(list(self.keys), dtype=int).reshape(-1, 2), frames, change,
-                            0.1 * NOTABLE * typical)  # fmt: skip
+                            0.1 * NOTABLE_CHANGE * typical)  # fmt: skip
 
-    def moved(self, y: Array, closed: Bools) -> Array:
+    def displace_points(self, y: Array, closed: Bools) -> Array:
         """Displacements (c, 3) of the contact points by the half solution ``y (n, 1)``.
 
         Where only inner points are ``closed (c,)``, the others are taken to stay.
         """
         assert self._bodies is not None
         if not self.inner.any() or (closed & ~self.inner).any():
-            return self._bodies.springs_of(self._halves.backward(y))[..., 0]
+            return self._bodies.move_springs(self._halves.backward(y))[..., 0]
         x = self._halves.backward(y[self._halves.last], True)
-        return np.where(self.inner[:, None], self._bodies.springs_of(x, self._shares)[..., 0], 0.0)
+        return np.where(self.inner[:, None], self._bodies.move_springs(x, self._shares)[..., 0], 0.0)
 
-    def pushed(self, y: Array, coefficients: Array) -> Array:
+    def add_to(self, y: Array, coefficients: Array) -> Array:
         """Half solutions ``y (n, r)`` with the columns added, ``coefficients (k, r)`` times."""
         y = y.copy()
         y[self.rows] += self.W[:, : len(coefficients)] @ coefficients.astype(np.float32)
@@ -104,7 +104,7 @@ class SpringColumns:
         """Make the columns that are missing, unless they would be too many in all."""
         new = [key for key in zip(*map(np.ndarray.tolist, np.nonzero(wanted))) if key not in self.keys]
         dear = sum(not self.inner[point] for point, _ in (*self.keys, *new))
-        if dear > most or len(self.keys) + len(new) > max(most, MOST_COLUMNS):
+        if dear > most or len(self.keys) + len(new) > max(most, MAX_COLUMNS):
             return False
         for inner in (True, False):
             self._add([key for key in new if self.inner[key[0]] == inner], inner)
@@ -119,20 +119,20 @@ class SpringColumns:
         unit = np.zeros((len(self.inner), 3, len(new)))
         unit[points, :, np.arange(len(new))] = self._bodies.frames[points, axes]
         shares = self._shares if inner else None
-        N = self._bodies.at_springs(unit, shares)
+        N = self._bodies.spread_forces(unit, shares)
         W = self._halves.forward(N, inner)
-        at_points = self._bodies.springs_of(self._halves.backward(W, inner), shares)
+        at_points = self._bodies.move_springs(self._halves.backward(W, inner), shares)
         if inner:
             at_points[~self.inner] = 0.0
         elif not isinstance(self.rows, slice):
-            self.W, self.rows = self._widened(self.W), slice(None)
+            self.W, self.rows = self._widen(self.W), slice(None)
         narrow = inner and isinstance(self.rows, slice)
-        self.W = np.hstack([self.W, self._widened(W) if narrow else W.astype(np.float32)])
+        self.W = np.hstack([self.W, self._widen(W) if narrow else W.astype(np.float32)])
         self.P = self.W if self._halves.transposed else np.hstack([self.P, N.astype(np.float32)])
         self.S = (self.P.T @ self.W).astype(float)
         self.at_points = np.concatenate([self.at_points, at_points], axis=2)
 
-    def _widened(self, W: Array | Single) -> Single:
+    def _widen(self, W: Array | Single) -> Single:
         """Columns (m, k) of the unknowns that are eliminated last, as those of all (n, k)."""
         out = np.zeros((self._unknowns, W.shape[1]), dtype=np.float32)
         out[self._halves.last] = W
@@ -169,7 +169,7 @@ class SpringChange:
         moved = (self._columns.P.T @ y[self._columns.rows].astype(np.float32))[self._stiffer]
         coefficients = np.zeros((len(self._points), y.shape[1]))
         coefficients[self._stiffer] = -(self._answer @ moved)
-        return self._columns.pushed(y, coefficients)
+        return self._columns.add_to(y, coefficients)
 
     def coefficients(self, moved: Array, forces: Array) -> Array:
         """What to add (k,) of each column, for displacements of the factor's solution and forces (c, 3)."""

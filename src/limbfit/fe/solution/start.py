@@ -27,7 +27,9 @@ from .coupling import Coupling
 
 def compute_elastic_residual(system: System, laws: Laws, state: State) -> float:
     """Norm of the nodal forces of elastic tissue in a state, N."""
-    still = Memory.rest(system, laws).increment(system, laws, 0.0, 1.0, state.displacement, 0.0, state.drives)
+    still = Memory.rest(system, laws).build_increment(
+        system, laws, 0.0, 1.0, state.displacement, 0.0, state.drives
+    )
     return float(np.linalg.norm(system.evaluate(state.rows, laws, still, tangent=False).residual))
 
 
@@ -74,7 +76,7 @@ def start_grips(
 ) -> tuple[StickyContact | None, ...]:
     """The grips with which a run begins, its bodies at rest where they start."""
     tools = [] if system.bodies is None else system.bodies.tools(u, drives)
-    return tuple(grip and grip.begun(tool) for grip, tool in zip(grips, tools, strict=True))
+    return tuple(grip and grip.start(tool) for grip, tool in zip(grips, tools, strict=True))
 
 
 def compute_tangent_at_rest(system: System) -> Array:
@@ -82,11 +84,13 @@ def compute_tangent_at_rest(system: System) -> Array:
     problem = system.problem
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
     start = problem.history.displacement_at(0.0)
-    increment = Memory.rest(system, laws).increment(system, laws, 1.0, 1.0, start, 0.0, problem.drives(0.0))
+    increment = Memory.rest(system, laws).build_increment(
+        system, laws, 1.0, 1.0, start, 0.0, problem.drives(0.0)
+    )
     return system.evaluate(np.zeros((system.rows, 3)), laws, increment).tangent
 
 
-CLEAR = 3.0  # widths of the indenter that it is off the tissue until it touches
+CLEARANCE_WIDTHS = 3.0  # widths of the indenter that it is off the tissue until it touches
 
 
 @dataclass(frozen=True)
@@ -110,9 +114,9 @@ class IndenterStart:
         meets = problem.touch_down_s > 0.0 or (problem.prestretch is not None and problem.start == "touching")
         if problem.indenter is None or not meets:
             return cls()
-        return cls(True, -CLEAR * problem.indenter.width)
+        return cls(True, -CLEARANCE_WIDTHS * problem.indenter.width)
 
-    def after(self, system: System, u: Array, drives: Drives, du: Array | None) -> IndenterStart:
+    def touch_down(self, system: System, u: Array, drives: Drives, du: Array | None) -> IndenterStart:
         """It touches the tissue at ``u (r, 3)``, whose derivative is ``du (r, 3, p)``."""
         assert system.bodies is not None
         body = system.bodies.first
@@ -120,22 +124,24 @@ class IndenterStart:
         offset = find_touching_offset(surface, body.start)
         if du is None:
             return IndenterStart(False, offset)
-        moved = IndenterStart(False, offset).drives(drives)
+        moved = IndenterStart(False, offset).shift_drives(drives)
         tool = system.bodies.tools(u, moved)[0]
         gaps, normals, _ = tool.body.local_distance(tool.local)
         at = np.unravel_index(gaps.argmin(), gaps.shape)
         normal = normals[at]
-        return IndenterStart(False, offset, normal @ tool.moved(du)[at] / normal[2])
+        return IndenterStart(False, offset, normal @ tool.relative_motion(du)[at] / normal[2])
 
-    def drives(self, stated: Drives) -> Drives:
+    def shift_drives(self, drives: Drives) -> Drives:
         """What drives the bodies, with the indenter moved by the offset."""
         if not self.offset:
-            return stated
-        values = stated.values.copy()
+            return drives
+        values = drives.values.copy()
         values[0, 2] += self.offset
-        return replace(stated, values=values)
+        return replace(drives, values=values)
 
-    def pushed(self, system: System, at: Evaluation, coupling: Coupling) -> Array | None:
+    def differentiate_contact_forces(
+        self, system: System, at: Evaluation, coupling: Coupling
+    ) -> Array | None:
         """Derivative (c, 3, p) of the forces on the contact points through the offset alone, N."""
         if self.slope is None or system.bodies is None or at.touch is None:
             return None
@@ -145,7 +151,7 @@ class IndenterStart:
         out[points] = -(stiff @ axis)[..., None] * self.slope
         return out
 
-    def beside(self, system: System, du: Array | None) -> Array | None:
+    def relative_to_touch(self, system: System, du: Array | None) -> Array | None:
         """Derivatives (r, 3, p) of displacements, relative to where the indenter touched."""
         if du is None or self.slope is None or system.bodies is None:
             return du

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -116,10 +115,10 @@ def solve(
             kept.append(step.state if deepest else replace(step.state, memory=None))
         if on_step is not None:
             on_step(step)
-        if checkpoints is not None and checkpoints.at(step.time):
+        if checkpoints is not None and checkpoints.is_due(step.time):
             checkpoints.keep(_take_snapshot(run, rows, time.perf_counter() - started))
             for factor in {id(one): one for one in (run.factor, run.slopes)}.values():
-                factor.begin_anew()  # as that of a run that begins here does
+                factor.reset()  # as that of a run that begins here does
     return _build_result(
         problem, run, rows, kept, deepest_state, sensitivities, time.perf_counter() - started
     )
@@ -151,9 +150,9 @@ def _resume_run(run: SteppedRun, begin: Snapshot) -> list[Step]:
         setattr(run, name, copy(begin[name]))
     for name in _PARTS:
         if getattr(run, name) is not None:
-            setattr(run, name, begin.like(name, getattr(run, name)))
-    run.grips = tuple(grip and begin.like(f"grips.{i}", grip) for i, grip in enumerate(run.grips))
-    run.states = [replace(begin.like(f"states.{i}", first), grips=()) for i in range(begin["count"])]
+            setattr(run, name, begin.restore(name, getattr(run, name)))
+    run.grips = tuple(grip and begin.restore(f"grips.{i}", grip) for i, grip in enumerate(run.grips))
+    run.states = [replace(begin.restore(f"states.{i}", first), grips=()) for i in range(begin["count"])]
     run.counts.update(begin["counts"])
     run.slopes.counts["inexact"] = begin["inexact"]
     columns = {name: begin[name] for name in _COLUMNS if begin[name] is not None}
@@ -247,11 +246,12 @@ def _collect_warnings(
 ) -> tuple[SimulationWarning, ...]:
     """What is doubtful about the steps of a run, of which ``deepest`` is the one farthest in."""
     folds: tuple[SimulationWarning, ...] = ()
+    system = run.system
     if deepest is not None:
         folds = find_inverted_elements(
             run.problem.mesh,
             deepest.u,
-            partial(_compute_energies, run, deepest),
+            lambda: compute_element_fields(system, run.laws, deepest).energy * system.weights.sum(axis=1),
             deepest.displacement,
             displacement,
         )
@@ -263,11 +263,6 @@ def _collect_warnings(
         *find_unconverged_friction(displacement, run.unsettled),
         *find_inexact_sensitivities(displacement, run.slopes.counts["inexact"]),
     )
-
-
-def _compute_energies(run: SteppedRun, state: State) -> Array:
-    """Long-term elastic strain energy (m,) of the elements, N mm."""
-    return compute_element_fields(run.system, run.laws, state).energy * run.system.weights.sum(axis=1)
 
 
 def _collect_statistics(run: SteppedRun, seconds: float, sunk_steps: int) -> dict[str, Any]:
@@ -314,7 +309,7 @@ class Snapshot:
             _flatten(name, value, facts, arrays)
         return cls(facts, arrays)
 
-    def like(self, name: str, pattern: Kind) -> Kind:
+    def restore(self, name: str, pattern: Kind) -> Kind:
         """The value of that name, a dataclass of the kind of ``pattern``, whose other fields it takes."""
         known = {}
         for one in fields(pattern):  # type: ignore[arg-type]
@@ -322,7 +317,7 @@ class Snapshot:
             if inner in self.arrays or inner in self.facts:
                 known[one.name] = self[inner]
             elif is_dataclass(old):
-                known[one.name] = self.like(inner, old)
+                known[one.name] = self.restore(inner, old)
         return replace(pattern, **known)  # type: ignore[type-var]
 
     def __getitem__(self, name: str) -> Any:
@@ -337,7 +332,7 @@ class Checkpoints:
     times: Sequence[float]
     keep: Callable[[Snapshot], None]
 
-    def at(self, time: float) -> bool:
+    def is_due(self, time: float) -> bool:
         return bool(np.isclose(time, self.times, rtol=1e-9, atol=0.0).any())
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ...arrays import Array
 from ..bodies import count_body_rows
 from ..problem import Problem
-from ..result import Result, State
+from ..result import Result
 
 _SAME_S = 1e-9
 
@@ -44,17 +44,20 @@ class WarmStart:
     u: tuple[Array, ...]
 
     @classmethod
-    def of(cls, problem: Problem, found: Result | None) -> WarmStart:
+    def of(cls, problem: Problem, result: Result | None) -> WarmStart:
         """Those of a result on the same mesh, moved to the new parameters along their sensitivities."""
         rows = count_body_rows(problem.rigid_bodies)
-        shapes = [(state.u.shape, len(state.coordinates)) for state in found.states[:1]] if found else []
-        if found is None or shapes != [(problem.mesh.points.shape, rows)]:
+        shapes = [(state.u.shape, len(state.coordinates)) for state in result.states[:1]] if result else []
+        if result is None or shapes != [(problem.mesh.points.shape, rows)]:
             return cls(np.zeros(0), ())
-        new, old = problem.parameters, found.problem.parameters
+        new, old = problem.parameters, result.problem.parameters
         with np.errstate(all="ignore"):  # moduli act by their ratio
             change = np.where(new * old > 0.0, old * np.log(new / old), new - old)
-        times = np.array([state.time for state in found.states])
-        return cls(times, tuple(_move_state(state, change) for state in found.states))
+        moved = [
+            state.rows if state.sensitivity is None else state.rows + state.slopes @ change
+            for state in result.states
+        ]
+        return cls(np.array([state.time for state in result.states]), tuple(moved))
 
     def at(self, t: float) -> Array | None:
         """Displacement (n, 3) at a time, linear between the states; None outside of them."""
@@ -66,8 +69,3 @@ class WarmStart:
             return self.u[after]
         share = (t - self.times[before]) / (self.times[after] - self.times[before])
         return self.u[before] + share * (self.u[after] - self.u[before])
-
-
-def _move_state(state: State, change: Array) -> Array:
-    """All rows (r, 3) of a state, after a ``change (p,)`` of the parameters if its derivatives are known."""
-    return state.rows if state.sensitivity is None else state.rows + state.slopes @ change

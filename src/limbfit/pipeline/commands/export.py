@@ -109,7 +109,7 @@ def check_export(
             model = _build_block_model(study, one, file)
             problem = build_problem(model, block, used)
             if study.clamps is not None:
-                later = problem.history.later(study.clamps.begun_s)
+                later = problem.history.delay(study.clamps.begun_s)
                 problem = replace(problem, history=later, touch_down_s=study.clamps.begun_s)
             found = Indentation(context, one, model, used, origin)
             _write(found, problem, to, Path(folder), _NO_CURVE)

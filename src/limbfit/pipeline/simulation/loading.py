@@ -15,7 +15,7 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from ...anatomy.sites.sites import compute_indenter_axis, compute_square_edges, measure_tissue_under
 from ...anatomy.surfaces.surfaces import Anatomy
 from ...arrays import Array
-from ...donning import Held
+from ...donning import LoadedState
 from ...identify.checks.domain import (
     ANGLE,
     COMPRESSION,
@@ -182,7 +182,7 @@ def describe_indentation(
 def describe_socket_load(
     mesh: Mesh,
     faces: NDArray[np.int64],
-    held: Held,
+    held: LoadedState,
     before: Sequence[Extent],
     history: LoadHistory,
     tissues: Collection[str],

@@ -17,9 +17,9 @@ from ...anatomy.frame import Frame, build_limb_frame
 from ...anatomy.surfaces.surfaces import Anatomy, write_surface
 from ...anatomy.surfaces.triangles import Surface
 from ...arrays import Array
-from ...donning import build_pressed_problem, extract_outer_surface, press
+from ...donning import build_pressed_problem, extract_outer_surface, press_limb
 from ...donning.model import OUTER
-from ...donning.relief import Relief, Trial
+from ...donning.relief import Relief, SocketTrial
 from ...errors import RunError, SurfaceError
 from ...fe import Step
 from ...fe.materials import Material
@@ -204,7 +204,7 @@ class _Bench:
             self.tell(step.time / end, f"target pressure: {step.time:.2f} of {end:g} s")
 
         def make() -> Made:
-            result = press(problem, on_step)
+            result = press_limb(problem, on_step)
             if not result.completed:
                 raise RunError(
                     f"the limb could not be put under the target pressure: {result.reason}; lower "
@@ -212,7 +212,7 @@ class _Bench:
                 )
             return {"statistics": result.statistics}, {"displacement": result.states[-1].u}
 
-        given = self._key(self.plain), code_digest(press), pressure.tolist()
+        given = self._key(self.plain), code_digest(press_limb), pressure.tolist()
         _, fields = self.kept.get(compute_digest("pressed", *given), make)
         self.count += 1
         limb = compute_profile(self.limb.outer.skin, self.frame)
@@ -327,7 +327,7 @@ def _find_limits(bench: _Bench, control: Mapping[str, float], regions: Sequence[
 
 
 def _to_row(
-    trial: Trial, optimise: Sequence[str], peaks: Mapping[str, float] | None, reason: str = ""
+    trial: SocketTrial, optimise: Sequence[str], peaks: Mapping[str, float] | None, reason: str = ""
 ) -> dict[str, Any]:
     return {
         "depths_mm": dict(zip(optimise, trial.depths, strict=True)),

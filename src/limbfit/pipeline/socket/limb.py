@@ -17,15 +17,15 @@ from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...arrays import Array
 from ...donning import (
     SETTLING,
-    Donned,
-    Held,
+    DonningResult,
     Load,
+    LoadedState,
     Patch,
     SocketFit,
     SocketStep,
     build_socket_problem,
-    don,
     pack,
+    simulate_donning,
     unpack,
 )
 from ...donning.model import OUTER
@@ -150,7 +150,7 @@ class SocketLimb:
         table = self.study.socket.model_dump(mode="json", exclude={"design", "worn_s"})
         return compute_digest(
             *(table, self.study.material.model_dump(mode="json"), parameters, sensitivities),
-            *(compute_file_digest(folder / MESH), code_digest(SocketLimb.of), code_digest(don)),
+            *(compute_file_digest(folder / MESH), code_digest(SocketLimb.of), code_digest(simulate_donning)),
             *(socket.points.tolist(), socket.clear.tolist()),
         )
 
@@ -163,7 +163,7 @@ class SocketLimb:
         sensitivities: bool = False,
         threads: int | None = None,
         begun: Begun | None = None,
-    ) -> Donned:
+    ) -> DonningResult:
         """Put a socket on and load it.
 
         Parameters
@@ -189,7 +189,7 @@ class SocketLimb:
             build_socket_problem(mesh, laws, socket, fit), fibres=build_fibre_field(self.fibres, mesh)
         )
         before = None if begun is None else begun.latest()
-        found = don(
+        found = simulate_donning(
             problem,
             fit,
             self.faces(mesh, socket),
@@ -203,7 +203,9 @@ class SocketLimb:
             raise RunError(_describe_stop(found, fit))
         return found
 
-    def facts(self, found: Donned, socket: Socket, known: ParameterSpread | None = None) -> dict[str, Any]:
+    def facts(
+        self, found: DonningResult, socket: Socket, known: ParameterSpread | None = None
+    ) -> dict[str, Any]:
         """What is stored of a simulation, with intervals where parameters are ``known`` so well."""
         fit = self.fit(socket)
         spread = (
@@ -323,7 +325,7 @@ def format_warning(doubt: SimulationWarning) -> str:
     )
 
 
-def _describe_stop(found: Donned, fit: SocketFit) -> str:
+def _describe_stop(found: DonningResult, fit: SocketFit) -> str:
     """Why a simulation did not come to its end, and what may be done about it."""
     last = found.rows[-1] if found.rows else None
     time = 0.0 if last is None else last.time
@@ -342,7 +344,7 @@ def _describe_stop(found: Donned, fit: SocketFit) -> str:
     )
 
 
-def _loaded_to_dict(one: Held, spread: SimulationSpread | None) -> dict[str, Any]:
+def _loaded_to_dict(one: LoadedState, spread: SimulationSpread | None) -> dict[str, Any]:
     def of(name: str, patch: Patch) -> dict[str, Any]:
         known = spread_to_facts(spread, "", "kPa", patch.mean_kPa, one.slopes.get(name))
         return {"region": name, **asdict(patch), **known}
@@ -358,7 +360,7 @@ def _loaded_to_dict(one: Held, spread: SimulationSpread | None) -> dict[str, Any
     }
 
 
-def _summarise_strain(mesh: Mesh, one: Held, faces: Mapping[str, Mask]) -> list[dict[str, Any]]:
+def _summarise_strain(mesh: Mesh, one: LoadedState, faces: Mapping[str, Mask]) -> list[dict[str, Any]]:
     """Strain of each tissue under the liner, and where most: the place at rest, the region nearest to it."""
     middles = mesh.points[mesh.face_sets[OUTER][:, :3]].mean(axis=1)
     rows = []

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...anatomy.surfaces.surfaces import write_surface
 from ...arrays import Array
-from ...donning import Donned
+from ...donning import DonningResult
 from ...donning.model import OUTER
 from ...identify.checks.domain import Extent, RecordedRange, describe_outside
 from ...identify.fit.prediction import RelaxationSpread
@@ -120,7 +120,7 @@ def run_socket(
 
 
 def _compare_with_records(
-    limb: SocketLimb, mesh: Mesh, found: Donned, stored: Mapping[str, Any] | None
+    limb: SocketLimb, mesh: Mesh, found: DonningResult, stored: Mapping[str, Any] | None
 ) -> dict[str, dict[str, Any]]:
     """What donning and each load do to the tissue, and what of it no fitted record did, by name.
 
@@ -218,7 +218,7 @@ def _describe_shape(limb: SocketLimb, socket: Socket) -> dict[str, Any]:
     }
 
 
-def _write_fields(folder: Path, mesh: Mesh, found: Donned) -> None:
+def _write_fields(folder: Path, mesh: Mesh, found: DonningResult) -> None:
     """One VTU for donning and each load: pressure, shear, displacement at the nodes, strains of the cells."""
     for i, one in enumerate(found.held.values()):
         fields = {"pressure_kPa": one.pressure, "shear_kPa": one.shear, "displacement_mm": one.displacement}
