@@ -47,7 +47,7 @@ class SocketFit:
 
     Parameters
     ----------
-    pivot : (3,) LPS mm, the point that its way is told of, such as the knee centre.
+    pivot : (3,) LPS mm, the point whose motion is reported, such as the knee centre.
     proximal, anterior : (3,) unit vectors at right angles.
     friction : Coulomb's coefficient, or ``frictionless`` or ``sticky``.
     donning_s, hold_s : how long it grows, or slides on, and then rests.

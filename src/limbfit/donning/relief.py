@@ -22,8 +22,8 @@ MAX_DEPTH_MM, MIN_DEPTH_MM = 4.0, -8.0  # bounds of the depths
 TRUST_MM, MAX_TRUST_MM, MIN_TRUST_MM = 2.0, 4.0, 0.25
 MEAN_WEIGHT = 0.1  # of the mean beside the worst, so that regions that are not the worst gain too
 LIMIT_WEIGHT = 5.0  # of what is beyond the limits
-MIN_GAIN = 0.01  # a foreseen gain that is less is not simulated for
-GOOD, POOR = 0.5, 0.1  # share of the foreseen gain from, or below, which the trust region changes
+MIN_GAIN = 0.01  # of the merit: a design with a smaller predicted gain is not simulated
+GOOD, POOR = 0.5, 0.1  # share of the predicted gain from, or below, which the trust region changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class SocketTrial:
 
 @dataclass(eq=False)
 class Relief:
-    """The search, asked for depths and told what they gave.
+    """The search: `propose` gives depths, `tell` takes the pressures that they caused.
 
     Parameters
     ----------
@@ -79,12 +79,12 @@ class Relief:
         return float(gain.max() + MEAN_WEIGHT * gain.mean() + LIMIT_WEIGHT * excess)
 
     def propose(self) -> Array | None:
-        """Depths (k,) mm to be simulated next; None where no gain that is worth it is foreseen."""
+        """Depths (k,) mm to be simulated next; None where no sufficient gain is predicted."""
         if self.trust_mm < MIN_TRUST_MM:
             return None
         depths = self._solve_linear_program()
-        foreseen = self._compute_merit(self._predict_pressures(depths))
-        return None if foreseen > self.best.merit - MIN_GAIN else depths
+        predicted = self._compute_merit(self._predict_pressures(depths))
+        return None if predicted > self.best.merit - MIN_GAIN else depths
 
     def tell(self, depths: Array, pressures: Array | None) -> SocketTrial:
         """What the proposed depths gave: pressures (r,) kPa, or None where they could not be simulated."""
@@ -93,8 +93,8 @@ class Relief:
             self.trust_mm /= 2.0
         else:
             trial = SocketTrial(depths, pressures, self.merit(pressures))
-            foreseen = self.best.merit - self._compute_merit(self._predict_pressures(depths))
-            share = (self.best.merit - trial.merit) / foreseen
+            predicted = self.best.merit - self._compute_merit(self._predict_pressures(depths))
+            share = (self.best.merit - trial.merit) / predicted
             if share > GOOD:
                 self.trust_mm = min(2.0 * self.trust_mm, MAX_TRUST_MM)
             elif share < POOR:

@@ -144,7 +144,7 @@ def _describe_death(function: Callable, job: int, key: str | None) -> str:
     return f"a worker process died twice in {function.__name__} of {name}: out of memory, killed or crashed"
 
 
-GRACE_S = 2.0  # for workers to end when told so
+GRACE_S = 2.0  # for workers to end when they are asked to
 READY = "ready"  # a worker's first word: its start is not its first job's time
 
 
@@ -183,7 +183,7 @@ class Worker:
     def send(self, function: Callable, job: Any) -> None:
         if self.began is not None:
             self.began = time.monotonic()
-        with suppress(OSError):  # it died while idle: reading its line tells so
+        with suppress(OSError):  # it died while idle: reading its line shows it
             self.connection.send((function, job))
 
     def receive(self) -> JobOutcome | JobReport | str | None:

@@ -38,7 +38,7 @@ Index = NDArray[np.int32]
 HOLDING_STIFFNESS = 100.0
 # Stiffness of a coordinate whose body touches nothing, over that of the tissue against a body of its width.
 GROUNDING_STIFFNESS = 0.1
-# Move of a body that a force drives over its width, up to which a linear model foresees its contact.
+# Move of a body that a force drives over its width, up to which a linear model predicts its contact.
 TRUSTED_MOVE = 0.05
 # Gap over a body's width up to which it may touch what is beside its way.
 NEAR_GAP = 0.05

@@ -1,6 +1,6 @@
-"""What is doubtful about a simulation that goes on to its end, by kind.
+"""Warnings about a simulation that reaches its end, by kind.
 
-Those who use a simulation decide by the kind what to do with it; the text is for people.
+The caller decides by the kind what to do with the simulation; the text is for the user.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ..mesh import Mesh, node_jacobians
 
 Kind = Literal["folded", "slipped", "sunk", "unbalanced", "unsettled", "inexact"]
 
-RELAXATION_SHARE = 0.9  # force over the one before, in an advancing step, that is no relaxation
+RELAXATION_SHARE = 0.9  # a force below this share of the one before, in an advancing step, is no relaxation
 # Share of the strain energy that folded elements may hold: their stiffness lost, the force would fall by
 # about as much, and less than by the error of the mesh.
 FOLDED_ENERGY = 0.01
@@ -24,7 +24,7 @@ FOLDED_ENERGY = 0.01
 
 @dataclass(frozen=True)
 class SimulationWarning:
-    """One doubt about a simulation.
+    """One warning about a simulation.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class SimulationWarning:
         (sensitivities).
     text : one sentence, with its remedy.
     count : elements (``folded``), or steps.
-    depth_mm : indentation where it is first seen; of folded elements, where they were counted.
+    depth_mm : indentation at which it first occurs; of folded elements, at which they were counted.
     share : the same over the largest indentation.
     """
 
@@ -46,7 +46,7 @@ class SimulationWarning:
 
 
 def list_texts(doubts: Sequence[SimulationWarning], *kinds: Kind) -> tuple[str, ...]:
-    """What is said of each kind; empty where it is not doubted."""
+    """The text of each kind of warning; empty where there is none of that kind."""
     said = {doubt.kind: doubt.text for doubt in doubts}
     return tuple(said.get(kind, "") for kind in kinds)
 
@@ -64,7 +64,7 @@ def find_inverted_elements(
     """Elements that are inside out at a node of theirs at the displacements ``u (n, 3)`` of a depth.
 
     The quadrature of ``tet10`` lies inside and does not see it; the element has lost part of its stiffness.
-    Not doubted where they hold less than `FOLDED_ENERGY` of all ``energy (m,)``, N mm.
+    There is no warning where they hold less than `FOLDED_ENERGY` of all ``energy (m,)``, N mm.
     """
     shape = mesh.with_points(mesh.points + u)
     inverted = (node_jacobians(shape) <= 0.0).any(axis=1)
@@ -84,7 +84,7 @@ def find_inverted_elements(
 
 
 def find_slip(displacement: Array, force: Array) -> tuple[SimulationWarning, ...]:
-    """Whether the force (n,), N, falls while the indenter advances (n,), mm.
+    """A warning if the force (n,), N, falls while the indenter advances (n,), mm.
 
     The tissue has lost its equilibrium.
     """

@@ -129,7 +129,7 @@ class Motion:
 
     @property
     def grows(self) -> bool:
-        """Whether its shape is ever another than the final one."""
+        """True if its shape is ever another than the final one."""
         return bool((np.asarray(self.growth) != 1.0).any())
 
     def at(self, t: float) -> tuple[Array, NDArray[np.bool_], float]:

@@ -56,7 +56,7 @@ class History:
 
     @property
     def forced(self) -> bool:
-        """Whether a force drives the indenter along its axis."""
+        """True if a force drives the indenter along its axis."""
         return self.force is not None
 
     @property

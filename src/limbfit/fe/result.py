@@ -96,7 +96,7 @@ class Result:
     displacement_sensitivity : (n, p) derivative of the displacement, where a force drives the indenter.
     states : kept steps.
     completed, reason : False and why where the end of the history was not reached.
-    doubts : what is doubtful about it, by kind; ``warnings`` are their texts.
+    doubts : the warnings about it, by kind; ``warnings`` are their texts.
     statistics : steps, ``sunk_steps`` (deeper in the skin than allowed), ``unbalanced_steps`` (accepted at
         more than the tolerance), ``unsettled_steps`` (whose friction had not settled), ``penalty_per_mm``
         (the largest), newton_iterations, factorisations, multigrids (made, one for each matrix), solves,
@@ -128,7 +128,7 @@ class Result:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is doubtful about it, in words."""
+        """The texts of the warnings about it."""
         return tuple(doubt.text for doubt in self.doubts)
 
     @property

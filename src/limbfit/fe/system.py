@@ -58,11 +58,11 @@ class Increment:
 
     @property
     def lags(self) -> bool:
-        """Whether the step holds something constant that follows the displacement."""
+        """True if the step holds something constant that follows the displacement."""
         return bool(self.pressures) or any(grip is not None and grip.lags for grip in self.grips)
 
     def predict(self, tools: Sequence[Tool], du: Array) -> Increment:
-        """With the grips that their tangents foresee after a change ``du (r, 3)``; the ``tools`` as now."""
+        """With the grips that their tangents predict after a change ``du (r, 3)``; the ``tools`` as now."""
         if not any(self.grips):
             return self
         return replace(self, grips=tuple(g and g.predict(tool, du) for g, tool in zip(self.grips, tools)))
@@ -197,7 +197,7 @@ class System:
         return len(self.free)
 
     def fits(self, problem: Problem) -> bool:
-        """Whether this discretisation is also that of ``problem`` (the same mesh, supports and indenter)."""
+        """True if this discretisation is also that of ``problem`` (the same mesh, supports and indenter)."""
         mine = self.problem
         return (
             mine.mesh is problem.mesh
@@ -225,7 +225,7 @@ class System:
         return self.cells[cells], *own, self.fibres[cells], self.prestretch[cells]
 
     def map_cells(self, work: Callable[[slice], T]) -> list[T]:
-        """``work`` done on as many parts of the cells as there are threads, side by side."""
+        """The results of ``work`` on as many parts of the cells as there are threads, in parallel."""
         ends = np.linspace(0, len(self.cells), self.threads + 1).astype(int)
         parts = [slice(a, b) for a, b in pairwise(ends)]
         return [work(parts[0])] if len(parts) == 1 else list(get_thread_pool(self.threads).map(work, parts))

@@ -29,20 +29,8 @@ RINGS_MM, DIRECTIONS = (3.0, 8.0, 15.0), 8
 MOST_ASIDE = 0.25  # of a ring's radius: where the skin ends its nearest point is elsewhere
 
 
-def build_gauges(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
-    """The gauges of the model's ``layers``, in their order, then those of its ``skin_points``.
-
-    A point has one along each of the ``skin_axes``.
-
-    Raises
-    ------
-    ProblemError
-        For a layer that is not there, and a point that is not on the skin.
-    """
-    return (*_build_layer_gauges(model, mesh), *_build_skin_gauges(model, mesh))
-
-
 def _build_layer_gauges(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
+    """The gauges of the model's ``layers``, in their order."""
     if not model.layers:
         return ()
     found = {
@@ -59,6 +47,7 @@ def _build_layer_gauges(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
 
 
 def _build_skin_gauges(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
+    """The gauges of the model's ``skin_points``: of each point one along each of the ``skin_axes``."""
     if not model.skin_points:
         return ()
     found = find_skin_points(mesh, np.array(model.skin_points))
@@ -121,10 +110,11 @@ def observe_result(result: Result, model: SiteModel, times_s: Array) -> tuple[Ar
 
     Lengths, mm, count from touch-down. And derivatives (g, n, p) with respect to the solver's parameters,
     where the states have some. The result must hold all of its states (``store="all"``). Tissue that the
-    indenter has left comes back by and by, so readings go on where the force has ended.
+    indenter has left recovers gradually, so readings continue after the force has ended.
     """
     states = result.states
-    gauges = build_gauges(model, result.problem.mesh)
+    mesh = result.problem.mesh
+    gauges = (*_build_layer_gauges(model, mesh), *_build_skin_gauges(model, mesh))
     if not states:
         return np.zeros((model.gauges, len(times_s))), None
     values, slopes = _read_at_states(result, model.waves, [gauge.read for gauge in gauges])

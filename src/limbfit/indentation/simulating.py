@@ -70,7 +70,7 @@ class Simulation:
 
     Where a force drives the indenter, ``force_N`` is what answers to it: the displacement, mm.
 
-    Derivatives are in flat order, per kPa, -, -, s.  ``doubts``: what is doubtful about it, by kind.
+    Derivatives are in flat order, per kPa, -, -, s.  ``doubts``: the warnings about it, by kind.
     ``observed`` (g, n) is what else is seen, in rows: the thickness that each of the model's layers has lost,
     then the moves of each of its points of the skin along the model's axes, mm, and the speeds of its shear
     waves, m/s. ``observed_jacobian`` (g, n, p) are its derivatives.
@@ -89,7 +89,7 @@ class Simulation:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is doubtful about it, in words."""
+        """The texts of the warnings about it."""
         return tuple(doubt.text for doubt in self.doubts)
 
 

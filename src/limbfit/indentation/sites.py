@@ -44,7 +44,7 @@ from .waves import WavePlace
 
 RISE_S, REST_S = 2.0, 5.0  # muscle tenses, and rests tensed, before the indenter touches
 # Of the solver's tolerance: it is one of the reactions of all pins, of which the test pin's is a small part.
-FINELY = 0.1
+CLAMPED_TOLERANCE_SHARE = 0.1
 ROUGHLY = 3.0  # a percent of penetration costs half a percent of force (docs/contact.md)
 
 
@@ -90,7 +90,7 @@ class SiteModel:
 
     @property
     def forced(self) -> bool:
-        """Whether a force drives the indenter."""
+        """True if a force drives the indenter."""
         return bool(self.knots_N)
 
     @property
@@ -101,21 +101,14 @@ class SiteModel:
     @property
     def waits_s(self) -> float:
         """How long the limb is held before the indenter touches it, s: a result's times are later by that."""
-        return self._rise_s + self._rest_s
+        return sum(self._rise_and_rest_s)
 
     @property
-    def _rise_s(self) -> float:
-        """How long what holds and tenses the limb takes to rise, s."""
+    def _rise_and_rest_s(self) -> tuple[float, float]:
+        """How long what holds and tenses the limb takes to rise, and how long it acts before the touch, s."""
         if self.clamps is not None:
-            return self.clamps.clamping_s
-        return RISE_S if self.course else 0.0
-
-    @property
-    def _rest_s(self) -> float:
-        """How long it then acts before the indenter touches, s."""
-        if self.clamps is not None:
-            return self.clamps.settling_s
-        return REST_S if self.course else 0.0
+            return self.clamps.clamping_s, self.clamps.settling_s
+        return (RISE_S, REST_S) if self.course else (0.0, 0.0)
 
     @property
     def activation(self) -> Activation | None:
@@ -124,7 +117,7 @@ class SiteModel:
             return None
         times, shares = zip(*self.course, strict=True)
         late = [self.waits_s + t for t in times]
-        return Activation([0.0, self._rise_s, *late], [0.0, shares[0], *shares])
+        return Activation([0.0, self._rise_and_rest_s[0], *late], [0.0, shares[0], *shares])
 
     @property
     def bare(self) -> SiteModel:
@@ -287,7 +280,7 @@ def build_steps(model: SiteModel) -> StepControl:
     if model.within_mm is not None:
         control = replace(control, penetration=ROUGHLY * control.penetration)
     if model.clamps is not None:
-        control = replace(control, tolerance=FINELY * control.tolerance)
+        control = replace(control, tolerance=CLAMPED_TOLERANCE_SHARE * control.tolerance)
     if table.penalty_per_mm is None:
         return control
     return replace(control, penalty=table.penalty_per_mm, hold_penalty=True)

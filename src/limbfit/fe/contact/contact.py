@@ -192,7 +192,7 @@ class Touch:
         return self.stick + pushing * closed[:, None, None], forces
 
 
-def find_touching_offset(surface: ContactSurface, indenter: RigidShape, tolerance: float = 1e-9) -> float:
+def find_touching_offset(surface: ContactSurface, indenter: RigidShape) -> float:
     """Advance along the axis, mm, that brings the indenter to just touch the undeformed surface.
 
     From far outside it advances by the smallest distance, which cannot jump over the first touch, or by a
@@ -208,13 +208,13 @@ def find_touching_offset(surface: ContactSurface, indenter: RigidShape, toleranc
 
     while high < end and (distance := gap(high)) > 0.0:
         low, high = high, high + max(distance, least)
-    while high - low > tolerance:
+    while high - low > 1e-9:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if gap(middle) > 0.0 else (low, middle)
     return low
 
 
-def check_clear(surface: ContactSurface, indenter: RigidShape, name: str = "indenter") -> None:
+def check_clear(surface: ContactSurface, indenter: RigidShape, name: str) -> None:
     """Raise `ProblemError` where the body starts inside the undeformed tissue."""
     gaps = surface.gaps_at_rest(indenter)
     at = np.unravel_index(gaps.argmin(), gaps.shape)

@@ -6,7 +6,7 @@ it first touched.  With its move along the tangent plane, ``s = P (x - a)``, ``P
 by the contact's own penalty up to a slip of ``b`` mm, and beyond pulls with ``eps b`` whatever the slip.  In
 a step anchors, planes and bounds are constant, so this is a convex potential with a symmetric tangent.
 
-Its kink is sharp, ``b`` is thousandths of a mm: Newton's method with the second derivative does not foresee
+Its kink is sharp, ``b`` is thousandths of a mm: Newton's method with the second derivative does not predict
 that a slip turns round or ends, and then takes as many iterations as there are points that do.  So it is
 primal-dual (Chan, Golub and Mulet 1999): the part ``p`` of the slip that pulls, ``|s| p = b s``, is a
 variable of its own, with which the tangent of a point that slips is ``eps b / |s| (P - (p s^T + s p^T) / (2 b

@@ -64,7 +64,7 @@ def assemble(
 
 
 def is_compiled() -> bool:
-    """Whether the costliest kernel is at hand, in this process or stored on this machine."""
+    """True if the costliest kernel is at hand, in this process or stored on this machine."""
     stored = Path(_assemble.stats.cache_path or ".").glob(f"assembly.{_assemble.py_func.__name__}-*.nbi")
     return bool(_assemble.signatures) or any(stored)
 

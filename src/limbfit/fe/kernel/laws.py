@@ -53,7 +53,7 @@ class Laws:
 
     @property
     def has_fibres(self) -> bool:
-        """Whether a region has fibres."""
+        """True if a region has fibres."""
         return bool((self.fibre[:, ::2] > 0.0).any())
 
     @property

@@ -42,12 +42,12 @@ class LawTable:
 
     @property
     def has_fibres(self) -> bool:
-        """Whether the direction of its fibres matters."""
+        """True if the direction of its fibres matters."""
         return self.fibre[0] > 0.0 or self.active > 0.0
 
     @property
     def has_terms(self) -> bool:
-        """Whether the law is a sum of Ogden terms."""
+        """True if the law is a sum of Ogden terms."""
         return self.elastic is OGDEN
 
     @property

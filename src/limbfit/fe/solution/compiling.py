@@ -23,12 +23,12 @@ _TETS = np.array([[0, 3, 1, 7], [0, 2, 3, 7], [0, 6, 2, 7], [0, 4, 6, 7], [0, 5,
 
 
 def are_compiled() -> bool:
-    """Whether the two costliest kernels are stored on this machine; the others are made with them."""
+    """True if the two costliest kernels are stored on this machine; the others are made with them."""
     stored = Path(explicit_derivatives.stats.cache_path or ".")
     return is_compiled() and any(stored.glob(f"sensitivity.{explicit_derivatives.py_func.__name__}-*.nbi"))
 
 
-def compile_kernels(element: str = "tet10p0") -> None:
+def compile_kernels() -> None:
     """Compile what an indentation with a square punch, its derivatives and its fields need, and store it.
 
     That takes half a minute.  Kernels hold for every element and law: one small block meets them all.
@@ -47,7 +47,7 @@ def compile_kernels(element: str = "tet10p0") -> None:
         contact_faces=mesh.face_sets["skin"],
         indenter=Indenter("square", _SIDE_MM, 2.0, (10.0, 10.0, _SIDE_MM), (0.0, 0.0, -1.0)),
         history=History(np.array([0.0, 1.0]), np.array([0.0, _DEPTH_MM])),
-        element=element,
+        element="tet10p0",
     )
     found = solve(problem, steps=StepControl(times=(0.5, 1.0)), sensitivities=True)
     if found.deepest is not None:

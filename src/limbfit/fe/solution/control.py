@@ -35,15 +35,15 @@ class StepControl:
     ----------
     load_steps, unload_steps : steps of an indentation on the way in and on the way out, before any is cut.
     times : (k,) s, instead of the two numbers: exactly these steps (rest at 0 left out).
-    stress : how the elastic stress runs in a step: ``quadratic``, through the step before it, or ``linear``,
-        as FEBio has it (second order in the step instead of third).
+    stress : how the elastic stress changes in a step: ``quadratic``, through the step before it, or
+        ``linear``, as FEBio has it (second order in the step instead of third).
     tolerance : residual over reactions at equilibrium.
     max_iterations, most_iterations : of Newton's method in a step, and in all.
     max_cuts : how often a step may be cut, to 0.3 of it each time.
     penetration : largest penetration over the largest displacement; the penalty is raised beyond it.
     penalty : contact stiffness over the mean instantaneous shear modulus, 1/mm; None: 2000 / width.
     hold_penalty : it is never raised, so that forces of neighbouring parameters do not jump; a deeper
-        penetration is a doubt of the result.
+        penetration is a warning of the result.
     linear_solver : name in the solver table, multigrid (``tet10`` only), or auto.
     threads : of assembly and linear algebra.
     """
@@ -100,9 +100,9 @@ def schedule_steps(history: History, control: StepControl, turns: Sequence[float
 FROM_REST, AFTER_TURN = 1.2, 3.0
 REST_SHARE = 0.05  # of the deepest: an indenter that comes from there hardly touches
 # The step put in before contact ends is at one of so many even places in the step that was planned, the last
-# that is short of this share of the way to where the force is foreseen to vanish: places that do not move
-# with the parameters.  What is foreseen a little beyond the next step may come before it.
-PLACES, SHORT_OF_END, FORESIGHT = 4, 0.9, 1.1
+# that is short of this share of the way to where the force is predicted to vanish: places that do not move
+# with the parameters.  What is predicted a little beyond the next step may come before it.
+PLACES, SHORT_OF_END, LOOK_AHEAD = 4, 0.9, 1.1
 
 
 def grade_steps(history: History, load_steps: int, unload_steps: int) -> Array:
@@ -156,8 +156,8 @@ def predict_remaining_times(
     ahead = targets[0] - now
     if made + 1 + _count(phase, np.asarray(targets)) > allowed:
         return targets
-    end = _end_of_contact(phase, np.asarray(times), np.asarray(forces)) - now
-    if end < FORESIGHT * ahead:
+    end = _predict_contact_end(phase, np.asarray(times), np.asarray(forces)) - now
+    if end < LOOK_AHEAD * ahead:
         place = min(int(PLACES * SHORT_OF_END * end / ahead), PLACES - 1)
         targets[:0] = [now + ahead * place / PLACES] if place else []
     return targets
@@ -175,8 +175,8 @@ def _find_phase(history: History, now: float, target: float) -> MotionPhase | No
     return next((phase for phase in history.phases if phase.start_s <= middle <= phase.end_s), None)
 
 
-def _end_of_contact(phase: MotionPhase, times: Array, forces: Array) -> float:
-    """When the force is foreseen to vanish, s: its rate changes by the factor by which it changed last."""
+def _predict_contact_end(phase: MotionPhase, times: Array, forces: Array) -> float:
+    """When the force is predicted to vanish, s: its rate changes by the factor by which it changed last."""
     recent = np.flatnonzero(times >= phase.start_s * (1.0 - 1e-9))[-3:]
     if len(recent) < 3:
         return np.inf

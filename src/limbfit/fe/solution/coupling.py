@@ -158,9 +158,9 @@ def couple(
         direction = np.zeros(here.residual.size)
         direction[system.free] = d[:, 0]
         way, step = direction.reshape(u.shape), 1.0
-        foreseen = now.predict(system.tools(u, now), way)
+        predicted = now.predict(system.tools(u, now), way)
         for _ in range(MAX_CUTS):
-            there, at = evaluate_at(u + step * way, foreseen)
+            there, at = evaluate_at(u + step * way, predicted)
             if np.isfinite(at.energy):
                 break
             step *= 0.5

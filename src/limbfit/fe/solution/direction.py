@@ -1,4 +1,4 @@
-"""Newton's direction with the contact points that it closes and opens foreseen.
+"""Newton's direction, with a prediction of the contact points that it closes and opens.
 
 The set of closed points is iterated on the linear model (a primal-dual active set, Hintermueller, Ito and
 Kunisch 2003).  Each missed point would cost an assembly of all elements; here it costs a small dense
@@ -98,10 +98,10 @@ def _solve_with_contact(
             found = factor.refactor_and_solve(data, right, blocks, tolerance, found.x)
         if not found.convex and factor.lasting:
             found = _solve_for_descent(factor, data, right, blocks, tolerance)
-        foreseen = _find_closed(touch, bodies.move_springs(found.x[:, 0]))
-        if (foreseen == closed).all() or (factor.lasting and springs is None) or not found.convex:
+        predicted = _find_closed(touch, bodies.move_springs(found.x[:, 0]))
+        if (predicted == closed).all() or (factor.lasting and springs is None) or not found.convex:
             break
-        closed = foreseen
+        closed = predicted
     return found
 
 

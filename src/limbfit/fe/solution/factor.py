@@ -62,7 +62,7 @@ class Factor:
     """The linear algebra of one simulation: a factor of some earlier tangent and what to do with it.
 
     ``counts`` and ``seconds`` tell what was done.  ``name`` auto is `Multigrid` for quadratic tetrahedra,
-    unless they are few or the factor is to be ``lasting``, and factors are not dear here.
+    unless they are few or the factor is to be ``lasting``, and this machine's factorisations are not slow.
     ``moduli (r,)``: shear modulus of each region, MPa; ``steps``: of the simulation, as planned.
     """
 
@@ -120,12 +120,12 @@ class Factor:
 
     @property
     def shifted(self) -> bool:
-        """Whether what was factorised last had to be stiffened."""
+        """True if what was factorised last had to be stiffened."""
         return self._shift > 0.0
 
     @property
     def lasting(self) -> bool:
-        """Whether what was factorised is worth keeping for other matrices."""
+        """True if what was factorised is worth keeping for other matrices."""
         return self._solver.lasting
 
     @property
@@ -134,7 +134,7 @@ class Factor:
         return int(self._solver.worth) if self.lasting else MAX_CYCLES
 
     def is_worn(self) -> bool:
-        """Whether another step with this factor costs more than the steps since it was made did on average.
+        """True if another step with this factor costs more than the steps since it was made did on average.
 
         The optimal time to replace a machine whose running cost rises (Barlow and Proschan 1965).
         """

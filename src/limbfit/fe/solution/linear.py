@@ -50,7 +50,7 @@ NONE: Index = np.zeros(0, dtype=np.int32)
 class LinearSolver(ABC):
     """Analyse once, factorise often, solve oftener.
 
-    ``lasting``: whether a factorisation is worth keeping for other matrices; ``dear``: whether multigrid wins
+    ``lasting``: whether a factorisation is worth keeping for other matrices; ``slow``: whether multigrid wins
     at any size; ``worth``: its cost over that of one solution and one product with the matrix, estimated from
     the factor's entries (not timed: a run must be repeatable).
 
@@ -61,7 +61,7 @@ class LinearSolver(ABC):
 
     name: ClassVar[str]
     lasting: ClassVar[bool]
-    dear: ClassVar[bool]
+    slow: ClassVar[bool]
     worth: float
     transposed: ClassVar[bool] = False
     last: Index = NONE
@@ -107,7 +107,7 @@ class Pardiso(LinearSolver):
     """
 
     name = "pardiso"
-    lasting, dear, transposed = True, False, True
+    lasting, slow, transposed = True, False, True
 
     def __init__(
         self, indptr: Index, indices: Index, threads: int = 1, single: bool = False, last: Index = NONE
@@ -248,7 +248,7 @@ class Cholmod(_ByPattern):
     """Supernodal Cholesky by CHOLMOD, through scikit-sparse."""
 
     name = "cholmod"
-    dear = False
+    slow = False
     worth = 20.0
 
     def __init__(self, indptr: Index, indices: Index, *unused: Any) -> None:
@@ -274,7 +274,7 @@ class SuperLU(_ByPattern):
     """LU by SciPy's SuperLU: everywhere there is SciPy; slow, and blind to negative eigenvalues."""
 
     name = "superlu"
-    dear = True
+    slow = True
     worth = 40.0
     _factor: Any
 
@@ -313,8 +313,8 @@ def build_linear_solver(
 
 
 def prefers_multigrid() -> bool:
-    """Whether the only factorisations of this machine are much slower than multigrid."""
-    return build_linear_solver(np.arange(2, dtype=np.int32), np.zeros(1, dtype=np.int32)).dear
+    """True if the only factorisations of this machine are much slower than multigrid."""
+    return build_linear_solver(np.arange(2, dtype=np.int32), np.zeros(1, dtype=np.int32)).slow
 
 
 def multiply_symmetric(indptr: Index, indices: Index, data: Array, x: Array, threads: int = 1) -> Array:

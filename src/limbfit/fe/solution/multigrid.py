@@ -32,7 +32,7 @@ class Multigrid(LinearSolver):
     """
 
     name = "multigrid"
-    lasting, dear = False, False
+    lasting, slow = False, False
     worth = 4.0  # setting up costs about four cycles and products
 
     def __init__(self, system: System, threads: int = 1) -> None:

@@ -5,7 +5,7 @@ far: the next ones are damped by the stiffness of shear (`convexity`), more afte
 after every full one, as in a trust region (Levenberg 1944, Marquardt 1963).
 
 Bodies that a force drives would follow a direction by millimetres in one step, but which points will touch is
-foreseen on flat faces and for small moves only.  So their moves are bounded, by a share of their width.
+predicted on flat faces and for small moves only.  So their moves are bounded, by a share of their width.
 
 A guess lies deep in the indenter, and a rounded edge that presses on it that hard makes a tangent of large
 negative eigenvalues, pressure over radius, which say nothing of the equilibrium.  So far from it the edge is
@@ -31,8 +31,10 @@ from .linear import NotPositiveDefiniteError
 # A shorter step damps the next directions, at first by this share of each tissue's own shear modulus; it is
 # changed by a factor, and less than the smallest is none.
 SHORT_STEP, FIRST_DAMPING, DAMPING_CHANGE, LEAST_DAMPING = 0.3, 0.1, 4.0, 0.02
-# Times the tolerance: a residual that is taken where the line search finds no lower energy; it is told.
+# Times the tolerance: a residual that is accepted, with a warning, where the line search finds no lower
+# energy.
 LOOSE_FACTOR = 100.0
+MAX_BACKTRACKS = 12  # of a line search
 NEAR_EQUILIBRIUM = 0.1  # residual over reactions from which the tangent is the exact one
 MIN_FORCE_N = 1e-300  # N; before the first touch there are no reactions
 
@@ -48,7 +50,6 @@ class NewtonControl:
 
     tolerance: float = 3e-5
     max_iterations: int = 30
-    max_backtracks: int = 12
     damping: float = 0.0
     reduction: float = 0.0
     max_penetration: float = np.inf
@@ -81,7 +82,7 @@ def equilibrate(
     """Minimise the potential of ``increment`` from the first of the ``guesses`` (n, 3), or a better one.
 
     Supported components of the guesses are in place; ``floor`` (N) is the smallest force against which the
-    residual is judged, ``deep`` (mm) the penetration from which a guess is doubted.
+    residual is judged, ``deep`` (mm) the penetration from which other guesses are tried.
     """
     evaluate = _Evaluator(system, laws, increment, seconds)
     u, here = _select_lowest(evaluate, guesses, deep)
@@ -115,7 +116,7 @@ def equilibrate(
             direction = system.bodies.compute_trusted_share(direction) * direction
         evaluate.predict_friction(u, direction)
         wants_tangent = control.tangent or forcing > sufficient
-        found = _search_along_line(evaluate, u, here, direction, control.max_backtracks, wants_tangent)
+        found = _search_along_line(evaluate, u, here, direction, wants_tangent)
         if found is None:
             if norm <= LOOSE_FACTOR * control.tolerance * scale:
                 return Equilibrium(u, here, iteration, damped=damped, residual=share, first=first)
@@ -170,7 +171,7 @@ class _Evaluator:
         self._increment = replace(self._increment, flat_from=np.inf)
 
     def predict_friction(self, u: Array, direction: Array) -> None:
-        """From here on with the pulls of friction that the tangent at ``u`` foresees for a full step."""
+        """From here on with the pulls of friction that the tangent at ``u`` predicts for a full step."""
         now = self._increment
         self._increment = now.predict(self._system.tools(u, now) if any(now.grips) else [], direction)
 
@@ -186,7 +187,6 @@ def _search_along_line(
     u: Array,
     here: Evaluation,
     direction: Array,
-    max_backtracks: int,
     wants_tangent: bool,
 ) -> tuple[Array, Evaluation, float] | None:
     """Backtrack until the energy falls (Armijo), or nearly so where the slope does (Hager and Zhang 2005).
@@ -199,7 +199,7 @@ def _search_along_line(
         return None
     noise = 1e-11 * abs(here.energy)
     step = 1.0
-    for _ in range(max_backtracks):
+    for _ in range(MAX_BACKTRACKS):
         there = evaluate(u + step * direction, tangent=wants_tangent and step == 1.0)
         if not np.isfinite(there.energy):
             step *= 0.4

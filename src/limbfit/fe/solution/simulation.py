@@ -31,7 +31,6 @@ from .start import (
     build_grips,
     compute_elastic_residual,
     measure_indenter_travel,
-    start_grips,
 )
 from .warm_start import WarmStart, compute_extrapolation
 
@@ -65,7 +64,7 @@ class SteppedRun:
         problem: Problem,
         control: StepControl,
         sensitivities: bool,
-        warm_start: Result | None,
+        warm_start: Result | None = None,
         system: System | None = None,
     ) -> None:
         started = time.perf_counter()
@@ -87,7 +86,6 @@ class SteppedRun:
         self.memory = Memory.rest(self.system, self.laws)
         self.slope = MemoryDerivative.rest(self.system, self.laws) if sensitivities else None
         self.damping = 0.0  # to begin a step with, after one that needed it
-        self.grips = build_grips(self.system, self.laws.count if sensitivities else 0)
         self.warm = WarmStart.of(problem, warm_start)
         widths = [body.shape.width for body in problem.rigid_bodies]
         width = min(widths, default=1.0)
@@ -102,7 +100,8 @@ class SteppedRun:
         self.rest = self._read_coordinates(rest, drives)
         self.rested: Array | None = None  # the same where pre-strained tissue is in equilibrium
         start = problem.history.displacement_at(0.0)
-        self.grips = start_grips(self.system, self.grips, rest, drives)
+        parameters = self.laws.count if sensitivities else 0
+        self.grips = build_grips(self.system, parameters, rest, drives)
         self.states = [self._build_state(0.0, start, rest, self.stiffness, still, None, drives, self.grips)]
         self.takeover = None
         if still is not None:
@@ -158,7 +157,7 @@ class SteppedRun:
             self.takeover = self.takeover.update(took, self.system.bodies, step.state, self.laws.modulus)
 
     def _equilibrate_prestretch(self) -> bool:
-        """Whether pre-strained tissue is brought to the equilibrium that it has had long since."""
+        """True if pre-strained tissue is brought to the equilibrium that it has had long since."""
         strained = compute_elastic_residual(self.system, self.laws, self.states[0])
         self.floor = max(self.floor, 1e-2 * strained)  # it may be left without any stress
         with limit_numpy_threads():
@@ -244,7 +243,7 @@ class SteppedRun:
         return replace(found, reason=found.reason or reason, unsettled=unsettled), increment
 
     def _is_spent(self) -> bool:
-        """Whether no more Newton iterations are allowed, those that led nowhere counted."""
+        """True if no more Newton iterations are allowed, those that led nowhere counted."""
         used = self.counts["newton_iterations"] + self.counts["vain_iterations"]
         return used >= self.control.most_iterations
 
@@ -365,7 +364,7 @@ class SteppedRun:
         )  # fmt: skip
 
     def _has_turned(self, t: float, force: float) -> bool:
-        """Whether the stress after a step to ``t`` does not go on as it went before: the indenter turned, or
+        """True if the stress after a step to ``t`` does not go on as it went before: the indenter turned, or
         contact began or ended."""
         met, self.pushing = (force > 0.0) != self.pushing, force > 0.0
         touched = self.states[-1].time > self.problem.touch_down_s * (1.0 + 1e-9)

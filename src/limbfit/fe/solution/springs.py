@@ -23,9 +23,10 @@ Single = NDArray[np.float32]
 Bools = NDArray[np.bool_]
 # Smaller changes, relative to the stiffest spring, are left to the iteration.
 NOTABLE_CHANGE = 0.03
-# More columns than this make the dense solutions dear.
+# With more columns than this the dense solutions cost too much.
 MAX_COLUMNS = 500
-# Over the power 2/3 of all unknowns, as a cut across the body has: with more, the factor itself gets dear.
+# Over the power 2/3 of all unknowns, as a cut across the body has: with more, the factor itself costs too
+# much.
 MAX_LAST = 1.5
 
 
@@ -103,8 +104,8 @@ class SpringColumns:
     def _complete(self, wanted: Bools, most: int) -> bool:
         """Make the columns that are missing, unless they would be too many in all."""
         new = [key for key in zip(*map(np.ndarray.tolist, np.nonzero(wanted))) if key not in self.keys]
-        dear = sum(not self.inner[point] for point, _ in (*self.keys, *new))
-        if dear > most or len(self.keys) + len(new) > max(most, MAX_COLUMNS):
+        costly = sum(not self.inner[point] for point, _ in (*self.keys, *new))
+        if costly > most or len(self.keys) + len(new) > max(most, MAX_COLUMNS):
             return False
         for inner in (True, False):
             self._add([key for key in new if self.inner[key[0]] == inner], inner)

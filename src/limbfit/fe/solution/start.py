@@ -8,7 +8,6 @@ there. That place follows the parameters, and so its derivative enters all other
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,27 +55,23 @@ def measure_indenter_travel(system: System, modulus: float) -> float:
     return max(min(way, width / 2) for way, width in zip(pushed, widths)) or max(widths) / 2
 
 
-def build_grips(system: System, parameters: int) -> tuple[StickyContact | None, ...]:
-    """What holds the points of each body at first; None where nothing ever does."""
-    found: list[StickyContact | None] = []
-    for body in [] if system.bodies is None else system.bodies.all:
+def build_grips(
+    system: System, parameters: int, u: Array, drives: Drives
+) -> tuple[StickyContact | None, ...]:
+    """What holds the points of each body at first, where it is at rest; None where nothing ever does."""
+    grips: list[StickyContact | None] = []
+    tools = [] if system.bodies is None else system.bodies.tools(u, drives)
+    for body, tool in zip([] if system.bodies is None else system.bodies.all, tools, strict=True):
         friction = body.stated.friction
         if friction in ("frictionless", 0.0):
-            found.append(None)
+            grips.append(None)
         elif isinstance(friction, str):
-            found.append(Anchors.none(body.surface, parameters))
+            grips.append(Anchors.none(body.surface, parameters))
         else:
             law = LAWS_OF_STICKING[body.stated.sticking]
-            found.append(law.none(float(friction), body.surface, parameters, body.stated.holding))
-    return tuple(found)
-
-
-def start_grips(
-    system: System, grips: Sequence[StickyContact | None], u: Array, drives: Drives
-) -> tuple[StickyContact | None, ...]:
-    """The grips with which a run begins, its bodies at rest where they start."""
-    tools = [] if system.bodies is None else system.bodies.tools(u, drives)
-    return tuple(grip and grip.start(tool) for grip, tool in zip(grips, tools, strict=True))
+            grip = law.none(float(friction), body.surface, parameters, body.stated.holding)
+            grips.append(grip.start(tool))
+    return tuple(grips)
 
 
 def compute_tangent_at_rest(system: System) -> Array:

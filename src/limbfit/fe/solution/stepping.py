@@ -43,11 +43,7 @@ _PARTS = ("memory", "slope", "pace", "takeover")
 
 
 def iterate(
-    problem: Problem,
-    steps: StepControl = StepControl(),
-    sensitivities: bool = False,
-    warm_start: Result | None = None,
-    system: System | None = None,
+    problem: Problem, steps: StepControl = StepControl(), sensitivities: bool = False
 ) -> Iterator[Step]:
     """Accepted steps of a simulation, one by one; ends early where no step converges.
 
@@ -56,7 +52,7 @@ def iterate(
     ProblemError
         Before anything is solved, where the problem is impossible as stated.
     """
-    yield from SteppedRun(problem, steps, sensitivities, warm_start, system).run()
+    yield from SteppedRun(problem, steps, sensitivities).run()
 
 
 def solve(
@@ -92,7 +88,7 @@ def solve(
         on is no error: the result says ``completed = False`` and why.
     """
     if (checkpoints or begin) and (problem.indenter is not None or steps.times is None):
-        raise ProblemError("only a simulation without an indenter and with stated times can be gone on with")
+        raise ProblemError("only a simulation without an indenter and with stated times can be resumed")
     started = time.perf_counter()
     run = SteppedRun(problem, steps, sensitivities, warm_start, system)
     rows: list[Step] = []
@@ -185,7 +181,7 @@ def solve_until_onset(problem: Problem, steps: StepControl = StepControl()) -> F
     ProblemError
         Where the problem is impossible as stated, and where that is not reached.
     """
-    run = SteppedRun(problem, steps, False, None)
+    run = SteppedRun(problem, steps, False)
     start, first = run.rest, None
     for step in run.run():
         if first is None:
@@ -244,7 +240,7 @@ def _build_result(
 def _collect_warnings(
     run: SteppedRun, deepest: State | None, displacement: Array, force: Array, penetration: Array
 ) -> tuple[SimulationWarning, ...]:
-    """What is doubtful about the steps of a run, of which ``deepest`` is the one farthest in."""
+    """The warnings about the steps of a run, of which ``deepest`` is the one farthest in."""
     folds: tuple[SimulationWarning, ...] = ()
     system = run.system
     if deepest is not None:

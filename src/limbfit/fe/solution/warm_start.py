@@ -16,7 +16,7 @@ _SAME_S = 1e-9
 
 
 def compute_extrapolation(travels: Sequence[float], travel: float) -> Array:
-    """Weights (k,) of the last states' fields, at ``travels (k,)`` of the indenter, that foresee that at
+    """Weights (k,) of the last states' fields, at ``travels (k,)`` of the indenter, that predict the field at
     ``travel`` mm.
 
     Quadratic in the travel while it goes on steadily; linear where it has just turned or leaps.
