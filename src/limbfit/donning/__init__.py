@@ -1,6 +1,6 @@
-"""A limb in its socket: donned, held, loaded; pressure and shear on it, and where the socket goes.
+"""A limb in its socket while it is donned, held and loaded: pressure, shear, strain, and the socket's motion.
 
-Or the other way round: under a stated pressure, whose shape is a socket's.
+Also the reverse: a limb under a stated pressure, whose deformed surface is the shape of a socket.
 """
 
 from .model import Load, SocketFit, build_socket_problem, build_socket_steps

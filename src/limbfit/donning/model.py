@@ -43,7 +43,7 @@ class Load:
 
 @dataclass(frozen=True)
 class SocketFit:
-    """How a socket comes on a limb, and what it is loaded by then.
+    """How a socket is put on a limb, and its loads afterwards.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class SocketFit:
     proximal, anterior : (3,) unit vectors at right angles.
     friction : Coulomb's coefficient, or ``frictionless`` or ``sticky``.
     donning_s, hold_s : how long it grows, or slides on, and then rests.
-    travel_mm : it slides on from so far distal in its final shape; None: it grows where it is.
+    travel_mm : the distance over which it slides on in its final shape, from distal; None: it grows in place.
     """
 
     pivot: Array

@@ -24,10 +24,10 @@ class Motion:
 
     Parameters
     ----------
-    times : (n,) s, from 0.  One that stands twice ends what went before and begins what follows: there a
-        coordinate may go over from displacement to force, or back.
-    values : (n, 6) of the `COORDINATES`: mm and rad; of forced ones the force, N, or the moment, N mm.
-        Where a coordinate goes over to force (`then`), nan is the force that holds it then.
+    times : (n,) s, from 0.  A time that occurs twice ends one motion and begins the next: there a
+        coordinate may change from displacement to force, or back.
+    values : (n, 6) of the `COORDINATES`: mm and rad; of those driven by force, the force, N, or the moment,
+        N mm.  Where a coordinate changes to force (`then`), nan stands for the force that holds it then.
     forced : (6,), or (n - 1, 6) for each interval: which coordinates are driven by force; the others are
         held at their values.
     growth : (n,) how far the shape has grown, from 0, its ``clear`` one, to 1, its final one; 1 throughout
@@ -99,7 +99,7 @@ class Motion:
         )
 
     def delay(self, seconds: float) -> Motion:
-        """The same after so many seconds at its first values."""
+        """The same motion, begun so many seconds later; until then it stays at its first values."""
         if not seconds:
             return self
         times, forced = np.append(0.0, np.asarray(self.times) + seconds), np.asarray(self.forced)
@@ -107,7 +107,7 @@ class Motion:
         return Motion(times, values, np.vstack([forced[:1], forced]), np.append(growth[0], growth))
 
     def take_over_forces(self, t: float, reaction: Array) -> Motion:
-        """With forces (6,) where values begin to be forces at time ``t`` and are left open."""
+        """The motion with the ``reaction (6,)`` as the forces that begin at time ``t`` and were open."""
         here = np.isclose(self.times, t, rtol=1e-9, atol=0.0)[:, None] & np.isnan(self.values)
         return replace(self, values=np.where(here, reaction, self.values)) if here.any() else self
 
@@ -142,7 +142,7 @@ class Motion:
         return found[:6], np.asarray(self.forced)[i], float(found[6])
 
     def moving_s(self, t: float) -> float:
-        """How long anything has changed up to time ``t``, s."""
+        """For how long anything has changed up to time ``t``, s."""
         steps = np.diff(self.times)
         moving = (np.diff(self._driven, axis=0) != 0.0).any(axis=1)
         return float((np.clip(t - self.times[:-1], 0.0, steps) * moving).sum())
@@ -154,7 +154,7 @@ class Motion:
 
     @property
     def turns(self) -> Array:
-        """Times between the ends where a rate changes, or what drives, s."""
+        """Times between the ends at which a rate, or what drives a coordinate, changes, s."""
         steps = np.diff(self.times)
         kept = steps > 0.0
         rates, forced = (
@@ -225,7 +225,7 @@ class RigidBody:
 
     @property
     def holding(self) -> float:
-        """The hardness, or what stands for it."""
+        """The hardness, or its default for the shape."""
         if self.hardness is not None:
             return self.hardness
         return HARDNESS_GROWING if self.shape.grows else 1.0

@@ -67,7 +67,7 @@ class History:
         return values
 
     def at(self, t: float | NDArray[np.float64]) -> NDArray[np.float64]:
-        """What drives it at time(s) ``t``: mm, or N where it is a force."""
+        """Displacement, mm, or force, N, that drives it at time(s) ``t``."""
         return np.asarray(np.interp(t, self.times, self.driver))
 
     def displacement_at(self, t: float) -> float:
@@ -76,7 +76,7 @@ class History:
 
     @cached_property
     def motion(self) -> Motion:
-        """As that of a rigid body."""
+        """The history as the motion of a rigid body."""
         values = np.zeros((len(self.times), 6))
         values[:, 2] = self.driver
         if self.across is not None:
@@ -91,16 +91,16 @@ class History:
         return x, y
 
     def travel(self, t: float) -> float:
-        """Driver and moves across together: what changes while the indenter moves in any direction."""
+        """The sum of driver and moves across, which changes while the indenter moves in any direction."""
         return float(self.at(t)) + sum(self.across_at(t))
 
     @cached_property
     def phases(self) -> tuple[MotionPhase, ...]:
-        """What the indenter does: loads, holds, unloads, in any number."""
+        """The phases of the indenter: loading, holding, unloading, in any number."""
         return find_phases(self.times, self.driver)
 
     def delay(self, seconds: float) -> History:
-        """The same after a rest of so many seconds."""
+        """The same history, begun so many seconds later."""
         if not seconds:
             return self
         values = {"displacement" if self.force is None else "force": np.append(self.driver[0], self.driver)}
@@ -217,7 +217,7 @@ class Problem:
         return Drives.of([body.motion for body in self.rigid_bodies], t)
 
     def take_over_forces(self, t: float, reactions: NDArray[np.float64]) -> Problem:
-        """With the ``reactions (b, 6)`` of the bodies at time ``t`` as the forces that are left open then."""
+        """The problem with the ``reactions (b, 6)`` of the bodies as the forces left open at time ``t``."""
         first = len(self.rigid_bodies) - len(self.bodies)
         moved = [body.motion.take_over_forces(t, reactions[first + i]) for i, body in enumerate(self.bodies)]
         if all(motion is body.motion for motion, body in zip(moved, self.bodies)):
@@ -226,7 +226,7 @@ class Problem:
         return replace(self, bodies=bodies)
 
     def delay(self, seconds: float) -> Problem:
-        """The same after so many seconds in which whatever drives it rests."""
+        """The same problem, begun so many seconds later; until then whatever drives it rests."""
         if not seconds:
             return self
         return replace(
@@ -239,7 +239,7 @@ class Problem:
         )
 
     def travel(self, t: float) -> float:
-        """What grows evenly while the indenter moves, or what drives bodies or activates tissue changes."""
+        """A measure that grows evenly while the indenter, further bodies or the activation change."""
         contracting = 0.0 if self.activation is None else self.activation.moving_s(t)
         return contracting + self.history.travel(t) + sum(b.motion.moving_s(t) for b in self.bodies)
 
@@ -249,7 +249,7 @@ class Problem:
 
     @property
     def turns(self) -> NDArray[np.float64]:
-        """Times where what drives a further body, a pressure or the activation turns or contact begins, s."""
+        """Times at which a further body, a pressure or the activation turns, or contact begins, s."""
         knots = [np.asarray(one.times)[1:-1] for one in self.pressures]
         if self.touch_down_s:
             knots.append(np.array([self.touch_down_s]))
@@ -316,7 +316,7 @@ class Activation:
         return Activation(np.append(0.0, times + seconds), np.append(shares[0], shares))
 
     def moving_s(self, t: float) -> float:
-        """How long the share has changed up to time ``t``, s."""
+        """For how long the share has changed up to time ``t``, s."""
         times, steps = np.asarray(self.times), np.diff(self.times)
         return float((np.clip(t - times[:-1], 0.0, steps) * (np.diff(self.shares) != 0.0)).sum())
 

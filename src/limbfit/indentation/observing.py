@@ -1,8 +1,8 @@
-"""What is seen of a limb beside the force: layers that become thinner, skin that moves, waves.
+"""What is observed of a limb beside the force: layers that become thinner, skin that moves, waves.
 
-Ultrasound through the indenter sees the interfaces between tissues on its axis, cameras see the skin around
-it. Both are followed as material points (`mesh.gauges`, `find_skin_points`). Their displacement is that of
-the steps, and so are its derivatives, exact as those of the force are. Speeds follow from both (`waves`).
+Ultrasound through the indenter shows the interfaces between tissues on its axis, cameras show the skin around
+it. Both are followed as material points (`mesh.gauges`, `find_skin_points`), whose displacements and exact
+derivatives come from the steps. Speeds of waves follow from both (`waves`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ..study import Vector
 from .sites import SiteModel, read_indenter
 from .waves import WavePlace, compute_wave_speeds, place_waves, to_vector3
 
-OFF_SKIN_MM = 5.0  # farther from the skin than that is no point of it
+OFF_SKIN_MM = 5.0  # a point farther from the skin than this is not on it
 RINGS_MM, DIRECTIONS = (3.0, 8.0, 15.0), 8
 MOST_ASIDE = 0.25  # of a ring's radius: where the skin ends its nearest point is elsewhere
 
@@ -106,11 +106,12 @@ def find_nearby_skin_points(model: SiteModel) -> tuple[Vector, ...]:
 
 
 def observe_result(result: Result, model: SiteModel, times_s: Array) -> tuple[Array, Array | None]:
-    """What is seen at times (n,) s from touch-down, in the order of `Simulation.observe_result`: (g, n).
+    """What is observed at times (n,) s from touch-down, in the order of `Simulation.observed`: (g, n).
 
-    Lengths, mm, count from touch-down. And derivatives (g, n, p) with respect to the solver's parameters,
-    where the states have some. The result must hold all of its states (``store="all"``). Tissue that the
-    indenter has left recovers gradually, so readings continue after the force has ended.
+    Lengths, mm, count from touch-down. The second array holds the derivatives (g, n, p) with respect to the
+    solver's parameters; None where the states have none. The result must hold all of its states
+    (``store="all"``). Tissue that the indenter has left recovers gradually, so readings continue after the
+    force has ended.
     """
     states = result.states
     mesh = result.problem.mesh

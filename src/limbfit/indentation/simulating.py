@@ -1,4 +1,4 @@
-"""Simulations of a site, as jobs for any process; what a process keeps of a site between them.
+"""Simulations of a site as jobs for any process, and what a process keeps of a site between them.
 
 `simulate` is the one function that every stage, executor and phantom calls.
 """
@@ -34,7 +34,7 @@ from .sites import (
 
 @dataclass(frozen=True)
 class SimulationJob:
-    """A simulation to be done: parameters (flat over ``tissues``, kPa), the times of the wanted force.
+    """A simulation to be done: parameters (flat over ``tissues``, kPa), and the times of the force.
 
     ``starts``: other parameters, whose simulation gives the first guesses, and those that gave them theirs,
     the first from rest; several times quicker where they are near. Forces then differ within the solver's
@@ -66,14 +66,14 @@ class SimulationJob:
 
 @dataclass(frozen=True)
 class Simulation:
-    """What came back: force (n,) N and its derivatives (n, p) at the job's times.
+    """The result of a job: force (n,) N and its derivatives (n, p) at the job's times.
 
     Where a force drives the indenter, ``force_N`` is what answers to it: the displacement, mm.
 
-    Derivatives are in flat order, per kPa, -, -, s.  ``doubts``: the warnings about it, by kind.
-    ``observed`` (g, n) is what else is seen, in rows: the thickness that each of the model's layers has lost,
-    then the moves of each of its points of the skin along the model's axes, mm, and the speeds of its shear
-    waves, m/s. ``observed_jacobian`` (g, n, p) are its derivatives.
+    Derivatives are in flat order, per kPa, -, -, s.  ``doubts``: the warnings about it, by kind. ``observed``
+    (g, n) holds what else is observed, in rows: the thickness that each of the model's layers has lost, then
+    the moves of each of its points of the skin along the model's axes, mm, and the speeds of its shear waves,
+    m/s. ``observed_jacobian`` (g, n, p) are its derivatives.
     """
 
     site: str
@@ -160,7 +160,7 @@ def count_stored_nodes(memory: float, cores: int) -> int:
 
 @lru_cache(maxsize=64)
 def _estimate_yielding(model: SiteModel, tissues: tuple[str, ...]) -> float:
-    """How far reference tissue lets the indenter sink in, over the way, times the contact penalty (1/mm).
+    """Penetration of the indenter into reference tissue over its travel, times the contact penalty (1/mm).
 
     Over the penetration that is allowed it is the penalty, which all simulations of a site hold.  One that
     each found for itself would change in steps with the parameters, and the force by a percent with it; one

@@ -79,10 +79,10 @@ class SiteModel:
     extensions: tuple[Path, ...] = ()  # files that register what the study has of its own
     site: str = ""
     knots_N: tuple[float, ...] = ()
-    layers: tuple[str, ...] = ()  # tissues whose compression under the indenter is wanted, too
-    skin_points: tuple[Vector, ...] = ()  # points of the skin at rest, LPS mm, whose moves are, too
+    layers: tuple[str, ...] = ()  # tissues whose compression under the indenter is observed
+    skin_points: tuple[Vector, ...] = ()  # points of the skin at rest, LPS mm, whose moves are observed
     skin_axes: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # of moves
-    waves: tuple[WavePlace, ...] = ()  # where the speeds of shear waves are
+    waves: tuple[WavePlace, ...] = ()  # where the speeds of shear waves are observed
     clamps: ClampsTable | None = None  # pins that hold the limb, in a ring across ``along``
     along: Vector = (0.0, 0.0, 1.0)  # the limb's axis, proximally, across which the clamps are
     course: tuple[tuple[float, float], ...] = ()  # s from touch-down, and share of the active stress
@@ -95,12 +95,12 @@ class SiteModel:
 
     @property
     def gauges(self) -> int:
-        """How many numbers are wanted of every moment beside the force."""
+        """The number of values that are observed at every time beside the force."""
         return len(self.layers) + len(self.skin_axes) * len(self.skin_points) + len(self.waves)
 
     @property
     def waits_s(self) -> float:
-        """How long the limb is held before the indenter touches it, s: a result's times are later by that."""
+        """How long the limb is held before the indenter touches it, s; a result's times are later by it."""
         return sum(self._rise_and_rest_s)
 
     @property
@@ -112,7 +112,7 @@ class SiteModel:
 
     @property
     def activation(self) -> Activation | None:
-        """The share of the active stress: what it is at touch-down rises first, and rests."""
+        """The share of the active stress over time; it first rises to its value at touch-down, and rests."""
         if not self.course:
             return None
         times, shares = zip(*self.course, strict=True)
@@ -121,7 +121,7 @@ class SiteModel:
 
     @property
     def bare(self) -> SiteModel:
-        """The site where nothing moves the limb but the indenter."""
+        """The model of the site without clamps, activation and pre-stretch."""
         return replace(self, clamps=None, course=(), prestretch=())
 
     @property
@@ -183,9 +183,9 @@ def build_site_materials(model: SiteModel, parameters: Parameters) -> dict[str, 
 def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Problem:
     """The site's boundary-value problem: node sets ``fixed_*`` held, skin in contact with the indenter.
 
-    Only skin near the indenter enters the contact: what it cannot reach costs time for nothing. Where the
-    model goes no farther than ``within_mm``, so is the cut below the indenter. What holds the limb before
-    comes first, for `SiteModel.waits_s`.
+    Only skin near the indenter enters the contact; the rest would cost time for nothing. Where the model ends
+    at ``within_mm``, the cut below the indenter is held, too. What holds the limb acts first, for
+    `SiteModel.waits_s`.
     """
     load_extensions(model.extensions)
     cut, fibres = np.empty(0, dtype=np.int64), build_fibre_field(model.fibres, mesh)

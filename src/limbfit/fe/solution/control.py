@@ -209,19 +209,19 @@ class StepController:
         return self.usual * (PATIENCE if self.cuts >= CUTS_TO_PATIENCE else 1)
 
     def next_time(self, now: float, target: float) -> float:
-        """Where to go from ``now``, s; no step is made that is much shorter than the one before it."""
+        """The end of the next step from ``now``, s; no step is much shorter than the one before it."""
         left = target - now
         if left <= 1.3 * self.stride:
             return target
         return now + min(self.stride, 0.5 * left)
 
     def cut(self, now: float, t: float) -> None:
-        """The step to ``t`` failed."""
+        """Shorten the steps, after the one to ``t`` failed."""
         self.stride, self.until = CUT * (t - now), max(t, self.until)
         self.cuts += 1
 
     def accept(self, now: float, t: float, iterations: int) -> None:
-        """The step to ``t`` was made: beyond what had failed, steps grow again."""
+        """Lengthen the steps again, after one to ``t`` beyond those that had failed was made."""
         if iterations > self.usual:  # another equilibrium: what was hard before is behind
             self.stride, self.cuts = np.inf, 0
         elif t >= self.until:

@@ -183,11 +183,7 @@ class _Evaluator:
 
 
 def _search_along_line(
-    evaluate: _Evaluator,
-    u: Array,
-    here: Evaluation,
-    direction: Array,
-    wants_tangent: bool,
+    evaluate: _Evaluator, u: Array, here: Evaluation, direction: Array, wants_tangent: bool
 ) -> tuple[Array, Evaluation, float] | None:
     """Backtrack until the energy falls (Armijo), or nearly so where the slope does (Hager and Zhang 2005).
 

@@ -349,20 +349,25 @@ def _advance_derivative(  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True)
 class ForceTakeover:
-    """When each body's forces were taken over last, ``since (b,)`` s, not a number where never, and their
-    derivatives ``slopes (r - n, 3, p)`` in the rows of `System`, N over mm."""
+    """The forces that bodies took over from what held them, and their derivatives.
+
+    ``since (b,)``: when each body did so last, s; not a number where it never did.  ``slopes (r - n, 3, p)``:
+    derivatives of the forces in the rows of `System`, N over mm.
+    """
 
     since: Array
     slopes: Array
 
     @classmethod
     def none(cls, bodies: Sequence[RigidBody], slopes: Array) -> ForceTakeover:
-        """Of bodies that took nothing over; ``slopes`` are zeros."""
+        """That of bodies that have taken nothing over; ``slopes`` are zeros."""
         return cls(np.full(len(bodies), np.nan), slopes)
 
     def update(self, took: Sequence[bool], bodies: Bodies, state: State, modulus: float) -> ForceTakeover:
-        """When some bodies ``took (b,)`` over what held them in a state with derivatives; ``modulus`` is that
-        of the contact's stiffness, MPa."""
+        """The same after some bodies ``took (b,)`` over what held them in a state with derivatives.
+
+        ``modulus``: that to which the contact's stiffness is relative, MPa.
+        """
         assert state.bodies is not None
         since, slopes = self.since.copy(), self.slopes.copy()
         slopes_here = bodies.differentiate_holding_forces(state.drives, state.penalty * modulus, state.bodies)
@@ -372,7 +377,7 @@ class ForceTakeover:
         return replace(self, since=since, slopes=slopes)
 
     def remaining(self, rigid_bodies: Sequence[RigidBody], bodies: Bodies, t: float) -> Array:
-        """Derivatives (r - n, 3, p) of the forces that are left at time ``t`` of those taken over."""
+        """Derivatives (r - n, 3, p) of the part of the forces that is left at time ``t``."""
         shares = np.zeros(len(self.slopes))
         for body, since, rows in zip(rigid_bodies, self.since, bodies.own_rows, strict=True):
             shares[rows] = body.motion.remaining_share(since, t)

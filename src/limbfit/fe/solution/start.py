@@ -33,8 +33,10 @@ def compute_elastic_residual(system: System, laws: Laws, state: State) -> float:
 
 
 def measure_indenter_travel(system: System, modulus: float) -> float:
-    """The way against which penetration is judged, mm: the largest of a body that is driven by displacement,
-    or how deep the tissue at rest lies in what a body grows to.
+    """The travel against which penetration is judged, mm.
+
+    It is the largest travel of a body that is driven by displacement, or the depth of the tissue at rest in
+    what a body grows to.
 
     Where only forces drive bodies it is that of a flat punch on a half-space of the tissue's shear
     ``modulus``, ``F / (4 mu w)``, and no more than half a width.
@@ -94,7 +96,7 @@ class IndenterStart:
 
     Parameters
     ----------
-    waits : whether it is still clear of the tissue.
+    waits : True if it is still clear of the tissue.
     offset : mm along its axis.
     slope : (p,) derivative of the offset with respect to the parameters; None where it has none.
     """
@@ -105,14 +107,14 @@ class IndenterStart:
 
     @classmethod
     def of(cls, problem: Problem) -> IndenterStart:
-        """That with which a simulation begins."""
+        """The start of a simulation of a problem."""
         meets = problem.touch_down_s > 0.0 or (problem.prestretch is not None and problem.start == "touching")
         if problem.indenter is None or not meets:
             return cls()
         return cls(True, -CLEARANCE_WIDTHS * problem.indenter.width)
 
     def touch_down(self, system: System, u: Array, drives: Drives, du: Array | None) -> IndenterStart:
-        """It touches the tissue at ``u (r, 3)``, whose derivative is ``du (r, 3, p)``."""
+        """The start once it touches the tissue at ``u (r, 3)``, whose derivative is ``du (r, 3, p)``."""
         assert system.bodies is not None
         body = system.bodies.first
         surface = replace(body.surface, points=body.surface.points + u[: system.nodes])

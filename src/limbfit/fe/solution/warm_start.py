@@ -45,7 +45,7 @@ class WarmStart:
 
     @classmethod
     def of(cls, problem: Problem, result: Result | None) -> WarmStart:
-        """Those of a result on the same mesh, moved to the new parameters along their sensitivities."""
+        """The states of a result on the same mesh, moved to the new parameters along their sensitivities."""
         rows = count_body_rows(problem.rigid_bodies)
         shapes = [(state.u.shape, len(state.coordinates)) for state in result.states[:1]] if result else []
         if result is None or shapes != [(problem.mesh.points.shape, rows)]:
