@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -18,6 +19,7 @@ from ..._version import __version__
 from .storage import compute_digest, compute_file_digest
 
 PACKAGE = Path(__file__).parents[2]
+_DEFINITION = re.compile(r"^(?:def |class |async |@)", re.MULTILINE)
 _LAZY = "_HOME"  # name of the table of an ``__init__`` that loads its names when they are first used
 
 
@@ -62,54 +64,65 @@ def _find_closure(file: Path) -> tuple[Path, ...]:
 
 @dataclass(frozen=True)
 class _Module:
-    """What the text of a module says: its imports (place without suffix, name), strings, lazy names."""
+    """What the text of a module says: its imports (place without suffix, name), files that it names, lazy
+    names."""
 
-    file: Path
     imports: tuple[tuple[Path, str], ...]
-    strings: frozenset[str]
+    beside: tuple[Path, ...]
     lazy: dict[str, Path]
 
     @property
     def reached(self) -> list[Path]:
         """The files that this one needs."""
-        return [home for place, name in self.imports for home in _find_homes(place, name)] + self._beside()
-
-    def _beside(self) -> list[Path]:
-        """Files beside the module that it names in a string, and those in a folder that is no package."""
-        found = []
-        for name in self.strings & _list_names(self.file.parent):
-            place = self.file.parent / name
-            if place.is_file():
-                found.append(place)
-            elif not (place / "__init__.py").exists():
-                found += [path for path in place.rglob("*") if path.is_file()]
-        return found
-
-
-@cache
-def _list_names(folder: Path) -> frozenset[str]:
-    own = ("__init__.py", "__pycache__")
-    return frozenset(path.name for path in folder.iterdir() if path.name not in own)
+        return [home for place, name in self.imports for home in _find_homes(place, name)] + [*self.beside]
 
 
 @cache
 def _read(file: Path) -> _Module:
     imports: list[tuple[Path, str]] = []
-    strings: set[str] = set()
     lazy: dict[str, Path] = {}
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            strings.add(node.value)
-        elif isinstance(node, ast.Import):
+    text = file.read_text(encoding="utf-8")
+    for node in ast.walk(_parse_head(text)):
+        if isinstance(node, ast.Import):
             paths = [alias.name.split(".") for alias in node.names]
             imports += [(_place(path[:-1]), path[-1]) for path in paths if path[0] == PACKAGE.name]
         elif isinstance(node, ast.ImportFrom):
             place = _find_base(file, node)
             imports += [] if place is None else [(place, alias.name) for alias in node.names]
-        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == _LAZY:
+        elif isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == _LAZY:
             homes = ast.literal_eval(node.value) if isinstance(node.value, ast.Dict) else _read_stub(file)
             lazy = {name: file.parent.joinpath(*home.split(".")) for name, home in homes.items()}
-    return _Module(file, tuple(imports), frozenset(strings), lazy)
+    return _Module(tuple(imports), _find_beside(file, text), lazy)
+
+
+def _parse_head(text: str) -> ast.Module:
+    """What stands before the first function or class of a module: imports stand nowhere else, and reading the
+    rest takes most of the time."""
+    first = _DEFINITION.search(text)
+    try:
+        return ast.parse(text[: first.start()] if first else text)
+    except SyntaxError:  # that line was one of a string
+        return ast.parse(text)
+
+
+def _find_beside(file: Path, text: str) -> tuple[Path, ...]:
+    """Files beside the module that it names in a string, and those in a folder that is no package."""
+    names = {name for name in _list_names(file.parent) if name in text}
+    if not names:  # as a rule: it spares the walk through all expressions
+        return ()
+    values = (node.value for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Constant))
+    places = [file.parent / name for name in names.intersection(v for v in values if isinstance(v, str))]
+    inside = [path for place in places for path in place.rglob("*") if path.is_file()]
+    return (*(place for place in places if place.is_file()), *inside)
+
+
+@cache
+def _list_names(folder: Path) -> frozenset[str]:
+    """The files of a folder, and the folders in it that are no packages."""
+    own = ("__init__.py", "__pycache__")
+    return frozenset(
+        path.name for path in folder.iterdir() if path.name not in own and not (path / "__init__.py").exists()
+    )
 
 
 def _read_stub(file: Path) -> dict[str, str]:
