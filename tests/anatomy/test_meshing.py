@@ -18,7 +18,7 @@ from limbfit.anatomy.meshing.background import LAYER, build_box_grid, compute_in
 from limbfit.anatomy.meshing.curving import curve_diagonals
 from limbfit.anatomy.meshing.extrusion import build_columns
 from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, compute_signed_distance
-from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
+from limbfit.anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
 from limbfit.anatomy.meshing.meshreport import check_quality
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, read_surface
 from limbfit.errors import MeshingError, SurfaceError
@@ -45,9 +45,14 @@ def oblique() -> Anatomy:
 
 
 @pytest.fixture(scope="module")
-def meshed(oblique: Anatomy) -> tuple:
+def base(oblique: Anatomy) -> BaseMesh:
+    return build_base_mesh(oblique, COARSE)
+
+
+@pytest.fixture(scope="module")
+def meshed(oblique: Anatomy, base: BaseMesh) -> tuple:
     position, axis = site_of(oblique, np.array([1.0, 0.2, 0.1]), -35.0)
-    return *mesh_site(oblique, position, axis, COARSE), position
+    return *mesh_site(oblique, position, axis, COARSE, base), position
 
 
 def conforms(mesh: Mesh) -> None:
@@ -165,16 +170,19 @@ def test_elements_are_small_at_the_site_and_large_far_away(meshed: tuple) -> Non
     assert edges[distance > 40].mean() > 1.4 * edges[distance < 10].mean()
 
 
-def test_curved_elements_follow_the_skin_better_than_straight_ones(meshed: tuple, oblique: Anatomy) -> None:
+def test_curved_elements_follow_the_skin_better_than_straight_ones(
+    meshed: tuple, oblique: Anatomy, base: BaseMesh
+) -> None:
     _, report, position = meshed
     axis = site_of(oblique, np.array([1.0, 0.2, 0.1]), -35.0)[1]
-    _, straight = mesh_site(oblique, position, axis, replace(COARSE, curved=False))
+    _, straight = mesh_site(oblique, position, axis, replace(COARSE, curved=False), base)
     assert abs(report.volume_error) < abs(straight.volume_error) / 2
 
 
 def test_shallow_bone_is_trimmed_and_reported() -> None:
     deep, shallow = limb(), limb(bone_offset=19.0)
-    assert build_base_mesh(deep, COARSE).trimmed["tibia"].volume_mm3 == 0.0
+    fields = build_limb_fields(deep, COARSE.layers, COARSE.bone_clearance_mm)
+    assert fields.trimmed()["tibia"].volume_mm3 == 0.0
     position, axis = site_of(shallow, np.array([1.0, 0, 0]), -40.0)
     mesh, report = mesh_site(shallow, position, axis, COARSE)
     trimmed = report.trimmed_bone["tibia"]
@@ -224,10 +232,10 @@ def test_settled_cells_have_the_exact_sign_and_band() -> None:
     assert (np.abs(found[~inside]) > 5.0).all()
 
 
-def test_a_mesher_that_takes_too_long_is_stopped(oblique: Anatomy) -> None:
+def test_a_mesher_that_takes_too_long_is_stopped(oblique: Anatomy, base: BaseMesh) -> None:
     position, axis = site_of(oblique, np.array([1.0, 0, 0]), -35.0)
     with pytest.raises(MeshingError, match=r"did not end in 0\.05 s"):
-        mesh_site(oblique, position, axis, replace(COARSE, time_limit_s=0.05))
+        mesh_site(oblique, position, axis, replace(COARSE, time_limit_s=0.05), base)
 
 
 def test_a_mesher_that_crashes_is_an_error_not_a_crash() -> None:
@@ -262,16 +270,24 @@ def test_diagonals_follow_the_curved_edges_above_and_below() -> None:
     np.testing.assert_array_equal(found[upright & ~diagonal], 0.0)
 
 
-@pytest.mark.skipif(not OPENLIMB.is_dir(), reason="the shared mean limb is not beside the repository")
-@pytest.mark.parametrize("name", ["1", "4"])
-def test_real_mean_limb(name: str) -> None:
+REAL = replace(COARSE, edge_far_mm=18.0)
+
+
+@pytest.fixture(scope="module")
+def mean_limb() -> tuple[Anatomy, BaseMesh]:
     bones = {bone: read_surface(OPENLIMB / f"{bone}.stl") for bone in ("tibia", "fibula")}
     anatomy = Anatomy(
         read_surface(OPENLIMB / "skin.stl"), bones, np.array([0, 0, 5.0]), np.array([0, 0, 1.0])
     )
+    return anatomy, build_base_mesh(anatomy, REAL)
+
+
+@pytest.mark.skipif(not OPENLIMB.is_dir(), reason="the shared mean limb is not beside the repository")
+@pytest.mark.parametrize("name", ["1", "4"])
+def test_real_mean_limb(mean_limb: tuple[Anatomy, BaseMesh], name: str) -> None:
     site = json.loads((OPENLIMB / "sites.json").read_text(encoding="utf-8"))["sites"][name]
-    settings = replace(COARSE, edge_far_mm=18.0)
-    mesh, report = mesh_site(anatomy, np.array(site["position"]), np.array(site["axis"]), settings)
+    place = np.array(site["position"]), np.array(site["axis"])
+    mesh, report = mesh_site(mean_limb[0], *place, REAL, mean_limb[1])
     conforms(mesh)
     assert report.min_dihedral_deg >= 8.0
     assert abs(report.volume_error) < 0.005
@@ -280,9 +296,9 @@ def test_real_mean_limb(name: str) -> None:
 
 
 @pytest.mark.skipif(find_spec("netgen") is None, reason="netgen-mesher is not installed")
-def test_netgen_makes_the_same_limb(oblique: Anatomy, meshed: tuple) -> None:
+def test_netgen_makes_the_same_limb(oblique: Anatomy, base: BaseMesh, meshed: tuple) -> None:
     position, axis = site_of(oblique, np.array([1.0, 0.2, 0.1]), -35.0)
-    mesh, report = mesh_site(oblique, position, axis, replace(COARSE, engine="netgen"))
+    mesh, report = mesh_site(oblique, position, axis, replace(COARSE, engine="netgen"), base)
     conforms(mesh)
     assert measure_quality(mesh).inverted == 0
     assert report.engine == "netgen"
@@ -295,8 +311,10 @@ def test_netgen_makes_the_same_limb(oblique: Anatomy, meshed: tuple) -> None:
         assert np.abs(found.mean(axis=0) - meshed[0].points[nodes].mean(axis=0)).max() < 3.0
 
 
-def test_a_mesher_that_is_not_installed_is_named(oblique: Anatomy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mesher_that_is_not_installed_is_named(
+    oblique: Anatomy, base: BaseMesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(engines, "find_spec", lambda name: None)
     position, axis = site_of(oblique, np.array([1.0, 0, 0]), -35.0)
     with pytest.raises(MeshingError, match=r"Netgen is not installed; install it with  pip install"):
-        mesh_site(oblique, position, axis, replace(COARSE, engine="netgen"))
+        mesh_site(oblique, position, axis, replace(COARSE, engine="netgen"), base)

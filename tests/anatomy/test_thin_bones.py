@@ -9,7 +9,7 @@ from bodies import limb, revolved
 from limbfit.anatomy.meshing import meshing
 from limbfit.anatomy.meshing.background import compute_volumes
 from limbfit.anatomy.meshing.layers import build_limb_fields
-from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
+from limbfit.anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface
 
 RADIUS, AT = 4.0, np.array([-17.0, 0.0, 0.0])
@@ -27,12 +27,19 @@ def thin() -> Anatomy:
     return Anatomy(whole.skin, {**whole.bones, "fibula": fibula}, whole.cut_point, whole.cut_normal)
 
 
-def test_the_base_keeps_a_bone_half_as_thick_as_its_grid_is_wide(thin: Anatomy) -> None:
+@pytest.fixture(scope="module")
+def base(thin: Anatomy) -> BaseMesh:
+    return build_base_mesh(thin, COARSE)
+
+
+def test_the_base_keeps_a_bone_half_as_thick_as_its_grid_is_wide(thin: Anatomy, base: BaseMesh) -> None:
     """The volume that it takes from the core is three quarters of its own; an even grid keeps a third."""
     assert COARSE.base_spacing_mm > 1.85 * RADIUS
     without = Anatomy(thin.skin, {"tibia": thin.bones["tibia"]}, thin.cut_point, thin.cut_normal)
-    core = [np.abs(compute_volumes(base.grid.points, base.grid.tets)).sum()
-            for base in (build_base_mesh(without, COARSE), build_base_mesh(thin, COARSE))]  # fmt: skip
+    core = [
+        np.abs(compute_volumes(made.grid.points, made.grid.tets)).sum()
+        for made in (build_base_mesh(without, COARSE), base)
+    ]
     own = np.pi * RADIUS**2 * 60.0
     assert 0.75 * own < core[0] - core[1] < 1.05 * own
 
@@ -45,9 +52,11 @@ def test_only_thin_bone_is_found_thin(thin: Anatomy) -> None:
     assert (meshing.find_thin_bone(fields, 2.0)[:, 2] < -58.0).all()  # its tip at most
 
 
-def test_a_mesh_that_lost_a_bone_says_so(thin: Anatomy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mesh_that_lost_a_bone_says_so(
+    thin: Anatomy, base: BaseMesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
     position, axis = thin.cut_point + np.array([-31.0, 0.0, -30.0]), np.array([1.0, 0.0, 0.0])
-    _, report = mesh_site(thin, position, axis, COARSE)
+    _, report = mesh_site(thin, position, axis, COARSE, base)
     assert "loses" not in " ".join(report.warnings)
     monkeypatch.setattr(meshing, "MAX_HALVINGS", 0)
     _, report = mesh_site(thin, position, axis, COARSE)

@@ -208,20 +208,19 @@ def test_a_held_strain_relaxes_as_the_closed_form(law):
 
 
 @every_law
-def test_every_parameter_of_a_simulation_has_its_sensitivity(law):
+def test_a_simulation_has_the_sensitivities_of_its_law(law):
+    """Along one direction of all parameters of the law."""
     problem = punch("tet4", 2, 1, materials={"skin": law, "muscle": SAMPLES["paper"]})
     control = StepControl(load_steps=4, unload_steps=3, tolerance=1e-11)
     centre = solve(problem, control, sensitivities=True, store="all")
     values = np.array(law.parameters)
-    for j in range(len(values)):
-        h, forces = 1e-4 * abs(values[j]), []
-        for sign in (1, -1):
-            skin = moved(law, values + sign * h * np.eye(len(values))[j])
-            changed = problem.with_materials({**problem.materials, "skin": skin})
-            forces.append(solve(changed, control, warm_start=centre).force)
-        difference = (forces[0] - forces[1]) / (2 * h)
-        error = np.abs(difference - centre.force_sensitivity[:, j]).max()
-        assert error <= 1e-4 * np.abs(difference).max(), law.parameter_names[j]
+    change = 1e-4 * values * np.random.default_rng(3).uniform(-1, 1, len(values))
+    ahead, back = (
+        solve(problem.with_materials({**problem.materials, "skin": skin}), control, warm_start=centre).force
+        for skin in (moved(law, values + sign * change) for sign in (1, -1))
+    )
+    difference, slope = (ahead - back) / 2, centre.force_sensitivity[:, : len(values)] @ change
+    assert np.abs(difference - slope).max() <= 1e-4 * np.abs(difference).max()
 
 
 @pytest.mark.parametrize("law", sorted(VOLUMETRIC_LAWS))

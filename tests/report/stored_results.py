@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 import pyvista as pv
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 
 from limbfit.mesh import Mesh, write_vtu
 
@@ -31,6 +34,23 @@ TWO = {
     "muscle": {"c_kPa": 4.43, "m": 4.97, "gamma": 2.24, "tau_s": 0.512},
 }
 NAMES = [f"{tissue}.{name}" for tissue in TRUTH for name in ("c_kPa", "m", "gamma", "tau_s")]
+
+
+def leave_unarranged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw without arranging labels and panels: it takes half of a report's time and changes no text."""
+    drawn = FigureCanvasSVG.print_svg
+
+    def print_svg(canvas: FigureCanvasSVG, *args: Any, **options: Any) -> None:
+        canvas.figure.set_layout_engine("none")
+        drawn(canvas, *args, **options)
+
+    monkeypatch.setattr(FigureCanvasSVG, "print_svg", print_svg)
+
+
+def remove_geometry(results: Path) -> None:
+    """Take away the meshes and surfaces, which only pictures need."""
+    for file in (*results.rglob("*.vtu"), *results.rglob("*.stl")):
+        file.unlink()
 
 
 def radius(z: np.ndarray) -> np.ndarray:

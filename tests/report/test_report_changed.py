@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from page_outline import Outline, section_of, without_scripts
-from stored_results import add_fat, write_results
+from stored_results import add_fat, leave_unarranged, remove_geometry, write_results
 
 from limbfit import compress_cube
 from limbfit.errors import InputError
@@ -20,14 +20,16 @@ SKIN = {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.5}
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_results(tmp_path_factory.mktemp("study") / "results")
+    written = write_results(tmp_path_factory.mktemp("study") / "results")
+    remove_geometry(written)
+    return written
 
 
 @pytest.fixture
-def copy(results: Path, tmp_path: Path) -> Path:
-    """The results without the geometry that only pictures need, to change and to break."""
-    left_out = shutil.ignore_patterns("report", "*.vtu", "*.stl")
-    return Path(shutil.copytree(results, tmp_path / "results", ignore=left_out))
+def copy(results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The results without what only pictures need, to change and to break."""
+    leave_unarranged(monkeypatch)
+    return Path(shutil.copytree(results, tmp_path / "results"))
 
 
 def test_three_tissues_stand_in_every_table_and_curve(copy: Path) -> None:

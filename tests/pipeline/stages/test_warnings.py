@@ -18,7 +18,7 @@ from limbfit.pipeline.simulation import simulations
 from limbfit.report import build_report
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "report"))
-from stored_results import write_results
+from stored_results import leave_unarranged, remove_geometry, write_results
 
 FOLD = SimulationWarning("folded", "7 elements are inside out at a node at 9.1 mm", 7, 9.1, 1.0)
 DOUBT = FOLD.text
@@ -39,8 +39,10 @@ def test_the_command_line_names_the_site(capsys):
     assert capsys.readouterr().err.strip() == f"warning: site tibia: {DOUBT}"
 
 
-def test_the_report_shows_them_and_counts_those_of_the_search(tmp_path):
+def test_the_report_shows_them_and_counts_those_of_the_search(tmp_path, monkeypatch):
     results = write_results(tmp_path / "results")
+    remove_geometry(results)
+    leave_unarranged(monkeypatch)
     file = results / "predict" / "predict.json"
     predicted = json.loads(file.read_text())
     predicted["sites"][0]["warnings"] = [DOUBT]
