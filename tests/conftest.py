@@ -110,6 +110,12 @@ def coarse_settings() -> str:
 
 
 @pytest.fixture
+def commands_unasked(monkeypatch) -> None:
+    """``limbfit check`` looks at the inputs alone: what commands would refuse takes half of its time."""
+    monkeypatch.setattr("limbfit.pipeline.verbs.check.list_refused_commands", lambda *given: [])
+
+
+@pytest.fixture
 def limbfit(monkeypatch, capsys):
     """Run a command; returns (exit code, standard output, standard error)."""
 

@@ -13,6 +13,7 @@ from limbfit import check_study, load_study
 from limbfit.errors import InputError, StudyError, TraceError
 from limbfit.traces import Trace, find_touch_down, interpret_record
 
+pytestmark = pytest.mark.usefixtures("commands_unasked")
 NOISE_N = 0.03
 
 

@@ -24,7 +24,7 @@ from limbfit.pipeline.variants.sensitivity import (
 from limbfit.pipeline.variants.variants import choose_sites
 from limbfit.study import IndenterTable, load_study
 
-SETTINGS = coarse_mesh("tet10", 9.0) + "[indenter]\nedge_radius_mm = 2.0\n"
+SETTINGS = coarse_mesh("tet4", 9.0) + "[indenter]\nedge_radius_mm = 2.0\n"
 SKIN = {"c_kPa": 6.0, "m": 6.0, "gamma": 1.0, "tau_s": 0.5}
 MUSCLE = {"c_kPa": 4.0, "m": 3.0, "gamma": 1.0, "tau_s": 0.5}
 

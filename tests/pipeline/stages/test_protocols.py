@@ -60,9 +60,9 @@ position = [0.0, 0.0, 0.0]
 """
 
 
-def write_record(file: Path, knots_s, knots_mm, force, slack_mm=0.36, slack_s=0.3) -> None:
+def write_record(file: Path, knots_s, knots_mm, force, slack_mm=0.36, slack_s=0.3, step_s=0.004) -> None:
     """What a robot writes down: slack before and after, noise of both sensors; ``force`` of the time."""
-    times = np.arange(0.0, knots_s[-1] + 2 * slack_s, 0.004)
+    times = np.arange(0.0, knots_s[-1] + 2 * slack_s, step_s)
     ends = np.r_[0.0, slack_s + np.array(knots_s), knots_s[-1] + 2 * slack_s]
     moved = np.interp(times, ends, np.r_[0.0, slack_mm + np.array(knots_mm), 0.0])
     pushed = np.where((times > slack_s) & (times < ends[-2]), force(times - slack_s), 0.0)
@@ -134,7 +134,8 @@ def test_check_tells_the_phases_of_a_record(study):
     times = {"1": PROTOCOLS["held"], "2": PROTOCOLS["cycles"]}
     for name, (knots_s, knots_mm, _) in times.items():
         depth = lambda t, s=knots_s, mm=knots_mm: np.interp(t, s, mm)  # noqa: E731
-        write_record(study / f"{name}.csv", knots_s, knots_mm, lambda t, d=depth: 0.6 * d(t) ** 1.3)
+        force = lambda t, d=depth: 0.6 * d(t) ** 1.3  # noqa: E731
+        write_record(study / f"{name}.csv", knots_s, knots_mm, force, step_s=0.02)
     facts = check_study(load_study(study), listener=lambda event: None)["facts"]
     for name, (_, _, words) in times.items():
         assert any(fact.startswith(f"site {name}: peak force") and fact.endswith(words) for fact in facts)

@@ -24,7 +24,7 @@ PLACES = ([40.0, 0.0, 60.0], [0.0, 40.0, 50.0], [-40.0, 0.0, 60.0], [0.0, -40.0,
 
 
 @pytest.fixture
-def five(study):
+def five(study, commands_unasked):
     """A study of five sites around the stump; the records are of one limb."""
     head = (study / "study.toml").read_text().split("[[sites]]")[0]
     tables = [
@@ -33,7 +33,7 @@ def five(study):
     ]
     (study / "study.toml").write_text(head + "".join(tables))
     for k in range(5):
-        write_trace(study / f"{k}.csv", depth=5.0 + 0.2 * k, peak=5.0 + 0.3 * k)
+        write_trace(study / f"{k}.csv", depth=5.0 + 0.2 * k, peak=5.0 + 0.3 * k, rate=50.0)
     return study
 
 
