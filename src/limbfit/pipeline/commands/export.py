@@ -131,8 +131,12 @@ def _build_block(study: Study) -> Mesh:
 
 
 def _build_block_model(study: Study, one: Planned, file: Path) -> SiteModel:
-    """An indentation in the middle of that block's top, without pins."""
-    model = build_block_model(one.name, file, study.solver, study.mesh.element)
+    """An indentation in the middle of that block's top, without pins.
+
+    Its penalty is any: that of a site is found by solving, and nobody reads what is written of the block.
+    """
+    solver = study.solver.model_copy(update={"penalty_per_mm": study.solver.penalty_per_mm or 1.0})
+    model = build_block_model(one.name, file, solver, study.mesh.element)
     along = (0.0, 0.0, 1.0)
     return replace(
         model,
