@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -58,9 +59,15 @@ def module_name(path: Path) -> str:
     return ".".join(parts)
 
 
+@cache
+def parse(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
 def imports(path: Path) -> list[tuple[str, int, bool]]:
     """(absolute module, line, inside a function) of every limbfit import in a file."""
-    tree = ast.parse(path.read_text())
+    tree = parse(path)
     inside = {
         id(child)
         for node in ast.walk(tree)
@@ -83,6 +90,7 @@ def imports(path: Path) -> list[tuple[str, int, bool]]:
     return [entry for entry in found if entry[0].split(".")[0] == "limbfit"]
 
 
+@cache
 def files() -> list[Path]:
     return [p for p in sorted(PACKAGE.rglob("*.py")) if p != PACKAGE / "__init__.py"]
 
@@ -181,7 +189,7 @@ def test_only_the_command_line_prints_and_exits():
     for path in files():
         if room_of(module_name(path)) in {"cli", "__main__"}:
             continue
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parse(path)):
             if isinstance(node, ast.Call) and ast.unparse(node.func) in {"print", "sys.exit", "exit"}:
                 wrong.append(f"{path.relative_to(PACKAGE)}:{node.lineno}")
     assert not wrong, "\n".join(wrong)
@@ -190,7 +198,7 @@ def test_only_the_command_line_prints_and_exits():
 def test_a_public_class_has_a_name_of_its_own():
     homes: dict[str, list[str]] = {}
     for path in files():
-        for node in ast.parse(path.read_text()).body:
+        for node in parse(path).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 homes.setdefault(node.name, []).append(module_name(path))
     assert {name: where for name, where in homes.items() if len(where) > 1} == {}

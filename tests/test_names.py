@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import limbfit
@@ -54,6 +55,7 @@ EXCEPTIONS = {
 }
 
 
+@cache
 def functions() -> list[tuple[str, str]]:
     """File below the package and name of each function that stands at the top of a module."""
     found = []
