@@ -27,7 +27,7 @@ def playwright() -> Iterator[Any]:
         yield running
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def launch(playwright: Any) -> Iterator[Callable[..., Any]]:
     """``launch(arguments)``: one browser for each set of them; LIMBFIT_CHROMIUM names another program."""
     program = os.environ.get("LIMBFIT_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
