@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin
 
 import numpy as np
 import pytest
 import pyvista as pv
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 
+from limbfit.laws import LAWS, OGDEN
 from limbfit.mesh import Mesh, write_vtu
+from limbfit.results.base import ResultPart
+from limbfit.results.study_results import MODELS
 
 SITES = (
     ("PT-1", "patellar tendon", True, -1.45, 10.0),
@@ -85,6 +89,8 @@ def add_fat(folder: Path) -> Path:
     names = [f"{tissue}.{name}" for tissue in ("skin", "fat", "muscle") for name in FAT]
     told["correlation"] = {"names": names, "matrix": np.eye(12).tolist()}
     told["verdict"] = {name: told["verdict"].get(name, "not determined") for name in names}
+    told["at_bound"] = dict.fromkeys(names, False)
+    content["bounds"] = {"lower": three["start"], "upper": three["start"]}
     file.write_text(json.dumps(content))
     truth.write_text(json.dumps({"parameters": with_fat(TRUTH, FAT)}))
     meshes = json.loads((folder / "mesh" / "mesh.json").read_text())
@@ -104,6 +110,41 @@ def add_fat(folder: Path) -> Path:
     return folder
 
 
+def complete(model: type[ResultPart], content: Any) -> Any:
+    """The content with every key that its model requires: null, nothing or zero where it has none."""
+    if isinstance(content, dict):
+        for key, field in model.model_fields.items():
+            if key in content:
+                content[key] = _complete_value(field.annotation, content[key])
+            elif field.is_required():
+                content[key] = _make_empty(field.annotation)
+    return content
+
+
+def _complete_value(kind: Any, value: Any) -> Any:
+    if isinstance(kind, type) and issubclass(kind, ResultPart):
+        return complete(kind, value)
+    parts = get_args(kind)
+    if get_origin(kind) is Mapping and value:
+        return {key: _complete_value(parts[1], one) for key, one in value.items()}
+    if get_origin(kind) is Sequence and value:
+        return [_complete_value(parts[0], one) for one in value]
+    models = [part for part in parts if isinstance(part, type) and issubclass(part, ResultPart)]
+    return complete(models[0], value) if models else value
+
+
+def _make_empty(kind: Any) -> Any:
+    if isinstance(kind, type) and issubclass(kind, ResultPart):
+        return complete(kind, {})
+    if type(None) in get_args(kind):
+        return None
+    if get_origin(kind) is tuple:
+        return [_make_empty(part) for part in get_args(kind)]
+    return {Mapping: {}, dict: {}, Sequence: [], str: "", bool: False, int: 0, float: 0.0}[
+        get_origin(kind) or kind
+    ]
+
+
 def write_results(folder: Path, *, sites: tuple = SITES, name: str = "Phantom 7 (coarse)") -> Path:
     """Every artefact of a finished study below ``folder``."""
     _json(folder / "run.json", _run(sites, name))
@@ -120,6 +161,9 @@ def write_results(folder: Path, *, sites: tuple = SITES, name: str = "Phantom 7 
 
 
 def _json(file: Path, content: dict) -> None:
+    models = {Path(model.FILE).name: model for model in MODELS.values()}
+    if file.name in models:
+        content = complete(models[file.name], content)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(content, indent=1))
 
@@ -218,6 +262,7 @@ def _traces(folder: Path, sites: tuple) -> None:
         _csv(folder / f"{row[0]}-raw.csv", time_s=raw_time, displacement_mm=raw_d, force_N=raw_force)
         _csv(folder / f"{row[0]}.csv", time_s=time, displacement_mm=d, force_N=force)
         facts[row[0]] = {
+            "site": row[0],
             "touch_down_s": 1.3,
             "touch_down_mm": 1.25,
             "touch_down_uncertainty_mm": 0.04,
@@ -344,6 +389,7 @@ def _calibration(sites: tuple) -> dict:
         },
         "correlation": {"names": NAMES, "matrix": matrix.tolist()},
         "verdict": verdict,
+        "at_bound": dict.fromkeys(NAMES, False),
         "combinations": [
             "muscle.c_kPa^0.82 · muscle.gamma^0.57: determined",
             "skin.m^0.71 · muscle.m^-0.70: not determined by these data",
@@ -359,6 +405,8 @@ def _calibration(sites: tuple) -> dict:
             stage("two materials", ONE, TWO, (2.9, 0.9)),
         ],
         "objective": "pointwise",
+        "law": LAWS[OGDEN].record(),
+        "bounds": {"lower": START, "upper": START},
         "uncertainty": uncertainty,
         "forward_runs": 48,
         "linear_solver": "pardiso",
@@ -385,6 +433,7 @@ def _predict(folder: Path, sites: tuple) -> None:
         rows.append(
             {
                 "site": row[0],
+                "record": row[0],
                 "region": row[1],
                 "fitted": row[2],
                 "peak_force_N": float(force.max()),

@@ -3,76 +3,103 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, Protocol, TypeVar
 
 from ..arrays import Array
 from ..errors import InputError
 from ..laws import TissueLaw
+from ..results.base import Interval
+from ..results.curves import read_curves
+from ..results.identification import (
+    CalibrationResult,
+    CalibrationUncertainty,
+    PredictResult,
+    RecordPrediction,
+    SearchStage,
+)
+from ..results.limb import MeshMeasures, MeshResult, PlacedSite, SegmentResult, SitesResult, SurfacesResult
+from ..results.models import ModelsResult
+from ..results.records import TraceFacts, TracesResult
+from ..results.runs import CompareResult, RunResult, SimulateResult
+from ..results.socket import SocketResult
 from .formats import format_fixed, format_symbol
 
 Curves = dict[str, Array]
 Json = dict[str, Any]
+
+
+class OfSite(Protocol):
+    """A row of a site."""
+
+    @property
+    def site(self) -> str: ...
+
+
+Row = TypeVar("Row", bound=OfSite)
 PAPER_TISSUES = {"skin": "Skin–adipose", "muscle": "Muscle"}
 
 
 @dataclass(frozen=True)
 class Results:
-    """A results folder; every dictionary is empty where its file is not there (yet).
+    """A results folder; what is not there (yet) is None or empty.
 
     ``experiments``: what each finished experiment stored, by its name; ``outdated``: those that are stale.
     ``models``: other models of the same records.
     """
 
     folder: Path
-    run: Json
-    segment: Json
-    surfaces: Json
-    sites: tuple[Json, ...]
-    traces: Json
-    mesh: Json
-    calibration: Json
-    predict: Json
-    simulated: tuple[Json, ...]
-    compared: tuple[Json, ...]
+    run: RunResult | None
+    segment: SegmentResult | None
+    surfaces: SurfacesResult | None
+    sites: Sequence[PlacedSite]
+    traces: Mapping[str, TraceFacts]
+    mesh: Mapping[str, MeshMeasures]
+    calibration: CalibrationResult | None
+    predict: PredictResult | None
+    simulated: tuple[SimulateResult, ...]
+    compared: tuple[CompareResult, ...]
     truth: Json
     experiments: dict[str, Json] = field(default_factory=dict)
     outdated: tuple[str, ...] = ()
-    models: Json = field(default_factory=dict)
+    models: ModelsResult | None = None
 
     @property
     def site_names(self) -> tuple[str, ...]:
         """Names of the sites in the order of the study, whichever stage knows them."""
-        known = [site["site"] for site in self.sites] or [site["site"] for site in self.predicted]
+        known = [site.site for site in self.sites] or [site.site for site in self.predicted]
         return tuple(known or self.traces)
 
     @property
-    def predicted(self) -> tuple[Json, ...]:
-        """A row of each record; ``record`` is its name, the site's where that states one only."""
-        return tuple({**row, "record": get_record_name(row)} for row in self.predict.get("sites", ()))
+    def predicted(self) -> Sequence[RecordPrediction]:
+        """A row of each record."""
+        return self.predict.sites if self.predict else ()
 
     def records_of(self, site: str) -> tuple[str, ...]:
         """Names of the records of a site that are stored."""
-        return tuple(name for name, facts in self.traces.items() if facts.get("site", name) == site)
+        return tuple(name for name, facts in self.traces.items() if facts.site == site)
 
     @property
     def fitted(self) -> tuple[str, ...]:
         rows = self.sites or self.predicted
-        return tuple(row["site"] for row in rows if row.get("fitted"))
+        return tuple(dict.fromkeys(row.site for row in rows if row.fitted))
 
     @property
-    def stages(self) -> tuple[Json, ...]:
+    def socket(self) -> SocketResult | None:
+        """What the experiment ``socket`` stored, where it is not stale."""
+        return SocketResult.read(self.folder) if "socket" in self.experiments else None
+
+    @property
+    def stages(self) -> Sequence[SearchStage]:
         """The stages of the identification, one material first."""
-        return tuple(self.calibration.get("stages", ()))
+        return self.calibration.stages if self.calibration else ()
 
     @property
     def tissues(self) -> tuple[str, ...]:
         """Names of the identified tissues, outermost first; none where nothing was identified."""
-        return tuple(self.stages[-1].get("parameters", ())) if self.stages else ()
+        return tuple(self.stages[-1].parameters) if self.stages else ()
 
     @property
     def parameters(self) -> tuple[tuple[str, str], ...]:
@@ -82,27 +109,26 @@ class Results:
     @property
     def law(self) -> TissueLaw:
         """What the identification says of the tissues' law."""
-        return TissueLaw.of_record(self.calibration.get("law") or {})
+        return TissueLaw.of_record(self.calibration.law.to_plain() if self.calibration else {})
 
     @property
     def materials(self) -> str:
         """What the model with a material for each tissue is called: ``two materials``."""
-        return str(self.stages[-1].get("name")) if self.stages else "identified materials"
+        return self.stages[-1].name if self.stages else "identified materials"
 
     def mean_error(self, use: str) -> str:
         """``4.5 ± 1.0``: mean and standard deviation of the errors at ``fitted`` or ``heldout`` sites, %."""
-        mean, sd = (self.predict.get(f"{kind}_error_{use}_percent") for kind in ("mean", "sd"))
+        mean, sd = (getattr(self.predict, f"{kind}_error_{use}_percent", None) for kind in ("mean", "sd"))
         return format_fixed(mean) if sd is None else f"{format_fixed(mean)} ± {format_fixed(sd)}"
 
     @property
-    def uncertainty(self) -> Json:
+    def uncertainty(self) -> CalibrationUncertainty | None:
         """What the calibration says of its intervals."""
-        return self.calibration.get("uncertainty") or {}
+        return self.calibration.uncertainty if self.calibration else None
 
-    def interval(self, tissue: str, name: str) -> list[float] | None:
+    def interval(self, tissue: str, name: str) -> Interval | None:
         """The stored 95 % interval of a parameter."""
-        limits = (self.uncertainty.get("intervals_95") or {}).get(tissue, {}).get(name)
-        return limits if limits and None not in limits else None
+        return self.uncertainty.intervals_95[tissue][name] if self.uncertainty else None
 
     def describe_parameter(self, name: str) -> str:
         """A parameter's symbol and what it is."""
@@ -127,43 +153,39 @@ class Results:
         return {name: path for name, path in files.items() if path.is_file()}
 
     def region(self, site: str) -> str:
-        rows = {row["site"]: row for row in (*self.predicted, *self.sites)}
-        return str(rows.get(site, {}).get("region") or "")
+        rows = [row.region for row in self.sites if row.site == site]
+        rows += [row.region for row in self.predicted if row.site == site]
+        return (rows or [None])[0] or ""
 
     @property
-    def placed_sites(self) -> dict[str, Json]:
-        """The sites whose place and axis are known, by name."""
-        return {row["site"]: row for row in self.sites if row.get("position_mm") and row.get("axis")}
+    def placed_sites(self) -> dict[str, PlacedSite]:
+        """The sites by name."""
+        return {row.site: row for row in self.sites}
 
     def curves(self, stage: str, name: str) -> Curves | None:
         """The columns of ``<stage>/<name>.csv``, or None where there is no such file."""
         file = self.folder / stage / f"{name}.csv"
-        return _read_csv(file) if file.is_file() else None
+        return read_curves(file) if file.is_file() else None
 
     def record_curves(self, record: str) -> tuple[Curves | None, Curves | None, tuple[float, float]]:
         """A record as the robot wrote it, regularised in the same time and displacement, and touch-down."""
         raw, regular = self.curves("traces", f"{record}-raw"), self.curves("traces", record)
-        facts = self.traces.get(record, {})
-        time_s, depth_mm = facts.get("touch_down_s", 0.0), facts.get("touch_down_mm", 0.0)
+        facts = self.traces.get(record)
+        time_s, depth_mm = (facts.touch_down_s, facts.touch_down_mm) if facts else (0.0, 0.0)
         if regular is not None:
             time, depth = regular["time_s"] + time_s, regular["displacement_mm"] + depth_mm
             regular = {"time_s": time, "displacement_mm": depth, "force_N": regular["force_N"]}
         return raw, regular, (time_s, depth_mm)
 
-    def with_curves(self, stage: str, rows: Iterable[Json]) -> list[tuple[Json, Curves]]:
+    def with_curves(self, stage: str, rows: Iterable[Row]) -> list[tuple[Row, Curves]]:
         """Rows of records with the curves that the stage stored, where it did."""
-        found = ((row, self.curves(stage, get_record_name(row))) for row in rows)
+        found = ((row, self.curves(stage, getattr(row, "record", row.site))) for row in rows)
         return [(row, curves) for row, curves in found if curves is not None]
 
     def vtu(self, stage: str, site: str) -> Path | None:
         """The mesh or fields of a site; of several records' fields the first."""
         files = (self.folder / stage / f"{name}.vtu" for name in (site, *self.records_of(site)))
         return next((file for file in files if file.is_file()), None)
-
-
-def get_record_name(row: Json) -> str:
-    """The name of a row's record; the site's where that states one only."""
-    return str(row.get("record", row["site"]))
 
 
 def find_compared_quantity(curves: Curves) -> tuple[str, str]:
@@ -181,26 +203,26 @@ def load_store(results: Path) -> Results:
     """
     if not results.is_dir():
         raise InputError("no results there", file=results, remedy="run the study first")
-    sites = _read_json(results / "sites" / "sites.json").get("sites", [])
-    run = _read_json(results / "run.json")
-    states = {name: row.get("state") for name, row in (run.get("experiments") or {}).items()}
-    done = [name for name, state in states.items() if state == "done"]
+    run, sites = RunResult.find(results), SitesResult.find(results)
+    traces, mesh = TracesResult.find(results), MeshResult.find(results)
+    experiments = run.experiments if run else {}
+    done = [name for name, row in experiments.items() if row.state == "done"]
     return Results(
         folder=results,
         run=run,
-        segment=_read_json(results / "segment" / "segment.json"),
-        surfaces=_read_json(results / "surfaces" / "surfaces.json"),
-        sites=tuple(sites),
-        traces=_read_json(results / "traces" / "traces.json").get("sites", {}),
-        mesh=_read_json(results / "mesh" / "mesh.json").get("sites", {}),
-        calibration=_read_json(results / "calibrate" / "calibration.json"),
-        predict=_read_json(results / "predict" / "predict.json"),
-        simulated=tuple(_read_json(file) for file in sorted((results / "simulate").glob("*.json"))),
-        compared=tuple(_read_json(file) for file in sorted((results / "compare").glob("*.json"))),
+        segment=SegmentResult.find(results),
+        surfaces=SurfacesResult.find(results),
+        sites=sites.sites if sites else (),
+        traces=traces.sites if traces else {},
+        mesh=mesh.sites if mesh else {},
+        calibration=CalibrationResult.find(results),
+        predict=PredictResult.find(results),
+        simulated=tuple(SimulateResult.find_all(results).values()),
+        compared=tuple(CompareResult.find_all(results).values()),
         truth=_read_json(results / "truth.json"),
         experiments={name: _read_json(results / name / f"{name}.json") for name in done},
-        outdated=tuple(name for name, state in states.items() if state == "stale"),
-        models=_read_json(results / "models" / "models.json"),
+        outdated=tuple(name for name, row in experiments.items() if row.state == "stale"),
+        models=ModelsResult.find(results),
     )
 
 
@@ -214,15 +236,3 @@ def _read_json(file: Path) -> Json:
     if not isinstance(content, dict):
         raise InputError("not a JSON object", file=file, remedy="run its stage again")
     return content
-
-
-def _read_csv(file: Path) -> Curves:
-    lines = file.read_text(encoding="utf-8").splitlines()
-    names = [name.strip() for name in lines[0].split(",")] if lines else []
-    try:
-        values = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
-    except ValueError as error:
-        raise InputError(f"not readable: {error}", file=file, remedy="run its stage again") from None
-    if values.shape[1:] != (len(names),):
-        raise InputError("its rows do not fit its header", file=file, remedy="run its stage again")
-    return {name: values[:, i] for i, name in enumerate(names)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -44,7 +44,7 @@ def make_table(
     """
     body = []
     for row in rows:
-        stands_out = row.get(marked) if isinstance(marked, str) else marked is not None and marked(row)
+        stands_out = _read_cell(row, marked) is True if isinstance(marked, str) else marked and marked(row)
         body.append(make_row(*(_read_cell(row, *column[1:]) for column in columns), marked=stands_out))
     return Table(name, caption, tuple(column[0] for column in columns), tuple(body), tuple(foot), folded)
 
@@ -53,7 +53,7 @@ def _read_cell(row: Any, what: Path | Callable[[Any], Any], decimals: int | None
     if callable(what):
         return what(row)
     for key in (what,) if isinstance(what, str) else what:
-        row = (row or {}).get(key)
+        row = row.get(key) if isinstance(row, Mapping) else getattr(row, key, None)
     if decimals is not None:
         return to_numeric(format_fixed(row, decimals))
     return NOTHING if row is None or row == "" else row

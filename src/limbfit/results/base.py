@@ -91,12 +91,13 @@ class StoredResult(ResultPart):
         return found
 
     @classmethod
-    def list_names(cls, results: Path) -> list[str]:
-        """Return what stands in place of the star, of every file that is there."""
+    def find_all(cls, results: Path) -> dict[str, Self]:
+        """Read every file that is there, by what stands in place of the star."""
         start, end = cls.FILE.split("*")
         files = sorted(file.relative_to(results).as_posix() for file in results.glob(cls.FILE))
         names = [file.removeprefix(start).removesuffix(end) for file in files]
-        return [name for name in names if not name.startswith(".")]  # of stages that are not done
+        # A stage that is not done has a hidden folder.
+        return {name: cls.read(results, name) for name in names if not name.startswith(".")}
 
 
 def _describe_first(error: ValidationError) -> str:

@@ -72,9 +72,7 @@ class Each(Generic[R]):
     def __get__(self, results: StudyResults, owner: type) -> dict[str, R]: ...
 
     def __get__(self, results: StudyResults | None, owner: type) -> Self | dict[str, R]:
-        if results is None:
-            return self
-        return {name: self.model.read(results.folder, name) for name in self.model.list_names(results.folder)}
+        return self if results is None else self.model.find_all(results.folder)
 
 
 class StudyResults:

@@ -9,9 +9,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from ...results.identification import (
+    ObservedError,
+    QuantityRange,
+    RecordPrediction,
+    SearchStage,
+)
 from ..formats import format_fixed, format_symbol, format_with_value, get_unit
 from ..page import Figure
-from ..store import Curves, Json, Results, find_compared_quantity
+from ..store import Curves, Results, find_compared_quantity
 from . import plots
 from .colours import (
     FITTED,
@@ -38,7 +44,7 @@ def thin_curves(curves: Curves) -> Curves:
 
 @plots.styled
 def draw_force_figure(
-    store: Results, rows: Iterable[Json], against: str, name: str, columns: int
+    store: Results, rows: Iterable[RecordPrediction], against: str, name: str, columns: int
 ) -> Figure | None:
     """Figure 7: measured and simulated force of each site, against ``time_s`` or ``displacement_mm``."""
     pairs = [(row, curves) for row, curves in store.with_curves("predict", rows) if against in curves]
@@ -53,20 +59,19 @@ def draw_force_figure(
         if (quantity := find_compared_quantity(curves)) != ("force", "N"):
             ax.set_ylabel(f"{quantity[0].capitalize()} ({quantity[1]})")
     plots.add_legend(drawing, max(axes, key=lambda ax: len(ax.get_legend_handles_labels()[1])))
-    sites = ", ".join(f"{row['record']} ({format_fixed(row.get('error_percent'))} %)" for row, _ in pairs)
+    sites = ", ".join(f"{row.record} ({format_fixed(row.error_percent)} %)" for row, _ in pairs)
     alt = f"Measured and simulated force against {words}; site and error: {sites}"
-    kind = "fitted" if all(row.get("fitted") for row, _ in pairs) else "held-out"
+    kind = "fitted" if all(row.fitted for row, _ in pairs) else "held-out"
     paper = "Figure 7 of the paper for this study: m" if name == "forces-fitted" else "M"
     caption = f"{paper}easured and simulated force against {words} at the {kind} sites, with the error."
     return plots.make_figure(drawing, name, alt, caption)
 
 
-def _make_site_title(row: Json, columns: int) -> str:
-    region = str(row.get("region") or "")
-    head = f"site {row['record']}" + (f", {region}" if region and columns < 3 else "")
+def _make_site_title(row: RecordPrediction, columns: int) -> str:
+    head = f"site {row.record}" + (f", {row.region}" if row.region and columns < 3 else "")
     most = MAX_TITLE // (columns - 1 or 1)
     head = head if len(head) <= most else head[: most - 1] + "…"
-    return f"{head}: {format_fixed(row.get('error_percent'))} %"
+    return f"{head}: {format_fixed(row.error_percent)} %"
 
 
 def _draw_forces(ax: Axes, curves: Curves, against: str, materials: str) -> None:
@@ -87,15 +92,15 @@ def _draw_forces(ax: Axes, curves: Curves, against: str, materials: str) -> None
 @plots.styled
 def draw_domain_figure(store: Results) -> Figure | None:
     """Times and shear of each tissue: those of the records, and those of predictions and of the socket."""
-    tested = _read_extents(store.predict.get("recorded_range", {}).get("extents"))
+    tested = _read_extents(store.predict.recorded_range.extents if store.predict else ())
     tissues = [tissue for quantity, tissue in tested if quantity == "shear strain" and tissue]
     if not tissues:
         return None
-    socket = store.experiments.get("socket") or {"donning": {}, "loads": []}
+    loads = store.socket.loads if store.socket else ()
     rows = [
-        *((row["loading"], "fitted record", FITTED, "") for row in store.predicted if row["fitted"]),
-        *((row["loading"], "held-out record", HELD_OUT, "") for row in store.predicted if not row["fitted"]),
-        *((one.get("loading"), "socket", THIRD, str(one["name"])) for one in socket["loads"]),
+        *((row.loading, "fitted record", FITTED, "") for row in store.predicted if row.fitted),
+        *((row.loading, "held-out record", HELD_OUT, "") for row in store.predicted if not row.fitted),
+        *((one.loading or (), "socket", THIRD, one.name) for one in loads),
     ]
     drawing, axes = plots.make_panels(len(tissues), 3, 2.4)
     plots.label_outer(axes, 3, "Time (s)", "Shear strain")
@@ -108,7 +113,7 @@ def draw_domain_figure(store: Results) -> Figure | None:
                 own_time, (_, high) = own["time", None], own["shear strain", tissue]
                 ax.plot(own_time, (high, high), color=color, marker="|", label=label)
                 ax.annotate(name, (own_time[1], high), xytext=(0, 3), textcoords="offset points", ha="right")
-        plots.set_log_scale(ax, minor=not socket["loads"])
+        plots.set_log_scale(ax, minor=not loads)
         ax.set_ylim(bottom=0.0)
         ax.set_title(tissue)
     handles = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
@@ -122,9 +127,9 @@ def draw_domain_figure(store: Results) -> Figure | None:
     return plots.make_figure(drawing, "domain", alt, caption)
 
 
-def _read_extents(loading: Iterable[Json] | None) -> dict[tuple[str, str | None], tuple[float, float]]:
+def _read_extents(loading: Iterable[QuantityRange]) -> dict[tuple[str, str | None], tuple[float, float]]:
     """The stored range of each quantity, by its name and tissue."""
-    return {(one["quantity"], one["tissue"]): (one["low"], one["high"]) for one in loading or ()}
+    return {(one.quantity, one.tissue): (one.low, one.high) for one in loading}
 
 
 @plots.styled
@@ -136,12 +141,12 @@ def draw_simulated_figure(store: Results) -> Figure | None:
     drawing, axes = plots.make_panels(2, 2, 2.6)
     for i, (row, curves) in enumerate(pairs):
         color, ls = (SIMULATED, ONE_MATERIAL, TRUTH, INK)[i % 4], ("-", "--", ":", "-.")[i % 4]
-        axes[0].plot(curves["time_s"], curves["force_N"], color=color, ls=ls, label=row["site"])
+        axes[0].plot(curves["time_s"], curves["force_N"], color=color, ls=ls, label=row.site)
         axes[1].plot(curves["displacement_mm"], curves["force_N"], color=color, ls=ls)
     for ax, label in zip(axes, ("Time (s)", "Displacement (mm)"), strict=True):
         ax.set(xlabel=label, ylabel="Force (N)")
     plots.add_legend(drawing, axes[0])
-    names = ", ".join(row["site"] for row, _ in pairs)
+    names = ", ".join(row.site for row, _ in pairs)
     alt = f"Simulated force against time and displacement, sites {names}"
     return plots.make_figure(drawing, "simulated", alt, "Force of the simulated indentations.")
 
@@ -149,18 +154,18 @@ def draw_simulated_figure(store: Results) -> Figure | None:
 @plots.styled
 def draw_convergence_figure(store: Results) -> Figure | None:
     """The error and the parameters over the accepted iterates, stage after stage."""
-    stages = [stage for stage in store.stages if stage.get("iterations")]
+    stages = [stage for stage in store.stages if stage.iterations]
     if not stages:
         return None
     drawing, axes = plots.make_panels(1 + len(store.law.keys), 5, 2.3)
     offset = 0
     for stage in stages:
         _draw_stage(axes, store, stage, offset)
-        offset += len(stage["iterations"])
+        offset += len(stage.iterations)
     _finish_convergence(axes, store)
     count = sum(len(ax.get_legend_handles_labels()[0]) for ax in axes[:2])
     plots.add_legend(drawing, *axes[:2], columns=math.ceil(count / math.ceil(count / MAX_LEGEND_ROW)))
-    last = format_fixed(stages[-1]["iterations"][-1].get("error_percent"), 2)
+    last = format_fixed(stages[-1].iterations[-1].error_percent, 2)
     alt = f"Error and parameters against iteration; the error ends at {last} %"
     caption = (
         "The paper's two steps (figure 5) as they went: the mean error at the fitted sites (thin lines: "
@@ -170,19 +175,17 @@ def draw_convergence_figure(store: Results) -> Figure | None:
     return plots.make_figure(drawing, "convergence", alt, caption)
 
 
-def _draw_stage(axes: Sequence[Axes], store: Results, stage: Json, offset: int) -> None:
+def _draw_stage(axes: Sequence[Axes], store: Results, stage: SearchStage, offset: int) -> None:
     """Draw one stage from iteration ``offset`` on."""
-    steps = stage["iterations"]
+    steps = stage.iterations
     x = offset + np.arange(len(steps))
-    sites = sorted({site for step in steps for site in step.get("error_percent_by_site", {})})
-    for site in sites:
-        errors = [step.get("error_percent_by_site", {}).get(site, math.nan) for step in steps]
-        axes[0].plot(x, errors, color=MUTED, lw=0.8)
-    mean = [step.get("error_percent", math.nan) for step in steps]
+    for site in sorted(steps[0].error_percent_by_site):
+        axes[0].plot(x, [step.error_percent_by_site[site] for step in steps], color=MUTED, lw=0.8)
+    mean = [step.error_percent for step in steps]
     axes[0].plot(x, mean, color=INK, marker="o", ms=3, label="mean error" if offset == 0 else None)
     for ax, name in zip(axes[1:], store.law.keys, strict=True):
-        for i, tissue in enumerate(stage["parameters"]):
-            values = [step["parameters"].get(tissue, {}).get(name, math.nan) for step in steps]
+        for i, tissue in enumerate(stage.parameters):
+            values = [step.parameters[tissue][name] for step in steps]
             ax.plot(x, values, ms=3, label=tissue if offset == 0 else None, **choose_tissue_style(i))
     if offset:
         for ax in axes:
@@ -206,17 +209,17 @@ def _finish_convergence(axes: Sequence[Axes], store: Results) -> None:
 @plots.styled
 def draw_error_figure(store: Results) -> Figure | None:
     """The error of every site as a bar, fitted and held-out told apart by colour and hatching."""
-    rows = [row for row in store.predicted if isinstance(row.get("error_percent"), int | float)]
+    rows = [(row, row.error_percent) for row in store.predicted if row.error_percent is not None]
     if not rows:
         return None
     drawing, (ax,) = plots.make_panels(1, 1, 0.7 + 0.24 * len(rows))
-    for at, row in enumerate(rows):
-        color, hatch = (FITTED, None) if row.get("fitted") else (HELD_OUT, "///")
-        ax.barh(at, row["error_percent"], color=color, alpha=0.75, hatch=hatch, height=0.62)
-        ax.text(row["error_percent"], at, f" {format_fixed(row['error_percent'])}", va="center", fontsize=8)
-    plots.set_rows(ax, [f"{row['record']} ({'fitted' if row.get('fitted') else 'held out'})" for row in rows])
+    for at, (row, error) in enumerate(rows):
+        color, hatch = (FITTED, None) if row.fitted else (HELD_OUT, "///")
+        ax.barh(at, error, color=color, alpha=0.75, hatch=hatch, height=0.62)
+        ax.text(error, at, f" {format_fixed(error)}", va="center", fontsize=8)
+    plots.set_rows(ax, [f"{row.record} ({'fitted' if row.fitted else 'held out'})" for row, _ in rows])
     ax.set_xlabel("Mean absolute error over largest force (%)")
-    sites = ", ".join(f"{row['record']} {format_fixed(row['error_percent'])} %" for row in rows)
+    sites = ", ".join(f"{row.record} {format_fixed(error)} %" for row, error in rows)
     caption = "Force error of each site. Plain bars: sites that were fitted; hatched: held out."
     return plots.make_figure(drawing, "errors", f"Error of each site: {sites}", caption)
 
@@ -224,10 +227,9 @@ def draw_error_figure(store: Results) -> Figure | None:
 @plots.styled
 def draw_interval_figure(store: Results) -> Figure | None:
     """Start, one-material value, interval and truth of every parameter, as a ratio to the identified one."""
-    last = store.stages[-1].get("parameters", {}) if store.stages else {}
-    names = [(t, n) for t in store.tissues for n in store.law.keys if last.get(t, {}).get(n)]
-    if not names:
+    if not store.stages:
         return None
+    last, names = store.stages[-1].parameters, store.parameters
     drawing, (ax,) = plots.make_panels(1, 1, 0.7 + 0.3 * len(names))
     for at, (tissue, name) in enumerate(names):
         _draw_ratios(ax, store, at, tissue, name)
@@ -246,15 +248,15 @@ def draw_interval_figure(store: Results) -> Figure | None:
 
 def _draw_ratios(ax: Axes, store: Results, at: int, tissue: str, name: str) -> None:
     stages = store.stages
-    value = stages[-1]["parameters"][tissue][name]
+    value = stages[-1].parameters[tissue][name]
     if limits := store.interval(tissue, name):
         low, high = max(limits[0] / value, 1e-3), min(limits[1] / value, 1e3)
         label = "" if at else "95 % interval"
         ax.plot([low, high], [at, at], color=SIMULATED, lw=6, alpha=0.35, solid_capstyle="butt", label=label)
-    one = stages[0]["parameters"] if len(stages) > 1 else {}
+    one = stages[0].parameters if len(stages) > 1 else {}
     marks = (
-        ("identified", stages[-1]["parameters"], "o", SIMULATED, SIMULATED),
-        ("start", stages[0].get("start", {}), "|", MUTED, MUTED),
+        ("identified", stages[-1].parameters, "o", SIMULATED, SIMULATED),
+        ("start", stages[0].start, "|", MUTED, MUTED),
         ("one material", one, "D", ONE_MATERIAL, "none"),
         ("truth", store.truth.get("parameters", {}), "x", TRUTH, TRUTH),
     )
@@ -302,10 +304,10 @@ def _draw_time_figure(
             ax.plot(x, curves[f"{what}_simulated_{unit}"], color=SIMULATED, label=store.materials)
         if f"{what}_low_{unit}" in curves:
             plots.plot_band(ax, x, curves[f"{what}_low_{unit}"], curves[f"{what}_high_{unit}"])
-        ax.set_title(f"{row['record']}, {layer['what']}: {format_fixed(layer['error_percent'])} %")
+        ax.set_title(f"{row.record}, {layer.what}: {format_fixed(layer.error_percent)} %")
     plots.add_legend(drawing, axes[0])
     use = "fitted" if fitted else "held-out"
-    records = ", ".join(f"{row['record']} {layer['what']}" for row, layer, _ in rows)
+    records = ", ".join(f"{row.record} {layer.what}" for row, layer, _ in rows)
     alt = f"Measured and predicted {words}: {records}"
     return plots.make_figure(drawing, f"{stem}-{use}", alt, caption.format(use))
 
@@ -320,11 +322,11 @@ def draw_skin_figure(store: Results, fitted: bool) -> Figure | None:
     drawing, axes = plots.make_panels(len(rows), 3, 2.6)
     plots.label_outer(axes, 3, "Measured (mm)", "Predicted (mm)")
     for ax, (row, seen, curves) in zip(axes, rows, strict=True):
-        _draw_pairs(ax, curves, seen["components"])
-        ax.set_title(f"{row['record']}: {format_fixed(seen['error_percent'])} %")
+        _draw_pairs(ax, curves, seen.components)
+        ax.set_title(f"{row.record}: {format_fixed(seen.error_percent)} %")
     plots.add_legend(drawing, axes[0])
     use = "fitted" if fitted else "held-out"
-    records = ", ".join(str(row["record"]) for row, _, _ in rows)
+    records = ", ".join(row.record for row, _, _ in rows)
     caption = (
         f"Displacement of the skin around the indenter at the {use} sites: predicted against "
         "measured, for every point, component and span of time that is compared, with its 95 % interval. On "
@@ -334,7 +336,7 @@ def draw_skin_figure(store: Results, fitted: bool) -> Figure | None:
     return plots.make_figure(drawing, f"surface-{use}", alt, caption)
 
 
-def _draw_pairs(ax: Axes, curves: Curves, components: list[str]) -> None:
+def _draw_pairs(ax: Axes, curves: Curves, components: Sequence[str]) -> None:
     x, y = curves["displacement_measured_mm"], curves["displacement_simulated_mm"]
     ends = [min(x.min(), y.min()), max(x.max(), y.max())]
     ax.plot(ends, ends, color=MEASURED, lw=0.8)
@@ -348,12 +350,14 @@ def _draw_pairs(ax: Axes, curves: Curves, components: list[str]) -> None:
             ax.plot(x[chosen], y[chosen], **style, label=word)
 
 
-def _read_curves(store: Results, fitted: bool, kind: str) -> list[tuple[Json, Json, Curves]]:
+def _read_curves(
+    store: Results, fitted: bool, kind: str
+) -> list[tuple[RecordPrediction, ObservedError, Curves]]:
     """Rows of records, what was seen beside each in one way, and its stored curves."""
     return [
         (row, one, curves)
         for row in store.predicted
-        if bool(row.get("fitted")) == fitted
-        for one in row.get("observed") or ()
-        if one["kind"] == kind and (curves := store.curves("predict", one["name"])) is not None
+        if row.fitted == fitted
+        for one in row.observed
+        if one.kind == kind and (curves := store.curves("predict", one.name)) is not None
     ]

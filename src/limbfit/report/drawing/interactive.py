@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from ...arrays import Array
 from ...mesh import read_vtu
+from ...results.identification import SearchIteration
+from ...results.limb import PlacedSite
 from ...web.arrays import pack
 from ...web.shapes import extract_interface, read_shell, to_shell, to_volume_shape
 from ..formats import format_symbol, get_unit
@@ -98,18 +100,17 @@ def _read_layers(store: Results) -> Iterable[tuple[str, Any]]:
         yield f"inner face of {name}", extract_interface(volume, index)
 
 
-def _describe_site(store: Results, row: Json) -> Json:
-    fitted = bool(row.get("fitted"))
-    axis = np.asarray(row["axis"], dtype=float)
-    known = [one["error_percent"] for one in store.predicted if one["site"] == row["site"]]
+def _describe_site(store: Results, row: PlacedSite) -> Json:
+    axis = np.asarray(row.axis, dtype=float)
+    known = [one.error_percent for one in store.predicted if one.site == row.site]
     errors = [error for error in known if error is not None]
     return {
-        "name": str(row["site"]),
-        "region": store.region(row["site"]),
-        "fitted": fitted,
-        "at": [float(value) for value in row["position_mm"]],
+        "name": row.site,
+        "region": store.region(row.site),
+        "fitted": row.fitted,
+        "at": list(row.position_mm),
         "axis": (axis / np.linalg.norm(axis)).tolist(),
-        "colour": FITTED if fitted else HELD_OUT,
+        "colour": FITTED if row.fitted else HELD_OUT,
         "error_percent": statistics.fmean(errors) if errors else None,
     }
 
@@ -122,13 +123,13 @@ def _cut_fields(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
         cut = _cut_field(store, row, file)
         if cut is None:
             continue
-        name = f"field.{row['site']}"
+        name = f"field.{row.site}"
         arrays |= {f"{name}.{part}": values for part, values in cut.items() if part != "direction"}
-        found.append({"site": str(row["site"]), "name": name, "direction": cut["direction"].tolist()})
+        found.append({"site": row.site, "name": name, "direction": cut["direction"].tolist()})
     return found
 
 
-def _cut_field(store: Results, row: Json, file: Path) -> dict[str, NDArray[Any]] | None:
+def _cut_field(store: Results, row: PlacedSite, file: Path) -> dict[str, NDArray[Any]] | None:
     grid = read_linear(file)
     if STRESS not in grid.cell_data or "displacement_mm" not in grid.point_data:
         return None
@@ -187,14 +188,14 @@ def record_curves(store: Results, sites: Sequence[str]) -> Interactive | None:
         raw, smooth, start = store.record_curves(site)
         if raw is None or smooth is None:
             continue
-        phases = store.traces.get(site, {}).get("phases") or []
+        phases = store.traces[site].phases
         choices[site] = {
             "raw": _to_lists(raw),
             "smooth": _to_lists(smooth),
             "touch": {"time_s": start[0], "displacement_mm": start[1]},
             "ends": {
-                "time_s": [one["end_s"] for one in phases],
-                "displacement_mm": [one["end_mm"] + start[1] for one in phases],
+                "time_s": [one.end_s for one in phases],
+                "displacement_mm": [one.end_mm + start[1] for one in phases],
             },
         }
     if not choices:
@@ -208,13 +209,13 @@ def record_curves(store: Results, sites: Sequence[str]) -> Interactive | None:
 
 def draw_convergence_curves(store: Results) -> Interactive | None:
     """The error and each parameter over the accepted iterates of all stages."""
-    steps = [step for stage in store.stages for step in stage.get("iterations") or ()]
+    steps = [step for stage in store.stages for step in stage.iterations]
     if not steps:
         return None
     make_panels = [_make_error_panel(steps)]
     for name in store.law.keys:
         series = [
-            {"label": tissue, "y": [step["parameters"].get(tissue, {}).get(name) for step in steps]}
+            {"label": tissue, "y": [step.parameters[tissue][name] for step in steps]}
             for tissue in store.tissues
         ]
         make_panels.append(
@@ -226,11 +227,10 @@ def draw_convergence_curves(store: Results) -> Interactive | None:
     )
 
 
-def _make_error_panel(steps: Sequence[Json]) -> Json:
-    sites = sorted({site for step in steps for site in step.get("error_percent_by_site", {})})
-    series = [{"label": "mean error", "y": [step.get("error_percent") for step in steps]}]
+def _make_error_panel(steps: Sequence[SearchIteration]) -> Json:
+    sites = sorted(steps[0].error_percent_by_site)
+    series = [{"label": "mean error", "y": [step.error_percent for step in steps]}]
     series += [
-        {"label": f"site {site}", "y": [step.get("error_percent_by_site", {}).get(site) for step in steps]}
-        for site in sites
+        {"label": f"site {site}", "y": [step.error_percent_by_site[site] for step in steps]} for site in sites
     ]
     return {"title": "Error", "unit": "%", "log": True, "series": series}

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from vtkmodules.vtkCommonCore import vtkLogger
 
 from ...arrays import Array
+from ...results.limb import PlacedSite
 from ...web.shapes import build_patient_frame
 from ..page import Figure
-from ..store import Json, Results
+from ..store import Results
 from .panels import (
     FIELD_MAP,
     PAPER,
@@ -53,7 +54,7 @@ def normalise(values: Iterable[float]) -> Array:
 
 def read_limb_frame(store: Results) -> Array:
     """Rows: patient's left, posterior and proximal direction, the last one along the limb."""
-    return build_patient_frame(store.surfaces.get("cut_normal"))
+    return build_patient_frame(store.surfaces.cut_normal if store.surfaces else None)
 
 
 @contextmanager
@@ -185,16 +186,14 @@ def make_four_views(store: Results, skin: Any) -> list[View]:
 def _mark_facing_sites(store: Results, view: View) -> list[Mark]:
     """The sites whose skin faces the camera of a view."""
     return [
-        _mark_site(row)
-        for row in store.placed_sites.values()
-        if normalise(row["axis"]) @ view.direction > 0.5
+        _mark_site(row) for row in store.placed_sites.values() if normalise(row.axis) @ view.direction > 0.5
     ]
 
 
-def _mark_site(row: Json, axis: bool = False) -> Mark:
-    color = FITTED if row.get("fitted") else HELD_OUT
-    position, direction = np.array(row["position_mm"]), normalise(row["axis"]) if axis else None
-    return Mark(str(row["site"]), position, color, bool(row.get("fitted")), direction)
+def _mark_site(row: PlacedSite, axis: bool = False) -> Mark:
+    color = FITTED if row.fitted else HELD_OUT
+    position, direction = np.array(row.position_mm), normalise(row.axis) if axis else None
+    return Mark(row.site, position, color, row.fitted, direction)
 
 
 @silence_display_warning()
@@ -212,7 +211,7 @@ def draw_mesh_figure(store: Results, sites: Sequence[str]) -> Figure | None:
         whole.append((picture, view, [_mark_site(row, axis=True)]))
         near.append(close)
         colours |= choose_region_colours(grid)
-        names.append(row["site"])
+        names.append(row.site)
     if not names:
         return None
     alt = "Meshes cut through the sites " + ", ".join(names) + f": {', '.join(colours)} and bone voids"
@@ -247,7 +246,7 @@ def draw_field_figure(store: Results, sites: Sequence[str], stage: str, name: st
     cuts = [cut_behind(grid, view, smooth=True) for view, (_, _, grid) in zip(views, grids, strict=True)]
     limits = _find_colour_limits(cuts, views, field[0])
     shots = [render_field(cut, view, field[0], limits) for view, cut in zip(views, cuts, strict=True)]
-    names = [row["site"] for row, _, _ in grids]
+    names = [row.site for row, _, _ in grids]
     alt = f"Deformed cut at the peak, coloured by {field[1]}, sites " + ", ".join(names)
     caption = f"Deformed cut through each site at the largest indentation; colour: {field[1]}."
     markup = build_picture_row(shots, [f"site {name}" for name in names], alt) + make_colour_bar(
@@ -262,7 +261,7 @@ def render_field(cut: Grid, view: View, field: str, limits: tuple[float, float])
     return render_views(make_field_plotter(surface, field, limits), [view])[0]
 
 
-def find_placed_meshes(store: Results, sites: Sequence[str], stage: str) -> list[tuple[Json, Path]]:
+def find_placed_meshes(store: Results, sites: Sequence[str], stage: str) -> list[tuple[PlacedSite, Path]]:
     """Sites with a place and a stored mesh."""
     rows = store.placed_sites
     found = [(rows[name], store.vtu(stage, name)) for name in sites if name in rows]
@@ -286,10 +285,10 @@ def read_linear(file: Path) -> Grid:
     return plain
 
 
-def make_cut_views(store: Results, row: Json, file: Path) -> tuple[View, View]:
+def make_cut_views(store: Results, row: PlacedSite, file: Path) -> tuple[View, View]:
     """The whole limb and the neighbourhood of a site, seen at right angles to the cut through it."""
     up = read_limb_frame(store)[2]
-    axis = normalise(row["axis"])
+    axis = normalise(row.axis)
     normal = normalise(np.cross(axis, up)) if abs(axis @ up) < 0.98 else read_limb_frame(store)[0]
     points = np.asarray(pv.read(file).points)
     height = points @ up
@@ -298,7 +297,7 @@ def make_cut_views(store: Results, row: Json, file: Path) -> tuple[View, View]:
     centre = middle + ((height.max() + height.min()) / 2 - middle @ up) * up
     reach = float(np.abs((points - centre) @ axis).max()) + 30
     whole = View(centre, normal, up, half, (round(900 * reach / half), 900))
-    close = View(np.array(row["position_mm"]) + 14 * axis, normal, up, 34.0, (700, 700))
+    close = View(np.array(row.position_mm) + 14 * axis, normal, up, 34.0, (700, 700))
     return whole, close
 
 

@@ -11,7 +11,8 @@ from scipy.spatial import KDTree
 
 from ...errors import InputError
 from ...mesh import compute_dihedral_angles
-from ..store import Json, Results, load_store
+from ...results.limb import PlacedSite
+from ..store import Results, load_store
 from .panels import Drawing, Mark, PictureRow, Shot, View, build_figure_sheet, make_key, write_png
 from .pictures import (
     BONE,
@@ -84,23 +85,23 @@ def draw_surfaces_sheet(store: Results) -> Drawing:
 def draw_sites_sheet(store: Results) -> Drawing:
     """Four sides: every site on the side that shows it, with the axis of the indenter."""
     skin = pv.read(store.surface_files["skin"])
-    regions = list(dict.fromkeys(str(row.get("region") or "") for row in store.sites))
+    regions = list(dict.fromkeys(row.region or "" for row in store.sites))
     colours = {name: REGIONS[i % len(REGIONS)] for i, name in enumerate(regions)}
     plotter = make_limb_plotter(store, skin)
     for row in store.sites:
-        axis, place = normalise(row["axis"]), np.array(row["position_mm"])
+        axis, place = normalise(row.axis), np.array(row.position_mm)
         arrow = pv.Arrow(
             start=place - AXIS_MM * axis, direction=axis, scale=AXIS_MM, tip_length=0.4, tip_radius=0.14
         )
-        plotter.add_mesh(arrow, color=colours[str(row.get("region") or "")], **MATT)
+        plotter.add_mesh(arrow, color=colours[row.region or ""], **MATT)
 
     def mark_facing(view: View) -> list[Mark]:
-        facing = [row for row in store.sites if normalise(row["axis"]) @ view.direction > 0.35]
+        facing = [row for row in store.sites if normalise(row.axis) @ view.direction > 0.35]
         return [_mark_site(row, colours) for row in facing]
 
     shots = render_views(plotter, make_four_views(store, skin), mark_facing)
     keys = [make_key(name or "no region", colour, dot=True) for name, colour in colours.items()]
-    used = {bool(row.get("fitted")) for row in store.sites}
+    used = {row.fitted for row in store.sites}
     if len(used) == 2:
         keys += [make_key("fitted", "#555555", True), make_key("held out", "#555555", True, filled=False)]
     return build_figure_sheet("Sites, with the axis of the indenter", [PictureRow(shots, SIDES)], keys)
@@ -118,12 +119,12 @@ def draw_mesh_sheet(store: Results) -> Drawing:
         colours |= choose_region_colours(grid)
         plotter = make_plotter()
         add_regions(plotter, cut_behind(grid, views[0]))
-        mark = Mark(str(row["site"]), np.array(row["position_mm"]), CUT_PLANE, True, normalise(row["axis"]))
+        mark = Mark(row.site, np.array(row.position_mm), CUT_PLANE, True, normalise(row.axis))
         shots = [(picture, view, [mark]) for picture, view, _ in render_views(plotter, views)]
         whole.append(shots[0])
         near.append(shots[1])
         tets = grid.cell_connectivity.reshape(-1, 4)
-        angles[str(row["site"])] = compute_dihedral_angles(np.asarray(grid.points, float), tets).min(axis=1)
+        angles[row.site] = compute_dihedral_angles(np.asarray(grid.points, float), tets).min(axis=1)
     titles = [f"site {name}" for name in angles]
     keys = [make_key(name, colour) for name, colour in (colours | {"wall of a bone": BONE}).items()]
     drawing = build_figure_sheet(
@@ -150,7 +151,8 @@ def _draw_histogram(drawing: Drawing, angles: dict[str, Any]) -> None:
 
 
 def _make_cut_plane(store: Results, skin: Any) -> Any:
-    normal, point = normalise(store.surfaces["cut_normal"]), np.array(store.surfaces["cut_point"])
+    assert store.surfaces is not None
+    normal, point = normalise(store.surfaces.cut_normal), np.array(store.surfaces.cut_point)
     near = np.asarray(skin.points)[np.abs((skin.points - point) @ normal) < 3.0]
     centre = near.mean(axis=0) if len(near) else point
     reach = 1.12 * float(np.linalg.norm(near - centre, axis=1).max()) if len(near) else 60.0
@@ -173,9 +175,9 @@ def _measure_thicknesses(store: Results, skin: Any) -> list[tuple[Any, str]]:
     return found
 
 
-def _mark_site(row: Json, colours: dict[str, str]) -> Mark:
-    colour = colours[str(row.get("region") or "")]
-    return Mark(str(row["site"]), np.array(row["position_mm"]), colour, bool(row.get("fitted")))
+def _mark_site(row: PlacedSite, colours: dict[str, str]) -> Mark:
+    colour = colours[row.region or ""]
+    return Mark(row.site, np.array(row.position_mm), colour, row.fitted)
 
 
 _SHEETS = {"surfaces": draw_surfaces_sheet, "sites": draw_sites_sheet, "mesh": draw_mesh_sheet}

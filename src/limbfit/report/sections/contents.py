@@ -50,18 +50,18 @@ PRIVACY = (
 
 def make_page(store: Results) -> Page:
     """Every section in the order in which a reader asks."""
-    study = store.run.get("study") or {}
+    run = store.run
     sections = (
         make_model_section(store),
         make_mesh_section(store),
         make_record_section(store),
         make_fit_section(store),
         make_prediction_section(store),
-        make_domain_section(store) if "recorded_range" in store.predict else None,
-        make_record_check_section(store) if "flags" in store.predict else None,
+        make_domain_section(store) if store.predict else None,
+        make_record_check_section(store) if store.predict else None,
         make_parameter_section(store),
         make_convergence_section(store),
-        make_models_section(store) if store.models else None,
+        make_models_section(store, store.models) if store.models else None,
         *_list_experiment_sections(store),
         make_simulated_section(store) if store.simulated else None,
         make_comparison_section(store) if store.compared else None,
@@ -71,10 +71,10 @@ def make_page(store: Results) -> Page:
         make_settings_section(store),
         make_provenance_section(store),
     )
-    version = store.run.get("limbfit", "unknown version")
+    version = run.limbfit if run else "of an unknown version"
     return Page(
-        title=str(study.get("name") or "Unnamed study"),
-        subtitle=str(study.get("description") or ""),
+        title=run.study.name if run else "Unnamed study",
+        subtitle=run.study.description if run else "",
         key_numbers=list_key_numbers(store),
         summary=build_summary(store),
         sections=tuple(section for section in sections if section is not None),

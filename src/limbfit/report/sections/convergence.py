@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 
+from ...results.identification import SearchStage, SimulationDoubts
 from ..drawing.figures import draw_convergence_figure
 from ..drawing.interactive import draw_convergence_curves
-from ..formats import NOTHING, format_fixed, format_with_unit, number
+from ..formats import format_fixed, format_with_unit, number
 from ..page import Bullets, Section, Table, make_bullets, make_section
-from ..store import Json, Results
+from ..store import Results
 from ..tables import Column, make_table, to_numeric
 
 _KINDS = {
@@ -26,9 +27,8 @@ def make_convergence_section(store: Results) -> Section:
     """How the identification went."""
     stages = store.stages
     texts = (
-        f"{str(stage['name']).capitalize()}: {'' if stage.get('converged') else 'not '}converged after "
-        f"{len(stage.get('iterations') or ())} iterates and {stage.get('evaluations', NOTHING)} "
-        f"evaluations; {stage.get('reason') or 'no reason stored'}."
+        f"{stage.name.capitalize()}: {'' if stage.converged else 'not '}converged after "
+        f"{len(stage.iterations)} iterates and {stage.evaluations} evaluations; {stage.reason}."
         for stage in stages
     )
     return make_section(
@@ -38,46 +38,45 @@ def make_convergence_section(store: Results) -> Section:
         draw_convergence_figure(store),
         draw_convergence_curves(store),
         describe_search(store),
-        (make_iteration_table(store, stage) for stage in stages if stage.get("iterations")),
+        (make_iteration_table(store, stage) for stage in stages if stage.iterations),
         otherwise="No identification is stored yet.",
     )
 
 
-def make_iteration_table(store: Results, stage: Json) -> Table:
+def make_iteration_table(store: Results, stage: SearchStage) -> Table:
     """Every accepted iterate of one identification stage."""
-    known = tuple(stage.get("parameters", ()))
-    tissues = known if stage.get("name") != "one material" else known[:1]
+    known = tuple(stage.parameters)
+    tissues = known if stage.name != "one material" else known[:1]
     columns: tuple[Column, ...] = (
         ("Iteration", "iteration"),
-        ("Objective", lambda step: to_numeric(number(step.get("cost"), 4))),
+        ("Objective", lambda step: to_numeric(number(step.cost, 4))),
         ("Error (%)", "error_percent", 2),
         *(
             (
                 f"{tissue + ' ' if len(tissues) > 1 else ''}{format_with_unit(key)}",
-                lambda step, t=tissue, k=key: to_numeric(
-                    number(step.get("parameters", {}).get(t, {}).get(k))
-                ),
+                lambda step, t=tissue, k=key: to_numeric(number(step.parameters[t][k])),
             )
             for tissue in tissues
             for key in store.law.keys
         ),
     )
-    name = str(stage.get("name"))
-    caption = f"Iterations of the stage “{name}”."
-    rows = stage.get("iterations") or ()
-    return make_table(f"iterations-{name.replace(' ', '-')}", caption, columns, rows, folded=True)
+    caption = f"Iterations of the stage “{stage.name}”."
+    name = f"iterations-{stage.name.replace(' ', '-')}"
+    return make_table(name, caption, columns, stage.iterations, folded=True)
 
 
 def describe_search(store: Results) -> tuple[Bullets | None, Table | None]:
     """What the record of the identification says of its doubtful simulations; nothing where none is."""
-    found = store.calibration.get("doubts") or {}
-    rows, answer = found.get("search") or [], found.get("answer") or {}
-    texts = [_summarise_search(found, rows)] if rows else []
+    if store.calibration is None:
+        return None, None
+    found = store.calibration.doubts
+    rows, answer = found.search, found.answer
+    texts = [_summarise_search(found)] if rows else []
     texts += [
-        f"At the answer, site {site}: {doubt['text']}." for site, doubts in answer.items() for doubt in doubts
+        f"At the answer, site {site}: {doubt.text}." for site, doubts in answer.items() for doubt in doubts
     ]
-    for site, one in (store.calibration.get("contact") or {}).items():
-        if (off := one.get("from_rest_percent") or 0.0) > EQUAL_PERCENT:
+    for site, one in store.calibration.contact.items():
+        if (off := one.from_rest_percent or 0.0) > EQUAL_PERCENT:
             texts.append(
                 f"The answer's force from rest differs from the fitted one by "
                 f"{format_fixed(off, 2)} % at site "
@@ -86,22 +85,22 @@ def describe_search(store: Results) -> tuple[Bullets | None, Table | None]:
     columns = (
         ("Evaluation", "evaluation"),
         ("Site", "site"),
-        ("Doubt", lambda row: _KINDS[row["kind"]]),
+        ("Doubt", lambda row: _KINDS[row.kind]),
         ("How many", "count", 0),
-        ("From (% of the depth)", lambda row: to_numeric(format_fixed(100 * row["share"], 0))),
-        ("Accepted iterate", lambda row: "no" if row["iterate"] is None else row["iterate"]),
+        ("From (% of the depth)", lambda row: to_numeric(format_fixed(100 * row.share, 0))),
+        ("Accepted iterate", lambda row: "no" if row.iterate is None else row.iterate),
     )
     caption = "Simulations of the search that completed but are doubtful."
     table = make_table("doubtful-simulations", caption, columns, rows, folded=True)
     return make_bullets(texts), table if rows else None
 
 
-def _summarise_search(found: Json, rows: list[Json]) -> str:
-    kinds = Counter(row["kind"] for row in rows)
+def _summarise_search(found: SimulationDoubts) -> str:
+    kinds = Counter(row.kind for row in found.search)
     words = ", ".join(f"{_KINDS[kind]} in {count}" for kind, count in kinds.items())
-    used = sum(row["iterate"] is not None for row in rows)
+    used = sum(row.iterate is not None for row in found.search)
     return (
-        f"{found['doubtful']} of {found['simulations']} simulations of the search completed but are doubtful "
+        f"{found.doubtful} of {found.simulations} simulations of the search completed but are doubtful "
         f"({words}); {used} of these doubts are at accepted iterates. A step is shortened where the force "
         "newly falls, and up to three times a stage where elements newly fold."
     )

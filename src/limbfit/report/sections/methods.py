@@ -12,6 +12,8 @@ from collections.abc import Iterable
 from jinja2 import ChainableUndefined, Environment, PackageLoader
 
 from ...laws import ACTIVE, OGDEN, split_key
+from ...results.base import Parameters, ResultPart
+from ...results.identification import ParameterBounds
 from ...shapes import SHAPES
 from ..formats import (
     NOTHING,
@@ -43,11 +45,11 @@ def make_method_section(store: Results) -> Section:
 
 def write_method_markdown(store: Results) -> str:
     """The same as Markdown, with every setting as a table at its end."""
-    name = str((store.run.get("study") or {}).get("name") or "Unnamed study")
+    name = store.run.study.name if store.run else "Unnamed study"
     lines = [f"# Methods: {name}", ""]
     for head, text in write_method_parts(store):
         lines += [f"## {head}", "", text, ""]
-    settings = flatten_settings(store.run.get("settings") or {})
+    settings = flatten_settings(store.run.settings if store.run else {})
     if settings:
         lines += ["## Every setting", "", "| key | value |", "|---|---|"]
         cells = ([text.replace("|", "\\|").replace("\n", " ") for text in pair] for pair in settings.items())
@@ -65,22 +67,21 @@ def write_method_parts(store: Results) -> tuple[Part, ...]:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    records, contact = store.traces, (store.calibration.get("contact") or {}).values()
-    depths = [row["penetration_mm"] for row in store.predicted if row.get("penetration_mm") is not None]
+    records, contact = store.traces, store.calibration.contact.values() if store.calibration else ()
     text = environment.get_template("methods.j2").render(
         store=store,
         found=store.calibration,
-        settings=store.run.get("settings") or {},
-        machine=store.run.get("machine") or {},
+        settings=store.run.settings if store.run else {},
+        machine=store.run.machine if store.run else {},
         records=list(records.values()),
-        sites={one.get("site", name) for name, one in records.items()},
-        markers=sum(1 for site in store.sites if site.get("marker")),
+        sites={one.site for one in records.values()},
+        markers=sum(1 for site in store.sites if site.marker),
         meshes=list(store.mesh.values()),
-        penalties=[one["penalty_per_mm"] for one in contact if one.get("penalty_per_mm") is not None],
-        depths=depths,
-        heldout={row["site"] for row in store.predicted if not row.get("fitted")},
+        penalties=[one.penalty_per_mm for one in contact if one.penalty_per_mm is not None],
+        depths=[row.penetration_mm for row in store.predicted],
+        heldout={row.site for row in store.predicted if not row.fitted},
         experiments=_list_experiments(store),
-        seconds=sum(stage.get("seconds") or 0.0 for stage in (store.run.get("stages") or {}).values()),
+        seconds=sum(stage.seconds for stage in store.run.stages.values()) if store.run else 0.0,
         **{"NOTHING": NOTHING, "OGDEN": OGDEN, "elements": ELEMENTS},
         **{
             "fixed": format_fixed,
@@ -100,9 +101,9 @@ def write_method_parts(store: Results) -> tuple[Part, ...]:
     return tuple((head, " ".join(body.split())) for head, body in parts if body.strip())
 
 
-def _format_span(facts: Iterable[Json], key: str, digits: int, factor: int = 1) -> str:
+def _format_span(facts: Iterable[ResultPart], key: str, digits: int, factor: int = 1) -> str:
     """From the least to the largest value of a key, where there is one."""
-    values = [factor * fact[key] for fact in facts if isinstance(fact.get(key), int | float)]
+    values = [factor * value for fact in facts if (value := getattr(fact, key)) is not None]
     return (
         f"{format_fixed(min(values), digits)} to {format_fixed(max(values), digits)}" if values else NOTHING
     )
@@ -112,18 +113,16 @@ def _format_pairs(table: Json) -> str:
     return ", ".join(f"{key} = {value}" for key, value in table.items() if value not in (None, [], ""))
 
 
-def _format_start(start: Json) -> str:
-    tissues = (start or {}).items()
+def _format_start(start: Parameters) -> str:
     return _join_tissues(
-        {t: ", ".join(map(format_with_value, values, values.values())) for t, values in tissues}
+        {t: ", ".join(map(format_with_value, values, values.values())) for t, values in start.items()}
     )
 
 
-def _format_bounds(bounds: Json) -> str:
-    lower, upper = (bounds or {}).get("lower") or {}, (bounds or {}).get("upper") or {}
+def _format_bounds(bounds: ParameterBounds) -> str:
     texts = {}
-    for tissue, values in lower.items():
-        ends = {key: (low, upper.get(tissue, {}).get(key)) for key, low in values.items()}
+    for tissue, values in bounds.lower.items():
+        ends = {key: (low, bounds.upper[tissue][key]) for key, low in values.items()}
         words = (
             f"{format_symbol(key)} {format_limits(both)} {split_key(key)[1]}".strip()
             for key, both in ends.items()
@@ -176,7 +175,8 @@ def _list_experiments(store: Results) -> list[str]:
     """Every finished experiment with its options; what is nested stands in its own record."""
     done = []
     for name in store.experiments:
-        options = store.run["experiments"][name].get("options") or {}
+        assert store.run is not None
+        options = store.run.experiments[name].options
         plain = {key: value for key, value in options.items() if not isinstance(value, dict)}
         done.append(name + (f" ({_format_pairs(plain)})" if plain else ""))
     return done

@@ -2,36 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
+from ...results.base import Parameters
+from ...results.identification import CorrelationMatrix, RecordResiduals, ResidualsSummary
 from ..drawing.figures import draw_interval_figure
-from ..formats import NOTHING, format_fixed, format_limits, get_unit, label, number
-from ..page import Block, Bullets, Cell, Note, Prose, Section, Table, make_section
-from ..store import Json, Results
+from ..formats import format_fixed, format_limits, get_unit, label, number
+from ..page import Block, Bullets, Cell, Prose, Section, Table, make_section
+from ..store import Results
 from ..tables import Column, make_row, make_table, to_numeric
 
 
 def make_parameter_section(store: Results) -> Section:
     """Table 1, intervals and correlations."""
-    found = store.stages
-    none = Note("No uncertainty is stored, so the table has no intervals.")
-    section = make_section(
-        "parameters",
-        "Parameters",
-        make_parameter_table(store) if found else None,
-        draw_interval_figure(store),
-        make_correlation_table(store) if found else None,
-        otherwise="No parameters have been identified yet.",
-    )
+    title, none = "Parameters", "No parameters have been identified yet."
+    known = store.uncertainty
+    if known is None:
+        return make_section("parameters", title, otherwise=none)
     return make_section(
-        section.name,
-        section.title,
-        section.blocks,
-        none if found and not store.uncertainty else None,
+        "parameters",
+        title,
+        make_parameter_table(store),
+        draw_interval_figure(store),
+        make_correlation_table(known.correlation),
         describe_relaxation(store),
         describe_priors(store),
         _describe_combinations(store),
-        _describe_residuals(store),
+        _describe_residuals(known.residuals),
+        otherwise=none,
     )
 
 
@@ -44,7 +42,7 @@ def make_parameter_columns(store: Results) -> tuple[Column, ...]:
     )
 
 
-def make_value_column(head: str, tissues: Json) -> Column:
+def make_value_column(head: str, tissues: Parameters) -> Column:
     """The values of parameters by tissue and key."""
     return head, lambda row: to_numeric(number(tissues.get(row[0], {}).get(row[1])))
 
@@ -53,8 +51,8 @@ def make_parameter_table(store: Results) -> Table:
     """Table 1: start, value after each stage, interval, verdict, and the truth where it is known."""
     columns = (
         *make_parameter_columns(store),
-        make_value_column("Start", store.stages[0].get("start", {})),
-        *(make_value_column(one["name"].capitalize(), one.get("parameters", {})) for one in store.stages),
+        make_value_column("Start", store.stages[0].start),
+        *(make_value_column(one.name.capitalize(), one.parameters) for one in store.stages),
         ("95 % interval", lambda row: to_numeric(format_limits(store.interval(*row)))),
         ("Verdict", lambda row: _read_verdict(store, *row)),
         *((make_value_column("Truth", store.truth.get("parameters", {})),) if store.truth else ()),
@@ -68,61 +66,56 @@ def make_parameter_table(store: Results) -> Table:
 
 def _read_verdict(store: Results, tissue: str, name: str) -> str:
     """What the identification says about a parameter: ``determined`` or the contrary, in its own words."""
+    assert store.uncertainty is not None
     key = f"{tissue}.{name}"
-    word = str((store.uncertainty.get("verdict") or {}).get(key, NOTHING))
-    return f"{word}; at its bound" if (store.uncertainty.get("at_bound") or {}).get(key) else word
+    word = store.uncertainty.verdict[key]
+    return f"{word}; at its bound" if store.uncertainty.at_bound[key] else word
 
 
-def make_correlation_table(store: Results) -> Table | None:
+def make_correlation_table(correlation: CorrelationMatrix) -> Table:
     """The correlation of every pair of parameters, coloured."""
-    correlation = store.uncertainty.get("correlation") or {}
-    names, matrix = correlation.get("names"), correlation.get("matrix")
-    if not names or not matrix:
-        return None
-    heads = [label(str(name)) for name in names]
-    rows = [make_row(head, *map(_shade_cell, values)) for head, values in zip(heads, matrix, strict=True)]
+    heads = [label(name) for name in correlation.names]
+    pairs = zip(heads, correlation.matrix, strict=True)
+    rows = [make_row(head, *map(_shade_cell, values)) for head, values in pairs]
     caption = (
         "Correlation of the identified parameters. Near ±1 the data determine only a combination of the two."
     )
     return Table("correlation", caption, ("", *heads), tuple(rows))
 
 
-def _shade_cell(value: Any) -> Cell:
-    known = isinstance(value, int | float) and value == value
-    return Cell(
-        format_fixed(value, 2), number=True, shade=max(-1.0, min(1.0, float(value))) if known else None
-    )
+def _shade_cell(value: float) -> Cell:
+    return Cell(format_fixed(value, 2), number=True, shade=max(-1.0, min(1.0, value)))
 
 
 def describe_relaxation(store: Results) -> tuple[Block, ...]:
     """What the records tell of relaxation, and the modulus of each tissue at several times after a step."""
-    found = store.uncertainty.get("relaxation")
-    if not found:
+    found = store.uncertainty.relaxation if store.uncertainty else None
+    if found is None:
         return ()
-    first = str(found["words"][0])
-    longest, (low, high) = found["beyond"]["longest_s"], found["prior"]["slope"]
+    first = found.words[0]
+    longest, (low, high) = found.beyond.longest_s, found.prior.slope
     lead = (
         f"{first[0].upper()}{first[1:]}. No record shows the modulus that longer loads see: after "
         f"{longest:.0f} s it falls as a power of time, whose slope is between {low:g} and {high:g} "
-        f"({found['prior']['source']})."
+        f"({found.prior.source})."
     )
     columns: tuple[Column, ...] = (
-        ("Tissue", lambda row: store.describe_tissue(row["tissue"])),
-        ("After a step (s)", lambda row: to_numeric(number(row["time_s"]))),
-        ("Modulus (kPa)", lambda row: to_numeric(number(row["modulus_kPa"]))),
-        ("95 % interval", lambda row: to_numeric(format_limits(row["interval_95"]))),
+        ("Tissue", lambda row: store.describe_tissue(row.tissue)),
+        ("After a step (s)", lambda row: to_numeric(number(row.time_s))),
+        ("Modulus (kPa)", lambda row: to_numeric(number(row.modulus_kPa))),
+        ("95 % interval", lambda row: to_numeric(format_limits(row.interval_95))),
     )
     caption = "Modulus of each tissue after a step of strain: of the model, and what the records leave open."
-    return Prose(lead), make_table("moduli", caption, columns, found["moduli"])
+    return Prose(lead), make_table("moduli", caption, columns, found.moduli)
 
 
 def describe_priors(store: Results) -> tuple[Block, ...]:
     """Each parameter's prior, how much of its variance priors cause, and its interval without them."""
-    found = store.uncertainty.get("priors")
-    if not found:
+    found = store.uncertainty.priors if store.uncertainty else None
+    if found is None:
         return ()
-    stated, nothing = found["stated"], {"median": None, "factor": None}
-    sources = list(dict.fromkeys(one["source"] for one in stated.values()))
+    stated = found.stated
+    sources = list(dict.fromkeys(one.source for one in stated.values()))
     caption = (
         "What was known beforehand, and how much of each interval comes from it: the share of the "
         "variance of its logarithm that the priors' own deviations cause (the rest is that of records and "
@@ -130,18 +123,21 @@ def describe_priors(store: Results) -> tuple[Block, ...]:
         "factor is one standard deviation either way."
     )
 
+    def read_prior(row: tuple[str, str], key: str) -> float | None:
+        return getattr(stated.get(".".join(row)), key, None)
+
     def share(row: tuple[str, str]) -> Cell:
-        value = float(found["share"][".".join(row)])
+        value = found.share[".".join(row)]
         return to_numeric(format_fixed(100 * value, 0), share=min(value, 1.0))
 
     columns = (
         *make_parameter_columns(store),
-        ("Prior", lambda row: to_numeric(number(stated.get(".".join(row), nothing)["median"]))),
-        ("Factor", lambda row: to_numeric(format_fixed(stated.get(".".join(row), nothing)["factor"], 2))),
+        ("Prior", lambda row: to_numeric(number(read_prior(row, "median")))),
+        ("Factor", lambda row: to_numeric(format_fixed(read_prior(row, "factor"), 2))),
         ("From priors (%)", share),
         (
             "Wider without",
-            lambda row: to_numeric(f"{format_fixed(found['wider_without']['.'.join(row)], 2)} times"),
+            lambda row: to_numeric(f"{format_fixed(found.wider_without['.'.join(row)], 2)} times"),
         ),
     )
     table = make_table("priors", caption, columns, store.parameters)
@@ -150,7 +146,7 @@ def describe_priors(store: Results) -> tuple[Block, ...]:
 
 def _describe_combinations(store: Results) -> tuple[Block, ...]:
     """What the data determine of several parameters together, best determined first."""
-    sentences = [str(sentence) for sentence in store.uncertainty.get("combinations") or ()]
+    sentences = list(store.uncertainty.combinations) if store.uncertainty else []
     if not sentences:
         return ()
     for name in map(".".join, store.parameters):
@@ -163,24 +159,24 @@ def _describe_combinations(store: Results) -> tuple[Block, ...]:
     return Prose(lead), Bullets(tuple(sentences))
 
 
-def _describe_residuals(store: Results) -> Prose | None:
+def _describe_residuals(found: ResidualsSummary) -> Prose | None:
     """What the intervals rest on: noise, misfit of the model, errors of meshes and surfaces, by site."""
-    found = store.uncertainty.get("residuals") or {}
-    rows = found.get("sites") or {}
+    rows = found.sites
     if not rows:
         return None
     meshes, own = (
         ", ".join(
-            f"{name} {format_fixed(100 * site[share], 1)} %"
-            for name, site in rows.items()
-            if site.get(share) is not None
+            f"{name} {format_fixed(100 * share, 1)} %" for name, share in shares.items() if share is not None
         )
-        for share in ("mesh_share", "site_share")
+        for shares in (
+            {name: row.mesh_share for name, row in rows.items()},
+            {name: row.site_share for name, row in rows.items()},
+        )
     )
     text = (
         "The intervals rest on two kinds of residuals at the fitted sites, standard deviations of the noise "
         f"as recorded and of the smooth misfit of the model: {describe_residuals(rows)}. "
-        f"A misfit lasts about {format_fixed(100 * found['correlation'], 0)} % of a record. "
+        f"A misfit lasts about {format_fixed(100 * found.correlation, 0)} % of a record. "
     )
     if meshes:
         text += f"The error of the meshes is added, in percent of the largest force: {meshes}."
@@ -189,16 +185,15 @@ def _describe_residuals(store: Results) -> Prose | None:
     if own:
         text += (
             " So is what tissue and surfaces make a site as a whole stiffer or softer, root mean square over "
-            f"the record: {own}; {format_fixed(found['site_factor'], 1)} times what its thickness "
+            f"the record: {own}; {format_fixed(found.site_factor, 1)} times what its thickness "
             "lets expect."
         )
     return Prose(text)
 
 
-def describe_residuals(sites: Json) -> str:
+def describe_residuals(sites: Mapping[str, RecordResiduals]) -> str:
     """Standard deviations of each fitted record's noise and of the model's misfit, in words."""
     return ", ".join(
-        f"{name} {format_fixed(one.get('noise_sd_N'), 3)} and {format_fixed(one.get('misfit_sd_N'), 3)} "
-        f"{one.get('unit', 'N')}"
+        f"{name} {format_fixed(one.noise_sd_N, 3)} and {format_fixed(one.misfit_sd_N, 3)} {one.unit}"
         for name, one in sites.items()
     )

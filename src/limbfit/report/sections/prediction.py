@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from ...results.identification import RecordFit, RecordPrediction
 from ..drawing import figures
 from ..drawing.pictures import draw_field_figure
 from ..formats import NOTHING, format_fixed, number
@@ -14,7 +15,7 @@ from ..tables import Column, make_row, make_table, to_numeric
 
 def make_fit_section(store: Results) -> Section:
     """Force against time at the fitted sites."""
-    rows = [row for row in store.predicted if row.get("fitted")]
+    rows = [row for row in store.predicted if row.fitted]
     return make_section(
         "fit",
         "Fitted sites",
@@ -29,7 +30,7 @@ def make_fit_section(store: Results) -> Section:
 
 def make_prediction_section(store: Results) -> Section:
     """Everything about the sites that were not used, and table 2."""
-    rows = [row for row in store.predicted if not row.get("fitted")]
+    rows = [row for row in store.predicted if not row.fitted]
     unseen = "Every site was fitted, so nothing tests the model on unseen data."
     return make_section(
         "prediction",
@@ -50,14 +51,13 @@ def make_prediction_section(store: Results) -> Section:
 
 def make_domain_section(store: Results) -> Section:
     """What predictions and the socket do to the tissue that no fitted record did."""
-    socket = store.experiments.get("socket") or {"loads": []}
-    held = [{"record": "socket, donning", **socket["donning"]}] if "donning" in socket else []
-    held += [{**load, "record": f"socket, {load['name']}"} for load in socket["loads"]]
-    rows = [
-        {"record": one["record"], **row}
-        for one in (*store.predicted, *held)
-        for row in one.get("outside_records") or ()
-    ]
+    predicted = [({"record": one.record}, one.outside_records) for one in store.predicted]
+    socket = store.socket
+    if socket is not None:
+        states = [("donning", socket.donning), *((load.name, load) for load in socket.loads)]
+        predicted += [({"record": f"socket, {name}"}, one.outside_records or ()) for name, one in states]
+    rows = [head | row.to_plain() for head, outside in predicted for row in outside]
+    told = (*(store.predict.outside_text if store.predict else ()), *(socket.outside_text if socket else ()))
     within = "Every prediction lies within what the fitted records did to the tissue."
     return make_section(
         "domain",
@@ -66,7 +66,7 @@ def make_domain_section(store: Results) -> Section:
             "Parameters are tested by what the records did to the tissue: how far they strained it, how "
             "fast, for how long, and where. A small error at held-out sites says nothing beyond that."
         ),
-        map(Note, [*store.predict.get("outside_text", ()), *socket.get("outside_text", ())]),
+        map(Note, told),
         figures.draw_domain_figure(store),
         make_outside_table(rows) if rows else Note(within),
     )
@@ -97,7 +97,7 @@ def _format_range(limits: Sequence[float]) -> str:
 
 def make_site_table(store: Results) -> Table:
     """Table 2: largest force and errors of each site, fitted sites marked."""
-    several = len({row["site"] for row in store.predicted}) < len(store.predicted)
+    several = len({row.site for row in store.predicted}) < len(store.predicted)
     records = " A row is a record, named site-record; means are over sites, of the means of their records."
     caption = (
         "Table 2. Force error at every site: the mean absolute error over the trace divided by the "
@@ -110,13 +110,13 @@ def make_site_table(store: Results) -> Table:
         ("Largest force (N)", "peak_force_N", 2),
         (
             "Depth (mm)",
-            lambda row: to_numeric(format_fixed(store.traces.get(row["record"], {}).get("depth_mm"), 2)),
+            lambda row: to_numeric(format_fixed(getattr(store.traces.get(row.record), "depth_mm", None), 2)),
         ),
         (
             "Error, one material (%)",
-            lambda row: _format_error(row, "error_one_material_percent", "one_material"),
+            lambda row: _format_error(row, row.error_one_material_percent, "one_material"),
         ),
-        (f"Error, {store.materials} (%)", lambda row: _format_error(row, "error_percent", "force")),
+        (f"Error, {store.materials} (%)", lambda row: _format_error(row, row.error_percent, "force")),
     )
     foot = _make_mean_rows(store)
     return make_table("sites", caption, columns, store.predicted, marked="fitted", foot=foot)
@@ -124,19 +124,19 @@ def make_site_table(store: Results) -> Table:
 
 def make_quality_table(store: Results) -> Table | None:
     """How well the model follows each record, by phase; None where it is not stored."""
-    found = store.predict.get("fit_quality") or {}
-    if not found.get("records"):
+    found = store.predict.fit_quality if store.predict else None
+    if found is None or not found.records:
         return None
     caption = (
-        f"Goodness of fit: {found['verdict']}. Error: root mean square over the largest force, by phase, and "
+        f"Goodness of fit: {found.verdict}. Error: root mean square over the largest force, by phase, and "
         "how many times what noise, touch-down, mesh and site explain (about one where the model is right)."
     )
 
     def phase(name: str) -> Column:
-        def cell(row: Json) -> Cell:
-            here = next((one for one in row["phases"] if one["phase"] == name), None)
+        def cell(row: RecordFit) -> Cell:
+            here = next((one for one in row.phases if one.phase == name), None)
             text = (
-                f"{format_fixed(here['error_percent'], 2)} ({format_fixed(here['times_noise'], 1)})"
+                f"{format_fixed(here.error_percent, 2)} ({format_fixed(here.times_noise, 1)})"
                 if here
                 else NOTHING
             )
@@ -148,43 +148,43 @@ def make_quality_table(store: Results) -> Table | None:
         ("Record", "record"),
         ("Use", _name_use),
         *map(phase, ("loading", "hold", "unloading")),
-        ("In the 95 % band (%)", lambda row: to_numeric(format_fixed(100 * row["inside_95"], 0))),
-        ("Verdict", lambda row: row["verdict"] or "follows"),
+        ("In the 95 % band (%)", lambda row: to_numeric(format_fixed(100 * row.inside_95, 0))),
+        ("Verdict", lambda row: row.verdict or "follows"),
     )
-    return make_table("fit-quality", caption, columns, found["records"], marked="fitted")
+    return make_table("fit-quality", caption, columns, found.records, marked="fitted")
 
 
-def _name_use(row: Json) -> str:
-    return "fitted" if row.get("fitted") else "held out"
+def _name_use(row: RecordPrediction | RecordFit) -> str:
+    return "fitted" if row.fitted else "held out"
 
 
-def _format_error(row: Json, key: str, what: str) -> object:
-    return to_numeric("not predicted" if what in row.get("not_predicted", ()) else format_fixed(row.get(key)))
+def _format_error(row: RecordPrediction, error: float | None, what: str) -> object:
+    return to_numeric("not predicted" if what in row.not_predicted else format_fixed(error))
 
 
 def _make_mean_rows(store: Results) -> Iterable[Row]:
     for use, key in (("fitted", "fitted"), ("held out", "heldout")):
         chosen = [row for row in store.predicted if _name_use(row) == use]
-        one = _average_by_site(chosen, "error_one_material_percent")
+        one = _average_by_site((row.site, row.error_one_material_percent) for row in chosen)
         if chosen:
             mean = to_numeric(format_fixed(sum(one) / len(one)) if one else NOTHING)
             cells = (_count_sites(chosen), use, to_numeric(""), to_numeric(""), mean)
             yield make_row(f"Mean, {use}", *cells, to_numeric(store.mean_error(key)))
 
 
-def _average_by_site(rows: list[Json], key: str) -> list[float]:
+def _average_by_site(errors: Iterable[tuple[str, float | None]]) -> list[float]:
     """A value of each site: the mean over its records that have one."""
     found: dict[str, list[float]] = {}
-    for row in rows:
-        if row.get(key) is not None:
-            found.setdefault(row["site"], []).append(float(row[key]))
+    for site, error in errors:
+        if error is not None:
+            found.setdefault(site, []).append(error)
     return [sum(values) / len(values) for values in found.values()]
 
 
-def _count_sites(rows: list[Json]) -> str:
+def _count_sites(rows: Sequence[RecordPrediction]) -> str:
     """How many sites, and how many of them the mean lacks."""
-    sites = len({row["site"] for row in rows})
-    lacking = sites - len(_average_by_site(rows, "error_percent"))
+    sites = len({row.site for row in rows})
+    lacking = sites - len(_average_by_site((row.site, row.error_percent) for row in rows))
     return f"{sites} site{'s' if sites > 1 else ''}" + (f", without {lacking}" if lacking else "")
 
 
@@ -198,7 +198,7 @@ def make_observed_table(store: Results) -> Table | None:
     columns = (
         ("Record", "record"),
         ("Seen", "what"),
-        ("Use", _name_use),
+        ("Use", lambda row: "fitted" if row["fitted"] else "held out"),
         ("Compared", "compared"),
         ("Left out", lambda row: ", ".join(f"{n} {why}" for why, n in row["left_out"].items()) or NOTHING),
         ("Largest", "largest", 2),
@@ -207,8 +207,8 @@ def make_observed_table(store: Results) -> Table | None:
         ("Error (%)", "error_percent", 1),
     )
     rows = [
-        {**one, "left_out": one.get("left_out") or {}, "record": row["record"], "fitted": row.get("fitted")}
+        one.model_dump() | {"record": row.record, "fitted": row.fitted}
         for row in store.predicted
-        for one in row.get("observed") or ()
+        for one in row.observed
     ]
     return make_table("observed", caption, columns, rows, marked="fitted") if rows else None

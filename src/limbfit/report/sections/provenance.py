@@ -5,51 +5,43 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from ...results.runs import StageRecord
 from ..formats import NOTHING, format_duration, format_fixed
 from ..page import Prose, Section, Table, make_section
 from ..store import Results
-from ..tables import make_row, make_table, to_numeric
+from ..tables import Column, make_row, make_table, to_numeric
 
 
 def make_timing_section(store: Results) -> Section:
     """How long it took, and on what."""
-    machine = store.run.get("machine") or {}
-    words = (
-        f"{machine['cores']} cores" if "cores" in machine else "",
-        f"{format_fixed(machine['memory_GB'])} GB of memory" if "memory_GB" in machine else "",
-        f"Python {machine['python']}" if "python" in machine else "",
-    )
-    known = ", ".join(word for word in words if word)
+    if store.run is None:
+        return make_section("timing", "Computing time", otherwise="No times are stored.")
+    machine = store.run.machine
+    memory = "" if machine.memory_GB is None else f"{format_fixed(machine.memory_GB)} GB of memory, "
     return make_section(
         "timing",
         "Computing time",
-        make_timing_table(store) if store.run.get("stages") else None,
-        Prose(f"Machine: {known}.") if known else None,
-        otherwise="No times are stored.",
+        make_timing_table(store.run.stages),
+        Prose(f"Machine: {machine.cores} cores, {memory}Python {machine.python}."),
     )
 
 
-def make_timing_table(store: Results) -> Table:
+def make_timing_table(stages: Mapping[str, StageRecord]) -> Table:
     """How long each stage took, with bars."""
-    rows = [
-        {"stage": name, "seconds": facts["seconds"], "finished": facts.get("finished") or NOTHING}
-        for name, facts in store.run["stages"].items()
-        if isinstance(facts.get("seconds"), int | float)
-    ]
-    seconds = [row["seconds"] for row in rows]
+    seconds = [stage.seconds for stage in stages.values()]
     longest = max([*seconds, 1e-9])
-    columns = (
-        ("Stage", "stage"),
-        ("Time", lambda row: to_numeric(format_duration(row["seconds"]), share=row["seconds"] / longest)),
-        ("Finished", lambda row: row["finished"][:16].replace("T", " ")),
+    columns: tuple[Column, ...] = (
+        ("Stage", lambda row: row[0]),
+        ("Time", lambda row: to_numeric(format_duration(row[1].seconds), share=row[1].seconds / longest)),
+        ("Finished", lambda row: row[1].finished[:16].replace("T", " ")),
     )
     total = make_row("Total", to_numeric(format_duration(sum(seconds))), "")
-    return make_table("timing", "How long each stage took.", columns, rows, foot=(total,))
+    return make_table("timing", "How long each stage took.", columns, stages.items(), foot=(total,))
 
 
 def make_settings_section(store: Results) -> Section:
     """Every setting of the study file."""
-    flat = flatten_settings(store.run.get("settings") or {})
+    flat = flatten_settings(store.run.settings if store.run else {})
     caption = "Every setting of the study, defaults included."
     table = make_pair_table("all-settings", caption, ("Key", "Value"), flat)
     return make_section("settings", "Settings", table, otherwise="No settings are stored.")
@@ -57,14 +49,13 @@ def make_settings_section(store: Results) -> Section:
 
 def make_provenance_section(store: Results) -> Section:
     """Versions and hashes of inputs."""
-    versions = {"limbfit": store.run.get("limbfit")} | (store.run.get("versions") or {})
-    known = {name: value for name, value in versions.items() if value}
-    inputs, head = store.run.get("inputs") or {}, ("Key of the study", "SHA-256")
+    run, head = store.run, ("Key of the study", "SHA-256")
+    versions = {"limbfit": run.limbfit, **run.versions} if run else {}
     return make_section(
         "provenance",
         "Versions and inputs",
-        make_pair_table("versions", "Software.", ("Library", "Version"), known),
-        make_pair_table("inputs", "Inputs and their SHA-256.", head, inputs),
+        make_pair_table("versions", "Software.", ("Library", "Version"), versions),
+        make_pair_table("inputs", "Inputs and their SHA-256.", head, run.inputs if run else {}),
         otherwise="No versions and input hashes are stored.",
     )
 

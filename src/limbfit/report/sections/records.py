@@ -6,13 +6,14 @@ from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 
+from ...results.records import RecordPhase
 from ..drawing.colours import GRID, INK, MUTED, SIMULATED
 from ..drawing.figures import thin_curves
 from ..drawing.interactive import record_curves
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import format_fixed
 from ..page import Figure, Section, Table, make_section
-from ..store import Curves, Json, Results
+from ..store import Curves, Results
 from ..tables import make_table
 
 MAX_NAMED_PHASES = 6  # whose names have room in a panel
@@ -38,15 +39,14 @@ def draw_record_figure(store: Results, site: str) -> Figure | None:
     raw, regular, touch_down = store.record_curves(site)
     if raw is None or regular is None:
         return None
-    facts = store.traces.get(site, {})
+    facts = store.traces[site]
     drawing, axes = make_panels(3, 3, 2.5)
     _draw_record(axes, thin_curves(raw), regular, touch_down)
     for ax in axes[:2]:
-        _mark_phases(ax, facts.get("phases") or [])
+        _mark_phases(ax, facts.phases)
     add_legend(drawing, axes[0])
-    peak, depth = format_fixed(facts.get("peak_force_N"), 2), format_fixed(facts.get("depth_mm"), 2)
-    words = facts.get("phases_in_words")
-    phases = f"the indenter's phases are {words} (holds are shaded); " if words else ""
+    peak, depth = format_fixed(facts.peak_force_N, 2), format_fixed(facts.depth_mm, 2)
+    phases = f"the indenter's phases are {facts.phases_in_words} (holds are shaded); "
     alt = f"Record of site {site}: displacement and force against time, and force against displacement"
     caption = (
         f"Figure 3 of the paper for this study: record of site {site}, raw and regularised. The dashed "
@@ -67,15 +67,15 @@ def _draw_record(axes: Sequence[Axes], raw: Curves, regular: Curves, touch_down:
         ax.set(xlabel=labels[x], ylabel=labels[y])
 
 
-def _mark_phases(ax: Axes, phases: list[Json]) -> None:
+def _mark_phases(ax: Axes, phases: Sequence[RecordPhase]) -> None:
     """Holds shaded, boundaries as thin lines, names where there is room."""
     for phase in phases:
-        start, end = phase["start_s"], phase["end_s"]
-        if phase["kind"] == "hold":
+        start, end = phase.start_s, phase.end_s
+        if phase.kind == "hold":
             ax.axvspan(start, end, facecolor=GRID, alpha=0.6, lw=0, zorder=0)
         ax.axvline(end, color=GRID, lw=0.8, zorder=0)
         if len(phases) <= MAX_NAMED_PHASES:
-            text = ax.text((start + end) / 2, 0.02, phase["kind"], transform=ax.get_xaxis_transform())
+            text = ax.text((start + end) / 2, 0.02, phase.kind, transform=ax.get_xaxis_transform())
             text.set(color=MUTED, fontsize=6, ha="center", va="bottom", rotation=90)
 
 
@@ -93,6 +93,6 @@ def make_trace_table(store: Results) -> Table:
         ("Unloading (mm/s)", "speed_unload_mm_s", 3),
         ("Phases", "phases_in_words"),
     )
-    rows = [{"site": name, **facts, "record": name} for name, facts in store.traces.items()]
+    rows = [facts.to_plain() | {"record": name} for name, facts in store.traces.items()]
     caption = "What was found in each indentation record."
     return make_table("trace-facts", caption, columns, rows, marked=lambda row: row["site"] in store.fitted)

@@ -146,7 +146,7 @@ def _make_derivative_table(content: Json) -> Table:
 
 def make_kappa_section(store: Results, content: Json) -> Section:
     """The ratio of bulk modulus to c, and the change of volume that it allows."""
-    name = "sensitivity-kappa"
+    name, element = "sensitivity-kappa", store.calibration.element if store.calibration else None
     columns = (
         *_CHANGES,
         ("Least J", "J_min", 4),
@@ -159,7 +159,7 @@ def make_kappa_section(store: Results, content: Json) -> Section:
         f"The bulk modulus is {number(content['kappa_ratio'])} times c in this study; the paper took 100, "
         "enough to keep the ratio of volumes J within 1 % of one in its models. J is the mean of an element "
         "at the deepest point, over the elements within one width of the indenter. Elements that lock "
-        f"stiffen with it; those of this study are {store.calibration.get('element') or 'not named'}. "
+        f"stiffen with it; those of this study are {element}. "
         f"{_describe_volume_ratio(content)}"
     )
     caption = "Force and ratio of volumes against the ratio of bulk modulus and c."

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from ...results.identification import MeshCorrectionRound, RecordPrediction
+from ...results.runs import CompareResult, SimulateResult
 from ..drawing.colours import MEASURED, SIMULATED, TRUTH
 from ..drawing.figures import draw_simulated_figure
 from ..drawing.pictures import draw_field_figure
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import count
 from ..page import Bullets, Figure, Note, Prose, Section, Table, make_bullets, make_section
-from ..store import Json, Results
+from ..store import Results
 from ..tables import make_table, to_numeric
 from .provenance import make_pair_table
 
 
 def make_simulated_section(store: Results) -> Section:
     """Indentations that were simulated one by one."""
-    sites = [str(row["site"]) for row in store.simulated]
+    sites = [row.site for row in store.simulated]
     columns = (
         ("Site", "site"),
         ("Depth (mm)", "depth_mm", 2),
@@ -34,13 +38,13 @@ def make_simulated_section(store: Results) -> Section:
     )
 
 
-def _describe_end(row: Json) -> str:
-    return "yes" if row.get("completed") else f"no: {row.get('reason') or 'reason not stored'}"
+def _describe_end(row: SimulateResult | RecordPrediction) -> str:
+    return "yes" if row.completed else f"no: {row.reason}"
 
 
-def _list_warnings(rows: tuple[Json, ...]) -> Bullets | None:
+def _list_warnings(rows: Sequence[SimulateResult | RecordPrediction]) -> Bullets | None:
     """The solver's warnings about the simulations of the sites; None where there are none."""
-    return make_bullets(f"Site {row['site']}: {text}" for row in rows for text in row.get("warnings") or ())
+    return make_bullets(f"Site {row.site}: {text}" for row in rows for text in row.warnings)
 
 
 def make_comparison_section(store: Results) -> Section:
@@ -63,10 +67,8 @@ def make_comparison_section(store: Results) -> Section:
     return make_section("comparison", "Comparison with FEBio", words, draw_compared_figure(store), table)
 
 
-def _describe_febio_end(row: Json) -> str:
-    febio = row.get("febio", {})
-    end = "completed" if febio.get("completed") else febio.get("reason")
-    return f"{febio.get('version') or 'FEBio'}, {end}"
+def _describe_febio_end(row: CompareResult) -> str:
+    return f"{row.febio.version}, {'completed' if row.febio.completed else row.febio.reason}"
 
 
 @styled
@@ -81,26 +83,26 @@ def draw_compared_figure(store: Results) -> Figure | None:
         ax.plot(at, curves["febio_N"], "o", ms=3, mfc="none", color=MEASURED, label="FEBio")
         ax.plot(at, curves["limbfit_N"], color=SIMULATED, label="limbfit")
         ax.plot(at, curves["limbfit_matched_N"], "--", color=TRUTH, label="with FEBio's contact penalty")
-        ax.set(title=f"Site {row['site']}", xlabel="Time (s)", ylabel="Force (N)")
+        ax.set(title=f"Site {row.site}", xlabel="Time (s)", ylabel="Force (N)")
     add_legend(drawing, axes[0])
-    alt = f"Force by FEBio and by limbfit against time, sites {', '.join(row['site'] for row, _ in found)}"
+    alt = f"Force by FEBio and by limbfit against time, sites {', '.join(row.site for row, _ in found)}"
     return make_figure(drawing, "compared", alt, "Force of the same indentation by FEBio and by limbfit.")
 
 
 def make_solver_section(store: Results) -> Section:
     """What the simulations say about themselves."""
     found = store.calibration
-    facts = {
-        "Objective": found.get("objective"),
-        "Forward simulations of the identification": found.get("forward_runs"),
-        "Of them with derivatives": found.get("forward_runs_with_sensitivities"),
-        "Corrections of the search by the whole meshes": _build_corrections(found.get("corrections") or []),
-        "Starts": (found.get("multistart") or {}).get("summary"),
-        "Linear solver": found.get("linear_solver"),
-        "Element": found.get("element"),
+    facts = found and {
+        "Objective": found.objective,
+        "Forward simulations of the identification": found.forward_runs,
+        "Of them with derivatives": found.forward_runs_with_sensitivities,
+        "Corrections of the search by the whole meshes": _describe_corrections(found.corrections),
+        "Starts": found.multistart and found.multistart.summary,
+        "Linear solver": found.linear_solver,
+        "Element": found.element,
     }
-    known = {key: value for key, value in facts.items() if value is not None}
-    failed = ", ".join(str(row["record"]) for row in store.predicted if not row.get("completed"))
+    known = {key: value for key, value in (facts or {}).items() if value is not None}
+    failed = ", ".join(row.record for row in store.predicted if not row.completed)
     return make_section(
         "solver",
         "Solver",
@@ -112,14 +114,14 @@ def make_solver_section(store: Results) -> Section:
     )
 
 
-def _build_corrections(rounds: list[Json]) -> str | None:
+def _describe_corrections(rounds: Sequence[MeshCorrectionRound]) -> str | None:
     """How many, and what the last one changed."""
     if not rounds:
         return None
     last = rounds[-1]
-    if last["reason"]:
-        return f"{len(rounds)}; the last failed: {last['reason']}"
-    left = max(last["change_percent_by_site"].values())
+    if last.reason:
+        return f"{len(rounds)}; the last failed: {last.reason}"
+    left = max(change or 0.0 for change in last.change_percent_by_site.values())
     return f"{len(rounds)}; the last changed no force by more than {left:.2g} % of its largest"
 
 
@@ -128,7 +130,7 @@ def make_solver_table(store: Results) -> Table:
     columns = (
         ("Site", "record"),
         ("Element", "element"),
-        ("Steps", lambda row: to_numeric(count(row.get("steps")))),
+        ("Steps", lambda row: to_numeric(count(row.steps))),
         ("Largest penetration (mm)", "penetration_mm", 3),
         ("Completed", _describe_end),
         ("Not predicted", _list_not_predicted),
@@ -137,5 +139,5 @@ def make_solver_table(store: Results) -> Table:
     return make_table("solver", caption, columns, store.predicted, marked="fitted")
 
 
-def _list_not_predicted(row: Json) -> str:
-    return "; ".join(f"{what.replace('_', ' ')}: {why}" for what, why in row.get("not_predicted", {}).items())
+def _list_not_predicted(row: RecordPrediction) -> str:
+    return "; ".join(f"{what.replace('_', ' ')}: {why}" for what, why in row.not_predicted.items())

@@ -18,11 +18,9 @@ def list_key_numbers(store: Results) -> tuple[KeyNumber, ...]:
         found.append(KeyNumber(store.mean_error("heldout"), "%", "mean force error at the held-out sites"))
         found.append(KeyNumber(store.mean_error("fitted"), "%", "mean force error at the fitted sites"))
     for tissue in store.tissues:
-        last = store.stages[-1].get("parameters", {}).get(tissue) if store.stages else None
-        if last:
-            modulus = number(last.get(store.law.moduli[0]))
-            found.append(KeyNumber(modulus, "kPa", _label_modulus(store, tissue)))
-    seconds = [stage.get("seconds", 0.0) for stage in (store.run.get("stages") or {}).values()]
+        modulus = number(store.stages[-1].parameters[tissue][store.law.moduli[0]])
+        found.append(KeyNumber(modulus, "kPa", _label_modulus(store, tissue)))
+    seconds = [stage.seconds for stage in store.run.stages.values()] if store.run else []
     if seconds:
         size, unit = (1, "s") if sum(seconds) < 120 else (60, "min")
         found.append(KeyNumber(f"{sum(seconds) / size:.0f}", unit, "computing time, all stages"))
@@ -65,14 +63,14 @@ def _describe_study(store: Results) -> str:
 
 
 def _describe_errors(store: Results) -> str:
-    held = [row for row in store.predicted if not row.get("fitted")]
+    held = [row for row in store.predicted if not row.fitted]
     if not store.predict:
         return ""
     if not held:
         return f"At the fitted sites the force error is {store.mean_error('fitted')} %."
-    sites = len({row["site"] for row in held})
+    sites = len({row.site for row in held})
     places = "the one site that was" if sites == 1 else f"the {sites} sites that were"
-    errors = [row["error_percent"] for row in held if row.get("error_percent") is not None]
+    errors = [row.error_percent for row in held if row.error_percent is not None]
     worst = f" (largest {format_fixed(max(errors))} %)" if errors else ""
     return (
         f"At {places} not used, the model predicts the force with a mean error of "
@@ -82,8 +80,8 @@ def _describe_errors(store: Results) -> str:
 
 
 def _compare_materials(store: Results) -> str:
-    held = [row for row in store.predicted if not row.get("fitted")]
-    pairs = [(row.get("error_one_material_percent"), row.get("error_percent")) for row in held]
+    held = [row for row in store.predicted if not row.fitted]
+    pairs = [(row.error_one_material_percent, row.error_percent) for row in held]
     known = [(one, two) for one, two in pairs if one is not None and two is not None]
     if not known:
         return ""
@@ -96,15 +94,14 @@ def _compare_materials(store: Results) -> str:
 
 def _list_verdicts(store: Results) -> tuple[str, ...]:
     """Which parameters the data determine, best first, and how many combinations of them."""
-    stored = store.uncertainty.get("verdict") or {}
-    if not stored:
+    if store.uncertainty is None:
         return ()
     groups: dict[str, list[str]] = {}
-    for name, word in stored.items():
-        groups.setdefault(str(word), []).append(label(name))
+    for name, word in store.uncertainty.verdict.items():
+        groups.setdefault(word, []).append(label(name))
     best_first = sorted(groups, key=lambda word: _RANKS.get(word.split()[0], 1))
     words = [f"{word.capitalize()}: {', '.join(groups[word])}." for word in best_first]
-    combinations = [str(sentence) for sentence in store.uncertainty.get("combinations") or ()]
+    combinations = store.uncertainty.combinations
     known = sum(sentence.endswith(": determined") for sentence in combinations)
     if not known:
         return tuple(words)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,14 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure as Drawing
 from matplotlib.ticker import MaxNLocator
 
+from ...results.base import Interval
+from ...results.models import MixedPrediction, ModelsResult
 from ..drawing import plots
 from ..drawing.colours import INK, MEASURED, MUTED, SIMULATED, choose_truth_style
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import NOTHING, format_fixed, format_limits, label, number
 from ..page import Block, Bullets, Cell, Figure, Note, Prose, Section, Table, make_section
-from ..store import Curves, Json, Results, find_compared_quantity, get_record_name
+from ..store import Curves, Json, Results, find_compared_quantity
 from ..tables import Column, make_table, to_numeric
 
 TrueValues = dict[str, tuple[float, dict[str, Any]]]  # by name: a true parameter and its line
@@ -209,7 +212,7 @@ def _describe_change(row: Json) -> str:
 
 def _make_prediction_table(content: Json) -> Table:
     columns = (
-        ("Site", get_record_name),
+        ("Site", "record"),
         ("Inside (%)", _format_inside),
         ("Half-width (% of force)", "half_width_percent", 1),
         ("Parameters", "parameters_sd_percent", 2),
@@ -331,9 +334,7 @@ def draw_prediction_figure(store: Results, content: Json) -> Figure | None:
         ax.plot(time, measured, color=MEASURED, lw=2.2, alpha=0.55, label="measured")
         ax.plot(time, predicted, color=SIMULATED, lw=1.1, label="predicted")
         kind = "fitted" if row["fitted"] else "held out"
-        ax.set_title(
-            f"site {get_record_name(row)}, {kind}: {format_fixed(row['inside_percent'], 0)} % inside"
-        )
+        ax.set_title(f"site {row['record']}, {kind}: {format_fixed(row['inside_percent'], 0)} % inside")
         ax.margins(x=0.01)
         if quantity != "force":
             ax.set_ylabel(f"{quantity.capitalize()} ({unit})")
@@ -344,7 +345,7 @@ def draw_prediction_figure(store: Results, content: Json) -> Figure | None:
         "Records beside their 95 % prediction intervals: uncertainty of the parameters, all counted sources, "
         "noise of the record and misfit of the model."
     )
-    records = ", ".join(get_record_name(row) for row, _ in pairs)
+    records = ", ".join(row["record"] for row, _ in pairs)
     alt = f"Measured and predicted force with intervals: {records}"
     return plots.make_figure(drawing, "predictions", alt, caption)
 
@@ -352,43 +353,34 @@ def draw_prediction_figure(store: Results, content: Json) -> Figure | None:
 _MAX_PANELS = 4
 
 
-def make_models_section(store: Results) -> Section:
+def make_models_section(store: Results, content: ModelsResult) -> Section:
     """What ``limbfit uncertainty --models`` found."""
-    content = store.models
-    rows = [
-        row
-        | {
-            "weight_percent": 100 * row["weight"],
-            "named": f"{row['words']} ({row['model']})" if row["model"] != row["words"] else row["words"],
-        }
-        for row in content["models"]
-    ]
     models = make_table(
         "models",
         "Models of the same records. Evidence is 2 ln B against the study's own model: positive where the "
         "records prefer the other.",
         (
-            ("Model", "named"),
+            ("Model", lambda row: f"{row.words} ({row.model})"),
             ("Fitted (%)", "error_fitted_percent", 2),
             ("Held out (%)", "error_heldout_percent", 2),
             ("Evidence", "evidence", 1),
-            ("Weight (%)", "weight_percent", 0),
+            ("Weight (%)", lambda row: to_numeric(format_fixed(100 * row.weight, 0))),
         ),
-        rows,
+        content.models,
     )
     records = make_table(
         "models-records",
         "The largest measured value of each record, with 95 % intervals of the study's own model and of all.",
         (
             ("Record", "record"),
-            ("Use", lambda row: "fitted" if row["fitted"] else "held out"),
+            ("Use", lambda row: "fitted" if row.fitted else "held out"),
             ("Unit", "unit"),
             ("Measured", "peak", 2),
-            ("Own model", lambda row: _format_model_interval(row["own_interval_95"])),
-            ("All models", lambda row: _format_model_interval(row["interval_95"])),
+            ("Own model", lambda row: _format_model_interval(row.own_interval_95)),
+            ("All models", lambda row: _format_model_interval(row.interval_95)),
             ("Between models, sd", "sd_between_models", 3),
         ),
-        content["records"],
+        content.records,
     )
     return make_section(
         "models",
@@ -399,36 +391,36 @@ def make_models_section(store: Results) -> Section:
             "theirs, so that its interval holds what the choice of the model leaves open."
         ),
         models,
-        _draw_model_figure(store),
+        _draw_model_figure(store, content),
         records,
-        (Note(f"Left out: {text}") for text in content["left_out"].values()),
+        (Note(f"Left out: {text}") for text in content.left_out.values()),
     )
 
 
-def _format_model_interval(interval: list[float]) -> str:
+def _format_model_interval(interval: Interval) -> str:
     low, high = interval
     return f"{low:.3g} to {high:.3g}"
 
 
-def _draw_model_figure(store: Results) -> Figure | None:
-    rows = [row for row in store.models["records"] if not row["fitted"]] or store.models["records"]
-    found = store.with_curves("models", rows)[:_MAX_PANELS]
-    return _draw_model_bands(store, found) if found else None
+def _draw_model_figure(store: Results, content: ModelsResult) -> Figure | None:
+    rows = [row for row in content.records if not row.fitted] or content.records
+    drawn = store.with_curves("models", rows[:_MAX_PANELS])
+    return _draw_model_bands(drawn, [one.model for one in content.models[1:]]) if drawn else None
 
 
 @styled
-def _draw_model_bands(store: Results, found: list[tuple[Json, Curves]]) -> Figure:
+def _draw_model_bands(found: Sequence[tuple[MixedPrediction, Curves]], models: Sequence[str]) -> Figure:
     drawing, axes = make_panels(len(found), min(len(found), 2), 2.8)
     for ax, (row, curves) in zip(axes, found, strict=False):
         what, unit = find_compared_quantity(curves)
         time = curves["time_s"]
         low, high = (curves[f"{what}_{end}_{unit}"] for end in ("low", "high"))
         ax.fill_between(time, low, high, color=SIMULATED, alpha=0.25, lw=0, label="95 % by all models")
-        for model in store.models["models"][1:]:
-            ax.plot(time, curves[f"{what}_{model['model']}_{unit}"], color=MUTED, lw=0.8)
+        for model in models:
+            ax.plot(time, curves[f"{what}_{model}_{unit}"], color=MUTED, lw=0.8)
         ax.plot(time, curves[f"{what}_own_{unit}"], color=SIMULATED, label="own model")
         ax.plot(time, curves[f"{what}_measured_{unit}"], color=INK, lw=1.0, label="measured")
-        ax.set(title=f"site {row['record']}", xlabel="time (s)", ylabel=f"{what} ({unit})")
+        ax.set(title=f"site {row.record}", xlabel="time (s)", ylabel=f"{what} ({unit})")
         ax.set_xlim(0.0, float(np.max(time)))
     add_legend(drawing, axes[0])
     return make_figure(
