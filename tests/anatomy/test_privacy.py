@@ -17,7 +17,7 @@ from conftest import COARSE
 from limbfit import load_study
 from limbfit.cli import main
 from limbfit.pipeline.commands.run import run_record
-from limbfit.pipeline.engine.storage import write_json
+from limbfit.pipeline.engine.storage import write_result
 
 IN_TAGS = {
     "PatientName": "QUIXOTE^ALONSO^MARKERX1",
@@ -152,7 +152,7 @@ def test_nothing_of_it_is_stored_or_said(folder, monkeypatch, capfd):
         assert code == 0, told
         assert leaks(told.encode(), TAG_SECRETS) == []
     study = load_study(folder)
-    write_json(study.results / "run.json", run_record(study))
+    write_result(study.results / "run.json", run_record(study))
     assert_private(study.results)
     record = json.loads((study.results / "run.json").read_text())
     assert record["settings"]["image"]["path"].startswith("sha256:")

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from completing import complete
 from guide import identified
 from layered import block_context, block_study
 from limbfit.bench.blocks import build_punched_block
@@ -34,6 +35,7 @@ from limbfit.pipeline.simulation.simulations import compute_job_digest
 from limbfit.relaxation import DEFAULT_SPAN_S, choose_relaxation_times, compute_power_law_terms
 from limbfit.report.sections.methods import write_method_parts
 from limbfit.report.store import load_store
+from limbfit.results.identification import CalibrationResult
 
 LAW = f'law = "{POWER}"\n'
 SPAN = "relaxation_span_s = [0.05, 50.0]\n"
@@ -185,7 +187,9 @@ def test_a_study_identifies_it(tmp_path):
 def test_the_report_states_its_times(tmp_path):
     (tmp_path / "calibrate").mkdir()
     law = block_study(tmp_path, LAW).law
-    write_json(tmp_path / "calibrate" / "calibration.json", {"law": law.record()})
+    write_json(
+        tmp_path / "calibrate" / "calibration.json", complete(CalibrationResult, {"law": law.record()})
+    )
     (text,) = (text for head, text in write_method_parts(load_store(tmp_path)) if head == "Constitutive law")
     assert "γ Σ (τᵢ/1 s)^(−slope) exp(−t/τᵢ) acting" in text
     assert "with τᵢ = 0.0300, 0.300, 3.00, 30.0, 300, 3 000 s. The bulk" in text

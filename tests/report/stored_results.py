@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args, get_origin
 
 import numpy as np
 import pytest
 import pyvista as pv
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 
+from completing import complete
 from limbfit.laws import LAWS, OGDEN
 from limbfit.mesh import Mesh, write_vtu
-from limbfit.results.base import ResultPart
 from limbfit.results.study_results import MODELS
 
 SITES = (
@@ -108,41 +106,6 @@ def add_fat(folder: Path) -> Path:
     run["settings"]["geometry"] |= {"layers": layers, "core": "muscle"}
     (folder / "run.json").write_text(json.dumps(run))
     return folder
-
-
-def complete(model: type[ResultPart], content: Any) -> Any:
-    """The content with every key that its model requires: null, nothing or zero where it has none."""
-    if isinstance(content, dict):
-        for key, field in model.model_fields.items():
-            if key in content:
-                content[key] = _complete_value(field.annotation, content[key])
-            elif field.is_required():
-                content[key] = _make_empty(field.annotation)
-    return content
-
-
-def _complete_value(kind: Any, value: Any) -> Any:
-    if isinstance(kind, type) and issubclass(kind, ResultPart):
-        return complete(kind, value)
-    parts = get_args(kind)
-    if get_origin(kind) is Mapping and value:
-        return {key: _complete_value(parts[1], one) for key, one in value.items()}
-    if get_origin(kind) is Sequence and value:
-        return [_complete_value(parts[0], one) for one in value]
-    models = [part for part in parts if isinstance(part, type) and issubclass(part, ResultPart)]
-    return complete(models[0], value) if models else value
-
-
-def _make_empty(kind: Any) -> Any:
-    if isinstance(kind, type) and issubclass(kind, ResultPart):
-        return complete(kind, {})
-    if type(None) in get_args(kind):
-        return None
-    if get_origin(kind) is tuple:
-        return [_make_empty(part) for part in get_args(kind)]
-    return {Mapping: {}, dict: {}, Sequence: [], str: "", bool: False, int: 0, float: 0.0}[
-        get_origin(kind) or kind
-    ]
 
 
 def write_results(folder: Path, *, sites: tuple = SITES, name: str = "Phantom 7 (coarse)") -> Path:

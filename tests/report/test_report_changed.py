@@ -11,9 +11,11 @@ import pytest
 from page_outline import Outline, section_of, without_scripts
 from stored_results import add_fat, leave_unarranged, remove_geometry, write_results
 
+from completing import complete
 from limbfit import compress_cube
 from limbfit.errors import InputError
 from limbfit.report import build_report
+from limbfit.results.runs import RunResult, SimulateResult
 
 SKIN = {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.5}
 
@@ -96,19 +98,23 @@ def test_an_empty_folder_gives_a_report_that_says_so(tmp_path: Path) -> None:
     assert text.count('role="note"') >= 9
 
 
-def test_no_truth_no_uncertainty_no_band(copy: Path) -> None:
+def test_no_truth_no_band(copy: Path) -> None:
     (copy / "truth.json").unlink()
-    file = copy / "calibrate" / "calibration.json"
-    content = json.loads(file.read_text())
-    del content["uncertainty"]
-    file.write_text(json.dumps(content))
     for curve in (copy / "predict").glob("*.csv"):
         rows = [",".join(line.split(",")[:4]) for line in curve.read_text().splitlines()]
         curve.write_text("\n".join(rows))
     text = build_report(copy, copy / "report").read_text(encoding="utf-8")
     assert "Truth" not in text
-    assert "No uncertainty is stored" in text
-    assert ">95 % interval</text>" not in text
+    assert ">95 % interval</text>" in text  # of the parameters
+
+
+def test_results_of_another_version_are_refused_with_the_command_that_makes_them_anew(copy: Path) -> None:
+    file = copy / "calibrate" / "calibration.json"
+    content = json.loads(file.read_text())
+    del content["uncertainty"]
+    file.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"no key 'uncertainty'.*run limbfit run again"):
+        build_report(copy, copy / "report")
 
 
 def test_a_failed_simulation_is_named(copy: Path) -> None:
@@ -157,7 +163,8 @@ def test_indentations_without_records(copy: Path) -> None:
     }
     folder = copy / "simulate"
     folder.mkdir()
-    (folder / "TI-2.json").write_text(json.dumps(facts | {"parameters_from": "start of the study"}))
+    stored = complete(SimulateResult, facts | {"parameters_from": "start of the study"})
+    (folder / "TI-2.json").write_text(json.dumps(stored))
     (folder / "TI-2.csv").write_text("time_s,displacement_mm,force_N\n0,0,0\n6.25,6,7.126\n")
     text = build_report(copy, copy / "report").read_text(encoding="utf-8")
     section = section_of(text, "simulated")
@@ -168,7 +175,7 @@ def test_indentations_without_records(copy: Path) -> None:
 
 def test_broken_summary_names_the_file(copy: Path) -> None:
     (copy / "predict" / "predict.json").write_text('{"sites": [')
-    with pytest.raises(InputError, match=r"predict\.json: not readable.*run its stage again"):
+    with pytest.raises(InputError, match=r"predict\.json: not readable.*run limbfit run again"):
         build_report(copy, copy / "report")
     assert not (copy / "report").exists()
 
@@ -189,7 +196,7 @@ def test_experiments_are_shown_unless_stale(copy, tmp_path):
     compress_cube(copy / "cube", parameters={"skin": SKIN, "muscle": SKIN})
     run = json.loads((copy / "run.json").read_text())
     states = {"cube": {"state": "done", "options": {}}, "regions": {"state": "stale"}}
-    (copy / "run.json").write_text(json.dumps(run | {"experiments": states}))
+    (copy / "run.json").write_text(json.dumps(complete(RunResult, run | {"experiments": states})))
     page = build_report(copy, tmp_path / "out").read_text(encoding="utf-8")
     assert '<section id="cube"' in page
     assert "pig skin, along the spine" in page

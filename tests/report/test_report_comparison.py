@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from stored_results import write_results
 
+from completing import complete
 from limbfit.report import build_report
+from limbfit.results.runs import CompareResult
 
 
 def compared(folder, peak=3.0, reason=""):
@@ -16,7 +18,7 @@ def compared(folder, peak=3.0, reason=""):
     run = {"completed": True, "reason": "", "peak_force_N": peak, "difference": {"max_percent": 0.4}}
     febio = {"version": "FEBio 4.11.0", "completed": not reason, "reason": reason, "peak_force_N": 2.9}
     row = {"site": "1", "febio": febio, "limbfit": run, "limbfit_matched": run}
-    (folder / "1.json").write_text(json.dumps(row))
+    (folder / "1.json").write_text(json.dumps(complete(CompareResult, row)))
     t = np.linspace(0, 2, 9)
     columns = np.column_stack([t, t, 2.9 * t, 3 * t, 3 * t])
     head = "time_s,displacement_mm,febio_N,limbfit_N,limbfit_matched_N"

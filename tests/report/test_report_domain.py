@@ -12,7 +12,7 @@ from limbfit.report.formats import number
 from limbfit.report.page import Figure, Note, Section, Table
 from limbfit.report.sections.prediction import make_domain_section
 from limbfit.report.store import Results, load_store
-from limbfit.results.identification import QuantityRange, RecordedExtents
+from limbfit.results.socket import SocketLoad, SocketResult, SocketState
 
 
 def loading(ramp_s: float, end_s: float, skin: float, muscle: float) -> list[Extent]:
@@ -23,33 +23,28 @@ def loading(ramp_s: float, end_s: float, skin: float, muscle: float) -> list[Ext
     ]
 
 
-def told(own: list[Extent], tested: RecordedRange) -> dict:
-    return {
-        "loading": [QuantityRange.model_validate(one).to_plain() for one in own],
-        "outside_records": [row.to_plain() for row in tested.find_outside(own)],
-    }
-
-
 @pytest.fixture(scope="module")
 def store(tmp_path_factory) -> Results:
     """Records of ramps; a load of a socket that lasts an hour and shears the skin more."""
     found = load_store(write_results(tmp_path_factory.mktemp("study") / "results"))
-    rows = []
-    for i, row in enumerate(found.predict["sites"]):
-        own = loading(7.0 + 0.1 * i, 14.0 + 0.2 * i, 0.24 - 0.01 * i, 0.2 + 0.01 * i)
-        rows.append((row, own))
-    tested = RecordedRange.from_records([own for row, own in rows if row["fitted"]], ())
-    sites = [{**row, **told(own, tested)} for row, own in rows]
-    load = {"name": "stance", **told(loading(1.0, 3600.0, 0.36, 0.18), tested)}
-    text = describe_outside({"the load 'stance'": tested.find_outside(loading(1.0, 3600.0, 0.36, 0.18))})
-    donning = {"loading": None, "outside_records": None}
-    predict = {
-        **found.predict,
-        "sites": sites,
-        "recorded_range": RecordedExtents.model_validate(tested).to_plain(),
-        "outside_text": [],
-    }
-    socket = {"donning": donning, "loads": [load], "outside_text": text}
+    own = [
+        loading(7.0 + 0.1 * i, 14.0 + 0.2 * i, 0.24 - 0.01 * i, 0.2 + 0.01 * i)
+        for i in range(len(found.predicted))
+    ]
+    fitted = [one for one, row in zip(own, found.predicted, strict=True) if row.fitted]
+    tested, worn = RecordedRange.from_records(fitted, ()), loading(1.0, 3600.0, 0.36, 0.18)
+    sites = [
+        row.model_copy(update={"loading": one, "outside_records": tested.find_outside(one)})
+        for one, row in zip(own, found.predicted, strict=True)
+    ]
+    changed = {"sites": sites, "recorded_range": tested, "outside_text": ()}
+    outside = tested.find_outside(worn)
+    socket = SocketResult.model_construct(
+        donning=SocketState.model_construct(),
+        loads=[SocketLoad.model_construct(name="stance", loading=worn, outside_records=outside)],
+        outside_text=describe_outside({"the load 'stance'": outside}),
+    )
+    predict = found.predict.model_copy(update=changed)
     return replace(found, predict=predict, experiments={"socket": socket})
 
 
@@ -72,7 +67,7 @@ def test_what_lies_outside_stands_in_words_in_a_picture_and_in_a_table(store):
 
 
 def test_where_nothing_lies_outside_the_report_says_so(store):
-    predict = {**store.predict, "sites": [row for row in store.predict["sites"] if row["fitted"]]}
+    predict = store.predict.model_copy(update={"sites": [row for row in store.predicted if row.fitted]})
     section = make_domain_section(replace(store, predict=predict, experiments={}))
     (note,) = blocks(section, Note)
     assert note.text.startswith("Every prediction lies within")

@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 from stored_results import NAMES, write_results
 
+from completing import complete
 from limbfit.priors import SOURCE
 from limbfit.report.page import Prose, Table
 from limbfit.report.sections.methods import describe_constraints
 from limbfit.report.sections.parameters import describe_priors, describe_relaxation, make_parameter_section
 from limbfit.report.store import load_store
+from limbfit.results.identification import CalibrationResult
 
 
 @pytest.fixture
@@ -83,7 +85,7 @@ def test_moduli_at_several_times_are_shown_with_what_the_records_prefer(results:
         "prior": {"slope": [0.0, 0.3], "source": "published tissue"},
         "beyond": {"longest_s": 12.6},
     }
-    file.write_text(json.dumps(content))
+    file.write_text(json.dumps(complete(CalibrationResult, content)))
     words, table = describe_relaxation(load_store(results))
     assert words.text.startswith("The records cannot tell")
     assert "after 13 s" in words.text

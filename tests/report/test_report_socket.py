@@ -82,10 +82,10 @@ def test_the_command_says_what_most_of_an_interval_comes_from(capsys):
 @pytest.mark.parametrize("finding", FINDINGS, ids=lambda finding: finding.source)
 def test_every_finding_is_told_of_its_regions_with_its_source(finding):
     rows = select_published_findings([*finding.regions, "another"])
-    assert finding.source in {row["source"] for row in rows}
+    assert finding.source in {row.source for row in rows}
     table = make_published_table({"published": rows}, HELD | {"mean_kPa": 12.0}, "stance")
     assert any(finding.found in {cell.text for cell in row.cells} for row in table.rows)
-    assert all(set(row["regions"]) <= {*finding.regions, WHOLE} for row in rows)
+    assert all(set(row.regions) <= {*finding.regions, WHOLE} for row in rows)
 
 
 def test_what_others_found_stands_beside_the_regions_own_pressures():

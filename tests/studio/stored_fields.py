@@ -7,7 +7,9 @@ import json
 import numpy as np
 import pyvista as pv
 
+from completing import complete
 from limbfit.mesh import Mesh, to_tet10, write_pvd, write_vtu
+from limbfit.results.identification import CalibrationResult, PredictResult
 
 STEPS = 4
 BESIDE_SITE_1 = np.array([28.0, -4.5, 55.0])
@@ -44,7 +46,9 @@ def write_outcome(results, error: float = 3.0) -> None:
         {"name": name, "parameters": parameters, "iterations": [{}]}
         for name in ("one material", "two materials")
     ]
-    (results / "calibrate" / "calibration.json").write_text(json.dumps({"stages": stages}))
+    (results / "calibrate" / "calibration.json").write_text(
+        json.dumps(complete(CalibrationResult, {"stages": stages}))
+    )
     rows = [
         {
             "site": "1",
@@ -56,7 +60,7 @@ def write_outcome(results, error: float = 3.0) -> None:
         }
     ]
     content = {"sites": rows, "mean_error_fitted_percent": error, "mean_error_heldout_percent": None}
-    (results / "predict" / "predict.json").write_text(json.dumps(content))
+    (results / "predict" / "predict.json").write_text(json.dumps(complete(PredictResult, content)))
     (results / "predict" / "1.csv").write_text(
         f"time_s,displacement_mm,force_measured_N,force_simulated_N\n0,0,0,0\n1,5,6,{error}\n2,0,0,0\n"
     )

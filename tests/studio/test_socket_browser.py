@@ -9,8 +9,10 @@ import pytest
 from stored_fields import block
 
 from browsing import serious_findings, until
+from completing import complete
 from limbfit import load_study
 from limbfit.mesh import write_vtu
+from limbfit.results.runs import StageStamp
 
 
 def held(name: str, share: float) -> dict:
@@ -39,7 +41,7 @@ def test_pressure_is_stepped_through_and_read_under_the_pointer(study, serve, op
     design = {"name": "design", "simulation": write_run(results, "socket_design", "design", 2.0)}
     (results / "socket_design" / "socket_design.json").write_text(json.dumps({"designs": [design]}))
     for folder in ("socket", "socket_design"):
-        (results / folder / "stage.json").write_text("{}")
+        (results / folder / "stage.json").write_text(json.dumps(complete(StageStamp, {})))
     words, slider = page.locator(".view.socket .player-words"), page.get_by_label("step", exact=True)
     until(lambda: words.inner_text().startswith("donning; contact pressure at most 10.0 kPa"))
     bar = page.locator(".view.socket .lf-bar")
@@ -73,7 +75,7 @@ def test_two_runs_stand_beside_each_other_on_one_scale_and_turn_together(study, 
         for name, factor in (("control", 5.0), ("design", 2.0))
     ]
     (results / "socket_design" / "socket_design.json").write_text(json.dumps({"designs": designs}))
-    (results / "socket_design" / "stage.json").write_text("{}")
+    (results / "socket_design" / "stage.json").write_text(json.dumps(complete(StageStamp, {})))
     page = open_page(serve(study) + "#/socket")
     words, canvas = page.locator(".view.socket .player-words"), page.locator(".view.socket .lf-canvas")
     until(lambda: words.inner_text().startswith("donning"))

@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeVar
 from ..arrays import Array
 from ..errors import InputError
 from ..laws import TissueLaw
-from ..results.base import Interval
+from ..results.base import Interval, StoredResult
 from ..results.curves import read_curves
 from ..results.identification import (
     CalibrationResult,
@@ -25,6 +25,7 @@ from ..results.models import ModelsResult
 from ..results.records import TraceFacts, TracesResult
 from ..results.runs import CompareResult, RunResult, SimulateResult
 from ..results.socket import SocketResult
+from ..results.study_results import MODELS
 from .formats import format_fixed, format_symbol
 
 Curves = dict[str, Array]
@@ -46,8 +47,8 @@ PAPER_TISSUES = {"skin": "Skin–adipose", "muscle": "Muscle"}
 class Results:
     """A results folder; what is not there (yet) is None or empty.
 
-    ``experiments``: what each finished experiment stored, by its name; ``outdated``: those that are stale.
-    ``models``: other models of the same records.
+    ``experiments``: what each finished experiment stored, by its name (of an extension as its file has it);
+    ``outdated``: those that are stale. ``models``: other models of the same records.
     """
 
     folder: Path
@@ -62,7 +63,7 @@ class Results:
     simulated: tuple[SimulateResult, ...]
     compared: tuple[CompareResult, ...]
     truth: Json
-    experiments: dict[str, Json] = field(default_factory=dict)
+    experiments: Mapping[str, StoredResult | Json] = field(default_factory=dict)
     outdated: tuple[str, ...] = ()
     models: ModelsResult | None = None
 
@@ -89,7 +90,8 @@ class Results:
     @property
     def socket(self) -> SocketResult | None:
         """What the experiment ``socket`` stored, where it is not stale."""
-        return SocketResult.read(self.folder) if "socket" in self.experiments else None
+        found = self.experiments.get("socket")
+        return found if isinstance(found, SocketResult) else None
 
     @property
     def stages(self) -> Sequence[SearchStage]:
@@ -220,10 +222,15 @@ def load_store(results: Path) -> Results:
         simulated=tuple(SimulateResult.find_all(results).values()),
         compared=tuple(CompareResult.find_all(results).values()),
         truth=_read_json(results / "truth.json"),
-        experiments={name: _read_json(results / name / f"{name}.json") for name in done},
+        experiments={name: _read_experiment(results, name) for name in done},
         outdated=tuple(name for name, row in experiments.items() if row.state == "stale"),
         models=ModelsResult.find(results),
     )
+
+
+def _read_experiment(results: Path, name: str) -> StoredResult | Json:
+    model = MODELS.get(name.replace("-", "_"))
+    return model.read(results) if model else _read_json(results / name / f"{name}.json")
 
 
 def _read_json(file: Path) -> Json:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from completing import complete
 from conftest import coarse_mesh
 from limbfit.errors import InputError
 from limbfit.execution import SerialExecutor
@@ -22,6 +23,7 @@ from limbfit.pipeline.variants.sensitivity import (
     summarise_volumes,
 )
 from limbfit.pipeline.variants.variants import choose_sites
+from limbfit.results.identification import CalibrationResult
 from limbfit.study import IndenterTable, load_study
 
 SETTINGS = coarse_mesh("tet4", 9.0) + "[indenter]\nedge_radius_mm = 2.0\n"
@@ -44,7 +46,8 @@ def context(pristine, tmp_path_factory):
     store = Store(study.results)
     store["calibrate"].mkdir()
     parameters = {"skin": SKIN, "muscle": MUSCLE}
-    write_json(store["calibrate"] / "calibration.json", {"stages": [{"parameters": parameters}]})
+    content = complete(CalibrationResult, {"stages": [{"parameters": parameters}]})
+    write_json(store["calibrate"] / "calibration.json", content)
     return Context(study, store, SerialExecutor(), quiet)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import pyvista as pv
 
+from completing import complete
 from layered import layered_block, store_blocks
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_parameters, to_vector
@@ -21,6 +22,7 @@ from limbfit.pipeline.engine.storage import read_curves, write_json
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.simulation.simulations import COARSE, compute_job_digest
+from limbfit.results.identification import CalibrationResult
 from limbfit.study import Study, load_study
 
 TISSUES = ("skin", "muscle")
@@ -118,7 +120,7 @@ def blocks(tmp_path_factory) -> Blocks:
     study = load_study(folder)
     store = store_blocks(study, BLOCKS, TRUTH, 4, coarse=3)
     store["calibrate"].mkdir()
-    write_json(store["calibrate"] / "calibration.json", calibration())
+    write_json(store["calibrate"] / "calibration.json", complete(CalibrationResult, calibration()))
     return Blocks(study, store)
 
 

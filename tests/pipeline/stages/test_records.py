@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from completing import complete
 from limbfit.errors import StudyError, TraceError
 from limbfit.identify.checks.crossvalidation import Fold, average_by_site, expand_to_records, list_choices
 from limbfit.identify.checks.leave_one_out import LeaveOutFits, list_pairs
@@ -23,7 +25,7 @@ from limbfit.pipeline.limb.mesh import mesh_job, mesh_settings
 from limbfit.pipeline.records.traces import read_record
 from limbfit.report.sections.prediction import make_site_table
 from limbfit.report.store import load_store
-from limbfit.results.identification import RecordResiduals
+from limbfit.results.identification import PredictResult, RecordResiduals
 from limbfit.study import Record, Study, load_study
 
 STUDY = """
@@ -199,7 +201,9 @@ def test_table_2_has_a_row_of_each_record_and_means_over_sites(tmp_path: Path) -
         f'"error_one_material_percent": {error}, "peak_force_N": 5.0}}'
         for site, record, error in rows
     )
-    (tmp_path / "predict" / "predict.json").write_text(f'{{"sites": [{text}]}}')
+    (tmp_path / "predict" / "predict.json").write_text(
+        json.dumps(complete(PredictResult, json.loads(f'{{"sites": [{text}]}}')))
+    )
     table = make_site_table(load_store(tmp_path))
     assert [row.cells[0].text for row in table.rows] == ["1", "1-fast", "2"]
     (mean,) = table.foot

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from completing import complete
 from limbfit.cli.commands import show_warnings
 from limbfit.execution import SerialExecutor
 from limbfit.fe import SimulationWarning
@@ -16,6 +17,7 @@ from limbfit.indentation import Simulation
 from limbfit.pipeline.identification.simulation_warnings import SearchWarning, summarise_doubts
 from limbfit.pipeline.simulation import simulations
 from limbfit.report import build_report
+from limbfit.results.identification import CalibrationResult
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "report"))
 from stored_results import leave_unarranged, remove_geometry, write_results
@@ -55,7 +57,7 @@ def test_the_report_shows_them_and_counts_those_of_the_search(tmp_path, monkeypa
     answer = Simulation("tibia", np.arange(3.0), None, True, "", 0.02, {}, (FOLD,))
     content["doubts"] = summarise_doubts(searched, {"tibia": answer}, 8, found).to_plain()
     content["contact"] = {"tibia": {"from_rest_percent": 0.3}}
-    file.write_text(json.dumps(content))
+    file.write_text(json.dumps(complete(CalibrationResult, content)))
     text = build_report(results, tmp_path / "report.html").read_text()
     assert f"Site {predicted['sites'][0]['site']}: {DOUBT}" in text
     assert f"Site {predicted['sites'][1]['site']}: {DOUBT}" not in text

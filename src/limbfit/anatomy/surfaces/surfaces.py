@@ -16,7 +16,7 @@ import pyvista as pv
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, Indices, Mask
-from ...errors import LabelError, SurfaceError
+from ...errors import InputError, LabelError, SurfaceError
 from ...results.limb import SurfaceMeasures, SurfacesResult
 from ..frame import ProximalEnd, find_proximal_end, select_layer
 from ..grid import LabelMap
@@ -337,10 +337,11 @@ def _measure_surface(surface: Surface) -> SurfaceMeasures:
 def load_anatomy(folder: str | Path) -> Anatomy:
     """What :func:`save_anatomy` wrote."""
     folder = Path(folder)
-    file, remedy = folder / "surfaces.json", "run the surfaces stage again"
-    if not file.is_file():
-        raise SurfaceError("surfaces.json is missing", file=folder, remedy=remedy)
-    summary = SurfacesResult.read_file(file, remedy)
+    remedy = "run the surfaces stage again"
+    try:
+        summary = SurfacesResult.read_file(folder / "surfaces.json", remedy)
+    except (OSError, InputError):
+        raise SurfaceError("surfaces.json is missing or unreadable", file=folder, remedy=remedy) from None
     skin = read_surface(folder / "skin.stl")
     bones = {name: read_surface(folder / f"bone-{name}.stl") for name in summary.bones}
     regions = {name: read_surface(folder / f"region-{name}.stl") for name in summary.regions}

@@ -11,6 +11,7 @@ from ...execution import Executor, Limits, make_executor, run_in_background
 from ...fe import are_compiled, compile_kernels
 from ...results.study_results import StudyResults
 from ...study import Study
+from .storage import read_json
 from .store import Store
 
 
@@ -60,6 +61,10 @@ class Context:
         facts: Mapping[str, Any] | None = None,
     ) -> None:
         self.listener(Progress(stage, done, total, text, fit, facts))
+
+    def stored(self, stage: str, name: str) -> Any:
+        """A JSON file of a finished stage or experiment as it is, such as one of an extension."""
+        return read_json(self.store[stage] / name)
 
     @property
     def results(self) -> StudyResults:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ...extensions import Registry
+from ...results.base import StoredResult
 from ..page import Note, Page, Section, make_section
 from ..store import Json, Results
 from .convergence import make_convergence_section
@@ -85,7 +86,9 @@ def make_page(store: Results) -> Page:
 def _list_experiment_sections(store: Results) -> tuple[Section, ...]:
     """A section for each finished experiment, then one that names those that are stale."""
     found = [
-        SECTIONS[name](store, store.experiments[name]) for name in SECTIONS.names if name in store.experiments
+        SECTIONS[name](store, one.to_plain() if isinstance(one, StoredResult) else one)
+        for name in SECTIONS.names
+        if (one := store.experiments.get(name)) is not None
     ]
     if store.outdated:
         found.append(make_section("outdated", "Left out", map(_describe_outdated, store.outdated)))
