@@ -8,25 +8,35 @@ from stored_results import write_results
 
 from limbfit.report.sections.uncertainty import _describe_profile, _draw_profile, draw_profile_figure
 from limbfit.report.store import load_store
+from limbfit.results.uncertainty import (
+    LikelihoodProfile,
+    ParameterUncertainty,
+    ProfileCheck,
+    UncertaintyResult,
+)
 
-PROFILE = {
-    "values": [1.0, 2.0, 3.0, 4.0, 6.0, 9.0],
-    "rise": [8.0, 4.0, 0.5, 0.0, 1.0, 2.0],
-    "threshold": 3.84,
-    "interval_95": [2.04, 9.0],
-    "closed": [True, False],
-    "verdict": "determined on one side",
-    "extrapolated": [True, False, False, False, True, True],
-    "ends_extrapolated": [False, True],
-}
-CHECKS = [
+PROFILE = LikelihoodProfile.model_validate(
     {
-        "name": "skin.m",
-        "why": "widest",
-        "emulated": [3.84, 2.0],
-        "solved": [3.5, None],
-        "extrapolated": [False, True],
+        "values": [1.0, 2.0, 3.0, 4.0, 6.0, 9.0],
+        "rise": [8.0, 4.0, 0.5, 0.0, 1.0, 2.0],
+        "threshold": 3.84,
+        "interval_95": [2.04, 9.0],
+        "closed": [True, False],
+        "verdict": "determined on one side",
+        "extrapolated": [True, False, False, False, True, True],
+        "ends_extrapolated": [False, True],
     }
+)
+CHECKS = [
+    ProfileCheck.model_validate(
+        {
+            "name": "skin.m",
+            "why": "widest",
+            "emulated": [3.84, 2.0],
+            "solved": [3.5, None],
+            "extrapolated": [False, True],
+        }
+    )
 ]
 
 
@@ -34,7 +44,7 @@ def test_extrapolated_parts_of_a_profile_are_dashed():
     ax = Figure().add_subplot()
     _draw_profile(ax, PROFILE)
     lines = {line.get_linestyle(): np.asarray(line.get_ydata()) for line in ax.get_lines()}
-    assert np.isnan(lines["-"]).tolist() == PROFILE["extrapolated"]
+    assert np.isnan(lines["-"]).tolist() == PROFILE.extrapolated
     # The neighbours of what is extrapolated belong to the dashed line, so that nothing is left out between.
     assert np.isnan(lines["--"]).tolist() == [False, False, True, False, False, False]
     assert lines["None"].tolist() == [8.0, 1.0, 2.0]
@@ -42,13 +52,20 @@ def test_extrapolated_parts_of_a_profile_are_dashed():
 
 def test_the_figure_of_profiles_says_what_dashes_mean_and_what_the_solver_said(tmp_path):
     store = load_store(write_results(tmp_path))
-    figure = draw_profile_figure(store, {"profiles": {"skin.m": PROFILE}, "checks": CHECKS})
+    figure = draw_profile_figure(
+        store, UncertaintyResult.model_construct(profiles={"skin.m": PROFILE}, checks=CHECKS)
+    )
     assert "beyond the emulator's simulations" in figure.caption
     assert "0.34 (the widest, not simulated at each end)" in figure.caption
 
 
 def test_the_table_names_the_ends_that_are_extrapolated():
-    row = {"profile_verdict": "determined on one side", "profile_extrapolated": [False, True]}
-    assert _describe_profile(row) == "determined on one side; high end extrapolated"
-    assert _describe_profile(row | {"profile_extrapolated": [False, False]}) == "determined on one side"
-    assert _describe_profile({"profile_verdict": None, "profile_extrapolated": None}) == "–"
+    def describe(verdict: str | None, ends: tuple[bool, bool] | None) -> str:
+        row = ParameterUncertainty.model_construct(profile_verdict=verdict, profile_extrapolated=ends)
+        return _describe_profile(row)
+
+    assert (
+        describe("determined on one side", (False, True)) == "determined on one side; high end extrapolated"
+    )
+    assert describe("determined on one side", (False, False)) == "determined on one side"
+    assert describe(None, None) == "–"

@@ -333,7 +333,7 @@ def _write(folder: Path, content: CubeResult) -> None:
     heads = ["time_s", *(_format_column(name) for name in content.stress_kPa)]
     table = np.column_stack(columns)
     np.savetxt(folder / "cube.csv", table, fmt="%.9g", delimiter=",", header=",".join(heads), comments="")
-    (folder / "cube.svg").write_text(report.draw_cube(content.to_plain()), encoding="utf-8")
+    (folder / "cube.svg").write_text(report.draw_cube(content), encoding="utf-8")
 
 
 def _format_column(name: str) -> str:

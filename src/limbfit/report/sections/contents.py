@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from ...extensions import Registry
-from ...results.base import StoredResult
 from ..page import Note, Page, Section, make_section
-from ..store import Json, Results
+from ..store import Results
 from .convergence import make_convergence_section
 from .crossvalidation import make_crossvalidation_section
 from .cube import make_cube_section
@@ -27,9 +27,9 @@ from .socket_design import make_socket_design_section
 from .summary import build_summary, list_key_numbers
 from .uncertainty import make_models_section, make_uncertainty_section
 
-Maker = Callable[[Results, Json], Section]
-# By the name of the experiment, in the order of the page; a maker is given the store and what
-# ``<name>.json`` holds.
+Maker = Callable[[Results, Any], Section]
+# By the name of the experiment, in the order of the page; a maker is given the store and the stored result,
+# of an extension as ``<name>.json`` holds it.
 _OWN: dict[str, Maker] = {
     "uncertainty": make_uncertainty_section,
     "regions": make_regions_section,
@@ -86,7 +86,7 @@ def make_page(store: Results) -> Page:
 def _list_experiment_sections(store: Results) -> tuple[Section, ...]:
     """A section for each finished experiment, then one that names those that are stale."""
     found = [
-        SECTIONS[name](store, one.to_plain() if isinstance(one, StoredResult) else one)
+        SECTIONS[name](store, one)
         for name in SECTIONS.names
         if (one := store.experiments.get(name)) is not None
     ]

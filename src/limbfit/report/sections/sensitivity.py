@@ -5,18 +5,30 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 
+from ...results.variants import (
+    FrictionResult,
+    IndenterResult,
+    RefinedSite,
+    RefinementResult,
+    StiffnessResult,
+    VariantRun,
+    VariedSite,
+    VolumeResult,
+)
 from ..drawing.colours import GRID, INK, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH, choose_tissue_style
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import format_fixed, format_friction, number
 from ..page import Block, Bullets, Figure, Prose, Section, Table, make_bullets, make_section
-from ..store import Json, Results
+from ..store import Results
 from ..tables import Column, make_table
 
 _COLOURS = (SIMULATED, ONE_MATERIAL, TRUTH, THIRD, MUTED, INK)
 _LINES: tuple[Any, ...] = ("-", "--", "-.", (0, (6, 2)), ":", "-")
 _STYLES = tuple(zip(_COLOURS, _LINES, strict=True))
+Compared = StiffnessResult | VolumeResult | FrictionResult | IndenterResult | RefinementResult
 _RANGE = ("J_min", "J_low", "J_high", "J_max")
 _CHANGES: tuple[Column, ...] = (
     ("Largest force (N)", "peak_force_N", 3),
@@ -30,12 +42,12 @@ _EFFORT: tuple[Column, ...] = (
 )
 
 
-def make_stiffness_section(store: Results, content: Json) -> Section:
+def make_stiffness_section(store: Results, content: StiffnessResult) -> Section:
     """Force against c of each tissue at equal m, at thin and thick sites, and its derivatives everywhere."""
     name = "sensitivity-c"
     words = Prose(
         "Force with c of one tissue at a time halved and doubled, all tissues with the same m "
-        f"({number(content['equal_m'])}, the geometric mean of those identified), as in the paper's "
+        f"({number(content.equal_m)}, the geometric mean of those identified), as in the paper's "
         f"analysis; everything else as identified. {_describe_thickness(content)}"
     )
     more = _find_leading_tissue(content)
@@ -51,17 +63,17 @@ def make_stiffness_section(store: Results, content: Json) -> Section:
     )
 
 
-def _describe_thickness(content: Json) -> str:
+def _describe_thickness(content: Compared) -> str:
     return _join_clauses(
-        f"site {row['site']}{_format_role(row, ' ({})')}: {format_fixed(row['tissue_mm'])} mm of "
+        f"site {row.site}{_format_role(row, ' ({})')}: {format_fixed(row.tissue_mm)} mm of "
         "tissue to the nearest "
-        f"bone, indented by {format_fixed(row['indentation_mm'])} mm"
-        for row in content["sites"]
+        f"bone, indented by {format_fixed(row.indentation_mm)} mm"
+        for row in content.sites
     )
 
 
-def _format_role(row: Json, form: str) -> str:
-    return form.format(row["role"]) if row["role"] else ""
+def _format_role(row: VariedSite, form: str) -> str:
+    return form.format(row.role) if row.role else ""
 
 
 def _join_clauses(parts: Iterable[str]) -> str:
@@ -70,28 +82,28 @@ def _join_clauses(parts: Iterable[str]) -> str:
     return text[:1].upper() + text[1:] + "." if text else ""
 
 
-def _find_leading_tissue(content: Json) -> str:
+def _find_leading_tissue(content: StiffnessResult) -> str:
     """Which tissue a thin and a thick site feel more: the paper's claim, for this study."""
     found = []
-    for site in content["sites"]:
+    for site in content.sites:
         changes: dict[str, float] = {}
-        for row in content["runs"]:
-            if row["site"] == site["site"] and row["tissue"] and row["peak_change_percent"] is not None:
-                spread = abs(row["peak_change_percent"])
-                changes[row["tissue"]] = max(changes.get(row["tissue"], 0.0), spread)
+        for row in content.runs:
+            if row.site == site.site and row.tissue and row.peak_change_percent is not None:
+                spread = abs(row.peak_change_percent)
+                changes[row.tissue] = max(changes.get(row.tissue, 0.0), spread)
         if len(changes) > 1:
             most = max(changes, key=lambda tissue: changes[tissue])
             numbers = ", ".join(f"{tissue} {format_fixed(value)} %" for tissue, value in changes.items())
-            words = f"at site {site['site']} the force follows the {most} most (largest change: {numbers})"
+            words = f"at site {site.site} the force follows the {most} most (largest change: {numbers})"
             found.append(words)
     return _join_clauses(found)
 
 
 @styled
-def _draw_stiffness_figure(store: Results, content: Json) -> Figure:
-    sites = content["sites"][:2]
+def _draw_stiffness_figure(store: Results, content: StiffnessResult) -> Figure:
+    sites = content.sites[:2]
     drawing, axes = make_panels(len(sites) + 1, len(sites) + 1, 2.9)
-    tissues = list(content["parameters"])
+    tissues = list(content.parameters)
     for ax, site in zip(axes, sites, strict=False):
         _draw_curves(ax, store, "sensitivity-c", site, content)
     _draw_derivatives(axes[-1], content, tissues)
@@ -105,26 +117,24 @@ def _draw_stiffness_figure(store: Results, content: Json) -> Figure:
     return make_figure(drawing, "sensitivity-c", "Force against c of each tissue", caption)
 
 
-def _draw_curves(ax: Axes, store: Results, name: str, site: Json, content: Json) -> None:
+def _draw_curves(ax: Axes, store: Results, name: str, site: VariedSite, content: Compared) -> None:
     """Force against time of every variant of a site."""
-    curves = store.curves(name, site["site"]) or {}
-    rows = [row for row in content["runs"] if row["site"] == site["site"] and row["completed"]]
+    curves = store.curves(name, site.site) or {}
+    rows = [row for row in content.runs if row.site == site.site and row.completed]
     heads = [head for head in curves if head.endswith("_N")]
     for i, (row, head) in enumerate(zip(rows, heads, strict=False)):
-        color, line = (INK, "-") if row["base"] else _STYLES[i % len(_STYLES)]
+        color, line = (INK, "-") if row.base else _STYLES[i % len(_STYLES)]
         ax.plot(curves["time_s"], curves[head], color=color, ls=line, label=_name_model(row))
-    ax.set_title(
-        f"site {site['site']}{_format_role(site, ', {}')}: {format_fixed(site['tissue_mm'])} mm of tissue"
-    )
+    ax.set_title(f"site {site.site}{_format_role(site, ', {}')}: {format_fixed(site.tissue_mm)} mm of tissue")
     ax.set_xlabel("Time (s)")
     ax.margins(x=0.01)
 
 
-def _draw_derivatives(ax: Axes, content: Json, tissues: Sequence[str]) -> None:
+def _draw_derivatives(ax: Axes, content: StiffnessResult, tissues: Sequence[str]) -> None:
     for i, tissue in enumerate(tissues):
-        rows = [row for row in content["local"] if row["peak_percent_per_percent"][tissue] is not None]
-        depth = [row["tissue_mm"] for row in rows]
-        slope = [row["peak_percent_per_percent"][tissue] for row in rows]
+        rows = [row for row in content.local if row.peak_percent_per_percent[tissue] is not None]
+        depth = [row.tissue_mm for row in rows]
+        slope = np.array([row.peak_percent_per_percent[tissue] for row in rows], dtype=float)
         style = choose_tissue_style(i)
         ax.plot(depth, slope, ls="", marker=style["marker"], color=style["color"], label=tissue)
     ax.set_title("% of force for 1 % of c")
@@ -133,18 +143,18 @@ def _draw_derivatives(ax: Axes, content: Json, tissues: Sequence[str]) -> None:
     ax.legend(fontsize=8)
 
 
-def _make_derivative_table(content: Json) -> Table:
+def _make_derivative_table(content: StiffnessResult) -> Table:
     columns: tuple[Column, ...] = (
         ("Site", "site"),
         ("Region", "region"),
         ("Tissue over bone (mm)", "tissue_mm", 1),
-        *((f"{tissue} (%)", ("peak_percent_per_percent", tissue), 3) for tissue in content["parameters"]),
+        *((f"{tissue} (%)", ("peak_percent_per_percent", tissue), 3) for tissue in content.parameters),
     )
     caption = "Change of the largest force in percent for one percent more c, from exact derivatives."
-    return make_table("sensitivity-c-local", caption, columns, content["local"])
+    return make_table("sensitivity-c-local", caption, columns, content.local)
 
 
-def make_kappa_section(store: Results, content: Json) -> Section:
+def make_kappa_section(store: Results, content: VolumeResult) -> Section:
     """The ratio of bulk modulus to c, and the change of volume that it allows."""
     name, element = "sensitivity-kappa", store.calibration.element if store.calibration else None
     columns = (
@@ -156,7 +166,7 @@ def make_kappa_section(store: Results, content: Json) -> Section:
         ("Volume beyond 1 % (%)", "beyond_percent", 1),
     )
     words = Prose(
-        f"The bulk modulus is {number(content['kappa_ratio'])} times c in this study; the paper took 100, "
+        f"The bulk modulus is {number(content.kappa_ratio)} times c in this study; the paper took 100, "
         "enough to keep the ratio of volumes J within 1 % of one in its models. J is the mean of an element "
         "at the deepest point, over the elements within one width of the indenter. Elements that lock "
         f"stiffen with it; those of this study are {element}. "
@@ -168,27 +178,27 @@ def make_kappa_section(store: Results, content: Json) -> Section:
     return make_section(name, title, words, _draw_kappa_figure(content), table, _list_warnings(content))
 
 
-def _describe_volume_ratio(content: Json) -> str:
+def _describe_volume_ratio(content: VolumeResult) -> str:
     """How far J goes with the study's ratio."""
-    rows = [row for row in content["runs"] if row["base"] and row["J_min"] is not None]
+    rows = [row for row in content.runs if row.base and row.J_min is not None]
     parts = [
-        f"from {format_fixed(row['J_min'], 3)} to {format_fixed(row['J_max'], 3)} at site {row['site']}, "
-        f"{format_fixed(row['beyond_percent'], 0)} % of that volume beyond 1 %"
+        f"from {format_fixed(row.J_min, 3)} to {format_fixed(row.J_max, 3)} at site {row.site}, "
+        f"{format_fixed(row.beyond_percent, 0)} % of that volume beyond 1 %"
         for row in rows
     ]
     return f"Here it goes {'; '.join(parts)}." if parts else ""
 
 
 @styled
-def _draw_kappa_figure(content: Json) -> Figure:
+def _draw_kappa_figure(content: VolumeResult) -> Figure:
     drawing, axes = make_panels(2, 2, 2.7)
-    for i, site in enumerate(content["sites"]):
+    for i, site in enumerate(content.sites):
         color, line = _STYLES[i % len(_STYLES)]
-        rows = [row for row in content["runs"] if row["site"] == site["site"] and row["completed"]]
-        ratio = [row["kappa_ratio"] for row in rows]
-        known = {key: [row[key] for row in rows] for key in ("peak_force_N", *_RANGE)}
+        rows = [row for row in content.runs if row.site == site.site and row.completed]
+        ratio = [row.kappa_ratio for row in rows]
+        known = {key: [getattr(row, key) for row in rows] for key in ("peak_force_N", *_RANGE)}
         style: dict[str, Any] = {"color": color, "ls": line, "marker": "o", "ms": 4}
-        label = f"site {site['site']}{_format_role(site, ', {}')}"
+        label = f"site {site.site}{_format_role(site, ', {}')}"
         axes[0].plot(ratio, known["peak_force_N"], label=label, **style)
         axes[1].fill_between(ratio, known["J_min"], known["J_max"], color=color, alpha=0.15, lw=0)
         axes[1].plot(ratio, known["J_low"], ratio, known["J_high"], **style)
@@ -199,7 +209,7 @@ def _draw_kappa_figure(content: Json) -> Figure:
         ax.set_xscale("log")
         ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         ax.set_xlabel("κ over c (–)")
-        ax.axvline(content["kappa_ratio"], color=MUTED, lw=0.8, ls="--")
+        ax.axvline(content.kappa_ratio, color=MUTED, lw=0.8, ls="--")
     add_legend(drawing, axes[0])
     caption = (
         "Largest force and ratio of volumes against κ over c; dashed: the study's. Right: all elements near "
@@ -209,20 +219,20 @@ def _draw_kappa_figure(content: Json) -> Figure:
     return make_figure(drawing, name, "Force and ratio of volumes against the bulk modulus", caption)
 
 
-def make_contact_section(store: Results, content: Json) -> Section:
+def make_contact_section(store: Results, content: FrictionResult) -> Section:
     """Sticky against frictionless contact."""
     words = Prose(
-        f"The skin under the indenter slips freely in this study's model ({content['friction']}), or sticks "
+        f"The skin under the indenter slips freely in this study's model ({content.friction}), or sticks "
         "to it where it has touched: the two ends of what friction can do. The paper found no significant "
         f"change of the largest force. {_describe_changes(content)}"
-        if content["friction"] == "frictionless"
-        else f"Contact in this study's model is {format_friction(content['friction'])}. "
+        if content.friction == "frictionless"
+        else f"Contact in this study's model is {format_friction(content.friction)}. "
         f"{_describe_changes(content)}"
     )
     return _compare_models(store, "sensitivity-contact", "Sensitivity to friction", words, content, _EFFORT)
 
 
-def make_indenter_section(store: Results, content: Json) -> Section:
+def make_indenter_section(store: Results, content: IndenterResult) -> Section:
     """The square against a sphere and others."""
     words = Prose(
         "The same displacement and width with other indenters. The paper expects of a sphere that "
@@ -235,16 +245,16 @@ def make_indenter_section(store: Results, content: Json) -> Section:
     )
 
 
-def _describe_changes(content: Json) -> str:
+def _describe_changes(content: Compared) -> str:
     return _join_clauses(
-        f"{row['label']}: the largest force at site {row['site']} changes by "
-        f"{format_fixed(row['peak_change_percent'])} %"
-        for row in content["runs"]
-        if not row["base"] and row["peak_change_percent"] is not None
+        f"{row.label}: the largest force at site {row.site} changes by "
+        f"{format_fixed(row.peak_change_percent)} %"
+        for row in content.runs
+        if not row.base and row.peak_change_percent is not None
     )
 
 
-def make_mesh_section(store: Results, content: Json) -> Section:
+def make_mesh_section(store: Results, content: RefinementResult) -> Section:
     """Mesh independence."""
     name = "sensitivity-mesh"
     words = Prose(
@@ -263,36 +273,36 @@ def make_mesh_section(store: Results, content: Json) -> Section:
     return make_section(name, "Mesh independence", words, figure, table, _list_warnings(content))
 
 
-def _describe_limits(content: Json) -> str:
-    return _join_clauses(f"at site {row['site']} {_describe_limit(row)}" for row in content["sites"])
+def _describe_limits(content: RefinementResult) -> str:
+    return _join_clauses(f"at site {row.site} {_describe_limit(row)}" for row in content.sites)
 
 
-def _describe_limit(row: Json) -> str:
-    if row["limit_N"] is None:
+def _describe_limit(row: RefinedSite) -> str:
+    if row.limit_N is None:
         return "the forces do not tend to a value yet: finer meshes are needed"
-    error, limit = format_fixed(row["error_percent"], 2), format_fixed(row["limit_N"], 3)
-    if row["order"] is None:
+    error, limit = format_fixed(row.error_percent, 2), format_fixed(row.limit_N, 3)
+    if row.order is None:
         return (
             f"the study's mesh is {error} % off the finest, whose largest force is {limit} N; with this "
             "element forces do not change in one direction, so nothing is extrapolated"
         )
-    order = f"order {number(row['order'], 2)}" + ("" if row["order_measured"] else ", assumed")
+    order = f"order {number(row.order, 2)}" + ("" if row.order_measured else ", assumed")
     return f"the largest force tends to {limit} N ({order}), and the study's mesh is {error} % off"
 
 
 @styled
-def _draw_mesh_figure(store: Results, content: Json) -> Figure:
-    sites = content["sites"][:2]
+def _draw_mesh_figure(store: Results, content: RefinementResult) -> Figure:
+    sites = content.sites[:2]
     drawing, axes = make_panels(len(sites) + 1, len(sites) + 1, 2.7)
     for ax, site in zip(axes, sites, strict=False):
         _draw_curves(ax, store, "sensitivity-mesh", site, content)
-    for i, site in enumerate(content["sites"]):
-        rows = [row for row in content["runs"] if row["site"] == site["site"] and row["completed"]]
+    for i, site in enumerate(content.sites):
+        rows = [row for row in content.runs if row.site == site.site and row.completed]
         color, line = _STYLES[i % len(_STYLES)]
-        edge, peak = ([row[key] for row in rows] for key in ("edge_near_mm", "peak_force_N"))
-        axes[-1].plot(edge, peak, color=color, ls=line, marker="o", label=f"site {site['site']}")
-        if site["order"] is not None:
-            axes[-1].plot(0.0, site["limit_N"], color=color, marker="x", ls="", mew=1.8)
+        edge, peak = np.array([(row.edge_near_mm, row.peak_force_N) for row in rows], dtype=float).T
+        axes[-1].plot(edge, peak, color=color, ls=line, marker="o", label=f"site {site.site}")
+        if site.limit_N is not None and site.order is not None:
+            axes[-1].plot(0.0, site.limit_N, color=color, marker="x", ls="", mew=1.8)
     axes[0].set_ylabel("Force (N)")
     axes[-1].set_title("Largest force (N)")
     axes[-1].set_xlabel("Edge near the indenter (mm)")
@@ -308,11 +318,11 @@ def _draw_mesh_figure(store: Results, content: Json) -> Figure:
 
 @styled
 def _compare_models(
-    store: Results, name: str, title: str, words: Block, content: Json, more: Iterable[Column]
+    store: Results, name: str, title: str, words: Block, content: Compared, more: Iterable[Column]
 ) -> Section:
     """Curves of every site, and the table of its runs."""
-    drawing, axes = make_panels(len(content["sites"]), 2, 2.7)
-    for ax, site in zip(axes, content["sites"], strict=True):
+    drawing, axes = make_panels(len(content.sites), 2, 2.7)
+    for ax, site in zip(axes, content.sites, strict=True):
         _draw_curves(ax, store, name, site, content)
         ax.set_ylabel("Force (N)")
     add_legend(drawing, axes[0])
@@ -322,25 +332,25 @@ def _compare_models(
     return make_section(name, title, words, figure, table, _list_warnings(content))
 
 
-def _make_run_table(name: str, caption: str, content: Json, columns: Iterable[Column]) -> Table:
+def _make_run_table(name: str, caption: str, content: Compared, columns: Iterable[Column]) -> Table:
     first = (("Site", "site"), ("Model", _name_model))
     caption = f"{caption} Marked: as in the study."
-    return make_table(name, caption, (*first, *columns), content["runs"], marked="base")
+    return make_table(name, caption, (*first, *columns), content.runs, marked="base")
 
 
-def _name_model(row: Json) -> str:
-    return str(row["label"].replace(" x ", " × "))
+def _name_model(row: VariantRun) -> str:
+    return row.label.replace(" x ", " × ")
 
 
-def _list_warnings(content: Json) -> Bullets | None:
+def _list_warnings(content: Compared) -> Bullets | None:
     """Simulations that did not reach their end, and what is doubtful about others."""
-    runs = content["runs"]
-    texts = [(row, f"stopped early: {row['reason']}") for row in runs if not row["completed"]]
-    texts += [(row, text) for row in runs for text in row["warnings"]]
-    return make_bullets(f"Site {row['site']}, {row['label']}: {text}" for row, text in texts)
+    runs = content.runs
+    texts = [(row, f"stopped early: {row.reason}") for row in runs if not row.completed]
+    texts += [(row, text) for row in runs for text in row.warnings]
+    return make_bullets(f"Site {row.site}, {row.label}: {text}" for row, text in texts)
 
 
-SENSITIVITIES: dict[str, Callable[[Results, Json], Section]] = {
+SENSITIVITIES: dict[str, Callable[[Results, Any], Section]] = {
     "sensitivity-c": make_stiffness_section,
     "sensitivity-kappa": make_kappa_section,
     "sensitivity-contact": make_contact_section,

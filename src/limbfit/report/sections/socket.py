@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ...results.socket import SocketResult
 from ..drawing.socket_pictures import draw_inside_figure, draw_pressure_figures, draw_settling_figure
 from ..formats import NOTHING, format_fixed, format_friction, format_symbol, label
 from ..page import Block, Note, Prose, Row, Section, Table, make_section
@@ -28,8 +29,9 @@ ORIGINS = {
 }
 
 
-def make_socket_section(store: Results, content: Json) -> Section:
+def make_socket_section(store: Results, found: SocketResult) -> Section:
     """What the experiment ``socket`` found."""
+    content = found.to_plain()
     loads = content["loads"]
     folder = store.folder / "socket"
     names = ["donning", *(load["name"] for load in loads)]

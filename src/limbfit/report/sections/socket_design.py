@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from ...results.socket import SocketDesignResult
 from ..drawing.socket_pictures import draw_offset_figure, draw_pressure_figures
 from ..formats import format_fixed
 from ..page import Note, Prose, Section, Table, make_section
@@ -12,8 +13,9 @@ from ..tables import Column, make_table
 from .socket import ORIGINS
 
 
-def make_socket_design_section(store: Results, content: Json) -> Section:
+def make_socket_design_section(store: Results, found: SocketDesignResult) -> Section:
     """What the experiment ``socket_design`` found."""
+    content = found.to_plain()
     folder, designs = store.folder / "socket_design", content["designs"]
     names = [one["name"] for one in designs]
     last = len(designs[0]["simulation"]["loads"])  # donning is the first

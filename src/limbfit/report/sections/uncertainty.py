@@ -13,92 +13,100 @@ from matplotlib.ticker import MaxNLocator
 
 from ...results.base import Interval
 from ...results.models import MixedPrediction, ModelsResult
+from ...results.uncertainty import (
+    IntervalParts,
+    LikelihoodProfile,
+    ParameterUncertainty,
+    ProfileCheck,
+    SourceEffect,
+    UncertaintyResult,
+)
 from ..drawing import plots
 from ..drawing.colours import INK, MEASURED, MUTED, SIMULATED, choose_truth_style
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import NOTHING, format_fixed, format_limits, label, number
 from ..page import Block, Bullets, Cell, Figure, Note, Prose, Section, Table, make_section
-from ..store import Curves, Json, Results, find_compared_quantity
+from ..store import Curves, Results, find_compared_quantity
 from ..tables import Column, make_table, to_numeric
 
 TrueValues = dict[str, tuple[float, dict[str, Any]]]  # by name: a true parameter and its line
 MAX_DRAWS, MAX_SITES = 300, 18
 
 
-def make_uncertainty_section(store: Results, content: Json) -> Section:
+def make_uncertainty_section(store: Results, content: UncertaintyResult) -> Section:
     """What the experiment ``uncertainty`` found."""
     return make_section(
         "uncertainty",
         "What the records determine",
-        Bullets(tuple(content["verdict"])),
+        Bullets(tuple(content.verdict)),
         _describe_method(content),
         _make_parameter_table(content),
         _make_combination_table(content),
         draw_profile_figure(store, content),
         draw_pairs_figure(store, content),
         _make_evidence_table(content),
-        _make_source_table(content) if content["sources"] else None,
+        _make_source_table(content) if content.sources else None,
         draw_prediction_figure(store, content),
         _make_prediction_table(content),
         _describe_emulator(content),
     )
 
 
-def _describe_method(content: Json) -> Prose:
-    residuals = content["residuals"]
+def _describe_method(content: UncertaintyResult) -> Prose:
+    residuals = content.residuals
     return Prose(
         "Residuals are noise of the record, estimated from what smoothing took away (its autocorrelation and "
         "the doubt about touch-down included), plus a smooth misfit of the model at each site, a Gaussian "
         "process whose size and duration are found by restricted maximum likelihood: a misfit of "
-        f"{format_fixed(100 * residuals['misfit_elsewhere'], 2)} % of the largest force that lasts "
-        f"{format_fixed(100 * residuals['correlation'], 0)} % of a record. Posterior and profiles "
+        f"{format_fixed(100 * residuals.misfit_elsewhere, 2)} % of the largest force that lasts "
+        f"{format_fixed(100 * residuals.correlation, 0)} % of a record. Posterior and profiles "
         "use an emulator "
         "of the solver; the further sources are simulations of their own, carried to the parameters by the "
         "linearised fit."
     )
 
 
-def _make_parameter_table(content: Json) -> Table:
+def _make_parameter_table(content: UncertaintyResult) -> Table:
     columns = (
-        ("Parameter", lambda row: label(row["name"])),
-        ("Identified", lambda row: to_numeric(number(row["calibrated"]))),
-        ("Linearised", lambda row: to_numeric(format_limits(row["linearised_95"]))),
-        ("Posterior", lambda row: to_numeric(format_limits(row["posterior_95"]))),
-        ("Profile", lambda row: to_numeric(format_limits(row["profile_95"]))),
+        ("Parameter", lambda row: label(row.name)),
+        ("Identified", lambda row: to_numeric(number(row.calibrated))),
+        ("Linearised", lambda row: to_numeric(format_limits(row.linearised_95))),
+        ("Posterior", lambda row: to_numeric(format_limits(row.posterior_95))),
+        ("Profile", lambda row: to_numeric(format_limits(row.profile_95))),
         ("Profile says", _describe_profile),
-        ("With all sources", lambda row: to_numeric(format_limits(row["with_sources_95"]))),
+        ("With all sources", lambda row: to_numeric(format_limits(row.with_sources_95))),
         ("Verdict", "verdict"),
     )
     caption = (
         "Parameters (c in kPa, τ in s) with 95 % intervals by three methods on the records alone, and with "
         "geometry, contact and mesh added. A profile that is determined on both sides needs no bounds."
     )
-    return make_table("uncertainty-parameters", caption, columns, content["parameters"])
+    return make_table("uncertainty-parameters", caption, columns, content.parameters)
 
 
-def _describe_profile(row: Json) -> str:
+def _describe_profile(row: ParameterUncertainty) -> str:
     """What a profile says, and which of its ends rest on an emulator beyond its simulations."""
-    if row["profile_verdict"] is None:
+    if row.profile_verdict is None:
         return NOTHING
-    low, high = row["profile_extrapolated"]
+    low, high = row.profile_extrapolated or (False, False)
     ends = [word for word, beyond in (("low", low), ("high", high)) if beyond]
     where = f"; {' and '.join(ends)} end extrapolated" if ends else ""
-    return f"{row['profile_verdict']}{where}"
+    return f"{row.profile_verdict}{where}"
 
 
-def _make_combination_table(content: Json) -> Table:
+def _make_combination_table(content: UncertaintyResult) -> Table:
     columns = (
-        ("Combination", lambda row: Cell(row["text"])),
-        ("Linearised", lambda row: _format_factor(row["linearised_factor_95"])),
-        ("Posterior", lambda row: _format_factor(row["posterior_factor_95"])),
-        ("With all sources", lambda row: _format_factor(row["with_sources_factor_95"])),
+        ("Combination", lambda row: Cell(row.text)),
+        ("Linearised", lambda row: _format_factor(row.linearised_factor_95)),
+        ("Posterior", lambda row: _format_factor(row.posterior_factor_95)),
+        ("With all sources", lambda row: _format_factor(row.with_sources_factor_95)),
         ("Verdict", "verdict"),
     )
     caption = (
         "Independent products of powers of the parameters, the best known first; × and ÷ by the factor is "
         "the 95 % interval."
     )
-    return make_table("uncertainty-combinations", caption, columns, content["combinations"])
+    return make_table("uncertainty-combinations", caption, columns, content.combinations)
 
 
 def _format_factor(value: float) -> Cell:
@@ -106,9 +114,9 @@ def _format_factor(value: float) -> Cell:
 
 
 @plots.styled
-def draw_profile_figure(store: Results, content: Json) -> Figure | None:
+def draw_profile_figure(store: Results, content: UncertaintyResult) -> Figure | None:
     """How much worse the records are met as one parameter moves and the others follow."""
-    profiles = content["profiles"]
+    profiles = content.profiles
     if not profiles:
         return None
     truth = read_true_values(store)
@@ -116,29 +124,29 @@ def draw_profile_figure(store: Results, content: Json) -> Figure | None:
     plots.label_outer(axes, 4, "", "Rise of −2 ln L")
     for ax, (name, one) in zip(axes, profiles.items(), strict=True):
         _draw_profile(ax, one)
-        ax.axhline(one["threshold"], color=MUTED, ls=":", lw=1.2, label="95 %")
-        ax.axvspan(*one["interval_95"], color=SIMULATED, alpha=0.12, lw=0)
+        ax.axhline(one.threshold, color=MUTED, ls=":", lw=1.2, label="95 %")
+        ax.axvspan(*one.interval_95, color=SIMULATED, alpha=0.12, lw=0)
         if name in truth:
             ax.axvline(truth[name][0], **truth[name][1], label="truth")
-        ax.set_ylim(0, 2.5 * one["threshold"])
+        ax.set_ylim(0, 2.5 * one.threshold)
         plots.set_log_scale(ax)
-        ax.set_title(f"{label(name)}: {one['verdict']}", fontsize=7.5)
+        ax.set_title(f"{label(name)}: {one.verdict}", fontsize=7.5)
     plots.add_legend(drawing, axes[0])
     caption = (
         "Profile likelihood of every parameter: all others chosen anew for each value. Where the curve stays "
         "below the dotted line up to a bound, the records do not determine the parameter on that side. "
         "Dashed, with open circles: beyond the emulator's simulations, extrapolated."
     )
-    if checked := [_describe_check(check) for check in content["checks"]]:
+    if checked := [_describe_check(check) for check in content.checks]:
         caption += f" At the ends, emulator and solver differ by (in the same unit): {', '.join(checked)}."
-    words = ", ".join(f"{label(name)} {one['verdict']}" for name, one in profiles.items())
+    words = ", ".join(f"{label(name)} {one.verdict}" for name, one in profiles.items())
     return plots.make_figure(drawing, "profiles", f"Profile likelihood: {words}", caption)
 
 
-def _draw_profile(ax: Axes, one: Json) -> None:
+def _draw_profile(ax: Axes, one: LikelihoodProfile) -> None:
     """A profile, dashed and with open circles where it is extrapolated."""
-    values, rise = np.array(one["values"]), np.array(one["rise"])
-    beyond = np.array(one["extrapolated"], dtype=bool)
+    values, rise = np.array(one.values), np.array(one.rise)
+    beyond = np.array(one.extrapolated, dtype=bool)
     # The neighbours too, so that the two lines meet.
     dashed = np.where(beyond | np.r_[beyond[1:], False] | np.r_[False, beyond[:-1]], rise, np.nan)
     ax.plot(values, np.where(beyond, np.nan, rise), color=SIMULATED, marker="o", ms=2.5, label="profile")
@@ -146,20 +154,17 @@ def _draw_profile(ax: Axes, one: Json) -> None:
     ax.plot(values[beyond], rise[beyond], color=SIMULATED, ls="", marker="o", ms=3.0, mfc="none")
 
 
-def _describe_check(check: Json) -> str:
+def _describe_check(check: ProfileCheck) -> str:
     """By how much emulator and solver differ at the ends of a profile."""
-    pairs = zip(check["emulated"], check["solved"], strict=True)
-    off = [abs(a - b) for a, b in pairs if b is not None]
-    failed = "" if len(off) == len(check["solved"]) else ", not simulated at each end"
-    return f"{label(check['name'])} {format_fixed(max(off, default=None), 2)} (the {check['why']}{failed})"
+    failed = ", not simulated at each end" if None in check.solved else ""
+    return f"{label(check.name)} {format_fixed(check.largest_difference, 2)} (the {check.why}{failed})"
 
 
-def _make_evidence_table(content: Json) -> Table | None:
+def _make_evidence_table(content: UncertaintyResult) -> Table | None:
     """One material against several."""
-    found = content["evidence"]
-    if not found:
+    found = content.evidence
+    if found is None:
         return None
-    heldout = found["heldout"] or {}
     columns = (
         ("Model", "name"),
         ("Free parameters", "parameters", 0),
@@ -168,49 +173,50 @@ def _make_evidence_table(content: Json) -> Table | None:
         ("Held-out error (%)", "heldout_percent", 2),
     )
     rows = [
-        found[which] | {"heldout_percent": heldout.get(f"{which}_percent")} for which in ("first", "second")
+        one.to_plain() | {"heldout_percent": found.heldout.get(f"{which}_percent")}
+        for which, one in (("first", found.first), ("second", found.second))
     ]
-    samples = format_fixed(found["first"]["effective_samples"], 0)
+    samples = format_fixed(found.first.effective_samples, 0)
     caption = (
-        f"One material or several: {found['verdict']}. Evidence: the likelihood's mean over the bounds. "
+        f"One material or several: {found.verdict}. Evidence: the likelihood's mean over the bounds. "
         f"Residuals are correlated: {samples} count, too few for criteria that count samples."
     )
-    return make_table("evidence", caption, columns, rows, marked=lambda row: row["name"] == found["better"])
+    return make_table("evidence", caption, columns, rows, marked=lambda row: row["name"] == found.better)
 
 
-def _make_source_table(content: Json) -> Table:
+def _make_source_table(content: UncertaintyResult) -> Table:
     """What would change the answer by how much."""
-    names = list(content["sources"][0]["parameters_percent"])
+    names = list(content.sources[0].parameters_percent)
 
-    def shift(row: Json, name: str) -> Cell:
-        value, shifts = row["parameters_percent"][name], row["parameters_percent"].values()
+    def shift(row: SourceEffect, name: str) -> Cell:
+        value, shifts = row.parameters_percent[name], row.parameters_percent.values()
         share = min(abs(value) / (max(map(abs, shifts)) or 1.0), 1.0)
-        return to_numeric(f"{'' if row['shared'] else '±'}{format_fixed(value)}", share)
+        return to_numeric(f"{'' if row.shared else '±'}{format_fixed(value)}", share)
 
     columns: tuple[Column, ...] = (
         ("Source", "source"),
         ("Change", _describe_change),
         (
             "Force (%)",
-            lambda row: to_numeric(format_fixed(float(np.mean(list(row["force_percent"].values()))), 2)),
+            lambda row: to_numeric(format_fixed(float(np.mean(list(row.force_percent.values()))), 2)),
         ),
         *((f"{label(name)} (%)", lambda row, name=name: shift(row, name)) for name in names),
-        ("Counted", lambda row: "yes" if row["counted"] else "told only"),
+        ("Counted", lambda row: "yes" if row.counted else "told only"),
     )
     caption = (
         "What would change the answer, by how much: change of force (mean over the fitted sites, of the "
         "largest) and what the fit would make of it in the parameters. ± where each site has its own, drawn "
         "together as the root of the sum of squares. Large changes are extrapolated linearly."
     )
-    return make_table("uncertainty-sources", caption, columns, content["sources"])
+    return make_table("uncertainty-sources", caption, columns, content.sources)
 
 
-def _describe_change(row: Json) -> str:
-    failed = f" (not simulated at {', '.join(row['failed'])})" if row["failed"] else ""
-    return f"{row['change']}{failed}"
+def _describe_change(row: SourceEffect) -> str:
+    failed = f" (not simulated at {', '.join(row.failed)})" if row.failed else ""
+    return f"{row.change}{failed}"
 
 
-def _make_prediction_table(content: Json) -> Table:
+def _make_prediction_table(content: UncertaintyResult) -> Table:
     columns = (
         ("Site", "record"),
         ("Inside (%)", _format_inside),
@@ -220,36 +226,37 @@ def _make_prediction_table(content: Json) -> Table:
         ("Noise", "noise_sd_percent", 2),
         ("Misfit", "misfit_sd_percent", 2),
     )
-    found = content["predictions"]
-    fitted, heldout = (format_fixed(found[f"coverage_{use}_percent"], 0) for use in ("fitted", "heldout"))
+    found = content.predictions
+    shares = found.coverage_fitted_percent, found.coverage_heldout_percent
+    fitted, heldout = (format_fixed(share, 0) for share in shares)
     caption = (
         "Prediction intervals of 95 %: how much of each record lies inside, and standard deviations by cause "
         f"in percent of the largest force. Fitted sites: {fitted} % inside; held-out sites: {heldout} %."
     )
-    return make_table("uncertainty-predictions", caption, columns, found["sites"], marked="fitted")
+    return make_table("uncertainty-predictions", caption, columns, found.sites, marked="fitted")
 
 
-def _format_inside(row: Json) -> Cell:
-    reason = row.get("reason")
-    return to_numeric(f"not predicted: {reason}" if reason else format_fixed(row["inside_percent"], 0))
+def _format_inside(row: IntervalParts) -> Cell:
+    told = f"not predicted: {row.reason}" if row.reason else format_fixed(row.inside_percent, 0)
+    return to_numeric(told)
 
 
-def _describe_emulator(content: Json) -> Block:
-    found, chain = content["emulator"], content["posterior"]
-    last = found["rounds"][-1]
+def _describe_emulator(content: UncertaintyResult) -> Block:
+    found, chain = content.emulator, content.posterior
+    last = found.rounds[-1]
     text = (
-        f"Emulator: {found['runs']} simulations of all fitted sites with derivatives; its stated "
+        f"Emulator: {found.runs} simulations of all fitted sites with derivatives; its stated "
         "error over "
-        f"nine tenths of the posterior is at most {format_fixed(max(last['error_percent']), 2)} % "
+        f"nine tenths of the posterior is at most {format_fixed(max(last.error_percent), 2)} % "
         "of the largest "
-        f"force (needed: {format_fixed(min(found['needed_percent']), 2)} %), left-out runs are met to "
-        f"{format_fixed(max(last['loo_percent']), 2)} % (median); "
-        f"{format_fixed(100 * last['outside'], 0)} % of the "
+        f"force (needed: {format_fixed(min(found.needed_percent), 2)} %), left-out runs are met to "
+        f"{format_fixed(max(last.loo_percent), 2)} % (median); "
+        f"{format_fixed(100 * last.outside, 0)} % of the "
         f"posterior lies beyond its simulations. Chain: "
-        f"{format_fixed(chain['independent_draws'], 0)} independent "
-        f"draws, acceptance {format_fixed(100 * chain['acceptance'], 0)} %."
+        f"{format_fixed(chain.independent_draws, 0)} independent "
+        f"draws, acceptance {format_fixed(100 * chain.acceptance, 0)} %."
     )
-    return Prose(text) if found["good_enough"] else Note(text)
+    return Prose(text) if found.good_enough else Note(text)
 
 
 def read_true_values(store: Results) -> TrueValues:
@@ -263,17 +270,17 @@ def read_true_values(store: Results) -> TrueValues:
 
 
 @plots.styled
-def draw_pairs_figure(store: Results, content: Json) -> Figure | None:
+def draw_pairs_figure(store: Results, content: UncertaintyResult) -> Figure | None:
     """Draws of the posterior, every parameter against every other, in logarithms."""
     draws = store.curves("uncertainty", "draws")
     if draws is None:
         return None
-    names = [row["name"] for row in content["parameters"] if np.ptp(draws[row["name"]]) > 0]
+    names = [row.name for row in content.parameters if np.ptp(draws[row.name]) > 0]
     n = len(names)
     drawing = Drawing(figsize=(plots.PANEL_WIDTH_IN, plots.PANEL_WIDTH_IN * 0.8), layout="constrained")
     drawing.get_layout_engine().set(w_pad=0.01, h_pad=0.01, wspace=0.02, hspace=0.02)  # type: ignore[union-attr, call-arg]
     drawing.patch.set_alpha(0)
-    identified = {row["name"]: row["calibrated"] for row in content["parameters"]}
+    identified = {row.name: row.calibrated for row in content.parameters}
     for i in range(n):
         for j in range(i + 1):
             ax = drawing.add_subplot(n, n, i * n + j + 1)
@@ -317,9 +324,9 @@ def _name_axis(axis: Axis, name: str, numbered: bool) -> None:
 
 
 @plots.styled
-def draw_prediction_figure(store: Results, content: Json) -> Figure | None:
+def draw_prediction_figure(store: Results, content: UncertaintyResult) -> Figure | None:
     """Records beside their prediction intervals, held-out sites first."""
-    rows = sorted(content["predictions"]["sites"], key=lambda row: row["fitted"])[:MAX_SITES]
+    rows = sorted(content.predictions.sites, key=lambda row: row.fitted)[:MAX_SITES]
     pairs = store.with_curves("uncertainty/predictions", rows)
     if not pairs:
         return None
@@ -333,8 +340,8 @@ def draw_prediction_figure(store: Results, content: Json) -> Figure | None:
         plots.plot_band(ax, time, low, high)
         ax.plot(time, measured, color=MEASURED, lw=2.2, alpha=0.55, label="measured")
         ax.plot(time, predicted, color=SIMULATED, lw=1.1, label="predicted")
-        kind = "fitted" if row["fitted"] else "held out"
-        ax.set_title(f"site {row['record']}, {kind}: {format_fixed(row['inside_percent'], 0)} % inside")
+        kind = "fitted" if row.fitted else "held out"
+        ax.set_title(f"site {row.record}, {kind}: {format_fixed(row.inside_percent, 0)} % inside")
         ax.margins(x=0.01)
         if quantity != "force":
             ax.set_ylabel(f"{quantity.capitalize()} ({unit})")
@@ -345,7 +352,7 @@ def draw_prediction_figure(store: Results, content: Json) -> Figure | None:
         "Records beside their 95 % prediction intervals: uncertainty of the parameters, all counted sources, "
         "noise of the record and misfit of the model."
     )
-    records = ", ".join(row["record"] for row, _ in pairs)
+    records = ", ".join(row.record for row, _ in pairs)
     alt = f"Measured and predicted force with intervals: {records}"
     return plots.make_figure(drawing, "predictions", alt, caption)
 
