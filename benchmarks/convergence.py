@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_site
 from limbfit.anatomy.surfaces.surfaces import Anatomy, read_surface
-from limbfit.bench.measuring import measure_max_rss_MB, warm_up
-from limbfit.bench.reference import find_reference
+from limbfit.bench.parity import find_reference
+from limbfit.bench.timing import measure_max_rss_MB, warm_up
 from limbfit.fe import ELEMENTS, Problem, StepControl, solve
 from limbfit.indentation import SiteModel, build_problem
 from limbfit.mesh import Mesh, check, read_vtu, to_tet10, write_vtu

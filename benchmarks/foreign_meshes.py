@@ -44,8 +44,7 @@ from limbfit.anatomy.surfaces.mending import build_closed_anatomy, open_loops
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, build_anatomy, find_bodies, read_surface
 from limbfit.anatomy.surfaces.thickness import measure_fat_depth
 from limbfit.anatomy.surfaces.triangles import from_pyvista
-from limbfit.bench.limbs import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, draw_random_sites
-from limbfit.bench.meshing import measure_cpu_seconds
+from limbfit.bench.meshing import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, draw_random_sites, measure_cpu_seconds
 from limbfit.errors import LimbfitError
 from limbfit.fe import solve
 from limbfit.indentation import SiteModel, build_problem, build_steps

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from limbfit.bench.measuring import measure_max_rss_MB
+from limbfit.bench.timing import measure_max_rss_MB
 from limbfit.indentation import (
     Simulation,
     SimulationJob,

@@ -15,11 +15,8 @@ import pytest
 
 from limbfit.bench import bench_forward, bench_scaling
 from limbfit.bench.blocks import build_layered_block, build_punched_block, choose_divisions
-from limbfit.bench.measuring import measure_max_rss_MB, run_in_fresh_process, solve_timed
-from limbfit.bench.parity import ALL_CASES, bench_febio_parity
-from limbfit.bench.reference import CUBES, find_reference, load_case
-from limbfit.bench.scaling import fit_exponent
-from limbfit.bench.socket import SOCKET
+from limbfit.bench.parity import ALL_CASES, CUBES, SOCKET, bench_febio_parity, find_reference, load_case
+from limbfit.bench.timing import fit_exponent, measure_max_rss_MB, run_in_fresh_process, solve_timed
 from limbfit.cli import main
 from limbfit.errors import InputError
 from limbfit.fe import ELEMENTS, StepControl, System
@@ -73,7 +70,7 @@ def rss_after(megabytes: int) -> float:
 @pytest.mark.slow
 def test_memory_is_that_of_the_process_alone():
     mine = np.ones(400 * 131072)
-    small, large = (run_in_fresh_process(rss_after, size, 1) for size in (1, 200))
+    small, large = (run_in_fresh_process(rss_after, 1, size) for size in (1, 200))
     assert small < 400 < measure_max_rss_MB()
     assert large - small == pytest.approx(199, abs=15)
     assert mine.all()
@@ -117,7 +114,7 @@ def test_a_forward_run_as_febio_has_its_softer_contact():
 def elsewhere(monkeypatch):
     """A folder name that no machine has above its temporary files."""
     name = Path("shared") / "reference-of-this-test"
-    monkeypatch.setattr("limbfit.bench.reference.FOLDER", name)
+    monkeypatch.setattr("limbfit.bench.parity.FOLDER", name)
     return name
 
 

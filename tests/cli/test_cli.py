@@ -14,9 +14,8 @@ import pyvista as pv
 import typer
 
 from limbfit import __version__
-from limbfit.cli.app import app
+from limbfit.cli.app import GROUPS, app
 from limbfit.cli.commands import show_summary
-from limbfit.cli.groups import GROUPS
 
 HEADER = "time_s,displacement_mm,force_N"
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from limbfit.bench.parity import compare_force, compare_stress
-from limbfit.bench.reference import CUBES, PUNCHED
+from limbfit.bench.parity import CUBES, PUNCHED, compare_force, compare_stress
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
 pytestmark = pytest.mark.skipif(

@@ -6,7 +6,7 @@ import time
 
 import psutil
 
-from limbfit.studio.commands import find_command, interrupt_process, start_command
+from limbfit.studio.processes import find_command, interrupt_process, start_command
 
 
 def ended(process, within_s=60.0):

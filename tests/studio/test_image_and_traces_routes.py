@@ -16,10 +16,10 @@ from limb_image import make_segmented
 from limbfit.anatomy.imaging import read_labels
 from limbfit.pipeline import run_study, study_status
 from limbfit.pipeline.engine.store import lock
-from limbfit.studio.app import create_app
 from limbfit.studio.folder import StudyFolder
-from limbfit.studio.guard import Door
+from limbfit.studio.guard import AccessGuard
 from limbfit.studio.processes import find_running, stop_run
+from limbfit.studio.server import create_app
 from limbfit.study import load_study
 
 HOST = "http://127.0.0.1:8124"
@@ -27,7 +27,7 @@ SENT = {"Origin": HOST}
 
 
 def client_of(folder) -> TestClient:
-    door = Door("127.0.0.1", 8124)
+    door = AccessGuard("127.0.0.1", 8124)
     client = TestClient(create_app(StudyFolder(folder / "study.toml"), door), base_url=HOST)
     client.cookies.set(door.cookie, door.token)
     return client

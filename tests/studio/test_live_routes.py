@@ -13,9 +13,9 @@ from fastapi.testclient import TestClient
 from limbfit.acquire import Recorder
 from limbfit.acquire.events import PINS, Sample
 from limbfit.acquire.recording import FOLLOWED_BYTES
-from limbfit.studio.app import create_app
 from limbfit.studio.folder import StudyFolder
-from limbfit.studio.guard import Door
+from limbfit.studio.guard import AccessGuard
+from limbfit.studio.server import create_app
 
 STAMP = "20260102T030405.678"
 HEAD = {
@@ -26,7 +26,7 @@ HEAD = {
 
 @pytest.fixture
 def client(study):
-    door = Door("127.0.0.1", 8125)
+    door = AccessGuard("127.0.0.1", 8125)
     client = TestClient(
         create_app(StudyFolder(study / "study.toml"), door),
         base_url="http://127.0.0.1:8125",

@@ -12,10 +12,10 @@ from fastapi.testclient import TestClient
 
 from limbfit import load_study
 from limbfit.mesh import Mesh, boundary_faces, measure_quality, write_vtu
-from limbfit.studio.app import create_app
 from limbfit.studio.folder import StudyFolder
-from limbfit.studio.guard import Door
-from limbfit.studio.scene import read_anatomy
+from limbfit.studio.guard import AccessGuard
+from limbfit.studio.model_routes import read_anatomy
+from limbfit.studio.server import create_app
 from limbfit.web.arrays import unpack
 
 ORIGIN = "http://127.0.0.1:8123"
@@ -26,7 +26,7 @@ def page(study):
     """The stump with comments in its file, as its page talks to it."""
     file = study / "study.toml"
     file.write_text(file.read_text().replace('name = "1"', 'name = "1"  # the first one\nregion = "lateral"'))
-    door = Door("127.0.0.1", 8123)
+    door = AccessGuard("127.0.0.1", 8123)
     client = TestClient(create_app(StudyFolder(file), door), base_url=ORIGIN, headers={"Origin": ORIGIN})
     assert client.get("/", params={"token": door.token}).status_code == 200
     return client

@@ -9,11 +9,11 @@ import pytest
 from fastapi.testclient import TestClient
 from stored_fields import block, fields, write_outcome, write_stored
 
-from limbfit.studio.app import create_app
 from limbfit.studio.folder import StudyFolder
-from limbfit.studio.guard import Door
+from limbfit.studio.guard import AccessGuard
 from limbfit.studio.playback import FIELDS
-from limbfit.studio.simulating import find_simulating
+from limbfit.studio.processes import find_simulating
+from limbfit.studio.server import create_app
 from limbfit.web.arrays import unpack
 
 ORIGIN = "http://127.0.0.1:8123"
@@ -22,7 +22,7 @@ ORIGIN = "http://127.0.0.1:8123"
 @pytest.fixture
 def page(study):
     write_stored(study / "results")
-    door = Door("127.0.0.1", 8123)
+    door = AccessGuard("127.0.0.1", 8123)
     client = TestClient(
         create_app(StudyFolder(study / "study.toml"), door), base_url=ORIGIN, headers={"Origin": ORIGIN}
     )
@@ -114,7 +114,7 @@ def test_a_febio_input_needs_meshes_that_are_up_to_date(page):
 
 def test_a_simulation_is_found_by_its_command_and_stopped(page, study, monkeypatch):
     """With a program in place of limbfit that takes the same words and waits."""
-    monkeypatch.setattr("limbfit.studio.simulating.PROGRAM", ("-c", "import time; time.sleep(60)"))
+    monkeypatch.setattr("limbfit.studio.processes.PROGRAM", ("-c", "import time; time.sleep(60)"))
     folder = StudyFolder(study / "study.toml")
     assert page.post("/api/results/simulate/9").status_code == 422
     started = page.post("/api/results/simulate/1").json()

@@ -7,9 +7,9 @@ import pytest
 from fastapi.testclient import TestClient
 
 from limbfit import load_study
-from limbfit.studio.app import create_app
 from limbfit.studio.folder import StudyFolder
-from limbfit.studio.guard import Door
+from limbfit.studio.guard import AccessGuard
+from limbfit.studio.server import create_app
 from limbfit.web.arrays import unpack
 
 ORIGIN = "http://127.0.0.1:8123"
@@ -21,7 +21,7 @@ def page(study):
     """The stump with a socket and a comment in its file, as its page talks to it."""
     file = study / "study.toml"
     file.write_text(file.read_text() + "[socket]\ntrim_mm = 40.0  # of the brim\n")
-    door = Door("127.0.0.1", 8123)
+    door = AccessGuard("127.0.0.1", 8123)
     client = TestClient(create_app(StudyFolder(file), door), base_url=ORIGIN, headers={"Origin": ORIGIN})
     assert client.get("/", params={"token": door.token}).status_code == 200
     return client

@@ -15,10 +15,9 @@ from typer.testing import CliRunner
 
 from limbfit.cli import app as command_line
 from limbfit.errors import InputError, RunError
-from limbfit.studio.app import STATIC, create_app
 from limbfit.studio.folder import StudyFolder
-from limbfit.studio.guard import LARGEST_BODY, Door
-from limbfit.studio.server import serve
+from limbfit.studio.guard import LARGEST_BODY, AccessGuard
+from limbfit.studio.server import STATIC, create_app, serve
 
 PORT = 8123
 HOST = f"127.0.0.1:{PORT}"
@@ -27,7 +26,7 @@ ORIGIN = f"http://{HOST}"
 
 @pytest.fixture
 def door():
-    return Door("127.0.0.1", PORT)
+    return AccessGuard("127.0.0.1", PORT)
 
 
 @pytest.fixture
@@ -123,10 +122,10 @@ def test_the_key_counts_on_the_first_page_only(stranger, door):
 
 
 def test_keys_differ_and_are_long():
-    keys = {Door("127.0.0.1", 1).token for _ in range(50)}
+    keys = {AccessGuard("127.0.0.1", 1).token for _ in range(50)}
     assert len(keys) == 50
     assert min(map(len, keys)) >= 43
-    assert Door("127.0.0.1", 1).token not in repr(Door("127.0.0.1", 1))
+    assert AccessGuard("127.0.0.1", 1).token not in repr(AccessGuard("127.0.0.1", 1))
 
 
 @pytest.mark.parametrize(

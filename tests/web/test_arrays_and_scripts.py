@@ -10,8 +10,8 @@ import pytest
 import pyvista as pv
 
 from limbfit.mesh import Mesh, boundary_faces, to_tet10
+from limbfit.web import STATIC, build_inline_script
 from limbfit.web.arrays import pack, unpack
-from limbfit.web.assets import STATIC, build_inline_script
 from limbfit.web.shapes import compute_cell_quality, extract_interface, read_shell, to_volume_shape
 
 
@@ -61,7 +61,7 @@ def test_inlined_modules_are_one_classic_script(tmp_path, monkeypatch):
     text = build_inline_script("colours.js", "overlay.js", "camera.js", "volume.js", "viewer.js", "chart.js")
     assert not re.search(r"^\s*(import|export)\b", text, re.MULTILINE)
     (tmp_path / "bad.js").write_text('const end = "</SCRIPT>";')
-    monkeypatch.setattr("limbfit.web.assets.STATIC", tmp_path)
+    monkeypatch.setattr("limbfit.web.STATIC", tmp_path)
     with pytest.raises(ValueError, match="ends a script"):
         build_inline_script("bad.js")
 

@@ -50,11 +50,11 @@ def solve_layer(
         t = targets.pop(0)
         dt, depth = t - times[-1], float(history.at(t))
         increment = memory.build_increment(point, laws, t, dt, depth, 0.0, Drives.none())
-        scale, kept = float(increment.scale[0]), float(increment.history[0, 0, 0])
+        scale, offset = float(increment.scale[0]), float(increment.history[0, 0, 0])
         elastic = max(depth, 0.0) ** power
-        force = scale * elastic + kept
+        force = scale * elastic + offset
         if force < 0.0:  # the indenter has left it
-            elastic, force = max(-kept / scale, 0.0), 0.0
+            elastic, force = max(-offset / scale, 0.0), 0.0
         memory = memory.advance(point, laws, np.full((1, 1, 6), elastic), dt)
         met = len(times) > 1 and (force > 0.0) != (forces[-1] > 0.0)
         kink = met or np.isclose(t, history.kinks, rtol=1e-9).any()
@@ -74,9 +74,9 @@ def solve_reference_layer(history: History, parts: int = 600, **layer: Any) -> L
     return solve_layer(history, StepControl(times=tuple(times)), **layer)
 
 
-def compute_curve_error(found: LayerResult, exact: LayerResult, count: int = 2001) -> tuple[float, float]:
+def compute_curve_error(result: LayerResult, exact: LayerResult, count: int = 2001) -> tuple[float, float]:
     """Root mean square and largest error of the whole curve over the largest force, percent."""
     t = np.linspace(0.0, float(exact.times[-1]), count)
     force = np.interp(t, exact.times, exact.force)
-    error = 100.0 * (found.force_at(t) - force) / exact.force.max()
+    error = 100.0 * (result.force_at(t) - force) / exact.force.max()
     return float(np.sqrt((error**2).mean())), float(np.abs(error).max())

@@ -1,29 +1,55 @@
-"""Indentations on a device: record them, look at a record, and a device that is a program."""
+"""Indentations on a device: recorded, shown while they run, judged; and a device that is a program."""
 
 from __future__ import annotations
 
+import os
+import select
 import signal
 import sys
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
 from queue import SimpleQueue
+from threading import Event as Flag
+from threading import Thread
+from time import monotonic
 from typing import Annotated, Any
 
 import typer
+from rich.console import Group
+from rich.live import Live as RichLive
+from rich.panel import Panel
+from rich.text import Text
 
 import limbfit
 
-from ..acquire import DEFAULT_ADDRESS, DEFAULT_PORT, Event, prioritise
+from ..acquire import (
+    DEFAULT_ADDRESS,
+    DEFAULT_PORT,
+    Event,
+    Keyboard,
+    LiveUpdate,
+    PhaseUpdate,
+    Update,
+    prioritise,
+)
 from ..acquire.events import Abort
 from ..acquire.virtual import Serving, read_faults
 from ..errors import InputError
+from ..study.tables import AcquireTable
 from .commands import StudyPath
-from .console import STDERR, STDOUT, AsJson, print_json
-from .live import Live, PlainLines, read_keys
+from .console import STDERR, AsJson, print_aside, print_json, print_line, print_result
 
-MOST_SPEED = 1000  # of an accelerated clock
+MAX_SPEED = 1000  # of an accelerated clock
+WIDTH, HEIGHT = 60, 12
+MAX_SAMPLES = 3000  # samples shown: two minutes
+HINTS = {
+    "position": "put the limb in place, the test pin at its site; then Enter",
+    "ready": "hold the space bar to push in, let go at the limit of comfort",
+    "search": "let go of the space bar to stop",
+}
 
 
 def acquire(
@@ -58,18 +84,18 @@ def acquire(
     if not unattended and not (sys.stdin.isatty() and find_spec("termios")):
         remedy = "run it in a terminal, or with --unattended"
         raise InputError("the operator's key needs a terminal", place="standard input", remedy=remedy)
-    given = limbfit.load_study(study, recorded=False)
-    names = [site] if site else [one.name for one in limbfit.waiting(given)]
+    checked = limbfit.load_study(study, recorded=False)
+    names = [site] if site else [record.name for record in limbfit.waiting(checked)]
     if not names:
-        raise InputError("every record is made", file=given.file, remedy="give --site and --again")
+        raise InputError("every record is made", file=checked.file, remedy="give --site and --again")
     for name in names:  # all of them, before the first is made
-        limbfit.check_recording(given, name, depth_mm=depth, unattended=unattended, replace_record=again)
+        limbfit.check_recording(checked, name, depth_mm=depth, unattended=unattended, replace_record=again)
     rows = []
     for name in names:
-        tool = given.indentation(name).indenter
+        tool = checked.indentation(name).indenter
         if tool is not None:
-            STDERR.print(f"{name} is made with the indenter {tool!r}", soft_wrap=True)
-        rows.append(_acquire_one(given, name, device, depth, unattended, again))
+            print_aside(f"{name} is made with the indenter {tool!r}")
+        rows.append(_acquire_one(checked, name, device, depth, unattended, again))
         if not as_json:
             _show(rows[-1])
         if not rows[-1]["completed"]:
@@ -121,27 +147,23 @@ def _stop_on_signals(events: SimpleQueue[Event]) -> Iterator[None]:
 def _show(row: dict[str, Any]) -> None:
     if not row["completed"]:
         out = f"; pins out of reach: {', '.join(map(str, row['unreachable']))}" if row["unreachable"] else ""
-        STDERR.print(f"stopped: site {row['name']}: {row['reason']} ({row['phase']}{out})", soft_wrap=True)
+        print_aside(f"stopped: site {row['name']}: {row['reason']} ({row['phase']}{out})")
     else:
         good = "good" if row["verdict"]["good"] else "not good: record it again (--site, --again)"
-        STDOUT.print(f"site {row['name']}: {row['depth_mm']:.2f} mm deep, record {good}", soft_wrap=True)
+        print_line(f"site {row['name']}: {row['depth_mm']:.2f} mm deep, record {good}")
         _show_checks(row["verdict"])
-    STDOUT.print(f"record: {row['files']['record']}", soft_wrap=True)
+    print_line(f"record: {row['files']['record']}")
     if row["files"]["trace"]:
-        STDOUT.print(f"trace: {row['files']['trace']}", soft_wrap=True)
+        print_line(f"trace: {row['files']['trace']}")
     elif row["completed"]:
-        STDOUT.print(
-            "trace: none; no ramp counts, or the study names no file for it (sites.trace)", soft_wrap=True
-        )
+        print_line("trace: none; no ramp counts, or the study names no file for it (sites.trace)")
 
 
 def _show_checks(verdict: dict[str, Any]) -> None:
     words = {True: "good", False: "BAD", None: "-"}
     for check in verdict["checks"]:
         remedy = f"; {check['remedy']}" if check["passed"] is False and check["remedy"] else ""
-        STDOUT.print(
-            f"  {words[check['passed']]:<5} {check['name']}: {check['found']}{remedy}", soft_wrap=True
-        )
+        print_line(f"  {words[check['passed']]:<5} {check['name']}: {check['found']}{remedy}")
 
 
 def recording(
@@ -149,14 +171,14 @@ def recording(
     as_json: AsJson = False,
 ) -> None:
     """Judge the record of a session, even one that a crash cut short."""
-    found = limbfit.judge_recording(file)
-    if as_json:
-        print_json(found)
-        return
-    cut = f", {found['lost_bytes']} bytes after the last whole block" if found["lost_bytes"] else ""
-    STDOUT.print(f"site {found['site']}: {found['samples']} samples in {found['seconds']:.1f} s{cut}")
-    STDOUT.print("phases: " + ", ".join(found["phases"]), soft_wrap=True)
-    _show_checks(found["verdict"])
+    print_result(limbfit.judge_recording(file), _show_recording, as_json)
+
+
+def _show_recording(result: dict[str, Any]) -> None:
+    cut = f", {result['lost_bytes']} bytes after the last whole block" if result["lost_bytes"] else ""
+    print_line(f"site {result['site']}: {result['samples']} samples in {result['seconds']:.1f} s{cut}")
+    print_line("phases: " + ", ".join(result["phases"]))
+    _show_checks(result["verdict"])
 
 
 def virtual_fitsocket(
@@ -176,24 +198,136 @@ def virtual_fitsocket(
     ] = 1.0,
 ) -> None:
     """Run a virtual FitSocket around the study's simulated limb; Ctrl-C ends it."""
-    if not 1 <= speed <= MOST_SPEED:
-        remedy = f"1 is the wall's clock, up to {MOST_SPEED} an accelerated one"
+    if not 1 <= speed <= MAX_SPEED:
+        remedy = f"1 is the wall's clock, up to {MAX_SPEED} an accelerated one"
         raise InputError(f"{speed:g} is no speed of the clock", place="--speed", remedy=remedy)
-    given = limbfit.load_study(study, recorded=False)
+    checked = limbfit.load_study(study, recorded=False)
     wrong = read_faults(faults) if faults is not None else ()
-    device = limbfit.virtual_fitsocket(given, seed=seed, faults=wrong, paced=speed > 1)
+    device = limbfit.virtual_fitsocket(checked, seed=seed, faults=wrong, paced=speed > 1)
     serving = Serving.on_terminal() if terminal else Serving.on_port(host, port)
     wakeup = signal.set_wakeup_fd(-1)
     for kind in (signal.SIGINT, signal.SIGTERM):
         signal.signal(kind, lambda number, frame: serving.stop())
     for name, surrogate in device.limb.sites.items():
-        STDERR.print(f"site {name}: {surrogate.error_percent:.2f} % from its simulation", soft_wrap=True)
-    STDOUT.print(f"device: {serving.address}", soft_wrap=True)
+        print_aside(f"site {name}: {surrogate.error_percent:.2f} % from its simulation")
+    print_line(f"device: {serving.address}")
     sys.stdout.flush()
-    limbfit.serve_fitsocket(
-        device, serving, speed=speed, tell=lambda line: STDERR.print(line, soft_wrap=True)
-    )
+    limbfit.serve_fitsocket(device, serving, speed=speed, tell=print_aside)
     signal.set_wakeup_fd(wakeup)
+
+
+class PlainLines:
+    """Phases as lines on standard error, with the time since the first."""
+
+    def __init__(self, site: str) -> None:
+        self.site = site
+        self._began: float | None = None
+
+    def __enter__(self) -> PlainLines:
+        return self
+
+    def __exit__(self, *what: object) -> None:
+        """Nothing to take down."""
+
+    def listen(self, update: Update) -> None:
+        if isinstance(update, PhaseUpdate):
+            self._began = update.time_s if self._began is None else self._began
+            cycle = f" (ramp {update.cycle})" if update.phase in ("load", "hold", "unload") else ""
+            reason = f": {update.reason}" if update.reason else ""
+            since = update.time_s - self._began
+            print_aside(f"[{since:8.3f} s] site {self.site}: {update.phase}{cycle}{reason}")
+
+
+class Live:
+    """Two plots drawn with characters, eight times a second, by a thread of rich's."""
+
+    def __init__(self, site: str, settings: AcquireTable) -> None:
+        self.site, self.settings = site, settings
+        self._phase = PhaseUpdate("idle", 0.0)
+        self._samples: deque[LiveUpdate] = deque(maxlen=MAX_SAMPLES)
+        self._shown = RichLive(console=STDERR, refresh_per_second=8, get_renderable=self._draw)
+
+    def __enter__(self) -> Live:
+        self._shown.start()
+        return self
+
+    def __exit__(self, *what: object) -> None:
+        self._shown.stop()
+
+    def listen(self, update: Update) -> None:
+        if isinstance(update, PhaseUpdate):
+            self._phase = update
+        else:
+            self._samples.append(update)
+
+    def _draw(self) -> Any:
+        samples = list(self._samples)
+        phase = self._phase
+        head = Text(f"site {self.site}   {phase.phase}   ", style="bold")
+        if samples:
+            last = samples[-1]
+            head.append(
+                f"{last.displacement_mm:7.2f} mm {last.force_N:7.2f} N {last.capacitance_pF:6.1f} pF   "
+                f"clamps {last.clamp_N:5.1f} N"
+            )
+        hint = phase.reason or HINTS.get(phase.phase, "any other key: emergency stop")
+        touched = [s for s in samples if s.phase in ("search", "return", "load", "hold", "unload")]
+        plots = [
+            Panel(
+                plot([s.displacement_mm for s in touched], [s.force_N for s in touched]),
+                title="N over mm",
+                width=66,
+            ),
+            Panel(
+                plot([s.time_s for s in samples], [s.force_N for s in samples]), title="N over s", width=66
+            ),
+        ]
+        return Group(head, Text(hint), *plots)
+
+
+def plot(x: list[float], y: list[float], width: int = WIDTH, height: int = HEIGHT) -> str:
+    """Points in a field of characters, the least and the largest of both axes beside it."""
+    if len(x) < 2:
+        return "\n" * (height + 1)
+    low, high, bottom, top = min(x), max(x), min(0.0, *y), max(*y, 1.0)
+    field = [[" "] * width for _ in range(height)]
+    for at, value in zip(x, y):
+        column = round((at - low) / ((high - low) or 1.0) * (width - 1))
+        row = round((value - bottom) / (top - bottom) * (height - 1))
+        field[height - 1 - row][column] = "•"
+    lines = ["".join(row).rstrip() for row in field]
+    lines[0] = f"{top:.1f}".ljust(6) + lines[0][6:]
+    foot = f"{low:.1f}".ljust(width - 8) + f"{high:.1f}".rjust(8)
+    return "\n".join([*lines, foot])
+
+
+@contextmanager
+def read_keys(events: SimpleQueue[Event], gap_s: float) -> Iterator[None]:
+    """Read the terminal's keys, unbuffered and unechoed, in a thread; it is as before afterwards."""
+    import termios
+    import tty
+
+    handle = sys.stdin.fileno()
+    before = termios.tcgetattr(handle)
+    over = Flag()
+
+    def read() -> None:
+        keyboard = Keyboard(gap_s)
+        while not over.is_set():
+            ready, _, _ = select.select([handle], [], [], 0.01)
+            typed = os.read(handle, 64) if ready else b""
+            for event in (*keyboard.read(typed, monotonic()), *keyboard.check_release(monotonic())):
+                events.put(event)
+
+    thread = Thread(target=read, name="keys", daemon=True)
+    tty.setcbreak(handle)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+        termios.tcsetattr(handle, termios.TCSADRAIN, before)
 
 
 VERBS = (acquire, recording, virtual_fitsocket)

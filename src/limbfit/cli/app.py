@@ -4,17 +4,41 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from .._version import __version__
 from ..errors import InputError, LimbfitError
 from ..execution import SAFE_PATH
-from . import acquire, bench, commands, experiments, febio, geometry, runs, socket, studio, trust
-from .console import INTERRUPTED, STDOUT, fail, prompt_interrupt
-from .groups import Grouped
+from . import acquire, bench, commands, experiments, febio, runs, socket
+from .console import INTERRUPTED, fail, print_line, prompt_interrupt
+
+GROUPS: Mapping[str, tuple[str, ...]] = {
+    "Patient": ("demo", "phantom", "series", "check", "segment", "surfaces", "sites", "mesh"),
+    "Identify": ("run", "status", "report", "simulate", "batch", "reproduce"),
+    "Trust": ("uncertainty", "crossvalidate", "regions", "sensitivity", "cube", "experiment"),
+    "Socket": ("socket",),
+    "Experiment": ("design", "acquire", "recording", "virtual-fitsocket"),
+    "Exchange": ("export", "febio", "compare", "schema"),
+    "Machine": ("studio", "doctor", "bench"),
+}
+_MAX_HELP = 500  # characters: none of the sentences is cut
+
+
+class GroupedCommands(TyperGroup):
+    """A command whose help lists its commands by `GROUPS`, each with its whole first sentence."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # of click, or of typer's copy of it
+        for title, names in GROUPS.items():
+            with formatter.section(title):
+                verbs = [(name, self.get_command(ctx, name)) for name in names]
+                formatter.write_dl(
+                    [(name, verb.get_short_help_str(_MAX_HELP)) for name, verb in verbs if verb]
+                )
+
 
 app = typer.Typer(
     name="limbfit",
@@ -22,28 +46,22 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    cls=Grouped,
+    cls=GroupedCommands,
 )
 
 
 @app.callback(invoke_without_command=True)
-def top(
+def root(
     version: Annotated[bool, typer.Option("--version", help="print the version and stop")] = False,
 ) -> None:
     if version:
-        STDOUT.print(f"limbfit {__version__}")
+        print_line(f"limbfit {__version__}")
         raise typer.Exit
 
 
-_PLACED = {commands.run, commands.demo, *experiments.VERBS, *trust.VERBS}
-_VERBS: tuple[Callable[..., None], ...] = (
-    *(*commands.VERBS, *geometry.VERBS, *experiments.VERBS, *trust.VERBS, *febio.VERBS),
-    *runs.VERBS,
-    *acquire.VERBS,
-    *studio.VERBS,
-)
-for verb in _VERBS:
-    app.command()(runs.add_execution_options(verb) if verb in _PLACED else verb)
+_WITH_JOBS = {commands.run, commands.demo, *experiments.VERBS}
+for verb in (*commands.VERBS, *experiments.VERBS, *febio.VERBS, *runs.VERBS, *acquire.VERBS):
+    app.command()(runs.add_execution_options(verb) if verb in _WITH_JOBS else verb)
 app.add_typer(socket.app, name="socket")
 app.add_typer(bench.app, name="bench")
 

@@ -11,8 +11,9 @@ from rich.table import Table
 
 import limbfit
 
+from ..bench.timing import UNKNOWNS
 from ..execution import count_usable_cores
-from .console import STDOUT, AsJson, listen_on_console, print_json
+from .console import STDOUT, AsJson, Column, Row, listen_on_console, print_line, print_result, print_table
 
 app = typer.Typer(
     help="Benchmarks of solver, meshes and identification.", no_args_is_help=True, rich_markup_mode=None
@@ -24,7 +25,7 @@ Reference = Annotated[
 ]
 Threads = Annotated[int, typer.Option(min=1, help="threads of the linear algebra; default: all cores")]
 CORES = count_usable_cores()
-UNKNOWNS, LARGE = (20_000, 45_000, 80_000), (125_000, 200_000, 300_000)
+LARGE_UNKNOWNS = (125_000, 200_000, 300_000)
 
 
 @app.command()
@@ -32,19 +33,26 @@ def febio_parity(reference: Reference = None, as_json: AsJson = False) -> None:
     """Compare forces and stresses with FEBio 4.11 on the same mesh, with the same element and steps."""
     with listen_on_console() as listener:
         rows = limbfit.bench_febio_parity(reference, tell=build_listener(listener, "febio-parity"))
-    if as_json:
-        print_json(rows)
-        return
-    table = Table(
-        "case", "element", "difference (%)", "goal (%)", "peak", "FEBio's peak", "what explains it", box=None
-    )
-    for row in rows:
-        difference = row["max_difference_percent"]
-        peaks = [next((f"{row[key]:.4g} {key.rpartition('_')[2]}" for key in row if key.startswith(who)), "-")
-                 for who in ("peak_", "febio_peak_")]  # fmt: skip
-        shown = "-" if difference is None else f"{difference:.2g}"
-        table.add_row(row["case"], row["element"], shown, f"{row['goal_percent']:g}", *peaks, row["note"])
-    STDOUT.print(table)
+    print_result(rows, show_parity, as_json)
+
+
+def show_parity(rows: list[dict[str, Any]]) -> None:
+    columns: dict[str, Column] = {
+        "case": "case",
+        "element": "element",
+        "difference (%)": ("max_difference_percent", ".2g"),
+        "goal (%)": ("goal_percent", "g"),
+        "peak": lambda row: format_peak(row, "peak_"),
+        "FEBio's peak": lambda row: format_peak(row, "febio_peak_"),
+        "what explains it": "note",
+    }
+    print_table(rows, columns)
+
+
+def format_peak(row: Row, start: str) -> str:
+    """The first value whose key begins with ``start``, with the unit at the end of the key."""
+    key = next((key for key in row if key.startswith(start)), None)
+    return "-" if key is None else f"{row[key]:.4g} {key.rpartition('_')[2]}"
 
 
 @app.command()
@@ -60,13 +68,10 @@ def forward(
 ) -> None:
     """Time one simulation, plain and with sensitivities, beside FEBio's time for it."""
     with listen_on_console() as listener:
-        found = limbfit.bench_forward(
+        result = limbfit.bench_forward(
             reference, case, element, threads, as_febio, tell=build_listener(listener, "forward")
         )
-    if as_json:
-        print_json(found)
-    else:
-        show_facts(found)
+    print_result(result, show_facts, as_json)
 
 
 @app.command()
@@ -78,20 +83,20 @@ def scaling(
 ) -> None:
     """Time and memory over the number of unknowns, and of a model of the paper's size."""
     with listen_on_console() as listener:
-        found = limbfit.bench_scaling(
-            element, UNKNOWNS + (LARGE if large else ()), threads, tell=build_listener(listener, "scaling")
+        result = limbfit.bench_scaling(
+            element,
+            (*UNKNOWNS, *(LARGE_UNKNOWNS if large else ())),
+            threads,
+            tell=build_listener(listener, "scaling"),
         )
-    if as_json:
-        print_json(found)
-        return
-    table = Table("element", "cells", "unknowns", "steps", "seconds", "memory (MB)", box=None)
-    for row in (*found["sizes"], found["paper_sized"]):
-        table.add_row(
-            row["element"], f"{row['cells']}", f"{row['unknowns']}", f"{row['steps']}",
-            f"{row['seconds']:.1f}", f"{row['max_rss_MB']:.0f}",
-        )  # fmt: skip
-    STDOUT.print(table)
-    STDOUT.print(f"seconds grow as unknowns^{found['seconds_exponent']:.2f}")
+    print_result(result, show_scaling, as_json)
+
+
+def show_scaling(result: dict[str, Any]) -> None:
+    columns: dict[str, Column] = {key: key for key in ("element", "cells", "unknowns", "steps")}
+    columns |= {"seconds": ("seconds", ".1f"), "memory (MB)": ("max_rss_MB", ".0f")}
+    print_table((*result["sizes"], result["paper_sized"]), columns)
+    print_line(f"seconds grow as unknowns^{result['seconds_exponent']:.2f}")
 
 
 @app.command()
@@ -105,14 +110,14 @@ def meshing(
 ) -> None:
     """Mesh random sites of five limbs: failures, angles, thickness, volume, time."""
     with listen_on_console() as listener:
-        found = limbfit.bench_meshing(shared, sites, engine, tell=build_listener(listener, "meshing"))
-    if as_json:
-        print_json(found)
-        return
-    of_limbs = found.pop("limbs")
-    show_facts(found)
-    for name, facts in of_limbs.items():
-        STDOUT.print(name)
+        result = limbfit.bench_meshing(shared, sites, engine, tell=build_listener(listener, "meshing"))
+    print_result(result, show_meshing, as_json)
+
+
+def show_meshing(result: dict[str, Any]) -> None:
+    show_facts({key: value for key, value in result.items() if key != "limbs"})
+    for name, facts in result["limbs"].items():
+        print_line(name)
         show_facts(facts)
 
 
@@ -125,11 +130,8 @@ def calibrate(
 ) -> None:
     """Identify a copy of a study from scratch, and time it beside FEBio's loop of finite differences."""
     with listen_on_console() as listener:
-        found = limbfit.bench_calibrate(study, listener=listener)
-    if as_json:
-        print_json(found)
-    else:
-        show_facts(found)
+        result = limbfit.bench_calibrate(study, listener=listener)
+    print_result(result, show_facts, as_json)
 
 
 def build_listener(

@@ -1,21 +1,33 @@
-"""The verbs of a study, in the order of ``limbfit --help``."""
+"""The commands of one study: made, checked, run, simulated; and its geometry, stage by stage."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 import limbfit
 
 from ..errors import InputError
 from ..study import Study
-from .console import STDERR, STDOUT, AsJson, format_parameter_heads, listen_on_console, print_json
+from .console import (
+    AsJson,
+    Column,
+    Row,
+    format_parameter_heads,
+    format_use,
+    listen_on_console,
+    print_aside,
+    print_json,
+    print_line,
+    print_result,
+    print_table,
+    print_warning,
+)
 
 StudyPath = Annotated[
     Path, typer.Argument(help="study.toml, or the folder that holds it", show_default=False)
@@ -53,10 +65,9 @@ def demo(
     summary["seconds"] = round(perf_counter() - start, 1)
     show_summary(summary, as_json)
     if not as_json:
-        STDOUT.print(
+        print_line(
             f"next: limbfit studio {folder} shows it all in a browser; limbfit uncertainty {folder} finds "
-            f"what the records determine; {folder / 'study.toml'} is an example of a study file",
-            soft_wrap=True,
+            f"what the records determine; {folder / 'study.toml'} is an example of a study file"
         )
 
 
@@ -101,7 +112,7 @@ def phantom(
     if as_json:
         print_json({"study": str(folder / "study.toml"), **truth})
     else:
-        STDOUT.print(f"synthetic patient in {folder}; next: limbfit run {folder}")
+        print_line(f"synthetic patient in {folder}; next: limbfit run {folder}")
 
 
 def series(
@@ -109,16 +120,16 @@ def series(
     as_json: AsJson = False,
 ) -> None:
     """List the DICOM series of a folder, to choose one by its UID (image.series in study.toml)."""
-    found = limbfit.describe_series(folder)
+    result = limbfit.describe_series(folder)
     if as_json:
-        print_json({"series": found})
+        print_json({"series": result})
         return
-    for row in found:
+    for row in result:
         number = f"series {row['number']}: " if row["number"] else ""
         size = f"{row['slices']} slices of {row['rows']} x {row['columns']}"
         step = " x ".join(f"{s:.4g}" for s in row["spacing_mm"]) + " mm, whole" if row["whole"] else ""
         state = step or f"no volume: {row['why_not']}"
-        STDOUT.print(f"{number}{row['modality'] or '?'}, {size}, {state}\n  {row['uid']}", soft_wrap=True)
+        print_line(f"{number}{row['modality'] or '?'}, {size}, {state}\n  {row['uid']}")
 
 
 def check(study: StudyPath, as_json: AsJson = False) -> None:
@@ -129,10 +140,10 @@ def check(study: StudyPath, as_json: AsJson = False) -> None:
         print_json(findings)
         return
     for line in findings["facts"]:
-        STDOUT.print(line)
+        print_line(line)
     show_flags(findings["flags"])
     show_outside(findings["outside_text"])
-    STDOUT.print("the study can be run" + (", but see the warnings" if findings["flags"] else ""))
+    print_line("the study can be run" + (", but see the warnings" if findings["flags"] else ""))
 
 
 def run(
@@ -169,18 +180,20 @@ def run(
 
 def status(study: StudyPath, as_json: AsJson = False) -> None:
     """List the stages that are done, begun, stale (and why) or missing."""
-    states = limbfit.study_status(limbfit.load_study(study))
-    if as_json:
-        print_json({"stages": states})
-        return
-    table = Table("stage", "state", "seconds", "finished", box=None)
-    for row in states:
-        seconds = "" if row["seconds"] is None else f"{row['seconds']:.1f}"
-        table.add_row(row["stage"], row["state"], seconds, row["finished"] or "")
-    STDOUT.print(table)
-    for row in states:
+    print_result({"stages": limbfit.study_status(limbfit.load_study(study))}, show_states, as_json)
+
+
+def show_states(result: dict[str, Any]) -> None:
+    columns: dict[str, Column] = {
+        "stage": "stage",
+        "state": "state",
+        "seconds": ("seconds", ".1f"),
+        "finished": "finished",
+    }
+    print_table(result["stages"], columns, dash="")
+    for row in result["stages"]:
         if row["why"]:
-            STDOUT.print(f"{row['stage']} is stale: {'; '.join(row['why'])}", soft_wrap=True)
+            print_line(f"{row['stage']} is stale: {'; '.join(row['why'])}")
 
 
 def simulate(
@@ -205,7 +218,7 @@ def simulate(
     """Simulate one indentation; curve and fields go to results/simulate."""
     checked = limbfit.load_study(study)
     with listen_on_console() as listener:
-        found = limbfit.simulate_site(
+        result = limbfit.simulate_site(
             checked,
             site,
             parameters=parse_parameters(parameters, checked),
@@ -214,20 +227,20 @@ def simulate(
             listener=listener,
         )
     if as_json:
-        print_json(found)
+        print_json(result)
     else:
-        deep = found["penetration_mm"]
-        STDOUT.print(
-            f"site {site}: peak force {found['peak_force_N']:.3f} N at {found['depth_mm']:.2f} mm, "
-            + (f"penetration {deep:.3f} mm, " if deep is not None else f"{found['solver']}, ")
-            + f"{found['element']}, {found['unknowns']} unknowns\n"
-            f"parameters: {found['parameters_from']}\n"
-            f"curve: {found['curve']}\nfields: {found['fields']}"
+        deep = result["penetration_mm"]
+        print_line(
+            f"site {site}: peak force {result['peak_force_N']:.3f} N at {result['depth_mm']:.2f} mm, "
+            + (f"penetration {deep:.3f} mm, " if deep is not None else f"{result['solver']}, ")
+            + f"{result['element']}, {result['unknowns']} unknowns\n"
+            f"parameters: {result['parameters_from']}\n"
+            f"curve: {result['curve']}\nfields: {result['fields']}"
         )
-    show_warnings([found])
-    show_outside(found["outside_text"])
-    if not found["completed"]:
-        STDERR.print(f"error: site {site}: the simulation is partial: {found['reason']}")
+    show_warnings([result])
+    show_outside(result["outside_text"])
+    if not result["completed"]:
+        print_aside(f"error: site {site}: the simulation is partial: {result['reason']}")
         raise typer.Exit(1)
 
 
@@ -263,7 +276,7 @@ def show_summary(summary: dict[str, Any], as_json: bool) -> None:
     if "parameters" in summary:
         show_parameters(summary)
     elif "until" in summary:
-        STDOUT.print(f"done until {summary['until']}; results in {summary['results']}")
+        print_line(f"done until {summary['until']}; results in {summary['results']}")
         return
     if "sites" in summary:  # as the report, not before its stage
         show_sites(summary)
@@ -271,54 +284,166 @@ def show_summary(summary: dict[str, Any], as_json: bool) -> None:
         show_outside(summary["outside_text"])
     show_flags(summary.get("flags", ()))
     if "report" in summary:
-        STDOUT.print(f"report: {summary['report']}")
+        print_line(f"report: {summary['report']}")
 
 
 def show_warnings(sites: Sequence[Mapping[str, Any]]) -> None:
     """What is doubtful about the simulations of the sites."""
     for site in sites:
         for text in site["warnings"]:
-            STDERR.print(f"warning: site {site.get('record', site['site'])}: {text}", soft_wrap=True)
+            print_warning(f"site {site.get('record', site['site'])}: {text}")
 
 
 def show_outside(texts: Sequence[str]) -> None:
     """What predictions do to the tissue that no fitted record did."""
     for text in texts:
-        STDERR.print(f"warning: {text}", soft_wrap=True)
+        print_warning(text)
 
 
 def show_flags(flags: Sequence[Mapping[str, Any]]) -> None:
     """What looks wrong about records, names and places."""
     for flag in flags:
-        STDERR.print(f"warning: {flag['text']}", soft_wrap=True)
+        print_warning(flag["text"])
 
 
 def show_parameters(summary: dict[str, Any]) -> None:
-    names = list(next(iter(summary["parameters"].values())))
-    table = Table("tissue", *format_parameter_heads(names), box=None)
-    rows = [("identified", summary["parameters"])]
-    if "truth" in summary:
-        rows.append(("truth", summary["truth"]))
-    for kind, values in rows:
-        for tissue, known in values.items():
-            table.add_row(f"{tissue}, {kind}", *(f"{known[name]:.3g}" for name in names))
-    STDOUT.print(table)
+    keys = list(next(iter(summary["parameters"].values())))
+    rows = [
+        values | {"tissue": f"{tissue}, {kind}"}
+        for kind, tissues in (("identified", summary["parameters"]), ("truth", summary.get("truth", {})))
+        for tissue, values in tissues.items()
+    ]
+    columns: dict[str, Column] = {"tissue": "tissue"}
+    columns |= {head: (key, ".3g") for head, key in zip(format_parameter_heads(keys), keys)}
+    print_table(rows, columns)
     for text in summary.get("relaxation", {}).get("words", ()):
-        STDOUT.print(f"relaxation: {text}", soft_wrap=True)
+        print_line(f"relaxation: {text}")
 
 
 def show_sites(summary: dict[str, Any]) -> None:
-    table = Table("site", "region", "used", "peak force (N)", "error (%)", box=None)
-    for site in summary["sites"]:
-        used = "fitted" if site["fitted"] else "held out"
-        error = "-" if site["error_percent"] is None else f"{site['error_percent']:.2f}"
-        table.add_row(site["record"], site["region"], used, f"{site['peak_force_N']:.2f}", error)
-    STDOUT.print(table)
+    columns: dict[str, Column] = {
+        "site": "record",
+        "region": "region",
+        "used": format_use,
+        "peak force (N)": ("peak_force_N", ".2f"),
+        "error (%)": ("error_percent", ".2f"),
+    }
+    print_table(summary["sites"], columns)
     for kind, key in (("fitted", "mean_error_fitted_percent"), ("held-out", "mean_error_heldout_percent")):
         if summary.get(key) is not None:
-            STDOUT.print(f"mean error at the {kind} sites: {summary[key]:.2f} %")
+            print_line(f"mean error at the {kind} sites: {summary[key]:.2f} %")
     if summary.get("fit_quality"):
-        STDOUT.print(f"fit: {summary['fit_quality']}")
+        print_line(f"fit: {summary['fit_quality']}")
+
+
+def segment(study: StudyPath, as_json: AsJson = False) -> None:
+    """Run up to the label map; list tissues and volumes."""
+    _run_until(study, "segment", show_labels, as_json)
+
+
+def surfaces(study: StudyPath, as_json: AsJson = False) -> None:
+    """Run up to the surfaces; list closed bodies, volumes and the thinnest tissue over each bone."""
+    _run_until(study, "surfaces", show_surfaces, as_json)
+
+
+def sites(study: StudyPath, as_json: AsJson = False) -> None:
+    """Run up to the sites; list their places on the skin and the markers found there."""
+    _run_until(study, "sites", show_placed_sites, as_json)
+
+
+def mesh(study: StudyPath, as_json: AsJson = False) -> None:
+    """Run up to the meshes; list their size, angles and what was trimmed."""
+    _run_until(study, "mesh", show_meshes, as_json)
+
+
+def _run_until(
+    study: StudyPath, stage: str, show_words: Callable[[dict[str, Any]], None], as_json: bool
+) -> None:
+    """Run the study until a stage, print what it made and where its picture is."""
+    with listen_on_console() as listener:
+        result = limbfit.show_stage(limbfit.load_study(study), stage, listener=listener)
+    print_result(result, show_words, as_json)
+    if result["picture"] and not as_json:
+        print_line(f"picture: {result['picture']}")
+
+
+def show_labels(result: dict[str, Any]) -> None:
+    volumes = ", ".join(f"{name} {value:.1f}" for name, value in result["volumes_cm3"].items())
+    print_line(f"{result['method']}; volumes in cm3: {volumes}")
+    for repair in result.get("repairs", ()):
+        print_line(f"repaired: {repair}")
+    for warning in result.get("warnings", ()):
+        print_line(f"warning: {warning}")
+    if "markers_removed" in result:
+        print_line(f"markers taken off the skin: {result['markers_removed']}")
+    if "motion" in result:
+        motion = result["motion"]
+        print_line(
+            f"between the images the limb moved by {motion['shift_mm']:.1f} mm and {motion['turn_deg']:.1f} "
+            f"degrees (correlation {motion['correlation']:.2f})"
+        )
+    print_line(f"labels: {result['labels']}")
+
+
+def show_surfaces(result: dict[str, Any]) -> None:
+    rows = []
+    for name, volume in result["volumes_cm3"].items():
+        thinnest = result["thinnest_mm"].get(name) or {}
+        rows.append(thinnest | {"body": name, "volume": volume, "triangles": result["triangles"][name]})
+    columns: dict[str, Column] = {
+        "body": "body",
+        "volume (cm3)": ("volume", ".1f"),
+        "triangles": "triangles",
+        "thinnest tissue (mm)": ("tissue_mm", ".1f"),
+        "at (LPS mm)": lambda row: format_point(row["at"]) if "at" in row else "",
+    }
+    print_table(rows, columns, dash="", unwrapped=columns)
+    print_line(
+        f"{result['closed_bodies']} closed bodies; proximal cut through {format_point(result['cut_point'])}"
+    )
+    if result["amputation"]:
+        ends = result["amputation"]["beyond_plane_mm"].items()
+        print_line(
+            "amputated; ends beyond the plane (mm): " + ", ".join(f"{name} {end:.1f}" for name, end in ends)
+        )
+
+
+def show_placed_sites(result: dict[str, Any]) -> None:
+    rows = ((site["marker"] or {}) | site for site in result["sites"])
+    columns: dict[str, Column] = {
+        "site": "site",
+        "region": "region",
+        "used": format_use,
+        "at (LPS mm)": lambda row: format_point(row["position_mm"]),
+        "off skin": lambda row: f"{row['off_skin_mm']:.2f} mm",
+        "marker": lambda row: f"{row['height_mm']:.1f} mm" if row["marker"] else "",
+        "from 'near'": lambda row: f"{row['distance_to_hint_mm']:.1f} mm" if row["marker"] else "",
+    }
+    print_table(rows, columns, unwrapped=columns.keys() - {"region"})
+
+
+def show_meshes(result: dict[str, Any]) -> None:
+    def format_trimmed(row: Row) -> str:
+        bones = (f"{bone} {cut['volume_mm3'] / 1000:.2f}" for bone, cut in row["trimmed_bone"].items())
+        return ", ".join(bones) or "none"
+
+    columns: dict[str, Column] = {
+        "site": "site",
+        "nodes": "nodes",
+        "elements": "cells",
+        "least angle": lambda row: f"{row['min_dihedral_deg']:.1f} deg",
+        "layers (mm)": lambda row: f"{row['layer_mean_mm']:.2f} +- {row['layer_std_mm']:.2f}",
+        "trimmed bone (cm3)": format_trimmed,
+    }
+    rows = ({"site": name} | row for name, row in result["sites"].items())
+    print_table(rows, columns, unwrapped=columns.keys() - {"trimmed bone (cm3)"})
+    for name, row in result["sites"].items():
+        for warning in row["warnings"]:
+            print_line(f"warning: site {name}: {warning}")
+
+
+def format_point(position: Sequence[float]) -> str:
+    return ", ".join(f"{value:.1f}" for value in position)
 
 
 def schema(
@@ -328,4 +453,4 @@ def schema(
     print_json(limbfit.build_schema(result))
 
 
-VERBS = (demo, phantom, series, check, run, status, simulate, report, schema)
+VERBS = (demo, phantom, series, check, run, status, simulate, report, schema, segment, surfaces, sites, mesh)

@@ -7,12 +7,12 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from threading import Event, Thread
 from time import perf_counter, sleep
 from types import FrameType
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import typer
 from rich.console import Console
@@ -24,16 +24,20 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
 
 import limbfit
 
 from ..laws import split_key
 
 INTERRUPTED = "interrupted; run the same command again to continue"
-_PATIENCE_S = 3.0  # for an interrupt to be heard
-_CLEARING_S = 15.0  # for what heard it to end its workers and files
+HEARING_TIME_S = 3.0  # for an interrupt to be heard
+CLEARING_TIME_S = 15.0  # for what heard it to end its workers and files
 STDOUT = Console(highlight=False, markup=False)
 STDERR = Console(stderr=True, highlight=False, markup=False)
+Result = TypeVar("Result")
+Row = Mapping[str, Any]
+Column = str | tuple[str, str] | Callable[[Row], str]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
 
 
@@ -41,14 +45,63 @@ def print_json(content: Any) -> None:
     sys.stdout.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
-def tell_stored(found: dict[str, Any], show: Callable[[dict[str, Any]], None], as_json: bool) -> None:
-    """What an experiment found: as JSON and nothing else, or in words with where it is stored."""
+def print_result(content: Result, show: Callable[[Result], None], as_json: bool) -> None:
+    """Print what a command found: as JSON and nothing else, or as ``show`` prints it."""
     if as_json:
-        print_json(found)
-        return
-    show(found)
-    shown = f"report: {found['report']}" if "report" in found else "limbfit report shows it"
-    STDOUT.print(f"stored in {found['folder']}; {shown}", soft_wrap=True)
+        print_json(content)
+    else:
+        show(content)
+
+
+def print_stored(content: dict[str, Any], show: Callable[[dict[str, Any]], None], as_json: bool) -> None:
+    """Print what an experiment found; in words, where it is stored comes last."""
+    print_result(content, show, as_json)
+    if not as_json:
+        place = f"report: {content['report']}" if "report" in content else "limbfit report shows it"
+        print_line(f"stored in {content['folder']}; {place}")
+
+
+def print_line(text: str) -> None:
+    """Print a line on standard output; a terminal wraps it, rich does not."""
+    STDOUT.print(text, soft_wrap=True)
+
+
+def print_aside(text: str) -> None:
+    """Print a line on standard error: a note, or an error that does not end the program."""
+    STDERR.print(text, soft_wrap=True)
+
+
+def print_warning(text: str) -> None:
+    print_aside(f"warning: {text}")
+
+
+def print_table(
+    rows: Iterable[Row], columns: Mapping[str, Column], *, dash: str = "-", unwrapped: Container[str] = ()
+) -> None:
+    """Print rows as a table of columns by their heads, each with what stands below it.
+
+    A column is a key of the rows, a key with a format, or a function of the row. A value that is not there is
+    a ``dash``. The cells of ``unwrapped`` columns stay on one line.
+    """
+    table = Table(box=None)
+    for head in columns:
+        table.add_column(head, no_wrap=head in unwrapped)
+    for row in rows:
+        table.add_row(*(_format_cell(row, column, dash) for column in columns.values()))
+    STDOUT.print(table)
+
+
+def _format_cell(row: Row, column: Column, dash: str) -> str:
+    if callable(column):
+        return column(row)
+    key, form = (column, "") if isinstance(column, str) else column
+    value = row.get(key)
+    return dash if value is None else format(value, form)
+
+
+def format_use(row: Row) -> str:
+    """Whether a site or record was fitted, in words."""
+    return "fitted" if row["fitted"] else "held out"
 
 
 @contextmanager
@@ -58,14 +111,14 @@ def listen_on_console() -> Iterator[Callable[[limbfit.Progress], None]]:
     An interrupt ends here: typer would turn it into an exit without a word.
     """
     try:
-        with draw_bars() if STDERR.is_terminal else nullcontext(build_plain_listener()) as listener:
+        with _draw_bars() if STDERR.is_terminal else nullcontext(_build_plain_listener()) as listener:
             yield listener
     except KeyboardInterrupt:
         fail(INTERRUPTED, 130)
 
 
 @contextmanager
-def draw_bars() -> Iterator[Callable[[limbfit.Progress], None]]:
+def _draw_bars() -> Iterator[Callable[[limbfit.Progress], None]]:
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description:<10}"),
@@ -91,13 +144,13 @@ def draw_bars() -> Iterator[Callable[[limbfit.Progress], None]]:
         yield listen
 
 
-def build_plain_listener() -> Callable[[limbfit.Progress], None]:
+def _build_plain_listener() -> Callable[[limbfit.Progress], None]:
     start = perf_counter()
 
     def listen(event: limbfit.Progress) -> None:
         share = f" {round(event.done, 1):g}/{event.total:g}" if event.total else ""
         text = f": {event.text}" if event.text else ""
-        STDERR.print(f"[{perf_counter() - start:7.1f} s] {event.stage}{share}{text}", soft_wrap=True)
+        print_aside(f"[{perf_counter() - start:7.1f} s] {event.stage}{share}{text}")
 
     return listen
 
@@ -108,11 +161,9 @@ def prompt_interrupt() -> Iterator[None]:
 
     What is on disk is whole at every moment, so that ending at once loses no more than the work in progress.
     """
-    near, far = socket.socketpair()
-    for end in (near, far):
-        end.setblocking(False)
-    wakeup = signal.set_wakeup_fd(far.fileno(), warn_on_full_buffer=False)
-    near.setblocking(True)
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    wakeup = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
     heard = Event()
 
     def hear(number: int, frame: FrameType | None) -> None:
@@ -120,10 +171,10 @@ def prompt_interrupt() -> Iterator[None]:
         raise KeyboardInterrupt
 
     def watch() -> None:
-        while numbers := near.recv(64):
+        while numbers := reader.recv(64):
             if signal.SIGINT in numbers:
-                if heard.wait(_PATIENCE_S):
-                    sleep(_CLEARING_S)
+                if heard.wait(HEARING_TIME_S):
+                    sleep(CLEARING_TIME_S)
                 os.write(2, f"error: {INTERRUPTED}\n".encode())
                 os._exit(130)
 
@@ -134,7 +185,7 @@ def prompt_interrupt() -> Iterator[None]:
     finally:
         signal.signal(signal.SIGINT, handler)
         signal.set_wakeup_fd(wakeup)
-        far.close()  # which ends the watch
+        writer.close()  # which ends the watch
 
 
 def format_parameter_heads(keys: Iterable[str]) -> list[str]:
@@ -146,5 +197,5 @@ def format_parameter_heads(keys: Iterable[str]) -> list[str]:
 def fail(text: str, code: int) -> None:
     """One line on standard error, without control characters, then the exit."""
     line = "".join(c if c.isprintable() else " " for c in " ".join(text.split()))
-    STDERR.print(f"error: {line}", soft_wrap=True)
+    print_aside(f"error: {line}")
     sys.exit(code)

@@ -3,36 +3,38 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
-from rich.table import Table
 
 import limbfit
 
 from ..errors import InputError
-from .commands import StudyPath
+from .commands import StudyPath, parse_parameters
 from .console import (
-    STDERR,
-    STDOUT,
     AsJson,
+    Column,
     format_parameter_heads,
+    format_use,
     listen_on_console,
     print_json,
-    tell_stored,
+    print_line,
+    print_stored,
+    print_table,
+    print_warning,
 )
 
 
-def run_verb(
-    study: Path, name: str, tell: Callable[[dict[str, Any]], None], *, as_json: bool, **options: Any
+def _run_and_print(
+    study: Path, name: str, show: Callable[[dict[str, Any]], None], *, as_json: bool, **options: Any
 ) -> None:
-    """Do the experiment ``name`` with ``options``, tell of it, and say where it is stored."""
+    """Do the experiment ``name`` with ``options``, print what it found and where it is stored."""
     with listen_on_console() as listener:
-        found = limbfit.run_experiment(limbfit.load_study(study), name, listener=listener, **options)
-    tell_stored(found, tell, as_json)
+        result = limbfit.run_experiment(limbfit.load_study(study), name, listener=listener, **options)
+    print_stored(result, show, as_json)
 
 
 def cube(
@@ -48,24 +50,25 @@ def cube(
     if study is not None:
         if output is not None:
             raise InputError("a study has its own folder", place="--output", remedy="leave it out")
-        run_verb(study, "cube", show_cube, as_json=as_json, compression_percent=compression)
+        _run_and_print(study, "cube", show_cube, as_json=as_json, compression_percent=compression)
         return
     folder = output or Path("cube")
-    found = limbfit.compress_cube(folder, compression_percent=compression)
+    result = limbfit.compress_cube(folder, compression_percent=compression)
     if as_json:
-        print_json(found | {"folder": str(folder)})
+        print_json(result | {"folder": str(folder)})
         return
-    show_cube(found)
-    STDOUT.print(f"stored in {folder}: cube.json, cube.csv, cube.svg", soft_wrap=True)
+    show_cube(result)
+    print_line(f"stored in {folder}: cube.json, cube.csv, cube.svg")
 
 
-def show_cube(found: dict[str, Any]) -> None:
-    table = Table("tissue", "peak (kPa)", "back (kPa)", "least J", box=None)
-    table.columns[0].no_wrap = True
-    for row in found["tissues"]:
-        numbers = (f"{row['peak_kPa']:.3g}", f"{row['back_kPa']:.2f}", f"{row['J_min']:.4f}")
-        table.add_row(row["tissue"], *numbers)
-    STDOUT.print(table)
+def show_cube(result: dict[str, Any]) -> None:
+    columns: dict[str, Column] = {
+        "tissue": "tissue",
+        "peak (kPa)": ("peak_kPa", ".3g"),
+        "back (kPa)": ("back_kPa", ".2f"),
+        "least J": ("J_min", ".4f"),
+    }
+    print_table(result["tissues"], columns, unwrapped=("tissue",))
 
 
 class RegionSites(StrEnum):
@@ -82,27 +85,23 @@ def regions(
     as_json: AsJson = False,
 ) -> None:
     """Identify each region separately, beside the model of the whole limb (the paper's table 3)."""
-    run_verb(study, "regions", show_regions, as_json=as_json, sites=sites.value)
+    _run_and_print(study, "regions", show_regions, as_json=as_json, sites=sites.value)
 
 
-def show_regions(found: dict[str, Any]) -> None:
-    names = format_parameter_heads(next(iter(found["whole"]["parameters"].values())))
-    table = Table("region", "sites", "tissue", *names, "error (%)", "whole (%)", box=None)
-    rows = [("whole limb", found["whole"]["fitted_sites"], found["whole"]["parameters"], None, None)]
-    errors = ("own_error_percent", "whole_error_percent")
-    rows += [
-        (row["region"], row["fitted_sites"], row["parameters"], *(row[key] for key in errors))
-        for row in found["regions"]
-    ]
-    for name, sites, parameters, *known in rows:
-        words = [name, ", ".join(sites)]
-        told = ["" if error is None else f"{error:.2f}" for error in known]
-        for tissue, values in parameters.items():
-            table.add_row(*words, tissue, *(f"{value:.3g}" for value in values.values()), *told)
-            words, told = ["", ""], ["", ""]
-    STDOUT.print(table)
-    for text in found["left_out"]:
-        STDOUT.print(f"left out: {text}", soft_wrap=True)
+def show_regions(result: dict[str, Any]) -> None:
+    rows = []
+    for fit in ({"region": "whole limb"} | result["whole"], *result["regions"]):
+        head = fit | {"sites": ", ".join(fit["fitted_sites"])}
+        for tissue, values in fit["parameters"].items():
+            rows.append(head | values | {"tissue": tissue})
+            head = {"region": "", "sites": ""}
+    keys = list(next(iter(result["whole"]["parameters"].values())))
+    columns: dict[str, Column] = {"region": "region", "sites": "sites", "tissue": "tissue"}
+    columns |= {head: (key, ".3g") for head, key in zip(format_parameter_heads(keys), keys)}
+    columns |= {"error (%)": ("own_error_percent", ".2f"), "whole (%)": ("whole_error_percent", ".2f")}
+    print_table(rows, columns, dash="")
+    for text in result["left_out"]:
+        print_line(f"left out: {text}")
 
 
 def uncertainty(
@@ -119,45 +118,51 @@ def uncertainty(
 ) -> None:
     """Find what the records determine, what else changes the answer, and how far to trust predictions."""
     if models is None:
-        run_verb(study, "uncertainty", show_uncertainty, as_json=as_json)
+        _run_and_print(study, "uncertainty", show_uncertainty, as_json=as_json)
         return
     names = [name.strip() for name in models.split(",") if name.strip()]
     with listen_on_console() as listener:
-        found = limbfit.compare_models(limbfit.load_study(study), names, listener=listener)
-    tell_stored(found, show_models, as_json)
+        result = limbfit.compare_models(limbfit.load_study(study), names, listener=listener)
+    print_stored(result, show_models, as_json)
 
 
-def show_models(found: dict[str, Any]) -> None:
+def show_models(result: dict[str, Any]) -> None:
     """The weight of each model, and the interval of each record's peak with all of them."""
-    columns = ("model", "fitted (%)", "held out (%)", "2 ln B against the study's", "weight (%)")
-    table = Table(*columns, box=None)
-    for row in found["models"]:
-        errors = (row["error_fitted_percent"], row["error_heldout_percent"])
-        words = ["" if error is None else f"{error:.2f}" for error in errors]
-        table.add_row(row["words"], *words, f"{row['evidence']:+.1f}", f"{100 * row['weight']:.0f}")
-    STDOUT.print(table)
-    table = Table("record", "", "measured peak", "95 % by the study's model", "95 % by all models", box=None)
-    for row in found["records"]:
-        ends = (row["own_interval_95"], row["interval_95"])
-        words = [f"{low:.3g} to {high:.3g} {row['unit']}" for low, high in ends]
-        kind = "fitted" if row["fitted"] else "held out"
-        table.add_row(row["record"], kind, f"{row['peak']:.3g} {row['unit']}", *words)
-    STDOUT.print(table)
-    for text in found["left_out"].values():
-        STDOUT.print(f"left out: {text}", soft_wrap=True)
+    columns: dict[str, Column] = {
+        "model": "words",
+        "fitted (%)": ("error_fitted_percent", ".2f"),
+        "held out (%)": ("error_heldout_percent", ".2f"),
+        "2 ln B against the study's": ("evidence", "+.1f"),
+        "weight (%)": lambda row: f"{100 * row['weight']:.0f}",
+    }
+    print_table(result["models"], columns, dash="")
+    columns = {
+        "record": "record",
+        "": format_use,
+        "measured peak": lambda row: f"{row['peak']:.3g} {row['unit']}",
+        "95 % by the study's model": lambda row: f"{_format_ends(row['own_interval_95'])} {row['unit']}",
+        "95 % by all models": lambda row: f"{_format_ends(row['interval_95'])} {row['unit']}",
+    }
+    print_table(result["records"], columns)
+    for text in result["left_out"].values():
+        print_line(f"left out: {text}")
 
 
-def show_uncertainty(found: dict[str, Any]) -> None:
-    table = Table(
-        "parameter", "identified", "95 % by the records", "95 % with all sources", "verdict", box=None
-    )
-    for row in found["parameters"]:
-        ranges = [row[key] for key in ("posterior_95", "with_sources_95")]
-        words = [f"{low:.3g} to {high:.3g}" for low, high in ranges]
-        table.add_row(row["name"], f"{row['calibrated']:.3g}", *words, row["verdict"])
-    STDOUT.print(table)
-    for text in found["verdict"]:
-        STDOUT.print(text, soft_wrap=True)
+def _format_ends(interval: Sequence[float]) -> str:
+    return f"{interval[0]:.3g} to {interval[1]:.3g}"
+
+
+def show_uncertainty(result: dict[str, Any]) -> None:
+    columns: dict[str, Column] = {
+        "parameter": "name",
+        "identified": ("calibrated", ".3g"),
+        "95 % by the records": lambda row: _format_ends(row["posterior_95"]),
+        "95 % with all sources": lambda row: _format_ends(row["with_sources_95"]),
+        "verdict": "verdict",
+    }
+    print_table(result["parameters"], columns)
+    for text in result["verdict"]:
+        print_line(text)
 
 
 class Sensitivity(StrEnum):
@@ -181,16 +186,16 @@ def sensitivity(
     as_json: AsJson = False,
 ) -> None:
     """Simulate again with another c, bulk modulus, friction, indenter or mesh."""
-    checked, found = limbfit.load_study(study), {}
+    checked, results = limbfit.load_study(study), {}
     with listen_on_console() as listener:
         for name in parse_sensitivities(only):
-            found[name] = limbfit.run_experiment(
+            results[name] = limbfit.run_experiment(
                 checked, f"sensitivity-{name}", listener=listener, sites=site or []
             )
             if not as_json:
-                show_sensitivity(name, found[name])
+                show_sensitivity(name, results[name])
     if as_json:
-        print_json(found)
+        print_json(results)
 
 
 def parse_sensitivities(only: str | None) -> list[str]:
@@ -203,28 +208,26 @@ def parse_sensitivities(only: str | None) -> list[str]:
     return names
 
 
-def show_sensitivity(name: str, found: dict[str, Any]) -> None:
-    head = ["site", "peak (N)", "change (%)", "mean (%)"] + (
-        ["least J", "largest J"] if name == "kappa" else []
-    )
-    table = Table(f"sensitivity to {name}", *head, box=None)
-    for row in found["runs"]:
-        numbers = [row["peak_force_N"], row["peak_change_percent"], row["mean_change_percent"]]
-        words = ["-" if number is None else f"{number:.2f}" for number in numbers]
-        if name == "kappa":
-            words += ["-" if row[key] is None else f"{row[key]:.4f}" for key in ("J_min", "J_max")]
-        table.add_row(row["label"], row["site"], *words)
-    STDOUT.print(table)
+def show_sensitivity(name: str, result: dict[str, Any]) -> None:
+    columns: dict[str, Column] = {
+        f"sensitivity to {name}": "label",
+        "site": "site",
+        "peak (N)": ("peak_force_N", ".2f"),
+        "change (%)": ("peak_change_percent", ".2f"),
+        "mean (%)": ("mean_change_percent", ".2f"),
+    }
+    if name == "kappa":
+        columns |= {"least J": ("J_min", ".4f"), "largest J": ("J_max", ".4f")}
+    print_table(result["runs"], columns)
     if name == "mesh":
-        for row in found["sites"]:
+        for row in result["sites"]:
             if row["limit_N"] is not None:
                 text = f"site {row['site']}: tends to {row['limit_N']:.3f} N, order {row['order']:.2g}"
-                STDOUT.print(f"{text}; the study's mesh is {row['error_percent']:+.2f} % off", soft_wrap=True)
-    for row in found["runs"]:
+                print_line(f"{text}; the study's mesh is {row['error_percent']:+.2f} % off")
+    for row in result["runs"]:
         if not row["completed"]:
-            text = f"site {row['site']}, {row['label']}: {row['reason']}"
-            STDERR.print(f"warning: partial: {text}", soft_wrap=True)
-    STDOUT.print(f"stored in {found['folder']}; limbfit report shows it", soft_wrap=True)
+            print_warning(f"partial: site {row['site']}, {row['label']}: {row['reason']}")
+    print_line(f"stored in {result['folder']}; limbfit report shows it")
 
 
 def experiment(
@@ -236,21 +239,196 @@ def experiment(
     as_json: AsJson = False,
 ) -> None:
     """Run an experiment that has no command of its own."""
-    run_verb(study, name, print_json, as_json=as_json, **parse_options(option or ()))
+    _run_and_print(study, name, print_json, as_json=as_json, **parse_options(option or ()))
 
 
 def parse_options(words: Iterable[str]) -> dict[str, Any]:
     """``--option``: what an experiment is run with, by name."""
-    found = {}
+    result = {}
     for word in words:
         name, equals, value = word.partition("=")
         if not equals:
             raise InputError(f"{word!r} says no value", place="--option", remedy="write NAME=VALUE")
         try:
-            found[name] = json.loads(value)
+            result[name] = json.loads(value)
         except ValueError:
-            found[name] = value
-    return found
+            result[name] = value
+    return result
 
 
-VERBS = (cube, regions, sensitivity, uncertainty, experiment)
+def crossvalidate(
+    study: StudyPath,
+    fit: Annotated[int, typer.Option(help="sites to fit; 0: as many as the study fits", min=0)] = 0,
+    choices: Annotated[int, typer.Option(help="choices of sites, drawn where there are more", min=1)] = 200,
+    seed: Annotated[int, typer.Option(help="which choices are drawn")] = 0,
+    runs: Annotated[int, typer.Option(help="simulations of all sites that make the emulator", min=4)] = 12,
+    as_json: AsJson = False,
+) -> None:
+    """Fit other choices of sites and predict the rest; leave out whole regions."""
+    options = {"fit": fit, "choices": choices, "seed": seed, "runs": runs}
+    _run_and_print(study, "crossvalidate", show_crossvalidation, as_json=as_json, **options)
+
+
+def show_crossvalidation(result: dict[str, Any]) -> None:
+    own = result["own"]
+    print_line(
+        f"{result['choices']} of {result['choices_possible']} choices of {result['fitted_sites']} sites: "
+        f"mean held-out error {own['median_percent']:.2f} % (median; 5 to 95 %: {own['low_percent']:.2f} to "
+        f"{own['high_percent']:.2f} %)\n"
+        f"the study's own choice ({', '.join(own['fitted'])}): {own['mean_error_heldout_percent']:.2f} %; "
+        f"{100 * own['share_better']:.0f} % of the choices do better"
+    )
+    sites = ({"name": f"site {row['site']}", "error": row["mean_percent"]} for row in result["sites"])
+    rows = [row for row in sites if row["error"] is not None]
+    for row in result["regions"]:
+        rows.append({"name": f"region {row['label']}", "error": row["mean_error_heldout_percent"]})
+    print_table(rows, {"left out": "name", "error (%)": ("error", ".2f")})
+    checks = [row["emulator_error_percent"] for row in result["emulator"]["checks"]]
+    if checks:
+        print_line(
+            f"the emulator at {len(checks)} of the fits, against the solver: within {max(checks):.2f} %"
+        )
+
+
+def design(
+    study: StudyPath,
+    sites: Annotated[int, typer.Option(help="how many to choose; 0: as many as the study fits", min=0)] = 0,
+    depths: Annotated[
+        str | None,
+        typer.Option(help="depths in mm to choose from, such as 3,5,7; default: the study's"),
+    ] = None,
+    parameters: Annotated[
+        str | None,
+        typer.Option(help="the law's parameters of each tissue; default: identified, or the study's start"),
+    ] = None,
+    protocol: Annotated[
+        bool, typer.Option("--protocol", help="choose the records of a whole session instead")
+    ] = False,
+    minutes: Annotated[float, typer.Option(help="with --protocol: length of the session, min", min=1)] = 25.0,
+    speeds: Annotated[
+        str | None,
+        typer.Option(help="with --protocol: speeds in mm/s; default: the study's and five times it"),
+    ] = None,
+    holds: Annotated[
+        str | None,
+        typer.Option(
+            help="with --protocol: holds in s, 0 for none; default: 0,30, for a socket as long as its loads"
+        ),
+    ] = None,
+    determine: Annotated[
+        str | None,
+        typer.Option(
+            help="with --protocol: parameters such as muscle.c_kPa, or socket (pressures); default: all"
+        ),
+    ] = None,
+    criterion: Annotated[
+        Literal["D", "A"] | None, typer.Option(help="with --protocol: D or A; default: D, for a socket A")
+    ] = None,
+    draws: Annotated[int, typer.Option(help="with --protocol: how many tissues", min=1, max=64)] = 3,
+    ultrasound: Annotated[
+        float | None,
+        typer.Option(help="with --protocol: ultrasound reads thicknesses with this deviation, mm", min=1e-3),
+    ] = None,
+    surface: Annotated[
+        float | None,
+        typer.Option(help="with --protocol: cameras read the skin with this deviation, mm", min=1e-3),
+    ] = None,
+    shear_waves: Annotated[
+        float | None,
+        typer.Option(
+            help="with --protocol: elastography reads shear-wave speeds with this deviation, m/s",
+            min=1e-3,
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Choose the sites and depths that determine the parameters best, for records or for a plan.
+
+    With --protocol: the records (site, indenter, depth, speed, hold) of a session of stated length, judged at
+    several tissues; records.toml has them as a study's [[records]].
+    """
+    checked = limbfit.load_study(study)
+    values = parse_parameters(parameters, checked)
+    chosen = parse_list(depths, "--depths", "give millimetres, such as 3,5,7")
+    with listen_on_console() as listener:
+        if protocol:
+            result = limbfit.plan_protocol(
+                checked,
+                minutes=minutes,
+                speeds_mm_s=parse_list(speeds, "--speeds", "give mm/s, such as 0.96,4.8"),
+                holds_s=parse_list(holds, "--holds", "give seconds, such as 0,30", least=0.0),
+                depths_mm=chosen,
+                determine=determine.split(",") if determine else (),
+                criterion=criterion,
+                draws=draws,
+                ultrasound_sd_mm=ultrasound,
+                surface_sd_mm=surface,
+                shear_waves_sd_m_s=shear_waves,
+                parameters=values,
+                listener=listener,
+            )
+        else:
+            result = limbfit.design_study(
+                checked,
+                sites=sites,
+                depths_mm=chosen,
+                parameters=values,
+                listener=listener,
+            )
+    print_stored(result, show_protocol if protocol else show_design, as_json)
+
+
+def parse_list(text: str | None, place: str, remedy: str, least: float = 1e-3) -> tuple[float, ...]:
+    """Numbers with commas between them, from ``least`` to 600; none where nothing is given."""
+    if text is None:
+        return ()
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if not values or not all(least <= value <= 600 for value in values):
+        raise InputError(f"{text!r} will not do", place=place, remedy=remedy)
+    return values
+
+
+def show_design(result: dict[str, Any]) -> None:
+    columns: dict[str, Column] = {
+        "design": "design",
+        "sites (depth in mm)": lambda row: ", ".join(
+            f"{site['site']} ({site['depth_mm']:.1f})" for site in row["sites"]
+        ),
+        "D (%)": lambda row: f"{100 * row['d_efficiency']:.0f}",
+        "A (%)": lambda row: f"{100 * row['a_efficiency']:.0f}",
+    }
+    print_table(result["designs"], columns)
+    _show_expected(result, result["designs"])
+
+
+def show_protocol(result: dict[str, Any]) -> None:
+    """The records, then what each protocol would determine."""
+    columns: dict[str, Column] = {
+        "site": "site",
+        "indenter": "indenter",
+        "depth (mm)": ("depth_mm", ".3g"),
+        "speed (mm/s)": ("speed_mm_s", ".3g"),
+        "hold (s)": ("hold_s", ".3g"),
+        "force (N)": ("peak_force_N", ".3g"),
+    }
+    print_table(result["records"], columns)
+    _show_expected(result, result["protocols"])
+
+
+def _show_expected(result: dict[str, Any], choices: list[dict[str, Any]]) -> None:
+    """The factors of the 95 % intervals that each choice promises, and the verdict."""
+    rows = []
+    for kind in ("factor_95", "pressures_95"):
+        for name in choices[0].get(kind, {}):
+            factors = {choice["design"]: f"x/ {min(choice[kind][name], 999):.3g}" for choice in choices}
+            rows.append(factors | {"parameter": name})
+    print_table(rows, {head: head for head in ("parameter", *(choice["design"] for choice in choices))})
+    print_line(result["verdict"])
+    for text in result["left_out"]:
+        print_line(f"told: {text}" if "protocols" in result else f"left out: {text}")
+
+
+VERBS = (cube, regions, sensitivity, uncertainty, experiment, crossvalidate, design)

@@ -11,7 +11,14 @@ import typer
 import limbfit
 
 from .commands import StudyPath, parse_parameters
-from .console import STDERR, STDOUT, AsJson, listen_on_console, print_json
+from .console import (
+    AsJson,
+    listen_on_console,
+    print_aside,
+    print_json,
+    print_line,
+    print_warning,
+)
 
 Parameters = Annotated[
     str | None,
@@ -36,22 +43,21 @@ def febio(
 ) -> None:
     """Solve a FEBio input with limbfit's solver, and write the log-file tables that it asks for."""
     with listen_on_console() as listener:
-        found = limbfit.simulate_feb(file, output, threads=threads, listener=listener)
+        result = limbfit.simulate_feb(file, output, threads=threads, listener=listener)
     if as_json:
-        print_json(found)
+        print_json(result)
     else:
-        for note in found["notes"]:
-            STDERR.print(f"note: {file}: {note}", soft_wrap=True)
-        peak = "" if found["peak_force_N"] is None else f"peak force {found['peak_force_N']:.4g} N, "
-        STDOUT.print(
-            f"{peak}{found['steps']} steps, {found['element']}, {found['unknowns']} unknowns; "
-            f"{', '.join(found['files']) or 'no table asked for'}",
-            soft_wrap=True,
+        for note in result["notes"]:
+            print_aside(f"note: {file}: {note}")
+        peak = "" if result["peak_force_N"] is None else f"peak force {result['peak_force_N']:.4g} N, "
+        print_line(
+            f"{peak}{result['steps']} steps, {result['element']}, {result['unknowns']} unknowns; "
+            f"{', '.join(result['files']) or 'no table asked for'}"
         )
-    for warning in found["warnings"]:
-        STDERR.print(f"warning: {warning}", soft_wrap=True)
-    if not found["completed"]:
-        STDERR.print(f"error: {file}: the simulation is partial: {found['reason']}", soft_wrap=True)
+    for warning in result["warnings"]:
+        print_warning(warning)
+    if not result["completed"]:
+        print_aside(f"error: {file}: the simulation is partial: {result['reason']}")
         raise typer.Exit(1)
 
 
@@ -74,7 +80,7 @@ def export(
     """Write indentations as inputs of FEBio, Abaqus or CalculiX, with the numbers of limbfit simulate."""
     checked = limbfit.load_study(study)
     with listen_on_console() as listener:
-        found = limbfit.export_study(
+        result = limbfit.export_study(
             checked,
             to.value,
             site=site,
@@ -83,15 +89,15 @@ def export(
             listener=listener,
         )
     if as_json:
-        print_json(found)
+        print_json(result)
         return
-    for row in found["sites"]:
+    for row in result["sites"]:
         head = f"site {row['site']}, parameters {row['parameters_from']}"
-        STDOUT.print(f"{head}: {', '.join(row['files'])}", soft_wrap=True)
+        print_line(f"{head}: {', '.join(row['files'])}")
         for note in row["notes"]:
-            STDERR.print(f"note: {note}", soft_wrap=True)
+            print_aside(f"note: {note}")
     if to is Format.optimize:
-        STDOUT.print("run: febio4 -i SITE-model.feb -s SITE-optimize.feb; FEBio fits one site at a time")
+        print_line("run: febio4 -i SITE-model.feb -s SITE-optimize.feb; FEBio fits one site at a time")
 
 
 def compare(
@@ -107,7 +113,7 @@ def compare(
     """Solve a site by limbfit and by FEBio; curves and difference go to results/compare."""
     checked = limbfit.load_study(study)
     with listen_on_console() as listener:
-        found = limbfit.compare_site(
+        result = limbfit.compare_site(
             checked,
             site,
             parameters=parse_parameters(parameters, checked),
@@ -115,21 +121,21 @@ def compare(
             listener=listener,
         )
     if as_json:
-        print_json(found)
+        print_json(result)
     else:
-        STDOUT.print(f"FEBio: peak force {found['febio']['peak_force_N']:.4g} N")
+        print_line(f"FEBio: peak force {result['febio']['peak_force_N']:.4g} N")
         for key, words in (
             ("limbfit", "limbfit"),
             ("limbfit_matched", "limbfit with FEBio's contact penalty and steps"),
         ):
-            row = found[key]
-            most = row["difference"]["max_percent"]
-            gap = "-" if most is None else f"{most:.2f} % of FEBio's peak at most"
-            STDOUT.print(f"{words}: peak force {row['peak_force_N']:.4g} N, difference {gap}")
-        STDOUT.print(", ".join(found["files"].values()), soft_wrap=True)
-    partial = [found[key]["reason"] for key in ("febio", "limbfit", "limbfit_matched")]
+            row = result[key]
+            percent = row["difference"]["max_percent"]
+            gap = "-" if percent is None else f"{percent:.2f} % of FEBio's peak at most"
+            print_line(f"{words}: peak force {row['peak_force_N']:.4g} N, difference {gap}")
+        print_line(", ".join(result["files"].values()))
+    partial = [result[key]["reason"] for key in ("febio", "limbfit", "limbfit_matched")]
     if any(partial):
-        STDERR.print(f"error: site {site}: partial: {'; '.join(filter(None, partial))}", soft_wrap=True)
+        print_aside(f"error: site {site}: partial: {'; '.join(filter(None, partial))}")
         raise typer.Exit(1)
 
 

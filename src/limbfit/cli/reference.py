@@ -8,8 +8,7 @@ from typing import Any
 
 import typer.main
 
-from .app import app
-from .groups import GROUPS
+from .app import GROUPS, app
 
 HEAD = """# Commands
 
@@ -22,50 +21,57 @@ _MANY = 5  # commands that share an option or argument: it is explained once
 
 def build_command_page() -> str:
     """All commands with their arguments and options, as Markdown."""
-    known: Any = typer.main.get_command(app)
+    root: Any = typer.main.get_command(app)
     counted = Counter(
-        _format_item(one) for _, command in _list_verbs("", known) for one in _list_parameters(command)
+        _format_item(parameter)
+        for _, command in _list_verbs("", root)
+        for parameter in _list_parameters(command)
     )
     shared = {item for item, count in counted.items() if count >= _MANY}
     parts = [HEAD, *(item for item in counted if item in shared)]
     for title, names in GROUPS.items():
         parts.append(f"\n## {title}\n")
         for name in names:
-            parts += _format_section(f"limbfit {name}", known.commands[name], shared)
+            parts += _format_section(f"limbfit {name}", root.commands[name], shared)
     return "\n".join(parts)
 
 
 def _list_verbs(name: str, command: Any) -> Iterator[tuple[str, Any]]:
     """The command, or those inside it."""
-    inside = getattr(command, "commands", None)
-    if inside is None:
+    subcommands = getattr(command, "commands", None)
+    if subcommands is None:
         yield name, command
     else:
-        for verb, one in inside.items():
-            yield from _list_verbs(f"{name} {verb}", one)
+        for verb, subcommand in subcommands.items():
+            yield from _list_verbs(f"{name} {verb}", subcommand)
 
 
 def _format_section(name: str, command: Any, shared: set[str]) -> list[str]:
     lines = [f"### {name}\n", _format_text(command.help)] if hasattr(command, "commands") else []
-    for verb, one in _list_verbs(name, command):
-        parameters = _list_parameters(one)
+    for verb, subcommand in _list_verbs(name, command):
+        parameters = _list_parameters(subcommand)
         arguments = [p for p in parameters if p.param_type_name == "argument"]
         words = (p.name.upper() if p.required else f"[{p.name.upper()}]" for p in arguments)
-        own = [item for item in map(_format_item, parameters) if item not in shared]
+        unshared = [item for item in map(_format_item, parameters) if item not in shared]
         also = [p for p in parameters if _format_item(p) in shared and p not in arguments]
-        lines += [f"### {' '.join([verb, *words])}\n", _format_text(one.help), *own, *([""] if own else [])]
+        lines += [
+            f"### {' '.join([verb, *words])}\n",
+            _format_text(subcommand.help),
+            *unshared,
+            *([""] if unshared else []),
+        ]
         lines += [f"Also {', '.join(map(_format_names, also))}.\n"] if also else []
     return lines
 
 
 def _list_parameters(command: Any) -> list[Any]:
-    return [one for one in command.params if one.name != "help"]
+    return [parameter for parameter in command.params if parameter.name != "help"]
 
 
 def _format_names(parameter: Any) -> str:
     if parameter.param_type_name == "argument":
         return f"`{parameter.name.upper()}`"
-    return ", ".join(f"`{one}`" for one in (*parameter.opts, *parameter.secondary_opts))
+    return ", ".join(f"`{name}`" for name in (*parameter.opts, *parameter.secondary_opts))
 
 
 def _format_item(parameter: Any) -> str:
@@ -74,7 +80,7 @@ def _format_item(parameter: Any) -> str:
 
 def _format_text(help_text: str | None) -> str:
     paragraphs = (help_text or "").replace("\b", "").split("\n\n")
-    return "\n\n".join(" ".join(one.split()) for one in paragraphs) + "\n"
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs) + "\n"
 
 
 if __name__ == "__main__":

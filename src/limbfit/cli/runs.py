@@ -1,4 +1,4 @@
-"""Many studies, studies once more, whether the machine is fit for it, and where jobs run."""
+"""The commands around studies: many of them, one again, the studio, the machine; and where jobs run."""
 
 from __future__ import annotations
 
@@ -9,13 +9,20 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 import limbfit
 
 from ..execution import QUEUES, Placement, place_jobs
-from .commands import list_stage_names
-from .console import STDERR, STDOUT, AsJson, listen_on_console, print_json
+from .commands import StudyPath, list_stage_names
+from .console import (
+    AsJson,
+    Column,
+    listen_on_console,
+    print_aside,
+    print_json,
+    print_line,
+    print_table,
+)
 
 _OPTIONS = {
     "workers": Annotated[
@@ -35,19 +42,20 @@ def add_execution_options(verb: Callable[..., None]) -> Callable[..., None]:
     """The verb with ``--workers``, ``--scheduler`` and ``--dask``, which say where its jobs run."""
 
     @wraps(verb)
-    def told(**given: Any) -> None:
-        chosen = {name: given.pop(name) for name in _OPTIONS}
+    def run(**arguments: Any) -> None:
+        chosen = {name: arguments.pop(name) for name in _OPTIONS}
         with place_jobs(Placement(**chosen)):
-            verb(**given)
+            verb(**arguments)
 
-    own = list(inspect.signature(verb, eval_str=True).parameters.values())
+    parameters = list(inspect.signature(verb, eval_str=True).parameters.values())
     added = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
         for name, kind in _OPTIONS.items()
     ]
-    told.__signature__ = inspect.Signature([*own, *added])  # type: ignore[attr-defined]
-    told.__annotations__ = {one.name: one.annotation for one in (*own, *added)}
-    return told
+    parameters += added
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
 
 
 def batch(
@@ -63,18 +71,20 @@ def batch(
         for row in limbfit.run_batch(studies, until=until, listener=listener):
             rows.append(row)
             if row["error"] and not as_json:
-                STDERR.print(f"failed: {row['study']}: {row['error']}", soft_wrap=True)
+                print_aside(f"failed: {row['study']}: {row['error']}")
     failed = [row for row in rows if row["state"] == "failed"]
     if as_json:
         print_json({"studies": rows, "failed": len(failed)})
     else:
-        table = Table("study", "state", "seconds", "fitted (%)", "held out (%)", box=None)
-        for row in rows:
-            keys = ("mean_error_fitted_percent", "mean_error_heldout_percent")
-            errors = ["-" if row.get(key) is None else f"{row[key]:.2f}" for key in keys]
-            table.add_row(row["study"], row["state"], f"{row['seconds']:.1f}", *errors)
-        STDOUT.print(table)
-        STDOUT.print(f"{len(rows) - len(failed)} of {len(rows)} studies done")
+        columns: dict[str, Column] = {
+            "study": "study",
+            "state": "state",
+            "seconds": ("seconds", ".1f"),
+            "fitted (%)": ("mean_error_fitted_percent", ".2f"),
+            "held out (%)": ("mean_error_heldout_percent", ".2f"),
+        }
+        print_table(rows, columns)
+        print_line(f"{len(rows) - len(failed)} of {len(rows)} studies done")
     if failed:
         raise typer.Exit(1)
 
@@ -92,18 +102,18 @@ def reproduce(
 ) -> None:
     """Run a study again from its record in a new folder, and compare parameters and forces."""
     with listen_on_console() as listener:
-        found = limbfit.reproduce_study(record, folder, tolerance=tolerance, listener=listener)
+        result = limbfit.reproduce_study(record, folder, tolerance=tolerance, listener=listener)
     if as_json:
-        print_json(found)
+        print_json(result)
     else:
-        for what in ("parameters", "forces"):
-            name, most = max(found[what].items(), key=lambda item: item[1])
-            STDOUT.print(f"{what}: at most {most:.1e} apart, relative ({name})")
-        for name, (then, now) in found["versions"].items():
-            STDOUT.print(f"{name}: then {then or 'not installed'}, now {now or 'not installed'}")
-        verdict = "the same" if found["same"] else "not the same"
-        STDOUT.print(f"{verdict} within {tolerance:g}; run again in {folder}", soft_wrap=True)
-    if not found["same"]:
+        for quantity in ("parameters", "forces"):
+            name, difference = max(result[quantity].items(), key=lambda item: item[1])
+            print_line(f"{quantity}: at most {difference:.1e} apart, relative ({name})")
+        for name, (then, now) in result["versions"].items():
+            print_line(f"{name}: then {then or 'not installed'}, now {now or 'not installed'}")
+        verdict = "the same" if result["same"] else "not the same"
+        print_line(f"{verdict} within {tolerance:g}; run again in {folder}")
+    if not result["same"]:
         raise typer.Exit(1)
 
 
@@ -112,16 +122,37 @@ def doctor(
     as_json: AsJson = False,
 ) -> None:
     """Check this machine: versions, cores, memory, solvers, meshers, write access, and a small problem."""
-    found = limbfit.diagnose(folder)
+    result = limbfit.diagnose(folder)
     if as_json:
-        print_json(found)
+        print_json(result)
     else:
-        for row in found["checks"]:
-            STDOUT.print(f"{row['state']:<8} {row['check']}: {row['found']}", soft_wrap=True)
+        for row in result["checks"]:
+            print_line(f"{row['state']:<8} {row['check']}: {row['found']}")
             if row["remedy"]:
-                STDOUT.print(f"         {row['remedy']}", soft_wrap=True)
-    if not found["healthy"]:
+                print_line(f"         {row['remedy']}")
+    if not result["healthy"]:
         raise typer.Exit(1)
 
 
-VERBS = (add_execution_options(batch), reproduce, doctor)
+def studio(
+    study: StudyPath,
+    port: Annotated[int, typer.Option(help="port to listen on; 0: a free one", min=0, max=65535)] = 0,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="print the address, open no browser")
+    ] = False,
+    host: Annotated[str, typer.Option(help="the address to listen on")] = "127.0.0.1",
+    expose: Annotated[
+        bool,
+        typer.Option("--expose", help="allow a --host that other machines reach: they can change the study"),
+    ] = False,
+) -> None:
+    """View and correct the limb, and watch its identification, in a browser on this machine."""
+
+    def tell(address: str) -> None:
+        print_line(f"studio of {study}; Ctrl-C ends it, runs go on")
+        print_line(address)
+
+    limbfit.serve_studio(study, port=port, host=host, expose=expose, browser=not no_browser, tell=tell)
+
+
+VERBS = (add_execution_options(batch), reproduce, doctor, studio)

@@ -26,7 +26,7 @@ from ..identify.uncertainty.uncertainty import Uncertainty, estimate_uncertainty
 from .solution import Solution, announce_compilation, new_axes, solve
 
 Curve = tuple[ArrayLike, ArrayLike]  # times (n,) s; force (n,) N, or displacement, mm, under a force
-WIDEST = 100.0  # of default bounds, over the start
+DEFAULT_BOUND_FACTOR = 100.0  # of default bounds, over the start
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,14 @@ class Fit:
 
     def table(self) -> str:
         """Parameters, 95 % intervals and verdicts as text."""
-        known = self.uncertainty
+        uncertainty = self.uncertainty
         rows = [("parameter", "value", "95 % interval", "")]
         for name, value, (low, high), verdict in zip(
-            known.names, self.parameters.values(), known.intervals_95, known.verdicts, strict=True
+            uncertainty.names,
+            self.parameters.values(),
+            uncertainty.intervals_95,
+            uncertainty.verdicts,
+            strict=True,
         ):
             rows.append((name, f"{value:.4g}", f"{low:.4g} to {high:.4g}", verdict))
         widths = [max(len(row[k]) for row in rows) for k in range(4)]
@@ -120,29 +124,29 @@ def calibrate(
         Where no simulation completes at the start.
     """
     cases = (problems,) if isinstance(problems, Problem) else tuple(problems)
-    given = _pair_curves(
+    pairs = _pair_curves(
         cast("Sequence[Curve]", (curves,) if isinstance(problems, Problem) else curves), cases
     )
     unknowns = _build_unknowns(cases, start, bounds or {})
     announce_compilation()
-    model = _Model(cases, given, unknowns.names, steps or StepControl(), listener)
-    measured = _to_measured(given)
-    found = search(
+    model = _Model(cases, pairs, unknowns.names, steps or StepControl(), listener)
+    measured = _to_measured(pairs)
+    result = search(
         model, measured, unknowns, CalibrationSettings(), stages=[group_separately(unknowns.names)]
     )
-    names, best = unknowns.names, found.parameters
+    names, best = unknowns.names, result.parameters
     return Fit(
         parameters=dict(zip(names, best.tolist(), strict=True)),
         error_percent=tuple(
-            compute_error_percent(r.force_N, one.force_N)
-            for r, one in zip(found.responses, measured, strict=True)
+            compute_error_percent(r.force_N, curve.force_N)
+            for r, curve in zip(result.responses, measured, strict=True)
         ),
-        converged=found.stages[-1].converged,
-        reason=found.stages[-1].reason,
-        simulations=found.evaluations * len(cases),
+        converged=result.stages[-1].converged,
+        reason=result.stages[-1].reason,
+        simulations=result.evaluations * len(cases),
         problems=tuple(with_parameters(case, dict(zip(names, best, strict=True))) for case in cases),
-        curves=given,
-        responses=tuple(found.responses),
+        curves=pairs,
+        responses=tuple(result.responses),
         unknowns=unknowns,
     )
 
@@ -178,29 +182,29 @@ class _Model:
         values = dict(zip(self.names, parameters, strict=True))
         answers = [self._one(k, values) for k in range(len(self.problems))]
         if self.listener is not None:
-            told = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
-            self.listener(f"simulation {self.calls}: {told}")
+            values_text = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+            self.listener(f"simulation {self.calls}: {values_text}")
         return answers
 
     def _one(self, number: int, values: Mapping[str, float]) -> SiteResponse:
         problem, (times, _) = with_parameters(self.problems[number], values), self.curves[number]
-        found = simulate(problem, self.steps[number], sensitivities=True, system=self.systems[number])
-        if not self.steps[number].hold_penalty and found.completed:
-            penalty = found.statistics["penalty_per_mm"]
+        result = simulate(problem, self.steps[number], sensitivities=True, system=self.systems[number])
+        if not self.steps[number].hold_penalty and result.completed:
+            penalty = result.statistics["penalty_per_mm"]
             self.steps[number] = replace(self.steps[number], penalty=penalty, hold_penalty=True)
-        known = [f"{region}.{parameter}" for region, parameter in found.parameter_names]
-        full = found.response_sensitivity_at(times)
+        names = [f"{region}.{parameter}" for region, parameter in result.parameter_names]
+        full = result.response_sensitivity_at(times)
         absent = np.zeros(len(times))
-        columns = [full[:, known.index(name)] if name in known else absent for name in self.names]
-        answer = found.response_at(times), np.stack(columns, axis=1), found.completed, found.reason
-        kinds = list_texts(found.doubts, "slipped", "folded")
-        return SiteResponse(*answer, f"curve {number + 1}", found.warnings, *kinds)
+        columns = [full[:, names.index(name)] if name in names else absent for name in self.names]
+        answer = result.response_at(times), np.stack(columns, axis=1), result.completed, result.reason
+        kinds = list_texts(result.doubts, "slipped", "folded")
+        return SiteResponse(*answer, f"curve {number + 1}", result.warnings, *kinds)
 
 
 def _pair_curves(curves: Sequence[Curve], problems: Sequence[Problem]) -> tuple[tuple[Array, Array], ...]:
     if len(curves) != len(problems):
         raise ProblemError(f"{len(curves)} curves for {len(problems)} problems", remedy="give one for each")
-    found = []
+    pairs = []
     for number, (curve, problem) in enumerate(zip(curves, problems), start=1):
         times, force = (np.asarray(values, dtype=float) for values in curve)
         end = float(problem.history.times[-1])
@@ -214,8 +218,8 @@ def _pair_curves(curves: Sequence[Curve], problems: Sequence[Problem]) -> tuple[
                 f"curve {number} lasts from {times[0]:g} to {times[-1]:g} s, the indentation to {end:g} s",
                 remedy="count time from touch-down, and cut what lies outside",
             )
-        found.append((times, force))
-    return tuple(found)
+        pairs.append((times, force))
+    return tuple(pairs)
 
 
 def _build_unknowns(
@@ -223,14 +227,17 @@ def _build_unknowns(
 ) -> Unknowns:
     for problem in problems:
         check(problem)
-    known = {f"{region}.{parameter}" for one in problems for region, parameter in one.parameter_names}
+    names = {f"{region}.{parameter}" for problem in problems for region, parameter in problem.parameter_names}
     for name in (*start, *bounds):
-        if name not in known:
-            raise ProblemError(f"no parameter {name!r}", remedy=f"there are {', '.join(sorted(known))}")
+        if name not in names:
+            raise ProblemError(f"no parameter {name!r}", remedy=f"there are {', '.join(sorted(names))}")
     if not start or not bounds.keys() <= start.keys():
         raise ProblemError("a parameter to be fitted has no start", remedy="name each in start")
     values = np.array([float(value) for value in start.values()])
-    limits = [bounds.get(name, (value / WIDEST, value * WIDEST)) for name, value in start.items()]
+    limits = [
+        bounds.get(name, (value / DEFAULT_BOUND_FACTOR, value * DEFAULT_BOUND_FACTOR))
+        for name, value in start.items()
+    ]
     low, high = np.array(limits, dtype=float).T
     return Unknowns(tuple(start), values, low, high)
 

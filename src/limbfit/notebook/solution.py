@@ -90,18 +90,18 @@ def solve(
         is no error: the solution says ``completed = False`` and why.
     """
     announce_compilation()
-    kept: list[State] = []
+    states: list[State] = []
 
     def keep(step: Step) -> None:
         if frames:
-            kept.append(step.state)
+            states.append(step.state)
         if listener is not None:
             listener(step)
 
-    found = simulate(problem, steps or StepControl(), sensitivities=sensitivities, on_step=keep)
+    result = simulate(problem, steps or StepControl(), sensitivities=sensitivities, on_step=keep)
     if frames:
-        kept.insert(0, rest(found.system, problem))
-    return Solution(**{f.name: getattr(found, f.name) for f in fields(Result)}, frames=tuple(kept))
+        states.insert(0, rest(result.system, problem))
+    return Solution(**{f.name: getattr(result, f.name) for f in fields(Result)}, frames=tuple(states))
 
 
 def new_axes() -> Axes:

@@ -11,7 +11,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from ..web.assets import build_inline_script, compute_integrity, read_asset
+from ..web import build_inline_script, compute_integrity, read_asset
 from .drawing.plots import make_standalone
 from .page import Cell, Figure, Page, Row, Table
 from .sections.contents import make_page

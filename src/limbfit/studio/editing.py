@@ -1,11 +1,7 @@
-"""Changes of ``study.toml`` that keep its comments, its order and its layout; labels corrected on the page.
+"""Changes of ``study.toml`` that keep its comments, its order and its layout.
 
 Every change is made on the text, written beside the file, read back as a study, and only then put in its
 place: a change that the study file's own checks refuse leaves the file as it was.
-
-A label map that the stage ``segment`` made is saved over, as 3D Slicer would: the pipeline takes it as
-corrected by hand from then on. Where the study names labels of its own, the corrected map is put
-beside the study file, which then names that one: the given file stays as it is.
 """
 
 from __future__ import annotations
@@ -13,8 +9,6 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +16,9 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT
 
-from ..anatomy.imaging import LabelMap, read_labels, write_labels
 from ..errors import StudyError
-from ..pipeline.engine.storage import compute_file_digest
 from ..study import Record, Study, load_study
-from .folder import StudyFolder
 
-LABELS = "labels.seg.nrrd"
-BESIDE = "corrected.seg.nrrd"
 POSITION_DIGITS = 2  # of a place in mm
 
 
@@ -131,13 +120,13 @@ def set_area(file: Path, name: str, values: Mapping[str, Any]) -> Study:
 
     def change(document: tomlkit.TOMLDocument) -> None:
         rows = _ensure_areas(document)
-        known = next((row for row in rows if str(row.get("name")) == name), None)
-        if known is None:
-            known = tomlkit.table() if isinstance(rows, AoT) else tomlkit.inline_table()
-            _assign(known, {"name": name, **values})
-            rows.append(known)
+        area = next((row for row in rows if str(row.get("name")) == name), None)
+        if area is None:
+            area = tomlkit.table() if isinstance(rows, AoT) else tomlkit.inline_table()
+            _assign(area, {"name": name, **values})
+            rows.append(area)
         else:
-            _assign(known, values)
+            _assign(area, values)
 
     return edit_study(file, change)
 
@@ -210,44 +199,3 @@ def _assign(table: Any, values: Mapping[str, Any]) -> None:
         if isinstance(value, (list, tuple)):
             value = [float(x) if isinstance(x, float) else x for x in value]
         table[key] = value
-
-
-@dataclass(frozen=True)
-class Shown:
-    """The label map on the page: its file and the digest of its content."""
-
-    file: Path
-    digest: str
-
-    def saved_to(self, study: Study) -> str:
-        """Where a correction goes, relative to the study."""
-        return BESIDE if study.segmentation.is_given else f"results/segment/{LABELS}"
-
-
-def find_shown_labels(folder: StudyFolder) -> Shown | None:
-    """The corrected map beside the study where the study names it, else that of the stage ``segment``."""
-    given = folder.load().segmentation.labels
-    file = folder.results / "segment" / LABELS
-    if given == Path(BESIDE) and (folder.folder / BESIDE).is_file():
-        file = folder.folder / BESIDE
-    return Shown(file, compute_file_digest(file)) if file.is_file() else None
-
-
-@lru_cache(maxsize=1)
-def read_shown_labels(shown: Shown) -> LabelMap:
-    """The label map on the page; the last one is kept: a page asks for its names, then for its voxels."""
-    return read_labels(shown.file)
-
-
-def save_labels(folder: StudyFolder, study: Study, shown: Shown, labels: LabelMap) -> None:
-    """Write a corrected map to where the pipeline takes it from, in one piece."""
-    place = folder.folder / shown.saved_to(study)
-    written = place.with_name(f".new-{place.name}")
-    try:
-        write_labels(written, labels)
-        written.replace(place)
-    finally:
-        written.unlink(missing_ok=True)
-    if study.segmentation.is_given and study.segmentation.labels != Path(BESIDE):
-        set_key(folder.file, "segmentation", "contours", None)
-        set_key(folder.file, "segmentation", "labels", BESIDE)

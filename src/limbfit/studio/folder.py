@@ -88,12 +88,12 @@ def read_stored(file: Path) -> dict[str, Any]:
 
 def compute_fingerprint(files: Iterable[Path]) -> str:
     """Changes when one of the files is written, appears or goes."""
-    seen: list[Any] = []
+    states: list[Any] = []
     for file in files:
         try:
             stat = file.stat()
         except OSError:
-            seen.append((file.name, None))
+            states.append((file.name, None))
         else:
-            seen.append((str(file), stat.st_mtime_ns, stat.st_size, stat.st_ino))
-    return hashlib.sha256(repr(seen).encode()).hexdigest()[:16]
+            states.append((str(file), stat.st_mtime_ns, stat.st_size, stat.st_ino))
+    return hashlib.sha256(repr(states).encode()).hexdigest()[:16]

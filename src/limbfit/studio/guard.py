@@ -46,7 +46,7 @@ _HEADERS = {
 
 
 @dataclass(frozen=True)
-class Door:
+class AccessGuard:
     """Where the studio listens and what opens it."""
 
     host: str
@@ -83,8 +83,8 @@ def is_loopback(host: str) -> bool:
 class GuardMiddleware:
     """ASGI middleware that refuses everything that is not the page of this server."""
 
-    def __init__(self, app: ASGIApp, door: Door) -> None:
-        self.app, self.door = app, door
+    def __init__(self, app: ASGIApp, guard: AccessGuard) -> None:
+        self.app, self.guard = app, guard
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
@@ -94,30 +94,30 @@ class GuardMiddleware:
             await send({"type": "websocket.close", "code": 1008})
             return
         headers = Headers(scope=scope)
-        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
         is_entry = scope["path"] == "/" and scope["method"] in _SAFE_METHODS
-        refused = self._refusal(scope, headers, given if is_entry else "")
+        refused = self._refusal(scope, headers, token if is_entry else "")
         if refused:
             await _answer(send, *refused)
             return
         cookie = ""
-        if is_entry and self.door.opens(given):
-            cookie = f"{self.door.cookie}={self.door.token}; Path=/; HttpOnly; SameSite=Strict"
+        if is_entry and self.guard.opens(token):
+            cookie = f"{self.guard.cookie}={self.guard.token}; Path=/; HttpOnly; SameSite=Strict"
         await self.app(scope, _limit_body(receive), _add_headers(send, cookie))
 
-    def _refusal(self, scope: Scope, headers: Headers, given: str) -> tuple[int, str] | None:
+    def _refusal(self, scope: Scope, headers: Headers, token: str) -> tuple[int, str] | None:
         """Status and reason why a request is refused; None where it is not."""
-        if headers.getlist("host") not in [[host] for host in self.door.hosts]:
+        if headers.getlist("host") not in [[host] for host in self.guard.hosts]:
             return 421, "this is not the address that limbfit studio printed"
         origin = headers.get("origin")
-        origins = {f"http://{host}" for host in self.door.hosts}
+        origins = {f"http://{host}" for host in self.guard.hosts}
         is_changing = scope["method"] not in _SAFE_METHODS
         if (origin is None and is_changing) or (origin is not None and origin not in origins):
             return 403, "requests from other pages are refused"
         site = headers.get("sec-fetch-site", "none")
-        if site not in ("same-origin", "none") and (is_changing or not given):
+        if site not in ("same-origin", "none") and (is_changing or not token):
             return 403, "requests from other pages are refused"
-        if not self.door.opens(given) and not self.door.opens(self._cookie(headers)):
+        if not self.guard.opens(token) and not self.guard.opens(self._cookie(headers)):
             return 401, "open the address that limbfit studio printed: it holds the key of this page"
         length = headers.get("content-length", "0")
         if not length.isdigit() or int(length) > LARGEST_BODY:
@@ -130,8 +130,8 @@ class GuardMiddleware:
             jar.load(headers.get("cookie", ""))
         except CookieError:
             return ""
-        found = jar.get(self.door.cookie)
-        return "" if found is None else found.value
+        value = jar.get(self.guard.cookie)
+        return "" if value is None else value.value
 
 
 class TooLargeError(Exception):
@@ -139,13 +139,13 @@ class TooLargeError(Exception):
 
 
 def _limit_body(receive: Receive) -> Receive:
-    seen = 0
+    length = 0
 
     async def bounded() -> Message:
-        nonlocal seen
+        nonlocal length
         message = await receive()
-        seen += len(message.get("body", b""))
-        if seen > LARGEST_BODY:
+        length += len(message.get("body", b""))
+        if length > LARGEST_BODY:
             raise TooLargeError
         return message
 

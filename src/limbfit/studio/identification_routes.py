@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from fastapi import APIRouter
-from pydantic import BaseModel, ConfigDict
 
 from ..pipeline import STAGE_NAMES
 from ..pipeline.engine.storage import read_curves
@@ -16,7 +15,7 @@ from ..results.identification import CalibrationResult
 from ..study import Record
 from .folder import StudyFolder
 from .processes import find_running, find_starting, start_run, stop_run
-from .study_routes import Folder, list_stages
+from .study_routes import Folder, StrictModel, list_stage_states, list_stages
 
 router = APIRouter(prefix="/api/identification")
 LAST_LINES = 40  # of the log
@@ -24,14 +23,12 @@ LOGS_SEARCHED = 5  # for the iterates of a search that was stopped
 _ENDS = {"end": "ended", "failed": "failed", "interrupted": "stopped"}
 
 
-class RunRequest(BaseModel):
+class RunRequest(StrictModel):
     """What to run: up to a stage, and stages that are done anew whether they are done or not."""
-
-    model_config = ConfigDict(extra="forbid")
 
     until: str | None = None
     start: str | None = None
-    force: list[str] = []
+    force: tuple[str, ...] = ()
 
 
 @router.get("")
@@ -40,7 +37,7 @@ def get_identification(folder: Folder) -> dict[str, Any]:
     study = folder.load()
     stages = list_stages(folder)
     logs = _list_logs(folder)
-    done = _answer(folder)
+    answer = _answer(folder)
     run = find_running(folder)
     state = next(row for row in stages if row["stage"] == "calibrate")
     return {
@@ -49,11 +46,11 @@ def get_identification(folder: Folder) -> dict[str, Any]:
         "run": run,
         "starting": find_starting(folder) if run is None else None,
         "last": describe_last_run(folder, run is not None),
-        "iterates": _collect_iterates(folder, logs, state["state"], done),
+        "iterates": _collect_iterates(folder, logs, state["state"], answer),
         "parameters": list(study.law.keys),
         "tissues": list(study.tissues),
         "sites": [{"site": record.name, "fitted": record.fitted} for record in study.recorded],
-        "answer": done and {**done, "state": state["state"]},
+        "answer": answer and {**answer, "state": state["state"]},
     }
 
 
@@ -65,7 +62,7 @@ def get_curves(folder: Folder, name: str) -> dict[str, Any]:
     that are measured and simulated. ``of`` is null where nothing is simulated yet.
     """
     site = folder.load().indentation(name)
-    states = {row["stage"]: row["state"] for row in list_stages(folder)}
+    states = list_stage_states(folder)
     live = _read_newest(folder, site.name) if states["calibrate"] != "done" else None
     stored = folder.results / "predict" / f"{site.name}.csv"
     measured = folder.results / "traces" / f"{site.name}.csv"
@@ -83,9 +80,9 @@ def get_curves(folder: Folder, name: str) -> dict[str, Any]:
 
 
 @router.post("/start")
-def post_start(folder: Folder, wanted: RunRequest) -> dict[str, Any]:
+def post_start(folder: Folder, request: RunRequest) -> dict[str, Any]:
     """Start or resume: ``limbfit run`` with these options, as a process of its own."""
-    return start_run(folder, wanted.until, wanted.start, wanted.force)
+    return start_run(folder, request.until, request.start, request.force)
 
 
 @router.post("/stop")
@@ -95,28 +92,31 @@ def post_stop(folder: Folder) -> dict[str, Any]:
 
 
 def _answer(folder: StudyFolder) -> dict[str, Any] | None:
-    found = CalibrationResult.find(folder.results)
-    if found is None:
+    calibration = CalibrationResult.find(folder.results)
+    if calibration is None:
         return None
-    plain = found.to_plain()
-    known, stages = plain["uncertainty"], plain["stages"]
+    plain = calibration.to_plain()
+    uncertainty, stages = plain["uncertainty"], plain["stages"]
     keys = ("name", "cost", "evaluations", "converged", "reason", "parameters")
     rows = ("parameters", "cost", "error_percent", "error_percent_by_site")
     return {
         "stages": [{key: stage[key] for key in keys} for stage in stages],
-        "parameters": found.parameters,
+        "parameters": calibration.parameters,
         "warnings": plain["warnings"],
         "iterates": [
             {"of": stage["name"], **{key: row[key] for key in rows}}
             for stage in stages
             for row in stage["iterations"]
         ],
-        **{key: known[key] for key in ("intervals_95", "correlation", "verdict", "at_bound", "combinations")},
+        **{
+            key: uncertainty[key]
+            for key in ("intervals_95", "correlation", "verdict", "at_bound", "combinations")
+        },
     }
 
 
 def _collect_iterates(
-    folder: StudyFolder, logs: list[Path], state: str, done: dict[str, Any] | None
+    folder: StudyFolder, logs: list[Path], state: str, answer: dict[str, Any] | None
 ) -> dict[str, Any]:
     """Iterates of the search that goes on or was stopped; else of the stored answer."""
     if state != "done":
@@ -129,7 +129,7 @@ def _collect_iterates(
             facts = [row["facts"] for row in rows if row.get("facts") and row["time"] > finished]
             if facts:
                 return {"of": "log", "rows": facts}
-    return {"of": "answer" if done else "nothing", "rows": done.pop("iterates") if done else []}
+    return {"of": "answer" if answer else "nothing", "rows": answer.pop("iterates") if answer else []}
 
 
 def _list_logs(folder: StudyFolder) -> list[Path]:
@@ -174,7 +174,7 @@ def _read_events(log: Path) -> list[dict[str, Any]]:
 
 def _read_newest(folder: StudyFolder, site: str) -> list[float] | None:
     for runs in sorted(folder.results.glob(".work-calibrate-*/runs")):
-        found = find_newest_simulations(runs, (site,)).get(site)
-        if found is not None and found.completed:
-            return list(map(float, found.force_N))
+        simulation = find_newest_simulations(runs, (site,)).get(site)
+        if simulation is not None and simulation.completed:
+            return list(map(float, simulation.force_N))
     return None

@@ -1,7 +1,14 @@
-"""The view Image: the image and its labels as NIfTI, surfaces for 3-D, and labels corrected by hand."""
+"""The view Image: the image and its labels as NIfTI, surfaces for 3-D, and labels corrected by hand.
+
+A label map that the stage ``segment`` made is saved over, as 3D Slicer would: the pipeline takes it as
+corrected by hand from then on. Where the study names labels of its own, the corrected map is put
+beside the study file, which then names that one: the given file stays as it is.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -11,20 +18,24 @@ import SimpleITK as sitk  # noqa: N813
 from fastapi import APIRouter, Response
 from pydantic import BaseModel, Field
 
-from ..anatomy.imaging import LabelMap, Volume
+from ..anatomy.imaging import LabelMap, Volume, read_labels, write_labels
 from ..anatomy.labels.labelfiles import colour_of
 from ..anatomy.surfaces.surfaces import read_surface
 from ..errors import InputError, RunError
+from ..pipeline.engine.storage import compute_file_digest
 from ..pipeline.limb.inputs import read_plain_image
 from ..study import Study
-from .editing import LABELS, find_shown_labels, read_shown_labels, save_labels
+from .editing import set_key
+from .folder import StudyFolder
 from .processes import find_running
 from .study_routes import Folder
 
 router = APIRouter(prefix="/api/image")
+LABELS = "labels.seg.nrrd"
+BESIDE = "corrected.seg.nrrd"
 # Index axes to the right, to the front and up: the order in which the page counts voxels.
 PAGE_AXES = np.diag([-1.0, -1.0, 1.0])
-MOST_RUNS = 2_000_000
+MAX_RUNS = 2_000_000
 Whole = Annotated[int, Field(ge=0)]
 Positive = Annotated[int, Field(gt=0)]
 Label = Annotated[int, Field(ge=0, le=255)]
@@ -34,7 +45,7 @@ class Painting(BaseModel):
     """Painted voxels as runs ``[first, count, label]`` of the page's order, and on which labels they are."""
 
     base: Annotated[str, Field(min_length=1, max_length=80)]
-    runs: Annotated[list[tuple[Whole, Positive, Label]], Field(min_length=1, max_length=MOST_RUNS)]
+    runs: Annotated[list[tuple[Whole, Positive, Label]], Field(min_length=1, max_length=MAX_RUNS)]
 
 
 @router.get("")
@@ -45,12 +56,12 @@ def get_facts(folder: Folder) -> dict[str, Any]:
         return {"has_image": False}
     surfaces = sorted(file.name for file in (folder.results / "surfaces").glob("*.stl"))
     facts: dict[str, Any] = {"has_image": True, "surfaces": surfaces, "labels": None}
-    shown = find_shown_labels(folder)
+    shown = _find_shown_labels(folder)
     if shown is not None:
-        labels = read_shown_labels(shown)
+        labels = _read_shown_labels(shown)
         facts["labels"] = {
             "base": shown.digest,
-            "saved_to": shown.saved_to(study),
+            "saved_to": shown.name_target(study),
             "names": [
                 {"value": value, "name": name, "colour": _format_hex(colour_of(name, n))}
                 for n, (value, name) in enumerate(sorted(labels.names.items()))
@@ -68,10 +79,10 @@ def get_volume(folder: Folder) -> Response:
 @router.get("/labels")
 def get_labels(folder: Folder) -> Response:
     """The label map as NIfTI, voxels as in `get_volume`; the header ``X-Base`` names its content."""
-    shown = find_shown_labels(folder)
+    shown = _find_shown_labels(folder)
     if shown is None:
         raise FileNotFoundError(LABELS)
-    answer = _respond_nifti(read_shown_labels(shown).align_axes(PAGE_AXES))
+    answer = _respond_nifti(_read_shown_labels(shown).align_axes(PAGE_AXES))
     answer.headers["X-Base"] = shown.digest
     return answer
 
@@ -82,7 +93,7 @@ def post_labels(folder: Folder, painting: Painting) -> dict[str, Any]:
 
     It is refused where the labels are others than those that were painted on, and while a run goes on.
     """
-    study, shown = folder.load(), find_shown_labels(folder)
+    study, shown = folder.load(), _find_shown_labels(folder)
     if shown is None:
         raise FileNotFoundError(LABELS)
     if find_running(folder) is not None:
@@ -91,14 +102,18 @@ def post_labels(folder: Folder, painting: Painting) -> dict[str, Any]:
         raise RunError(
             "the labels have changed since they were opened here; open them again and repeat the changes"
         )
-    labels = read_shown_labels(shown)
-    painted = paint(labels, painting.runs)
+    labels = _read_shown_labels(shown)
+    painted = paint_runs(labels, painting.runs)
     changed = int((painted.array != labels.array).sum())
     if changed:
-        save_labels(folder, study, shown, painted)
-    again = find_shown_labels(folder)
-    assert again is not None
-    return {"changed_voxels": changed, "base": again.digest, "saved_to": again.saved_to(folder.load())}
+        _save_labels(folder, study, shown, painted)
+    saved = _find_shown_labels(folder)
+    assert saved is not None
+    return {
+        "changed_voxels": changed,
+        "base": saved.digest,
+        "saved_to": saved.name_target(folder.load()),
+    }
 
 
 @router.get("/surfaces/{name}")
@@ -112,7 +127,48 @@ def get_surface(folder: Folder, name: str) -> Response:
     return Response(head + rows.tobytes(), media_type="model/stl")
 
 
-def paint(labels: LabelMap, runs: list[tuple[int, int, int]]) -> LabelMap:
+@dataclass(frozen=True)
+class ShownLabels:
+    """The label map on the page: its file and the digest of its content."""
+
+    file: Path
+    digest: str
+
+    def name_target(self, study: Study) -> str:
+        """Where a correction goes, relative to the study."""
+        return BESIDE if study.segmentation.is_given else f"results/segment/{LABELS}"
+
+
+def _find_shown_labels(folder: StudyFolder) -> ShownLabels | None:
+    """The corrected map beside the study where the study names it, else that of the stage ``segment``."""
+    named = folder.load().segmentation.labels
+    file = folder.results / "segment" / LABELS
+    if named == Path(BESIDE) and (folder.folder / BESIDE).is_file():
+        file = folder.folder / BESIDE
+    return ShownLabels(file, compute_file_digest(file)) if file.is_file() else None
+
+
+@lru_cache(maxsize=1)
+def _read_shown_labels(shown: ShownLabels) -> LabelMap:
+    """The label map on the page; the last one is kept: a page asks for its names, then for its voxels."""
+    return read_labels(shown.file)
+
+
+def _save_labels(folder: StudyFolder, study: Study, shown: ShownLabels, labels: LabelMap) -> None:
+    """Write a corrected map to where the pipeline takes it from, in one piece."""
+    place = folder.folder / shown.name_target(study)
+    written = place.with_name(f".new-{place.name}")
+    try:
+        write_labels(written, labels)
+        written.replace(place)
+    finally:
+        written.unlink(missing_ok=True)
+    if study.segmentation.is_given and study.segmentation.labels != Path(BESIDE):
+        set_key(folder.file, "segmentation", "contours", None)
+        set_key(folder.file, "segmentation", "labels", BESIDE)
+
+
+def paint_runs(labels: LabelMap, runs: list[tuple[int, int, int]]) -> LabelMap:
     """The labels with runs of voxels of the page's order set.
 
     Raises

@@ -22,12 +22,12 @@ from .folder import StudyFolder, resolve_inside
 from .study_routes import Folder
 
 router = APIRouter(prefix="/api/live")
-EVERY = 5  # samples: 100 a second
+SAMPLE_STRIDE = 5  # samples: 100 a second
 SILENT_S = 3.0  # blocks come every 50 ms: a record that has not grown for so long is not being written
 RECENT_S = 600.0  # a session that ended longer ago is not shown by itself
 _STAMP = re.compile(r"[0-9]{8}T[0-9]{6}\.[0-9]{3}")
-_WAITING = 1 << 16  # bytes: more than is written between two requests
-_MOST_VERDICT = 1 << 20
+_PENDING = 1 << 16  # bytes: more than is written between two requests
+_MAX_VERDICT = 1 << 20
 
 
 class StoredCheck(BaseModel):
@@ -50,10 +50,10 @@ class StoredVerdict(BaseModel):
 @router.get("")
 def get_session(folder: Folder) -> dict[str, Any]:
     """The newest session that is being recorded, else the newest that ended lately; null if none."""
-    found = [(age, file.parent) for age, file in _list_records(folder) if age < RECENT_S]
-    if not found:
+    recent = [(age, file.parent) for age, file in _list_records(folder) if age < RECENT_S]
+    if not recent:
         return {"session": None}
-    _, newest = max(found, key=lambda one: (one[0] < SILENT_S, one[1].name))
+    _, newest = max(recent, key=lambda session: (session[0] < SILENT_S, session[1].name))
     return {"session": {"site": newest.parent.name, "time": newest.name}}
 
 
@@ -68,12 +68,12 @@ def get_part(
     """
     file = resolve_inside(folder.folder, ACQUIRED, site, stamp, RECORD)
     age = _compute_age(file)
-    part, following = follow_recording(file, offset, every=EVERY)
+    part, following = follow_recording(file, offset, every=SAMPLE_STRIDE)
     return {
         "site": site,
         "time": stamp,
         "offset": following,
-        "more": file.stat().st_size - following > _WAITING,
+        "more": file.stat().st_size - following > _PENDING,
         "age_s": age,
         "silent": age > SILENT_S,
         **_read(part, file, first=offset == 0),
@@ -83,11 +83,11 @@ def get_part(
 
 def _list_records(folder: StudyFolder) -> list[tuple[float, Path]]:
     """Records that were begun, with their ages in s."""
-    found = []
+    records = []
     for file in (folder.folder / ACQUIRED).glob(f"*/*/{RECORD}"):
         if _STAMP.fullmatch(file.parent.name) and file.is_file():
-            found.append((_compute_age(file), file))
-    return found
+            records.append((_compute_age(file), file))
+    return records
 
 
 def _compute_age(file: Path) -> float:
@@ -104,7 +104,7 @@ def _read(part: Recording, file: Path, first: bool) -> dict[str, Any]:
             raise ValueError
     except (KeyError, TypeError, ValueError, IndexError, OverflowError):
         raise TraceError("its head or its events lack what a session has", file=file) from None
-    ended = [one for one in phases if one["phase"] in FINAL]
+    ended = [phase for phase in phases if phase["phase"] in FINAL]
     return {
         "head": {"pin": pin + 1, "force_limit_N": limit_N, "ramps": ramps} if first else None,
         "phases": phases,
@@ -130,7 +130,7 @@ def _read_verdict(file: Path) -> dict[str, Any] | None:
     if not file.is_file():
         return None
     try:
-        if file.stat().st_size > _MOST_VERDICT:
+        if file.stat().st_size > _MAX_VERDICT:
             raise ValueError
         return StoredVerdict.model_validate_json(file.read_bytes()).model_dump()
     except (ValidationError, ValueError):

@@ -1,28 +1,40 @@
-"""The routes of the view Model: surfaces, meshes and sites, and the changes of sites in the study file."""
+"""The view Model: surfaces, meshes and sites of the limb, and changes of sites in the study file."""
 
 from __future__ import annotations
 
+import tomllib
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from fastapi import APIRouter, Response
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from . import scene
+from ..anatomy.sites.sites import project_to_skin
+from ..anatomy.surfaces.surfaces import Anatomy, Surface, load_anatomy, read_surface
+from ..errors import InputError, SiteError
+from ..mesh import read_vtu
+from ..pipeline.engine.storage import compute_digest
+from ..pipeline.limb.sites import place_site
+from ..pipeline.limb.surfaces import read_given_anatomy
+from ..results.limb import PlacedSite, SitesResult
+from ..study import Site, Study
+from ..web.shapes import Shell, build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape
 from .editing import add_site, remove_site, set_site
-from .study_routes import Folder
+from .folder import StudyFolder, compute_fingerprint, read_stored
+from .study_routes import Folder, StrictModel, respond_block
 
 router = APIRouter(prefix="/api/model")
+SKIN = "skin"
 Coordinate = Annotated[float, Field(allow_inf_nan=False, ge=-1e5, le=1e5)]
 Place = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
 Text = Annotated[str, Field(max_length=200)]
 
 
-class StrictModel(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
 class NewSite(StrictModel):
-    """A site that a click places; without a record it is one to be simulated, to ``depth_mm``."""
+    """A site that a click places; it has no record and is simulated to ``depth_mm``."""
 
     name: Text
     position: Place
@@ -39,41 +51,67 @@ class SiteChange(StrictModel):
     position: Place | None = None
 
 
-def _respond_block(content: bytes) -> Response:
-    return Response(content, media_type="application/octet-stream")
-
-
 @router.get("/scene")
 def get_scene(folder: Folder) -> dict[str, Any]:
-    """Surfaces, sites and meshes as they stand."""
-    return scene.describe_scene(folder)
+    """Surfaces by name, the patient's sides, every site as the study file has it now, and what is meshed.
+
+    A site without a place (not matched to a marker yet, or off the skin) has ``problem`` in words. Surfaces
+    and meshes come with fingerprints, so that the page reads again only what was made anew.
+    """
+    study = folder.load()
+    anatomy = read_anatomy(folder, study)
+    stored = SitesResult.find(folder.results)
+    placed = {row.site: row for row in stored.sites} if stored else {}
+    meshes = {site.name: folder.results / "mesh" / f"{site.name}.vtu" for site in study.sites}
+    return {
+        "surfaces": {} if anatomy is None else _mark_each_surface(folder, study, anatomy),
+        "frame": build_patient_frame(None if anatomy is None else anatomy.cut_normal).tolist(),
+        "sites": [_describe_site(site, study, anatomy, placed.get(site.name)) for site in study.sites],
+        "meshes": {name: compute_fingerprint([file]) for name, file in meshes.items() if file.is_file()},
+        "layers": [layer.name for layer in study.geometry.model_layers],
+        "quality": read_stored(folder.results / "mesh" / "mesh.json").get("sites", {}),
+    }
 
 
 @router.get("/surface/{name}")
 def get_surface(folder: Folder, name: str) -> Response:
-    """A surface as a block of arrays (see limbfit/web/arrays.py)."""
-    return _respond_block(scene.build_surface_block(folder, name))
+    """A surface as a block of arrays: ``points``, ``faces``.
+
+    Raises
+    ------
+    InputError
+        For a name that the model does not have.
+    """
+    surface = _read_one_surface(folder, name)
+    if surface is None:
+        raise InputError("the model has no such surface", remedy="run the stages until surfaces")
+    return _respond_shell(Shell(surface.points.astype(np.float32), surface.faces.astype(np.uint32)))
 
 
 @router.get("/layer/{site}/{layer}")
 def get_layer(folder: Folder, site: str, layer: str) -> Response:
-    """The inner face of a layer, of a site's mesh."""
-    return _respond_block(scene.build_layer_block(folder, site, layer))
+    """The inner face of a layer in the mesh of a site, as a block of arrays: ``points``, ``faces``."""
+    mesh = read_vtu(folder.artefact("mesh", f"{site}.vtu"))
+    if layer not in mesh.region_names[:-1]:
+        raise InputError("the mesh has no such layer", remedy="make the meshes again")
+    return _respond_shell(extract_interface(to_volume_shape(mesh), mesh.region_names.index(layer)))
 
 
 @router.get("/mesh/{site}")
 def get_mesh(folder: Folder, site: str) -> Response:
-    """The mesh of a site with the quality of its cells."""
-    return _respond_block(scene.mesh_block(folder, site))
+    """A site's mesh as arrays of `VolumeShape`, the quality of each cell, and the names of regions."""
+    mesh = read_vtu(folder.artefact("mesh", f"{site}.vtu"))
+    facts = {"regions": list(mesh.region_names), "element": mesh.cell_type, "cells": len(mesh.cells)}
+    return respond_block({**to_volume_shape(mesh).arrays(), **compute_cell_quality(mesh)}, facts)
 
 
 @router.post("/sites")
 def post_site(folder: Folder, site: NewSite) -> dict[str, Any]:
     """Add a site on the skin; the scene as it is afterwards."""
-    position = scene.project_to_skin_of_study(folder, site.position)
-    more = {"region": site.region or None, "depth_mm": site.depth_mm}
-    add_site(folder.file, site.name, position, {key: value for key, value in more.items() if value})
-    return scene.describe_scene(folder)
+    position = project_to_skin_of_study(folder, site.position)
+    region = {"region": site.region} if site.region else {}
+    add_site(folder.file, site.name, position, {**region, "depth_mm": site.depth_mm})
+    return get_scene(folder)
 
 
 @router.post("/sites/{name}")
@@ -81,15 +119,134 @@ def post_change(folder: Folder, name: str, change: SiteChange) -> dict[str, Any]
     """Move, rename or describe a site, or switch fitted; the scene as it is afterwards."""
     values: dict[str, Any] = change.model_dump(exclude_none=True)
     if change.position is not None:
-        scene.check_movable(folder.load(), name)
-        values["position"] = scene.project_to_skin_of_study(folder, change.position)
+        _check_movable(folder.load(), name)
+        values["position"] = project_to_skin_of_study(folder, change.position)
     if values:
         set_site(folder.file, name, values)
-    return scene.describe_scene(folder)
+    return get_scene(folder)
 
 
 @router.post("/sites/{name}/remove")
 def post_removal(folder: Folder, name: str) -> dict[str, Any]:
     """Take a site out of the study file; its record stays."""
     remove_site(folder.file, name)
-    return scene.describe_scene(folder)
+    return get_scene(folder)
+
+
+def read_anatomy(folder: StudyFolder, study: Study) -> Anatomy | None:
+    """The stored surfaces, else those that the study gives; None where the image is not segmented yet."""
+    return _read_marked_anatomy(folder, mark_surfaces(folder, study))
+
+
+def mark_surfaces(folder: StudyFolder, study: Study) -> str:
+    """A text that changes with the files of the limb's surfaces and with what the study says of them."""
+    given, geometry = study.surfaces, study.geometry
+    files = [] if given is None else [given.skin, *given.bones.values()]
+    files += [region.surface for region in geometry.regions if region.surface is not None]
+    stored = sorted((folder.results / "surfaces").glob("*"))
+    settings = compute_digest(*(table and table.model_dump(mode="json") for table in (given, geometry)))
+    return f"{compute_fingerprint([*stored, *map(study.path, files)])} {settings}"
+
+
+@lru_cache(maxsize=1)
+def _read_marked_anatomy(folder: StudyFolder, mark: str) -> Anatomy | None:
+    """The last anatomy is kept, by its ``mark``: to mend and check given surfaces can take seconds."""
+    study = folder.load()
+    if _has_made_surfaces(folder):
+        return load_anatomy(folder.results / "surfaces")
+    return None if study.surfaces is None else read_given_anatomy(study)[0]
+
+
+def project_to_skin_of_study(folder: StudyFolder, position: Sequence[float]) -> list[float]:
+    """The point of the skin nearest to a place (LPS, mm).
+
+    Raises
+    ------
+    InputError
+        Where there is no skin, or the place is far off it.
+    """
+    anatomy = read_anatomy(folder, folder.load())
+    if anatomy is None:
+        raise InputError("there is no skin yet to place a site on", remedy="run the stages until surfaces")
+    point, _ = project_to_skin(anatomy, position)
+    return [float(value) for value in point]
+
+
+def _mark_each_surface(folder: StudyFolder, study: Study, anatomy: Anatomy) -> dict[str, str]:
+    if _has_made_surfaces(folder):
+        files = {name: _find_surface_file(folder, name) for name in (SKIN, *anatomy.bones)}
+    else:
+        assert study.surfaces is not None
+        files = {SKIN: study.surfaces.skin, **study.surfaces.bones}
+        files = {name: study.path(file) for name, file in files.items()}
+    return {name: compute_fingerprint([file]) for name, file in files.items()}
+
+
+def _has_made_surfaces(folder: StudyFolder) -> bool:
+    return (folder.results / "surfaces" / "surfaces.json").is_file()
+
+
+def _find_surface_file(folder: StudyFolder, name: str) -> Path:
+    return folder.artefact("surfaces", f"{name}.stl" if name == SKIN else f"bone-{name}.stl")
+
+
+def _describe_site(
+    site: Site, study: Study, anatomy: Anatomy | None, placed: PlacedSite | None
+) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "name": site.name,
+        "region": site.region,
+        "fitted": site.fitted,
+        "has_trace": bool(study.records_at(site)),
+        "records": [record.name for record in study.records_at(site)],
+        "depth_mm": site.depth_mm,
+        "given": "position" if site.position is not None else "near",
+        "position_mm": None,
+        "axis": None,
+        "problem": None,
+    }
+    try:
+        if site.position is not None:
+            placed = None if anatomy is None else place_site(site, study, anatomy, None)
+        if placed is None:
+            row["problem"] = "not on the skin yet: run the stages until sites"
+        else:
+            row |= placed.model_dump(include={"position_mm", "axis", "off_skin_mm", "marker"}, mode="json")
+    except SiteError as error:
+        row["problem"] = error.what
+    return row
+
+
+def _read_one_surface(folder: StudyFolder, name: str) -> Surface | None:
+    """One surface; where surfaces are stored, only its file is read."""
+    if _has_made_surfaces(folder):
+        bones = read_stored(folder.results / "surfaces" / "surfaces.json").get("bones", ())
+        return read_surface(_find_surface_file(folder, name)) if name == SKIN or name in bones else None
+    anatomy = read_anatomy(folder, folder.load())
+    return None if anatomy is None else {SKIN: anatomy.skin, **anatomy.bones}.get(name)
+
+
+def _respond_shell(shell: Shell) -> Response:
+    return respond_block({"points": shell.points, "faces": shell.faces})
+
+
+def _check_movable(study: Study, name: str) -> None:
+    """Refuse to move a site that the markups file places, and an unknown one.
+
+    Raises
+    ------
+    InputError
+        For such a site.
+    """
+    site = study.site(name)
+    if study.markups is None:
+        return
+    for row in tomllib.loads(study.file.read_text(encoding="utf-8")).get("sites", []):
+        if str(row.get("name")) == site.name and ("position" in row or "near" in row):
+            return
+    raise InputError(
+        f"site {name} has its place from the markups file {study.markups.file}",
+        file=study.file,
+        place="markups",
+        remedy="move its control point in 3D Slicer",
+    )

@@ -15,10 +15,10 @@ from ..errors import InputError
 from ..mesh import read_grid, read_vtu
 from ..phases import find_loading_end, find_phases
 from ..pipeline.engine.storage import read_curves
-from ..web.arrays import pack
 from ..web.shapes import to_volume_shape
 from .folder import StudyFolder, compute_fingerprint, read_stored
 
+Block = tuple[dict[str, NDArray[Any]], dict[str, Any]]  # arrays and facts, see `limbfit.web.arrays`
 _FRAME = re.compile(r'<DataSet timestep="([^"]+)" part="0" file="[^"/]+/(step-\d{4,}\.vtu)"/>')
 
 
@@ -55,12 +55,12 @@ def list_sources(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
     Each has ``source``, ``title``, ``times_s``, ``deepest`` (which of them), ``parameters_from``, and
     ``mark``, which other fields change.
     """
-    found = []
+    sources = []
     moments = _list_moments(folder, site)
     if moments:
         times_s = [time for time, _ in moments]
         origin = read_stored(folder.results / "simulate" / f"{site}.json").get("parameters_from")
-        found.append(
+        sources.append(
             {
                 "source": "simulate",
                 "title": "every step, simulated",
@@ -72,7 +72,7 @@ def list_sources(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
         )
     predicted = folder.results / "predict" / f"{site}.vtu"
     if predicted.is_file():
-        found.append(
+        sources.append(
             {
                 "source": "predict",
                 "title": "the deepest point, predicted",
@@ -82,7 +82,7 @@ def list_sources(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
                 "mark": compute_fingerprint([predicted]),
             }
         )
-    return found
+    return sources
 
 
 def _list_moments(folder: StudyFolder, site: str) -> list[tuple[float, Path]]:
@@ -105,8 +105,8 @@ def _find_deepest(folder: StudyFolder, site: str, times_s: list[float]) -> int:
 
 def _find_peak_time(curve: Path) -> float:
     columns = read_curves(curve)
-    stated = columns["displacement_mm"] if "displacement_mm" in columns else columns["force_N"]
-    loading = find_loading_end(find_phases(columns["time_s"], stated))
+    motion = columns["displacement_mm"] if "displacement_mm" in columns else columns["force_N"]
+    loading = find_loading_end(find_phases(columns["time_s"], motion))
     return 0.0 if loading is None else loading.end_s
 
 
@@ -122,8 +122,8 @@ def _find_file(folder: StudyFolder, source: str, site: str, moment: int) -> Path
     return folder.artefact("simulate", site, moments[moment][1].name)
 
 
-def mesh_block(folder: StudyFolder, source: str, site: str) -> bytes:
-    """The mesh that the fields of a site stand on: arrays of `Volume`; facts: names of regions, fields."""
+def read_mesh(folder: StudyFolder, source: str, site: str) -> Block:
+    """The mesh of a site's fields: the arrays of `VolumeShape`; facts: names of regions, stored fields."""
     file = _find_file(folder, source, site, 0)
     mesh = read_vtu(file)
     arrays = read_arrays(file)
@@ -133,10 +133,10 @@ def mesh_block(folder: StudyFolder, source: str, site: str) -> bytes:
         if field.array in arrays
     ]
     facts = {"regions": list(mesh.region_names), "fields": fields, "cells": len(mesh.cells)}
-    return pack(to_volume_shape(mesh).arrays(), facts)
+    return to_volume_shape(mesh).arrays(), facts
 
 
-def build_moment_block(folder: StudyFolder, source: str, site: str, moment: int, name: str) -> bytes:
+def read_moment(folder: StudyFolder, source: str, site: str, moment: int, name: str) -> Block:
     """``moved`` (n, 3) of the drawn nodes in mm, and ``values`` of a field on cells or drawn nodes.
 
     Raises
@@ -155,22 +155,20 @@ def build_moment_block(folder: StudyFolder, source: str, site: str, moment: int,
     values = arrays[field.array]
     if values.ndim == 2:
         values = np.linalg.norm(values, axis=1) if field.component is None else values[:, field.component]
-    return pack(
-        {
-            "moved": arrays["displacement_mm"][nodes].astype(np.float32),
-            "values": (values if field.on_cells else values[nodes]).astype(np.float32),
-        },
-        {"on": "cells" if field.on_cells else "nodes"},
-    )
+    drawn = {
+        "moved": arrays["displacement_mm"][nodes].astype(np.float32),
+        "values": (values if field.on_cells else values[nodes]).astype(np.float32),
+    }
+    return drawn, {"on": "cells" if field.on_cells else "nodes"}
 
 
 def read_arrays(file: Path) -> dict[str, NDArray[Any]]:
     """The point and cell arrays of a VTU file, and its ``cells`` (m, k)."""
     grid = read_grid(file)
-    found = {}
+    arrays = {}
     for data in (grid.GetPointData(), grid.GetCellData()):
         for i in range(data.GetNumberOfArrays()):
-            found[data.GetArrayName(i)] = vtk_to_numpy(data.GetArray(i))
+            arrays[data.GetArrayName(i)] = vtk_to_numpy(data.GetArray(i))
     connectivity = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
-    found["cells"] = connectivity.reshape(grid.GetNumberOfCells(), -1)
-    return found
+    arrays["cells"] = connectivity.reshape(grid.GetNumberOfCells(), -1)
+    return arrays

@@ -1,36 +1,71 @@
-"""The routes of the view Results: fields to play, tables, runs to compare, files to keep."""
+"""The view Results: parameters and errors, fields to play, runs kept for comparison, files to download."""
 
 from __future__ import annotations
 
+import re
+import shutil
+import tempfile
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Response
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from . import outcome, playback, simulating
-from .study_routes import Folder
+from ..errors import InputError, RunError
+from ..pipeline import export_study
+from ..pipeline.engine.storage import read_curves, write_json
+from ..study import Record
+from . import playback, processes
+from .folder import StudyFolder, read_stored
+from .study_routes import Folder, StrictModel, list_stage_states, respond_block
 
 router = APIRouter(prefix="/api/results")
+KEPT, ABOUT = "kept", "kept.json"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,39}")
+_FILES = ("calibrate/calibration.json", "predict/predict.json")
+_COLUMNS = (
+    "error_percent",
+    "error_one_material_percent",
+    "peak_force_N",
+    "penetration_mm",
+    "completed",
+    "warnings",
+)
 
 
-class Name(BaseModel):
-    """What a run is kept as."""
+class KeptRunName(StrictModel):
+    """The name under which a run is kept."""
 
-    model_config = ConfigDict(extra="forbid")
     name: Annotated[str, Field(min_length=1, max_length=40)]
-
-
-def _respond_block(content: bytes) -> Response:
-    return Response(content, media_type="application/octet-stream")
 
 
 @router.get("")
 def get_outcome(folder: Folder, kept: str | None = None) -> dict[str, Any]:
-    """Parameters and errors of this run or of a kept one; kept runs; files to keep."""
+    """Parameters with intervals and verdicts, errors by site and their means, what is outside the records.
+
+    ``kept`` is the name of a kept run; by default the study's own results are read, and tables are empty
+    where nothing is stored. The names of kept runs and the files to download come with them.
+    """
+    place = folder.results if kept is None else _find_kept_run(folder, kept)
+    calibration, predicted = (read_stored(place / name) for name in _FILES)
+    uncertainty = calibration.get("uncertainty") or {}
     return {
-        **outcome.collect_outcome(folder, kept),
-        "kept": outcome.list_kept_runs(folder),
-        "downloads": outcome.list_downloads(folder),
+        "stages": [
+            {key: stage.get(key) for key in ("name", "parameters", "converged", "reason")}
+            | {"iterates": len(stage.get("iterations") or ())}
+            for stage in calibration.get("stages", [])
+        ],
+        "intervals_95": uncertainty.get("intervals_95") or {},
+        "verdict": uncertainty.get("verdict") or {},
+        "sites": [
+            {key: row.get(key) for key in ("site", "record", "region", "fitted", *_COLUMNS)}
+            for row in predicted.get("sites", [])
+        ],
+        "outside": predicted.get("outside_text", []),
+        "means": {key: value for key, value in predicted.items() if key.endswith("_percent")},
+        "kept": _list_kept_runs(folder),
+        "downloads": _list_downloads(folder),
     }
 
 
@@ -39,56 +74,157 @@ def get_site(folder: Folder, site: str) -> dict[str, Any]:
     """What can be shown of a site, its files, and how a simulation of it goes."""
     return {
         "sources": playback.list_sources(folder, folder.load().indentation(site).name),
-        "downloads": outcome.list_site_downloads(folder, site),
-        "simulating": simulating.find_simulating(folder),
-        "failure": simulating.read_failure(folder, site),
+        "downloads": _list_site_downloads(folder, site),
+        "simulating": processes.find_simulating(folder),
+        "failure": processes.read_failure(folder, site),
     }
 
 
 @router.get("/curves/{site}")
 def get_curves(folder: Folder, site: str, kept: str | None = None) -> dict[str, list[float]]:
-    """Predicted forces of a site, of this run or of a kept one."""
-    return outcome.read_site_curves(folder, site, kept)
+    """Columns of the predicted forces of a site (s, mm, N), of this run or of a kept one.
+
+    Raises
+    ------
+    FileNotFoundError
+        Where none are stored.
+    """
+    if kept is not None:
+        _find_kept_run(folder, kept)
+    parts = ("predict",) if kept is None else (KEPT, kept)
+    curves = read_curves(folder.artefact(*parts, f"{site}.csv"))
+    return {name: values.tolist() for name, values in curves.items()}
 
 
 @router.get("/mesh/{source}/{site}")
 def get_mesh(folder: Folder, source: str, site: str) -> Response:
     """The mesh that the fields of a site stand on, as a block of arrays."""
-    return _respond_block(playback.mesh_block(folder, source, site))
+    return respond_block(*playback.read_mesh(folder, source, site))
 
 
 @router.get("/moment/{source}/{site}/{moment}/{field}")
 def get_moment(folder: Folder, source: str, site: str, moment: int, field: str) -> Response:
     """Displacements and a field at one moment, as a block of arrays."""
-    return _respond_block(playback.build_moment_block(folder, source, site, moment, field))
+    return respond_block(*playback.read_moment(folder, source, site, moment, field))
 
 
 @router.post("/simulate/{site}")
 def post_simulation(folder: Folder, site: str) -> dict[str, Any]:
     """Start ``limbfit simulate --animation`` for a site."""
-    return simulating.start_simulation(folder, site)
+    return processes.start_simulation(folder, site)
 
 
 @router.post("/stop")
 def post_stop(folder: Folder) -> dict[str, Any]:
     """Interrupt the simulation."""
-    return simulating.stop_simulation(folder)
+    return processes.stop_simulation(folder)
 
 
 @router.post("/feb/{site}")
 def post_feb(folder: Folder, site: str) -> dict[str, str]:
-    """Write the FEBio input of a site."""
-    return outcome.write_feb_of(folder, site)
+    """Write a site as an input of FEBio; the path of the file below ``/api/files``.
+
+    Raises
+    ------
+    RunError
+        Where meshes are missing or stale: only a run makes them.
+    """
+    study = folder.load()
+    name = study.indentation(site).name
+    if list_stage_states(folder).get("mesh") != "done":
+        raise RunError("the meshes are not up to date; run the study until mesh first")
+    export_study(study, "feb", site=name)
+    return {"path": f"export/{name}.feb"}
 
 
 @router.post("/keep")
-def post_kept(folder: Folder, run: Name) -> dict[str, Any]:
-    """Keep this run for comparison."""
-    return outcome.keep_run(folder, run.name)
+def post_kept(folder: Folder, run: KeptRunName) -> dict[str, Any]:
+    """Copy what the page shows of this run to ``results/kept/<name>``, to compare later runs with it.
+
+    Raises
+    ------
+    InputError
+        For a name that is no plain one, or is taken.
+    RunError
+        Where the study has no finished prediction.
+    """
+    name = run.name
+    if not _NAME.fullmatch(name):
+        raise InputError(
+            "not a name to keep a run under", remedy="use letters, digits, spaces, '-', '_', '.'"
+        )
+    place = folder.results / KEPT / name
+    if place.exists():
+        raise InputError(f"a run is already kept as {name!r}", remedy="choose another name")
+    if not (folder.results / _FILES[1]).is_file():
+        raise RunError("there is no finished prediction to keep; run the study first")
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".", dir=place.parent) as work:
+        draft = Path(work) / "run"
+        for file in (*_FILES, *(f"predict/{csv.name}" for csv in (folder.results / "predict").glob("*.csv"))):
+            source = folder.results / file
+            target = draft / (file if file in _FILES else source.name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if source.is_file():
+                shutil.copyfile(source, target)
+        write_json(draft / ABOUT, {"since": datetime.now(UTC).isoformat(timespec="seconds")})
+        draft.rename(place)
+    return {"name": name}
 
 
 @router.post("/drop")
-def post_drop(folder: Folder, run: Name) -> dict[str, Any]:
+def post_drop(folder: Folder, run: KeptRunName) -> dict[str, Any]:
     """Remove a kept run."""
-    outcome.drop_run(folder, run.name)
+    shutil.rmtree(_find_kept_run(folder, run.name))
     return {}
+
+
+def _list_kept_runs(folder: StudyFolder) -> list[dict[str, Any]]:
+    """``name`` and ``since`` of the runs that were kept, newest first."""
+    runs = [
+        {"name": file.parent.name, "since": read_stored(file).get("since", "")}
+        for file in (folder.results / KEPT).glob(f"*/{ABOUT}")
+    ]
+    return sorted(runs, key=lambda row: str(row["since"]), reverse=True)
+
+
+def _find_kept_run(folder: StudyFolder, name: str) -> Path:
+    """The folder of a kept run.
+
+    Raises
+    ------
+    FileNotFoundError
+        Where none has this name.
+    """
+    if not _NAME.fullmatch(name) or not (folder.results / KEPT / name / ABOUT).is_file():
+        raise FileNotFoundError("the kept run")
+    return folder.artefact(KEPT, name, ABOUT).parent
+
+
+def _list_downloads(folder: StudyFolder) -> list[dict[str, str]]:
+    """``title`` and ``path`` below ``/api/files`` of the report and its tables."""
+    files = [("report/report.html", "report (HTML)"), ("report/methods.md", "methods (Markdown)")]
+    for file in sorted((folder.results / "report" / "tables").glob("*.csv")):
+        files.append((f"report/tables/{file.name}", f"table {file.stem} (CSV)"))
+    return _select_stored(folder, files)
+
+
+def _list_site_downloads(folder: StudyFolder, site: str) -> list[dict[str, str]]:
+    """The same for one site: curves, fields, the FEBio input where it was written."""
+    indentation = folder.load().indentation(site)
+    name = indentation.name
+    place = indentation.site.name if isinstance(indentation, Record) else name
+    files = [
+        (f"predict/{name}.csv", "predicted curves (CSV)"),
+        (f"traces/{name}.csv", "regularised record (CSV)"),
+        (f"predict/{name}.vtu", "fields at the deepest point (VTU)"),
+        (f"simulate/{name}.csv", "simulated curve (CSV)"),
+        (f"simulate/{name}.vtu", "simulated fields (VTU)"),
+        (f"mesh/{place}.vtu", "mesh (VTU)"),
+        (f"export/{name}.feb", "FEBio input (.feb)"),
+    ]
+    return _select_stored(folder, files)
+
+
+def _select_stored(folder: StudyFolder, files: list[tuple[str, str]]) -> list[dict[str, str]]:
+    return [{"title": title, "path": path} for path, title in files if (folder.results / path).is_file()]

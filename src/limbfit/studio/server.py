@@ -1,4 +1,4 @@
-"""The studio's server: a socket on this machine only, and a browser that opens its page."""
+"""The studio's server: a socket on this machine, the application behind it, a browser that opens its page."""
 
 from __future__ import annotations
 
@@ -7,15 +7,31 @@ import os
 import socket
 import webbrowser
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from threading import Timer
+from typing import Any
 
 import uvicorn
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import FileResponse, JSONResponse
+from fastapi.staticfiles import StaticFiles
+from starlette.exceptions import HTTPException
 
-from ..errors import InputError, RunError
-from .app import create_app
+from ..errors import InputError, LimbfitError, RunError
+from ..web import STATIC as SHARED
 from .folder import StudyFolder
-from .guard import Door, is_loopback
+from .guard import AccessGuard, GuardMiddleware, TooLargeError, is_loopback
+
+STATIC = Path(__file__).parent / "static"
+# Of every view: the modules beside this one whose names end in _routes.
+ROUTES = tuple(
+    import_module(f".{module.name}", __package__)
+    for module in iter_modules([str(Path(__file__).parent)])
+    if module.name.endswith("_routes")
+)
 
 
 def serve(
@@ -55,10 +71,10 @@ def serve(
     if host in ("0.0.0.0", "::", ""):
         raise InputError("name one address of this machine to listen on, not all of them", place="--host")
     listener = _open_socket(host, port)
-    door = Door(host, listener.getsockname()[1])
-    tell(door.address)
+    guard = AccessGuard(host, listener.getsockname()[1])
+    tell(guard.address)
     config = uvicorn.Config(
-        create_app(folder, door),
+        create_app(folder, guard),
         log_level=logging.WARNING if os.environ.get("LIMBFIT_TRACEBACK") else logging.CRITICAL,
         access_log=False,  # addresses hold the token
         server_header=False,
@@ -67,7 +83,7 @@ def serve(
         ws="none",
     )
     if browser:
-        opener = Timer(0.5, webbrowser.open, (door.address,))
+        opener = Timer(0.5, webbrowser.open, (guard.address,))
         opener.daemon = True
         opener.start()
     with listener:
@@ -92,3 +108,54 @@ def _open_socket(host: str, port: int) -> socket.socket:
         raise RunError(f"cannot listen on {host} port {port}: {reason}; give another --port") from None
     listener.set_inheritable(False)
     return listener
+
+
+def create_app(folder: StudyFolder, guard: AccessGuard) -> FastAPI:
+    """The application over one study, protected by its guard."""
+    app = FastAPI(title="limbfit studio", docs_url=None, redoc_url=None, openapi_url=None)
+    app.state.folder = folder
+    for routes in ROUTES:
+        app.include_router(routes.router)
+    for kind, status in ((InputError, 422), (LimbfitError, 409), (FileNotFoundError, 404)):
+        app.add_exception_handler(kind, _to_json(status))
+    app.add_exception_handler(TooLargeError, _to_json(413))
+    app.add_exception_handler(HTTPException, _respond_refused)
+    app.add_exception_handler(Exception, _respond_internal)
+    app.add_exception_handler(RequestValidationError, _respond_unusable)
+    app.add_api_route("/", _page, include_in_schema=False)
+    app.mount("/static", StaticFiles(directory=STATIC))
+    app.mount("/web", StaticFiles(directory=SHARED))
+    app.add_middleware(GuardMiddleware, guard=guard)
+    return app
+
+
+def _page() -> FileResponse:
+    return FileResponse(STATIC / "index.html")
+
+
+def _to_json(status: int) -> Any:
+    def handler(request: Request, error: Exception) -> JSONResponse:
+        text = str(error) or "the request is too large"
+        if isinstance(error, FileNotFoundError):
+            text = f"not there (yet): {error.args[0] if len(error.args) == 1 else 'a file of the study'}"
+        return JSONResponse({"error": text}, status)
+
+    return handler
+
+
+def _respond_refused(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    return JSONResponse({"error": error.detail}, error.status_code)
+
+
+def _respond_internal(request: Request, error: Exception) -> JSONResponse:
+    name = type(error).__name__
+    text = f"internal error: {name}; set LIMBFIT_TRACEBACK=1 to see where, and please report it"
+    return JSONResponse({"error": text}, 500)
+
+
+def _respond_unusable(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"][1:])
+    return JSONResponse({"error": f"{place}: {first['msg']}" if place else first["msg"]}, 422)

@@ -21,26 +21,24 @@ from ..socket import Socket
 from ..socket.rays import LimbProfile, compute_profile
 from ..socket.trim import Trim, find_brim, trim_limb, wrap_trimline
 from ..study import Study
-from ..web.arrays import pack
 from ..web.shapes import build_patient_frame, to_volume_shape
 from .editing import remove_area, set_area, set_trimline
 from .folder import StudyFolder, compute_fingerprint, read_stored
 from .identification_routes import describe_last_run
-from .model_routes import Place, StrictModel, Text
+from .model_routes import Place, Text, mark_surfaces, project_to_skin_of_study, read_anatomy
 from .playback import read_arrays
 from .processes import find_running, find_starting, start_socket
-from .scene import mark_surfaces, project_to_skin_of_study, read_anatomy
-from .study_routes import Folder
+from .study_routes import Folder, StrictModel, respond_block
 
 router = APIRouter(prefix="/api/socket")
 SOCKET = "socket"  # the run of `limbfit socket`; others are designs, by their names
-NONE_YET = "there is no limb yet to draw a socket around: run the stages until surfaces"
+NO_LIMB_YET = "there is no limb yet to draw a socket around: run the stages until surfaces"
 _FIELDS = {"pressure": "pressure_kPa", "shear": "shear_kPa"}
-HANDLES = 16  # along a brim that is no stated line
+HANDLE_COUNT = 16  # along a brim that is no stated line
 Length = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class AreaOfPage(StrictModel):
+class AreaRequest(StrictModel):
     """An area of the page: at a ``position`` that was clicked, or at the middle of a ``region``."""
 
     name: Text
@@ -50,13 +48,13 @@ class AreaOfPage(StrictModel):
     depth_mm: Length
 
 
-class LineOfPage(StrictModel):
+class TrimlineRequest(StrictModel):
     """A trimline of the page: ``points`` in order around the limb (LPS, mm), each put on its skin."""
 
     points: Annotated[list[Place], Field(min_length=3, max_length=60)]
 
 
-class WantedRun(StrictModel):
+class SocketRunRequest(StrictModel):
     """Which command to run: that of the socket, or its design."""
 
     design: bool = False
@@ -68,11 +66,11 @@ def list_runs(folder: StudyFolder) -> list[dict[str, Any]]:
     ``outside``: what it does to the tissue that no fitted record did, in words.
     """
     single = read_stored(folder.results / "socket" / "socket.json")
-    found = {SOCKET: single} if single else {}
+    runs = {SOCKET: single} if single else {}
     designed = read_stored(folder.results / "socket_design" / "socket_design.json")
-    found |= {one["name"]: one["simulation"] for one in designed.get("designs", [])}
+    runs |= {design["name"]: design["simulation"] for design in designed.get("designs", [])}
     rows = []
-    for name, content in found.items():
+    for name, content in runs.items():
         steps = [{"name": "donning"} | content["donning"], *content["loads"]]
         files = [_find_file(folder, name, i) for i in range(len(steps))]
         outside = content.get("outside_text", [])
@@ -116,7 +114,7 @@ def get_mesh(folder: Folder, run: str) -> Response:
     volume = to_volume_shape(mesh)
     place, places = _name_places(folder, volume.points.astype(float))
     facts = {"regions": list(mesh.region_names), "places": places}
-    return _respond_block(volume.arrays() | {"place": place}, facts)
+    return respond_block(volume.arrays() | {"place": place}, facts)
 
 
 def _name_places(folder: StudyFolder, points: np.ndarray) -> tuple[np.ndarray, list[str]]:
@@ -140,14 +138,11 @@ def get_step(folder: Folder, run: str, step: int, field: str) -> Response:
         raise InputError("no such field is stored", remedy="fields are " + ", ".join(_FIELDS))
     arrays = read_arrays(_find_file(folder, run, step))
     nodes = np.unique(arrays["cells"][:, :4])
-    return _respond_block({"values": arrays[_FIELDS[field]].reshape(-1)[nodes].astype(np.float32)}, {})
+    return respond_block({"values": arrays[_FIELDS[field]].reshape(-1)[nodes].astype(np.float32)})
 
 
-def _respond_block(arrays: dict[str, Any], facts: dict[str, Any]) -> Response:
-    return Response(pack(arrays, facts), media_type="application/octet-stream")
-
-
-def describe_shape(folder: StudyFolder) -> dict[str, Any]:
+@router.get("/shape")
+def get_shape(folder: Folder) -> dict[str, Any]:
     """What ``[socket]`` says of the shape, and whether such a face can be drawn around the bare skin.
 
     ``areas`` with their places, ``regions`` to choose from, ``file`` where the face is read from one;
@@ -158,8 +153,8 @@ def describe_shape(folder: StudyFolder) -> dict[str, Any]:
     table, anatomy = study.socket, read_anatomy(folder, study)
     regions = {} if anatomy is None else build_regions(study, anatomy)
     mark = _mark(folder, study)
-    found = _build_face(folder, mark)
-    drawn = isinstance(found, Socket)
+    face = _build_face(folder, mark)
+    has_face = isinstance(face, Socket)
     return {
         "file": None if table.file is None else table.file.name,
         "reduction_percent": table.reduction_percent,
@@ -176,9 +171,9 @@ def describe_shape(folder: StudyFolder) -> dict[str, Any]:
         ],
         "regions": list(regions),
         "mark": mark,
-        "problem": None if drawn else found,
+        "problem": None if has_face else face,
         "has_limb": anatomy is not None,
-        "volume_cm3": found.volume_mm3 / 1000.0 if isinstance(found, Socket) else None,
+        "volume_cm3": face.volume_mm3 / 1000.0 if isinstance(face, Socket) else None,
     }
 
 
@@ -198,7 +193,7 @@ def _find_handles(folder: StudyFolder, study: Study) -> list[list[float]]:
         limb = _compute_profile(folder, mark_surfaces(folder, study))
         if table.trimline and not table.trim_planes:
             return [[*map(float, row)] for row in wrap_trimline(limb, frame, np.array(table.trimline))]
-        return [[*map(float, row)] for row in find_brim(limb, frame, trim_of(study, anatomy), HANDLES)]
+        return [[*map(float, row)] for row in find_brim(limb, frame, trim_of(study, anatomy), HANDLE_COUNT)]
     except SurfaceError:
         return []  # `problem` says why there is no face
 
@@ -208,11 +203,12 @@ def _compute_profile(folder: StudyFolder, mark: str) -> LimbProfile:
     """That of the bare skin; the last ones are kept, by the ``mark`` of the limb's surfaces."""
     anatomy = read_anatomy(folder, folder.load())
     if anatomy is None:
-        raise InputError(NONE_YET)
+        raise InputError(NO_LIMB_YET)
     return compute_profile(anatomy.skin, build_limb_frame(anatomy.cut_point, anatomy.cut_normal))
 
 
-def build_face_block(folder: StudyFolder) -> bytes:
+@router.get("/face")
+def get_face(folder: Folder) -> Response:
     """The face as a block of arrays: ``points`` (n, 3), ``faces`` (m, 3), ``values`` (n,): offset, mm.
 
     Offsets are from the bare skin, negative where the face is pressed in.
@@ -223,23 +219,23 @@ def build_face_block(folder: StudyFolder) -> bytes:
         Where there is none.
     """
     study = folder.load()
-    found, anatomy = _build_face(folder, _mark(folder, study)), read_anatomy(folder, study)
-    if not isinstance(found, Socket) or anatomy is None:
-        raise InputError(found if isinstance(found, str) else NONE_YET)
+    face, anatomy = _build_face(folder, _mark(folder, study)), read_anatomy(folder, study)
+    if not isinstance(face, Socket) or anatomy is None:
+        raise InputError(face if isinstance(face, str) else NO_LIMB_YET)
     arrays = {
-        "points": found.points.astype(np.float32),
-        "faces": found.faces.astype(np.uint32),
-        "values": (-found.offset(anatomy.skin)).astype(np.float32),
+        "points": face.points.astype(np.float32),
+        "faces": face.faces.astype(np.uint32),
+        "values": (-face.offset(anatomy.skin)).astype(np.float32),
     }
-    return pack(arrays, {})
+    return respond_block(arrays)
 
 
 def _mark(folder: StudyFolder, study: Study) -> str:
     """Changes with the limb's surfaces, the socket's file and what the table says of the shape."""
     table = study.socket
     file = compute_fingerprint([] if table.file is None else [study.path(table.file)])
-    stated = compute_digest(table.model_dump(mode="json", exclude={"design", "loads"}))
-    return f"{mark_surfaces(folder, study)} {file} {stated}"
+    settings = compute_digest(table.model_dump(mode="json", exclude={"design", "loads"}))
+    return f"{mark_surfaces(folder, study)} {file} {settings}"
 
 
 @lru_cache(maxsize=2)
@@ -248,42 +244,30 @@ def _build_face(folder: StudyFolder, mark: str) -> Socket | str:
     study = folder.load()
     try:
         anatomy = read_anatomy(folder, study)
-        return NONE_YET if anatomy is None else build_socket(study, anatomy, anatomy.skin)
+        return NO_LIMB_YET if anatomy is None else build_socket(study, anatomy, anatomy.skin)
     except InputError as error:
         return f"{error.what}; {error.remedy}" if error.remedy else error.what
 
 
-@router.get("/shape")
-def get_shape(folder: Folder) -> dict[str, Any]:
-    """What the study says of the shape, and whether it can be drawn; see `describe_shape`."""
-    return describe_shape(folder)
-
-
-@router.get("/face")
-def get_face(folder: Folder) -> Response:
-    """The face with its offset from the bare skin; see `build_face_block`."""
-    return Response(build_face_block(folder), media_type="application/octet-stream")
-
-
 @router.post("/areas")
-def post_area(folder: Folder, area: AreaOfPage) -> dict[str, Any]:
+def post_area(folder: Folder, area: AreaRequest) -> dict[str, Any]:
     """Add an area to the study file, or change the one of that name; the shape as it is afterwards."""
     values = area.model_dump(exclude={"name"})
     if area.position is not None:
         values["position"] = project_to_skin_of_study(folder, area.position)
     set_area(folder.file, area.name, values)
-    return describe_shape(folder)
+    return get_shape(folder)
 
 
 @router.post("/areas/{name}/remove")
 def post_removal(folder: Folder, name: str) -> dict[str, Any]:
     """Take an area out of the study file."""
     remove_area(folder.file, name)
-    return describe_shape(folder)
+    return get_shape(folder)
 
 
 @router.post("/trimline")
-def post_trimline(folder: Folder, line: LineOfPage) -> dict[str, Any]:
+def post_trimline(folder: Folder, line: TrimlineRequest) -> dict[str, Any]:
     """Put a trimline into the study file, in the place of any other brim; the shape as it is afterwards.
 
     Raises
@@ -294,24 +278,24 @@ def post_trimline(folder: Folder, line: LineOfPage) -> dict[str, Any]:
     study = folder.load()
     anatomy = read_anatomy(folder, study)
     if anatomy is None:
-        raise InputError(NONE_YET)
+        raise InputError(NO_LIMB_YET)
     frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     with place_errors(study, "socket.trimline"):
         limb = _compute_profile(folder, mark_surfaces(folder, study))
         points = wrap_trimline(limb, frame, np.array(line.points))
         trim_limb(limb, frame, Trim(line=points))
     set_trimline(folder.file, points.tolist())
-    return describe_shape(folder)
+    return get_shape(folder)
 
 
 @router.post("/trimline/remove")
 def post_default_brim(folder: Folder) -> dict[str, Any]:
     """Take the trimline out of the study file: the brim is the default one."""
     set_trimline(folder.file, None)
-    return describe_shape(folder)
+    return get_shape(folder)
 
 
 @router.post("/start")
-def post_start(folder: Folder, wanted: WantedRun) -> dict[str, Any]:
+def post_start(folder: Folder, request: SocketRunRequest) -> dict[str, Any]:
     """Start ``limbfit socket`` or ``limbfit socket design``, as a process of its own."""
-    return start_socket(folder, design=wanted.design)
+    return start_socket(folder, design=request.design)

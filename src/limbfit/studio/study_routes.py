@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from threading import Lock
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Request
+from fastapi import APIRouter, Depends, Request, Response
 from fastapi.responses import FileResponse
+from pydantic import BaseModel, ConfigDict
 
 from ..pipeline import study_status
 from ..pipeline.engine.provenance import list_input_files
 from ..study import Study
+from ..web.arrays import pack
 from .folder import StudyFolder, compute_fingerprint
 from .processes import find_running
 
@@ -28,6 +31,17 @@ def get_study_folder(request: Request) -> StudyFolder:
 
 
 Folder = Annotated[StudyFolder, Depends(get_study_folder)]
+
+
+class StrictModel(BaseModel):
+    """The body of a request; unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+def respond_block(arrays: Mapping[str, Any], facts: Mapping[str, Any] | None = None) -> Response:
+    """Arrays and facts as a block that a script reads (see ``limbfit/web/arrays.py``)."""
+    return Response(pack(arrays, facts), media_type="application/octet-stream")
 
 
 @router.get("/study")
@@ -52,15 +66,15 @@ def get_study(folder: Folder) -> dict[str, Any]:
         ],
         "indentations": [
             {
-                "name": one.name,
-                "region": one.region,
-                "fitted": one.fitted,
-                "has_trace": one.trace is not None,
-                "is_recorded": one.trace is not None and study.path(one.trace).is_file(),
-                "touch_down_s": one.touch_down_s,
-                "peak_s": one.peak_s,
+                "name": indentation.name,
+                "region": indentation.region,
+                "fitted": indentation.fitted,
+                "has_trace": indentation.trace is not None,
+                "is_recorded": indentation.trace is not None and study.path(indentation.trace).is_file(),
+                "touch_down_s": indentation.touch_down_s,
+                "peak_s": indentation.peak_s,
             }
-            for one in study.indentations
+            for indentation in study.indentations
         ],
         "notes": list(study.notes),
     }
@@ -120,6 +134,11 @@ def list_stages(folder: StudyFolder) -> list[dict[str, Any]]:
             _remembered.rows = study_status(study)
             _remembered.mark = mark
         return _remembered.rows
+
+
+def list_stage_states(folder: StudyFolder) -> dict[str, str]:
+    """The state of each stage, by its name."""
+    return {row["stage"]: row["state"] for row in list_stages(folder)}
 
 
 def _mark(folder: StudyFolder, study: Study) -> str:

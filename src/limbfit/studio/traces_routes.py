@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from fastapi import APIRouter
-from pydantic import BaseModel, ConfigDict
+from pydantic import ConfigDict
 
 from ..anatomy.surfaces.surfaces import load_anatomy
 from ..errors import InputError
@@ -20,17 +20,17 @@ from ..study import Record, Study
 from ..traces.numerics import average_in_bins
 from .editing import set_record
 from .folder import StudyFolder, compute_fingerprint
-from .study_routes import Folder, list_stages
+from .study_routes import Folder, StrictModel, list_stage_states
 
 router = APIRouter(prefix="/api/traces")
-MOST_POINTS, CURVE_POINTS = 2000, 400  # of a raw record and of a regularised one on the page
-_MOST_KEPT = 64
+MAX_POINTS, CURVE_POINTS = 2000, 400  # of a raw record and of a regularised one on the page
+_MAX_CACHED = 64
 
 
-class Times(BaseModel):
+class Times(StrictModel):
     """When the indenter meets the skin and when its way in ends (s of the record); null: found by limbfit."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(allow_inf_nan=False)
 
     touch_down_s: float | None = None
     peak_s: float | None = None
@@ -44,19 +44,24 @@ def get_records(folder: Folder) -> dict[str, Any]:
     """
     study = folder.load()
     rows: list[dict[str, Any]] = []
-    records: dict[str, _Read] = {}
-    for one in study.indentations:
-        row: dict[str, Any] = {"site": one.name, "region": one.region, "fitted": one.fitted, "error": None}
-        if isinstance(one, Record) and study.path(one.trace).is_file():
+    records: dict[str, _ReadRecord] = {}
+    for indentation in study.indentations:
+        row: dict[str, Any] = {
+            "site": indentation.name,
+            "region": indentation.region,
+            "fitted": indentation.fitted,
+            "error": None,
+        }
+        if isinstance(indentation, Record) and study.path(indentation.trace).is_file():
             try:
-                records[one.name] = _read(study, one)
+                records[indentation.name] = _read(study, indentation)
             except InputError as error:
                 row["error"] = str(error)
-        found = records[one.name].told if one.name in records else {}
+        content = records[indentation.name].content if indentation.name in records else {}
         row |= {
-            "has_trace": one.trace is not None,
-            "facts": found.get("facts"),
-            "stated": found.get("stated"),
+            "has_trace": indentation.trace is not None,
+            "facts": content.get("facts"),
+            "stated": content.get("stated"),
         }
         rows.append(row)
     return {"sites": rows, "flags": _collect_flags(folder, study, records)}
@@ -66,14 +71,14 @@ def get_records(folder: Folder) -> dict[str, Any]:
 def get_record(folder: Folder, name: str) -> dict[str, Any]:
     """One record raw and regularised; times in s of the record, displacement in mm, force in N."""
     study = folder.load()
-    return _read(study, _find_record(study, name)).told
+    return _read(study, _find_record(study, name)).content
 
 
 @router.post("/{name}/preview")
 def preview_record(folder: Folder, name: str, times: Times) -> dict[str, Any]:
     """The record as it would be with other times; nothing is stored."""
     study = folder.load()
-    return _read(study, _replace_times(_find_record(study, name), times)).told
+    return _read(study, _replace_times(_find_record(study, name), times)).content
 
 
 @router.post("/{name}")
@@ -81,16 +86,16 @@ def post_times(folder: Folder, name: str, times: Times) -> dict[str, Any]:
     """Store the times in the study file, or remove them; the stage ``traces`` turns stale."""
     study = folder.load()
     record = _replace_times(_find_record(study, name), times)
-    found = _read(study, record).told
+    content = _read(study, record).content
     set_record(folder.file, record, {"touch_down_s": record.touch_down_s, "peak_s": record.peak_s})
-    return found
+    return content
 
 
 def _find_record(study: Study, name: str) -> Record:
-    one = study.indentation(name)
-    if not isinstance(one, Record):
+    record = study.indentation(name)
+    if not isinstance(record, Record):
         raise InputError(f"site {name} has no record", file=study.file, place=f"sites.{name}")
-    return one
+    return record
 
 
 def _replace_times(record: Record, times: Times) -> Record:
@@ -98,18 +103,18 @@ def _replace_times(record: Record, times: Times) -> Record:
     return replace(record, touch_down_s=rounded["touch_down_s"], peak_s=rounded["peak_s"])
 
 
-class _Read(NamedTuple):
-    """A record that was read, and what the page is told of it."""
+class _ReadRecord(NamedTuple):
+    """A record that was read, and what the page shows of it."""
 
     facts: TraceFacts
     step_s: float
-    told: dict[str, Any]
+    content: dict[str, Any]
 
 
-_kept: dict[str, _Read] = {}
+_cache: dict[str, _ReadRecord] = {}
 
 
-def _read(study: Study, record: Record) -> _Read:
+def _read(study: Study, record: Record) -> _ReadRecord:
     """A record with its curves, for as long as neither its file nor what is stated of it changes."""
     file = study.path(record.trace)
     key = repr(
@@ -122,21 +127,21 @@ def _read(study: Study, record: Record) -> _Read:
             record.peak_s,
         )
     )
-    if key not in _kept:
-        if len(_kept) >= _MOST_KEPT:
-            _kept.clear()
-        _kept[key] = _record(study, record)
-    return _kept[key]
+    if key not in _cache:
+        if len(_cache) >= _MAX_CACHED:
+            _cache.clear()
+        _cache[key] = _record(study, record)
+    return _cache[key]
 
 
-def _record(study: Study, record: Record) -> _Read:
+def _record(study: Study, record: Record) -> _ReadRecord:
     trace, smooth, facts = read_record(study, record)
     even = smooth.resample(CURVE_POINTS)
-    time, force, _ = average_in_bins(trace.time_s, trace.force_N, MOST_POINTS)
-    _, moved, _ = average_in_bins(trace.time_s, trace.displacement_mm, MOST_POINTS)
+    time, force, _ = average_in_bins(trace.time_s, trace.force_N, MAX_POINTS)
+    _, moved, _ = average_in_bins(trace.time_s, trace.displacement_mm, MAX_POINTS)
     start = facts.touch_down_s
     step_s = float(np.median(np.diff(trace.time_s)))
-    told = {
+    content = {
         "site": record.name,
         "facts": {key: value for key, value in facts.to_plain().items() if not key.startswith("knots")},
         "stated": {"touch_down_s": record.touch_down_s, "peak_s": record.peak_s},
@@ -153,24 +158,26 @@ def _record(study: Study, record: Record) -> _Read:
             "force_N": _shorten(even.force_N),
         },
     }
-    return _Read(facts, step_s, told)
+    return _ReadRecord(facts, step_s, content)
 
 
 def _shorten(values: np.ndarray) -> list[float]:
     return np.round(values, 5).tolist()
 
 
-def _collect_flags(folder: StudyFolder, study: Study, records: dict[str, _Read]) -> list[dict[str, Any]]:
+def _collect_flags(
+    folder: StudyFolder, study: Study, records: dict[str, _ReadRecord]
+) -> list[dict[str, Any]]:
     """Flags on the records as they are now, and those of the last prediction against the model."""
     sites, anatomy = SitesResult.find(folder.results), None
     placed = {} if sites is None else {row.site: row for row in sites.sites}
     if sites is not None:
         anatomy = load_anatomy(folder.results / "surfaces")
-    facts = {name: one.facts for name, one in records.items()}
-    steps = {name: one.step_s for name, one in records.items()}
+    facts = {name: record.facts for name, record in records.items()}
+    steps = {name: record.step_s for name, record in records.items()}
     flags = [flag.to_dict() for flag in record_flags(study, facts, steps, placed, anatomy)]
     if (predicted := PredictResult.find(folder.results)) is not None:
-        states = {row["stage"]: row["state"] for row in list_stages(folder)}
+        states = list_stage_states(folder)
         old = "" if states.get("predict") == "done" else " (of the last prediction, which is stale)"
         for flag in predicted.flags:
             if flag.found == "against the model":

@@ -54,9 +54,9 @@ def unpack(block: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         raise ValueError("not a block of arrays")
     start = len(MAGIC) + 4 + int.from_bytes(block[len(MAGIC) : len(MAGIC) + 4], "little")
     head = json.loads(block[len(MAGIC) + 4 : start])
-    found = {}
+    arrays = {}
     for name, row in head["arrays"].items():
         count = int(np.prod(row["shape"]))
         values = np.frombuffer(block, np.dtype("<" + row["type"]), count, start + row["at"])
-        found[name] = values.reshape(row["shape"])
-    return found, head["facts"]
+        arrays[name] = values.reshape(row["shape"])
+    return arrays, head["facts"]

@@ -62,8 +62,8 @@ def build_patient_frame(cut_normal: ArrayLike | None) -> NDArray[np.float64]:
     return np.array([np.cross(back, up), back, up])
 
 
-def read_shell(file: Path, most_faces: int | None = None) -> Shell:
-    """A stored surface; one of more than ``most_faces`` triangles is made coarser.
+def read_shell(file: Path, max_faces: int | None = None) -> Shell:
+    """A stored surface; one of more than ``max_faces`` triangles is made coarser.
 
     Raises
     ------
@@ -74,8 +74,8 @@ def read_shell(file: Path, most_faces: int | None = None) -> Shell:
     surface = surface.triangulate().clean()
     if surface.n_cells == 0:
         raise ProblemError("holds no triangles", file=file, remedy="make the surfaces again")
-    if most_faces is not None and surface.n_cells > most_faces:
-        surface = surface.decimate(1.0 - most_faces / surface.n_cells)
+    if max_faces is not None and surface.n_cells > max_faces:
+        surface = surface.decimate(1.0 - max_faces / surface.n_cells)
     return to_shell(surface)
 
 
@@ -126,20 +126,20 @@ def _build_face_table(cells: NDArray[np.int64], count: int) -> tuple[NDArray[np.
 def extract_interface(volume: VolumeShape, region: int) -> Shell:
     """The faces between the regions up to ``region`` (layers, outermost first) and those beyond."""
     inside = volume.neighbours != _NO_CELL
-    ours = volume.regions[volume.owners] <= region
-    theirs = np.where(inside, volume.regions[volume.neighbours], 0) <= region
-    chosen = inside & (ours != theirs)
-    used, faces = np.unique(volume.faces[chosen], return_inverse=True)
-    return Shell(volume.points[used], faces.reshape(-1, 3).astype(np.uint32))
+    near = volume.regions[volume.owners] <= region
+    far = np.where(inside, volume.regions[volume.neighbours], 0) <= region
+    chosen = inside & (near != far)
+    points, faces = np.unique(volume.faces[chosen], return_inverse=True)
+    return Shell(volume.points[points], faces.reshape(-1, 3).astype(np.uint32))
 
 
 def compute_cell_quality(mesh: Mesh) -> dict[str, Floats]:
     """Of each cell: its smallest dihedral angle (degrees), scaled Jacobian (-) and volume (mm3)."""
     jacobians = node_jacobians(mesh)
     scaled = jacobians.min(axis=1) / np.abs(jacobians.mean(axis=1))
-    found = {
+    measures = {
         "min_dihedral_deg": compute_dihedral_angles(mesh.points, mesh.cells[:, :4]).min(axis=1),
         "scaled_jacobian": scaled,
         "volume_mm3": cell_volumes(mesh),
     }
-    return {name: values.astype(np.float32) for name, values in found.items()}
+    return {name: values.astype(np.float32) for name, values in measures.items()}

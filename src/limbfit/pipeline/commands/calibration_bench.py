@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from ...bench.forward import FEBIO_SECONDS
+from ...bench.timing import FEBIO_SECONDS
 from ...study import Study, load_study
 from ..engine.context import Listener, ignore_progress
 from ..engine.store import Store

@@ -108,11 +108,11 @@ def draw_domain_figure(store: Results) -> Figure | None:
         time, shear = tested["time", None], tested["shear strain", tissue]
         ax.fill_between(time, 0.0, shear[1], color=FITTED, alpha=0.15, lw=0, label="what the records tell")
         for loading, label, color, name in rows:
-            own = _read_extents(loading)
-            if ("shear strain", tissue) in own:
-                own_time, (_, high) = own["time", None], own["shear strain", tissue]
-                ax.plot(own_time, (high, high), color=color, marker="|", label=label)
-                ax.annotate(name, (own_time[1], high), xytext=(0, 3), textcoords="offset points", ha="right")
+            extents = _read_extents(loading)
+            if ("shear strain", tissue) in extents:
+                times, (_, high) = extents["time", None], extents["shear strain", tissue]
+                ax.plot(times, (high, high), color=color, marker="|", label=label)
+                ax.annotate(name, (times[1], high), xytext=(0, 3), textcoords="offset points", ha="right")
         plots.set_log_scale(ax, minor=not loads)
         ax.set_ylim(bottom=0.0)
         ax.set_title(tissue)

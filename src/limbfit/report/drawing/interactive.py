@@ -36,7 +36,7 @@ from .pictures import (
     read_linear,
 )
 
-MOST_FACES, MOST_SAMPLES = 12_000, 300
+MAX_FACES, MAX_SAMPLES = 12_000, 300
 FIELD_RADIUS_MM = 50.0
 LAYER = "#c8a13a"
 STRESS = "von_mises_kPa"
@@ -70,7 +70,7 @@ def make_explorer(store: Results) -> Interactive | None:
 def _read_surfaces(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
     rows = []
     for name, file in store.surface_files.items():
-        shell = read_shell(file, MOST_FACES)
+        shell = read_shell(file, MAX_FACES)
         kind, _, title = name.partition("-")
         rows.append(
             {
@@ -118,15 +118,15 @@ def _describe_site(store: Results, row: PlacedSite) -> Json:
 def _cut_fields(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
     """The cut through each site at its deepest point, as triangles with displacements and stress."""
     stage = "predict" if store.predict else "simulate"
-    found = []
+    fields = []
     for row, file in find_placed_meshes(store, store.site_names, stage):
         cut = _cut_field(store, row, file)
         if cut is None:
             continue
         name = f"field.{row.site}"
         arrays |= {f"{name}.{part}": values for part, values in cut.items() if part != "direction"}
-        found.append({"site": row.site, "name": name, "direction": cut["direction"].tolist()})
-    return found
+        fields.append({"site": row.site, "name": name, "direction": cut["direction"].tolist()})
+    return fields
 
 
 def _cut_field(store: Results, row: PlacedSite, file: Path) -> dict[str, NDArray[Any]] | None:
@@ -156,7 +156,7 @@ def _thin_values(values: Array, stride: int) -> list[float | None]:
 
 
 def _to_lists(curves: Curves) -> dict[str, list[float | None]]:
-    stride = max(1, math.ceil(len(next(iter(curves.values()))) / MOST_SAMPLES))
+    stride = max(1, math.ceil(len(next(iter(curves.values()))) / MAX_SAMPLES))
     return {name: _thin_values(curves[name], stride) for name in _COLUMNS if name in curves}
 
 
@@ -194,8 +194,8 @@ def record_curves(store: Results, sites: Sequence[str]) -> Interactive | None:
             "smooth": _to_lists(smooth),
             "touch": {"time_s": start[0], "displacement_mm": start[1]},
             "ends": {
-                "time_s": [one.end_s for one in phases],
-                "displacement_mm": [one.end_mm + start[1] for one in phases],
+                "time_s": [phase.end_s for phase in phases],
+                "displacement_mm": [phase.end_mm + start[1] for phase in phases],
             },
         }
     if not choices:

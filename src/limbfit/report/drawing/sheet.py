@@ -20,8 +20,8 @@ Mask = NDArray[np.bool_]
 COLOURS = {LIMB: "#e34a33", FAT: "#f28e2b", "tibia": "#3bb2d0", "fibula": "#f4c542"}
 _OTHERS = ("#76d275", "#c58af9", "#ff9da7", "#9aa0ff")
 _COLUMNS, _ROWS = 6, 3
-_LARGE = 3  # suspects in a row
-_MOST = 6  # suspects drawn
+_SUSPECT_COLUMNS = 3  # suspects in a row
+_MAX_SUSPECTS = 6  # suspects drawn
 _MARGIN = 4  # voxels around the limb
 
 
@@ -36,9 +36,9 @@ def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: Labe
     colours = _choose_colours(list(masks))
     shown = _choose_slices(turned.limb)
     odd = _choose_suspects(quality)
-    large_rows = -(-len(odd) // _LARGE)
+    large_rows = -(-len(odd) // _SUSPECT_COLUMNS)
     ratio = _compute_ratio(window, turned)
-    small, large = 12 / _COLUMNS / ratio + 0.25, 12 / _LARGE / ratio + 0.3
+    small, large = 12 / _COLUMNS / ratio + 0.25, 12 / _SUSPECT_COLUMNS / ratio + 0.3
     rows = -(-len(shown) // _COLUMNS)
     figure = Figure(figsize=(12, 0.9 + rows * small + large_rows * large), facecolor="white")
     FigureCanvasAgg(figure)
@@ -50,13 +50,13 @@ def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: Labe
         wspace=0.04,
         hspace=0.14,
     )
-    span = _COLUMNS // _LARGE
+    span = _COLUMNS // _SUSPECT_COLUMNS
     for n, k in enumerate(shown):
         axes = figure.add_subplot(grid[n // _COLUMNS, n % _COLUMNS])
         _draw(axes, image, masks, colours, k, window, f"slice {k}")
     for n, (k, text) in enumerate(odd):
-        place = (n % _LARGE) * span
-        axes = figure.add_subplot(grid[rows + n // _LARGE, place : place + span])
+        place = (n % _SUSPECT_COLUMNS) * span
+        axes = figure.add_subplot(grid[rows + n // _SUSPECT_COLUMNS, place : place + span])
         _draw(axes, image, masks, colours, k, window, f"slice {k}: {text}", bold=True)
     handles = [Line2D([], [], color=colours[name], label=name) for name in masks]
     figure.legend(handles=handles, loc="upper center", ncol=len(handles), frameon=False, fontsize=10)
@@ -65,11 +65,11 @@ def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: Labe
 
 def _find_window(limb: Mask) -> tuple[slice, slice]:
     """Rows and columns of the limb with a margin."""
-    found = []
+    window = []
     for axes in ((0, 2), (0, 1)):
         filled = np.flatnonzero(limb.any(axis=axes))
-        found.append(slice(max(int(filled[0]) - _MARGIN, 0), int(filled[-1]) + 1 + _MARGIN))
-    return found[0], found[1]
+        window.append(slice(max(int(filled[0]) - _MARGIN, 0), int(filled[-1]) + 1 + _MARGIN))
+    return window[0], window[1]
 
 
 def _compute_ratio(window: tuple[slice, slice], labels: LabelMap) -> float:
@@ -87,13 +87,13 @@ def _choose_slices(limb: Mask) -> list[int]:
 
 def _choose_suspects(quality: LabelQuality) -> list[tuple[int, str]]:
     """Slices to look at with what is odd there, at most six, evenly taken from all."""
-    said: dict[int, list[str]] = {}
+    texts: dict[int, list[str]] = {}
     for suspect in quality.suspects:
-        said.setdefault(suspect.slice, []).append(f"{suspect.label} {suspect.what}")
-    slices = sorted(said)
-    if len(slices) > _MOST:
-        slices = [slices[n] for n in np.linspace(0, len(slices) - 1, _MOST).round().astype(int)]
-    return [(k, "; ".join(said[k][:2])) for k in slices]
+        texts.setdefault(suspect.slice, []).append(f"{suspect.label} {suspect.what}")
+    slices = sorted(texts)
+    if len(slices) > _MAX_SUSPECTS:
+        slices = [slices[n] for n in np.linspace(0, len(slices) - 1, _MAX_SUSPECTS).round().astype(int)]
+    return [(k, "; ".join(texts[k][:2])) for k in slices]
 
 
 def _choose_colours(names: list[str]) -> dict[str, str]:

@@ -12,11 +12,16 @@ from ...arrays import Array
 from ..page import Figure
 from ..store import Json, Results
 from .colours import MUTED, SIMULATED, THIRD
-from .panels import FIELD_MAP, Mark, Shot, View, build_picture_row, make_colour_bar
 from .pictures import (
+    FIELD_MAP,
     SIDES,
     Grid,
+    Mark,
+    Shot,
+    View,
+    build_picture_row,
     cut_behind,
+    make_colour_bar,
     make_field_plotter,
     make_four_views,
     normalise,
@@ -90,8 +95,8 @@ def draw_offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | No
     faces = {title: pv.read(file) for title, file in files.items() if file.is_file()}
     if not faces:
         return None
-    most = max(float(np.percentile(np.abs(face.point_data[OFFSET]), 99)) for face in faces.values())
-    limits = (-max(most, 0.1), max(most, 0.1))
+    limit = max(float(np.percentile(np.abs(face.point_data[OFFSET]), 99)) for face in faces.values())
+    limits = (-max(limit, 0.1), max(limit, 0.1))
     words = "offset from the unloaded limb (mm)"
     alt = f"Face of the socket coloured by {words}"
     markup = _render_surfaces(store, faces, OFFSET, limits, OFFSET_MAP, alt, words)
@@ -106,7 +111,7 @@ def draw_inside_figure(store: Results, title: str, inside: Sequence[Json], file:
     """Cuts along and across the limb through the place of the largest shear, coloured by it."""
     if not file.is_file():
         return ()
-    grid, worst = read_linear(file), max(inside, key=lambda found: found["shear"])
+    grid, worst = read_linear(file), max(inside, key=lambda place: place["shear"])
     place = np.asarray(worst["place_mm"], dtype=float)
     shear, words = np.asarray(grid.cell_data[SHEAR]), "shear strain"
     limits = (0.0, max(float(np.percentile(shear, 99.5)), 1e-6))

@@ -13,13 +13,18 @@ from ...errors import InputError
 from ...mesh import compute_dihedral_angles
 from ...results.limb import PlacedSite
 from ..store import Results, load_store
-from .panels import Drawing, Mark, PictureRow, Shot, View, build_figure_sheet, make_key, write_png
 from .pictures import (
     BONE,
     MATT,
     SIDES,
     SKIN_SURFACE,
+    Drawing,
+    Mark,
+    PictureRow,
+    Shot,
+    View,
     add_regions,
+    build_figure_sheet,
     choose_inner_colour,
     choose_region_colours,
     cut_behind,
@@ -27,12 +32,14 @@ from .pictures import (
     make_cut_views,
     make_field_plotter,
     make_four_views,
+    make_key,
     make_limb_plotter,
     make_plotter,
     normalise,
     read_linear,
     render_views,
     silence_display_warning,
+    write_png,
 )
 
 CUT_PLANE = "#0072b2"
@@ -162,17 +169,17 @@ def _make_cut_plane(store: Results, skin: Any) -> Any:
 
 def _measure_thicknesses(store: Results, skin: Any) -> list[tuple[Any, str]]:
     """What is known on the skin: tissue down to the nearest bone, and the fat's depth where it was mapped."""
-    found = []
+    maps = []
     bones = [pv.read(file) for name, file in store.surface_files.items() if name.startswith("bone-")]
     if bones:
         far = [np.abs(skin.compute_implicit_distance(bone)["implicit_distance"]) for bone in bones]
-        found.append((np.min(far, axis=0), "tissue over the nearest bone (mm)"))
+        maps.append((np.min(far, axis=0), "tissue over the nearest bone (mm)"))
     fat = store.folder / "surfaces" / "fat-depth.vtp"
     if fat.is_file():
         depth = pv.read(fat)
         same = KDTree(depth.points).query(skin.points)[1]  # a surface from STL numbers its vertices anew
-        found.append((np.asarray(depth.point_data["fat_depth_mm"])[same], "depth of the fat (mm)"))
-    return found
+        maps.append((np.asarray(depth.point_data["fat_depth_mm"])[same], "depth of the fat (mm)"))
+    return maps
 
 
 def _mark_site(row: PlacedSite, colours: dict[str, str]) -> Mark:

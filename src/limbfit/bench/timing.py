@@ -1,0 +1,181 @@
+"""Time and memory of single simulations, each in a process of its own: reference cases, and blocks."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ..errors import InputError
+from ..execution import ProcessExecutor
+from ..fe import Problem, StepControl, solve
+from .blocks import build_punched_block, choose_divisions
+from .parity import PUNCHED, ReferenceCase, Tell, find_reference, load_case
+
+Answer = TypeVar("Answer")
+# FEBio 4.11 with PARDISO, alone on 2 cores (Intel Xeon, 2.5 GHz), 2 threads.
+FEBIO_SECONDS = {"residuum/posterior_tet10": 144.8, "residuum/posterior_tet4": 10.6}
+CASES = {case.name: case for case in PUNCHED}
+UNKNOWNS = (20_000, 45_000, 80_000)
+# The paper's model of one site: about 150,000 linear tetrahedra.
+PAPER_ELEMENT, PAPER_DIVISIONS = "tet4", 37
+CONTROL = StepControl()
+MIB = 1024.0
+
+
+def bench_forward(
+    reference: Path | None = None,
+    case: str = "residuum/posterior_tet10",
+    element: str = "",
+    threads: int = 1,
+    as_febio: bool = False,
+    *,
+    tell: Tell,
+) -> dict[str, Any]:
+    """Time a reference case on FEBio's mesh and steps, with limbfit's own contact or FEBio's.
+
+    Parameters
+    ----------
+    reference : folder of FEBio's results; None: ``shared/reference``, here or above.
+    case : a case with an indenter in it.
+    element : name in the element table; empty: that of the mesh.
+    threads : of assembly and linear algebra.
+    as_febio : with the element's quadrature and the contact penalty of the parity table.
+
+    Raises
+    ------
+    InputError
+        Where the case is missing or the element does not fit its mesh.
+    """
+    if case not in CASES:
+        raise InputError(f"unknown case {case!r}", remedy=f"use one of {', '.join(CASES)}")
+    folder = reference or find_reference(Path.cwd())
+    named = CASES[case] if as_febio else replace(CASES[case], problem={}, control={})
+    problem = {**named.problem, "element": element} if element else named.problem
+    control = {**named.control, "threads": threads}
+    chosen = replace(named, problem=problem, control=control)
+    tell(0, 2, f"{case}, plain")
+    plain = run_in_fresh_process(run_forward, threads, chosen, folder, False)
+    tell(1, 2, f"{plain['seconds']:.1f} s plain; with sensitivities")
+    full = run_in_fresh_process(run_forward, threads, chosen, folder, True)
+    tell(2, 2, f"{full['seconds']:.1f} s with sensitivities")
+    febio = FEBIO_SECONDS.get(case)
+    return {
+        "case": case,
+        **plain,
+        "seconds_with_sensitivities": full["seconds"],
+        "sensitivities_over_plain": full["seconds"] / plain["seconds"],
+        "max_rss_with_sensitivities_MB": full["max_rss_MB"],
+        "seconds_by_part_with_sensitivities": full["seconds_by_part"],
+        "threads": threads,
+        "as_febio": as_febio,
+        "febio_seconds": febio,
+        "ratio": None if febio is None else febio / plain["seconds"],
+    }
+
+
+def run_forward(case: ReferenceCase, folder: Path, sensitivities: bool) -> dict[str, Any]:
+    problem, control, _ = load_case(case, folder)
+    return solve_timed(problem, control, sensitivities)
+
+
+def bench_scaling(
+    element: str = "tet10",
+    unknowns: Sequence[int] = UNKNOWNS,
+    threads: int = 1,
+    paper_divisions: int = PAPER_DIVISIONS,
+    *,
+    tell: Tell,
+    control: StepControl = CONTROL,
+) -> dict[str, Any]:
+    """Seconds and memory over unknowns, the exponent of their power law, and a model of the paper's size.
+
+    Parameters
+    ----------
+    element : name in the element table.
+    unknowns : about how many, two sizes or more.
+    paper_divisions : cells along the side of the model of the paper's size.
+
+    Raises
+    ------
+    InputError
+        For an element that is not in the table.
+    """
+    control = replace(control, threads=threads)
+    blocks = [(element, choose_divisions(element, size)) for size in unknowns]
+    blocks.append((PAPER_ELEMENT, paper_divisions))
+    rows = []
+    for i, (kind, divisions) in enumerate(blocks):
+        tell(i, len(blocks), f"{kind}, {divisions} cells along 60 mm")
+        rows.append(run_in_fresh_process(run_block, threads, kind, divisions, control))
+    tell(len(blocks), len(blocks), "done")
+    *curve, paper = rows
+    return {
+        "element": element,
+        "threads": threads,
+        "sizes": curve,
+        "seconds_exponent": fit_exponent(curve, "seconds"),
+        "memory_exponent": fit_exponent(curve, "max_rss_MB"),
+        "paper_sized": paper,
+    }
+
+
+def run_block(element: str, divisions: int, control: StepControl) -> dict[str, Any]:
+    problem = build_punched_block(element, divisions)
+    return {"cells": len(problem.mesh.cells), **solve_timed(problem, control, sensitivities=False)}
+
+
+def fit_exponent(rows: list[dict[str, Any]], key: str) -> float:
+    """Slope of the least-squares line of log ``key`` over log unknowns."""
+    x = np.log([row["unknowns"] for row in rows])
+    slope, _ = np.polyfit(x, np.log([row[key] for row in rows]), 1)
+    return float(slope)
+
+
+def run_in_fresh_process(function: Callable[..., Answer], threads: int, *arguments: Any) -> Answer:
+    """``function(*arguments)`` in a new process with that many threads: its largest memory is its own."""
+    *first, last = arguments
+    with ProcessExecutor(1, threads) as executor:
+        return next(executor.map(partial(function, *first), [last]))
+
+
+def solve_timed(problem: Problem, control: StepControl, sensitivities: bool) -> dict[str, Any]:
+    """Sizes, seconds by part, largest memory of this process, and how far the simulation came.
+
+    Kernels are warmed up before the clock starts.
+    """
+    warm_up(problem.formulation.name, sensitivities)
+    result = solve(problem, control, sensitivities, store="none")
+    statistics = dict(result.statistics)
+    seconds = dict(statistics.pop("seconds"))
+    return {
+        **{key: statistics[key] for key in ("unknowns", "element", "steps", "newton_iterations")},
+        **{key: statistics[key] for key in ("factorisations", "linear_solver")},
+        "seconds": seconds.pop("total"),
+        "peak_force_N": float(np.max(result.force)),
+        "max_rss_MB": measure_max_rss_MB(),
+        "seconds_by_part": seconds,
+        "completed": result.completed,
+        "reason": result.reason,
+    }
+
+
+def warm_up(element: str, sensitivities: bool) -> None:
+    """Compile, or load from the cache, all kernels of an element with a problem of a few cells."""
+    solve(build_punched_block(element, 4), StepControl(load_steps=2, unload_steps=2), sensitivities)
+
+
+def measure_max_rss_MB() -> float:
+    """Largest resident memory of this process so far, MiB."""
+    status = Path("/proc/self/status")
+    if status.is_file():  # the resource usage of a young process includes what its parent held
+        lines = status.read_text().splitlines()
+        return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM")) / MIB
+    usage = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return usage / (MIB * MIB if sys.platform == "darwin" else MIB)
