@@ -15,7 +15,13 @@ from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import build_space, group_separately
 from limbfit.identify.fit.prediction import PredictionModel
 from limbfit.identify.uncertainty.noise import SiteNoise
-from limbfit.identify.uncertainty.relaxation import OWN, POWER_LAW, assess_relaxation
+from limbfit.identify.uncertainty.relaxation import (
+    GIVES_WAY,
+    MAX_SLOPE,
+    OWN,
+    POWER_LAW,
+    assess_relaxation,
+)
 from limbfit.identify.uncertainty.superposition import (
     RelaxationModel,
     Superposition,
@@ -57,6 +63,22 @@ class Held(Bars):
         found = super().respond(p)
         touching = found.force_N > 0
         return SiteResponse(found.force_N * touching, found.jacobian * touching[:, None])
+
+
+@dataclass(frozen=True)
+class Receding(Held):
+    """The same where the limb recedes from the indenter, by a ``share`` of the travel at the end."""
+
+    share: float = 0.0
+
+    def split(self, p: np.ndarray) -> list[np.ndarray]:
+        end = self.times_s[-1]
+        travel = 0.96 * np.minimum(np.minimum(self.times_s, end - self.times_s), self.depth / 0.96)
+        left = np.maximum(travel - self.share * self.depth * self.times_s / end, 0.0)
+        return [
+            Bars.elastic(section, 1 - left / length, c, m)
+            for section, length, (c, m, *_) in zip(self.sections, self.lengths, p.reshape(-1, 4))
+        ]
 
 
 def held_sites(hold_s: float = 0.0) -> list[Held]:
@@ -218,3 +240,24 @@ def test_predictions_widen_only_beyond_the_longest_load(of_model):
     assert np.array_equal(above[~later], high[~later])
     i = int(np.searchsorted(site.times_s, 60.0))
     assert high[i] - below[i] > 5 * (high[i] - low[i])
+
+
+def test_an_interval_after_the_records_holds_any_fall_within_the_bound(of_model):
+    """The lower end gives room for the steepest fall, the upper one is that of no fall at all."""
+    known, found = of_model
+    longest = found.spread.longest_s
+    for number in (0, 1):
+        _, (low, high) = found.state_modulus(known, number, longest)
+        _, (later_low, later_high) = found.state_modulus(known, number, 100 * longest)
+        assert later_low == pytest.approx(low * 100.0**-MAX_SLOPE, rel=0.05)
+        assert later_high == pytest.approx(high, rel=0.05)
+
+
+def test_a_limb_that_gives_way_is_named_where_the_records_cannot_tell_it_from_relaxation(of_power_law):
+    """The tissue relaxes as the model's, and the limb recedes from the indenter by a tenth of the travel."""
+    sites = [Receding(one.sections, one.lengths, one.depth, share=0.1) for one in SITES]
+    known, found = assess(held_sites(), [site.force(TRUTH) for site in sites])
+    assert GIVES_WAY in found.describe(known)
+    assert found.to_dict(known)["tail_weight"] > 0.5
+    known, found = of_power_law
+    assert GIVES_WAY not in found.describe(known)

@@ -21,9 +21,12 @@ SLOPES = np.array([3.0, -1.0, 2.0])
 COVARIANCE = np.array([[0.04, -0.015], [-0.015, 0.09]])
 
 
-def spread_of(off=(0.0, 0.0), shift=(0.0, 0.0), relaxation=((0.0, 0.0), (0.0, 0.0))) -> SimulationSpread:
+def spread_of(
+    off=(0.0, 0.0), shift=(0.0, 0.0), relaxation=((0.0, 0.0), (0.0, 0.0)), fall=(0.0, 0.0)
+) -> SimulationSpread:
     known = ParameterSpread(COVARIANCE, np.array(off))
-    return SimulationSpread(NAMES, (0, 1), known.relax(1.0, np.array(shift), np.array(relaxation)))
+    worn = known.relax(1.0, np.array(shift), np.array(relaxation), np.array(fall))
+    return SimulationSpread(NAMES, (0, 1), worn)
 
 
 def test_interval_and_shares_are_those_of_drawn_parameters():
@@ -49,15 +52,22 @@ def test_an_interval_covers_the_most_probable_parameters_too():
 def test_an_interval_counts_relaxation_beyond_the_records_and_holds_the_value():
     """Moduli fall by 40 % on average, with a deviation of 20 %; the simulated value stays inside."""
     further = np.array([[0.04, 0.0], [0.0, 0.0]])
-    interval, _, _, (moved, sd) = spread_of(shift=[-0.4, 0.0], relaxation=further).told(50.0, SLOPES)
+    interval, _, _, (moved, sd, fall) = spread_of(shift=[-0.4, 0.0], relaxation=further).told(50.0, SLOPES)
     draws = np.random.default_rng(0).multivariate_normal([-0.4, 0.0], COVARIANCE + further, 200_000)
     values = 50.0 + draws @ SLOPES[:2]
-    assert (moved, sd) == pytest.approx((3.0 * -0.4, 3.0 * 0.2))
+    assert (moved, sd, fall) == pytest.approx((3.0 * -0.4, 3.0 * 0.2, 0.0))
     half = NORMAL_95 * values.std()
     assert interval == pytest.approx([values.mean() - half, values.mean() + half], abs=0.05)
     (low, high), *_ = spread_of(shift=[-4.0, 0.0]).told(50.0, SLOPES)
     assert low < 50.0 - 12.0
     assert high == 50.0
+
+
+def test_an_interval_reaches_to_the_farthest_fall_and_loses_nothing_at_the_other_end():
+    plain, *_ = spread_of().told(50.0, SLOPES)
+    (low, high), *_, (_, _, fall) = spread_of(fall=[0.5, 0.0]).told(50.0, SLOPES)
+    assert fall == pytest.approx(3.0 * 0.5)
+    assert (low, high) == pytest.approx((plain[0] - 1.5, plain[1]))
 
 
 def test_what_is_stored_has_the_same_keys_with_and_without_intervals():

@@ -163,6 +163,7 @@ class RelaxationBeyond(ResultPart):
     durations_s: Sequence[float] = Field(description="Durations of a load.")
     shift_log: Matrix = Field(description="Shift of the logarithms of the parameters, by duration.")
     covariance_log: Sequence[Matrix] = Field(description="What is added to their covariance, by duration.")
+    fall_log: Matrix = Field(description="How far below that they may lie at most, by duration.")
 
 
 class RelaxationSummary(ResultPart):
@@ -170,6 +171,7 @@ class RelaxationSummary(ResultPart):
 
     prefers: str = Field(description="Which law of relaxation the records prefer.")
     evidence: float = Field(description="Twice the logarithm of the evidence for a power of time.")
+    tail_weight: float = Field(description="Probability of a modulus that goes on to fall after the records.")
     words: Sequence[str] = Field(description="All of it in sentences.")
     moduli: Sequence[LongTermModulus] = Field(description="Moduli at stated times.")
     prior: RelaxationPrior = Field(description="What is assumed beyond the records.")

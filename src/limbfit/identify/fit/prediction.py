@@ -62,7 +62,8 @@ class RelaxationSpread:
 
     Forces then follow from the moduli at that time, with the logarithms' mean ``shift_log`` (d, p) over those
     of the answer and the covariance ``own_weight`` times that of the answer plus ``covariance_log``
-    (d, p, p). ``longest_s`` is the longest load in the records.
+    (d, p, p). ``longest_s`` is the longest load in the records. Later, logarithms may be lower by
+    anything up to ``fall_log`` (d, p): a bound and no distribution, so that intervals hold for every fall.
     """
 
     longest_s: float
@@ -70,30 +71,35 @@ class RelaxationSpread:
     durations_s: Array
     shift_log: Array
     covariance_log: Array
+    fall_log: Array
 
-    def interpolate(self, duration_s: float) -> tuple[Array, Array]:
-        """Return shift (p,) and covariance (p, p) at a duration, from its logarithm."""
+    def interpolate(self, duration_s: float) -> tuple[Array, Array, Array]:
+        """Return shift (p,), covariance (p, p) and fall (p,) at a duration, from its logarithm."""
         at = float(np.interp(np.log(duration_s), np.log(self.durations_s), np.arange(len(self.durations_s))))
         i = min(int(at), len(self.durations_s) - 2)
         weights = np.array([i + 1 - at, at - i])
-        return weights @ self.shift_log[i : i + 2], np.tensordot(weights, self.covariance_log[i : i + 2], 1)
+        shift, fall = weights @ self.shift_log[i : i + 2], weights @ self.fall_log[i : i + 2]
+        return shift, np.tensordot(weights, self.covariance_log[i : i + 2], 1), fall
 
-    def compute_beyond_N(self, slopes: Array, times_s: Array) -> tuple[Array, Array]:
-        """Return shift and standard deviation (n,) of forces at times beyond the records' longest load.
+    def compute_beyond_N(self, slopes: Array, times_s: Array) -> tuple[Array, Array, Array]:
+        """Return the lowest and the highest shift and the standard deviation (n,) of forces beyond the
+        records' longest load.
 
-        ``slopes`` (n, p) are by the logarithms of the parameters. Both are zero within the records' times.
+        ``slopes`` (n, p) are by the logarithms of the parameters. All are zero within the records' times.
         """
-        shift, sd = np.zeros(len(times_s)), np.zeros(len(times_s))
+        low, high, sd = np.zeros((3, len(times_s)))
         for i in np.flatnonzero(times_s > self.longest_s):
-            by_log, covariance = self.interpolate(float(times_s[i]))
-            shift[i], sd[i] = slopes[i] @ by_log, np.sqrt(slopes[i] @ covariance @ slopes[i])
-        return shift, sd
+            shift_log, covariance, fall_log = self.interpolate(float(times_s[i]))
+            shift, fall = float(slopes[i] @ shift_log), float(slopes[i] @ fall_log)
+            low[i], high[i] = shift - max(fall, 0.0), shift - min(fall, 0.0)
+            sd[i] = np.sqrt(slopes[i] @ covariance @ slopes[i])
+        return low, high, sd
 
     @classmethod
     def from_stored(cls, stored: RelaxationBeyond) -> RelaxationSpread:
         """Build it from what ``calibration.json`` holds."""
-        arrays = (np.array(part) for part in (stored.durations_s, stored.shift_log, stored.covariance_log))
-        return cls(stored.longest_s, stored.own_weight, *arrays)
+        parts = (stored.durations_s, stored.shift_log, stored.covariance_log, stored.fall_log)
+        return cls(stored.longest_s, stored.own_weight, *map(np.array, parts))
 
 
 @dataclass(frozen=True)
@@ -166,10 +172,11 @@ class PredictionModel:
         noise_N, misfit = self.find_residual_sd(name, unit)
         misfit_N = misfit * find_largest_magnitude(response.force_N)
         own_N = np.hypot(np.hypot(noise_N, misfit_N), self.site_factor * np.abs(site_N))
-        shift_N: Array | float = 0.0
+        lower_N: Array | float = 0.0
+        higher_N: Array | float = 0.0
         if self.relaxation is not None and times_s is not None:
             slopes = response.jacobian * parameters
-            shift_N, relaxation_N = self.relaxation.compute_beyond_N(slopes, times_s)
+            lower_N, higher_N, relaxation_N = self.relaxation.compute_beyond_N(slopes, times_s)
             own_N = np.hypot(own_N, relaxation_N)
         sd = compute_prediction_sd(response.jacobian, parameters, self.covariance_log, own_N)
         share = misfit_N**2 / np.maximum(sd, 1e-300) ** 2
@@ -177,4 +184,4 @@ class PredictionModel:
         half, off = stdtrit(freedom, 0.975) * sd, np.log(self.most_probable / parameters)
         other = response.force_N + response.jacobian @ (parameters * off)
         low, high = np.minimum(response.force_N, other), np.maximum(response.force_N, other)
-        return low + np.minimum(shift_N, 0.0) - half, high + np.maximum(shift_N, 0.0) + half
+        return low + np.minimum(lower_N, 0.0) - half, high + np.maximum(higher_N, 0.0) + half

@@ -4,7 +4,11 @@ Fitted to the records of force are the model's own terms alone, the same with a 
 as ``(1 + t/T)^-s``, T being the longest load in the records, and a spectrum of fixed times whose amplitudes
 are a power of time (`superposition`). They are weighed by their restricted likelihoods, each with a misfit
 of its own. Up to T these fits say how far the modulus is known. Beyond T it falls as ``(t/T)^-s``: no record
-shows that part, and s lies, each value as likely, between 0 and what tissues have at most (`MAX_SLOPE`).
+shows that part. All that is known of s is that it lies between 0 and what tissues have at most
+(`MAX_SLOPE`), so that intervals hold for every such s: they reach from the one end to the other.
+
+A force that goes on to fall slowly looks the same if the limb gives way to the indenter. Where the records
+prefer a tail, `RelaxationAssessment.describe` says so: no interval counts that.
 """
 
 from __future__ import annotations
@@ -39,6 +43,11 @@ _SHORTEST, _LONGEST, _SPECTRUM_TIMES = 0.02, 30.0, 12  # of the shortest ramp; o
 OWN, POWER_LAW, UNDECIDED = "the model's terms", "a power law", "undecided"
 NOT_LONG_TERM = "determined at {}; its long-term value not"
 NOT_ALONE = "not determined: another relaxation fits as well"
+GIVES_WAY = (
+    "the force falls slowly until the records end: a limb that gives way to the indenter looks the same, and "
+    "its tissue is stiffer in the long term than the intervals say; check that it was held"
+)
+_MOST = 0.5  # of the weights
 MIN_OWN_WEIGHT = 0.1  # of the answer: no other relaxation is quite that of the tissue
 LONG_TERM_S = 3600.0  # after which a modulus is long-term: a socket worn for an hour
 STATED_S = (1.0, 10.0)  # at which moduli are stated
@@ -65,14 +74,16 @@ class RelaxationAssessment:
     """Which relaxations fit the records at ``parameters`` (p,), and what they leave open.
 
     ``weights`` (w,) of the fitted worlds, the model's own terms first. ``evidence`` is twice the logarithm of
-    how much more probable the records are with a power law than with the model's own terms. ``spread`` is
-    what they leave open of each tissue's modulus at any time.
+    how much more probable the records are with a power law than with the model's own terms.
+    ``tail_weight`` is the part of the weights that fits with a tail have. ``spread`` is what they leave open
+    of each tissue's modulus at any time.
     """
 
     tissues: tuple[TissueParameters, ...]
     parameters: Array
     weights: Array
     evidence: float
+    tail_weight: float
     spread: RelaxationSpread
 
     @property
@@ -88,11 +99,11 @@ class RelaxationAssessment:
         at = tissue.modulus_log(p, duration_s)
         steps = np.exp(_DIFFERENCE * np.eye(len(p)))
         slopes = np.array([tissue.modulus_log(p * step, duration_s) - at for step in steps]) / _DIFFERENCE
-        shift, covariance = self.spread.interpolate(duration_s)
+        shift, covariance, fall = self.spread.interpolate(duration_s)
         i, weight = tissue.moduli[0], self.spread.own_weight
         half = NORMAL_95 * np.sqrt(weight * slopes @ known.covariance @ slopes + covariance[i, i])
         off = weight * float(slopes @ np.log(known.centre / p))
-        ends = at + shift[i] + np.array([min(off, 0.0) - half, max(off, 0.0) + half])
+        ends = at + shift[i] + np.array([min(off, 0.0) - half - fall[i], max(off, 0.0) + half])
         return float(np.exp(at)), np.exp([min(ends[0], at), max(ends[1], at)])
 
     def describe(self, known: Uncertainty) -> list[str]:
@@ -104,6 +115,8 @@ class RelaxationAssessment:
             UNDECIDED: f"{longest} cannot tell the relaxation of the model from a power law of time",
         }
         found = [f"{preferred[self.preferred]} (2 ln B = {abs(self.evidence):.0f})"]
+        if self.preferred == POWER_LAW and self.tail_weight > _MOST:
+            found.append(GIVES_WAY)
         for number, tissue in enumerate(self.tissues):
             modulus, (low, high) = self.state_modulus(known, number, LONG_TERM_S)
             found.append(
@@ -142,6 +155,7 @@ class RelaxationAssessment:
         return RelaxationSummary(
             prefers=self.preferred,
             evidence=self.evidence,
+            tail_weight=self.tail_weight,
             words=self.describe(known),
             moduli=moduli,
             prior=RelaxationPrior(slope=(0.0, MAX_SLOPE), source=SOURCE),
@@ -193,10 +207,12 @@ def assess_relaxation(
     fits = [records.fit(world) for world in worlds]
     weights, evidence = _weigh(fits)
     shifts, covariances = zip(*(records.spread(fits, weights, t) for t in _DURATIONS_S), strict=True)
+    falls = np.array([records.compute_largest_fall(t) for t in _DURATIONS_S])
     spread = RelaxationSpread(
-        longest, float(weights[0]), _DURATIONS_S, np.array(shifts), np.array(covariances)
+        longest, float(weights[0]), _DURATIONS_S, np.array(shifts), np.array(covariances), falls
     )
-    return RelaxationAssessment(tissues, parameters, weights, evidence, spread)
+    tails = float(weights[[fit.world.has_tail for fit in fits]].sum())
+    return RelaxationAssessment(tissues, parameters, weights, evidence, tails, spread)
 
 
 def _weigh(fits: Sequence[_Fit]) -> tuple[Array, float]:
@@ -333,24 +349,27 @@ class _Records:
     def spread(self, fits: Sequence[_Fit], weights: Array, duration_s: float) -> tuple[Array, Array]:
         """Mean (p,) and covariance (p, p) of elastic parameters at a time, over those of the answer.
 
-        The model's own terms keep the answer, whose covariance is not counted here.
+        The model's own terms keep the answer, whose covariance is not counted here. Later than the longest
+        load, a modulus is that at its end: `compute_largest_fall` says what may follow.
         """
         within, answer = min(duration_s, self.longest_s), np.log(self.parameters)
         changes, inner = [], []
         for fit in fits:
             z = self.space.reduce(answer) if fit.world.is_own else fit.z
             at = self._elastic_log(fit.world, z, within)
-            # Uniform from nothing to this.
-            further = self._is_modulus * MAX_SLOPE * np.log(duration_s / within)
             steps = _DIFFERENCE * np.eye(len(z))
             D = np.array([self._elastic_log(fit.world, z + s, within) - at for s in steps]) / _DIFFERENCE
-            changes.append(at - further / 2)
-            inner.append((not fit.world.is_own) * D.T @ fit.covariance @ D + np.outer(further, further) / 12)
+            changes.append(at)
+            inner.append((not fit.world.is_own) * D.T @ fit.covariance @ D)
         own = self._elastic_log(RelaxationModel(), self.space.reduce(answer), duration_s)
         change = np.array(changes) - own
         mean = weights @ change
         apart = change - mean
         return mean, np.einsum("w,wi,wj->ij", weights, apart, apart) + np.tensordot(weights, inner, 1)
+
+    def compute_largest_fall(self, duration_s: float) -> Array:
+        """The most by which the logarithms (p,) of moduli fall after the longest load until a time."""
+        return self._is_modulus * MAX_SLOPE * np.log(max(duration_s / self.longest_s, 1.0))
 
     def _elastic_log(self, world: RelaxationModel, z: Array, duration_s: float) -> Array:
         """Logarithms (p,) of moduli so long after a step and of other elastic parameters; 0 of the rest."""

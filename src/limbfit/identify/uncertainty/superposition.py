@@ -89,6 +89,10 @@ class RelaxationModel:
     def is_own(self) -> bool:
         return self.spectrum_s is None and self.slope == 0.0
 
+    @property
+    def has_tail(self) -> bool:
+        return self.spectrum_s is None and self.slope != 0.0
+
     def has_spectrum(self, tissue: TissueParameters) -> bool:
         return self.spectrum_s is not None and not tissue.is_given
 

@@ -39,22 +39,25 @@ class ParameterSpread:
     covariance : (p, p).
     off : (p,) how far the most probable ones are from those that are simulated.
     shift, relaxation : (p,) and (p, p) what relaxation beyond the records moves them by, and adds; or 0.
+    fall : (p,) by how much they may be lower beside that; or 0.
     """
 
     covariance: Array
     off: Array
     shift: Array | float = 0.0
     relaxation: Array | float = 0.0
+    fall: Array | float = 0.0
 
-    def relax(self, own_weight: float, shift: Array, relaxation: Array) -> ParameterSpread:
+    def relax(self, own_weight: float, shift: Array, relaxation: Array, fall: Array) -> ParameterSpread:
         """The same when a socket has been worn for long, of what `RelaxationSpread` says."""
-        return ParameterSpread(own_weight * self.covariance, own_weight * self.off, shift, relaxation)
+        return ParameterSpread(own_weight * self.covariance, own_weight * self.off, shift, relaxation, fall)
 
     def select(self, chosen: Array) -> ParameterSpread:
         """Those of which ``chosen`` (p,) is True."""
         both, shape = np.ix_(chosen, chosen), self.covariance.shape
-        shift, relaxation = np.broadcast_to(self.shift, shape[:1]), np.broadcast_to(self.relaxation, shape)
-        return ParameterSpread(self.covariance[both], self.off[chosen], shift[chosen], relaxation[both])
+        shift, fall = (np.broadcast_to(one, shape[:1])[chosen] for one in (self.shift, self.fall))
+        relaxation = np.broadcast_to(self.relaxation, shape)[both]
+        return ParameterSpread(self.covariance[both], self.off[chosen], shift, relaxation, fall)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +98,14 @@ class SimulationSpread:
         interval : 95 %, the value itself included.
         shares : of its variance by the parameters, percent, that would go if one were known, largest first.
         changes : of the value where each parameter of the simulation is ``CHANGE_PERCENT`` larger.
-        relaxation : by which relaxation beyond the records moves the value, and its standard deviation.
+        relaxation : by which relaxation beyond the records moves the value, its standard deviation, and by
+            how much the value may be lower beside that.
         """
         known, own = self.known, slopes[list(self.identified)]
         along = known.covariance @ own
         variance = float(own @ along)
         moved, further = float(own @ known.shift), max(float(own @ known.relaxation @ own), 0.0)
+        fall = float(np.sum(own * known.fall))
         half = NORMAL_95 * np.sqrt(max(variance, 0.0) + further)
         scale = np.maximum(np.diag(known.covariance) * variance, np.finfo(float).tiny)
         shares = 100.0 * along**2 / scale
@@ -108,8 +113,9 @@ class SimulationSpread:
         by = _CHANGE * slopes
         changes = dict(zip(self.names, map(float, by), strict=True))
         low, high = sorted((value, value + float(own @ known.off)))
-        interval = [max(min(low + moved - half, value), 0.0), max(high + moved + half, value)]
-        return interval, found, changes, [moved, float(np.sqrt(further))]
+        low, high = low + moved - half - max(fall, 0.0), high + moved + half - min(fall, 0.0)
+        interval = [max(min(low, value), 0.0), max(high, value)]
+        return interval, found, changes, [moved, float(np.sqrt(further)), fall]
 
 
 def _find_key(law: TissueLaw, name: str) -> str:
