@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from limbfit.identify.checks.fit_quality import assess_fit, refit_residuals, summarise_fit
-from limbfit.identify.uncertainty.discrepancy import compute_matern
+from limbfit.identify.uncertainty.discrepancy import compute_matern, estimate_mesh_misfit
+from limbfit.identify.uncertainty.noise import SiteNoise
 from limbfit.results.identification import RecordFit
 
 TIMES = np.linspace(0.0, 12.0, 81)
@@ -22,12 +23,12 @@ def assess(residual: np.ndarray, fitted: bool = True, inside: np.ndarray | None 
     return assess_fit("05", fitted, TIMES, DEPTH, residual, PEAK, COVARIANCE, inside)
 
 
-def noise(seed: int) -> np.ndarray:
+def draw_noise(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).multivariate_normal(np.zeros(81), COVARIANCE)
 
 
 def test_a_model_that_is_right_is_not_accused() -> None:
-    found = [assess(noise(seed)) for seed in range(300)]
+    found = [assess(draw_noise(seed)) for seed in range(300)]
     assert not any(one.verdict for one in found)
     assert np.mean([one.times_noise for one in found]) == pytest.approx(1.0, abs=0.02)
     assert np.mean([one.ljung_box_p < 0.05 for one in found]) == pytest.approx(0.05, abs=0.035)
@@ -36,7 +37,7 @@ def test_a_model_that_is_right_is_not_accused() -> None:
 
 def test_an_unloading_that_the_model_cannot_follow_is_named() -> None:
     bump = 0.48 * np.clip(np.sin(np.pi * (TIMES - 8.0) / 4.0), 0.0, None) * (TIMES > 8.0)
-    found = assess(noise(1) + bump)
+    found = assess(draw_noise(1) + bump)
     unload = found.phases[-1]
     assert [phase.phase for phase in found.phases] == ["loading", "hold", "unloading"]
     assert unload.error_percent == pytest.approx(100 * 0.48 / np.sqrt(2) / PEAK, rel=0.15)
@@ -44,7 +45,7 @@ def test_an_unloading_that_the_model_cannot_follow_is_named() -> None:
     assert max(phase.times_noise for phase in found.phases[:2]) < 1.5
     assert found.verdict.startswith("the model cannot follow the unloading at 05: 4.")
     assert "of the largest force" in found.verdict
-    others = [assess(noise(seed)) for seed in (2, 3)]
+    others = [assess(draw_noise(seed)) for seed in (2, 3)]
     assert summarise_fit([*others, found]) == found.verdict
 
 
@@ -61,7 +62,7 @@ def test_an_error_of_no_size_or_of_no_memory_is_not_said() -> None:
 def test_other_parameters_are_tried_before_the_model_is_blamed() -> None:
     """Two records share the parameters; what these explain goes, what is a record's own stays."""
     step = np.array([0.1, -0.25, 0.05])
-    shared = [noise(1) + SHAPE @ step, noise(2) + 2 * SHAPE @ step]
+    shared = [draw_noise(1) + SHAPE @ step, draw_noise(2) + 2 * SHAPE @ step]
     own = [shared[0], shared[1] + 0.3 * np.sin(TIMES) * (TIMES > 8.0)]
     shapes, covariances = [SHAPE, 2 * SHAPE], [COVARIANCE, COVARIANCE]
 
@@ -79,9 +80,44 @@ def test_other_parameters_are_tried_before_the_model_is_blamed() -> None:
 
 def test_a_held_out_record_is_judged_by_its_band() -> None:
     drift = compute_matern(TIMES, 0.3)[0] * 0.8
-    off = assess(noise(5) + drift, fitted=False, inside=np.arange(81) < 20)
+    off = assess(draw_noise(5) + drift, fitted=False, inside=np.arange(81) < 20)
     assert off.inside_95 == pytest.approx(20 / 81)
     assert off.verdict.startswith("05 is not predicted: 25 % of its points lie in the 95 % band")
-    assert not assess(noise(5) + drift, fitted=False, inside=np.ones(81, dtype=bool)).verdict
-    fitted = assess(noise(1))
+    assert not assess(draw_noise(5) + drift, fitted=False, inside=np.ones(81, dtype=bool)).verdict
+    fitted = assess(draw_noise(1))
     assert summarise_fit([fitted, off]).endswith("1 of 1 held-out records lie mostly outside their 95 % band")
+
+
+def test_a_record_on_another_mesh_is_no_fault_of_the_model() -> None:
+    """The force rises and falls as the footprint grows over the elements, on another mesh at other depths.
+
+    How much of that there is follows from the difference of two meshes, which has other ripples.
+    """
+    quiet = (SD / 4) ** 2 * np.eye(81) + 1e-4 * np.outer(FORCE, FORCE)
+    four = [SHAPE] * 4, [SiteNoise("05", TIMES, quiet, SD / 4, 0.0)] * 4, np.full(4, PEAK), np.eye(3)
+
+    def make_error(seed: int) -> np.ndarray:
+        random = np.random.default_rng(seed)
+        ripple = random.multivariate_normal(np.zeros(81), compute_matern(TIMES, 0.07)) * (DEPTH > 0)
+        return 0.02 * FORCE * random.standard_normal() + 0.004 * PEAK * ripple
+
+    def judge(covariances: list[np.ndarray], wrong: np.ndarray | float = 0.0) -> list[RecordFit]:
+        noise = np.random.default_rng(0).multivariate_normal(np.zeros(81), quiet, 4)
+        residuals = [one + make_error(100 + seed) + wrong for seed, one in enumerate(noise)]
+        left = refit_residuals(residuals, [SHAPE] * 4, covariances)
+        triples = zip(residuals, covariances, left, strict=True)
+        return [assess_fit("05", True, TIMES, DEPTH, r, PEAK, C, None, after) for r, C, after in triples]
+
+    meshes = [make_error(seed) for seed in range(4)]
+    found = estimate_mesh_misfit(meshes, *four)
+    assert found is not None
+    assert 0.003 < found.share < 0.006
+    assert found.correlation <= 0.12
+    without = [quiet + np.outer(mesh, mesh) for mesh in meshes]
+    counted = [one + found.compute_covariance(TIMES, PEAK) for one in without]
+    assert any(one.verdict for one in judge(without))
+    assert not any(one.verdict for one in judge(counted))
+    assert max(one.times_noise for one in judge(counted)) < 1.3
+    late = 0.05 * PEAK * np.clip(np.sin(np.pi * (TIMES - 8.0) / 2.0), 0.0, None) * (TIMES > 8.0)
+    assert any("the unloading" in one.verdict for one in judge(counted, late))
+    assert estimate_mesh_misfit([0.0 * FORCE] * 4, *four) is None

@@ -125,7 +125,15 @@ class RecordResiduals(ResultPart):
     misfit_sd_N: float = Field(description="Standard deviation of what the model cannot follow.")
     misfit_share: float = Field(description="That over the largest force.")
     mesh_share: float | None = Field(description="Error of the mesh over the largest force.")
+    mesh_N: Sequence[float] | None = Field(description="Error of the mesh at the compared times.")
     site_share: float | None = Field(description="Deviation of the whole site over the largest force.")
+
+
+class MeshMisfitSummary(ResultPart):
+    """A misfit that the mesh alone would cause."""
+
+    share: float = Field(description="Standard deviation over the largest force.")
+    correlation: float = Field(description="Correlation length over the duration of the record.")
 
 
 class ResidualsSummary(ResultPart):
@@ -134,6 +142,7 @@ class ResidualsSummary(ResultPart):
     sites: Mapping[str, RecordResiduals] = Field(description="Each fitted record.")
     site_factor: float | None = Field(description="Deviation of whole sites over the expected one.")
     misfit_elsewhere: float = Field(description="Misfit expected elsewhere, over the largest force.")
+    mesh_misfit: MeshMisfitSummary | None = Field(description="The part that the mesh may cause.")
     correlation: float = Field(description="Correlation of neighbouring residuals.")
     known_scale: float = Field(description="Independent residuals that tell the size of the misfit.")
     effective_samples: float = Field(description="Number of independent residuals.")

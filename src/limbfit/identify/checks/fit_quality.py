@@ -3,8 +3,11 @@
 The residuals r of a record that the model obeys have a known covariance C: noise, touch-down, mesh, and the
 stiffness of the site as a whole. ``sqrt(r' C^-1 r / n)`` is then about one in every phase. A model that
 cannot follow leaves smooth residuals, many times as large by this measure even where they are small beside
-the force. Their autocorrelation is tested on residuals whitened by C (Ljung and Box 1978). What other
-parameters would explain is taken out first: it is the model that is judged, not where the search stopped.
+the force. The mesh counts with the shape of its own error and with a smooth error of any shape
+(`MeshMisfit`): a record of the same limb on another mesh is no fault of the model.
+
+Autocorrelation is tested on residuals whitened by C (Ljung and Box 1978). What other parameters would explain
+is taken out first: it is the model that is judged, not where the search stopped.
 """
 
 from __future__ import annotations

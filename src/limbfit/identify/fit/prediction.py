@@ -145,11 +145,18 @@ class PredictionModel:
         noise = [found.compared_noise_sd_N for found in self.sites.values() if found.unit == unit]
         return float(np.median(noise)) if noise else 0.0, self.misfit_elsewhere
 
-    def find_mesh_share(self, site: str) -> float:
-        """Return the error of a record's mesh over its largest force: elsewhere the median of the fitted."""
-        if site in self.sites:
-            return self.sites[site].mesh_share or 0.0
-        return float(np.median([one.mesh_share or 0.0 for one in self.sites.values()] or [0.0]))
+    def find_mesh_error(self, site: str, force_N: Array) -> Array:
+        """Return one standard deviation (n,) in N of what the mesh lacks of a record's ``force_N`` (n,).
+
+        Where no other mesh was simulated it is as large, over the largest force, as the median of the fitted
+        records', and goes with the force.
+        """
+        if site in self.sites and (stored := self.sites[site].mesh_N):
+            return np.array(stored)
+        shares = [one.mesh_share or 0.0 for one in self.sites.values()]
+        share = float(np.median(shares)) if shares and site not in self.sites else 0.0
+        size = max(float(np.sqrt(np.mean(force_N**2))), np.finfo(float).tiny)
+        return np.asarray(share * find_largest_magnitude(force_N) * force_N / size)
 
     def compute_interval_95(
         self,

@@ -8,6 +8,10 @@ have absorbed.
 
 A site as a whole may be off as well, because its tissue differs or its surfaces are not where the image shows
 them. That is a random effect of every site on the stiffness of all its tissue, whose size is estimated, too.
+
+Part of a misfit may be the mesh's. As the footprint of the indenter grows over the elements, the force rises
+and falls by a little, on another mesh at other depths. What no parameter and no stiffer site explains of the
+difference of two meshes tells how much of that there is (`estimate_mesh_misfit`).
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve, cholesky, eigh, solv
 from scipy.optimize import minimize
 
 from ...arrays import Array
-from ...results.identification import RecordResiduals, ResidualsSummary
+from ...results.identification import MeshMisfitSummary, RecordResiduals, ResidualsSummary
 from .noise import SiteNoise
 
 # Of a record; longer ones cannot be told from an offset
@@ -42,6 +46,19 @@ def compute_matern(times_s: Array, correlation: float) -> Array:
 
 
 @dataclass(frozen=True)
+class MeshMisfit:
+    """A misfit that the mesh alone would cause: standard deviation over the largest force of a record
+    (``share``) and correlation length over its duration (``correlation``)."""
+
+    share: float
+    correlation: float
+
+    def compute_covariance(self, times_s: Array, peak_N: float) -> Array:
+        """Return its covariance (n, n) in N^2 for a record with so large a force."""
+        return (self.share * peak_N) ** 2 * compute_matern(times_s, self.correlation)
+
+
+@dataclass(frozen=True)
 class ResidualModel:
     """Covariance of the residuals: the noise of each record, the misfit of the model, and what records share.
 
@@ -50,7 +67,8 @@ class ResidualModel:
     all. ``site_N`` (n,) is the same for the expected difference of a site's stiffness, and ``site_factor``
     the estimated difference over the expected one; empty: it is left out. ``misfit`` (records,) is the
     standard deviation of the misfit over the largest force ``peaks_N`` (records,). ``known_scale`` is the
-    number of independent residuals from which the size of the misfit is known.
+    number of independent residuals from which the size of the misfit is known. ``mesh_misfit`` is the part
+    of the misfit that may be the mesh's.
     """
 
     noise: tuple[SiteNoise, ...]
@@ -62,6 +80,7 @@ class ResidualModel:
     mesh_N: tuple[Array, ...] = ()
     site_N: tuple[Array, ...] = ()
     site_factor: float = 1.0
+    mesh_misfit: MeshMisfit | None = None
 
     @property
     def misfit_elsewhere(self) -> float:
@@ -85,12 +104,16 @@ class ResidualModel:
                     misfit_sd_N=float(misfit * peak),
                     misfit_share=float(misfit),
                     mesh_share=self._share(self.mesh_N, i),
+                    mesh_N=self.mesh_N[i].tolist() if self.mesh_N else None,
                     site_share=self._share([self.site_factor * one for one in self.site_N], i),
                 )
                 for i, (noise, misfit, peak) in enumerate(zip(self.noise, self.misfit, self.peaks_N))
             },
             site_factor=self.site_factor if self.site_N else None,
             misfit_elsewhere=self.misfit_elsewhere,
+            mesh_misfit=None
+            if self.mesh_misfit is None
+            else MeshMisfitSummary.model_validate(self.mesh_misfit),
             correlation=self.correlation,
             known_scale=self.known_scale,
             effective_samples=self.effective_samples(),
@@ -222,6 +245,33 @@ def estimate_discrepancy(
         known_scale=rows.known_scale(logs),
         criterion=value,
     )
+
+
+def estimate_mesh_misfit(
+    mesh_N: Sequence[Array],
+    jacobians: Sequence[Array],
+    noise: Sequence[SiteNoise],
+    peaks_N: Array,
+    precision: Array,
+    site_N: Sequence[Array] = (),
+) -> MeshMisfit | None:
+    """Estimate the misfit that a study sees in records of a limb that its model describes, on another mesh.
+
+    The errors ``mesh_N`` (n,) of the mesh, from the difference of two, take the place of the residuals of
+    `estimate_discrepancy`, which has the other arguments. None if no record's error is known.
+    """
+    chosen = [i for i, error in enumerate(mesh_N) if np.any(error)]
+    if not chosen:
+        return None
+    found = estimate_discrepancy(
+        [mesh_N[i] for i in chosen],
+        [jacobians[i] for i in chosen],
+        [noise[i] for i in chosen],
+        np.asarray(peaks_N)[chosen],
+        precision,
+        site_N=[site_N[i] for i in chosen] if site_N else (),
+    )
+    return MeshMisfit(found.misfit_elsewhere, found.correlation)
 
 
 def _guess_misfit(residual: Array, noise: SiteNoise, peak: float) -> float:

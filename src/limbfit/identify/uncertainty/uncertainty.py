@@ -23,7 +23,7 @@ from ...arrays import Array
 from ..fit.objective import MeasuredCurve, SiteResponse
 from ..fit.parameters import Grouping, SearchSpace, Unknowns, build_space, group_separately
 from ..fit.state import CalibrationSettings
-from .discrepancy import ResidualModel, estimate_discrepancy
+from .discrepancy import ResidualModel, estimate_discrepancy, estimate_mesh_misfit
 from .estimator import Estimator, PriorPrecision
 from .noise import SiteNoise
 
@@ -122,6 +122,8 @@ def estimate_uncertainty(
     prior = PriorPrecision.from_unknowns(unknowns, space)
     peaks = np.array([site.peak_N for site in measured])
     model = estimate_discrepancy(residuals, scaled, noise, peaks, prior.precision, mesh_N, site_N)
+    of_mesh = estimate_mesh_misfit(mesh_N, scaled, noise, peaks, prior.precision, site_N)
+    model = replace(model, mesh_misfit=of_mesh)
     chosen = settings or CalibrationSettings()
     weights = [
         one.compute_cost_curvature(chosen.objective, r) for r, one in zip(residuals, measured, strict=True)

@@ -12,6 +12,7 @@ from ...errors import RunError
 from ...identify.fit.correction import MeshCorrection
 from ...study import Study
 from ...study.meshing import MeshTable
+from ...study.tables import SolverTable
 from ..engine.context import Context
 from ..limb.mesh import mesh_settings
 from ..limb.remesh import mesh_in_background, mesh_where_possible, scale_edges
@@ -19,7 +20,7 @@ from ..records.records import RecordSet, SiteRecord
 from ..simulation.extrapolation import MESH_ORDERS, estimate_fine_error
 from .record_simulator import RecordSimulator, Responses
 
-COARSENING_FACTOR = 1.3  # of the edges: another mesh that tells the error of the study's own
+COARSENING_FACTOR = 1.3  # of the edges and the steps: another mesh that tells the error of the study's own
 NO_MESH_ERROR = "intervals do not count the error of the site's own mesh"
 
 
@@ -116,12 +117,16 @@ def _estimate_mesh_errors(
     """One standard deviation (n,) N of what the study's meshes lack at every site.
 
     It follows from the difference of what is ``searched`` and of the same on ``others``, meshes of other
-    edges. Zero where there are none, or these cannot be simulated: a line says so.
+    edges, with fewer steps: in unloading these change the force as much as the mesh does. Zero where there
+    are none, or these cannot be simulated: a line says so.
     """
     records = simulator.records.own
     errors, share = [0.0 * record.compared for record in records], estimate_own_mesh_error(study.mesh)
     meshed = [(i, other) for i, other in enumerate(others) if other is not None]
-    near = [replace(one, model=replace(one.model, within_mm=study.within_mm)) for _, one in meshed]
+    steps = _scale_steps(study.solver)
+    near = [
+        replace(one, model=replace(one.model, within_mm=study.within_mm, steps=steps)) for _, one in meshed
+    ]
     jobs = [other.job(parameters, sensitivities=False) for other in near]
     done = simulator.cache.run(jobs, simulator.executor, again=True)
     for (i, _), simulation in zip(meshed, done, strict=True):
@@ -139,3 +144,10 @@ def estimate_own_mesh_error(table: MeshTable) -> float:
     """One standard deviation of what the study's own mesh lacks, over its difference from the coarser one."""
     ratio = COARSENING_FACTOR if table.coarse is None else table.coarse.edge_near_mm / table.edge_near_mm
     return estimate_fine_error(MESH_ORDERS[table.element], ratio)
+
+
+def _scale_steps(table: SolverTable) -> SolverTable:
+    """The steps in time `COARSENING_FACTOR` times as long."""
+    names = ("load_steps", "unload_steps")
+    fewer = {name: max(2, round(getattr(table, name) / COARSENING_FACTOR)) for name in names}
+    return table.model_copy(update=fewer)

@@ -16,6 +16,7 @@ from ...identify.checks.fit_quality import assess_fit, refit_residuals, summaris
 from ...identify.fit.correction import MeshCorrection
 from ...identify.fit.objective import SiteResponse, find_largest_magnitude
 from ...identify.fit.prediction import PredictionModel, compute_error_percent, summarise_errors
+from ...identify.uncertainty.discrepancy import MeshMisfit
 from ...indentation import Simulation, SimulationJob, store_job_fields
 from ...results.identification import (
     FitSummary,
@@ -96,7 +97,9 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     outside = {f"site {row.record}": row.outside_records for row in rows if not row.fitted}
     warnings = check_records(context, cache, records.own, ours, best, one, records.searched, correction)
     judged = [(site, band) for site, band in zip(sites, bands, strict=True) if band is not None]
-    quality = _assess_fits(context, judged, best, known)
+    of_mesh = calibration.uncertainty.residuals.mesh_misfit
+    mesh_misfit = None if of_mesh is None else MeshMisfit(of_mesh.share, of_mesh.correlation)
+    quality = _assess_fits(context, judged, best, known, mesh_misfit)
     content = PredictResult(
         sites=rows,
         recorded_range=RecordedExtents.model_validate(tested),
@@ -281,19 +284,31 @@ def _write_curves(folder: Path, site: SitePrediction, band: _Band | None) -> Non
 
 
 def _assess_fits(
-    context: Context, judged: Sequence[tuple[SitePrediction, _Band]], best: Array, known: PredictionModel
+    context: Context,
+    judged: Sequence[tuple[SitePrediction, _Band]],
+    best: Array,
+    known: PredictionModel,
+    of_mesh: MeshMisfit | None,
 ) -> list[RecordFit]:
-    """How well the model follows each record, beside its noise and the errors of its mesh and site."""
+    """How well the model follows each record, beside its noise and the errors of its mesh and site.
+
+    Forces are smoothed as the record is: else the corner at its peak would be taken for an error of the
+    model.
+    """
     sites = [site for site, _ in judged]
-    allowed, residuals = [], [site.ours.force_N - site.record.compared for site in sites]
-    for site, band in judged:
-        mesh = known.find_mesh_share(site.record.name) * site.ours.force_N
-        noise = estimate_site_noise(context.study, site.record, site.ours.force_N).covariance
-        allowed.append(noise + np.outer(band.deviation, band.deviation) + np.outer(mesh, mesh))
+    forces = [site.record.smoothing @ site.ours.force_N for site in sites]
+    allowed, residuals = [], [F - site.record.compared for F, site in zip(forces, sites, strict=True)]
+    for force, (site, band) in zip(forces, judged, strict=True):
+        noise = estimate_site_noise(context.study, site.record, force).covariance
+        errors = [band.deviation, known.find_mesh_error(site.record.name, force)]
+        covariance = noise + sum(np.outer(error, error) for error in errors)
+        if of_mesh is not None:
+            covariance += of_mesh.compute_covariance(site.record.times_s, find_largest_magnitude(force))
+        allowed.append(covariance)
     fitted = [i for i, site in enumerate(sites) if site.record.site.fitted]
     refitted = refit_residuals(
         [residuals[i] for i in fitted],
-        [sites[i].ours.jacobian * best for i in fitted],
+        [sites[i].record.smoothing @ sites[i].ours.jacobian * best for i in fitted],
         [allowed[i] for i in fitted],
     )
     left = dict(zip(fitted, refitted, strict=True))
