@@ -8,11 +8,12 @@ uniaxial stress whose relaxation is quasi-linear.  Four sites are fitted and fou
 from a limb that differs from the model in one way; calibration, residuals, intervals and the spread between
 relaxations are limbfit's own.  Every draw has other tissues and other noise.
 
-The table shows the error at held-out sites, how many parameters are called determined and hold the truth, how
-many points of held-out records lie inside their bands, and the force after ``--after`` seconds of a hold that
-no record has: its error, and the half width and the coverage of its interval from the parameters alone
-(before) and with what relaxation beyond the record may do (after).  ``--hold``: one fitted site is held so
-long in its record.
+The table shows how often the verdict on the fit blames the model, the error at held-out sites, how many
+parameters are called determined and hold the truth, how many points of held-out records lie inside their
+bands, and the force after ``--after`` seconds of a hold that no record has: its error, and the half width and
+the coverage of its interval from the parameters alone (before) and with what relaxation beyond the record may
+do (after).  ``--hold``: one fitted site is held so long in its record.  Last comes which relaxation the
+records prefer, and how often the user is warned that the limb may give way to the indenter.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from limbfit.autoregressive import compute_block_covariance
+from limbfit.identify.checks.fit_quality import FitQuality, assess_fit, refit_residuals
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import Unknowns, build_space, build_stage_groupings, group_separately
@@ -37,7 +39,7 @@ from limbfit.identify.fit.prediction import PredictionModel, compute_error_perce
 from limbfit.identify.fit.state import CalibrationSettings
 from limbfit.identify.uncertainty.intervals import EvaluationStore, sample_uncertainty
 from limbfit.identify.uncertainty.noise import compute_depth_slope, estimate_record_noise
-from limbfit.identify.uncertainty.relaxation import assess_relaxation
+from limbfit.identify.uncertainty.relaxation import GIVES_WAY, assess_relaxation
 from limbfit.identify.uncertainty.uncertainty import DETERMINED, NORMAL_95, estimate_uncertainty
 
 Array = NDArray[np.float64]
@@ -271,8 +273,12 @@ def run_draw(world: World, seed: int, hold_s: float, after_s: float) -> dict[str
     )  # fmt: skip
     inside = (known.intervals_95[:, 0] <= truth) & (truth <= known.intervals_95[:, 1])
     verdicts = relaxation.qualify_verdicts(known)
+    quality = _judge_fit(fitted, found.responses, best, [one.covariance for one in noise], off)
     row: dict[str, Any] = {
+        "named": any(one.verdict for one in quality),
+        "times_noise": max(phase.times_noise for one in quality for phase in one.phases),
         "prefers": relaxation.preferred,
+        "gives_way": GIVES_WAY in relaxation.describe(known),
         "weights": relaxation.weights.tolist(),
         "determined": [word == DETERMINED for word in known.verdicts],
         "still_determined": [word == DETERMINED for word in verdicts],
@@ -288,6 +294,26 @@ def run_draw(world: World, seed: int, hold_s: float, after_s: float) -> dict[str
             hold = world, record.bar, best, truth, after_s
             row["after"].append(_compare_hold(*hold, sampled, spread))
     return row
+
+
+def _judge_fit(
+    records: Sequence[Recorded],
+    responses: Sequence[SiteResponse],
+    best: Array,
+    noise: Sequence[Array],
+    off: Sequence[Array],
+) -> list[FitQuality]:
+    """What the stage ``predict`` says of the fit; nothing here has a mesh."""
+    allowed = [covariance + np.outer(error, error) for covariance, error in zip(noise, off, strict=True)]
+    residuals = [r.force_N - one.force_N for r, one in zip(responses, records, strict=True)]
+    left = refit_residuals(residuals, [r.jacobian * best for r in responses], allowed)
+    return [
+        assess_fit(
+            one.bar.name, True, one.times_s, one.depth_mm, residual,
+            float(one.force_N.max()), covariance, None, refitted,
+        )
+        for one, residual, covariance, refitted in zip(records, residuals, allowed, left, strict=True)
+    ]  # fmt: skip
 
 
 def _compare_record(record: Recorded, best: Array, model: PredictionModel) -> dict[str, float]:
@@ -310,7 +336,7 @@ def _compare_hold(
     truth: Array,
     after_s: float,
     sampled: tuple[Array, Array],
-    spread: tuple[float, Array, Array],
+    spread: tuple[float, Array, Array, Array],
 ) -> dict[str, float]:
     """Error and intervals of the force after a hold, from parameters alone and with the spread, percent."""
     time, depth = replace(bar, hold=after_s).history()
@@ -324,14 +350,15 @@ def _compare_hold(
     slope = np.array([(value(_STEP * row) - value(-_STEP * row)) / (2 * _STEP) for row in np.eye(8)])
     at, (centre, covariance) = value(np.zeros(8)), sampled
     off, variance = float(slope @ np.log(centre / best)), float(slope @ covariance @ slope)
-    weight, shift, further = spread
+    weight, shift, further, fall = spread
     found = {"error": 100 * float(np.expm1(at - true))}
-    for word, share, moved, added in (
-        ("before", 1.0, 0.0, 0.0),
-        ("after", weight, float(slope @ shift), float(slope @ further @ slope)),
+    for word, share, moved, added, falls in (
+        ("before", 1.0, 0.0, 0.0, 0.0),
+        ("after", weight, float(slope @ shift), float(slope @ further @ slope), float(slope @ fall)),
     ):
         half = NORMAL_95 * np.sqrt(share * variance + added)
         low, high = at + moved + share * min(0.0, off) - half, at + moved + share * max(0.0, off) + half
+        low -= falls
         low, high = min(low, at), max(high, at)  # as those of a socket
         found |= {f"{word}_inside": 100.0 * (low <= true <= high)}
         found |= {f"{word}_half": 50 * float(np.exp(high - at) - np.exp(low - at))}
@@ -349,6 +376,8 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         return 100 * float(np.mean(hits)) if hits else float("nan")
 
     return {
+        "named": 100 * float(np.mean([row["named"] for row in rows])),
+        "times noise": float(np.median([row["times_noise"] for row in rows])),
         "heldout": mean("heldout", "error"),
         "determined": float(np.mean([sum(row["determined"]) for row in rows])),
         "true": covered("determined"),
@@ -365,16 +394,20 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 HEADS = (
-    "| truth | held-out error | determined, of which true: before | after | band: inside, half width | "
-    "force after the hold: error | before: half width, inside | after: half width, inside | prefers |"
+    "| truth | named, times noise | held-out error | determined, of which true: before | after | "
+    "band: inside, half width | force after the hold: error | before: half width, inside | "
+    "after: half width, inside | prefers |"
 )
 
 
 def format_row(name: str, s: Mapping[str, float], rows: Sequence[Mapping[str, Any]]) -> str:
     words = [row["prefers"] for row in rows]
     counts = ", ".join(f"{words.count(word)} {word}" for word in sorted(set(words)))
+    if warned := sum(row["gives_way"] for row in rows):
+        counts += f"; {warned} may give way"
     return (
-        f"| {name} | {s['heldout']:.1f} % | {s['determined']:.1f}, {s['true']:.0f} % | "
+        f"| {name} | {s['named']:.0f} %, {s['times noise']:.1f} | {s['heldout']:.1f} % | "
+        f"{s['determined']:.1f}, {s['true']:.0f} % | "
         f"{s['still']:.1f}, {s['still true']:.0f} % | {s['band']:.0f} %, {s['band half']:.1f} % | "
         f"{s['error']:+.0f} % | {s['before half']:.0f} %, {s['before']:.0f} % | "
         f"{s['after half']:.0f} %, {s['after']:.0f} % | {counts} |"
@@ -385,6 +418,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("worlds", nargs="*", help=f"by default all: {', '.join(WORLDS)}")
     parser.add_argument("--draws", type=int, default=8)
+    parser.add_argument("--seed", type=int, default=0, help="of the first draw")
     parser.add_argument("--hold", type=float, default=0.0, help="s, of one fitted site")
     parser.add_argument("--after", type=float, default=60.0, help="s, of the hold that is predicted")
     parser.add_argument("--json", type=Path)
@@ -395,7 +429,8 @@ def main() -> None:
     print(HEADS, "|" + "---|" * HEADS.count(" |"), sep="\n")
     found, everything = {}, []
     for name in given.worlds or WORLDS:
-        rows = [run_draw(WORLDS[name], seed, given.hold, given.after) for seed in range(given.draws)]
+        seeds = range(given.seed, given.seed + given.draws)
+        rows = [run_draw(WORLDS[name], seed, given.hold, given.after) for seed in seeds]
         found[name] = {"summary": summarise(rows), "draws": rows}
         everything += rows
         print(format_row(name, found[name]["summary"], rows), flush=True)
