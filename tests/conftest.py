@@ -112,7 +112,7 @@ def coarse_settings() -> str:
 @pytest.fixture
 def commands_unasked(monkeypatch) -> None:
     """``limbfit check`` looks at the inputs alone: what commands would refuse takes half of its time."""
-    monkeypatch.setattr("limbfit.pipeline.verbs.check.list_refused_commands", lambda *given: [])
+    monkeypatch.setattr("limbfit.pipeline.commands.check.list_refused_commands", lambda *given: [])
 
 
 @pytest.fixture
