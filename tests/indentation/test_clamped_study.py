@@ -123,7 +123,7 @@ def test_they_are_among_what_decides_a_kept_simulation(context):
     assert len({compute_job_digest(job) for job in jobs}) == 3
 
 
-def test_the_check_says_how_many_hold_the_limb(context, tmp_path):
+def test_the_check_says_how_many_hold_the_limb(commands_unasked, context, tmp_path):
     facts = check_study(context.study)["facts"]
     assert "clamps: 11 pins of 4 N, 7 s before touch-down; 11 at site 1 meet the skin" in facts
     with pytest.raises(ProblemError) as caught:

@@ -130,7 +130,7 @@ def test_a_protocol_goes_from_its_record_to_residuals_and_report(tmp_path, name)
     assert words in [cell.text for cell in table.rows[0].cells]
 
 
-def test_check_tells_the_phases_of_a_record(study):
+def test_check_tells_the_phases_of_a_record(study, commands_unasked):
     times = {"1": PROTOCOLS["held"], "2": PROTOCOLS["cycles"]}
     for name, (knots_s, knots_mm, _) in times.items():
         depth = lambda t, s=knots_s, mm=knots_mm: np.interp(t, s, mm)  # noqa: E731
