@@ -11,7 +11,7 @@ from bodies import ellipsoid, limb
 
 from limbfit.anatomy.imaging import read_labels, write_labels
 from limbfit.anatomy.meshing.engines import VolumeTask, run_netgen
-from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, compute_signed_distance
+from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, evaluate_distance
 from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_limb, mesh_site
 from limbfit.anatomy.meshing.regions import build_region_level, find_interfaces
 from limbfit.anatomy.segmentation.amputation import amputate_limb, voxelise_anatomy
@@ -68,7 +68,7 @@ def test_the_mesh_conforms_to_a_region(meshed: tuple) -> None:
     anatomy, mesh, report = meshed
     assert mesh.region_names == ("skin", "scar", "muscle")
     assert len(boundary_faces(mesh)) < 4 * len(mesh.cells)  # raises where a face has three cells
-    depth = -compute_signed_distance(anatomy.regions["scar"], mesh.points)[0]
+    depth = -evaluate_distance(anatomy.regions["scar"], mesh.points)[0]
     between, scar = find_nodes_between(mesh), mesh.regions == 1
     assert np.percentile(np.abs(depth[between]), 95) < 0.01
     assert np.abs(depth[between]).max() < 0.3
@@ -107,7 +107,7 @@ def test_a_gap_thinner_than_the_clearance_is_closed() -> None:
     towards = fields.frame.to_limb(at(-28.0, 0.0, -40.0)[None])  # in the gap, 0.6 mm wide
     surface = fields.regions["scar"]
     outside = towards + np.linspace(0.0, 0.6, 4)[:, None] * fields.depth(towards)[1]
-    between = outside[compute_signed_distance(surface, outside)[0] > 0.0]
+    between = outside[evaluate_distance(surface, outside)[0] > 0.0]
     assert len(between)
     assert (level(between)[0] < 0.0).all()
 
@@ -175,9 +175,7 @@ def test_a_label_becomes_a_region_and_no_bone(tmp_path) -> None:
     check_anatomy(built)
     assert set(built.bones) == {"tibia"}
     assert built.regions["mark"].volume == pytest.approx(anatomy.regions["scar"].volume, rel=0.02)
-    assert (
-        np.abs(compute_signed_distance(anatomy.regions["scar"], built.regions["mark"].points)[0]).max() < 1.0
-    )
+    assert np.abs(evaluate_distance(anatomy.regions["scar"], built.regions["mark"].points)[0]).max() < 1.0
     save_anatomy(tmp_path, built)
     assert load_anatomy(tmp_path).regions["mark"].volume == pytest.approx(built.regions["mark"].volume)
     with pytest.raises(

@@ -7,7 +7,7 @@ import pytest
 from bodies import limb
 from limbs import rotation
 
-from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, compute_signed_distance
+from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, evaluate_distance
 from limbfit.anatomy.meshing.liner import build_liner_surface
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.anatomy.surfaces.surfaces import Anatomy
@@ -38,7 +38,7 @@ def test_the_outer_face_is_a_thickness_outside_the_skin(oblique: Anatomy, lined:
     assert lined.skin.volume > oblique.skin.volume
     below = lined.skin.points[lined.height(lined.skin.points) < -5.0]
     fields = build_limb_fields(oblique, (), 0.0)
-    away = compute_signed_distance(fields.skin, fields.frame.to_limb(below))[0]
+    away = evaluate_distance(fields.skin, fields.frame.to_limb(below))[0]
     assert away == pytest.approx(THICKNESS, abs=0.02)
     assert lined.height(lined.skin.points).max() == pytest.approx(0.0, abs=1e-6)
 

@@ -17,7 +17,7 @@ from limbfit.anatomy.meshing import engines
 from limbfit.anatomy.meshing.background import LAYER, build_box_grid, compute_in_band, compute_volumes, cut
 from limbfit.anatomy.meshing.curving import curve_diagonals
 from limbfit.anatomy.meshing.extrusion import build_columns
-from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, compute_signed_distance
+from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, evaluate_distance
 from limbfit.anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
 from limbfit.anatomy.meshing.meshreport import check_quality
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, read_surface
@@ -105,7 +105,7 @@ def test_nodes_of_the_skin_stay_on_a_rough_one(oblique: Anatomy) -> None:
     mesh, report = mesh_site(rough, position, axis, settings)
     heads = mesh.points[np.unique(mesh.face_sets["skin"])]
     below = heads[(heads - rough.cut_point) @ rough.cut_normal < -10.0]
-    assert np.abs(compute_signed_distance(rough.skin, below)[0]).max() < 1e-3
+    assert np.abs(evaluate_distance(rough.skin, below)[0]).max() < 1e-3
     assert report.min_dihedral_deg > 6.0
 
 
@@ -123,18 +123,18 @@ def test_sets_lie_on_their_surfaces(meshed: tuple, oblique: Anatomy) -> None:
     )
     assert len(missing) == 0
     bone = mesh.points[mesh.node_sets["fixed_bone"]]
-    off_bone = np.abs(compute_signed_distance(oblique.bones["tibia"], bone)[0])
+    off_bone = np.abs(evaluate_distance(oblique.bones["tibia"], bone)[0])
     assert np.median(off_bone) < 0.02
     assert np.percentile(off_bone, 95) < 0.25
     assert off_bone.max() < 1.0
     faces = mesh.face_sets["skin"]
     below = oblique.height(mesh.points[np.unique(faces)]) < -4
-    off_skin = np.abs(compute_signed_distance(oblique.skin, mesh.points[np.unique(faces)][below])[0])
+    off_skin = np.abs(evaluate_distance(oblique.skin, mesh.points[np.unique(faces)][below])[0])
     assert np.percentile(off_skin, 95) < 0.02
     assert off_skin.max() < 0.3
     corners = mesh.points[faces[:, :3]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    outward = compute_signed_distance(oblique.skin, corners.mean(axis=1))[1]
+    outward = evaluate_distance(oblique.skin, corners.mean(axis=1))[1]
     assert (np.einsum("ij,ij->i", normals, outward) > 0).all()
 
 
@@ -148,7 +148,7 @@ def test_coarse_faces_lie_on_a_bone_in_the_mean(oblique: Anatomy) -> None:
     faces = faces[~np.isin(faces, mesh.node_sets["fixed_proximal"]).all(axis=1)]
     shares = np.array([[i / 8, j / 8] for i in range(9) for j in range(9 - i)])
     places = np.einsum("qk,fki->fqi", quadratic_simplex(shares)[0], mesh.points[faces]).reshape(-1, 3)
-    level, _ = compute_signed_distance(oblique.bones["tibia"], places)
+    level, _ = evaluate_distance(oblique.bones["tibia"], places)
     assert abs(level.mean()) < 0.08
     assert np.sqrt(np.mean(level**2)) < 0.32
     assert report.min_scaled_jacobian > 0.25

@@ -83,12 +83,8 @@ def write_volume(path: str | Path, volume: Volume) -> None:
 
 
 def check_image(volume: Volume, path: str | Path) -> None:
-    """Refuse an image that cannot show a limb: one grey value, or of a size that only another unit explains.
-
-    Raises
-    ------
-    ImageError
-    """
+    """Raise `ImageError` for an image that cannot show a limb: of one grey value, or of another unit's
+    size."""
     if volume.array.min() == volume.array.max():
         raise ImageError("the image is constant", file=path, remedy="check the series, export it again")
     extent = float((np.array(volume.size) * volume.spacing).max())

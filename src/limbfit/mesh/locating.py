@@ -144,14 +144,14 @@ def find_gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[LayerGaug
     spans: dict[int, tuple[_Crossing, _Crossing]] = {}
     for top, bottom in pairwise(crossings[first : end + 1]):
         spans.setdefault(top.below, (top, bottom))
-    return tuple(_build_gauge(mesh.region_names[region], axis, *span) for region, span in spans.items())
-
-
-def _build_gauge(region: str, axis: Array, top: _Crossing, bottom: _Crossing) -> LayerGauge:
-    weights: Array = np.concatenate([top.weights, -bottom.weights])
-    nodes, place = np.unique(np.concatenate([top.nodes, bottom.nodes]), return_inverse=True)
-    thickness = bottom.along_mm - top.along_mm
-    return LayerGauge(nodes, np.bincount(place, weights).astype(np.float64), axis, region, thickness)
+    gauges = []
+    for region, (top, bottom) in spans.items():
+        weights: Array = np.concatenate([top.weights, -bottom.weights])
+        nodes, place = np.unique(np.concatenate([top.nodes, bottom.nodes]), return_inverse=True)
+        weights = np.bincount(place, weights).astype(np.float64)
+        thickness = bottom.along_mm - top.along_mm
+        gauges.append(LayerGauge(nodes, weights, axis, mesh.region_names[region], thickness))
+    return tuple(gauges)
 
 
 def _find_crossings(mesh: Mesh, origin: Array, axis: Array) -> list[_Crossing]:

@@ -56,7 +56,9 @@ class RigidSurface:
 
     points: Array
     faces: Indices
-    _rounded: dict[float, tuple[float, Body]] = field(default_factory=dict, init=False, repr=False)
+    _rounded: dict[tuple[float, bool], tuple[float, Body]] = field(
+        default_factory=dict, init=False, repr=False
+    )
 
     def __post_init__(self) -> None:
         points, faces = np.asarray(self.points, dtype=float), np.asarray(self.faces)
@@ -84,21 +86,18 @@ class RigidSurface:
         Where the surface has details that such a radius would swallow, it is halved; or refused, with
         ``exact``.
         """
-        key = -radius if exact else radius
+        key = radius, exact
         if key not in self._rounded:
-            self._rounded[key] = self._round(radius, 0 if exact else 12)
+            trials = (radius / 2**k for k in range(1 if exact else 13))
+            shrunk = ((trial, self._shrink(trial)) for trial in trials)
+            sound = next(((trial, points) for trial, points in shrunk if points is not None), None)
+            if sound is None:
+                raise ProblemError(
+                    f"the indenter's surface has details that cannot be rounded by {radius:g} mm",
+                    remedy="give a smaller edge radius or a coarser surface",
+                )
+            self._rounded[key] = sound[0], _build_body(sound[1], self.faces)
         return self._rounded[key]
-
-    def _round(self, radius: float, halvings: int) -> tuple[float, Body]:
-        for k in range(halvings + 1):
-            r = radius / 2**k
-            moved = self._shrink(r)
-            if moved is not None:
-                return r, _build_body(moved, self.faces)
-        raise ProblemError(
-            f"the indenter's surface has details that cannot be rounded by {radius:g} mm",
-            remedy="give a smaller edge radius or a coarser surface",
-        )
 
     def _shrink(self, radius: float) -> Array | None:
         """Points (n, 3) of the surface whose faces moved in by ``radius``; None where a face turns over."""

@@ -11,7 +11,7 @@ import hashlib
 import logging
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,7 +110,7 @@ def read_headers(path: Path) -> list[SliceHeader] | None:
                 if _is_image_class(tags):
                     raise damaged
                 return []
-            return _read_frames(tags, path) if _is_enhanced(tags) else [_read_single(tags, path)]
+            return _read_slices(tags, path)
     except InvalidDicomError:
         if _is_torn(path):
             raise damaged from None
@@ -145,80 +145,62 @@ def _is_enhanced(tags: FileDataset) -> bool:
     return "PerFrameFunctionalGroupsSequence" in tags or (kind is not None and kind.name in _ENHANCED)
 
 
-def _read_single(tags: FileDataset, path: Path) -> SliceHeader:
-    if int(tags.get("NumberOfFrames", 1) or 1) > 1:
-        raise ImageError(
-            "multi-frame images without a place for each frame",
-            file=path.parent,
-            remedy="export the original series, as enhanced MR or CT or as one file per slice",
-        )
-    return SliceHeader(
-        **_read_file_geometry(tags, path),
-        position=_to_numbers(tags.get("ImagePositionPatient"), 3),
-        orientation=_to_numbers(tags.get("ImageOrientationPatient"), 6),
-        pixel_spacing=_to_numbers(tags.get("PixelSpacing"), 2),
-        stated_spacing=_number(tags.get("SpacingBetweenSlices")),
-        thickness=_number(tags.get("SliceThickness")),
-        rescale=_rescale(tags),
-    )
-
-
-def _rescale(tags: Dataset) -> tuple[float, float]:
-    slope, intercept = _number(tags.get("RescaleSlope")), _number(tags.get("RescaleIntercept"))
-    return (1.0 if slope is None else slope, 0.0 if intercept is None else intercept)
-
-
-def _read_file_geometry(tags: FileDataset, path: Path) -> dict:
-    return {
-        "path": path,
-        "series_uid": _redact_uid(str(tags.get("SeriesInstanceUID", ""))),
-        "series_number": str(tags.get("SeriesNumber", "") or ""),
-        "modality": str(tags.get("Modality", "")),
-        "rows": int(tags.Rows),
-        "columns": int(tags.Columns),
-        "samples": int(tags.get("SamplesPerPixel", 1)),
-        "photometric": str(tags.get("PhotometricInterpretation", "")),
-        "syntax": str(tags.file_meta.get("TransferSyntaxUID", "")),
-    }
-
-
-def _redact_uid(uid: str) -> str:
-    """The UID as it will be shown; one that is not digits and dots (someone typed into it) as a digest."""
-    is_uid = re.fullmatch(r"[0-9.]{0,64}", uid) is not None
-    return uid if is_uid else "x" + hashlib.sha256(uid.encode()).hexdigest()[:12]
-
-
-def _read_frames(tags: FileDataset, path: Path) -> list[SliceHeader]:
-    """A slice for each frame of an enhanced file."""
+def _read_slices(tags: FileDataset, path: Path) -> list[SliceHeader]:
+    """A slice for each frame of an enhanced file, and the one of any other file."""
+    frames = int(tags.get("NumberOfFrames", 1) or 1)
+    if not _is_enhanced(tags):
+        if frames > 1:
+            raise ImageError(
+                "multi-frame images without a place for each frame",
+                file=path.parent,
+                remedy="export the original series, as enhanced MR or CT or as one file per slice",
+            )
+        return [_read_slice(tags, path, lambda _, tag: tags.get(tag))]
     groups = tags.get("PerFrameFunctionalGroupsSequence") or []
-    if not groups or len(groups) != int(tags.get("NumberOfFrames", 1) or 1):
+    if len(groups) != frames:
         raise ImageError(
             "an enhanced DICOM file does not say where each of its frames lies",
             file=path.parent,
             remedy="export the series again, or as one file per slice",
         )
     shared = (tags.get("SharedFunctionalGroupsSequence") or [Dataset()])[0]
-    file = _read_file_geometry(tags, path)
-    return [_read_frame(n, (group, shared), file) for n, group in enumerate(groups)]
+
+    def read_from(group: Dataset) -> Callable[[str, str], object]:
+        return lambda sequence, tag: find_functional_group((group, shared), sequence).get(tag)
+
+    return [_read_slice(tags, path, read_from(group), n) for n, group in enumerate(groups)]
 
 
-def _read_frame(number: int, groups: tuple[Dataset, Dataset], file: dict) -> SliceHeader:
-    measures = find_functional_group(groups, "PixelMeasuresSequence")
-    values = find_functional_group(groups, "PixelValueTransformationSequence")
+def _read_slice(
+    tags: FileDataset, path: Path, read: Callable[[str, str], object], frame: int | None = None
+) -> SliceHeader:
+    """One slice; ``read`` gives the value of a tag in the functional group of a name."""
+    slope = _to_number(read("PixelValueTransformationSequence", "RescaleSlope"))
+    intercept = _to_number(read("PixelValueTransformationSequence", "RescaleIntercept"))
     return SliceHeader(
-        **file,
-        position=_to_numbers(
-            find_functional_group(groups, "PlanePositionSequence").get("ImagePositionPatient"), 3
-        ),
-        orientation=_to_numbers(
-            find_functional_group(groups, "PlaneOrientationSequence").get("ImageOrientationPatient"), 6
-        ),
-        pixel_spacing=_to_numbers(measures.get("PixelSpacing"), 2),
-        stated_spacing=_number(measures.get("SpacingBetweenSlices")),
-        thickness=_number(measures.get("SliceThickness")),
-        frame=number,
-        rescale=_rescale(values),
+        path=path,
+        series_uid=_redact_uid(str(tags.get("SeriesInstanceUID", ""))),
+        series_number=str(tags.get("SeriesNumber", "") or ""),
+        modality=str(tags.get("Modality", "")),
+        rows=int(tags.Rows),
+        columns=int(tags.Columns),
+        samples=int(tags.get("SamplesPerPixel", 1)),
+        photometric=str(tags.get("PhotometricInterpretation", "")),
+        position=_to_numbers(read("PlanePositionSequence", "ImagePositionPatient"), 3),
+        orientation=_to_numbers(read("PlaneOrientationSequence", "ImageOrientationPatient"), 6),
+        pixel_spacing=_to_numbers(read("PixelMeasuresSequence", "PixelSpacing"), 2),
+        stated_spacing=_to_number(read("PixelMeasuresSequence", "SpacingBetweenSlices")),
+        thickness=_to_number(read("PixelMeasuresSequence", "SliceThickness")),
+        syntax=str(tags.file_meta.get("TransferSyntaxUID", "")),
+        frame=frame,
+        rescale=(1.0 if slope is None else slope, 0.0 if intercept is None else intercept),
     )
+
+
+def _redact_uid(uid: str) -> str:
+    """The UID as it will be shown; one that is not digits and dots (someone typed into it) as a digest."""
+    is_uid = re.fullmatch(r"[0-9.]{0,64}", uid) is not None
+    return uid if is_uid else "x" + hashlib.sha256(uid.encode()).hexdigest()[:12]
 
 
 def find_functional_group(groups: tuple[Dataset, Dataset], name: str) -> Dataset:
@@ -237,5 +219,5 @@ def _to_numbers(value: object, count: int) -> Array | None:
     return numbers if np.all(np.isfinite(numbers)) else None
 
 
-def _number(value: object) -> float | None:
+def _to_number(value: object) -> float | None:
     return float(str(value)) if value not in (None, "") else None

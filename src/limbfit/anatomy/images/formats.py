@@ -163,13 +163,8 @@ def read_image(path: Path) -> sitk.Image:
 
 
 def check_nifti(path: Path) -> None:
-    """Refuse a NIfTI file that is cut short, holds voxels that are not numbers, or contradicts itself on left
-    and right.
-
-    Raises
-    ------
-    ImageError
-    """
+    """Raise `ImageError` for a NIfTI file that is cut short, holds voxels that are not numbers, or whose two
+    statements of its place differ in left and right."""
     try:
         with _open(path) as stream:
             header = stream.read(_HEADER)

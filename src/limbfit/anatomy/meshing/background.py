@@ -15,13 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...arrays import Array, Indices, Mask
+from ...mesh.boxes import SIX_TETS
 
 Field = Callable[[Array], tuple[Array, Array]]
 
 PLANE, LAYER, BONE, REGION = 1, 2, 4, 8  # of regions the first's; each further one's is twice as large
 TET_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
-# Kuhn's subdivision of a cube into six tetrahedra; corner bits are (x, y, z), all share the diagonal 0-7.
-KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
 CELL_FACTORS = (8.0, 4.0, 2.0)  # of the spacing: cells that are settled by one value
 CELL_RANGE, CELL_OFFSET = 1 << 20, 1 << 19  # three cell indices in one integer
 LONGEST_EDGE = 1.8  # of the spacing: the cubes' diagonal; both ends of a crossed edge are that near
@@ -59,7 +58,7 @@ def build_box_grid(low: Array, high: Array, spacing: float) -> TetGrid:
     node = np.arange(len(points)).reshape(counts)
     corners = [node[x : x - 1 or None, y : y - 1 or None, z : z - 1 or None].ravel()
                for z in (0, 1) for y in (0, 1) for x in (0, 1)]  # fmt: skip
-    tets = np.stack(corners, axis=1)[:, KUHN].reshape(-1, 4)
+    tets = np.stack(corners, axis=1)[:, SIX_TETS].reshape(-1, 4)
     mask = np.where(points[:, 2] == axes[2][-1], PLANE, 0)
     return TetGrid(points, tets, mask, spacing, np.zeros(len(tets), dtype=np.int64))
 

@@ -94,7 +94,7 @@ class LimbFields:
 
     def depth(self, points: Array) -> Level:
         """Depth (n,) of points (n, 3) below the skin, positive inside, and its gradient (n, 3)."""
-        distance, slope = compute_signed_distance(self.skin, points)
+        distance, slope = evaluate_distance(self.skin, points)
         return -distance, -slope
 
     def layer_depths(self, points: Array) -> Array:
@@ -132,7 +132,7 @@ class LimbFields:
         value, gradient = np.full(len(points), np.inf), np.zeros((len(points), 3))
         for bone in self.bones.values():
             candidates = np.flatnonzero(compute_box_distance(bone, points) < value)
-            distance, slope = compute_signed_distance(bone, points[candidates])
+            distance, slope = evaluate_distance(bone, points[candidates])
             nearer = distance < value[candidates]
             value[candidates[nearer]], gradient[candidates[nearer]] = distance[nearer], slope[nearer]
         return value, gradient
@@ -153,7 +153,7 @@ class LimbFields:
         high[2] = min(high[2], 0.0)
         spacing = (np.prod(high - low) / TRIM_SAMPLES) ** (1 / 3)
         samples = sample_box(low, high, spacing)
-        inside = compute_signed_distance(bone, samples)[0] < 0
+        inside = evaluate_distance(bone, samples)[0] < 0
         cut = self.layer(samples[inside])[0] < self.bone_clearance_mm
         return TrimmedBone(float(cut.sum() * np.prod(high - low) / len(samples)), float(excess.max()))
 
@@ -240,7 +240,7 @@ def _thin_layers(fields: LimbFields) -> LimbFields:
     return replace(fields, depths=depths * (left / whole), thinned=thinned)
 
 
-def compute_signed_distance(surface: Surface, points: Array) -> Level:
+def evaluate_distance(surface: Surface, points: Array) -> Level:
     """Signed distance (n,) of points (n, 3) to a closed outward surface, negative inside, and gradient."""
     distance, face, nearest = surface.search.signed(points)
     close = np.abs(distance) < NORMAL_WITHIN_MM

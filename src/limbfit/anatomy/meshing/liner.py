@@ -12,7 +12,7 @@ from ..frame import build_limb_frame
 from ..surfaces.surfaces import Anatomy, cut_and_cap
 from ..surfaces.thickness import transfer_values
 from ..surfaces.triangles import Surface, find_bodies, from_pyvista
-from .layers import compute_signed_distance, prolong_surface
+from .layers import evaluate_distance, prolong_surface
 
 SPACING_MM = 3.0  # of the grid on which the surface is contoured
 EDGE_MM = 4.0  # of its triangles
@@ -56,7 +56,7 @@ def _extract_offset_surface(surface: Surface, distance_mm: float) -> Surface:
     low, high = surface.points.min(axis=0) - pad, surface.points.max(axis=0) + pad
     size = np.ceil((high - low) / SPACING_MM).astype(int) + 1
     grid = pv.ImageData(dimensions=size, spacing=[SPACING_MM] * 3, origin=low)
-    grid.point_data["distance"] = compute_signed_distance(surface, np.asarray(grid.points))[0]
+    grid.point_data["distance"] = evaluate_distance(surface, np.asarray(grid.points))[0]
     found = grid.contour([distance_mm], scalars="distance", method="flying_edges", compute_normals=False)
     outer = find_bodies(from_pyvista(found.clean()))[0].outward
     return Surface(_project_to_offset(surface, outer.points, distance_mm), outer.faces)
@@ -64,5 +64,5 @@ def _extract_offset_surface(surface: Surface, distance_mm: float) -> Surface:
 
 def _project_to_offset(surface: Surface, points: Array, distance_mm: float) -> Array:
     """Points (n, 3) near a surface's offset, put on it."""
-    distance, slope = compute_signed_distance(surface, points)
+    distance, slope = evaluate_distance(surface, points)
     return np.asarray(points + (distance_mm - distance)[:, None] * slope)

@@ -32,7 +32,7 @@ from .background import BONE, LAYER, PLANE, REGION, TetGrid, compute_volumes
 from .curving import balance_bone_faces, compute_curved_target, curve_diagonals, curve_mesh
 from .engines import ENGINES, MesherError, VolumeMesh, VolumeTask
 from .extrusion import build_core_mesh, extrude_layers
-from .layers import BonePolicy, LayerSpec, LimbFields, TrimmedBone, build_limb_fields, compute_signed_distance
+from .layers import BonePolicy, LayerSpec, LimbFields, TrimmedBone, build_limb_fields, evaluate_distance
 from .meshreport import GOOD_DIHEDRAL_DEG, MeshReport, compute_enclosed_volume, measure_mesh
 from .projection import project_safely, project_to_level
 from .regions import (
@@ -178,7 +178,7 @@ def find_thin_bone(fields: LimbFields, spacing: float) -> Array:
     found = [np.zeros((0, 3))]
     for bone in fields.bones.values():
         probe = PROBE_SPACINGS * spacing
-        depth = -compute_signed_distance(bone, bone.points - probe * bone.vertex_normals)[0]
+        depth = -evaluate_distance(bone, bone.points - probe * bone.vertex_normals)[0]
         below = bone.points[:, 2] < 0.0
         found.append(bone.points[below & (depth < THIN_DEPTH_SHARE * PROBE_SPACINGS * spacing)])
     return np.vstack(found)

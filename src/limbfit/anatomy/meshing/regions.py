@@ -21,7 +21,7 @@ from ...errors import SurfaceError
 from ...mesh import Mesh, boundary_faces
 from ..surfaces.triangles import Surface
 from .background import LONGEST_EDGE, REGION, Field, TetGrid, cut, refine_grid
-from .layers import Level, LimbFields, compute_box_distance, compute_signed_distance, sample_box
+from .layers import Level, LimbFields, compute_box_distance, evaluate_distance, sample_box
 
 FAR_MM = 15.0  # of a region's box: a bound of the distance does there
 MIN_SLOPE = 0.2  # slope of a region's level, below which it does not tell a distance
@@ -46,7 +46,7 @@ def build_region_level(fields: LimbFields, number: int) -> Field:
     def _near(points: Array) -> Level:
         distance, normal = _measure_to_wall(fields, number, points)
         push = np.maximum(fields.bone_clearance_mm - distance, 0.0)
-        value, slope = compute_signed_distance(surface, points + push[:, None] * normal)
+        value, slope = evaluate_distance(surface, points + push[:, None] * normal)
         across = np.einsum("ij,ij->i", slope, normal)
         return value, slope - np.where(push > 0.0, across, 0.0)[:, None] * normal
 
@@ -73,7 +73,7 @@ def measure_thickness(fields: LimbFields, number: int) -> float:
     """Thickness (mm) of a region where it is thickest: twice the greatest depth in it, below the cut."""
     surface = list(fields.regions.values())[number]
     samples, _ = _sample_region(fields, number)
-    return 2.0 * abs(float(compute_signed_distance(surface, samples)[0].min(initial=0.0)))
+    return 2.0 * abs(float(evaluate_distance(surface, samples)[0].min(initial=0.0)))
 
 
 def _sample_region(fields: LimbFields, number: int, pad_mm: float = 0.0) -> tuple[Array, float]:
@@ -117,7 +117,7 @@ def refine_at_regions(grid: TetGrid, fields: LimbFields) -> TetGrid:
 def _is_near(surface: Surface, distance_mm: float, points: Array) -> Mask:
     """Which points (n,) lie inside a closed surface, or no farther outside than so."""
     found = compute_box_distance(surface, points) < distance_mm
-    found[found] = compute_signed_distance(surface, points[found])[0] < distance_mm
+    found[found] = evaluate_distance(surface, points[found])[0] < distance_mm
     return found
 
 

@@ -13,10 +13,9 @@ import numpy as np
 
 from ...arrays import Array, Indices, Mask
 from ...mesh import Mesh, node_jacobians
-from ..frame import Frame
 from .background import compute_volumes
 from .extrusion import Columns
-from .layers import LimbFields, compute_signed_distance
+from .layers import LimbFields, evaluate_distance
 from .smoothing import DIRECTIONS, find_constraints, project_nodes
 
 MIN_ROUNDNESS = 0.03  # volume over that of a regular tetrahedron of the same edges; worked on below it
@@ -68,9 +67,9 @@ def repair_mesh(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Mesh, t
         tried = attempt(points)
         left = compute_volumes(tried, mesh.cells) <= 0.0
         if left.sum() < bad.sum():
-            repairs.append(
-                _repair(what, points, tried, mesh.cells[bad], int(bad.sum() - left.sum()), fields.frame)
-            )
+            x, y, z = fields.frame.to_patient(points[mesh.cells[bad]].reshape(-1, 3).mean(axis=0)).tolist()
+            moved = float(np.linalg.norm(tried - points, axis=1).max())
+            repairs.append(Repair(int(bad.sum() - left.sum()), what, (x, y, z), moved))
             points, bad = tried, left
     return mesh.with_points(points), tuple(repairs)
 
@@ -78,12 +77,6 @@ def repair_mesh(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Mesh, t
 def find_inverted_cells(mesh: Mesh) -> Mask:
     """Cells (m,) that have no positive Jacobian at one of their nodes."""
     return np.asarray(node_jacobians(mesh).min(axis=1) <= 0.0)
-
-
-def _repair(what: str, before: Array, after: Array, cells: Indices, count: int, frame: Frame) -> Repair:
-    place = frame.to_patient(before[cells].reshape(-1, 3).mean(axis=0))
-    moved = float(np.linalg.norm(after - before, axis=1).max())
-    return Repair(count, what, (float(place[0]), float(place[1]), float(place[2])), moved)
 
 
 def untangle_cells(points: Array, tets: Indices, normals: Array, movable: Mask) -> Array:
@@ -186,7 +179,7 @@ def _place(point: Array, fields: LimbFields) -> str:
         "the layers' inner face": abs(fields.layer(where)[0][0]),
         "the proximal cut": abs(point[2]),
     }
-    bones = {name: abs(compute_signed_distance(bone, where)[0][0]) for name, bone in fields.bones.items()}
+    bones = {name: abs(evaluate_distance(bone, where)[0][0]) for name, bone in fields.bones.items()}
     near |= {f"the bone {name}": distance for name, distance in bones.items()}
     surface = min(near, key=lambda name: near[name])
     place = ", ".join(f"{x:.1f}" for x in fields.frame.to_patient(point))

@@ -233,9 +233,7 @@ def amputate_anatomy(
     return build_anatomy(labels, edge_mm, (anatomy.cut_point, anatomy.cut_normal))
 
 
-def voxelise_anatomy(
-    anatomy: Anatomy, distal_mm: float = _MARGIN_MM, spacing_mm: float = VOXEL_MM
-) -> LabelMap:
+def voxelise_anatomy(anatomy: Anatomy, distal_mm: float = _MARGIN_MM) -> LabelMap:
     """The label map of an anatomy: cubic voxels in layers along the cut, the last just distal of it.
 
     ``distal_mm`` of empty voxels are left beyond the limb's end.
@@ -244,10 +242,10 @@ def voxelise_anatomy(
     points = frame.to_limb(anatomy.skin.points)
     low = points.min(axis=0) - [_MARGIN_MM, _MARGIN_MM, distal_mm]
     high = np.array([*(points.max(axis=0)[:2] + _MARGIN_MM), 0.0])
-    size = np.ceil((high - low) / spacing_mm).astype(int)
-    corner = np.array([*low[:2], -size[2] * spacing_mm]) + spacing_mm / 2
+    size = np.ceil((high - low) / VOXEL_MM).astype(int)
+    corner = np.array([*low[:2], -size[2] * VOXEL_MM]) + VOXEL_MM / 2
     empty = np.zeros(size[::-1], dtype=np.uint8)
-    grid = Grid(empty, np.full(3, spacing_mm), frame.to_patient(corner), frame.rotation.T)
+    grid = Grid(empty, np.full(3, VOXEL_MM), frame.to_patient(corner), frame.rotation.T)
     inner = {**anatomy.regions, **anatomy.bones}  # bones last: they stay whole where the two overlap
     masks = {name: fill_surface(body, grid) for name, body in inner.items()}
     labels = label_map(grid, fill_surface(anatomy.skin, grid), masks)

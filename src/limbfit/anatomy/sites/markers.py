@@ -17,7 +17,9 @@ from ...errors import SiteError
 from ..surfaces.triangles import Surface, find_half_edges, number_components
 
 CAP_MARGIN_MM = 6.0
-MIN_HEIGHT_MM, MAX_AREA_MM2 = 2.0, 500.0
+MIN_HEIGHT_MM = 2.0  # of a marker; half of it is where bumps are separated
+MAX_AREA_MM2 = 500.0  # what is larger is no marker (a cushion, a fold, a bandage)
+MAX_DISTANCE_MM = 15.0  # of a marker from its hint
 NORMAL_RADIUS_MM = 8.0
 
 
@@ -47,9 +49,6 @@ class Bump:
 def find_markers(
     skin_with: Surface,
     skin_without: Surface,
-    *,
-    min_height_mm: float = MIN_HEIGHT_MM,
-    max_area_mm2: float = MAX_AREA_MM2,
 ) -> tuple[Marker, ...]:
     """Markers on a limb, from the distance between its surfaces with and without them.
 
@@ -57,8 +56,6 @@ def find_markers(
     ----------
     skin_with, skin_without : closed outward surfaces of the limb in one place (``registration`` lays the
         images of two scans onto each other).
-    min_height_mm : the least height of a marker; half of it is where bumps are separated.
-    max_area_mm2 : what is larger is no marker (a cushion, a fold, a bandage).
 
     Returns
     -------
@@ -71,7 +68,7 @@ def find_markers(
     areas = _compute_vertex_areas(skin_with)
     open_skin = Surface(skin_without.points, skin_without.faces[~cap])
     found = []
-    for bump in find_bumps(skin_with, height, min_height_mm=min_height_mm, max_area_mm2=max_area_mm2):
+    for bump in find_bumps(skin_with, height):
         weights = areas[bump.upper] * height[bump.upper]
         position, direction = _find_foot(open_skin, skin_with.points[bump.upper], weights)
         found.append(Marker(position, bump.height, bump.area, direction))
@@ -81,12 +78,9 @@ def find_markers(
 def find_bumps(
     surface: Surface,
     height: Array,
-    *,
-    min_height_mm: float = MIN_HEIGHT_MM,
-    max_area_mm2: float = MAX_AREA_MM2,
 ) -> list[Bump]:
     """What stands out high and small enough for a marker; ``height`` (n,) of each vertex, mm."""
-    labels = _number_clusters(height > min_height_mm / 2, surface.faces)
+    labels = _number_clusters(height > MIN_HEIGHT_MM / 2, surface.faces)
     areas = _compute_vertex_areas(surface)
     found = []
     for label in range(labels.max(initial=-1) + 1):
@@ -94,14 +88,12 @@ def find_bumps(
         tallest = float(height[feet].max())
         upper = feet[height[feet] > tallest / 2]  # terraces of the skin may touch a marker's foot
         area = float(areas[upper].sum())
-        if tallest >= min_height_mm and area <= max_area_mm2:
+        if tallest >= MIN_HEIGHT_MM and area <= MAX_AREA_MM2:
             found.append(Bump(feet, upper, tallest, area))
     return found
 
 
-def match_markers(
-    markers: Sequence[Marker], hints: Mapping[str, Array], *, max_distance_mm: float = 15.0
-) -> dict[str, Marker]:
+def match_markers(markers: Sequence[Marker], hints: Mapping[str, Array]) -> dict[str, Marker]:
     """Give each named place its marker, one to one, with the least total distance.
 
     Markers that no place asks for are left over: a limb may carry more markers than the study has sites.
@@ -109,7 +101,6 @@ def match_markers(
     Parameters
     ----------
     hints : rough position (3,) in LPS mm by site name.
-    max_distance_mm : how far a marker may lie from its hint.
 
     Raises
     ------
@@ -121,12 +112,10 @@ def match_markers(
     names = list(hints)
     distance = _compute_distances(markers, np.array([np.asarray(hints[name], float) for name in names]))
     # A pair beyond reach costs more than any choice of pairs within it, so reach goes before nearness.
-    cost = np.where(distance <= max_distance_mm, distance, 1e3 * (1 + max_distance_mm) * len(names))
+    cost = np.where(distance <= MAX_DISTANCE_MM, distance, 1e3 * (1 + MAX_DISTANCE_MM) * len(names))
     rows, columns = linear_sum_assignment(cost)
-    pairs = {r: c for r, c in zip(rows, columns, strict=True) if distance[r, c] <= max_distance_mm}
-    faults = [
-        check(names, pairs, distance, max_distance_mm) for check in (_describe_missing, _describe_spare)
-    ]
+    pairs = {r: c for r, c in zip(rows, columns, strict=True) if distance[r, c] <= MAX_DISTANCE_MM}
+    faults = [check(names, pairs, distance) for check in (_describe_missing, _describe_spare)]
     if any(faults):
         raise SiteError(
             "; ".join(filter(None, faults)),
@@ -143,21 +132,21 @@ def _compute_distances(markers: Sequence[Marker], hints: Array) -> Array:
     return np.linalg.norm(hints[:, None] - positions, axis=-1)
 
 
-def _describe_missing(names: list[str], pairs: Mapping[int, int], distance: Array, reach: float) -> str:
+def _describe_missing(names: list[str], pairs: Mapping[int, int], distance: Array) -> str:
     """What to say of places without a marker; empty where there are none."""
     missing = [r for r in range(len(names)) if r not in pairs]
     places = [
         f"{names[r]} (nearest at {distance[r].min():.1f} mm)" if distance.shape[1] else names[r]
         for r in missing
     ]
-    return f"no marker of its own within {reach:g} mm for {', '.join(places)}" if places else ""
+    return f"no marker of its own within {MAX_DISTANCE_MM:g} mm for {', '.join(places)}" if places else ""
 
 
-def _describe_spare(names: list[str], pairs: Mapping[int, int], distance: Array, reach: float) -> str:
+def _describe_spare(names: list[str], pairs: Mapping[int, int], distance: Array) -> str:
     """What to say of places with a spare marker near them; empty where there are none."""
     spare = np.setdiff1d(np.arange(distance.shape[1]), list(pairs.values()))
-    doubled = [names[r] for r in pairs if (distance[r, spare] <= reach).any()]
-    return f"more than one marker within {reach:g} mm of {', '.join(doubled)}" if doubled else ""
+    doubled = [names[r] for r in pairs if (distance[r, spare] <= MAX_DISTANCE_MM).any()]
+    return f"more than one marker within {MAX_DISTANCE_MM:g} mm of {', '.join(doubled)}" if doubled else ""
 
 
 def _find_foot(skin: Surface, points: Array, weights: Array) -> tuple[Array, Array]:

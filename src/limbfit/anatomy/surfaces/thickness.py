@@ -11,13 +11,12 @@ from scipy.spatial import KDTree
 
 from ...arrays import Array, Indices
 from ...errors import LabelError, SurfaceError
-from ..grid import LabelMap
+from ..grid import FAT, LabelMap
 from ..morphology import find_largest_piece, open_mask
 from .extraction import extract_surface
 from .surfaces import Anatomy, compute_signed_distance
 from .triangles import Surface, find_half_edges
 
-FAT = "fat"
 FAT_DEPTH = "fat_depth_mm"
 SHELL_MM = 1.5  # half the thickness of the dark skin outside the fat, which is not taken for the core
 SMOOTH_MM = 4.0  # how far along the skin the measured depth is smoothed
