@@ -116,7 +116,7 @@ class Grid:
         return start + k[:, None, None] * steps[2] + j[:, None] * steps[1] + i * steps[0]
 
     def permute_axes(self, order: Sequence[int]) -> Self:
-        """The same samples with other index axes: ``order[n]`` is the present axis that becomes axis n."""
+        """Return the samples with other index axes: ``order[n]`` is the present axis that becomes axis n."""
         axes = tuple(2 - order[2 - n] for n in range(3))
         return replace(
             self,
@@ -126,7 +126,7 @@ class Grid:
         )
 
     def reverse_axes(self, axes: Sequence[int]) -> Self:
-        """The same samples with some index axes (0, 1, 2 for i, j, k) running the other way."""
+        """Return the samples with some index axes (0, 1, 2 for i, j, k) running the other way."""
         last = np.zeros(3)
         last[list(axes)] = [self.size[axis] - 1 for axis in axes]
         direction = self.direction.copy()
@@ -135,12 +135,12 @@ class Grid:
         return replace(self, array=array, origin=self.index_to_point(last), direction=direction)
 
     def crop(self, box: Sequence[slice]) -> Self:
-        """The samples in a box of array indices ``[k, j, i]``."""
+        """Return the samples in a box of array indices ``[k, j, i]``."""
         start = [part.start for part in box][::-1]
         return replace(self, array=self.array[tuple(box)], origin=self.index_to_point(start))
 
     def align_with_lps(self) -> Self:
-        """The same samples with right-handed index axes in the order and sense nearest to x, y, z.
+        """Return the samples with right-handed index axes in the order and sense nearest to x, y, z.
 
         What is computed from them then does not depend on how the file stored them.
         """
@@ -155,21 +155,21 @@ class Grid:
         return self.align_axes(best)
 
     def move_to_own_frame(self) -> Self:
-        """The same samples with the first voxel at zero and axes along x, y, z; spacing to 1e-5 mm.
+        """Return the samples with the first voxel at zero and axes along x, y, z; spacing to 1e-5 mm.
 
         Rounding in files moves voxels by less than that, but remeshing turns it into other triangles.
         """
         return replace(self, spacing=np.round(self.spacing, 5), origin=np.zeros(3), direction=np.eye(3))
 
     def align_axes(self, axes: Array) -> Self:
-        """The same samples with index axes in the order and sense nearest to the columns of ``axes``."""
+        """Return the samples with index axes in the order and sense nearest to the columns of ``axes``."""
         across = np.asarray(axes).T @ self.direction
         order = max(permutations(range(3)), key=lambda p: sum(abs(across[n, p[n]]) for n in range(3)))
         turned = self.permute_axes(order)
         return turned.reverse_axes([n for n in range(3) if across[n, order[n]] < 0])
 
     def has_same_grid(self, other: Grid) -> bool:
-        """Whether both sample the same points: every corner voxel within 0.01 mm."""
+        """True if both sample the same points: every corner voxel lies within 0.01 mm."""
         if self.array.shape != other.array.shape:
             return False
         gap = np.abs(self.index_to_point(self.corners) - other.index_to_point(self.corners))
@@ -243,7 +243,7 @@ class LabelMap(Grid):
         )
 
     def with_regions(self, regions: Mapping[str, str]) -> LabelMap:
-        """The map with some labels as regions: the label of each, by the region's name.
+        """Return the map with some labels as regions, given by the label of each region's name.
 
         Raises
         ------

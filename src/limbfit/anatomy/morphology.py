@@ -1,7 +1,7 @@
 """Masks of voxels: morphology by balls in millimetres, holes, pieces and boxes.
 
 A mask dilated by a ball holds what lies within the ball's radius of it. Exact distance maps (Maurer et al.
-2003) tell that in a time that is linear in the voxels, however fine they are. Masks are ``[k, j, i]``, or
+2003) give that in a time that is linear in the voxels, however fine they are. Masks are ``[k, j, i]``, or
 ``[j, i]`` for one slice; spacings are mm along i, j and k.
 """
 
@@ -51,7 +51,7 @@ def erode_mask(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
 
 
 def close_mask(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
-    """Closed over gaps that a ball does not fit into; beyond the array the mask goes on as at its border."""
+    """Close the gaps that a ball does not fit into; beyond the array the mask goes on as at its border."""
     room, inner, box = _make_room(mask, radius_mm, spacing)
     closed = erode_mask(dilate_mask(room, radius_mm, spacing), radius_mm, spacing)
     found = mask.copy()
@@ -60,7 +60,7 @@ def close_mask(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
 
 
 def open_mask(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
-    """Without what is too thin for a ball; beyond the array the mask goes on as at its border."""
+    """Remove what is too thin for a ball; beyond the array the mask goes on as at its border."""
     room, inner, box = _make_room(mask, 2 * radius_mm, spacing)
     opened = dilate_mask(erode_mask(room, radius_mm, spacing), radius_mm, spacing)
     found = np.zeros_like(mask)

@@ -90,7 +90,7 @@ class Gauge:
     along: Array
 
     def read(self, field: Array) -> Array:
-        """Of a nodal field (n, 3, ...), such as displacements, mm, or their derivatives: (...)."""
+        """The change (...) in a nodal field (n, 3, ...), such as displacements, mm, or their derivatives."""
         return np.asarray(self.weights @ np.tensordot(self.along, field[self.nodes], (0, 1)))
 
 

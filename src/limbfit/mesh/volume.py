@@ -217,7 +217,7 @@ def boundary_faces(mesh: Mesh, chosen: Mask | None = None) -> Indices:
     faces = faces.reshape(-1, faces.shape[2])
     if not len(faces):
         return faces
-    # Three of its corners tell a face of a conforming mesh, quadrilaterals included.
+    # Three of its corners identify a face of a conforming mesh, quadrilaterals included.
     low, middle, high = np.sort(faces[:, : mesh.kind.face_corners], axis=1)[:, :3].T
     count = len(mesh.points)
     _, first, counts = np.unique((low * count + middle) * count + high, return_index=True, return_counts=True)

@@ -78,7 +78,7 @@ def _add_arrays(data: vtkFieldData, arrays: Mapping[str, NDArray]) -> None:
 
 @contextmanager
 def silence_vtk() -> Iterator[None]:
-    """VTK's own reports stay out of the terminal: what fails is said in words by who called it."""
+    """Keep VTK's own messages out of the terminal: the caller raises an error in words."""
     shown = vtkObject.GetGlobalWarningDisplay()
     vtkObject.SetGlobalWarningDisplay(0)
     try:

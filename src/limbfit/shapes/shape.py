@@ -1,4 +1,4 @@
-"""What an indenter's shape says of itself: its distance, its facets, its section and its words.
+"""The contract of an indenter's shape: its distance, facets, section and words.
 
 The frame of a shape: origin at the middle of its foremost face, z along the axis into the tissue, x along the
 edge; the body lies at ``z <= 0``.
@@ -34,7 +34,7 @@ class Measure:
     ----------
     key : its name with its unit, such as ``taper_deg``: a field of the shape and a key of a study's
         ``[indenter]``.
-    value, lower, upper : what it is where nothing is given, and its bounds.
+    value, lower, upper : its value by default, and its bounds.
     words : what reports call it.
     """
 
@@ -47,7 +47,7 @@ class Measure:
 
 @dataclass(frozen=True)
 class Size:
-    """What is asked of a shape: ``width`` and ``edge_radius`` in mm, its measures by key, its surface, and
+    """The size of a shape: ``width`` and ``edge_radius`` in mm, its measures by key, its surface, and
     the rounding over the width that stands for a ``sharp`` edge."""
 
     width: float
@@ -116,7 +116,7 @@ class Shape(ABC):
 
     @classmethod
     def complete_measures(cls, given: Mapping[str, float]) -> dict[str, float]:
-        """Its measures by key; what is not given has its usual value.
+        """Return its measures by key, with the usual value of each that is not given.
 
         Raises
         ------
@@ -160,7 +160,7 @@ class Shape(ABC):
 
     @property
     def reach(self) -> float:
-        """How far from the axis, along x or y, tissue may touch it, mm."""
+        """Largest distance from the axis, along x or y, at which tissue may touch it, mm."""
         return 0.9 * self.width
 
     @property

@@ -1,7 +1,7 @@
 """DICOM series on disk: which there are, whether one is a whole volume, and its voxels.
 
 Headers are read with pydicom and only the tags that geometry needs, so that no identity enters the program.
-Nothing said to the user could identify a person: slices are named by their number along the normal, files by
+No message to the user could identify a person: slices are named by their number along the normal, files by
 their number in the order of names, and by name only where that holds nothing but counters.
 """
 
@@ -305,7 +305,7 @@ def _slice_spacing(slices: list[SliceHeader], normal: Array) -> float:
 
 
 def _check_stated(header: SliceHeader, usual: float) -> None:
-    """Every second slice missing leaves even gaps; only the header's own spacing tells."""
+    """Refuse a series that lacks every second slice: its gaps are even, only its header shows it."""
     stated, thickness = header.stated_spacing, header.thickness
     if stated and thickness and stated >= 0.999 * thickness and usual > 1.5 * stated:
         raise ImageError(

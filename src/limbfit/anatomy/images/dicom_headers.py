@@ -1,4 +1,4 @@
-"""What the headers of DICOM images say of their geometry: one image per file, or many frames in one.
+"""The geometry in the headers of DICOM images: one image per file, or many frames in one.
 
 Only the tags named here are read, so that no identity enters the program. An enhanced multi-frame file
 (Enhanced MR or CT) holds its geometry in functional groups: those shared by all frames, and those of each
@@ -122,14 +122,14 @@ def read_headers(path: Path) -> list[SliceHeader] | None:
 
 
 def _is_torn(path: Path) -> bool:
-    """Whether something that is not DICOM looks like the beginning of it, or like nothing at all."""
+    """True if a file that is not DICOM looks like the beginning of one, or is all zeros."""
     head = path.read_bytes()[: _PREAMBLE + 4] if path.stat().st_size < 10_000 else b"?"
     is_zero = len(head) < _PREAMBLE + 4 and not any(head)
     return is_zero or path.suffix.lower() in (".dcm", ".ima")
 
 
 def _is_image_class(tags: FileDataset) -> bool:
-    """Whether a file without rows and columns is of a class that has them, or breaks off before its class."""
+    """True if a file without rows and columns is of a class that has them, or ends before its class."""
     kind = tags.file_meta.get("MediaStorageSOPClassUID") or tags.get("SOPClassUID")
     return kind is None or kind.name.endswith(_IMAGE_CLASS)
 

@@ -21,7 +21,7 @@ _ON_GRID = 0.01  # voxels
 
 
 def clean_labels(labels: LabelMap, path: Path) -> tuple[LabelMap, list[str]]:
-    """The map with one connected limb and each bone in one piece, and sentences on what was changed.
+    """Return the map with one connected limb and each bone in one piece, and sentences on what was changed.
 
     Raises
     ------
@@ -139,7 +139,7 @@ def place_on_grid(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
 
 
 def _crop_labels(labels: LabelMap) -> LabelMap:
-    """Without the empty layers around what is labelled; a margin of zeros may lie outside the image."""
+    """Crop the empty layers around the labels; a margin of zeros may lie outside the image."""
     if not labels.array.any():
         return labels
     return labels.crop(find_box(labels.limb))

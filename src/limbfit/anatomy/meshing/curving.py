@@ -24,7 +24,7 @@ from .regions import build_region_level, find_interfaces
 SMALLEST_JACOBIAN = 0.3  # of the straight element's, at every node
 BISECTIONS = 5
 ROUNDS = 4
-SPLITS = 4  # of each edge of a face: so many squared places tell where it lies
+SPLITS = 4  # of each edge of a face: the level is averaged at so many squared places
 
 
 def curve_mesh(mesh: Mesh, target: Array, straight: Array) -> Mesh:

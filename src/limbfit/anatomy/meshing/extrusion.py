@@ -32,7 +32,7 @@ MAX_ASPECT_RATIO = 1.3  # step over edge length
 
 
 def build_core_mesh(points: Array, tets: Indices) -> Mesh:
-    """The tetrahedra under the layers as a mesh that tells no regions."""
+    """The tetrahedra under the layers as a mesh of one region."""
     return Mesh(points, tets, "tet4", np.zeros(len(tets), np.int64), ("core",))
 
 

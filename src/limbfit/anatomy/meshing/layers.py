@@ -89,7 +89,7 @@ class LimbFields:
 
     @property
     def floor_range_mm(self) -> float:
-        """How much the floor varies: by so much more than the distance between points their levels differ."""
+        """Range of the floor: the levels of two points differ by at most their distance and this."""
         return float(np.ptp(self.depths[-1]))
 
     def depth(self, points: Array) -> Level:

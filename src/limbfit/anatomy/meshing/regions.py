@@ -24,7 +24,7 @@ from .background import LONGEST_EDGE, REGION, Field, TetGrid, cut, refine_grid
 from .layers import Level, LimbFields, compute_box_distance, evaluate_distance, sample_box
 
 FAR_MM = 15.0  # of a region's box: a bound of the distance does there
-MIN_SLOPE = 0.2  # slope of a region's level, below which it does not tell a distance
+MIN_SLOPE = 0.2  # slope of a region's level, below which it is no distance
 WALL_REACHES = 2.0  # from a region before, where it may be a wall: it may itself be continued by one
 SAMPLES = 20_000  # all over a region's box
 CELLS_ACROSS = 3.0  # of the grid over a region's thickness, before it is cut
@@ -115,7 +115,7 @@ def refine_at_regions(grid: TetGrid, fields: LimbFields) -> TetGrid:
 
 
 def _is_near(surface: Surface, distance_mm: float, points: Array) -> Mask:
-    """Which points (n,) lie inside a closed surface, or no farther outside than so."""
+    """True (n,) for points inside a closed surface, or less than a distance outside it."""
     found = compute_box_distance(surface, points) < distance_mm
     found[found] = evaluate_distance(surface, points[found])[0] < distance_mm
     return found
@@ -175,6 +175,6 @@ def find_interfaces(mesh: Mesh, layers: int) -> list[Indices]:
 
 
 def find_same_faces(faces: Indices, chosen: Indices, count: int) -> Mask:
-    """Which faces (m, 3) are among the chosen (k, 3), in any order of nodes; ``count`` nodes in all."""
+    """True (m,) for faces (m, 3) among the chosen (k, 3), in any order of nodes; ``count`` nodes in all."""
     packed = [np.sort(part, axis=1) @ [count * count, count, 1] for part in (faces, chosen)]
     return np.isin(packed[0], packed[1])

@@ -1,4 +1,4 @@
-"""The few worst tetrahedra of a mesh made better by moving their nodes."""
+"""The few worst tetrahedra of a mesh are improved by moving their nodes."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def find_constraints(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Ar
 
 
 def _find_region_walls(mesh: Mesh, fields: LimbFields) -> list[tuple[Mask, Field]]:
-    """Which nodes (n,) lie on the surface of each region inside the core, and its level."""
+    """Mask (n,) of the nodes on the surface of each region inside the core, and the region's level."""
     found = []
     for number, faces in enumerate(find_interfaces(mesh, len(fields.depths))):
         chosen = np.zeros(len(mesh.points), dtype=bool)
@@ -107,7 +107,7 @@ def _find_region_walls(mesh: Mesh, fields: LimbFields) -> list[tuple[Mask, Field
 
 
 def _find_places(mesh: Mesh, stack: Columns) -> Mask:
-    """Which nodes lie on the cut plane, in the layers, on bone (3, n)."""
+    """Masks (3, n) of the nodes on the cut plane, in the layers, and on bone."""
     on_plane, in_layers, on_bone = np.zeros((3, len(mesh.points)), dtype=bool)
     on_plane[:] = mesh.points[:, 2] == 0.0
     in_layers[stack.base], in_layers[stack.top[0] :] = True, True

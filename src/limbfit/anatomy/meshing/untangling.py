@@ -1,4 +1,4 @@
-"""Inverted tetrahedra of a site mesh made sound again, by the least change that does it, and told.
+"""Inverted tetrahedra of a site mesh are made sound by the least change that does it, which is reported.
 
 Tried in turn, each about the inverted cells alone: nodes moved along the surfaces that they lie on; layers
 made thinner from below, where their columns cross; nodes moved off their surfaces.

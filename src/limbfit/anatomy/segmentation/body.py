@@ -104,7 +104,7 @@ def _compute_otsu_threshold(array: Field) -> float:
 
 
 def _fill_limb(mask: Mask, volume: Volume) -> Mask:
-    """Closed over dark skin and bone, filled slice by slice, without spikes."""
+    """Close a mask over dark skin and bone, fill it slice by slice and take its spikes off."""
     filled = fill_slices(close_mask(mask, _CLOSE_MM, volume.spacing))
     return fill_slices(open_mask(filled, _OPEN_MM, volume.spacing))
 
@@ -229,7 +229,7 @@ def _find_tissue(volume: Volume) -> tuple[Mask, float]:
 
 
 def _count_sections(plane: Mask, step: float) -> int:
-    """How many large roundish sections a slice shows."""
+    """Count the large, roundish sections in a slice."""
     solid = binary_opening(np.pad(binary_fill_holes(plane), 1, mode="edge"), np.ones((3, 3)))
     parts, count = connected(solid)
     if count == 0:

@@ -23,7 +23,7 @@ _LIGHTEST_HU = -200.0  # every CT of a limb shows something lighter than fat
 _DENSEST_AIR_HU = -400.0  # no air is denser, where a grey-value window cut it off
 _AIR_WIDTH_HU = 100.0  # half the width of its peak in the histogram
 _AIR_SHARE = 0.03  # of the voxels: fewer are an artefact of resampling
-_TOP_HU = 100.0  # the outline does not tell bone from soft tissue
+_TOP_HU = 100.0  # for the outline bone and soft tissue are the same
 _DENSE_HU = 200.0  # cancellous bone is denser, muscle and contrast-free vessels are not
 _MAX_BONE_HU = 1200.0  # denser than this counts as this, so that metal does not move outlines
 _RIM_MM = 2.5  # the outline is at half of the densest bone this near
@@ -32,7 +32,7 @@ _SMOOTH_MM = 1.0
 
 
 def is_ct(volume: Volume, expected: Contrast = "auto") -> bool:
-    """Whether an image has Hounsfield units: by its DICOM modality, else by the peak of air in its histogram.
+    """True if an image has Hounsfield units, by its DICOM modality or else the peak of air in its histogram.
 
     Without a modality an expected ``CT`` needs no such peak, only grey values below those of fat.
 
@@ -63,7 +63,7 @@ def is_ct(volume: Volume, expected: Contrast = "auto") -> bool:
 
 
 def _has_air_peak(volume: Volume, low: float) -> bool:
-    """Whether the histogram has a peak at -1000, or at the end of a grey-value window.
+    """True if the histogram has a peak at -1000, or at the end of a grey-value window.
 
     Resampling of MRI by B-splines overshoots to negative values too, but in few voxels, the fewer the lower.
     """
@@ -108,7 +108,7 @@ def find_dense_bones(hounsfield: Field, limb: Mask, spacing: Array, smallest_mm3
 
 
 def _fill_bone(part: Mask, spacing: Array) -> Mask:
-    """Closed over gaps of the cortex, filled slice by slice, without spikes."""
+    """Close a bone over gaps of its cortex, fill it slice by slice and take its spikes off."""
     padded = np.pad(part, ((0, 0), (1, 1), (1, 1)))  # a bone goes on beyond its ends, not beside them
     closed = fill_slices(close_mask(padded, _CLOSE_MM, spacing))
     opened = open_mask(closed, _SMOOTH_MM, spacing) | padded

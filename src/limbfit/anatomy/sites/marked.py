@@ -30,7 +30,7 @@ _NEIGHBOURS = 160  # of such places under a patch: some 20 mm around
 _REJECT_MM = 0.7  # what stands out of a patch by more does not pull it
 _ROUNDS = 8
 _AROUND_MM = 2.5  # a marker's foot beyond what stands out
-_PATCH_MM = 14.0  # of skin around a foot that tells how the skin under it runs
+_PATCH_MM = 14.0  # of skin around a foot, from which the skin under it follows
 _ABOVE_MM = 15.0  # no marker is higher
 
 

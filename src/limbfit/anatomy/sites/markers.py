@@ -1,7 +1,7 @@
 """Skin markers from two surfaces of the same limb, with and without them (paper, section 2.1.1, figure 1).
 
-What stands out of the skin by more than a threshold is clustered; each cluster that is high and small enough
-is a marker. The flat proximal cap is no skin and takes no part.
+Places that stand out of the skin by more than a threshold are clustered; each cluster that is high and small
+enough is a marker. The flat proximal cap is no skin and is left out.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def _compute_distances(markers: Sequence[Marker], hints: Array) -> Array:
 
 
 def _describe_missing(names: list[str], pairs: Mapping[int, int], distance: Array) -> str:
-    """What to say of places without a marker; empty where there are none."""
+    """Describe the places without a marker; empty if there are none."""
     missing = [r for r in range(len(names)) if r not in pairs]
     places = [
         f"{names[r]} (nearest at {distance[r].min():.1f} mm)" if distance.shape[1] else names[r]
@@ -143,7 +143,7 @@ def _describe_missing(names: list[str], pairs: Mapping[int, int], distance: Arra
 
 
 def _describe_spare(names: list[str], pairs: Mapping[int, int], distance: Array) -> str:
-    """What to say of places with a spare marker near them; empty where there are none."""
+    """Describe the places with more than one marker near them; empty if there are none."""
     spare = np.setdiff1d(np.arange(distance.shape[1]), list(pairs.values()))
     doubled = [names[r] for r in pairs if (distance[r, spare] <= MAX_DISTANCE_MM).any()]
     return f"more than one marker within {MAX_DISTANCE_MM:g} mm of {', '.join(doubled)}" if doubled else ""
@@ -179,7 +179,7 @@ def find_cap_faces(surface: Surface) -> Mask:
 
 
 def find_near_cap(surface: Surface, cap: Mask, points: Array) -> Mask:
-    """Which points (n,) lie beyond the plane of a surface's cap (faces of it) or just under it."""
+    """True (n,) for points beyond the plane of a surface's cap (faces of it) or just under it."""
     if not cap.any():
         return np.zeros(len(points), bool)
     areas = surface.face_areas[cap]

@@ -145,7 +145,7 @@ def remesh(
 
 
 def untangle_surface(surface: Surface, share: float = 0.5) -> Surface:
-    """Without faces that cross: their points go a share of the way to their neighbours' mean, until none do.
+    """Move the points of crossing faces a share of the way to their neighbours' mean, until none cross.
 
     Remeshing folds a few triangles where a bone is hardly thicker than they are long, as at a patella's rim.
     What still crosses after that is left to the check of the anatomy.
@@ -166,7 +166,8 @@ def untangle_surface(surface: Surface, share: float = 0.5) -> Surface:
 
 
 def keep_volume(surface: Surface, volume: float) -> Surface:
-    """Shifted along its normals until it encloses ``volume`` (mm3): chords cut the corners of a curve."""
+    """Shift the surface along its normals until it encloses ``volume`` (mm3): chords cut the corners of a
+    curve."""
     for _ in range(3):
         shift = (volume - surface.volume) / surface.area
         surface = Surface(surface.points + shift * surface.vertex_normals, surface.faces)

@@ -1,4 +1,6 @@
-"""Given surfaces closed as scans and atlases need it: one open end capped, small holes filled, each told.
+"""Repair of given surfaces, as scans and atlases need it: one open end is capped, small holes are filled.
+
+Each change is reported in words.
 
 Vocabulary
 ----------
@@ -197,7 +199,7 @@ def find_flat_ends(surface: Surface) -> list[tuple[Array, Array]]:
 
 
 def orient_outward(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
-    """With outward faces, where neighbours are oriented against each other; else as it is."""
+    """Turn the faces outward if neighbours are oriented against each other; else change nothing."""
     alike = orient_faces(surface)
     outward = alike if alike.volume > 0.0 else alike.flipped
     count = count_turned(surface, outward)
@@ -207,7 +209,8 @@ def orient_outward(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...
 
 
 def orient_faces(surface: Surface) -> Surface:
-    """The surface with all faces on one side, whichever; itself where they are, or where none is possible."""
+    """Turn all faces to one side, whichever; return the surface itself if they are, or if none is
+    possible."""
     if not has_turned_faces(surface.faces):
         return surface
     faces, patches = igl.bfs_orient(surface.faces)
@@ -215,7 +218,7 @@ def orient_faces(surface: Surface) -> Surface:
 
 
 def count_turned(before: Surface, after: Surface) -> int:
-    """How many faces look the other way."""
+    """Count the faces that look the other way."""
     return int((np.einsum("ij,ij->i", before.face_normals, after.face_normals) < 0.0).sum())
 
 
@@ -224,7 +227,7 @@ def _place(point: Array) -> str:
 
 
 def _remove_loose_pieces(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
-    """Without small open pieces beside the largest body; a small closed one may be meant and stays."""
+    """Leave out small open pieces beside the largest body; a small closed one may be meant and stays."""
     main, *others = find_bodies(surface)
     few = MAX_LOOSE_SHARE * len(surface.faces)
     loose = [part for part in others if len(part.faces) < few and len(find_open_edges(part.faces))]
@@ -268,13 +271,13 @@ def _is_small(surface: Surface, loop: Indices) -> bool:
 
 
 def _compute_area_vector(loop: Array) -> Array:
-    """Of what a loop (n, 3) spans, mm2, against the sense of its faces: it points out of the body."""
+    """Area vector of a loop (n, 3), mm2, against the sense of its faces: it points out of the body."""
     spokes = loop - loop.mean(axis=0)
     return np.asarray(-0.5 * np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0))
 
 
 def _compute_area(loop: Array) -> float:
-    """What a loop (n, 3) spans, mm2."""
+    """Area that a loop (n, 3) spans, mm2."""
     return float(np.linalg.norm(_compute_area_vector(loop)))
 
 
@@ -327,7 +330,7 @@ def _triangulate_polygon(polygon: Array, normal: Array) -> Indices | None:
 
 
 def _smooth_crossings(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
-    """A few crossing faces smoothed apart; a surface that crosses itself more is left as it is."""
+    """Smooth a few crossing faces; a surface that crosses itself more often is left as it is."""
     crossing = surface.self_intersections
     if not 0 < len(crossing) <= MAX_CROSSINGS:
         return surface, ()

@@ -125,7 +125,7 @@ def _read_ply(path: Path) -> pv.PolyData:
 
 
 def _merge_points(surface: Surface) -> Surface:
-    """One point where several coincide exactly (STL repeats them), without faces that collapse."""
+    """Merge points that coincide exactly (STL repeats them), and drop faces that collapse."""
     points, inverse = np.unique(surface.points, axis=0, return_inverse=True)
     faces = inverse.ravel()[surface.faces]
     a, b, c = faces.T

@@ -111,7 +111,7 @@ def build_anatomy(
     else:
         point, normal = _normalise_plane(
             *proximal_cut
-        )  # a short limb may be wider than long: the cut tells its axis
+        )  # a short limb may be wider than long: its axis follows from the cut
         end = find_proximal_end(labels.limb, labels, int(np.abs(normal @ labels.direction).argmax()))
     own_point = np.round(labels.direction.T @ (point - labels.origin), 4)
     own_normal = np.round(labels.direction.T @ normal, 6)
@@ -197,7 +197,7 @@ def _check_sides(limb: Mask, end: ProximalEnd) -> None:
 
 
 def cut_and_cap(surface: Surface, point: Array, normal: Array, edge_mm: float) -> Surface:
-    """The part distal of the plane, closed by a flat cap with a sharp rim, in even triangles."""
+    """Cut off what is proximal of the plane, close the rest by a flat cap with a sharp rim, and remesh it."""
     heights = (surface.points - point) @ normal
     if heights.min() >= 0 or heights.max() <= 0:
         raise SurfaceError("the proximal cut misses the limb", remedy="move its point into the limb (LPS mm)")

@@ -42,7 +42,7 @@ class Surface:
         object.__setattr__(self, "faces", np.asarray(self.faces, dtype=np.int64))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the trees, which no other process can be sent."""
+        """Leave out the trees, which cannot be sent to another process."""
         return {"points": self.points, "faces": self.faces}
 
     @cached_property
@@ -120,7 +120,7 @@ def from_pyvista(poly: pv.PolyData) -> Surface:
 
 
 def remove_unused_points(surface: Surface) -> Surface:
-    """Without the points that no face uses."""
+    """Return the surface without the points that no face uses."""
     used, inverse = np.unique(surface.faces, return_inverse=True)
     return Surface(surface.points[used], inverse.reshape(surface.faces.shape))
 
@@ -326,7 +326,7 @@ def _compute_radii(triangles: Array) -> Array:
 
 
 def _find_piercing(start: Array, end: Array, triangle: Array) -> Mask:
-    """Whether each segment passes through the inside of its triangle (signed volumes)."""
+    """True for each segment that passes through the inside of its triangle (signed volumes)."""
     a, b, c = np.moveaxis(triangle, 1, 0)
 
     def side(p: Array, q: Array, r: Array, s: Array) -> Array:
