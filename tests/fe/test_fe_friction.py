@@ -46,7 +46,7 @@ class Dragged:
     def field(self, size: float) -> np.ndarray:
         return size * self.rng.normal(size=self.system.points.shape) * ~self.system.supported
 
-    def build_increment(self, advance: float, grip: Coulomb) -> Increment:
+    def increment(self, advance: float, grip: Coulomb) -> Increment:
         return Increment(0.0, advance, np.zeros(2), self.rest, 0.5, drive(advance, 0.03, 0.02), (grip,))
 
     def renew(self, grip: Coulomb, u: np.ndarray) -> Coulomb:
