@@ -222,35 +222,35 @@ def _write_traces(
     return facts
 
 
-def _record_site(traces: Path, site: TrueSite, found: TrueForce, seed: int) -> dict[str, Any]:
+def _record_site(traces: Path, site: TrueSite, simulated: TrueForce, seed: int) -> dict[str, Any]:
     random = np.random.default_rng([seed, 8, int(site.name)])
-    made = record(site.ramp, lambda t: np.interp(t, found.times, found.force), random)
+    made = record(site.ramp, lambda t: np.interp(t, simulated.times, simulated.force), random)
     made.write(traces / f"site-{site.name}.csv")
-    if found.layers:
+    if simulated.layers:
         write_ultrasound(
             traces / f"site-{site.name}-layers.csv",
             made,
             {
-                tissue: (thickness, lambda t, lost=lost: np.interp(t, found.times, lost))  # type: ignore[misc]
-                for tissue, (thickness, lost) in found.layers.items()
+                tissue: (thickness, lambda t, lost=lost: np.interp(t, simulated.times, lost))  # type: ignore[misc]
+                for tissue, (thickness, lost) in simulated.layers.items()
             },
             np.random.default_rng([seed, 11, int(site.name)]),
         )
-    if len(found.skin_points):
+    if len(simulated.skin_points):
         write_surface(
             traces / f"site-{site.name}-surface.csv",
             made,
-            found.skin_points,
-            lambda t: interp1d(found.times, found.skin_moves)(np.minimum(t, found.times[-1])),
+            simulated.skin_points,
+            lambda t: interp1d(simulated.times, simulated.skin_moves)(np.minimum(t, simulated.times[-1])),
             np.random.default_rng([seed, 12, int(site.name)]),
         )
-    if found.speeds:
+    if simulated.speeds:
         write_waves(
             traces / f"site-{site.name}-waves.csv",
             made,
             {
-                tissue: lambda t, speed=speed: np.interp(t, found.times, speed)  # type: ignore[misc]
-                for tissue, speed in found.speeds.items()
+                tissue: lambda t, speed=speed: np.interp(t, simulated.times, speed)  # type: ignore[misc]
+                for tissue, speed in simulated.speeds.items()
             },
             np.random.default_rng([seed, 13, int(site.name)]),
         )
@@ -259,11 +259,11 @@ def _record_site(traces: Path, site: TrueSite, found: TrueForce, seed: int) -> d
         "depth_mm": site.depth,
         "speed_mm_s": site.speed,
         "fitted": site.fitted,
-        "peak_force_N": float(found.force.max()),
+        "peak_force_N": float(simulated.force.max()),
         "clearance_mm": made.clearance,
         "touch_down_s": made.touch_s,
         "force_noise_N": made.force_noise,
-        "simulation": found.facts,
+        "simulation": simulated.facts,
     }
 
 

@@ -187,7 +187,7 @@ def _select_levels(anatomy: Anatomy, directions: Directions, top: float) -> dict
     level = np.floor(3.0 * (top - height) / (top - bottom + 1e-9)).astype(int)
     left = np.cross(directions.proximal, directions.anterior)
     forwards, towards_left = np.zeros(len(middles)), np.zeros(len(middles))
-    for k in range(len(LEVELS)):  # sides are told from the middle of their level
+    for k in range(len(LEVELS)):  # sides are counted from the middle of their level
         here = level == k
         spokes = middles[here] - middles[here].mean(axis=0) if here.any() else middles[here]
         forwards[here], towards_left[here] = spokes @ directions.anterior, spokes @ left

@@ -148,9 +148,9 @@ class Study(TomlTable):
         named: dict[str | None, IndenterTable] = {None: self.indenter}
         return named | dict(self.indenters)
 
-    def indenter_of(self, one: Indentation) -> IndenterTable:
+    def indenter_of(self, indentation: Indentation) -> IndenterTable:
         """The indenter of a record or of a planned indentation, its file as a path of this machine."""
-        found = self.all_indenters[one.indenter]
+        found = self.all_indenters[indentation.indenter]
         return found.model_copy(update={"file": None if found.file is None else self.path(found.file)})
 
     @property
@@ -247,7 +247,7 @@ class Study(TomlTable):
         )
 
     def indentation(self, name: str) -> Indentation:
-        """What was recorded or is planned under a name: a record's, or that of a site with one at most."""
+        """Return the record, or the planned indentation, of a name; a site with one record stands for it."""
         for one in self.indentations:
             if one.name == name:
                 return one

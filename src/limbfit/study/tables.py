@@ -47,7 +47,7 @@ class TomlTable(BaseModel):
 
 
 class StudyTable(TomlTable):
-    """What the study is called; ``extensions`` are Python files that register laws and shapes of its own."""
+    """The study's name; ``extensions`` are Python files that register laws and shapes of its own."""
 
     name: str
     description: str = ""
@@ -276,7 +276,7 @@ class TracesTable(TomlTable):
 
 
 class PriorTable(TomlTable):
-    """What is known of a parameter beforehand: lognormal, ``factor`` is one standard deviation either way."""
+    """The lognormal prior of a parameter; ``factor`` is one standard deviation either way."""
 
     median: Positive
     factor: Annotated[float, Field(gt=1)]

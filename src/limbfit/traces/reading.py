@@ -150,10 +150,10 @@ def _find_factor(unit: str, key: str, name: str, file: Path, notes: list[str]) -
     return factor
 
 
-def _get_factor(known: Mapping[str, float], unit: str) -> float:
+def _get_factor(factors: Mapping[str, float], unit: str) -> float:
     """The factor of a unit, words in any case; 0 where it is not known."""
     unit = unit.replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
-    return known.get(unit, known.get(unit.lower() if len(unit) > 3 else "", 0.0))
+    return factors.get(unit, factors.get(unit.lower() if len(unit) > 3 else "", 0.0))
 
 
 def _get_cell(row: Row, place: int, file: Path, name: str) -> str:

@@ -129,7 +129,7 @@ def serve(
     Parameters
     ----------
     speed : how much faster than the wall's the device's clock may go; only a paced device waits for its host.
-    tell : is told of sessions and stops, a line each.
+    tell : called with a line for each session and each stop.
     """
     _Server(device, serving, speed, tell).run()
     serving.close()
