@@ -45,8 +45,8 @@ def read_socket(
 ) -> Socket:
     """The socket of a .stl, .ply, .vtp or .obj file, around a limb.
 
-    Of a socket with a wall the inner face is taken, if it can be recognised; one whose triangles look away from
-    the tissue is turned. `Socket.notes` says so.
+    Of a socket with a wall the inner face is taken, if it can be recognised. A face whose triangles look away
+    from the tissue is turned. `Socket.notes` says so.
 
     Parameters
     ----------
