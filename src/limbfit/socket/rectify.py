@@ -155,13 +155,13 @@ def _draw_surface(lines: TrimmedLimb, recipe: Recipe) -> SocketSurface:
         dense = lines.along(way)
         around = float(np.linalg.norm(dense - np.roll(dense, 1, axis=0), axis=1).sum())
         count = max(MIN_RING_POINTS, round(around / recipe.edge_mm))
-        points, where = resample_ring(dense, count, 0.5 * (number % 2))
+        points, where = _resample_ring(dense, count, 0.5 * (number % 2))
         rings.append(points)
         at.append(where)
         remaining = np.column_stack([dense[:, :2], lengths - way])
         below.append(_interpolate_along_ring(dense, remaining[:, 2:], where)[:, 0])
         up.append(_interpolate_along_ring(dense, lines.tangent(way), where))
-    faces = join_all_rings(at)
+    faces = _join_all_rings(at)
     count = sum(len(ring) for ring in rings)
     brim = np.arange(count - len(rings[-1]), count)
     return SocketSurface(np.vstack(rings), faces, np.concatenate(below), np.vstack(up), brim)
@@ -232,7 +232,7 @@ def _refuse_crossing(face: Surface, recipe: Recipe) -> None:
     raise SurfaceError(f"the socket's face would cross itself at ({words}) mm", remedy=remedy)
 
 
-def resample_ring(ring: Array, count: int, turn: float) -> tuple[Array, Array]:
+def _resample_ring(ring: Array, count: int, turn: float) -> tuple[Array, Array]:
     """``count`` points evenly spaced along a dense closed ring (n, 3), from the share ``turn`` of a step on.
 
     Returns
@@ -246,7 +246,7 @@ def resample_ring(ring: Array, count: int, turn: float) -> tuple[Array, Array]:
     return CubicSpline(length / length[-1], closed, bc_type="periodic")(shares), shares
 
 
-def join_rings(lower: Array, upper: Array, first: int, second: int) -> Ints:
+def _join_rings(lower: Array, upper: Array, first: int, second: int) -> Ints:
     """Triangles between two rings whose points lie at shares ``lower`` (a,) and ``upper`` (b,) of them.
 
     The points of the rings are numbered from ``first`` and ``second`` on. Seen from inside, where shares grow
@@ -267,12 +267,12 @@ def join_rings(lower: Array, upper: Array, first: int, second: int) -> Ints:
     return np.array(faces, dtype=np.int64)
 
 
-def join_all_rings(shares: Sequence[Array]) -> Ints:
+def _join_all_rings(shares: Sequence[Array]) -> Ints:
     """Triangles between rings, the first of which is a point, numbered one ring after the other."""
     starts = np.cumsum([0, *(len(ring) for ring in shares)])
     around = np.arange(len(shares[1]))
     pole = np.column_stack([np.zeros_like(around), 1 + around, 1 + np.roll(around, -1)])
     bands = [
-        join_rings(shares[k], shares[k + 1], starts[k], starts[k + 1]) for k in range(1, len(shares) - 1)
+        _join_rings(shares[k], shares[k + 1], starts[k], starts[k + 1]) for k in range(1, len(shares) - 1)
     ]
     return np.vstack([pole, *bands])
