@@ -140,7 +140,7 @@ def test_a_pin_that_stays_stuck_is_reported() -> None:
     assert bench.session.unreachable == (1,)
     reason = bench.session.protocol.reason
     assert "stuck, pin 1 (a driven pin does not move)" in reason
-    assert "cannot place_site every pin home; use the device's own release" in reason
+    assert "cannot bring every pin home; use the device's own release" in reason
     others = np.delete(bench.device.motors.position_mm, 0)
     assert (others < 0.1).all()  # the others went home
 
