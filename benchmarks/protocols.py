@@ -29,7 +29,7 @@ from protocols_limb import BALL_TABLE, SLOW, TISSUES, Limb, Take, write_case
 
 from limbfit import load_study, plan_protocol, run_study
 from limbfit.execution import SerialExecutor
-from limbfit.identify.checks.design import SampleNoise, compute_bounds_information, compute_information
+from limbfit.identify.checks.design import NoiseModel, compute_bounds_information, compute_information
 from limbfit.identify.checks.protocol import (
     Budget,
     DesignTarget,
@@ -135,8 +135,8 @@ def told_of(
     study = plan_study(folder, limb, edge_mm)
     context = Context(study, Store(study.results), SerialExecutor(), lambda event: None)
     truth = study.vector(parameters_of(limb.seed))
-    force = SampleNoise(EXPECTED_N, misfit, EXPECTED_CORRELATION)
-    layers = SampleNoise(ULTRASOUND_NOISE_MM, misfit, EXPECTED_CORRELATION)
+    force = NoiseModel(EXPECTED_N, misfit, EXPECTED_CORRELATION)
+    layers = NoiseModel(ULTRASOUND_NOISE_MM, misfit, EXPECTED_CORRELATION)
     plain = [replace(take, seen=NOTHING) for take in takes]
     jobs = []
     for take in plain:
