@@ -32,7 +32,8 @@ from limbfit.indentation import to_vector
 from limbfit.pipeline.engine.context import Context, ignore_progress
 from limbfit.pipeline.engine.storage import write_curves
 from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.simulation.simulations import SimulationCache, build_curve_job, build_site_model
+from limbfit.pipeline.simulation.limb_geometry import build_site_model
+from limbfit.pipeline.simulation.simulations import SimulationCache, build_curve_job
 
 COMMAND = (sys.executable, "-m", "limbfit")
 SPEEDS_MM_S, HOLD_S, REST_S = (4.8, 0.96), 30.0, 10.0

@@ -178,7 +178,7 @@ def study_robot(
     def deviation(responses: Sequence[SiteResponse], parameters: Array) -> tuple[Array, ...]:
         pairs = zip(records, responses, strict=True)
         return tuple(
-            estimate_site_deviation(context, record, response, parameters) for record, response in pairs
+            estimate_site_deviation(study, record, response, parameters) for record, response in pairs
         )
 
     true = list(emulator(truth))

@@ -21,7 +21,7 @@ from limbfit.mesh import read_vtu
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.problem import build_unknowns
-from limbfit.pipeline.limb.mesh import mesh_settings
+from limbfit.pipeline.limb.mesh import mesh_settings, plan_meshes
 from limbfit.pipeline.limb.remesh import mesh_models
 from limbfit.pipeline.records.records import load_site_record
 from limbfit.pipeline.simulation.simulations import SimulationCache
@@ -53,7 +53,10 @@ def main() -> None:
         if given.sites and recorded.site.name not in given.sites:
             continue
         record = load_site_record(context, recorded)
-        (model,) = mesh_models(context, given.folder / "fine", [record.model], fine, lambda text: None)
+        (given.folder / "fine").mkdir(parents=True, exist_ok=True)
+        place = record.model.site, record.model.position, record.model.axis
+        jobs = plan_meshes(context, given.folder / "fine", [place], fine)
+        (model,) = mesh_models(jobs, [record.model], context.executor, lambda text: None)
         jobs = [one.job(start, sensitivities=False) for one in (record, replace(record, model=model))]
         found = list(cache.run(jobs, context.executor))
         if failed := [one.reason for one in found if not one.completed]:

@@ -19,7 +19,8 @@ from limbfit.execution import SerialExecutor, share_executor
 from limbfit.fe import solve
 from limbfit.indentation import Simulation, SimulationJob, build_problem, build_steps, to_parameters
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.engine.storage import compute_digest, read_curves
+from limbfit.pipeline.engine.digests import compute_digest
+from limbfit.pipeline.engine.storage import read_curves
 from limbfit.pipeline.engine.store import RUNS
 from limbfit.pipeline.simulation.simulations import compute_job_digest
 

@@ -44,11 +44,10 @@ from limbfit.pipeline.design.protocol import DETERMINED
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.problem import build_unknowns
+from limbfit.pipeline.simulation.limb_geometry import build_site_model, coarsen_model
 from limbfit.pipeline.simulation.simulations import (
     SimulationCache,
     build_curve_job,
-    build_site_model,
-    coarsen_model,
 )
 from limbfit.study import Study
 

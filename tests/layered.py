@@ -19,9 +19,9 @@ from limbfit.mesh.boxes import SIX_TETS, build_boxes, turn_upright
 from limbfit.phantom.record import Ramp, record
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.storage import write_json
-from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.engine.store import COARSE, Store
 from limbfit.pipeline.records.traces import run_traces
-from limbfit.pipeline.simulation.simulations import COARSE, find_fibre_directions
+from limbfit.pipeline.simulation.limb_geometry import find_fibre_directions
 from limbfit.study import Study, load_study
 
 TISSUES = ("skin", "fat", "muscle")

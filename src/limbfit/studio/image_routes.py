@@ -22,7 +22,7 @@ from ..anatomy.imaging import LabelMap, Volume, read_labels, write_labels
 from ..anatomy.labels.labelfiles import colour_of
 from ..anatomy.surfaces.surfaces import read_surface
 from ..errors import InputError, RunError
-from ..pipeline.engine.storage import compute_file_digest
+from ..pipeline.engine.digests import compute_file_digest
 from ..pipeline.limb.inputs import read_plain_image
 from ..study import Study
 from .editing import set_key

@@ -16,7 +16,7 @@ from ..anatomy.sites.sites import project_to_skin
 from ..anatomy.surfaces.surfaces import Anatomy, Surface, load_anatomy, read_surface
 from ..errors import InputError, SiteError
 from ..mesh import read_vtu
-from ..pipeline.engine.storage import compute_digest
+from ..pipeline.engine.digests import compute_digest
 from ..pipeline.limb.sites import place_site
 from ..pipeline.limb.surfaces import read_given_anatomy
 from ..results.limb import PlacedSite, SitesResult

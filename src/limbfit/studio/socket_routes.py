@@ -15,7 +15,7 @@ from pydantic import Field
 from ..anatomy.frame import build_limb_frame
 from ..errors import InputError, SurfaceError
 from ..mesh import read_vtu
-from ..pipeline.engine.storage import compute_digest
+from ..pipeline.engine.digests import compute_digest
 from ..pipeline.socket.shape import build_regions, build_socket, place_errors, trim_of
 from ..socket import Socket
 from ..socket.rays import LimbProfile, compute_profile

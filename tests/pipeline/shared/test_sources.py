@@ -16,7 +16,7 @@ import pytest
 from limbfit.indentation import simulate
 from limbfit.pipeline.commands.experiments import EXPERIMENTS
 from limbfit.pipeline.commands.run import STAGES
-from limbfit.pipeline.engine.sources import PACKAGE, find_sources, format_source
+from limbfit.pipeline.engine.digests import PACKAGE, find_sources, format_source
 
 RUNS = {stage.name: stage.run for stage in (*STAGES, *EXPERIMENTS)} | {"simulation": simulate}
 
@@ -79,7 +79,7 @@ DIGESTS = """
 import json
 from limbfit.pipeline.commands.experiments import EXPERIMENTS
 from limbfit.pipeline.commands.run import STAGES
-from limbfit.pipeline.engine.sources import code_digest
+from limbfit.pipeline.engine.digests import code_digest
 print(json.dumps({stage.name: code_digest(stage.run) for stage in (*STAGES, *EXPERIMENTS)}))
 """
 

@@ -10,7 +10,8 @@ import sys
 import pytest
 
 from limbfit.errors import RunError
-from limbfit.pipeline.engine.storage import compute_file_digest, read_json, write_json
+from limbfit.pipeline.engine.digests import compute_file_digest
+from limbfit.pipeline.engine.storage import read_json, write_json
 from limbfit.pipeline.engine.store import EARLIER, Store, lock, translate_disk_errors
 
 

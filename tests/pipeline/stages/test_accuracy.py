@@ -14,8 +14,8 @@ from limbfit.errors import StudyError
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.indentation.sites import ROUGHLY
 from limbfit.pipeline.engine.provenance import record_settings
+from limbfit.pipeline.identification.problem import is_moved
 from limbfit.pipeline.limb.mesh import build_coarse_settings, mesh_settings
-from limbfit.pipeline.records.records import is_moved
 from limbfit.study import Study, load_study
 from limbfit.study.meshing import ACCURACIES, estimate_cells
 from limbfit.study.tables import SolverTable

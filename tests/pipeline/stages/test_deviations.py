@@ -15,17 +15,20 @@ from limbfit.identify.fit.objective import SiteResponse
 from limbfit.mesh import read_vtu, write_vtu
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.records.deviations import (
-    GIVEN_MM,
     LEAST_SHARE,
-    OF_A_VOXEL,
     compute_expected_share,
     compute_thickness_slope,
     estimate_site_deviation,
     estimate_site_noise,
-    estimate_surface_error_mm,
     measure_bone_distance_mm,
 )
-from limbfit.pipeline.records.records import SiteRecord, load_site_record
+from limbfit.pipeline.records.records import (
+    GIVEN_MM,
+    OF_A_VOXEL,
+    SiteRecord,
+    estimate_surface_error_mm,
+    load_site_record,
+)
 from limbfit.pipeline.records.secondary_measurements import WaveMeasurement
 from limbfit.pipeline.records.traces import read_record
 
@@ -70,14 +73,14 @@ def test_where_surfaces_are_known_from(tmp_path: Path) -> None:
     """Of files, of an image by its voxels, or as stated."""
     (tmp_path / "stated").mkdir()
     found = context(tmp_path)
-    assert estimate_surface_error_mm(found) == GIVEN_MM
+    assert estimate_surface_error_mm(found.study, found.store) == GIVEN_MM
     labels = sitk.Image(4, 4, 4, sitk.sitkUInt8)
     labels.SetSpacing((1.0, 1.0, 8.0))
     found.store["segment"].mkdir(parents=True)
     sitk.WriteImage(labels, str(found.store["segment"] / "labels.seg.nrrd"))
-    assert estimate_surface_error_mm(found) == pytest.approx(2.0 * OF_A_VOXEL)
+    assert estimate_surface_error_mm(found.study, found.store) == pytest.approx(2.0 * OF_A_VOXEL)
     stated = context(tmp_path / "stated", "[calibration]\nsurface_error_mm = 0.1\n")
-    assert estimate_surface_error_mm(stated) == 0.1
+    assert estimate_surface_error_mm(stated.study, stated.store) == 0.1
 
 
 def test_a_stiffer_site_moves_its_force_along_all_moduli(tmp_path: Path) -> None:
@@ -89,7 +92,7 @@ def test_a_stiffer_site_moves_its_force_along_all_moduli(tmp_path: Path) -> None
     jacobian = np.zeros((5, len(parameters)))
     jacobian[:, moduli] = np.linspace(0, 1, 5)[:, None]
     jacobian[:, moduli[0] + 1] = 7.0
-    off = estimate_site_deviation(found, record, SiteResponse(np.ones(5), jacobian), parameters)
+    off = estimate_site_deviation(found.study, record, SiteResponse(np.ones(5), jacobian), parameters)
     assert off == pytest.approx(12.0 * np.linspace(0, 1, 5) * compute_expected_share(record.model, GIVEN_MM))
 
 
@@ -105,7 +108,7 @@ def test_thinner_tissue_under_an_indenter_has_faster_waves(tmp_path: Path) -> No
     jacobian = np.zeros((4, len(parameters)))
     jacobian[:, 0] = 0.5 * speeds / parameters[0]
     off = estimate_site_deviation(
-        found, replace(record, seen=seen), SiteResponse(speeds, jacobian), parameters
+        found.study, replace(record, seen=seen), SiteResponse(speeds, jacobian), parameters
     )
     thickness = measure_bone_distance_mm(record.model)
     assert thickness is not None

@@ -17,7 +17,7 @@ from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.identification.problem import build_groupings, build_unknowns
 from limbfit.pipeline.records.records import build_model
-from limbfit.pipeline.simulation.simulations import find_fibre_directions
+from limbfit.pipeline.simulation.limb_geometry import find_fibre_directions
 from limbfit.pipeline.variants.cube import check_cube
 from limbfit.study import Study
 

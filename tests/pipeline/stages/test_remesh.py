@@ -9,8 +9,8 @@ from limbfit import load_study, run_study
 from limbfit.execution import SerialExecutor
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.limb.mesh import mesh_settings
-from limbfit.pipeline.limb.remesh import mesh_models, mesh_where_possible, scale_edges
+from limbfit.pipeline.limb.mesh import mesh_settings, plan_meshes, scale_edges
+from limbfit.pipeline.limb.remesh import mesh_models, mesh_where_possible
 from limbfit.pipeline.records.records import load_site_record
 
 
@@ -23,9 +23,13 @@ def test_a_site_without_such_a_mesh_is_left_out_and_named(study):
     context = Context(loaded, Store(loaded.results), SerialExecutor(), lambda event: None)
     models = [load_site_record(context, record).model for record in loaded.recorded]
     coarser, folder = scale_edges(mesh_settings(loaded), 1.3), study / "coarser"
-    mesh_models(context, folder, models[:1], coarser, told.append)
+    folder.mkdir()
+    places = [(model.site, model.position, model.axis) for model in models]
+    jobs = plan_meshes(context, folder, places[:1], coarser)
+    mesh_models(jobs, models[:1], context.executor, told.append)
     hurried = replace(coarser, time_limit_s=0.01)
-    found = mesh_where_possible(context, folder, models, hurried, told.append, "its error is not counted")
+    jobs, lost = plan_meshes(context, folder, places, hurried), "its error is not counted"
+    found = mesh_where_possible(jobs, models, context.executor, told.append, lost)
     assert found == [replace(models[0], mesh=folder / "1.vtu", mesh_digest=found[0].mesh_digest), None]
     assert found[0].mesh_digest != models[0].mesh_digest
     made, lost = told

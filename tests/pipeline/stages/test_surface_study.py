@@ -86,8 +86,9 @@ def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -
         records = load_records(context, study.recorded, secondary=True)
         cache = SimulationCache(tmp_path / name / "runs")
         simulator = RecordSimulator(records, cache, context.executor, lambda text: None)
-        at = correct_to_fine_meshes(study, simulator, study.vector(TRUTH))
-        known = estimate_linearised(context, build_problem(study), records.own, study.vector(TRUTH), at)
+        problem = build_problem(study)
+        at = correct_to_fine_meshes(problem, simulator, study.vector(TRUTH))
+        known = estimate_linearised(problem, records.own, study.vector(TRUTH), at)
         widths.append(np.sqrt(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
     assert [one.name for one in records.own] == ["a", "a+surface"]
     assert [one.unit for one in records.measured] == ["N", "mm"]
@@ -138,7 +139,7 @@ def test_one_component_in_the_frame_of_the_indenter(tmp_path: Path, monkeypatch)
     records = load_records(context, context.study.recorded, secondary=True)
     cache = SimulationCache(tmp_path / "runs")
     simulator = RecordSimulator(records, cache, context.executor, lambda text: None)
-    at = correct_to_fine_meshes(context.study, simulator, context.study.vector(TRUTH))
+    at = correct_to_fine_meshes(build_problem(context.study), simulator, context.study.vector(TRUTH))
     seen = records.own[1]
     assert set(seen.seen.components.tolist()) == {2}
     assert seen.compared.max() > 0.2  # into the limb

@@ -63,8 +63,9 @@ def test_speeds_are_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
         records = load_records(context, study.recorded, secondary=True)
         cache = SimulationCache(tmp_path / name / "runs")
         simulator = RecordSimulator(records, cache, context.executor, lambda text: None)
-        at = correct_to_fine_meshes(study, simulator, study.vector(TRUTH))
-        known = estimate_linearised(context, build_problem(study), records.own, study.vector(TRUTH), at)
+        problem = build_problem(study)
+        at = correct_to_fine_meshes(problem, simulator, study.vector(TRUTH))
+        known = estimate_linearised(problem, records.own, study.vector(TRUTH), at)
         widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
     assert [one.name for one in records.own] == ["a", "a+skin-waves", "a+muscle-waves"]
     assert [one.unit for one in records.measured] == ["N", "m/s", "m/s"]

@@ -20,8 +20,7 @@ from ..engine.store import Store
 from ..limb.inputs import check_labels, read_marked_image, read_study_image, read_study_labels
 from ..limb.sites import place_site
 from ..limb.surfaces import read_given_anatomy
-from ..records.record_checks import record_flags
-from ..records.secondary_measurements import choose_surface_points
+from ..records.record_checks import choose_surface_points, record_flags
 from ..records.traces import SecondaryMeasurement, read_observed, read_record
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, name_load, time_socket_loads

@@ -36,8 +36,8 @@ from ..limb.mesh import run_mesh
 from ..limb.segment import run_segment
 from ..limb.sites import run_sites
 from ..limb.surfaces import run_surfaces
-from ..records.record_checks import tell_flags
-from ..records.secondary_measurements import choose_surface_points, read_motion
+from ..records.record_checks import choose_surface_points, tell_flags
+from ..records.secondary_measurements import read_motion
 from ..records.traces import run_traces
 from ..simulation.limb_geometry import LimbGeometry
 from .experiments import (

@@ -41,15 +41,13 @@ from ...study import Study
 from ..engine.context import Context
 from ..engine.storage import write_result, write_rows, write_table
 from ..identification.problem import build_unknowns
-from ..records.deviations import compute_expected_share, estimate_surface_error_mm, is_modulus
+from ..records.deviations import compute_expected_share, is_modulus
 from ..records.planned_records import PlannedRecord, press, write_records
-from ..records.records import build_model
-from ..simulation.limb_geometry import LimbGeometry
+from ..records.records import build_model, estimate_surface_error_mm
+from ..simulation.limb_geometry import LimbGeometry, build_site_model, coarsen_model
 from ..simulation.loading import LoadHistory, describe_untested_times
 from ..simulation.simulations import (
     build_curve_job,
-    build_site_model,
-    coarsen_model,
     open_experiment_cache,
 )
 from .design import DEEPEST_SHARE
@@ -275,7 +273,7 @@ def _build_options(
                 left_out.append(f"{one.told}: not simulated to the end {where}, and is not counted there")
     places = [(planned[k].site, planned[k].tool) for k in kept]
     seconds = [planned[k].seconds + rest_s for k in kept]
-    off_mm = estimate_surface_error_mm(context)
+    off_mm = estimate_surface_error_mm(study, context.store)
     shares = [compute_expected_share(planned[k].model, off_mm) for k in kept]
     seeing, blind = (list(map(RecordOption, places, seconds, info[kept], shares)) for info in infos)
     return [planned[k] for k in kept], seeing, blind, [float(peaks[k]) for k in kept]

@@ -10,7 +10,8 @@ import shutil
 from pathlib import Path
 
 from ...study import Study
-from .storage import compute_file_digest, read_json, write_atomically
+from .digests import compute_file_digest
+from .storage import read_json, write_atomically
 
 LABELS = "labels.seg.nrrd"
 _BY_HAND = Path("results") / "by-hand" / LABELS

@@ -10,9 +10,8 @@ from typing import Any
 
 from ...extensions import compute_extensions_digest
 from ...study import Study
+from .digests import code_digest, compute_digest, compute_file_digest
 from .provenance import list_input_files
-from .sources import code_digest
-from .storage import compute_digest, compute_file_digest
 
 
 @dataclass(frozen=True)
@@ -20,7 +19,7 @@ class Stage:
     """A stage: what it stands on, which tables it reads, and which keys of ``[[sites]]`` and ``[[records]]``.
 
     ``apart`` are keys of its tables, such as ``socket.design``, that it does not read. Its code is that of
-    `sources.sources_of`.
+    `digests.find_sources`.
     """
 
     name: str

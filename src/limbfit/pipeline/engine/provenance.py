@@ -12,8 +12,8 @@ from typing import Any
 from ...anatomy.labels.labelfiles import find_sidecar
 from ...fe import StepControl
 from ...study import Study
+from .digests import compute_digest, compute_file_digest
 from .hand_labels import find_hand_labels
-from .storage import compute_digest, compute_file_digest
 
 LIBRARIES = (
     "numpy",

@@ -11,10 +11,9 @@ from typing import Any
 from ..._version import __version__
 from ...results.runs import StageParts
 from ...study import Study
+from .digests import code_parts, compute_digest
 from .keys import Keys, Stage, select_records_read
 from .provenance import list_input_files
-from .sources import code_parts
-from .storage import compute_digest
 
 _FEW = 4  # causes of one kind that are named
 

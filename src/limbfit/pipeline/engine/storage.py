@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import json
 import os
 import uuid
@@ -18,25 +17,6 @@ from numpy.typing import NDArray
 from ...results.base import ResultPart
 
 DRAFT = ".part"
-
-
-def compute_digest(*parts: Any) -> str:
-    """A short stable digest of JSON-like values."""
-    text = json.dumps(parts, sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def compute_file_digest(path: Path) -> str:
-    """SHA-256 of a file, or of the names and contents of all files below a folder."""
-    sha = hashlib.sha256()
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    for file in files:
-        if path.is_dir():
-            sha.update(str(file.relative_to(path)).encode())
-        with file.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                sha.update(block)
-    return sha.hexdigest()
 
 
 def write_json(path: Path, content: Any) -> None:

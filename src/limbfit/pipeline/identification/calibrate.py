@@ -36,9 +36,10 @@ from ...results.identification import (
 from ...study import Study
 from ..engine.context import Context
 from ..engine.storage import write_result
+from ..limb.remesh import mesh_in_background
 from ..records.records import load_records
 from ..simulation.simulations import SimulationCache
-from .fine_meshes import correct_answer, mesh_coarser_in_background
+from .fine_meshes import correct_answer, plan_coarser_meshes
 from .intervals import sample_intervals
 from .problem import CalibrationProblem, build_problem
 from .record_simulator import RecordSimulator, WarmStarts
@@ -51,20 +52,21 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
 
     A run taken up again repeats the interrupted one from its kept simulations.
     """
-    study, report = context.study, partial(context.tell, "calibrate", 0, 0)
+    study = context.study
+    report = partial(context.tell, "calibrate", 0, 0)
     records = load_records(context, study.records_at(*study.fitted), secondary=True)
     problem = build_problem(study)
     cache = SimulationCache(folder / "runs", also=[context.store["calibrate"] / "runs"])
     simulator = RecordSimulator(records, cache, context.executor, report)
-    with mesh_coarser_in_background(context, records, folder / "coarser") as wait:
-        starts, rounds = search_from_starts(study, problem, simulator)
+    coarser = plan_coarser_meshes(context, records, folder / "coarser")
+    with mesh_in_background(coarser, context.executor) as wait:
+        starts, rounds = search_from_starts(problem, simulator)
         wait()
     best = starts.best
-    correction, spent = correct_answer(
-        context, simulator, best.parameters, list(best.responses), folder / "coarser"
-    )
-    found, known = sample_intervals(context, problem, simulator, best, correction, spent)
-    relaxation = _assess_relaxation(study, problem, found, known, records.measured)
+    responses = list(best.responses)
+    correction, spent = correct_answer(problem, simulator, best.parameters, responses, coarser)
+    found, known = sample_intervals(problem, simulator, best, correction, spent)
+    relaxation = _assess_relaxation(problem, found, known, records.measured)
     simulations = simulator.run_answer(found.parameters)
     answers = {one.site: one for one in records.select_forces(simulations)}
     warnings = {site: list(one.warnings) for site, one in answers.items() if one.warnings}
@@ -72,9 +74,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
         report(f"warning: site {site}, at the answer: {'; '.join(texts)}")
     log, bounds, example = simulator.log, problem.unknowns, cache.example()
     content = CalibrationResult(
-        stages=[
-            _summarise_stage(found, i, problem, study, simulator.starts) for i in range(len(found.stages))
-        ],
+        stages=[_summarise_stage(found, i, problem, simulator.starts) for i in range(len(found.stages))],
         bounds=ParameterBounds(lower=study.by_tissue(bounds.lower), upper=study.by_tissue(bounds.upper)),
         law=StoredLaw(**study.law.record()),
         objective=study.calibration.objective,
@@ -83,7 +83,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
         forward_runs_with_sensitivities=cache.with_sensitivities(),
         linear_solver=example.facts["linear_solver"] if example else None,
         element=example.facts["element"] if example else None,
-        corrections=[_summarise_round(one, found.sites, problem, study) for one in rounds],
+        corrections=[_summarise_round(one, found.sites, problem) for one in rounds],
         multistart=_summarise_starts(starts, study) if study.calibration.starts > 1 else None,
         warnings=warnings,
         contact=summarise_contact(
@@ -99,10 +99,10 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
 
 
 def _summarise_stage(
-    found: Calibration, number: int, problem: CalibrationProblem, study: Study, warm_starts: WarmStarts
+    found: Calibration, number: int, problem: CalibrationProblem, warm_starts: WarmStarts
 ) -> SearchStage:
     """One stage: from the start of the problem, or the end of the stage before, to its own end."""
-    stage = found.stages[number]
+    study, stage = problem.study, found.stages[number]
     before = np.array(found.stages[number - 1].parameters) if number else problem.unknowns.start
     iterates = [iterate for iterate in found.history if iterate.stage == number]
 
@@ -132,12 +132,12 @@ def _summarise_stage(
 
 
 def _summarise_round(
-    one: CorrectionRound, sites: Sequence[str], problem: CalibrationProblem, study: Study
+    one: CorrectionRound, sites: Sequence[str], problem: CalibrationProblem
 ) -> MeshCorrectionRound:
     """One correction of the search by the whole meshes; percentages are of each site's largest force."""
     return MeshCorrectionRound(
         stage=problem.titles[one.stage] if one.stage >= 0 else "start",
-        parameters=study.by_tissue(np.array(one.parameters)),
+        parameters=problem.study.by_tissue(np.array(one.parameters)),
         scale_by_site=dict(zip(sites, one.scales, strict=True)),
         difference_percent_by_site=dict(zip(sites, one.difference_percent, strict=True)),
         change_percent_by_site=dict(zip(sites, one.expected_percent, strict=True)),
@@ -195,14 +195,14 @@ def group_intervals(known: Uncertainty, study: Study) -> Intervals:
 
 
 def _assess_relaxation(
-    study: Study,
     problem: CalibrationProblem,
     found: Calibration,
     known: Uncertainty,
     measured: Sequence[MeasuredCurve],
 ) -> RelaxationAssessment | None:
     """What is known of relaxation beyond the records; none of other laws."""
-    if not is_ogden(study.law.name) and study.law.name not in (FIBRED, FUNG):
+    law = problem.study.law.name
+    if not is_ogden(law) and law not in (FIBRED, FUNG):
         return None
     return assess_relaxation(
         found.parameters, found.responses, measured, known.residual_model, problem.unknowns, problem.space

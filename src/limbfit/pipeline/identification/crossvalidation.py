@@ -43,7 +43,7 @@ from ..records.records import load_records
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import open_experiment_cache
 from .fine_meshes import correct_to_fine_meshes
-from .problem import build_unknowns
+from .problem import build_problem
 from .record_simulator import RecordSimulator
 
 Runs = list[list[SiteResponse]]
@@ -123,7 +123,8 @@ class _Bench:
         study = context.study
         stored = context.results.calibration
         self.best = study.vector(stored.parameters)
-        self.bounds = build_unknowns(study).with_start(self.best)
+        problem = build_problem(study)
+        self.bounds = problem.unknowns.with_start(self.best)
         self.measured = simulator.records.measured
         of_site: dict[str, list[int]] = {}
         for i, one in enumerate(self.measured):
@@ -132,7 +133,7 @@ class _Bench:
         covariance = np.array(stored.uncertainty.covariance_log)
         # Where nothing is known, fits go anywhere; the emulator must not.
         drawn = spread_points(self.best, covariance, self.bounds, runs, seed)
-        correction = correct_to_fine_meshes(study, simulator, self.best)
+        correction = correct_to_fine_meshes(problem, simulator, self.best)
         self.as_fine = correction.as_fine
         self.points, self.runs = [self.best], [correction.responses]
         self.learn(list(drawn))

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ...arrays import Array
 from ...errors import RunError
 from ...identify.fit.correction import MeshCorrection
-from ...study import Study
 from ...study.meshing import MeshTable
 from ...study.tables import SolverTable
 from ..engine.context import Context
-from ..limb.mesh import mesh_settings
-from ..limb.remesh import mesh_in_background, mesh_where_possible, scale_edges
+from ..limb.mesh import MeshJob, mesh_settings, plan_meshes, scale_edges
+from ..limb.remesh import mesh_where_possible
 from ..records.records import RecordSet, SiteRecord
 from ..simulation.extrapolation import MESH_ORDERS, estimate_fine_error
+from .problem import CalibrationProblem
 from .record_simulator import RecordSimulator, Responses
 
 COARSENING_FACTOR = 1.3  # of the edges and the steps: another mesh that tells the error of the study's own
@@ -34,7 +33,9 @@ class FineMeshCorrection:
     mesh_N: tuple[Array, ...] = ()
 
 
-def correct_to_fine_meshes(study: Study, simulator: RecordSimulator, parameters: Array) -> FineMeshCorrection:
+def correct_to_fine_meshes(
+    problem: CalibrationProblem, simulator: RecordSimulator, parameters: Array
+) -> FineMeshCorrection:
     """The responses at an answer, and what brings those of the search to the study's own meshes.
 
     Raises
@@ -47,8 +48,8 @@ def correct_to_fine_meshes(study: Study, simulator: RecordSimulator, parameters:
     if simulator.records.is_coarsened:
         as_fine = MeshCorrection(searched, simulator.check(parameters))
         correction = FineMeshCorrection(as_fine(searched), as_fine)
-    if study.mesh.coarse is not None:
-        errors = _estimate_mesh_errors(study, simulator, parameters, searched, simulator.records.own)
+    if problem.study.mesh.coarse is not None:
+        errors = _estimate_mesh_errors(problem, simulator, parameters, searched, simulator.records.own)
         correction = replace(correction, mesh_N=errors)
     for one in correction.responses:
         if not one.completed:
@@ -56,59 +57,44 @@ def correct_to_fine_meshes(study: Study, simulator: RecordSimulator, parameters:
     return correction
 
 
+def plan_coarser_meshes(context: Context, records: RecordSet, folder: Path) -> list[MeshJob]:
+    """Coarser meshes that tell the error of the study's own, in ``folder``; none where it has coarse ones."""
+    if context.study.mesh.coarse is not None:
+        return []
+    coarser = scale_edges(mesh_settings(context.study), COARSENING_FACTOR)
+    folder.mkdir(exist_ok=True)
+    models = (record.model for record in records.own)
+    return plan_meshes(context, folder, ((one.site, one.position, one.axis) for one in models), coarser)
+
+
 def correct_answer(
-    context: Context, simulator: RecordSimulator, parameters: Array, responses: Responses, folder: Path
+    problem: CalibrationProblem,
+    simulator: RecordSimulator,
+    parameters: Array,
+    responses: Responses,
+    coarser: Sequence[MeshJob],
 ) -> tuple[FineMeshCorrection, int]:
     """The correction at the answer of a search whose ``responses`` are known, and how many simulations of
-    coarser meshes it took.
-
-    ``folder`` is for the coarser meshes that tell the error of the study's own, where it has no others.
-    """
-    study, records = context.study, simulator.records
+    the planned ``coarser`` meshes it took."""
+    records = simulator.records
     correction = FineMeshCorrection(responses, list)
     if records.is_coarsened:
-        correction = correct_to_fine_meshes(study, simulator, parameters)
-    if study.mesh.coarse is not None:
+        correction = correct_to_fine_meshes(problem, simulator, parameters)
+    if not coarser:
         return correction, 0
-    coarser = _mesh_coarser(context, records, folder, simulator)
-    if not any(coarser):
+    models = [record.model for record in records.own]
+    found = mesh_where_possible(coarser, models, simulator.executor, simulator.report, NO_MESH_ERROR)
+    pairs = zip(records.own, found, strict=True)
+    others = [replace(record, model=model) if model else None for record, model in pairs]
+    if not any(others):
         return correction, 0
     searched = simulator.search(parameters) if records.is_coarsened else responses
-    errors = _estimate_mesh_errors(study, simulator, parameters, searched, coarser)
+    errors = _estimate_mesh_errors(problem, simulator, parameters, searched, others)
     return replace(correction, mesh_N=errors), records.simulations
 
 
-@contextmanager
-def mesh_coarser_in_background(
-    context: Context, records: RecordSet, folder: Path
-) -> Iterator[Callable[[], None]]:
-    """The coarser meshes that `correct_answer` will want in ``folder``, made beside the block; it is given a
-    function that waits for them."""
-    if context.study.mesh.coarse is not None:
-        yield lambda: None
-        return
-    models = [record.model for record in records.own]
-    coarser = scale_edges(mesh_settings(context.study), COARSENING_FACTOR)
-    with mesh_in_background(context, folder, models, coarser) as wait:
-        yield wait
-
-
-def _mesh_coarser(
-    context: Context, records: RecordSet, folder: Path, simulator: RecordSimulator
-) -> list[SiteRecord | None]:
-    """The records on coarser meshes than the study's own, which are made in ``folder``.
-
-    None for a site of which none can be made: a line says so.
-    """
-    models = [record.model for record in records.own]
-    coarser = scale_edges(mesh_settings(context.study), COARSENING_FACTOR)
-    meshed = mesh_where_possible(context, folder, models, coarser, simulator.report, NO_MESH_ERROR)
-    pairs = zip(records.own, meshed, strict=True)
-    return [replace(record, model=model) if model else None for record, model in pairs]
-
-
 def _estimate_mesh_errors(
-    study: Study,
+    problem: CalibrationProblem,
     simulator: RecordSimulator,
     parameters: Array,
     searched: Responses,
@@ -120,7 +106,7 @@ def _estimate_mesh_errors(
     edges, with fewer steps: in unloading these change the force as much as the mesh does. Zero where there
     are none, or these cannot be simulated: a line says so.
     """
-    records = simulator.records.own
+    study, records = problem.study, simulator.records.own
     errors, share = [0.0 * record.compared for record in records], estimate_own_mesh_error(study.mesh)
     meshed = [(i, other) for i, other in enumerate(others) if other is not None]
     steps = _scale_steps(study.solver)

@@ -9,9 +9,8 @@ from ...identify.fit.calibration import move_answer
 from ...identify.fit.state import Calibration
 from ...identify.uncertainty.intervals import EvaluationStore, count_further_evaluations, sample_uncertainty
 from ...identify.uncertainty.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
-from ..engine.context import Context
 from ..records.deviations import estimate_site_deviation, estimate_site_noise
-from ..records.records import SiteRecord, is_moved
+from ..records.records import SiteRecord
 from .fine_meshes import FineMeshCorrection
 from .problem import CalibrationProblem
 from .record_simulator import RecordSimulator, Responses
@@ -21,17 +20,16 @@ NOT_MOVED = "what is most probable cannot be simulated, and the least squares ar
 
 
 def estimate_linearised(
-    context: Context,
     problem: CalibrationProblem,
     records: Sequence[SiteRecord],
     parameters: Array,
     correction: FineMeshCorrection,
 ) -> Uncertainty:
     """What fitted records tell about ``parameters`` (p,), at which the correction was made."""
-    study, responses = context.study, correction.responses
+    study, responses = problem.study, correction.responses
     pairs = list(zip(records, responses, strict=True))
     noise = [estimate_site_noise(study, record, response.force_N) for record, response in pairs]
-    off = [estimate_site_deviation(context, record, response, parameters) for record, response in pairs]
+    off = [estimate_site_deviation(study, record, response, parameters) for record, response in pairs]
     measured = [record.measured for record in records]
     return estimate_uncertainty(
         parameters,
@@ -47,7 +45,6 @@ def estimate_linearised(
 
 
 def sample_intervals(
-    context: Context,
     problem: CalibrationProblem,
     simulator: RecordSimulator,
     found: Calibration,
@@ -61,7 +58,7 @@ def sample_intervals(
     linearised, and the answer stays, where that cannot be for simulations that fail.
     """
     records = simulator.records
-    known = estimate_linearised(context, problem, records.own, found.parameters, correction)
+    known = estimate_linearised(problem, records.own, found.parameters, correction)
     evaluations = EvaluationStore()
     for point, run in zip(simulator.log.store.points, simulator.log.store.responses, strict=True):
         evaluations.add(point, correction.as_fine(list(run)))
@@ -72,7 +69,7 @@ def sample_intervals(
 
     further = count_further_evaluations(records.simulations, spent)
     about = known, records.measured, problem.unknowns, problem.space, evaluations, simulate, further
-    moves = moves and is_moved(context.study)
+    moves = moves and problem.is_moved
     sampled = sample_uncertainty(*about, move_answer=moves)
     if sampled.method == LINEARISED:
         simulator.report(f"warning: {ONLY_LINEARISED}")

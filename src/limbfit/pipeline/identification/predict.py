@@ -85,7 +85,7 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     sites = [SitePrediction(*parts) for parts in zip_longest(records.own, simulations[:n], ours, others)]
     whole = [job for site, job in zip(sites, jobs) if site.own.completed]
     strains = _write_fields(context, folder, whole, len(jobs))
-    bands = [_Band.compute(context, site, best, known) if site.ours.completed else None for site in sites]
+    bands = [_Band.compute(study, site, best, known) if site.ours.completed else None for site in sites]
     for site, band in zip(sites, bands, strict=True):
         _write_curves(folder, site, band)
     observed = [
@@ -99,7 +99,7 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
     judged = [(site, band) for site, band in zip(sites, bands, strict=True) if band is not None]
     of_mesh = calibration.uncertainty.residuals.mesh_misfit
     mesh_misfit = None if of_mesh is None else MeshMisfit(of_mesh.share, of_mesh.correlation)
-    quality = _assess_fits(context, judged, best, known, mesh_misfit)
+    quality = _assess_fits(study, judged, best, known, mesh_misfit)
     content = PredictResult(
         sites=rows,
         recorded_range=RecordedExtents.model_validate(tested),
@@ -256,9 +256,9 @@ class _Band:
     high: Array
 
     @classmethod
-    def compute(cls, context: Context, site: SitePrediction, best: Array, known: PredictionModel) -> _Band:
+    def compute(cls, study: Study, site: SitePrediction, best: Array, known: PredictionModel) -> _Band:
         record, ours = site.record, site.ours
-        deviation = estimate_site_deviation(context, record, ours, best)
+        deviation = estimate_site_deviation(study, record, ours, best)
         of_site = 0.0 if record.site.fitted else deviation
         unit = record.record.unit
         low, high = known.compute_interval_95(ours, best, record.name, unit, of_site, record.times_s)
@@ -284,7 +284,7 @@ def _write_curves(folder: Path, site: SitePrediction, band: _Band | None) -> Non
 
 
 def _assess_fits(
-    context: Context,
+    study: Study,
     judged: Sequence[tuple[SitePrediction, _Band]],
     best: Array,
     known: PredictionModel,
@@ -299,7 +299,7 @@ def _assess_fits(
     forces = [site.record.smoothing @ site.ours.force_N for site in sites]
     allowed, residuals = [], [F - site.record.compared for F, site in zip(forces, sites, strict=True)]
     for force, (site, band) in zip(forces, judged, strict=True):
-        noise = estimate_site_noise(context.study, site.record, force).covariance
+        noise = estimate_site_noise(study, site.record, force).covariance
         errors = [band.deviation, known.find_mesh_error(site.record.name, force)]
         covariance = noise + sum(np.outer(error, error) for error in errors)
         if of_mesh is not None:

@@ -25,16 +25,19 @@ COUNTS = ("no", "one", "two", "three", "four", "five", "six")
 
 @dataclass(frozen=True)
 class CalibrationProblem:
-    """The ``unknowns``, which of them move together in each of the ``stages``, whose ``titles`` are in words.
+    """What a ``study`` asks of its calibration: the ``unknowns``, and which of them move together in each of
+    the ``stages``, whose ``titles`` are in words.
 
-    ``space`` is that of the last stage.
+    ``space`` is that of the last stage; ``is_moved`` says that the answer is what is most probable.
     """
 
+    study: Study
     unknowns: Unknowns
     stages: tuple[Grouping, ...]
     titles: tuple[str, ...]
     settings: CalibrationSettings
     space: SearchSpace
+    is_moved: bool
 
 
 def check_fitted(study: Study) -> None:
@@ -54,7 +57,21 @@ def build_problem(study: Study) -> CalibrationProblem:
     """The problem that a study states."""
     unknowns, stages = build_unknowns(study), build_groupings(study)
     titles, settings = list_stage_titles(study.tissues), build_settings(study)
-    return CalibrationProblem(unknowns, stages, titles, settings, build_space(unknowns, stages[-1]))
+    space, moves = build_space(unknowns, stages[-1]), is_moved(study)
+    return CalibrationProblem(study, unknowns, stages, titles, settings, space, moves)
+
+
+def is_moved(study: Study) -> bool:
+    """Whether the answer is what is most probable, and not the least squares.
+
+    As the study states; else where a fitted site has more than one record of force. What the records' own
+    doubts weigh decides then: errors of touch-down and site that one fit to everything would take for tissue.
+    """
+    table, records = study.calibration, study.records_at(*study.fitted)
+    if table.answer is not None:
+        return table.answer == "most probable"
+    more = len(records) > len(study.fitted) or any(record.observed for record in records)
+    return more and not table.is_papers
 
 
 def build_unknowns(study: Study) -> Unknowns:

@@ -16,21 +16,20 @@ from ...identify.fit.multistart import (
 )
 from ...identify.fit.parameters import Grouping, Unknowns
 from ...identify.fit.state import Calibration, SearchState
-from ...study import Study
 from .problem import CalibrationProblem
 from .record_simulator import RecordSimulator
 
 
 def search_from_starts(
-    study: Study, problem: CalibrationProblem, simulator: RecordSimulator
+    problem: CalibrationProblem, simulator: RecordSimulator
 ) -> tuple[MultistartResult, tuple[CorrectionRound, ...]]:
     """Search from each of ``calibration.starts``: what came of them, and the corrections of the best."""
-    table, corrections = study.calibration, dict[int, tuple[CorrectionRound, ...]]()
+    table, corrections = problem.study.calibration, dict[int, tuple[CorrectionRound, ...]]()
 
     def run(number: int, start: Unknowns) -> Calibration:
         if number:
             simulator.report(f"start {number + 1} of {table.starts}")
-        answer, corrections[number] = search_parameters(study, problem, simulator, start, problem.stages)
+        answer, corrections[number] = search_parameters(problem, simulator, start, problem.stages)
         return answer
 
     starts = run_multistart(run, problem.unknowns, table.starts, table.seed, problem.stages[0])
@@ -38,7 +37,6 @@ def search_from_starts(
 
 
 def search_parameters(
-    study: Study,
     problem: CalibrationProblem,
     simulator: RecordSimulator,
     start: Unknowns,
@@ -50,22 +48,22 @@ def search_parameters(
     """
 
     def search(start: Unknowns, stages: Sequence[Grouping]) -> SearchResult:
-        return _search_once(study, problem, simulator, start, stages)
+        return _search_once(problem, simulator, start, stages)
 
     first = search(start, stages)
-    if study.calibration.stopping == "paper":
+    if problem.settings.stopping == "paper":
         return first
     return continue_from_bound(first, start, stages, search, simulator.report)
 
 
 def _search_once(
-    study: Study,
     problem: CalibrationProblem,
     simulator: RecordSimulator,
     start: Unknowns,
     stages: Sequence[Grouping],
 ) -> SearchResult:
-    table, records = study.calibration, simulator.records
+    study, records = problem.study, simulator.records
+    table = study.calibration
     titles = problem.titles[-len(stages) :]
 
     def report(state: SearchState) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -36,6 +36,22 @@ class MeshJob:
     axis: tuple[float, ...]
     settings: MeshSettings
     file: Path
+
+
+def plan_meshes(
+    context: Context,
+    folder: Path,
+    places: Iterable[tuple[str, Sequence[float], Sequence[float]]],
+    settings: MeshSettings,
+) -> list[MeshJob]:
+    """Meshes to be kept in ``folder``, by the name of each site; see `mesh_job`.
+
+    ``places`` are the name of each site, and its position and axis in LPS mm.
+    """
+    return [
+        mesh_job(context, site, position, axis, settings, folder / f"{site}.vtu")
+        for site, position, axis in places
+    ]
 
 
 def mesh_job(
@@ -150,10 +166,8 @@ def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
 
 def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: str) -> MeshSet:
     """The meshes of all sites that are not there yet; returns what ``mesh.json`` holds of all."""
-    jobs = [
-        mesh_job(context, one.site, one.position_mm, one.axis, settings, folder / f"{one.site}.vtu")
-        for one in context.results.sites.sites
-    ]
+    places = ((one.site, one.position_mm, one.axis) for one in context.results.sites.sites)
+    jobs = plan_meshes(context, folder, places, settings)
     facts = {job.site: read_mesh_facts(job.file) for job in jobs if is_meshed(job.file)}
     missing = [job for job in jobs if job.site not in facts]
     context.tell("mesh", len(facts), len(jobs), word.removesuffix(", "))
@@ -170,3 +184,9 @@ def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: s
 def is_meshed(file: Path) -> bool:
     """Whether a mesh was kept whole (see `keep_mesh`)."""
     return file.is_file() and file.with_suffix(".json").is_file()
+
+
+def scale_edges(settings: MeshSettings, factor: float) -> MeshSettings:
+    """The same with edges ``factor`` times as long."""
+    near, far = factor * settings.edge_near_mm, factor * settings.edge_far_mm
+    return replace(settings, edge_near_mm=near, edge_far_mm=far)

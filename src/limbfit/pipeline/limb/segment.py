@@ -18,8 +18,9 @@ from ...report.drawing.sheet import draw_sheet
 from ...results.limb import MarkerImageMotion, SegmentResult
 from ...study import Study
 from ..engine.context import Context
+from ..engine.digests import compute_file_digest
 from ..engine.hand_labels import LABELS
-from ..engine.storage import compute_file_digest, write_result
+from ..engine.storage import write_result
 from .files import MARKED_SKIN, name_file_in_errors
 from .inputs import read_marked_image, read_study_image, read_study_labels, segment_automatically
 

@@ -12,7 +12,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
 
 from ...arrays import Array
@@ -23,14 +22,9 @@ from ...indentation import SiteModel, compute_contact_radius
 from ...mesh import read_vtu
 from ...study import Study
 from ...traces.numerics import estimate_noise
-from ..engine.context import Context
 from .records import SiteRecord
 from .traces import read_record
 
-# Root mean square error of a tibia's surface near a site, over the edge of the image's voxels: 0.16 to 0.19
-# for synthetic patients (docs/uncertainty.md).
-OF_A_VOXEL = 0.17
-GIVEN_MM = 0.3  # of surfaces that come as files
 LEAST_SHARE = 0.01  # of the force: what is left on the true surfaces of those patients
 _STEP = 1.1
 _PRESSED_SHARE = 0.03  # of the peak: below it the force has a corner, where the skin lets go
@@ -81,15 +75,15 @@ def _estimate_curve_noise(study: Study, record: SiteRecord, force_N: Array) -> S
 
 
 def estimate_site_deviation(
-    context: Context, record: SiteRecord, response: SiteResponse, parameters: Array
+    study: Study, record: SiteRecord, response: SiteResponse, parameters: Array
 ) -> Array:
     """One standard deviation (n,) of what a record would be off by, as its site's tissue were stiffer.
 
     In N, or mm where the record compares depths, from the derivatives at ``parameters`` (p,). What thinner
     tissue is strained more by shows in what is seen of it (`SecondaryValues.by_strain`), not in its moduli.
     """
-    stiffer = np.asarray(response.jacobian @ (parameters * is_modulus(context.study)))
-    surface_mm, thickness_mm = estimate_surface_error_mm(context), measure_bone_distance_mm(record.model)
+    stiffer = np.asarray(response.jacobian @ (parameters * is_modulus(study)))
+    surface_mm, thickness_mm = record.surface_error_mm, measure_bone_distance_mm(record.model)
     strained = None if record.seen is None else record.seen.by_strain(response.force_N)
     if strained is None or thickness_mm is None:
         return stiffer * compute_expected_share(record.model, surface_mm)
@@ -111,20 +105,6 @@ def compute_thickness_slope(radius_mm: float, thickness_mm: float) -> float:
     return float(
         np.log(compute_layer_factor(ratio * _STEP) / compute_layer_factor(ratio / _STEP)) / np.log(_STEP**2)
     )
-
-
-def estimate_surface_error_mm(context: Context) -> float:
-    """Standard deviation of where the study's surfaces are: as stated, by the voxels, or of files."""
-    stated = context.study.calibration.surface_error_mm
-    labels = context.store["segment"] / "labels.seg.nrrd"
-    if stated is not None:
-        return stated
-    if not labels.is_file():
-        return GIVEN_MM
-    reader = sitk.ImageFileReader()
-    reader.SetFileName(str(labels))
-    reader.ReadImageInformation()
-    return OF_A_VOXEL * float(np.prod(reader.GetSpacing()[:3])) ** (1 / 3)
 
 
 def measure_bone_distance_mm(model: SiteModel) -> float | None:

@@ -14,8 +14,11 @@ from ...indentation import compute_contact_radius
 from ...results.limb import PlacedSite
 from ...results.records import RecordRemark, TraceFacts
 from ...study import Record, Study
+from ...traces import SurfaceMotion
 from ..engine.context import Context
 from ..engine.storage import read_curves
+from ..simulation.limb_geometry import LimbGeometry
+from .secondary_measurements import ChosenPoints, choose_points
 
 
 def read_record_warnings(context: Context) -> tuple[RecordWarning, ...]:
@@ -106,3 +109,21 @@ def _collect_facts(
 
 def _step(times_s: Sequence[float] | np.ndarray) -> float:
     return float(np.median(np.diff(times_s)))
+
+
+def choose_surface_points(
+    limb: LimbGeometry, study: Study, motions: Mapping[str, SurfaceMotion | None]
+) -> dict[str, ChosenPoints]:
+    """By record the points of its surface that can be compared; ``motions``: of records, by name.
+
+    Raises
+    ------
+    TraceError
+        Where a record has none.
+    """
+    skin, found = (limb.anatomy.skin.points, limb.anatomy.skin.faces), {}
+    for record in study.recorded:
+        motion = motions.get(record.name)
+        if motion is not None:
+            found[record.name] = choose_points(study, record, limb.place(record.site), skin, motion)
+    return found

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
+import SimpleITK as sitk  # noqa: N813
 
 from ...arrays import Array
 from ...fe import list_texts
@@ -16,11 +17,10 @@ from ...indentation import Simulation, SimulationJob, SiteModel
 from ...mesh import read_vtu
 from ...study import Indentation, Record, Site, Study
 from ..engine.context import Context
-from ..simulation.simulations import build_site_model, coarsen_model
+from ..engine.store import Store
+from ..simulation.limb_geometry import build_site_model, coarsen_model
 from .secondary_measurements import (
-    ChosenPoints,
     SecondaryValues,
-    StoredRecord,
     build_secondary_values,
     choose_points,
     place_waves,
@@ -28,19 +28,10 @@ from .secondary_measurements import (
 )
 
 T = TypeVar("T")
-
-
-def is_moved(study: Study) -> bool:
-    """Whether the answer is what is most probable, and not the least squares.
-
-    As the study states; else where a fitted site has more than one record of force. What the records' own
-    doubts weigh decides then: errors of touch-down and site that one fit to everything would take for tissue.
-    """
-    table, records = study.calibration, study.records_at(*study.fitted)
-    if table.answer is not None:
-        return table.answer == "most probable"
-    more = len(records) > len(study.fitted) or any(record.observed for record in records)
-    return more and not table.is_papers
+# Root mean square error of a tibia's surface near a site, over the edge of the image's voxels: 0.16 to 0.19
+# for synthetic patients (docs/uncertainty.md).
+OF_A_VOXEL = 0.17
+GIVEN_MM = 0.3  # of surfaces that come as files
 
 
 @dataclass(frozen=True)
@@ -52,7 +43,7 @@ class SiteRecord:
     blunts, would be taken for an error of the model. ``nested_mm``: parameters are searched on as much of the
     same mesh. ``secondary`` is what was seen beside the force; with ``seen`` it is that which is compared, of
     the same simulation. ``touch_down_sd_mm`` is how far the touch-down may be off, ``error_share`` how far
-    forces may be beside that.
+    forces may be beside that, ``surface_error_mm`` how far the limb's surfaces (`estimate_surface_error_mm`).
     """
 
     record: Record
@@ -67,6 +58,7 @@ class SiteRecord:
     secondary: tuple[SecondaryValues, ...] = ()
     touch_down_sd_mm: float = 0.0
     error_share: float = 0.01
+    surface_error_mm: float = GIVEN_MM
 
     @property
     def name(self) -> str:
@@ -178,16 +170,12 @@ class RecordSet:
 
 def load_records(context: Context, records: Sequence[Record], secondary: bool = False) -> RecordSet:
     """Stored records and their sites' models; with ``secondary`` what was seen beside each follows it."""
-    own = tuple(load_site_record(context, record) for record in records)
-    searched = own
-    if context.study.is_searched_apart:
-        searched = tuple(replace(one, model=coarsen_model(context, one.model)) for one in own)
-    if not secondary:
-        return RecordSet(own, searched)
-    compared = tuple(seen for one in own for seen in one.split())
-    if searched is own:
-        return RecordSet(compared, compared)
-    return RecordSet(compared, tuple(seen for one in searched for seen in one.split()))
+    loaded = [load_site_record(context, record) for record in records]
+    own = tuple(one for record in loaded for one in (record.split() if secondary else [record]))
+    if not context.study.is_searched_apart:
+        return RecordSet(own, own)
+    models = {record.name: coarsen_model(context, record.model) for record in loaded}
+    return RecordSet(own, tuple(replace(one, model=models[one.record.name]) for one in own))
 
 
 def load_site_record(context: Context, record: Record) -> SiteRecord:
@@ -198,8 +186,18 @@ def load_site_record(context: Context, record: Record) -> SiteRecord:
     TraceError
         Where nothing of its surface can be compared, or the limb has no place of its shear waves.
     """
-    study, stored = context.study, read_stored_record(context.store, record)
-    model, points = _build_model(context, record, stored)
+    study, surface_error_mm = context.study, estimate_surface_error_mm(context.study, context.store)
+    stored = read_stored_record(context.store, record)
+    facts, points = stored.facts, None
+    force = (facts.knots_N or ()) if record.forced else ()
+    model = build_site_model(context, record, facts.knots_s, facts.knots_mm, force, stored.tissues)
+    if stored.motion is not None:
+        mesh = read_vtu(model.mesh)
+        place, skin = (model.position, model.axis), (mesh.points, mesh.face_sets["skin"])
+        points = choose_points(study, record, place, skin, stored.motion)
+        model = replace(model, skin_points=points.points, skin_axes=points.axes)
+    if facts.waves:
+        model = replace(model, waves=place_waves(study, record, model, facts.waves))
     return SiteRecord(
         record=record,
         tissues=study.tissues,
@@ -210,35 +208,30 @@ def load_site_record(context: Context, record: Record) -> SiteRecord:
         smoothing=stored.smoothing,
         nested_mm=study.within_mm if study.mesh.coarse is None else None,
         secondary=build_secondary_values(record, stored, points),
-        touch_down_sd_mm=stored.facts.touch_down_uncertainty_mm,
+        touch_down_sd_mm=facts.touch_down_uncertainty_mm,
         error_share=study.calibration.force_error_percent / 100.0,
+        surface_error_mm=surface_error_mm,
     )
 
 
 def build_model(context: Context, one: Indentation) -> SiteModel:
     """An indentation as it was recorded, from touch-down on, or as the study plans it."""
     if isinstance(one, Record):
-        return _build_model(context, one, read_stored_record(context.store, one))[0]
+        return load_site_record(context, one).model
     assert one.depth_mm is not None
     ramp = one.depth_mm / one.speed_mm_s  # in and out
     return build_site_model(context, one, (0.0, ramp, 2 * ramp), (0.0, one.depth_mm, 0.0))
 
 
-def _build_model(
-    context: Context, record: Record, stored: StoredRecord
-) -> tuple[SiteModel, ChosenPoints | None]:
-    """A site driven by one of its records, and the points of its surface that are compared, if any."""
-    facts = stored.facts
-    force = (facts.knots_N or ()) if record.forced else ()
-    model = build_site_model(context, record, facts.knots_s, facts.knots_mm, force, stored.tissues)
-    points, waves = None, facts.waves
-    if stored.motion is None and not waves:
-        return model, None
-    mesh = read_vtu(model.mesh)
-    if stored.motion is not None:
-        place, skin = (model.position, model.axis), (mesh.points, mesh.face_sets["skin"])
-        points = choose_points(context.study, record, place, skin, stored.motion)
-        model = replace(model, skin_points=points.points, skin_axes=points.axes)
-    if waves:
-        model = replace(model, waves=place_waves(context.study, record, model, mesh, waves))
-    return model, points
+def estimate_surface_error_mm(study: Study, store: Store) -> float:
+    """Standard deviation of where the study's surfaces are: as stated, by the voxels, or of files."""
+    stated = study.calibration.surface_error_mm
+    labels = store["segment"] / "labels.seg.nrrd"
+    if stated is not None:
+        return stated
+    if not labels.is_file():
+        return GIVEN_MM
+    reader = sitk.ImageFileReader()
+    reader.SetFileName(str(labels))
+    reader.ReadImageInformation()
+    return OF_A_VOXEL * float(np.prod(reader.GetSpacing()[:3])) ** (1 / 3)

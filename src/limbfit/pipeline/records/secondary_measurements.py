@@ -29,14 +29,13 @@ from ...indentation import (
     read_indenter,
     to_vector3,
 )
-from ...mesh import Mesh
+from ...mesh import read_vtu
 from ...results.records import LayerRecord, TraceFacts, WaveRecord
 from ...study import Record, Study, Vector
 from ...traces import SurfaceMotion, Thinning, WaveMeans
 from ..engine.storage import read_curves, write_curves
 from ..engine.store import Store
 from ..limb.files import LAYERS, SMOOTHING, WAVES
-from ..simulation.limb_geometry import LimbGeometry
 
 Ints = NDArray[np.int64]
 
@@ -72,13 +71,14 @@ def read_stored_record(store: Store, record: Record) -> StoredRecord:
     """What `run_traces` stored of a record."""
     folder, facts = store["traces"], store.results.traces.sites[record.name]
     layers = any(layer.compared for layer in facts.layers.values())
+    motion = read_motion(folder, record) if facts.surface is not None and facts.surface.compared else None
     return StoredRecord(
         facts=facts,
         curves=read_curves(folder / f"{record.name}.csv"),
         smoothing=np.load(folder / SMOOTHING.format(record.name)),
         layers=read_curves(folder / LAYERS.format(record.name)) if layers else {},
         waves=read_curves(folder / WAVES.format(record.name)) if facts.waves else {},
-        motion=read_motion(folder, record) if facts.surface is not None and facts.surface.compared else None,
+        motion=motion,
     )
 
 
@@ -433,7 +433,7 @@ def _spread(points: Array, first: int) -> Ints:
 
 
 def place_waves(
-    study: Study, record: Record, model: SiteModel, mesh: Mesh, waves: Sequence[WaveRecord]
+    study: Study, record: Record, model: SiteModel, waves: Sequence[WaveRecord]
 ) -> tuple[WavePlace, ...]:
     """Where the shear waves of a record are, in the site's own mesh; ``waves`` as ``traces.json`` has them.
 
@@ -444,26 +444,8 @@ def place_waves(
     """
     assert record.shear_waves is not None
     try:
-        return place_waves_under(model, mesh, [(one.tissue, one.depth_mm) for one in waves])
+        return place_waves_under(model, read_vtu(model.mesh), [(one.tissue, one.depth_mm) for one in waves])
     except ProblemError as error:
         file = study.path(record.shear_waves)
         what = f"site {record.site.name}: {error.what}"
         raise TraceError(what, file=file, place="header", remedy=error.remedy) from None
-
-
-def choose_surface_points(
-    limb: LimbGeometry, study: Study, motions: Mapping[str, SurfaceMotion | None]
-) -> dict[str, ChosenPoints]:
-    """By record the points of its surface that can be compared; ``motions``: of records, by name.
-
-    Raises
-    ------
-    TraceError
-        Where a record has none.
-    """
-    skin, found = (limb.anatomy.skin.points, limb.anatomy.skin.faces), {}
-    for record in study.recorded:
-        motion = motions.get(record.name)
-        if motion is not None:
-            found[record.name] = choose_points(study, record, limb.place(record.site), skin, motion)
-    return found

@@ -1,16 +1,24 @@
-"""The limb of a study as far as it is known before anything is meshed or simulated, and what must fit it."""
+"""The limb of a study before anything is simulated: where its sites are, what must fit it, their models."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
+from ...arrays import Array
+from ...errors import ProblemError
+from ...indentation import Direction, SiteModel, build_clamping_pins, read_indenter
+from ...mesh import read_vtu
 from ...results.limb import PlacedSite
-from ...study import Site, Study, Vector
-from ..engine.store import Store
-from .simulations import count_pins_met
+from ...study import Indentation, IndenterTable, Record, Site, Study, Vector
+from ..engine.context import Context
+from ..engine.digests import compute_file_digest
+from ..engine.store import COARSE, Store
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,3 +59,137 @@ class LimbGeometry:
 
 # Refuses what a study, its limb (None: not known yet) and options decide, before anything is simulated.
 Check = Callable[[Study, LimbGeometry | None, Mapping[str, Any]], None]
+
+
+def build_site_model(
+    context: Context,
+    one: Indentation,
+    knots_s: Sequence[float],
+    knots_mm: Sequence[float],
+    knots_N: Sequence[float] = (),
+    layers: Sequence[str] = (),
+) -> SiteModel:
+    """The stored mesh and place of an indentation's site with a history of displacement, or of force.
+
+    ``layers``: tissues whose compression is wanted, too.
+
+    Raises
+    ------
+    ProblemError
+        Where the study's clamps do not meet the limb there.
+    """
+    study: Study = context.study
+    site = one.site if isinstance(one, Record) else one
+    placed = {row.site: row for row in context.results.sites.sites}[site.name]
+    mesh, indenter = context.store["mesh"] / f"{site.name}.vtu", study.indenter_of(one)
+    clamped: dict[str, Any] = {}
+    if study.clamps is not None:
+        clamped = {"clamps": study.clamps, "along": read_limb_axis(context)}
+    model = SiteModel(
+        name=one.name,
+        site=site.name,
+        fibres=find_fibre_directions(context),
+        mesh=mesh,
+        mesh_digest=compute_file_digest(mesh),
+        position=placed.position_mm,
+        axis=placed.axis,
+        knots_s=tuple(knots_s),
+        knots_mm=tuple(knots_mm),
+        knots_N=tuple(knots_N),
+        edge=site.edge,
+        indenter=indenter,
+        indenter_digest="" if indenter.file is None else compute_file_digest(indenter.file),
+        kappa_ratio=study.material.kappa_ratio,
+        steps=study.solver,
+        element=study.mesh.element,
+        law=study.material.law,
+        relaxation_span_s=study.material.relaxation_span_s,
+        extensions=study.extensions,
+        layers=tuple(layers),
+        course=study.material.course,
+        prestretch=tuple(sorted(study.material.prestretch.items())),
+        **clamped,
+    )
+    _check_pins(study, model)
+    return model
+
+
+def coarsen_model(context: Context, model: SiteModel) -> SiteModel:
+    """A site's model as parameters are searched: on its coarse mesh where the study has one.
+
+    No more of the mesh counts than ``calibration.search_radius_mm``.
+
+    Raises
+    ------
+    ProblemError
+        Where the study's clamps do not meet the limb there.
+    """
+    study = context.study
+    if study.mesh.coarse is not None:
+        mesh = context.store["mesh"] / COARSE / f"{model.site}.vtu"
+        _check_pins(study, replace(model, mesh=mesh))
+        model = replace(model, mesh=mesh, mesh_digest=compute_file_digest(mesh))
+    return replace(model, within_mm=study.within_mm)
+
+
+def _check_pins(study: Study, model: SiteModel) -> None:
+    """Refuse clamps that do not meet the limb, with the study's file, before workers build the site."""
+    if study.clamps is not None:
+        mesh, place = read_vtu(model.mesh), (model.position, model.axis)
+        skin = mesh.points, mesh.face_sets["skin"]
+        count_pins_met(study, model.name, model.indenter, place, skin, model.along)
+
+
+def count_pins_met(
+    study: Study,
+    name: str,
+    indenter: IndenterTable,
+    place: tuple[Vector, Vector],
+    skin: tuple[Array, NDArray[np.int64]],
+    along: Vector,
+) -> int:
+    """How many pins hold the limb in an indentation; 0 where the study has none.
+
+    Parameters
+    ----------
+    name : of the indentation.
+    place : position and axis of the indenter.
+    skin : points (n, 3) mm and faces (f, 3 or more).
+    along : the limb's axis, proximally.
+
+    Raises
+    ------
+    ProblemError
+        Where the pins cannot be placed, with the study's file.
+    """
+    if study.clamps is None:
+        return 0
+    try:
+        pins = build_clamping_pins(
+            *skin, read_indenter(indenter, *place, None), np.array(along), study.clamps
+        )
+        return len(pins)
+    except ProblemError as error:
+        what = f"site {name}: {error.what}"
+        raise ProblemError(what, file=study.file, place="clamps", remedy=error.remedy) from None
+
+
+def find_fibre_directions(context: Context) -> tuple[tuple[str, Direction], ...]:
+    """The direction of the fibres in each tissue that has some, of length one, or that of a flow."""
+    found: list[tuple[str, Direction]] = []
+    for tissue, stated in context.study.fibres.items():
+        if stated == "flow":
+            found.append((tissue, "flow"))
+        else:
+            found.append((tissue, read_limb_axis(context) if stated == "axis" else _normalise(stated)))
+    return tuple(found)
+
+
+def read_limb_axis(context: Context) -> Vector:
+    """The limb's axis, proximally: the unit normal of its proximal cut."""
+    return _normalise(context.results.surfaces.cut_normal)
+
+
+def _normalise(along: Sequence[float]) -> Vector:
+    x, y, z = (float(value) for value in np.array(along) / np.linalg.norm(along))
+    return x, y, z

@@ -34,9 +34,9 @@ from ...socket.targets import Target, build_zone
 from ...socket.wall import measure_thickness
 from ...study import Study
 from ..engine.context import Context
+from ..engine.digests import code_digest, compute_digest
 from ..engine.partial_results import Made, ResultFiles
-from ..engine.sources import code_digest
-from ..engine.storage import compute_digest, write_result, write_table
+from ..engine.storage import write_result, write_table
 from ..simulation.limb_geometry import LimbGeometry
 from .limb import SocketLimb, SocketRun, run_sockets, simulate_socket
 from .shape import (

@@ -40,11 +40,10 @@ from ...socket import Socket
 from ...socket.landmarks import SkinRegion, find_directions, find_load_point
 from ...study import Study
 from ..engine.context import Context
+from ..engine.digests import code_digest, compute_digest, compute_file_digest
 from ..engine.partial_results import Begun, Made, ResultFiles
-from ..engine.sources import code_digest
-from ..engine.storage import compute_digest, compute_file_digest
 from ..limb.mesh import is_meshed, keep_mesh, mesh_settings, read_mesh_facts, read_stored_depth
-from ..simulation.simulations import find_fibre_directions
+from ..simulation.limb_geometry import find_fibre_directions
 from .intervals import ParameterSpread, SimulationSpread, spread_to_facts
 from .shape import build_regions, find_covered_regions, load_of, mesh_edge_mm
 

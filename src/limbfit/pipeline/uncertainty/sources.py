@@ -25,8 +25,8 @@ from ...shapes import SHAPES
 from ...study import SolverTable, Study, Vector
 from ..engine.context import Context
 from ..identification.fine_meshes import estimate_own_mesh_error
-from ..limb.mesh import build_coarse_settings, mesh_settings
-from ..limb.remesh import mesh_models, scale_edges
+from ..limb.mesh import build_coarse_settings, mesh_settings, plan_meshes, scale_edges
+from ..limb.remesh import mesh_models
 from ..records.records import RecordSet, SiteRecord
 from ..simulation.extrapolation import MESH_ORDERS, estimate_coarse_error
 from ..simulation.simulations import SimulationCache
@@ -190,9 +190,15 @@ def _thicken_layer(context: Context, folder: Path, models: Sequence[SiteModel]) 
     else:
         layers[index] = replace(layer, thickness_mm=layer.thickness_mm + more)
     thicker = replace(settings, layers=tuple(layers))
-    return mesh_models(
-        context, folder / "thicker", models, thicker, partial(context.tell, "uncertainty", 0, 0)
-    )
+    return _mesh(context, folder / "thicker", models, thicker)
+
+
+def _mesh(
+    context: Context, folder: Path, models: Sequence[SiteModel], settings: MeshSettings
+) -> list[SiteModel]:
+    folder.mkdir(exist_ok=True)
+    jobs = plan_meshes(context, folder, ((one.site, one.position, one.axis) for one in models), settings)
+    return mesh_models(jobs, models, context.executor, partial(context.tell, "uncertainty", 0, 0))
 
 
 def _build_mesh_variant(
@@ -208,13 +214,7 @@ def _build_mesh_variant(
         models = [replace(record.model, within_mm=study.within_mm) for record in records.own]
     else:
         finer = scale_edges(settings, FINER)
-        models = mesh_models(
-            context,
-            folder / "finer",
-            [record.model for record in records.searched],
-            finer,
-            partial(context.tell, "uncertainty", 0, 0),
-        )
+        models = _mesh(context, folder / "finer", [record.model for record in records.searched], finer)
     jobs = [replace(job, model=model) for job, model in zip(plain, models, strict=True)]
     change, scale = mesh_share(study)
     # With coarse meshes the residuals' covariance has it already.

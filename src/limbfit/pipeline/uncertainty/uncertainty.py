@@ -48,8 +48,8 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     records = load_records(context, study.records_at(*study.fitted), secondary=True)
     cache = open_experiment_cache(context, folder)
     simulator = RecordSimulator(records, cache, context.executor, report)
-    correction = correct_to_fine_meshes(study, simulator, best)
-    known = estimate_linearised(context, problem, records.own, best, correction)
+    correction = correct_to_fine_meshes(problem, simulator, best)
+    known = estimate_linearised(problem, records.own, best, correction)
     explored = explore_posterior(
         partial(_simulate_points, context, simulator, correction, best, earlier),
         records.measured,

@@ -12,8 +12,8 @@ from ...indentation import Simulation
 from ...results.variants import RefinedSite, RefinementResult, RefinementRun
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import compute_file_digest
-from ..limb.mesh import make_mesh, mesh_job, mesh_settings, read_mesh_facts
+from ..engine.digests import compute_file_digest
+from ..limb.mesh import make_mesh, mesh_job, mesh_settings, read_mesh_facts, scale_edges
 from ..simulation.extrapolation import MESH_ORDERS, extrapolate_richardson
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import open_experiment_cache
@@ -99,11 +99,7 @@ def _make_meshes(
             one.site.name,
             one.model.position,
             one.model.axis,
-            replace(
-                settings,
-                edge_near_mm=factor * settings.edge_near_mm,
-                edge_far_mm=factor * settings.edge_far_mm,
-            ),
+            scale_edges(settings, factor),
             _find_file(context, folder, one, factor),
         )
         for one, factor in pairs

@@ -18,7 +18,7 @@ from ...study import Site, Study
 from ..engine.context import Context
 from ..engine.storage import write_result, write_table
 from ..identification.calibrate import group_intervals
-from ..identification.fine_meshes import correct_answer
+from ..identification.fine_meshes import correct_answer, plan_coarser_meshes
 from ..identification.intervals import sample_intervals
 from ..identification.problem import CalibrationProblem, build_problem
 from ..identification.record_simulator import RecordSimulator
@@ -115,11 +115,10 @@ def _describe_left_out(context: Context, members: dict[str, Any]) -> list[str]:
 def _build_region(
     context: Context, problem: CalibrationProblem, simulator: RecordSimulator, mine: Sequence[Site]
 ) -> RegionRecords:
-    study = context.study
-    records = [load_site_record(context, record) for record in study.records_at(*mine)]
+    records = [load_site_record(context, record) for record in context.study.records_at(*mine)]
 
     def identify(start: Unknowns) -> Calibration:
-        return search_parameters(study, problem, simulator, start, problem.stages[-1:])[0]
+        return search_parameters(problem, simulator, start, problem.stages[-1:])[0]
 
     def simulate(parameters: Array) -> list[SiteResponse]:
         return _simulate_forces(context, simulator.cache, records, parameters)
@@ -149,8 +148,9 @@ def _summarise_region(
     study, found = context.study, fit.calibration
     fitted, mine = chosen
     responses = list(found.responses)
-    correction, spent = correct_answer(context, simulator, found.parameters, responses, folder / "coarser")
-    _, known = sample_intervals(context, problem, simulator, found, correction, spent, moves=False)
+    coarser = plan_coarser_meshes(context, simulator.records, folder / "coarser")
+    correction, spent = correct_answer(problem, simulator, found.parameters, responses, coarser)
+    _, known = sample_intervals(problem, simulator, found, correction, spent, moves=False)
     return RegionFitted(
         region=name,
         sites=[site.name for site in mine],

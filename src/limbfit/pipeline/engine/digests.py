@@ -1,5 +1,6 @@
-"""Which source decides an answer: a function's module, what that imports, and the files beside them.
+"""Digests of what decides an answer: values, files, and source code.
 
+The source of a function is its module, what that imports, and the files beside them.
 A name imported from a package is followed to the module that defines it: a package's ``__init__`` that only
 hands names on is no reason for all of the package to count.
 """
@@ -7,7 +8,9 @@ hands names on is no reason for all of the package to count.
 from __future__ import annotations
 
 import ast
+import hashlib
 import inspect
+import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,11 +19,29 @@ from pathlib import Path
 from typing import Any
 
 from ..._version import __version__
-from .storage import compute_digest, compute_file_digest
 
 PACKAGE = Path(__file__).parents[2]
 _DEFINITION = re.compile(r"^(?:def |class |async |@)", re.MULTILINE)
 _LAZY = "_HOME"  # name of the table of an ``__init__`` that loads its names when they are first used
+
+
+def compute_digest(*parts: Any) -> str:
+    """A short stable digest of JSON-like values."""
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def compute_file_digest(path: Path) -> str:
+    """SHA-256 of a file, or of the names and contents of all files below a folder."""
+    sha = hashlib.sha256()
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    for file in files:
+        if path.is_dir():
+            sha.update(str(file.relative_to(path)).encode())
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                sha.update(block)
+    return sha.hexdigest()
 
 
 def find_sources(function: Callable[..., Any]) -> tuple[Path, ...]:
