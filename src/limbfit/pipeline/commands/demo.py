@@ -11,9 +11,9 @@ from ...execution import make_executor
 from ...phantom.build import make_phantom
 from ...phantom.forces import simulate_true_force
 from ...study import load_study
-from ..engine.context import Listener, Progress, compile_in_background, ignore_progress
+from ..engine.context import Listener, Progress, ignore_progress
 from ..engine.storage import read_json
-from .run import run_study
+from .run import compile_in_background, run_study
 
 
 def make_phantom_study(

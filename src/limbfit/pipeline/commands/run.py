@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from ... import report
 from ..._version import __version__
 from ...errors import InputError
+from ...execution import run_in_background
 from ...extensions import load_extensions
+from ...fe import are_compiled, compile_kernels
 from ...results.identification import CalibrationResult, PredictResult
 from ...results.runs import (
     ExperimentRecord,
@@ -21,7 +24,7 @@ from ...results.runs import (
     StudyName,
 )
 from ...study import Study
-from ..engine.context import Context, Listener, build_executor, compile_in_background, ignore_progress
+from ..engine.context import Context, Listener, build_executor, ignore_progress
 from ..engine.hand_labels import keep_hand_labels
 from ..engine.journal import write_journal
 from ..engine.keys import Keys, Stage
@@ -415,3 +418,21 @@ def summarise(study: Study) -> dict[str, Any]:
     if report.is_file():
         summary["report"] = str(report)
     return summary
+
+
+@contextmanager
+def compile_in_background(wanted: bool = True) -> Iterator[Callable[[], None]]:
+    """The block is given a function that waits until the kernels are there, where they are ``wanted``.
+
+    Where they are not stored yet, one process compiles them while the block goes on: workers that began to
+    solve at the same time would each compile them all.
+    """
+    if not wanted or are_compiled():
+        yield lambda: None
+        return
+    with run_in_background(_compile, None) as wait:
+        yield wait
+
+
+def _compile(_: None) -> None:
+    compile_kernels()

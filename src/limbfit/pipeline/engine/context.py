@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ...execution import Executor, Limits, make_executor, run_in_background
-from ...fe import are_compiled, compile_kernels
+from ...execution import Executor, Limits, make_executor
 from ...results.study_results import StudyResults
 from ...study import Study
 from .storage import read_json
@@ -76,21 +74,3 @@ def build_executor(study: Study) -> Executor:
     """What a study's jobs run on, with its limits."""
     table = study.execution
     return make_executor(table.workers, Limits(table.time_limit_s, table.memory_limit_GB))
-
-
-@contextmanager
-def compile_in_background(wanted: bool = True) -> Iterator[Callable[[], None]]:
-    """The block is given a function that waits until the kernels are there, where they are ``wanted``.
-
-    Where they are not stored yet, one process compiles them while the block goes on: workers that began to
-    solve at the same time would each compile them all.
-    """
-    if not wanted or are_compiled():
-        yield lambda: None
-        return
-    with run_in_background(_compile, None) as wait:
-        yield wait
-
-
-def _compile(_: None) -> None:
-    compile_kernels()

@@ -9,13 +9,13 @@ import numpy as np
 from ...anatomy.imaging import LabelMap, Volume, check_image, clean_labels, read_labels, read_volume
 from ...anatomy.labels.contours import read_contours
 from ...anatomy.labels.labelcheck import place_on_grid
-from ...anatomy.labels.labelfiles import normalise_name
 from ...anatomy.segmentation.body import check_one_limb
 from ...anatomy.segmentation.segmentation import segment
 from ...anatomy.surfaces.thickness import check_fat
 from ...study import Study
 from ..engine.hand_labels import find_hand_labels
 from .files import find_labelled_file, name_file_in_errors
+from .surfaces import has_mapped_fat, list_labelled_regions
 
 
 def read_study_image(study: Study) -> Volume:
@@ -98,13 +98,3 @@ def check_labels(study: Study, labels: LabelMap) -> None:
         labels.with_regions(list_labelled_regions(study))
         if has_mapped_fat(study):
             check_fat(labels)
-
-
-def list_labelled_regions(study: Study) -> dict[str, str]:
-    """The label of each region that has one, by the region's name."""
-    return {one.name: normalise_name(one.label) for one in study.geometry.regions if one.label is not None}
-
-
-def has_mapped_fat(study: Study) -> bool:
-    """True if a layer is as thick as the fat in the label map."""
-    return any(layer.thickness == "map" for layer in study.geometry.model_layers)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...anatomy.imaging import LabelMap, read_labels
+from ...anatomy.labels.labelfiles import normalise_name
 from ...anatomy.segmentation.amputation import amputate_anatomy, amputate_limb
 from ...anatomy.surfaces.mending import build_closed_anatomy, orient_outward
 from ...anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface, save_anatomy
@@ -16,7 +17,6 @@ from ...anatomy.surfaces.thickness import measure_fat_depth, write_thickness
 from ...study import Study
 from ..engine.context import Context
 from .files import THICKNESS, find_labelled_file, name_file_in_errors
-from .inputs import has_mapped_fat, list_labelled_regions
 
 
 def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
@@ -106,3 +106,13 @@ def read_given_anatomy(study: Study) -> tuple[Anatomy, tuple[str, ...]]:
         stump = amputate_anatomy(anatomy, plane.point, plane.normal, pad, geometry.surface_edge_mm)
         check_anatomy(stump)
     return stump, notes
+
+
+def list_labelled_regions(study: Study) -> dict[str, str]:
+    """The label of each region that has one, by the region's name."""
+    return {one.name: normalise_name(one.label) for one in study.geometry.regions if one.label is not None}
+
+
+def has_mapped_fat(study: Study) -> bool:
+    """True if a layer is as thick as the fat in the label map."""
+    return any(layer.thickness == "map" for layer in study.geometry.model_layers)
