@@ -66,6 +66,7 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     responses = list(best.responses)
     correction, spent = correct_answer(problem, simulator, best.parameters, responses, coarser)
     found, known = sample_intervals(problem, simulator, best, correction, spent)
+    corrections = [_summarise_round(one, found.sites, problem) for one in rounds]
     relaxation = _assess_relaxation(problem, found, known, records.measured)
     simulations = simulator.run_answer(found.parameters)
     answers = {one.site: one for one in records.select_forces(simulations)}
@@ -78,13 +79,13 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
         bounds=ParameterBounds(lower=study.by_tissue(bounds.lower), upper=study.by_tissue(bounds.upper)),
         law=StoredLaw(**study.law.record()),
         objective=study.calibration.objective,
-        uncertainty=_summarise_uncertainty(known, study, relaxation),
+        uncertainty=_summarise_uncertainty(known, problem.study, relaxation),
         forward_runs=len(cache),
         forward_runs_with_sensitivities=cache.with_sensitivities(),
         linear_solver=example.facts["linear_solver"] if example else None,
         element=example.facts["element"] if example else None,
-        corrections=[_summarise_round(one, found.sites, problem) for one in rounds],
-        multistart=_summarise_starts(starts, study) if study.calibration.starts > 1 else None,
+        corrections=corrections,
+        multistart=_summarise_starts(starts, problem.study) if study.calibration.starts > 1 else None,
         warnings=warnings,
         contact=summarise_contact(
             answers,
