@@ -49,13 +49,12 @@ from limbfit.mesh import write_vtu
 from limbfit.phantom.record import Ramp, record
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.storage import read_curves, write_json
-from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.engine.store import COARSE, Store
 from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.records.records import to_response
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.pipeline.simulation.loading import LoadHistory, describe_indentation
-from limbfit.pipeline.simulation.simulations import COARSE
 from limbfit.study import IndenterTable, SolverTable, Study
 
 Array = NDArray[np.float64]

@@ -123,7 +123,7 @@ def test_slow_noise_of_a_record_is_not_taken_for_the_force(tmp_path: Path, lag: 
     file = found.study.path(record.record.trace)
     table = np.loadtxt(file, delimiter=",", skiprows=1)
     _, smooth, facts = read_record(found.study, record.record)
-    since = table[:, 0] - facts["touch_down_s"]
+    since = table[:, 0] - facts.touch_down_s
     force = np.interp(since, smooth.time_s, smooth.force_N, right=0.0)
     sd, stated = 0.005 * smooth.peak_force_N, []
     for seed in range(4):
