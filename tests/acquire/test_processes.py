@@ -57,8 +57,8 @@ def test_both_sites_are_acquired_into_the_study(ready) -> None:
         assert sum(row["refused"].values()) == 0
         assert row["depth_mm"] == pytest.approx(4.0, abs=0.15)
         trace, _, facts = read_record(study, one)
-        assert 3.0 < facts["depth_mm"] < 4.1  # after a short pause the tissue is not quite back
-        assert facts["speed_load_mm_s"] == pytest.approx(1.4, abs=0.01)
+        assert 3.0 < facts.depth_mm < 4.1  # after a short pause the tissue is not quite back
+        assert facts.speed_load_mm_s == pytest.approx(1.4, abs=0.01)
         assert np.allclose(np.diff(trace.time_s), 0.002)
         record = read_recording(row["files"]["record"])
         assert record.lost_bytes == 0
@@ -88,7 +88,7 @@ def test_the_records_of_a_site_are_made_each_in_its_own_way(ready) -> None:
         study.recorded, (1.4, 4.0), (["load", "unload"], ["load", "hold", "unload"])
     ):
         _, curve, facts = read_record(study, one)
-        assert facts["speed_load_mm_s"] == pytest.approx(speed, rel=0.02)
+        assert facts.speed_load_mm_s == pytest.approx(speed, rel=0.02)
         assert [phase.kind for phase in curve.phases] == kinds
 
 

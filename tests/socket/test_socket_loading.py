@@ -57,7 +57,7 @@ def test_strain_rate_pressure_and_place_of_a_load(mesh):
     assert loaded[RATE, "top"].high == pytest.approx((0.8 - 0.2) / 0.5)
     assert loaded[PRESSURE, None].high == pytest.approx(30.0)
     (row,) = tested.find_outside(loaded.values())
-    assert (row["quantity"], row["share"]) == (PRESSURE, pytest.approx(1.0))
+    assert (row.quantity, row.share) == (PRESSURE, pytest.approx(1.0))
     less = describe(held(mesh, 0.1, 25.0), [*loaded.values()], LoadHistory(0.5, 16.0, 2.0))
     assert less[RATE, "top"].high == loaded[RATE, "top"].high  # it was strained as fast before
     level = axis.measure_level(np.array([[0.0, -90.0, 230.0]]))[0]

@@ -75,7 +75,7 @@ def test_a_stage_that_was_complete_when_killed_is_only_put_in_place(tmp_path):
     def again(folder):
         raise AssertionError("the stage is done twice")
 
-    assert store.make("mesh", "a", again)["made"] == 1
+    assert store.make("mesh", "a", again).made == 1
     assert store.state("mesh", "a").state == "done"
 
 

@@ -236,22 +236,22 @@ def test_a_record_under_force_is_ramps_of_force_and_smooth_depths(folder: Path) 
     assert isinstance(record, Record)
     assert (record.forced, record.unit) == (True, "mm")
     _, smooth, facts = read_record(study, record)
-    assert facts["touch_down_s"] == pytest.approx(1.0, abs=0.02)
-    assert facts["touch_down_mm"] == pytest.approx(0.8, abs=0.03)
-    held = next(phase for phase in facts["phases"] if phase["kind"] == "hold" and phase["end_s"] > 5.0)
-    assert held["start_s"] == pytest.approx(1.5, abs=0.03)
-    assert held["end_s"] == pytest.approx(7.5, abs=0.03)
-    assert held["end_mm"] == pytest.approx(1.5 * 2.0 * 1.5, rel=0.02)  # creep, so a hold that goes deeper
-    assert facts["peak_force_N"] == pytest.approx(2.0, rel=0.01)
-    assert facts["depth_mm"] == pytest.approx(4.46, rel=0.02)
+    assert facts.touch_down_s == pytest.approx(1.0, abs=0.02)
+    assert facts.touch_down_mm == pytest.approx(0.8, abs=0.03)
+    held = next(phase for phase in facts.phases if phase.kind == "hold" and phase.end_s > 5.0)
+    assert held.start_s == pytest.approx(1.5, abs=0.03)
+    assert held.end_s == pytest.approx(7.5, abs=0.03)
+    assert held.end_mm == pytest.approx(1.5 * 2.0 * 1.5, rel=0.02)  # creep, so a hold that goes deeper
+    assert facts.peak_force_N == pytest.approx(2.0, rel=0.01)
+    assert facts.depth_mm == pytest.approx(4.46, rel=0.02)
     assert smooth.noise_mm == pytest.approx(0.004, rel=0.2)
-    assert facts["knots_N"][0] == 0.0
-    assert facts["knots_N"][-1] == pytest.approx(0.05 * 2.0, abs=0.02)
+    assert facts.knots_N[0] == 0.0
+    assert facts.knots_N[-1] == pytest.approx(0.05 * 2.0, abs=0.02)
     even = smooth.resample(81)
     true = creep()
-    expected = np.interp(even.time_s + facts["touch_down_s"], true[:, 0], true[:, 1]) - facts["touch_down_mm"]
+    expected = np.interp(even.time_s + facts.touch_down_s, true[:, 0], true[:, 1]) - facts.touch_down_mm
     assert even.displacement_mm == pytest.approx(expected, abs=0.03)
-    assert even.force_N == pytest.approx(np.interp(even.time_s, facts["knots_s"], facts["knots_N"]))
+    assert even.force_N == pytest.approx(np.interp(even.time_s, facts.knots_s, facts.knots_N))
 
 
 def test_a_force_that_never_rises_is_refused_in_one_line(folder: Path) -> None:
