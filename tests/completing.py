@@ -23,9 +23,9 @@ def _complete_value(kind: Any, value: Any) -> Any:
     if isinstance(kind, type) and issubclass(kind, ResultPart):
         return complete(kind, value)
     parts = get_args(kind)
-    if get_origin(kind) is Mapping and value:
+    if get_origin(kind) is Mapping:
         return {key: _complete_value(parts[1], one) for key, one in value.items()}
-    if get_origin(kind) is Sequence and value:
+    if get_origin(kind) is Sequence:
         return [_complete_value(parts[0], one) for one in value]
     models = [part for part in parts if isinstance(part, type) and issubclass(part, ResultPart)]
     return complete(models[0], value) if models else value
