@@ -41,7 +41,8 @@ def edit(file: Path, change) -> None:
 
 
 def test_every_result_is_among_the_kept_files():
-    assert {name for name, _, _ in KEPT} == set(MODELS)
+    """But that of the slow tests in ``tests/pipeline/experiments/test_socket_design.py``, which write one."""
+    assert {name for name, _, _ in KEPT} == set(MODELS) - {"socket_design"}
 
 
 @pytest.mark.parametrize(("name", "model", "file"), KEPT, ids=[name for name, _, _ in KEPT])
