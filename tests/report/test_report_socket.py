@@ -83,7 +83,9 @@ def test_the_command_says_what_most_of_an_interval_comes_from(capsys):
 def test_every_finding_is_told_of_its_regions_with_its_source(finding):
     rows = select_published_findings([*finding.regions, "another"])
     assert finding.source in {row.source for row in rows}
-    table = make_published_table({"published": rows}, HELD | {"mean_kPa": 12.0}, "stance")
+    table = make_published_table(
+        {"published": [row.to_plain() for row in rows]}, HELD | {"mean_kPa": 12.0}, "stance"
+    )
     assert any(finding.found in {cell.text for cell in row.cells} for row in table.rows)
     assert all(set(row.regions) <= {*finding.regions, WHOLE} for row in rows)
 
@@ -91,7 +93,9 @@ def test_every_finding_is_told_of_its_regions_with_its_source(finding):
 def test_what_others_found_stands_beside_the_regions_own_pressures():
     """By region; what was found over the whole limb beside the whole limb's."""
     rows = select_published_findings(["tibial crest"])
-    table = make_published_table({"published": rows}, HELD | {"mean_kPa": 12.0}, "stance")
+    table = make_published_table(
+        {"published": [row.to_plain() for row in rows]}, HELD | {"mean_kPa": 12.0}, "stance"
+    )
     own = {tuple(cell.text for cell in row.cells[:3]) for row in table.rows}
     assert own == {("tibial crest", "30.0", "60.0"), (WHOLE, "12.0", "60.0")}
     assert len(table.rows) == sum("tibial crest" in one.regions or WHOLE in one.regions for one in FINDINGS)
