@@ -44,7 +44,7 @@ def build_block_site(
 def build_block_model(
     name: str, file: Path, steps: SolverTable, element: str, depth_mm: float = INDENTATION
 ) -> SiteModel:
-    """The same, of a mesh that ``file`` holds."""
+    """A site in the middle of a block's top, of a mesh that ``file`` holds."""
     ramp = depth_mm / SPEED
     return SiteModel(
         name=name,

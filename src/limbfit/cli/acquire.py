@@ -286,7 +286,7 @@ class Live:
 
 
 def plot(x: list[float], y: list[float], width: int = WIDTH, height: int = HEIGHT) -> str:
-    """Points in a field of characters, the least and the largest of both axes beside it."""
+    """Points drawn with characters, with the smallest and largest value of both axes."""
     if len(x) < 2:
         return "\n" * (height + 1)
     low, high, bottom, top = min(x), max(x), min(0.0, *y), max(*y, 1.0)

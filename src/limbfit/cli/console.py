@@ -100,7 +100,7 @@ def _format_cell(row: Row, column: Column, dash: str) -> str:
 
 
 def format_use(row: Row) -> str:
-    """Whether a site or record was fitted, in words."""
+    """The words for a site or record that was fitted, or held out."""
     return "fitted" if row["fitted"] else "held out"
 
 

@@ -1,4 +1,4 @@
-"""The verbs of the experiments: each runs one, then prints its JSON, or tells of it in its own words."""
+"""The commands of the experiments: each runs one and prints its result as JSON or in words."""
 
 from __future__ import annotations
 

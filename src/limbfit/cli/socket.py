@@ -1,4 +1,4 @@
-"""The verbs of the socket: what it does to the limb, and the design of one."""
+"""The commands of the socket: its load on the limb, and its design."""
 
 from __future__ import annotations
 

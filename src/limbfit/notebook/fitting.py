@@ -49,9 +49,9 @@ class Fit:
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
-        """What the curves tell: 95 % intervals, verdicts, correlations.
+        """What the curves determine: 95 % intervals, verdicts, correlations.
 
-        Noise is taken from how neighbouring differences scatter, smooth misfit from their size.
+        Noise is estimated from the scatter of neighbouring differences, smooth misfit from their size.
         """
         measured = _to_measured(self.curves)
         best = np.array(list(self.parameters.values()))
@@ -152,7 +152,7 @@ def calibrate(
 
 
 def with_parameters(problem: Problem, values: Mapping[str, float]) -> Problem:
-    """The problem with other values of its parameters, by ``region.parameter``."""
+    """A copy of the problem with new values of parameters, by ``region.parameter``."""
     materials = dict(problem.materials)
     for name, value in values.items():
         region, parameter = name.rsplit(".", 1)

@@ -23,7 +23,7 @@ POSITION_DIGITS = 2  # of a place in mm
 
 
 def edit_study(file: Path, change: Callable[[tomlkit.TOMLDocument], None]) -> Study:
-    """Change the study file; the study as it is afterwards.
+    """Change the study file and return the changed study.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The study folder as the studio sees it: loaded when asked, paths kept inside, changes by fingerprints."""
+"""The folder of a study: paths stay inside it, and fingerprints show which of its files have changed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..study import Study, load_study
 
 @dataclass(frozen=True)
 class StudyFolder:
-    """One study by its file; nothing of it is kept in memory between requests."""
+    """The folder of one study, by its file; nothing is kept in memory between requests."""
 
     file: Path
 
@@ -34,11 +34,11 @@ class StudyFolder:
         return Store(self.results)
 
     def load(self) -> Study:
-        """The study as it stands; records may be yet to be made."""
+        """The study as its file now states it; its records need not exist yet."""
         return load_study(self.file, recorded=False)
 
     def artefact(self, *parts: str) -> Path:
-        """A file under ``results/`` by the parts of its path; each part is a plain name.
+        """The path of a file under ``results/``, given as plain names, one for each part.
 
         Raises
         ------
@@ -68,7 +68,7 @@ class StudyFolder:
 
 
 def resolve_inside(root: Path, *parts: str) -> Path:
-    """A file below a folder by the parts of its path; see `StudyFolder.artefact` for the errors."""
+    """The path of a file below ``root``, given by its parts; see `StudyFolder.artefact` for the errors."""
     for part in parts:
         is_plain = bool(part) and part.isprintable() and not set(part) & set('/\\:*?"<>|')
         if not is_plain or part.startswith("."):
@@ -82,12 +82,12 @@ def resolve_inside(root: Path, *parts: str) -> Path:
 
 
 def read_stored(file: Path) -> dict[str, Any]:
-    """What a JSON artefact holds; empty where there is none."""
+    """The content of a JSON file; an empty dictionary where there is no such file."""
     return dict(read_json(file)) if file.is_file() else {}
 
 
 def compute_fingerprint(files: Iterable[Path]) -> str:
-    """Changes when one of the files is written, appears or goes."""
+    """A text that changes when one of the files is written, appears or disappears."""
     states: list[Any] = []
     for file in files:
         try:

@@ -64,7 +64,7 @@ class AccessGuard:
 
     @property
     def cookie(self) -> str:
-        """Cookies are shared by all ports of a host, so the name tells them apart."""
+        """The cookie's name; it holds the port because all ports of a host share their cookies."""
         return f"limbfit-studio-{self.port}"
 
     @property
@@ -135,7 +135,7 @@ class GuardMiddleware:
 
 
 class TooLargeError(Exception):
-    """A body without a stated length went over the limit."""
+    """A request without a content length had a larger body than is allowed."""
 
 
 def _limit_body(receive: Receive) -> Receive:

@@ -24,7 +24,7 @@ _ENDS = {"end": "ended", "failed": "failed", "interrupted": "stopped"}
 
 
 class RunRequest(StrictModel):
-    """What to run: up to a stage, and stages that are done anew whether they are done or not."""
+    """The last stage of a run, the stage to repeat from, and single stages to repeat."""
 
     until: str | None = None
     start: str | None = None
@@ -33,7 +33,7 @@ class RunRequest(StrictModel):
 
 @router.get("")
 def get_identification(folder: Folder) -> dict[str, Any]:
-    """Stages, those of them that a run does, that run or the last one, iterates of the search, its answer."""
+    """The stages and their states, the current or last run, the iterates of the search, and its answer."""
     study = folder.load()
     stages = list_stages(folder)
     logs = _list_logs(folder)
@@ -81,7 +81,7 @@ def get_curves(folder: Folder, name: str) -> dict[str, Any]:
 
 @router.post("/start")
 def post_start(folder: Folder, request: RunRequest) -> dict[str, Any]:
-    """Start or resume: ``limbfit run`` with these options, as a process of its own."""
+    """Start or resume ``limbfit run`` with these options, as a process of its own."""
     return start_run(folder, request.until, request.start, request.force)
 
 
@@ -118,7 +118,7 @@ def _answer(folder: StudyFolder) -> dict[str, Any] | None:
 def _collect_iterates(
     folder: StudyFolder, logs: list[Path], state: str, answer: dict[str, Any] | None
 ) -> dict[str, Any]:
-    """Iterates of the search that goes on or was stopped; else of the stored answer."""
+    """The iterates of a search that runs or was stopped; those of the stored answer otherwise."""
     if state != "done":
         stamp = folder.store.stamp("calibrate")
         finished = stamp.finished if stamp else ""
@@ -137,7 +137,7 @@ def _list_logs(folder: StudyFolder) -> list[Path]:
 
 
 def describe_last_run(folder: StudyFolder, is_running: bool) -> dict[str, Any] | None:
-    """The newest log, if any: what it is of, how it ended, its newest progress and lines."""
+    """The run of the newest log: its command, how it ended, and its last progress; None without a log."""
     logs = _list_logs(folder)
     if not logs:
         return None

@@ -50,7 +50,7 @@ class Painting(BaseModel):
 
 @router.get("")
 def get_facts(folder: Folder) -> dict[str, Any]:
-    """What there is to see: labels with names and colours, surfaces, and whether labels can be saved."""
+    """Names and colours of the labels, the stored surfaces, and where corrected labels are saved."""
     study = folder.load()
     if study.image is None:
         return {"has_image": False}
@@ -135,7 +135,7 @@ class ShownLabels:
     digest: str
 
     def name_target(self, study: Study) -> str:
-        """Where a correction goes, relative to the study."""
+        """The file that a correction is saved to, relative to the study."""
         return BESIDE if study.segmentation.is_given else f"results/segment/{LABELS}"
 
 
@@ -190,7 +190,7 @@ def paint_runs(labels: LabelMap, runs: list[tuple[int, int, int]]) -> LabelMap:
 
 
 def _read_study_volume(study: Study) -> Volume:
-    """The image as it is; what ``segment`` asks of it besides, one limb, is for that stage to say."""
+    """The image as stored; only the stage ``segment`` checks that it shows one limb."""
     if study.image is None:
         raise InputError("the study has no image", file=study.file, place="image")
     return read_plain_image(study)

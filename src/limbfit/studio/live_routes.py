@@ -40,7 +40,7 @@ class StoredCheck(BaseModel):
 
 
 class StoredVerdict(BaseModel):
-    """A stored verdict; ``trace`` is the record of the site that came of it, where one did."""
+    """A stored verdict; ``trace`` is the file of the site's record, None where the session made none."""
 
     good: bool
     checks: list[StoredCheck]

@@ -107,7 +107,7 @@ def get_mesh(folder: Folder, site: str) -> Response:
 
 @router.post("/sites")
 def post_site(folder: Folder, site: NewSite) -> dict[str, Any]:
-    """Add a site on the skin; the scene as it is afterwards."""
+    """Add a site on the skin; returns the changed scene."""
     position = project_to_skin_of_study(folder, site.position)
     region = {"region": site.region} if site.region else {}
     add_site(folder.file, site.name, position, {**region, "depth_mm": site.depth_mm})
@@ -116,7 +116,7 @@ def post_site(folder: Folder, site: NewSite) -> dict[str, Any]:
 
 @router.post("/sites/{name}")
 def post_change(folder: Folder, name: str, change: SiteChange) -> dict[str, Any]:
-    """Move, rename or describe a site, or switch fitted; the scene as it is afterwards."""
+    """Move, rename or describe a site, or change whether it is fitted; returns the changed scene."""
     values: dict[str, Any] = change.model_dump(exclude_none=True)
     if change.position is not None:
         _check_movable(folder.load(), name)

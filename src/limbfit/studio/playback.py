@@ -50,7 +50,7 @@ FIELDS = {
 
 
 def list_sources(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
-    """What can be shown of a site: every step of a simulation, or the deepest point of the prediction.
+    """The stored fields of a site: every step of a simulation, or the deepest point of the prediction.
 
     Each has ``source``, ``title``, ``times_s``, ``deepest`` (which of them), ``parameters_from``, and
     ``mark``, which other fields change.
@@ -86,7 +86,7 @@ def list_sources(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
 
 
 def _list_moments(folder: StudyFolder, site: str) -> list[tuple[float, Path]]:
-    """Times and files of a stored animation that are there."""
+    """The time (s) and file of every stored step of an animation."""
     collection = folder.results / "simulate" / f"{site}.pvd"
     if not collection.is_file():
         return []

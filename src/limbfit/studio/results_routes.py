@@ -71,7 +71,7 @@ def get_outcome(folder: Folder, kept: str | None = None) -> dict[str, Any]:
 
 @router.get("/site/{site}")
 def get_site(folder: Folder, site: str) -> dict[str, Any]:
-    """What can be shown of a site, its files, and how a simulation of it goes."""
+    """The stored fields and files of a site, and the state of its simulation."""
     return {
         "sources": playback.list_sources(folder, folder.load().indentation(site).name),
         "downloads": _list_site_downloads(folder, site),

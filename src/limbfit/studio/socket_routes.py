@@ -143,7 +143,7 @@ def get_step(folder: Folder, run: str, step: int, field: str) -> Response:
 
 @router.get("/shape")
 def get_shape(folder: Folder) -> dict[str, Any]:
-    """What ``[socket]`` says of the shape, and whether such a face can be drawn around the bare skin.
+    """The socket's shape as ``[socket]`` states it, and whether its face can be drawn around the bare skin.
 
     ``areas`` with their places, ``regions`` to choose from, ``file`` where the face is read from one;
     ``trim``: ``points`` where the brim runs on the skin, and whether they are those of a line; ``mark``,
@@ -251,7 +251,7 @@ def _build_face(folder: StudyFolder, mark: str) -> Socket | str:
 
 @router.post("/areas")
 def post_area(folder: Folder, area: AreaRequest) -> dict[str, Any]:
-    """Add an area to the study file, or change the one of that name; the shape as it is afterwards."""
+    """Add an area to the study file, or change the area of that name; returns the changed shape."""
     values = area.model_dump(exclude={"name"})
     if area.position is not None:
         values["position"] = project_to_skin_of_study(folder, area.position)
@@ -268,7 +268,7 @@ def post_removal(folder: Folder, name: str) -> dict[str, Any]:
 
 @router.post("/trimline")
 def post_trimline(folder: Folder, line: TrimlineRequest) -> dict[str, Any]:
-    """Put a trimline into the study file, in the place of any other brim; the shape as it is afterwards.
+    """Replace the brim in the study file by a trimline; returns the changed shape.
 
     Raises
     ------

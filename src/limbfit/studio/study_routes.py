@@ -46,7 +46,7 @@ def respond_block(arrays: Mapping[str, Any], facts: Mapping[str, Any] | None = N
 
 @router.get("/study")
 def get_study(folder: Folder) -> dict[str, Any]:
-    """The study as it stands: its tables, without paths of inputs, and what the server runs on."""
+    """The tables of the study without the paths of its inputs, and the name of its folder."""
     study = folder.load()
     return {
         "name": study.study.name,
@@ -82,13 +82,13 @@ def get_study(folder: Folder) -> dict[str, Any]:
 
 @router.get("/stages")
 def get_stages(folder: Folder) -> dict[str, Any]:
-    """State of every stage, as ``limbfit status`` tells it, and the run that goes on, if any."""
+    """The state of every stage, as ``limbfit status`` reports it, and the current run, if any."""
     return {"stages": list_stages(folder), "run": find_running(folder)}
 
 
 @router.get("/changes")
 def get_changes(folder: Folder) -> dict[str, Any]:
-    """Fingerprints by topic; a page reads again what stands on a topic whose fingerprint changed."""
+    """Fingerprints by topic; a page reads a topic again when its fingerprint has changed."""
     return {**folder.changes(), "run": find_running(folder)}
 
 
@@ -115,7 +115,7 @@ def _respond_file(folder: StudyFolder, parts: tuple[str, ...], download: bool) -
 
 
 class _Remembered:
-    """The last answer, for as long as no file that decides it has changed."""
+    """The states of the stages as last computed, with the mark of the files they depend on."""
 
     def __init__(self) -> None:
         self.lock = Lock()
@@ -126,7 +126,7 @@ _remembered = _Remembered()
 
 
 def list_stages(folder: StudyFolder) -> list[dict[str, Any]]:
-    """`study_status`, which reads every input file: again only where one was written."""
+    """The rows of `study_status`; they are computed again only when an input or a result has changed."""
     study = folder.load()
     mark = _mark(folder, study)
     with _remembered.lock:

@@ -1,4 +1,4 @@
-"""The view Traces: records raw and regularised, doubts about them, touch-down and peak as stated."""
+"""The view Traces: raw and regularised records, warnings about them, and stated touch-downs and peaks."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def get_record(folder: Folder, name: str) -> dict[str, Any]:
 
 @router.post("/{name}/preview")
 def preview_record(folder: Folder, name: str, times: Times) -> dict[str, Any]:
-    """The record as it would be with other times; nothing is stored."""
+    """The record as other times would change it; nothing is stored."""
     study = folder.load()
     return _read(study, _replace_times(_find_record(study, name), times)).content
 
@@ -115,7 +115,7 @@ _cache: dict[str, _ReadRecord] = {}
 
 
 def _read(study: Study, record: Record) -> _ReadRecord:
-    """A record with its curves, for as long as neither its file nor what is stated of it changes."""
+    """A record with its curves, from the cache while neither its file nor its settings have changed."""
     file = study.path(record.trace)
     key = repr(
         (
@@ -168,7 +168,7 @@ def _shorten(values: np.ndarray) -> list[float]:
 def _collect_flags(
     folder: StudyFolder, study: Study, records: dict[str, _ReadRecord]
 ) -> list[dict[str, Any]]:
-    """Flags on the records as they are now, and those of the last prediction against the model."""
+    """Flags on the records as they are now, and flags of the last prediction against the model."""
     sites, anatomy = SitesResult.find(folder.results), None
     placed = {} if sites is None else {row.site: row for row in sites.sites}
     if sites is not None:

@@ -17,7 +17,7 @@ from limbfit import check_study, load_study, run_study
 from limbfit.anatomy.imaging import write_labels, write_volume
 from limbfit.report.page import Bullets
 from limbfit.report.sections.model import make_model_section
-from limbfit.report.sections.record_checks import make_record_check_section
+from limbfit.report.sections.records import make_record_check_section
 from limbfit.report.store import Results, load_store
 
 PLACES = ([40.0, 0.0, 60.0], [0.0, 40.0, 50.0], [-40.0, 0.0, 60.0], [0.0, -40.0, 55.0], [28.0, 28.0, 55.0])

@@ -17,8 +17,7 @@ from .model import make_mesh_section, make_model_section
 from .parameters import make_parameter_section
 from .prediction import make_domain_section, make_fit_section, make_prediction_section
 from .provenance import make_provenance_section, make_settings_section, make_timing_section
-from .record_checks import make_record_check_section
-from .records import make_record_section
+from .records import make_record_check_section, make_record_section
 from .regions import make_regions_section
 from .sensitivity import SENSITIVITIES
 from .simulations import make_comparison_section, make_simulated_section, make_solver_section

@@ -1,4 +1,4 @@
-"""Indentation records in the report: what was found in them, and the paper's figure 3."""
+"""Indentation records in the report: the paper's figure 3, what was found in them, and what looks wrong."""
 
 from __future__ import annotations
 
@@ -6,17 +6,19 @@ from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 
-from ...results.records import RecordPhase
+from ...results.identification import LeftOutRecord
+from ...results.records import RecordFlag, RecordPhase
 from ..drawing.colours import GRID, INK, MUTED, SIMULATED
 from ..drawing.figures import thin_curves
 from ..drawing.interactive import record_curves
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
-from ..formats import format_fixed
-from ..page import Figure, Section, Table, make_section
+from ..formats import format_fixed, number
+from ..page import Figure, Note, Prose, Section, Table, make_bullets, make_section
 from ..store import Curves, Results
-from ..tables import make_table
+from ..tables import make_table, to_numeric
 
 MAX_NAMED_PHASES = 6  # whose names have room in a panel
+MARKED_ERROR = 4.0  # standardised errors from here on are marked
 
 
 def make_record_section(store: Results) -> Section:
@@ -96,3 +98,70 @@ def make_trace_table(store: Results) -> Table:
     rows = [facts.to_plain() | {"record": name} for name, facts in store.traces.items()]
     caption = "What was found in each indentation record."
     return make_table("trace-facts", caption, columns, rows, marked=lambda row: row["site"] in store.fitted)
+
+
+def make_record_check_section(store: Results) -> Section:
+    """What looks wrong with records, the evidence for it, and each site as predicted from all others."""
+    flags, left_out = (store.predict.flags, store.predict.left_out) if store.predict else ((), ())
+    nothing = Prose(
+        "Nothing looks wrong: units, names, axes and places of the records agree with one another, and "
+        "every site is predicted from the others about as well as they are."
+    )
+    return make_section(
+        "doubts",
+        "Records in doubt",
+        _list_failures(store),
+        make_bullets(f"{flag.text[:1].upper()}{flag.text[1:]}." for flag in flags) or nothing,
+        _make_flag_table(flags) if flags else None,
+        _make_left_out_table(store, left_out) if left_out else None,
+    )
+
+
+def _list_failures(store: Results) -> Note | None:
+    """A note on the sites that failed and therefore were not compared; None where none did."""
+    sites = [row.record for row in store.predicted if row.not_predicted.keys() - {"one_material"}]
+    failed = [f"Sites not compared with the others: {', '.join(sites)}."] if sites else []
+    failed += [f"Not simulated: {text}." for text in (store.predict.failed if store.predict else ())]
+    return Note(" ".join(failed)) if failed else None
+
+
+def _make_flag_table(flags: Sequence[RecordFlag]) -> Table:
+    columns = (
+        ("Sites", lambda flag: ", ".join(flag.sites) or "all"),
+        ("Kind", "kind"),
+        ("Found", "found"),
+        (
+            "Evidence",
+            lambda flag: "; ".join(f"{_format_words(k)} {number(v)}" for k, v in flag.evidence.items()),
+        ),
+        ("Likely cause", "cause"),
+    )
+    return make_table("flags", "What looks wrong, and the numbers that say so.", columns, flags)
+
+
+def _format_words(name: str) -> str:
+    for unit, shown in (("_percent", " (%)"), ("_kPa", " (kPa)"), ("_mm", " (mm)"), ("_deg", " (°)")):
+        if name.endswith(unit):
+            return name.removesuffix(unit).replace("_", " ") + shown
+    return name.replace("_", " ")
+
+
+def _make_left_out_table(store: Results, left_out: Sequence[LeftOutRecord]) -> Table:
+    fitted = [name for site in store.fitted for name in (site, *store.records_of(site))]
+    columns = (
+        ("Site", "site"),
+        ("Use", lambda row: "fitted" if row.site in fitted else "held out"),
+        ("Error without it (%)", lambda row: to_numeric(format_fixed(100 * row.error))),
+        ("Of others (%)", lambda row: to_numeric(format_fixed(100 * row.expected))),
+        ("Standardised", "standardised", 1),
+        ("Measured over predicted force", "ratio", 2),
+        ("Cook's distance", "cook", 2),
+    )
+    caption = (
+        "Every site predicted from all others: root mean square error over the peak; that of the others when "
+        "the site is left out; their ratio; the best factor from predicted to measured force; and how far "
+        "the site moves the fit, against the misfit. Computed on the first-order expansion about the answer."
+    )
+    return make_table(
+        "left-out", caption, columns, left_out, marked=lambda row: row.standardised > MARKED_ERROR
+    )
