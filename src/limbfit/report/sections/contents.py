@@ -21,8 +21,7 @@ from .records import make_record_check_section, make_record_section
 from .regions import make_regions_section
 from .sensitivity import SENSITIVITIES
 from .simulations import make_comparison_section, make_simulated_section, make_solver_section
-from .socket import make_socket_section
-from .socket_design import make_socket_design_section
+from .socket import make_socket_design_section, make_socket_section
 from .summary import build_summary, list_key_numbers
 from .uncertainty import make_models_section, make_uncertainty_section
 
