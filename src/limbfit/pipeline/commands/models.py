@@ -40,13 +40,12 @@ from ..engine.hand_labels import find_hand_labels
 from ..engine.storage import read_curves, write_curves, write_result
 from ..engine.store import Store, lock
 from .fitting import fit_socket
-from .run import run_study
+from .run import compute_keys, run_study
 
 FOLDER = "models"
 OWN = "the study's own"
 TWO_TERMS = "ogden-prony2"
 _LAYER_MM, _MIN_LAYER_MM, _FRICTION = 1.0, 0.5, 0.4
-_SHARED_STAGES = ("segment", "surfaces", "sites", "traces", "mesh", "by-hand")
 MIN_SOCKET_WEIGHT = 0.01  # of a model whose socket is simulated
 
 Document = tomlkit.TOMLDocument
@@ -165,7 +164,7 @@ def select_models(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def derive_study(study: Study, name: str) -> Study:
-    """Write the study of a model beside its inputs, and give it what is stored and stays as it was.
+    """Write the study of a model, with the same inputs, into its folder.
 
     Raises
     ------
@@ -184,11 +183,21 @@ def derive_study(study: Study, name: str) -> Study:
         derived = load_study(folder)
     except InputError as error:
         raise InputError(f"model {name}: {error.what}", place=error.place, remedy=error.remedy) from None
-    for stage in _SHARED_STAGES:
-        stored, own = study.results / stage, derived.results / stage
-        if stored.is_dir() and not own.exists():
-            shutil.copytree(stored, own, copy_function=_link_or_copy)
     return derived
+
+
+def _share_stages(study: Study, derived: Study) -> None:
+    """Give a model what is stored of its study and would come out the same."""
+    by_hand = Path("by-hand")
+    if (study.results / by_hand).is_dir() and not (derived.results / by_hand).exists():
+        shutil.copytree(study.results / by_hand, derived.results / by_hand)
+    stored, own = Store(study.results), Store(derived.results)
+    for stage, key in compute_keys(derived).items():
+        if stored.state(stage, key).state != "done" or own.state(stage, key).state == "done":
+            continue
+        if own[stage].is_dir():
+            shutil.rmtree(own[stage])
+        shutil.copytree(stored[stage], own[stage], copy_function=_link_or_copy)
 
 
 def _link_inputs(study: Study, folder: Path, document: Document) -> None:
@@ -260,7 +269,7 @@ def compare_models(
     run_study(study, until="predict", listener=listener)
     for number, name in enumerate(derived, 1):
         words = f"model {number} of {len(derived)}, {MODELS[name].words}"
-        derived[name] = derive_study(study, name)  # with what the run has stored since
+        _share_stages(study, derived[name])
         run_study(derived[name], until="predict", listener=_name_model(listener, words))
     with lock(study.results):
         content = _mix_predictions(study, derived, left_out)
