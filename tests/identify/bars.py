@@ -42,12 +42,16 @@ class Bars:
         """Evenly spread times (points,) of loading and unloading."""
         return np.linspace(0, 2 * self.depth / 0.96, self.points)
 
+    @property
+    def travel(self) -> np.ndarray:
+        """How far the bars are pressed (points,) mm."""
+        ramps = np.minimum(self.times_s, self.times_s[-1] - self.times_s)
+        return np.minimum(0.96 * ramps, self.depth)
+
     def split(self, p: np.ndarray) -> np.ndarray:
         """Elastic force (..., tissues, points) N of each bar, of parameters (..., p)."""
         c, m = np.moveaxis(p.reshape(*p.shape[:-1], -1, 4), -1, 0)[:2, ..., None]
-        ramps = np.minimum(self.times_s, self.times_s[-1] - self.times_s)
-        travel = np.minimum(0.96 * ramps, self.depth)
-        stretch = 1 - travel / np.array(self.lengths)[:, None]
+        stretch = 1 - self.travel / np.array(self.lengths)[:, None]
         half = stretch ** (m / 2)
         stress = -c * 1e-3 / m * (half**2 - half**-2 - 1 / half + half) / stretch
         return np.array(self.sections)[:, None] * stress

@@ -42,7 +42,7 @@ def test_what_lasts_longer_or_comes_on_faster_is_outside_with_both_ranges():
     assert (row.records, row.prediction) == ((2.0, 13.0), (1.0, 3600.0))
     assert row.share == pytest.approx(1.0 - 11.0 / 3599.0)
     (fast,) = find(Extent(TIME, "s", 0.1, 5.0))
-    assert fast["share"] == pytest.approx(1.9 / 4.9)
+    assert fast.share == pytest.approx(1.9 / 4.9)
 
 
 def test_the_share_of_strained_volume_is_that_beyond_the_records():
@@ -67,8 +67,8 @@ def test_places_are_judged_by_level_and_by_the_nearest_fitted_site_around_the_li
     np.testing.assert_allclose(TESTED.measure_angle(np.array([0.0, -20.0, 95.0, 179.0])), [10, 10, 85, 1])
     assert find(Extent(LEVEL, "mm", 45.0, 105.0), Extent(ANGLE, "deg", 0.0, 40.0)) == []
     level, angle = find(Extent(LEVEL, "mm", 30.0, 95.0), Extent(ANGLE, "deg", 0.0, 85.0))
-    assert level["records"] == [60.0, 90.0]
-    assert angle["prediction"] == [0.0, 85.0]
+    assert level.records == (60.0, 90.0)
+    assert angle.prediction == (0.0, 85.0)
 
 
 def test_two_short_sentences_say_the_figures_of_the_worst():

@@ -71,14 +71,10 @@ class Receding(Held):
 
     share: float = 0.0
 
-    def split(self, p: np.ndarray) -> list[np.ndarray]:
-        end = self.times_s[-1]
-        travel = 0.96 * np.minimum(np.minimum(self.times_s, end - self.times_s), self.depth / 0.96)
-        left = np.maximum(travel - self.share * self.depth * self.times_s / end, 0.0)
-        return [
-            Bars.elastic(section, 1 - left / length, c, m)
-            for section, length, (c, m, *_) in zip(self.sections, self.lengths, p.reshape(-1, 4))
-        ]
+    @property
+    def travel(self) -> np.ndarray:
+        receded = self.share * self.depth * self.times_s / self.times_s[-1]
+        return np.maximum(super().travel - receded, 0.0)
 
 
 def held_sites(hold_s: float = 0.0) -> list[Held]:
@@ -258,6 +254,6 @@ def test_a_limb_that_gives_way_is_named_where_the_records_cannot_tell_it_from_re
     sites = [Receding(one.sections, one.lengths, one.depth, share=0.1) for one in SITES]
     known, found = assess(held_sites(), [site.force(TRUTH) for site in sites])
     assert GIVES_WAY in found.describe(known)
-    assert found.to_dict(known)["tail_weight"] > 0.5
+    assert found.summarise(known).tail_weight > 0.5
     known, found = of_power_law
     assert GIVES_WAY not in found.describe(known)

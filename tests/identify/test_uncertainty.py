@@ -21,6 +21,7 @@ from limbfit.identify.fit.prediction import (
 from limbfit.identify.uncertainty.discrepancy import ResidualModel, _RestrictedLikelihood, compute_matern
 from limbfit.identify.uncertainty.noise import estimate_curve_noise
 from limbfit.identify.uncertainty.uncertainty import DETERMINED, GIVEN, UNDETERMINED, estimate_uncertainty
+from limbfit.results.identification import RecordResiduals
 
 
 def fitted(data, run=simulate):
@@ -131,10 +132,10 @@ def test_the_error_of_the_mesh_is_in_the_intervals():
     told = [u.residual_model.summarise().sites["s0"].mesh_share for u in (without, counted)]
     assert told[0] is None
     assert 0.005 < told[1] < 0.03
-    stored = counted.residual_model.to_dict()
-    assert stored["sites"]["s0"]["mesh_N"] == pytest.approx(mesh[0])
-    assert stored["mesh_misfit"]["share"] < 0.002
-    assert without.residual_model.to_dict()["mesh_misfit"] is None
+    stored = counted.residual_model.summarise()
+    assert stored.sites["s0"].mesh_N == pytest.approx(mesh[0])
+    assert stored.mesh_misfit.share < 0.002
+    assert without.residual_model.summarise().mesh_misfit is None
 
 
 def test_records_of_a_site_share_the_error_of_its_mesh():
@@ -347,10 +348,19 @@ def test_the_slope_of_the_restricted_likelihood_is_its_derivative(mesh, site):
     assert rows.criterion(at)[1] == pytest.approx(np.array(slopes), rel=1e-4)
 
 
+def counted_residuals() -> RecordResiduals:
+    """What is stored of a record's residuals."""
+    return linear_fit(records(0.02, seed=1))[1].residual_model.summarise().sites["s0"]
+
+
 def test_the_error_of_a_mesh_keeps_its_shape_where_it_was_measured():
     """Elsewhere it goes with the force, and is as large as the median of the others."""
     force, own = np.array([1.0, 2.0, 3.0, 0.0]), [0.01, 0.0, -0.02, 0.0]
-    stored = {"a": {"mesh_N": own, "mesh_share": 0.02}, "b": {"mesh_N": None, "mesh_share": None}}
+    plain = counted_residuals()
+    stored = {
+        "a": plain.model_copy(update={"mesh_N": own, "mesh_share": 0.02}),
+        "b": plain.model_copy(update={"mesh_N": None, "mesh_share": None}),
+    }
     known = PredictionModel(np.eye(1), np.ones(1), stored, 0.0, 10.0)
     assert known.find_mesh_error("a", force) == pytest.approx(own)
     assert known.find_mesh_error("b", force) == pytest.approx(np.zeros(4))
