@@ -114,6 +114,22 @@ def test_first_guesses_of_the_part_save_iterations_and_change_no_force(site):
     assert nested.facts["newton_iterations"] < rest.facts["newton_iterations"]
 
 
+def test_first_guesses_of_the_part_serve_a_law_with_other_parameters(site):
+    """Two relaxation terms, of which one does nothing, are the law of one."""
+    start = tuple(1.2 * to_vector(TRUTH, TISSUES))
+    one = simulate(job(site, sensitivities=False, starts=(start,), nested_mm=RADIUS_MM))
+    model = replace(site, law="ogden-prony2")
+    two = np.array(
+        [[c, m, gamma, tau, 1e-9, 8.0] for c, m, gamma, tau in to_vector(TRUTH, TISSUES).reshape(2, 4)]
+    )
+    more = replace(
+        job(model, sensitivities=False, nested_mm=RADIUS_MM),
+        parameters=tuple(two.ravel()),
+        starts=(tuple((two * [1.2, 1.2, 1.2, 1.2, 1.0, 1.0]).ravel()),),
+    )
+    assert np.abs(simulate(more).force_N - one.force_N).max() < 1e-6 * one.force_N.max()
+
+
 def test_first_guesses_do_not_depend_on_what_was_simulated_before(site):
     """The part's simulation is at hand in one process, and not in the other."""
     start = tuple(1.2 * to_vector(TRUTH, TISSUES))

@@ -50,6 +50,9 @@ class WarmStart:
         shapes = [(state.u.shape, len(state.coordinates)) for state in result.states[:1]] if result else []
         if result is None or shapes != [(problem.mesh.points.shape, rows)]:
             return cls(np.zeros(0), ())
+        times = np.array([state.time for state in result.states])
+        if all(state.sensitivity is None for state in result.states):  # of whatever law and parameters
+            return cls(times, tuple(state.rows for state in result.states))
         new, old = problem.parameters, result.problem.parameters
         with np.errstate(all="ignore"):  # moduli act by their ratio
             change = np.where(new * old > 0.0, old * np.log(new / old), new - old)
@@ -57,7 +60,7 @@ class WarmStart:
             state.rows if state.sensitivity is None else state.rows + state.slopes @ change
             for state in result.states
         ]
-        return cls(np.array([state.time for state in result.states]), tuple(moved))
+        return cls(times, tuple(moved))
 
     def at(self, t: float) -> Array | None:
         """Displacement (n, 3) at a time, linear between the states; None outside of them."""
