@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -12,13 +13,15 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2] / "anatomy"))
 from limbs import leg_image
 
+from completing import complete
 from conftest import write_trace
 from limbfit import check_study, load_study, run_study
 from limbfit.anatomy.imaging import write_labels, write_volume
 from limbfit.report.page import Bullets
 from limbfit.report.sections.model import make_model_section
 from limbfit.report.sections.records import make_record_check_section
-from limbfit.report.store import Results, load_store
+from limbfit.report.store import load_store
+from limbfit.results.identification import PredictResult
 
 PLACES = ([40.0, 0.0, 60.0], [0.0, 40.0, 50.0], [-40.0, 0.0, 60.0], [0.0, -40.0, 55.0], [28.0, 28.0, 55.0])
 
@@ -119,9 +122,11 @@ def test_an_image_that_says_twice_where_it_lies_is_told_by_check_stage_and_repor
 
 
 def section(tmp_path, **predict):
-    empty = {"run": {}, "segment": {}, "surfaces": {}, "sites": (), "traces": {}, "mesh": {}}
-    more = {"calibration": {}, "simulated": (), "compared": (), "truth": {}}
-    return make_record_check_section(Results(tmp_path, **empty, **more, predict={"sites": [], **predict}))
+    """The section of a folder that holds predictions alone."""
+    content = complete(PredictResult, {"sites": [], **predict})
+    (tmp_path / "predict").mkdir(exist_ok=True)
+    (tmp_path / "predict" / "predict.json").write_text(json.dumps(content))
+    return make_record_check_section(load_store(tmp_path))
 
 
 def test_the_report_says_that_nothing_is_wrong_or_what_is(five, tmp_path):
