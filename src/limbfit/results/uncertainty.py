@@ -150,6 +150,7 @@ class IntervalParts(ResultPart):
     half_width_percent: float | None = Field(description="Half the width of the interval.")
     parameters_sd_percent: float | None = Field(description="Standard deviation by the parameters.")
     sources_sd_percent: float | None = Field(description="Standard deviation by the sources.")
+    site_sd_percent: float | None = Field(description="Standard deviation by the site's own stiffness.")
     noise_sd_percent: float | None = Field(description="Standard deviation by noise.")
     misfit_sd_percent: float | None = Field(description="Standard deviation by the misfit.")
 

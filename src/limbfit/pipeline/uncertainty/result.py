@@ -83,7 +83,7 @@ def read_emulator(file: Path) -> Emulator:
 
 
 _DRAWS = 1500  # written
-_SHARES = {name: f"{name}_sd_percent" for name in ("parameters", "sources", "noise", "misfit")}
+_SHARES = {name: f"{name}_sd_percent" for name in ("parameters", "sources", "site", "noise", "misfit")}
 _MOST_OFF = 0.5  # of the rise that ends an interval: differences beyond it are told
 
 
@@ -109,11 +109,15 @@ class Found:
 @dataclass(frozen=True)
 class Predicted:
     """A recorded site as predicted at the identified parameters, beside its record and the record's noise
-    (None where the prediction failed)."""
+    (None where the prediction failed).
+
+    ``site_N`` (n,) is one standard deviation of the stiffness that is expected of a site that was not fitted.
+    """
 
     record: SiteRecord
     response: SiteResponse
     noise: SiteNoise | None
+    site_N: Array
 
 
 def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) -> None:
@@ -286,6 +290,7 @@ def _write_prediction(folder: Path, found: Found, one: Predicted) -> IntervalPar
     variances = {
         "parameters": np.einsum("ni,ij,nj->n", scaled, found.explored.posterior.covariance, scaled),
         "sources": np.einsum("ni,ij,nj->n", scaled, found.source_covariance, scaled),
+        "site": (model.site_factor * one.site_N) ** 2,
         "noise": np.diag(one.noise.covariance),
         "misfit": np.full(len(force), (share * peak) ** 2),
     }

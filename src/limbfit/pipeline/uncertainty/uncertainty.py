@@ -28,7 +28,7 @@ from ..identification.intervals import estimate_linearised
 from ..identification.predict import Answer, build_answer_jobs
 from ..identification.problem import CalibrationProblem, build_problem
 from ..identification.record_simulator import RecordSimulator
-from ..records.deviations import estimate_site_noise
+from ..records.deviations import estimate_site_deviation, estimate_site_noise
 from ..records.records import load_records, to_response
 from ..simulation.simulations import SimulationCache, open_experiment_cache
 from .result import Found, Predicted, write_results
@@ -152,7 +152,12 @@ def _predict_sites(
     if records.is_coarsened:
         n = len(records.own)
         responses = MeshCorrection(responses[n:], responses[:n])(responses[n:])
-    return [
-        Predicted(r, end, estimate_site_noise(study, r, end.force_N) if end.completed else None)
-        for r, end in zip(records.searched, responses)
-    ]
+    best, found = study.vector(calibration.parameters), []
+    for record, end in zip(records.searched, responses):
+        noise, of_site = None, np.zeros(len(record.compared))
+        if end.completed:
+            noise = estimate_site_noise(study, record, end.force_N)
+            if not record.site.fitted:
+                of_site = estimate_site_deviation(study, record, end, best)
+        found.append(Predicted(record, end, noise, of_site))
+    return found

@@ -224,6 +224,7 @@ def _make_prediction_table(content: UncertaintyResult) -> Table:
         ("Parameters", "parameters_sd_percent", 2),
         ("Sources", "sources_sd_percent", 2),
         ("Noise", "noise_sd_percent", 2),
+        ("Site's stiffness", "site_sd_percent", 2),
         ("Misfit", "misfit_sd_percent", 2),
     )
     found = content.predictions
