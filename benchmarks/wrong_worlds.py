@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from limbfit.autoregressive import compute_block_covariance
-from limbfit.identify.checks.fit_quality import FitQuality, assess_fit, refit_residuals
+from limbfit.identify.checks.fit_quality import assess_fit, refit_residuals
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import Unknowns, build_space, build_stage_groupings, group_separately
@@ -41,6 +41,7 @@ from limbfit.identify.uncertainty.intervals import EvaluationStore, sample_uncer
 from limbfit.identify.uncertainty.noise import compute_depth_slope, estimate_record_noise
 from limbfit.identify.uncertainty.relaxation import GIVES_WAY, assess_relaxation
 from limbfit.identify.uncertainty.uncertainty import DETERMINED, NORMAL_95, estimate_uncertainty
+from limbfit.results.identification import RecordFit
 
 Array = NDArray[np.float64]
 Terms = tuple[tuple[float, float], ...]  # amplitude and time, s
@@ -302,7 +303,7 @@ def _judge_fit(
     best: Array,
     noise: Sequence[Array],
     off: Sequence[Array],
-) -> list[FitQuality]:
+) -> list[RecordFit]:
     """What the stage ``predict`` says of the fit; nothing here has a mesh."""
     allowed = [covariance + np.outer(error, error) for covariance, error in zip(noise, off, strict=True)]
     residuals = [r.force_N - one.force_N for r, one in zip(responses, records, strict=True)]

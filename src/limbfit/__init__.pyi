@@ -3,10 +3,9 @@
 from ._version import __version__ as __version__
 from .anatomy.imaging import describe_series as describe_series
 from .anatomy.images.formats import register_image_format as register_image_format
-from .bench.forward import bench_forward as bench_forward
 from .bench.meshing import bench_meshing as bench_meshing
 from .bench.parity import bench_febio_parity as bench_febio_parity
-from .bench.scaling import bench_scaling as bench_scaling
+from .bench.timing import bench_forward as bench_forward, bench_scaling as bench_scaling
 from .errors import (
     InputError as InputError,
     LimbfitError as LimbfitError,

@@ -182,7 +182,7 @@ def test_curved_elements_follow_the_skin_better_than_straight_ones(
 def test_shallow_bone_is_trimmed_and_reported() -> None:
     deep, shallow = limb(), limb(bone_offset=19.0)
     fields = build_limb_fields(deep, COARSE.layers, COARSE.bone_clearance_mm)
-    assert fields.trimmed()["tibia"].volume_mm3 == 0.0
+    assert fields.measure_trimmed_bones()["tibia"].volume_mm3 == 0.0
     position, axis = site_of(shallow, np.array([1.0, 0, 0]), -40.0)
     mesh, report = mesh_site(shallow, position, axis, COARSE)
     trimmed = report.trimmed_bone["tibia"]

@@ -24,8 +24,8 @@ def test_a_good_map_has_measures_and_no_suspects(leg):
     quality = assess_labels(leg[1])
     assert quality.suspects == ()
     tibia = quality.labels["tibia"]
-    assert tibia["volume_cm3"] == pytest.approx(np.pi * 1.3**2 * 12, rel=0.07)
-    assert (tibia["pieces"], tibia["holes"], tibia["slices_without"]) == (1, 0, 0)
+    assert tibia.volume_cm3 == pytest.approx(np.pi * 1.3**2 * 12, rel=0.07)
+    assert (tibia.pieces, tibia.holes, tibia.slices_without) == (1, 0, 0)
     json.dumps(quality.summarise().to_plain())
 
 
@@ -71,8 +71,8 @@ def test_pieces_and_holes_are_counted(leg):
     array[k, j, i] = labels.soft_value
     array[30, 30, 30:32] = labels.value("tibia")
     facts = assess_labels(labels.with_array(array)).labels["tibia"]
-    assert (facts["pieces"], facts["holes"]) == (2, 1)
-    assert facts["holes_cm3"] == pytest.approx(0.01)
+    assert (facts.pieces, facts.holes) == (2, 1)
+    assert facts.holes_cm3 == pytest.approx(0.01)
 
 
 def test_slices_are_counted_along_the_limb_whatever_the_axis(leg):

@@ -59,7 +59,7 @@ def test_a_site_shows_what_is_asked_for_and_no_more(phantom):
     job = ForceJob("05", mesh, at, axis, site.ramp, steps, draw_true_parameters(0))
     plain, found = (
         simulate_true_force(job),
-        simulate_true_force(replace(job, seen=SecondaryMeasurements(True, True, True))),
+        simulate_true_force(replace(job, measurements=SecondaryMeasurements(True, True, True))),
     )
     assert found.force == pytest.approx(plain.force, abs=1e-6 * plain.force.max())
     assert (plain.layers, len(plain.skin_points)) == ({}, 0)

@@ -41,9 +41,9 @@ from .materials import (
     OgdenPower,
     OgdenQLV,
 )
-from .motion import Motion, RigidBody
+from .motion import Activation, Motion, RigidBody
 from .pressure import Pressure
-from .problem import Activation, History, Problem, Support, isochoric_stretch
+from .problem import History, Problem, Support, isochoric_stretch
 from .result import Result, State, Step
 from .solution.compiling import are_compiled, compile_kernels
 from .solution.control import StepControl

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..errors import ProblemError
-from .contact.contact import RigidShape
+from .contact.rigid import RigidShape
 
 HARDNESS_GROWING = 0.05  # of a surface that grows: its points move along it by tenths of a mm in a step
 # A body's coordinates: its move along the axes of its frame at the start, mm, and its rotation vector about
@@ -234,3 +234,47 @@ class RigidBody:
     def origin(self) -> Array:
         """(3,) the pivot, mm."""
         return np.asarray(self.shape.centre if self.pivot is None else self.pivot, dtype=float)
+
+
+@dataclass(frozen=True)
+class Activation:
+    """The share of full activation over time, piecewise linear; the last one holds on.
+
+    Parameters
+    ----------
+    times : (n,) s, from 0.
+    shares : (n,) of the active stress of every `Contractile` tissue; 0 at rest, not negative.
+
+    Raises
+    ------
+    ProblemError
+        Where times do not grow from 0, or a share is negative or not finite.
+    """
+
+    times: Sequence[float] | Array
+    shares: Sequence[float] | Array
+
+    def __post_init__(self) -> None:
+        times, shares = np.asarray(self.times, dtype=float), np.asarray(self.shares, dtype=float)
+        if times.ndim != 1 or times.shape != shares.shape or len(times) < 2:
+            raise ProblemError("an activation needs two or more times and as many shares")
+        if not np.isfinite(times).all() or times[0] != 0.0 or not (np.diff(times) > 0).all():
+            raise ProblemError("the times of an activation do not grow from 0")
+        if not (np.isfinite(shares).all() and (shares >= 0.0).all()):
+            raise ProblemError("a share of an activation is negative or not finite")
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "shares", shares)
+
+    def at(self, t: float) -> float:
+        """The share at time ``t``, s."""
+        return float(np.interp(t, np.asarray(self.times), np.asarray(self.shares)))
+
+    def delay(self, seconds: float) -> Activation:
+        """The same after so many seconds at its first share."""
+        times, shares = np.asarray(self.times), np.asarray(self.shares)
+        return Activation(np.append(0.0, times + seconds), np.append(shares[0], shares))
+
+    def moving_s(self, t: float) -> float:
+        """For how long the share has changed up to time ``t``, s."""
+        times, steps = np.asarray(self.times), np.diff(self.times)
+        return float((np.clip(t - times[:-1], 0.0, steps) * (np.diff(self.shares) != 0.0)).sum())

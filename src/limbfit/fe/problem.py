@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -16,7 +16,7 @@ from ..phases import MotionPhase, find_boundaries, find_loading_end, find_phases
 from .contact.indenter import Indenter
 from .kernel.elements import ELEMENTS, Element
 from .materials import Material
-from .motion import Drives, Motion, RigidBody
+from .motion import Activation, Drives, Motion, RigidBody
 from .pressure import Pressure
 
 
@@ -275,50 +275,6 @@ class Problem:
     def parameters(self) -> NDArray[np.float64]:
         """Values in the order of `parameter_names`; mm, N, s, MPa."""
         return np.array([v for region in self.mesh.region_names for v in self.materials[region].parameters])
-
-
-@dataclass(frozen=True)
-class Activation:
-    """The share of full activation over time, piecewise linear; the last one holds on.
-
-    Parameters
-    ----------
-    times : (n,) s, from 0.
-    shares : (n,) of the active stress of every `Contractile` tissue; 0 at rest, not negative.
-
-    Raises
-    ------
-    ProblemError
-        Where times do not grow from 0, or a share is negative or not finite.
-    """
-
-    times: Sequence[float] | Array
-    shares: Sequence[float] | Array
-
-    def __post_init__(self) -> None:
-        times, shares = np.asarray(self.times, dtype=float), np.asarray(self.shares, dtype=float)
-        if times.ndim != 1 or times.shape != shares.shape or len(times) < 2:
-            raise ProblemError("an activation needs two or more times and as many shares")
-        if not np.isfinite(times).all() or times[0] != 0.0 or not (np.diff(times) > 0).all():
-            raise ProblemError("the times of an activation do not grow from 0")
-        if not (np.isfinite(shares).all() and (shares >= 0.0).all()):
-            raise ProblemError("a share of an activation is negative or not finite")
-        object.__setattr__(self, "times", times)
-        object.__setattr__(self, "shares", shares)
-
-    def at(self, t: float) -> float:
-        """The share at time ``t``, s."""
-        return float(np.interp(t, np.asarray(self.times), np.asarray(self.shares)))
-
-    def delay(self, seconds: float) -> Activation:
-        """The same after so many seconds at its first share."""
-        times, shares = np.asarray(self.times), np.asarray(self.shares)
-        return Activation(np.append(0.0, times + seconds), np.append(shares[0], shares))
-
-    def moving_s(self, t: float) -> float:
-        """For how long the share has changed up to time ``t``, s."""
-        times, steps = np.asarray(self.times), np.diff(self.times)
-        return float((np.clip(t - times[:-1], 0.0, steps) * (np.diff(self.shares) != 0.0)).sum())
 
 
 def isochoric_stretch(directions: ArrayLike, stretches: ArrayLike) -> Array:

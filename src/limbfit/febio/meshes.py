@@ -17,7 +17,7 @@ import numpy as np
 from ..arrays import Array, Indices
 from ..errors import ProblemError
 from ..fe import Indenter, Motion, OpenSurface, Problem, SmoothSurface, System
-from ..fe.contact.contact import RigidShape
+from ..fe.contact.rigid import RigidShape
 from .conditions import FIXED_SET, find_rail, format_row, to_rail_motion, to_space
 
 INDENTER, PATCH, FRONT = "indenter", "contact_patch", "indenter_front"

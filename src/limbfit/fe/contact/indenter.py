@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...arrays import Array
 from ...errors import ProblemError
 from ...shapes import SHAPES, SHARP_EDGE, RigidSurface, Shape, Size
-from .contact import RigidShape
+from .rigid import RigidShape
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from ...shapes.triangles import (
     feature_normal,
     find_neighbours,
 )
-from .contact import RigidShape
+from .rigid import RigidShape
 
 
 @dataclass(frozen=True, eq=False)

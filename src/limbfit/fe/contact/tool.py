@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from ...arrays import Array
-from .contact import ContactSurface, RigidShape
+from .contact import ContactSurface
+from .rigid import RigidShape
 
 
 @dataclass(frozen=True)
