@@ -60,7 +60,7 @@ def test_tissue_goes_with_the_rigid_body_that_carries_it(tmp_path, text):
     stress = 2.0 / 3.0 * G * J ** (-5.0 / 3.0) * (J**2 - 1.0) + K * np.log(J) / J
     np.testing.assert_allclose(log.column("Fz"), 100.0 * stress, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(log.column("z"), 11.0 - 3.0 * log.times)
-    assert np.abs(log.column("Fx")).max() < 1e-9
+    assert np.abs(log.column("Fx")).max() < 1e-9 * np.abs(log.column("Fz")).max()  # N, by symmetry
     last = (tmp_path / "out" / "nodes.txt").read_text().rpartition("*Data")[2].splitlines()[1:]
     heights = {int(row.split(",")[0]): float(row.split(",")[1]) for row in last}
     assert [heights[node] for node in (5, 6, 7, 8)] == pytest.approx([7.0] * 4)
