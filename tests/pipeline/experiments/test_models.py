@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,20 @@ from limbfit.laws import FUNG, LAWS
 from limbfit.pipeline.commands.models import (
     MODELS,
     OWN,
+    _mix_predictions,
+    _mix_pressures,
     compare_models,
     derive_study,
     fit_socket_of_models,
     select_models,
 )
 from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.engine.storage import write_curves, write_result
+from limbfit.report.sections.uncertainty import make_models_section
+from limbfit.report.store import load_store
+from limbfit.results.identification import PredictResult
+from limbfit.results.models import ModelsResult, ModelWeight, SocketOfModels
+from limbfit.results.socket import SocketResult
 from limbfit.study import Study
 
 STATED = """
@@ -118,3 +127,45 @@ def test_the_interval_of_a_mixture_holds_95_percent_of_it():
         np.testing.assert_allclose(below, [0.025, 0.975], atol=1e-9)
     assert (low[1], high[1]) == pytest.approx(norm.interval(0.95, 1.0, 2.0))
     assert OWN not in MODELS
+
+
+STORED = Path(__file__).parents[2] / "results" / "stored"  # of real runs
+
+
+def test_predictions_of_models_are_mixed_and_read_back(tmp_path):
+    """A model that is as likely as the study's own, and predicts forces that are 1 N larger."""
+    study = study_of(tmp_path / "s")
+    derived = {FUNG: derive_study(study, FUNG)}
+    time = np.linspace(0.0, 6.0, 31)
+    for one, more in ((study, 0.0), (derived[FUNG], 1.0)):
+        for stage in ("calibrate", "predict"):
+            shutil.copytree(STORED / stage, one.results / stage)
+        for row in PredictResult.read(one.results).sites:
+            force = 4.0 * np.sin(np.pi * time / 6.0)
+            curves = {"time_s": time, "force_measured_N": force, "force_simulated_N": force + more}
+            ends = {"force_low_N": force + more - 0.2, "force_high_N": force + more + 0.2}
+            write_curves(one.results / "predict" / f"{row.record}.csv", **curves, **ends)
+    content = _mix_predictions(study, derived, {"thinner": "the layer is thin"})
+    write_result(study.results / ModelsResult.FILE, content)
+    assert ModelsResult.read(study.results) == content
+    assert [one.weight for one in content.models] == pytest.approx([0.5, 0.5])
+    record = content.records[0]
+    assert record.own_interval_95 == pytest.approx((3.8, 4.2))
+    assert record.interval_95 == pytest.approx((3.83, 5.17), abs=0.01)
+    assert record.sd_between_models == pytest.approx(0.5)
+    section = make_models_section(load_store(study.results), content)
+    assert "Fung" in section.blocks[1].rows[1].cells[0].text
+
+
+def test_pressures_of_models_are_mixed_and_read_back(tmp_path):
+    own = SocketResult.read(STORED)
+    loads = _mix_pressures([own, own], np.array([0.3, 0.7]))
+    assert [load.name for load in loads] == ["donning", *(load.name for load in own.loads)]
+    region, mixed = own.donning.regions[0], loads[0].regions[0]
+    assert mixed.mean_kPa == [region.mean_kPa] * 2
+    assert mixed.interval_kPa == pytest.approx(region.interval_kPa or 2 * (region.mean_kPa,), abs=1e-6)
+    weights = [ModelWeight(model=OWN, words="", weight=0.3), ModelWeight(model=FUNG, words="", weight=0.7)]
+    content = SocketOfModels(models=weights, loads=loads)
+    (tmp_path / "models").mkdir()
+    write_result(tmp_path / SocketOfModels.FILE, content)
+    assert SocketOfModels.read(tmp_path) == content
