@@ -30,7 +30,7 @@ import limbfit
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import to_vector
 from limbfit.pipeline.engine.context import Context, ignore_progress
-from limbfit.pipeline.engine.storage import write_curves
+from limbfit.pipeline.engine.storage import read_json, write_curves
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.simulation.limb_geometry import build_site_model
 from limbfit.pipeline.simulation.simulations import SimulationCache, build_curve_job
@@ -107,8 +107,8 @@ def true_limb(folder: Path, plan: Path) -> Path:
     )
     study = limbfit.load_study(plan)
     store = Store(study.results)
-    placed = {row["site"]: row for row in store.read("sites", "sites.json")["sites"]}
-    designed = store.read("protocol", "protocol.json")["records"]
+    placed = {row["site"]: row for row in read_json(store["sites"] / "sites.json")["sites"]}
+    designed = read_json(store["protocol"] / "protocol.json")["records"]
     for site in study.sites:
         depths = [site.depth_mm or 0.0, *(row["depth_mm"] for row in designed if row["site"] == site.name)]
         text += SITE.format(name=site.name, position=placed[site.name]["position_mm"], depth=max(depths))
@@ -165,7 +165,10 @@ def record(plan: Path, device: Path) -> None:
 def judged(folder: Path, plan: Path) -> dict[str, Any]:
     """What the identification found, beside the truth."""
     store = Store(limbfit.load_study(plan).results)
-    found, predicted = store.read("calibrate", "calibration.json"), store.read("predict", "predict.json")
+    found, predicted = (
+        read_json(store["calibrate"] / "calibration.json"),
+        read_json(store["predict"] / "predict.json"),
+    )
     truth = json.loads((folder / "patient" / "truth.json").read_text())["parameters"]
     known = found["uncertainty"]
     rows = {}

@@ -43,6 +43,7 @@ from limbfit.identify.uncertainty.emulator import Emulator
 from limbfit.identify.uncertainty.noise import SiteNoise, compute_depth_slope, estimate_record_noise
 from limbfit.phantom.record import DISPLACEMENT_NOISE_MM, RATE_HZ
 from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.engine.storage import read_json
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.problem import build_unknowns
 from limbfit.pipeline.records.deviations import estimate_site_deviation
@@ -170,7 +171,7 @@ def study_robot(
     study = load_study(study_file)
     store = Store(study.results)
     context = Context(study, store, SerialExecutor(), lambda progress: None)
-    found = store.read("uncertainty", "uncertainty.json")
+    found = read_json(store["uncertainty"] / "uncertainty.json")
     truth = np.array([row["calibrated"] for row in found["parameters"]])
     records = tuple(load_site_record(context, record) for record in study.records_at(*study.fitted))
     emulator = read_emulator(store["uncertainty"] / EMULATOR)

@@ -32,6 +32,7 @@ from limbfit import check_study, load_study, run_study
 from limbfit.errors import LimbfitError
 from limbfit.identify.fit.multistart import draw_starts
 from limbfit.indentation import to_parameters, to_vector
+from limbfit.pipeline.engine.storage import read_json
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.problem import build_unknowns
 
@@ -127,7 +128,7 @@ def run_start(study: Study, number: int, count: int, seed: int) -> Record:
     told: Record = {"case": number, "start": list(values.values()), "refused": ""}
     try:
         run_study(load_study(copy), until="calibrate", listener=quiet)
-        told |= ending(Store(copy / "results").read("calibrate", "calibration.json"))
+        told |= ending(read_json(Store(copy / "results")["calibrate"] / "calibration.json"))
     except LimbfitError as error:
         told["refused"] = str(error)
     shutil.rmtree(copy)

@@ -11,6 +11,7 @@ from identification_cases import make_study
 
 from limbfit import load_study, run_study
 from limbfit.indentation import list_flat_names, to_vector
+from limbfit.pipeline.engine.storage import read_json
 from limbfit.pipeline.engine.store import Store
 
 Record = dict[str, Any]
@@ -55,7 +56,10 @@ class Study:
 def outcome(copy: Path) -> Record:
     """What a study that was run to its prediction found."""
     store = Store(copy / "results")
-    found, predicted = store.read("calibrate", "calibration.json"), store.read("predict", "predict.json")
+    found, predicted = (
+        read_json(store["calibrate"] / "calibration.json"),
+        read_json(store["predict"] / "predict.json"),
+    )
     rows = predicted["sites"]
     return {
         **ending(found),

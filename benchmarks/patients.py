@@ -45,7 +45,10 @@ def run_patient(folder: Path, seed: int, detail: str) -> Record:
     study = load_study(folder)
     run_study(study, until="predict", listener=tell)
     store = Store(study.results)
-    found, predicted = store.read("calibrate", "calibration.json"), store.read("predict", "predict.json")
+    found, predicted = (
+        read_json(store["calibrate"] / "calibration.json"),
+        read_json(store["predict"] / "predict.json"),
+    )
     truth = to_vector(read_json(folder / "truth.json")["parameters"], study.tissues)
     best = to_vector(found["stages"][-1]["parameters"], study.tissues)
     names = [f"{tissue}.{name}" for tissue, name in list_flat_names(study.tissues)]

@@ -42,6 +42,7 @@ from limbfit.indentation import to_vector
 from limbfit.phantom.record import NOTHING, ULTRASOUND_NOISE_MM, WAVES_NOISE_M_S, SecondaryMeasurements
 from limbfit.pipeline.design.protocol import DETERMINED
 from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.engine.storage import read_json
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.problem import build_unknowns
 from limbfit.pipeline.simulation.limb_geometry import build_site_model, coarsen_model
@@ -212,7 +213,10 @@ def expected(folder: Path, limb: Limb, edge_mm: float | None) -> list[dict[str, 
 def judged(folder: Path, limb: Limb, takes: Sequence[Take]) -> dict[str, Any]:
     """What a study that was run to its prediction found, beside the truth."""
     store = Store(folder / "results")
-    found, predicted = store.read("calibrate", "calibration.json"), store.read("predict", "predict.json")
+    found, predicted = (
+        read_json(store["calibrate"] / "calibration.json"),
+        read_json(store["predict"] / "predict.json"),
+    )
     truth, known = to_vector(parameters_of(limb.seed), TISSUES), found["uncertainty"]
     names = list(known["verdict"])
     intervals = [known["intervals_95"][tissue][key] for tissue, key in (n.split(".") for n in names)]

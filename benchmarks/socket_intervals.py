@@ -33,6 +33,7 @@ from limbfit.indentation import list_flat_names, to_parameters, to_vector
 from limbfit.mesh import Mesh
 from limbfit.phantom.build import draw_true_parameters
 from limbfit.pipeline.engine.context import Context, ignore_progress
+from limbfit.pipeline.engine.storage import read_json
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.socket.intervals import ParameterSpread, draw_step, predict_change
 from limbfit.pipeline.socket.limb import SocketLimb
@@ -49,7 +50,7 @@ class Bench:
     def __init__(self, study: limbfit.Study, identified: limbfit.Study, folder: Path) -> None:
         limbfit.run_study(study, until="surfaces")
         context = Context(study, Store(study.results), SerialExecutor(), ignore_progress)
-        found = Store(identified.results).read("calibrate", "calibration.json")
+        found = read_json(Store(identified.results)["calibrate"] / "calibration.json")
         self.study = study
         self.covariance = np.array(found["uncertainty"]["covariance_log"])
         self.centre = to_vector(found["stages"][-1]["parameters"], study.tissues)

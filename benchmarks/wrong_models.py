@@ -89,7 +89,7 @@ skin = "skin.stl"
 load_steps = {load}
 unload_steps = {unload}
 [mesh]
-element = "tet10"
+element = "tet10p0"
 [mesh.coarse]
 edge_near_mm = 8.0
 """
@@ -220,7 +220,7 @@ class World:
             write_vtu(layered_block(stack, TISSUES, divisions=TRUE_DIVISIONS, height_mm=5.0), file)
         angle = np.radians(truth.tilt_degrees)
         model = replace(
-            build_block_model(name, file, TRUE_STEPS, "tet10", depth),
+            build_block_model(name, file, TRUE_STEPS, "tet10p0", depth),
             knots_s=tuple(knots_s),
             knots_mm=tuple(knots_mm),
             indenter=indenter.model_copy(update={"friction": truth.friction}),
@@ -293,38 +293,32 @@ def run_draw(name: str, folder: Path, seed: int) -> dict[str, Any]:
     run_traces(context, store["traces"])
     run_calibrate(context, store["calibrate"])
     run_predict(context, store["predict"])
-    calibration = store.read("calibrate", "calibration.json")
-    predicted = store.read("predict", "predict.json")
-    parameters = calibration["stages"][-1]["parameters"]
-    model = PredictionModel.from_stored(calibration["uncertainty"])
-    tested = RecordedRange.from_dict(predicted["recorded_range"])
+    calibration, predicted = store.results.calibration, store.results.predict
+    known, parameters = calibration.uncertainty, calibration.parameters
+    model = PredictionModel.from_stored(known)
+    tested = RecordedRange.from_stored(predicted.recorded_range)
     found: dict[str, list[dict[str, Any]]] = {case: [] for case in CASES}
     for site, (_, depth, fitted) in SITES.items():
         if fitted:
             continue
         found["held out"].append(compare_record(world, store, site, depth))
-        row = next(row for row in predicted["sites"] if row["record"] == site)
-        found["held out"][-1]["outside"] = bool(row["outside_records"])
+        row = next(row for row in predicted.sites if row.record == site)
+        found["held out"][-1]["outside"] = bool(row.outside_records)
         for case, (knots_s, knots_mm, indenter) in list_cases(depth).items():
             own = replace(
-                build_block_model(site, store["mesh"] / f"{site}.vtu", MODEL_STEPS, "tet10", depth),
+                build_block_model(site, store["mesh"] / f"{site}.vtu", MODEL_STEPS, "tet10p0", depth),
                 knots_s=knots_s, knots_mm=knots_mm, indenter=indenter,
             )  # fmt: skip
             found[case].append(compare_case(world, study, own, parameters, model, tested, case))
-    inside = {
-        f"{tissue}.{key}": calibration["uncertainty"]["intervals_95"][tissue][key]
-        for tissue in TISSUES
-        for key in TRUE[tissue]
-    }
     return {
         "truth": name,
         "seed": seed,
         "cases": found,
-        "fit": predicted["fit_quality"]["verdict"],
-        "named": any(row["verdict"] for row in predicted["fit_quality"]["records"]),
-        "verdict": calibration["uncertainty"]["verdict"],
-        "intervals_95": inside,
-        "error_fitted_percent": predicted["mean_error_fitted_percent"],
+        "fit": predicted.fit_quality.verdict,
+        "named": any(row.verdict for row in predicted.fit_quality.records),
+        "verdict": dict(known.verdict),
+        "intervals_95": known.to_plain()["intervals_95"],
+        "error_fitted_percent": predicted.mean_error_fitted_percent,
     }
 
 

@@ -267,10 +267,10 @@ def run_draw(world: World, seed: int, hold_s: float, after_s: float) -> dict[str
     residual_model = linearised.residual_model
     relaxation = assess_relaxation(best, found.responses, measured, residual_model, UNKNOWNS, space)
     assert relaxation is not None
-    residuals = known.residual_model.to_dict()
+    residuals = known.residual_model.summarise()
     model = PredictionModel(
-        known.covariance, known.centre, residuals["sites"], residuals["misfit_elsewhere"],
-        residuals["known_scale"], residuals["site_factor"] or 1.0,
+        known.covariance, known.centre, residuals.sites, residuals.misfit_elsewhere,
+        residuals.known_scale, residuals.site_factor or 1.0,
     )  # fmt: skip
     inside = (known.intervals_95[:, 0] <= truth) & (truth <= known.intervals_95[:, 1])
     verdicts = relaxation.qualify_verdicts(known)
