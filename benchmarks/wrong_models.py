@@ -74,7 +74,7 @@ TRUE: Values = {
     "muscle": {"c_kPa": 4.7, "m": 4.6, "gamma": 3.2, "tau_s": 0.3},
 }
 SPREAD_LOG, SPEED_MM_S, FASTER, HOLD_S = 0.1, 0.96, 10.0, 60.0
-DIVISIONS, COARSE_DIVISIONS, TRUE_DIVISIONS = 6, 4, 7
+DIVISIONS, COARSE_DIVISIONS, TRUE_DIVISIONS = 10, 7, 12
 MODEL_STEPS = SolverTable(load_steps=6, unload_steps=5)
 TRUE_STEPS = SolverTable(load_steps=14, unload_steps=12)
 PAD = IndenterTable(shape="cylinder", width_mm=34.0, edge_radius_mm=4.0)
