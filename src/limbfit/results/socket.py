@@ -27,8 +27,8 @@ class LoadedRegion(ResultPart):
     change_kPa: Mapping[str, float] | None = Field(
         description="Change of the mean pressure where a parameter is 10 % larger."
     )
-    relaxation_kPa: Interval | None = Field(
-        description="Shift of it by relaxation beyond the records, and its standard deviation."
+    relaxation_kPa: tuple[float, float, float] | None = Field(
+        description="What relaxation beyond the records adds: shift, standard deviation, largest further fall."
     )
     missed_kPa: Interval | None = Field(
         default=None, description="Mean and standard deviation of what the derivatives miss of the samples."
@@ -82,8 +82,8 @@ class SocketLoad(SocketState):
     settling_change_mm: Mapping[str, float] | None = Field(
         description="Change of the settling where a parameter is 10 % larger."
     )
-    settling_relaxation_mm: Interval | None = Field(
-        description="Shift of it by relaxation beyond the records, and its standard deviation."
+    settling_relaxation_mm: tuple[float, float, float] | None = Field(
+        description="What relaxation beyond the records adds: shift, standard deviation, largest further fall."
     )
     settling_missed_mm: Interval | None = Field(
         default=None, description="Mean and standard deviation of what the derivatives miss of the samples."
