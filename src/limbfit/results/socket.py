@@ -28,7 +28,7 @@ class LoadedRegion(ResultPart):
         description="Change of the mean pressure where a parameter is 10 % larger."
     )
     relaxation_kPa: tuple[float, float, float] | None = Field(
-        description="What relaxation beyond the records adds: shift, standard deviation, largest further fall."
+        description="By relaxation beyond the records: shift, standard deviation, largest fall."
     )
     missed_kPa: Interval | None = Field(
         default=None, description="Mean and standard deviation of what the derivatives miss of the samples."
@@ -83,7 +83,7 @@ class SocketLoad(SocketState):
         description="Change of the settling where a parameter is 10 % larger."
     )
     settling_relaxation_mm: tuple[float, float, float] | None = Field(
-        description="What relaxation beyond the records adds: shift, standard deviation, largest further fall."
+        description="By relaxation beyond the records: shift, standard deviation, largest fall."
     )
     settling_missed_mm: Interval | None = Field(
         default=None, description="Mean and standard deviation of what the derivatives miss of the samples."
