@@ -38,6 +38,7 @@ start = { m = 4.0 }
 upper = { c_kPa = 30.0, tau_s = 5.0 }
 [calibration]
 fixed = ["skin.tau_s", "skin.m"]
+tied = [["skin.gamma", "muscle.gamma"], ["skin.c_kPa", "muscle.c_kPa"]]
 prior = { "muscle.c_kPa" = { median = 5.0, factor = 1.5 }, "muscle.m" = { median = 4.0, factor = 2.0 } }
 """
 
@@ -76,6 +77,9 @@ def test_a_law_keeps_what_is_stated_of_the_parameters_that_it_has(tmp_path):
     assert derived.material.start["b"] == LAWS[FUNG].parameters[1].start
     assert derived.material.of("skin", "upper") == {"c_kPa": 30.0, "b": 20.0, "gamma": 10.0, "tau_s": 5.0}
     assert derived.fixed == ("skin.tau_s",)
+    assert derived.calibration.tied == (("skin.gamma", "muscle.gamma"), ("skin.c_kPa", "muscle.c_kPa"))
+    two = derive_study(study_of(tmp_path / "t"), "two-terms")
+    assert two.calibration.tied == (("skin.c_kPa", "muscle.c_kPa"),)
     assert set(derived.priors) == {"muscle.c_kPa"}
 
 

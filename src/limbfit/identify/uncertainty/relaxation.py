@@ -47,7 +47,7 @@ GIVES_WAY = (
     "the force falls slowly until the records end: a limb that gives way to the indenter looks the same, and "
     "its tissue is stiffer in the long term than the intervals say; check that it was held"
 )
-_MOST = 0.5  # of the weights
+_MIN_TAIL_WEIGHT = 0.5  # from which a limb may give way
 MIN_OWN_WEIGHT = 0.1  # of the answer: no other relaxation is quite that of the tissue
 LONG_TERM_S = 3600.0  # after which a modulus is long-term: a socket worn for an hour
 STATED_S = (1.0, 10.0)  # at which moduli are stated
@@ -115,7 +115,7 @@ class RelaxationAssessment:
             UNDECIDED: f"{longest} cannot tell the relaxation of the model from a power law of time",
         }
         found = [f"{preferred[self.preferred]} (2 ln B = {abs(self.evidence):.0f})"]
-        if self.preferred == POWER_LAW and self.tail_weight > _MOST:
+        if self.preferred == POWER_LAW and self.tail_weight > _MIN_TAIL_WEIGHT:
             found.append(GIVES_WAY)
         for number, tissue in enumerate(self.tissues):
             modulus, (low, high) = self.state_modulus(known, number, LONG_TERM_S)

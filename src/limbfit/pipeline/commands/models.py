@@ -91,13 +91,18 @@ def _set_law(name: str, fibred: bool = False) -> Callable[[Study, Document], Non
 
 
 def _drop_unknown(stated: Any, keys: Iterable[str]) -> None:
-    """Remove names of parameters, such as ``skin.tau_s``, that a law with these keys does not have."""
+    """Remove parameters, such as ``skin.tau_s``, and ties of some, if a law with these keys lacks them."""
     known = set(keys)
-    for name in [name for name in stated if str(name).rpartition(".")[2] not in known]:
+
+    def is_known(stated: str | Sequence[str]) -> bool:
+        names = [stated] if isinstance(stated, str) else stated
+        return all(name.rpartition(".")[2] in known for name in names)
+
+    for one in [one for one in stated if not is_known(one)]:
         if isinstance(stated, list):
-            stated.remove(name)
+            stated.remove(one)
         else:
-            del stated[name]
+            del stated[one]
 
 
 def _change_layer(change_mm: float) -> Callable[[Study, Document], None]:
