@@ -35,7 +35,7 @@ from limbfit.identify.checks.fit_quality import assess_fit, refit_residuals
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import Unknowns, build_space, build_stage_groupings, group_separately
-from limbfit.identify.fit.prediction import PredictionModel, compute_error_percent
+from limbfit.identify.fit.prediction import MAX_FREEDOM, PredictionModel, compute_error_percent
 from limbfit.identify.fit.state import CalibrationSettings
 from limbfit.identify.uncertainty.intervals import EvaluationStore, sample_uncertainty
 from limbfit.identify.uncertainty.noise import compute_depth_slope, estimate_record_noise
@@ -270,7 +270,7 @@ def run_draw(world: World, seed: int, hold_s: float, after_s: float) -> dict[str
     residuals = known.residual_model.summarise()
     model = PredictionModel(
         known.covariance, known.centre, residuals.sites, residuals.misfit_elsewhere,
-        residuals.known_scale, residuals.site_factor or 1.0,
+        residuals.known_scale, residuals.site_factor or 1.0, residuals.site_freedom or MAX_FREEDOM,
     )  # fmt: skip
     inside = (known.intervals_95[:, 0] <= truth) & (truth <= known.intervals_95[:, 1])
     verdicts = relaxation.qualify_verdicts(known)

@@ -13,7 +13,9 @@ from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve
 from limbfit.identify.fit.parameters import group_separately
 from limbfit.identify.fit.prediction import (
+    MAX_FREEDOM,
     PredictionModel,
+    combine_freedom,
     compute_error_percent,
     compute_prediction_sd,
     summarise_errors,
@@ -101,19 +103,38 @@ def test_intervals_cover_the_truth_where_sites_are_of_other_stiffness(stiffer):
     assert without.mean() < shares.mean() - 0.1, without
 
 
-def test_how_far_sites_are_off_is_found():
-    """Twelve sites tell it; four leave it near what was expected."""
-    factors = []
-    for sites in (SITES, 3 * SITES):
-        rng = np.random.default_rng(3)
-        clean = records(sites=sites)
+@pytest.mark.parametrize(("sites", "freedom"), [(SITES, (3, 6)), (3 * SITES, (15, 30))])
+def test_how_far_sites_are_off_is_found_and_few_sites_tell_it_poorly(sites, freedom):
+    """Sites that differ by 10 % where 2 % is expected: a factor of 5."""
+    clean, found = records(sites=sites), []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
         data = [replace(d, force_N=(1 + 0.1 * rng.standard_normal()) * d.force_N) for d in clean]
         data = [replace(d, force_N=d.force_N + 0.01 * rng.standard_normal(60)) for d in data]
         data = [replace(d, name=f"s{i}") for i, d in enumerate(data)]
-        _, found = linear_fit(data, sites=sites, site_N=[0.02 * d.force_N for d in clean])
-        factors.append(found.residual_model.site_factor)
-    assert 1.0 < factors[0] < factors[1]
-    assert 3.0 < factors[1] < 7.0
+        _, known = linear_fit(data, sites=sites, site_N=[0.02 * d.force_N for d in clean])
+        found.append(known.residual_model)
+    assert 3.0 < np.median([model.site_factor for model in found]) < 7.0
+    assert all(freedom[0] < model.site_freedom < freedom[1] for model in found)
+    inside = [np.quantile(m.site_factors, 0.025) < 5.0 < np.quantile(m.site_factors, 0.975) for m in found]
+    assert np.mean(inside) > 0.6
+
+
+def test_few_sites_widen_the_interval_of_a_site():
+    """Deviations are normal for each site factor; where that is uncertain, they have Student's tails."""
+    size = np.ones(1)
+    known = ResidualModel((), size, size, 0.1, 5.0, site_factor=3.0, site_factors=np.full(9, 3.0))
+    assert known.site_freedom == MAX_FREEDOM
+    rng = np.random.default_rng(0)
+    factors = 2.0 * np.sqrt(6 / rng.chisquare(6, 4000))  # Student's distribution with six degrees of freedom
+    few = replace(known, site_factor=2.0, site_factors=factors)
+    assert 5.0 < few.site_freedom < 7.5
+
+
+def test_degrees_of_freedom_of_a_sum_are_those_of_its_largest_estimated_part():
+    assert combine_freedom((1.0, 7.0)) == pytest.approx(7.0)
+    assert combine_freedom((0.5, 4.0), (0.5, 4.0)) == pytest.approx(8.0)
+    np.testing.assert_allclose(combine_freedom((np.array([0.0, 1.0]), 4.0)), [MAX_FREEDOM, 4.0])
 
 
 def test_the_error_of_the_mesh_is_in_the_intervals():

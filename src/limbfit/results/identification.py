@@ -141,6 +141,9 @@ class ResidualsSummary(ResultPart):
 
     sites: Mapping[str, RecordResiduals] = Field(description="Each fitted record.")
     site_factor: float | None = Field(description="Deviation of whole sites over the expected one.")
+    site_freedom: float | None = Field(
+        default=None, description="Degrees of freedom of Student's distribution of that deviation."
+    )
     misfit_elsewhere: float = Field(description="Misfit expected elsewhere, over the largest force.")
     mesh_misfit: MeshMisfitSummary | None = Field(description="The part that the mesh may cause.")
     correlation: float = Field(description="Correlation of neighbouring residuals.")

@@ -12,6 +12,9 @@ from ...arrays import Array
 from ...results.identification import CalibrationUncertainty, RecordResiduals, RelaxationBeyond
 from .objective import SiteResponse, find_largest_magnitude
 
+MAX_FREEDOM = 1e6  # of Student's distribution: a normal one
+MIN_FREEDOM = 3.0  # of a misfit: it is similar at other sites and in other studies
+
 
 def compute_error_percent(simulated_N: Array, measured_N: Array) -> float:
     """Return the mean absolute error over the largest measured force, in percent (paper, table 2).
@@ -19,6 +22,15 @@ def compute_error_percent(simulated_N: Array, measured_N: Array) -> float:
     Measured lengths may be negative; their largest magnitude is taken.
     """
     return float(100 * np.mean(np.abs(simulated_N - measured_N)) / find_largest_magnitude(measured_N))
+
+
+def combine_freedom(*parts: tuple[Array | float, float]) -> Array:
+    """Return the degrees of freedom of a variance, of whose parts some are estimated (Satterthwaite 1946).
+
+    A part is its share of the variance, a number or (n,), and the degrees of freedom with which it is known.
+    """
+    inverse = sum(np.asarray(share) ** 2 / known for share, known in parts)
+    return np.asarray(1.0 / np.clip(inverse, 1.0 / MAX_FREEDOM, 1.0))
 
 
 @dataclass(frozen=True)
@@ -108,8 +120,9 @@ class PredictionModel:
 
     ``sites`` holds noise and misfit of the fitted records, and ``known_scale`` the number of independent
     residuals from which the size of the misfit is known. ``site_factor`` is the deviation of whole sites over
-    the expected one. ``most_probable`` (p,) are the most probable parameters, which may differ from those of
-    least error. ``relaxation`` is what is added beyond the longest load in the records.
+    the expected one, known with ``site_freedom`` degrees of freedom. ``most_probable`` (p,) are the most
+    probable parameters, which may differ from those of least error. ``relaxation`` is what is added beyond
+    the longest load in the records.
     """
 
     covariance_log: Array
@@ -118,6 +131,7 @@ class PredictionModel:
     misfit_elsewhere: float
     known_scale: float
     site_factor: float = 1.0
+    site_freedom: float = MAX_FREEDOM
     relaxation: RelaxationSpread | None = None
 
     @classmethod
@@ -131,6 +145,7 @@ class PredictionModel:
             residuals.misfit_elsewhere,
             residuals.known_scale,
             residuals.site_factor or 1.0,
+            residuals.site_freedom or MAX_FREEDOM,
             None if relaxation is None else RelaxationSpread.from_stored(relaxation.beyond),
         )
 
@@ -171,14 +186,15 @@ class PredictionModel:
 
         It counts the uncertainty of the parameters, misfit and noise. The interval covers ``response``,
         simulated at the ``parameters`` (p,), and its linearised value at the most probable parameters. It is
-        in mm for a record that compares depths (``unit``). The misfit is known from few residuals only, so
-        the interval takes Student's quantile with Satterthwaite's degrees of freedom. ``site_N`` (n,) is one
-        standard deviation of the stiffness that is expected of a site that was not fitted. Beyond the longest
-        load in the records, by ``times_s`` (n,), the interval counts what relaxation may do there.
+        in mm for a record that compares depths (``unit``). The misfit is known from few residuals only, and
+        the spread between sites from few sites, so the interval takes Student's quantile. ``site_N`` (n,) is
+        one standard deviation of the stiffness that is expected of a site that was not fitted. Beyond the
+        longest load in the records, by ``times_s`` (n,), the interval counts what relaxation may do there.
         """
         noise_N, misfit = self.find_residual_sd(name, unit)
         misfit_N = misfit * find_largest_magnitude(response.force_N)
-        own_N = np.hypot(np.hypot(noise_N, misfit_N), self.site_factor * np.abs(site_N))
+        site_N = self.site_factor * np.abs(site_N)
+        own_N = np.hypot(np.hypot(noise_N, misfit_N), site_N)
         lower_N: Array | float = 0.0
         higher_N: Array | float = 0.0
         if self.relaxation is not None and times_s is not None:
@@ -186,8 +202,11 @@ class PredictionModel:
             lower_N, higher_N, relaxation_N = self.relaxation.compute_beyond_N(slopes, times_s)
             own_N = np.hypot(own_N, relaxation_N)
         sd = compute_prediction_sd(response.jacobian, parameters, self.covariance_log, own_N)
-        share = misfit_N**2 / np.maximum(sd, 1e-300) ** 2
-        freedom = np.clip(self.known_scale / np.maximum(share, 1e-3) ** 2, 3.0, 1e6)
+        variance = np.maximum(sd, 1e-150) ** 2
+        misfit_known = max(self.known_scale, MIN_FREEDOM)
+        freedom = combine_freedom(
+            (misfit_N**2 / variance, misfit_known), (site_N**2 / variance, self.site_freedom)
+        )
         half, off = stdtrit(freedom, 0.975) * sd, np.log(self.most_probable / parameters)
         other = response.force_N + response.jacobian @ (parameters * off)
         low, high = np.minimum(response.force_N, other), np.maximum(response.force_N, other)

@@ -18,20 +18,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve, cholesky, eigh, solve_triangular
-from scipy.optimize import minimize
+from scipy.optimize import brentq, minimize
+from scipy.special import ndtr, stdtrit
 
 from ...arrays import Array
 from ...results.identification import MeshMisfitSummary, RecordResiduals, ResidualsSummary
+from ..fit.prediction import MAX_FREEDOM
 from .noise import SiteNoise
 
 # Of a record; longer ones cannot be told from an offset
 CORRELATION_LENGTHS = (0.04, 0.07, 0.12, 0.2, 0.35, 0.6)
 _MIN_MISFIT, _MAX_MISFIT = 1e-5, 1.0  # of the largest force
-_SITE_FACTOR_SD_LOG = np.log(2.0)  # of the log of how far sites are off, over what was expected
-_SITE_FACTOR_BOUNDS = (0.2, 10.0)
+# How far sites are off, over what was expected: its log has a Cauchy distribution about 0 of this scale. It
+# lets the residuals say that a limb differs by much more than was expected, as real limbs do.
+_SITE_FACTOR_SCALE_LOG = np.log(4.0)
+_SITE_FACTOR_BOUNDS = (0.2, 50.0)
+_SITE_FACTOR_GRID = np.linspace(np.log(_SITE_FACTOR_BOUNDS[0]), np.log(_SITE_FACTOR_BOUNDS[1]), 56)
+_SITE_FACTORS = 40  # equally likely values
 _MISFIT_SD_LOG = 0.5  # sd of log(sd) between sites: a site with a lucky fit is not trusted beyond its fellows
 
 
@@ -65,7 +72,8 @@ class ResidualModel:
     ``mesh_N`` (n,) per record is one standard deviation of the mesh's error; it is empty if it was not
     measured. Records of one site (`SiteNoise.site_name`) have one mesh, whose error is one deviation of them
     all. ``site_N`` (n,) is the same for the expected difference of a site's stiffness, and ``site_factor``
-    the estimated difference over the expected one; empty: it is left out. ``misfit`` (records,) is the
+    the estimated difference over the expected one; empty: it is left out. Few sites tell this factor poorly:
+    ``site_factors`` (m,) are equally likely values of it. ``misfit`` (records,) is the
     standard deviation of the misfit over the largest force ``peaks_N`` (records,). ``known_scale`` is the
     number of independent residuals from which the size of the misfit is known. ``mesh_misfit`` is the part
     of the misfit that may be the mesh's.
@@ -80,7 +88,25 @@ class ResidualModel:
     mesh_N: tuple[Array, ...] = ()
     site_N: tuple[Array, ...] = ()
     site_factor: float = 1.0
+    site_factors: Array = field(default_factory=lambda: np.ones(1))
     mesh_misfit: MeshMisfit | None = None
+
+    @cached_property
+    def site_freedom(self) -> float:
+        """Degrees of freedom with which Student's 95 % interval of a site's deviation is as wide as it is.
+
+        The deviation is normal for each value of the site factor, and that is uncertain.
+        """
+
+        def compute_excess(half: float) -> float:
+            return float(np.mean(ndtr(half / self.site_factors))) - 0.975
+
+        half = brentq(compute_excess, 0.0, 10 * float(self.site_factors.max())) / self.site_factor
+        if half <= stdtrit(MAX_FREEDOM, 0.975):
+            return MAX_FREEDOM
+        if half >= stdtrit(1.0, 0.975):
+            return 1.0
+        return float(brentq(lambda freedom: stdtrit(freedom, 0.975) - half, 1.0, MAX_FREEDOM))
 
     @property
     def misfit_elsewhere(self) -> float:
@@ -110,6 +136,7 @@ class ResidualModel:
                 for i, (noise, misfit, peak) in enumerate(zip(self.noise, self.misfit, self.peaks_N))
             },
             site_factor=self.site_factor if self.site_N else None,
+            site_freedom=self.site_freedom if self.site_N else None,
             misfit_elsewhere=self.misfit_elsewhere,
             mesh_misfit=None
             if self.mesh_misfit is None
@@ -141,6 +168,13 @@ class ResidualModel:
             for row, noise, columns in zip(rows, self.noise, found, strict=True):
                 columns[:, k, self.sites.index(noise.site_name)] = factor * row
         return tuple(columns.reshape(len(columns), -1) for columns in found)
+
+    @property
+    def site_deviations(self) -> tuple[Array, ...]:
+        """Those of the `shared_deviations` that come from the sites' stiffness: (n, sites) per record."""
+        return tuple(
+            row[:, row.shape[1] - len(self.sites) * bool(self.site_N) :] for row in self.shared_deviations
+        )
 
     def own_covariance(self, i: int) -> Array:
         """Covariance (n, n) of what record i shares with no other: its noise and its misfit."""
@@ -216,8 +250,9 @@ def estimate_discrepancy(
 
     The derivatives are with respect to the logarithms of the parameters. ``precision`` (p, p) is what is
     known of these beforehand, ``mesh_N`` (n,) per record the error of the mesh, which records of one site
-    have in common, and ``site_N`` (n,) what is expected of the site's own stiffness. Misfits are similar, and
-    sites as far off as expected, within a factor of about two unless the residuals say otherwise.
+    have in common, and ``site_N`` (n,) what is expected of the site's own stiffness. Misfits are similar
+    within a factor of about two, and sites as far off as expected within a factor of four, unless the
+    residuals say otherwise.
     """
     best: tuple[float, Array, float, _RestrictedLikelihood] | None = None
     unit = np.ones(len(noise))
@@ -241,6 +276,7 @@ def estimate_discrepancy(
         model,
         misfit=np.exp(logs[: len(noise)]),
         site_factor=float(np.exp(logs[-1])) if site_N else 1.0,
+        site_factors=rows.sample_site_factors(logs) if site_N else np.ones(1),
         correlation=correlation,
         known_scale=rows.known_scale(logs),
         criterion=value,
@@ -334,9 +370,21 @@ class _RestrictedLikelihood:
         if not self.places:
             return value, slope
         moved = step[-self.places :] ** 2 + np.diag(inverse)[-self.places :]
-        value += 2 * self.places * logs[-1] + (logs[-1] / _SITE_FACTOR_SD_LOG) ** 2
-        of_sites = 2 * (self.places - np.exp(-2 * logs[-1]) * moved.sum() + logs[-1] / _SITE_FACTOR_SD_LOG**2)
+        off = logs[-1] / _SITE_FACTOR_SCALE_LOG
+        value += 2 * self.places * logs[-1] + 2 * np.log1p(off**2)
+        of_prior = 4 * off / (1 + off**2) / _SITE_FACTOR_SCALE_LOG
+        of_sites = 2 * (self.places - np.exp(-2 * logs[-1]) * moved.sum()) + of_prior
         return value, np.append(slope, of_sites)
+
+    def sample_site_factors(self, logs: Array) -> Array:
+        """Return equally likely values of the site factor (m,): quantiles of its posterior.
+
+        The misfits stay where they are.
+        """
+        values = np.array([self.criterion(np.append(logs[:-1], one))[0] for one in _SITE_FACTOR_GRID])
+        below = np.cumsum(np.exp(-(values - values.min()) / 2))
+        levels = (np.arange(_SITE_FACTORS) + 0.5) / _SITE_FACTORS
+        return np.exp(np.interp(levels, below / below[-1], _SITE_FACTOR_GRID))
 
     def known_scale(self, logs: Array) -> float:
         """Twice the information on the log of the misfit's variance (Satterthwaite's degrees of freedom)."""

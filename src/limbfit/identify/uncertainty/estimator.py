@@ -57,14 +57,16 @@ class Estimator:
     def hessian(self) -> Array:
         return self.force_hessian + self.prior_hessian
 
-    def propagate_covariance(self, covariances: Sequence[Array], shared: Sequence[Array] = ()) -> Array:
-        """Return the covariance (k, k) of the gradient if that of each record is (n, n) N^2.
-
-        ``shared`` (n, q) N of each record are deviations that all records have in common.
-        """
+    def propagate_covariance(self, covariances: Sequence[Array]) -> Array:
+        """Return the covariance (k, k) of the gradient if that of each record is (n, n) N^2."""
         parts = [G @ C @ G.T for G, C in zip(self.record_gradients, covariances, strict=True)]
-        common = np.sum([G @ E for G, E in zip(self.record_gradients, shared)], axis=0)
-        return np.asarray(np.sum(parts, axis=0)) + (common @ common.T if len(shared) else 0.0)
+        return np.asarray(np.sum(parts, axis=0))
+
+    def propagate_shared(self, deviations: Sequence[Array]) -> Array:
+        """Return the covariance (k, k) of the gradient from ``deviations`` (n, q) N of each record that all
+        records have in common."""
+        common = np.sum([G @ E for G, E in zip(self.record_gradients, deviations, strict=True)], axis=0)
+        return np.asarray(common @ common.T)
 
     @property
     def prior_covariance(self) -> Array:

@@ -168,11 +168,14 @@ def pool_linearised_samples(
 
     The posterior weighs the records by noise and misfit, and follows the bend; the linearised answer weighs
     all points alike. Details of the records also contain errors of the mesh, which only the posterior
-    believes. An interval must not say more than both readings agree on.
+    believes. An interval must not say more than both readings agree on. How far sites differ is drawn, too.
     """
-    drawn = np.random.default_rng(seed).multivariate_normal(
-        np.log(linearised.parameters), linearised.covariance, len(posterior.samples), method="eigh"
-    )
+    random, model, draws = np.random.default_rng(seed), linearised.residual_model, len(posterior.samples)
+    zero = np.zeros(len(linearised.parameters))
+    others = linearised.covariance - linearised.site_covariance
+    drawn = random.multivariate_normal(np.log(linearised.parameters), others, draws, method="eigh")
+    of_sites = random.multivariate_normal(zero, linearised.site_covariance, draws, method="eigh")
+    drawn += random.choice(model.site_factors, (draws, 1)) / model.site_factor * of_sites
     drawn = np.clip(drawn, *np.log([unknowns.lower, unknowns.upper]))
     pooled = np.vstack([posterior.samples, np.exp(drawn)])
     return restate_from_samples(linearised, replace(posterior, samples=pooled), unknowns, space)

@@ -22,6 +22,7 @@ from scipy.special import stdtrit  # Student quantiles; scipy.stats would take h
 from ...arrays import Array
 from ..fit.objective import MeasuredCurve, SiteResponse
 from ..fit.parameters import Grouping, SearchSpace, Unknowns, build_space, group_separately
+from ..fit.prediction import MAX_FREEDOM, combine_freedom
 from ..fit.state import CalibrationSettings
 from .discrepancy import ResidualModel, estimate_discrepancy, estimate_mesh_misfit
 from .estimator import Estimator, PriorPrecision
@@ -35,7 +36,6 @@ NORMAL_95 = 1.959964  # half of a 95 % interval, in standard deviations of a nor
 _MAX_DETERMINED_FACTOR, _MAX_WEAK_FACTOR = 1.25, 2.0
 # Whatever the width: an interval that is hardly narrower than the bounds comes from the bounds.
 _MAX_BOUND_SHARE = 0.5
-_MAX_FREEDOM = 1e6
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,8 @@ class Uncertainty:
     ``centre`` (p,) are the most probable parameters. ``covariance`` (p, p) is that of the answer's logarithms
     about the truth, always linearised, and ``about_centre`` (p, p) that of the most probable ones.
     ``sampling_covariance`` (p, p) is the part that the records cause: the scatter of answers to other records
-    with the same priors. ``correlation`` (p, p) is of the logarithms. ``intervals_95`` (p, 2) are of the
+    with the same priors. ``site_covariance`` (p, p) is the part that comes from sites that
+    differ as a whole. ``correlation`` (p, p) is of the logarithms. ``intervals_95`` (p, 2) are of the
     parameters and lie between the bounds; ``degrees_of_freedom`` (p,) belong to the linearised ones.
     ``combinations`` are the principal axes, the best known first. ``prior_share`` and ``wider_without`` (p,):
     see `PriorPrecision.compute_shares`. ``minus_2_log_evidence`` compares models of the same records:
@@ -75,6 +76,7 @@ class Uncertainty:
     covariance: Array
     about_centre: Array
     sampling_covariance: Array
+    site_covariance: Array
     correlation: Array
     intervals_95: Array
     verdicts: tuple[str, ...]
@@ -138,7 +140,8 @@ def estimate_uncertainty(
 
 @dataclass(frozen=True)
 class _LinearisedEstimate:
-    """Covariance about the calibrated ``z`` (k,), and the parts of it that records and that misfit cause.
+    """Covariance about the calibrated ``z`` (k,), and the parts of it that records, misfit and sites that
+    differ cause.
 
     ``centre`` (k,) is where generalised least squares by noise and misfit would go, with covariance ``best``
     (k, k); the calibration has other weights. If the two are farther apart than noise and misfit explain, the
@@ -155,7 +158,9 @@ class _LinearisedEstimate:
     about_centre: Array
     by_records: Array
     by_misfit: Array
+    by_sites: Array
     known_scale: float
+    site_freedom: float
 
     @classmethod
     def linearise(
@@ -172,10 +177,10 @@ class _LinearisedEstimate:
         best, centre = _solve_most_probable(residuals, scaled, model, prior, z)
         centre = np.clip(centre, space.lower, space.upper)
         own_covariances = [model.own_covariance(i) for i in range(len(residuals))]
-        M, H = (
-            estimator.propagate_covariance(own_covariances, model.shared_deviations),
-            estimator.force_hessian,
+        M = estimator.propagate_covariance(own_covariances) + estimator.propagate_shared(
+            model.shared_deviations
         )
+        H = estimator.force_hessian
         # What the bounds say has no place in the estimator: it counts as beside records of the mean noise.
         spread = max(float(np.trace(M) / np.trace(H)), 1e-16 * float(np.trace(H)))
         inverse = np.linalg.inv(estimator.hessian / spread + prior.bound_precision) / spread
@@ -184,6 +189,7 @@ class _LinearisedEstimate:
         covariance = by_records + inverse @ prior_covariance @ inverse
         misfits = [model.misfit_covariance(i) for i in range(len(residuals))]
         by_misfit = inverse @ estimator.propagate_covariance(misfits) @ inverse
+        by_sites = inverse @ estimator.propagate_shared(model.site_deviations) @ inverse
         unexplained = _compute_unexplained(centre - z, covariance - best)
         return cls(
             z=z,
@@ -193,15 +199,18 @@ class _LinearisedEstimate:
             about_centre=_symmetrise(covariance),
             by_records=_symmetrise(by_records),
             by_misfit=by_misfit + unexplained,
+            by_sites=_symmetrise(by_sites),
             known_scale=model.known_scale,
+            site_freedom=model.site_freedom,
         )
 
     def freedom(self, weights: Array) -> float:
         """Degrees of freedom of the variance of ``weights @ z`` (Satterthwaite 1946)."""
-        variance, caused = weights @ self.covariance @ weights, weights @ self.by_misfit @ weights
-        if caused * np.sqrt(_MAX_FREEDOM) <= variance:
-            return _MAX_FREEDOM
-        return float(np.clip(self.known_scale * (variance / caused) ** 2, 1.0, _MAX_FREEDOM))
+        variance = max(float(weights @ self.covariance @ weights), np.finfo(float).tiny)
+        misfit, sites = (
+            float(weights @ part @ weights) / variance for part in (self.by_misfit, self.by_sites)
+        )
+        return float(combine_freedom((misfit, self.known_scale), (sites, self.site_freedom)))
 
     def sd(self, weights: Array) -> float:
         return float(np.sqrt(weights @ self.covariance @ weights))
@@ -264,6 +273,7 @@ def _build_uncertainty(
         covariance=covariance,
         about_centre=space.tie @ estimate.about_centre @ space.tie.T,
         sampling_covariance=space.tie @ estimate.by_records @ space.tie.T,
+        site_covariance=space.tie @ estimate.by_sites @ space.tie.T,
         correlation=covariance / np.outer(sd, sd),
         intervals_95=np.stack([low, high], axis=1),
         verdicts=tuple(verdicts),
@@ -271,7 +281,7 @@ def _build_uncertainty(
         combinations=_build_combinations(estimate, space, unknowns.names, prior),
         residual_model=model,
         degrees_of_freedom=np.array(
-            [estimate.freedom(row) if row.any() else _MAX_FREEDOM for row in space.tie]
+            [estimate.freedom(row) if row.any() else MAX_FREEDOM for row in space.tie]
         ),
         prior_share=share,
         wider_without=wider,

@@ -14,6 +14,7 @@ from ...arrays import Array
 from ...errors import InputError
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
+from ...identify.fit.prediction import MIN_FREEDOM, combine_freedom
 from ...identify.uncertainty.emulator import Emulator
 from ...identify.uncertainty.estimator import FitSensitivity
 from ...identify.uncertainty.exploration import Exploration
@@ -295,8 +296,9 @@ def _write_prediction(folder: Path, found: Found, one: Predicted) -> IntervalPar
         "misfit": np.full(len(force), (share * peak) ** 2),
     }
     total = np.sum(list(variances.values()), axis=0)
-    part = variances["misfit"] / np.maximum(total, 1e-300)
-    freedom = np.clip(model.known_scale / np.maximum(part, 1e-3) ** 2, 3.0, 1e6)
+    misfit, site = (variances[part] / np.maximum(total, 1e-300) for part in ("misfit", "site"))
+    misfit_known = max(model.known_scale, MIN_FREEDOM)
+    freedom = combine_freedom((misfit, misfit_known), (site, model.site_freedom))
     half = stdtrit(freedom, 0.975) * np.sqrt(total)
     low, high = np.maximum(force - half, 0.0), force + half
     write_curves(
