@@ -7,8 +7,9 @@ of its own. Up to T these fits say how far the modulus is known. Beyond T it fal
 shows that part. All that is known of s is that it lies between 0 and what tissues have at most
 (`MAX_SLOPE`), so that intervals hold for every such s: they reach from the one end to the other.
 
-A force that goes on to fall slowly looks the same if the limb gives way to the indenter. Where the records
-prefer a tail, `RelaxationAssessment.describe` says so: no interval counts that.
+A force that goes on to fall slowly looks the same if the limb gives way to the indenter. So each fit with a
+tail counts twice, half with its tail as relaxation, half without. Where the records prefer a tail,
+`RelaxationAssessment.describe` says so.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ NOT_LONG_TERM = "determined at {}; its long-term value not"
 NOT_ALONE = "not determined: another relaxation fits as well"
 GIVES_WAY = (
     "the force falls slowly until the records end: a limb that gives way to the indenter looks the same, and "
-    "its tissue is stiffer in the long term than the intervals say; check that it was held"
+    "its tissue is stiffer in the long term; intervals count both, and are narrower where the limb is held"
 )
 _MIN_TAIL_WEIGHT = 0.5  # from which a limb may give way
 MIN_OWN_WEIGHT = 0.1  # of the answer: no other relaxation is quite that of the tissue
@@ -352,20 +353,23 @@ class _Records:
         The model's own terms keep the answer, whose covariance is not counted here. Later than the longest
         load, a modulus is that at its end: `compute_largest_fall` says what may follow.
         """
-        within, answer = min(duration_s, self.longest_s), np.log(self.parameters)
-        changes, inner = [], []
-        for fit in fits:
-            z = self.space.reduce(answer) if fit.world.is_own else fit.z
-            at = self._elastic_log(fit.world, z, within)
-            steps = _DIFFERENCE * np.eye(len(z))
-            D = np.array([self._elastic_log(fit.world, z + s, within) - at for s in steps]) / _DIFFERENCE
-            changes.append(at)
-            inner.append((not fit.world.is_own) * D.T @ fit.covariance @ D)
-        own = self._elastic_log(RelaxationModel(), self.space.reduce(answer), duration_s)
-        change = np.array(changes) - own
-        mean = weights @ change
+        within, answer = min(duration_s, self.longest_s), self.space.reduce(np.log(self.parameters))
+        own = RelaxationModel()
+        shares, changes, inner = [], [], []
+        for fit, weight in zip(fits, weights, strict=True):
+            z, covariance = (answer, 0 * fit.covariance) if fit.world.is_own else (fit.z, fit.covariance)
+            worlds = (fit.world, own) if fit.world.has_tail else (fit.world,)
+            for world in worlds:
+                at = self._elastic_log(world, z, within)
+                steps = _DIFFERENCE * np.eye(len(z))
+                D = np.array([self._elastic_log(world, z + s, within) - at for s in steps]) / _DIFFERENCE
+                shares.append(weight / len(worlds))
+                changes.append(at)
+                inner.append(D.T @ covariance @ D)
+        change = np.array(changes) - self._elastic_log(own, answer, duration_s)
+        mean = np.array(shares) @ change
         apart = change - mean
-        return mean, np.einsum("w,wi,wj->ij", weights, apart, apart) + np.tensordot(weights, inner, 1)
+        return mean, np.einsum("w,wi,wj->ij", shares, apart, apart) + np.tensordot(shares, inner, 1)
 
     def compute_largest_fall(self, duration_s: float) -> Array:
         """The most by which the logarithms (p,) of moduli fall after the longest load until a time."""
