@@ -32,14 +32,12 @@ class ActivationTable(TomlTable):
     time_s: tuple[float, ...]
     share: tuple[Annotated[float, Field(ge=0)], ...]
 
-    @model_validator(mode="after")
-    def _check_order(self) -> ActivationTable:
+    def check_keys(self) -> None:
         times = self.time_s
         if len(times) < 2 or len(times) != len(self.share):
             raise ValueError("give two or more times in time_s, and as many shares")
         if times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
             raise ValueError("time_s does not grow from 0, which is touch-down")
-        return self
 
 
 class MaterialTable(TomlTable):
@@ -138,8 +136,7 @@ class MaterialTable(TomlTable):
             )
         return ratio
 
-    @model_validator(mode="after")
-    def _check_bounds(self) -> MaterialTable:
+    def check_keys(self) -> None:
         for tissue in ("", *self.tissues):
             lower, start, upper = (self.of(tissue, which) for which in _ENDS)
             place = f"tissues.{tissue}." if tissue else ""
@@ -154,7 +151,6 @@ class MaterialTable(TomlTable):
                     raise ValueError(f"{place}start.{name} lies outside its bounds")
                 if not lower[name] < upper[name]:
                     raise ValueError(f"{place}lower.{name} is not below upper.{name}")
-        return self
 
     def check_tissues(self, tissues: tuple[str, ...], stretched: tuple[str, ...]) -> None:
         """Raise `ValueError` where a tissue is named that the model has not, or that cannot

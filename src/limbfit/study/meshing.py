@@ -104,10 +104,8 @@ class CoarseMeshTable(TomlTable):
     growth: Positive = 0.9
     flatness: Annotated[float, Field(ge=1, le=2)] = 1.6
 
-    @model_validator(mode="after")
-    def _check_size(self) -> CoarseMeshTable:
+    def check_keys(self) -> None:
         _check_cell_count(self)
-        return self
 
 
 class MeshTable(TomlTable):
@@ -135,10 +133,8 @@ class MeshTable(TomlTable):
     def _fill_edges(cls, given: Any) -> Any:
         return replace_edges(given)
 
-    @model_validator(mode="after")
-    def _check_size(self) -> MeshTable:
+    def check_keys(self) -> None:
         _check_cell_count(self)
-        return self
 
     def find_accuracy(self, widths_mm: Sequence[float]) -> str | None:
         """Find the ``accuracy`` that has these edges for such indenters; None if the study states others."""

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from .tables import Positive, TomlTable, Vector
 
@@ -44,11 +43,9 @@ class _RecordKeys(TomlTable):
     shear_waves_sd_m_s: Positive = 0.1
     shear_waves_bias_m_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.1
 
-    @model_validator(mode="after")
-    def _check_order(self) -> _RecordKeys:
+    def check_keys(self) -> None:
         if None not in (self.touch_down_s, self.peak_s) and self.touch_down_s >= self.peak_s:  # type: ignore[operator]
             raise ValueError("touch_down_s must come before peak_s")
-        return self
 
 
 class Site(_RecordKeys):
@@ -70,14 +67,13 @@ class Site(_RecordKeys):
     axis: Vector | None = None
     edge: Vector | None = None
 
-    @model_validator(mode="after")
-    def _check_place(self) -> Site:
+    def check_keys(self) -> None:
+        super().check_keys()
         if (self.position is None) == (self.near is None):
             raise ValueError("give either position (on the skin) or near (to be matched to a marker)")
         for key in ("touch_down_s", "peak_s", "ultrasound", "surface", "shear_waves"):
             if self.trace is None and getattr(self, key) is not None:
                 raise ValueError(f"{key} belongs to a record, and the site has no trace")
-        return self
 
 
 class RecordTable(_RecordKeys):
@@ -100,34 +96,22 @@ class RecordTable(_RecordKeys):
         return name
 
 
-@dataclass(frozen=True)
-class Record:
+class Record(_RecordKeys):
     """A record, and what a stage asks of it.
 
     ``name`` is the site's where the site states it, else ``<site>-<record>``: one name in files, tables and
-    messages. ``of_site`` is how many records the site has.
+    messages. ``key`` is where the study file states the record, ``of_site`` how many records the site has;
+    ``depth_mm``, ``speed_mm_s`` and ``hold_s`` are how it is to be made.
     """
 
     name: str
-    site: Site
     trace: Path
-    key: str  # where the study file states it
-    touch_down_s: float | None = None
-    peak_s: float | None = None
-    indenter: str | None = None
-    control: Control = "displacement"
+    site: Site
+    key: str
     of_site: int = 1
-    depth_mm: float | None = None  # how it is to be made
+    depth_mm: float | None = None
     speed_mm_s: float | None = None
     hold_s: float | None = None
-    ultrasound: Path | None = None
-    ultrasound_sd_mm: float = 0.1
-    surface: Path | None = None
-    surface_sd_mm: float = 0.05
-    surface_frame: Frame = "limb"
-    shear_waves: Path | None = None
-    shear_waves_sd_m_s: float = 0.1
-    shear_waves_bias_m_s: float = 0.1
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -169,18 +153,15 @@ Indentation = Record | Site  # a site is one where it plans an indentation
 
 def list_records(site: Site, tables: tuple[RecordTable, ...]) -> tuple[Record, ...]:
     """List the records of a site: its own, then those of the study's tables that name it."""
-    sources: list[tuple[str, str, _RecordKeys]] = []
-    if site.trace is not None:
-        sources.append((site.name, f"sites.{site.name}", site))
+    stated: dict[str, dict[str, Any]] = {}
+    if site.trace is not None:  # the site's depth and speed plan an indentation without a record
+        own = {field: getattr(site, field) for field in _RecordKeys.model_fields}
+        stated[site.name] = {**own, "key": f"sites.{site.name}"}
     for table in tables:
         if table.site == site.name:
             name = f"{site.name}-{table.name}"
-            sources.append((name, f"records.{name}", table))
-    records = []
-    for name, key, source in sources:
-        fields = [field for field in _RecordKeys.model_fields if field != "name"]
-        if isinstance(source, RecordTable):  # of a site they plan an indentation without a record
-            fields += ["depth_mm", "speed_mm_s", "hold_s"]
-        values: dict[str, Any] = {field: getattr(source, field) for field in fields}
-        records.append(Record(name, site, key=key, of_site=len(sources), **values))
-    return tuple(records)
+            stated[name] = {**dict(table), "name": name, "key": f"records.{name}"}
+    return tuple(
+        Record.model_construct(**{**values, "site": site, "of_site": len(stated)})
+        for values in stated.values()
+    )

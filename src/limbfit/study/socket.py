@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from .tables import Friction, Plane, Positive, TomlTable, Vector
+from .tables import Friction, Plane, Positive, TomlTable, Vector, find_repeated
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9 ().,_-]{0,39}$"
 Length = Annotated[float, Field(ge=0)]
@@ -27,11 +27,9 @@ class DesignRegionTable(TomlTable):
     pressure_kPa: Annotated[float, Field(ge=0, le=100)] | None = None
     limit_kPa: Positive | None = None
 
-    @model_validator(mode="after")
-    def _check_content(self) -> DesignRegionTable:
+    def check_keys(self) -> None:
         if self.pressure_kPa is None and self.limit_kPa is None:
             raise ValueError("give pressure_kPa, limit_kPa or both")
-        return self
 
 
 class SocketDesignTable(TomlTable):
@@ -46,13 +44,9 @@ class SocketDesignTable(TomlTable):
     adapter_diameter_mm: Annotated[float, Field(ge=0, le=150)] = 60.0
     adapter_mm: Annotated[float, Field(ge=1, le=60)] = 8.0
 
-    @model_validator(mode="after")
-    def _check_regions(self) -> SocketDesignTable:
-        names = [one.region for one in self.regions]
-        doubled = sorted({name for name in names if names.count(name) > 1})
-        if doubled:
+    def check_keys(self) -> None:
+        if doubled := find_repeated(one.region for one in self.regions):
             raise ValueError(f"regions: {doubled[0]!r} is given twice")
-        return self
 
 
 class LinerTable(TomlTable):
@@ -81,11 +75,9 @@ class SocketAreaTable(TomlTable):
     radius_mm: Annotated[float, Field(ge=3, le=150)]
     depth_mm: Annotated[float, Field(ge=-20, le=20)]
 
-    @model_validator(mode="after")
-    def _check_place(self) -> SocketAreaTable:
+    def check_keys(self) -> None:
         if (self.position is None) == (self.region is None):
             raise ValueError("give either position (LPS, mm) or region")
-        return self
 
 
 class SocketRegionTable(TomlTable):
@@ -107,13 +99,11 @@ class SocketLoadTable(TomlTable):
     duration_s: Positive = 1.0
     hold_s: Length = 2.0
 
-    @model_validator(mode="after")
-    def _check_kind(self) -> SocketLoadTable:
+    def check_keys(self) -> None:
         if (self.preset is None) == (self.force_N is None):
             raise ValueError(f"give either preset ({', '.join(get_args(Preset))}) or force_N")
         if self.preset is not None and "moment_Nmm" in self.model_fields_set:
             raise ValueError("a preset has its own moment; give force_N with moment_Nmm instead")
-        return self
 
 
 class SocketTable(TomlTable):
@@ -150,8 +140,7 @@ class SocketTable(TomlTable):
     regions: tuple[SocketRegionTable, ...] = ()
     design: SocketDesignTable = SocketDesignTable()
 
-    @model_validator(mode="after")
-    def _check_trim(self) -> SocketTable:
+    def check_keys(self) -> None:
         stated = [
             key for key in ("trim_mm", "trim_planes", "trimline") if getattr(self, key) not in (None, ())
         ]
@@ -159,19 +148,8 @@ class SocketTable(TomlTable):
             raise ValueError(f"trim_mm is a plane of its own: leave it or {stated[1]} out")
         if self.trimline and len(self.trimline) < 3:
             raise ValueError("trimline needs three points or more, in order around the limb")
-        return self
-
-    @model_validator(mode="after")
-    def _check_names(self) -> SocketTable:
         for kind in ("areas", "loads", "regions"):
-            names = [one.name for one in getattr(self, kind)]
-            doubled = sorted({name for name in names if names.count(name) > 1})
-            if doubled:
+            if doubled := find_repeated(one.name for one in getattr(self, kind)):
                 raise ValueError(f"{kind}: names must differ; given twice: {doubled[0]}")
-        return self
-
-    @model_validator(mode="after")
-    def _check_edge_length(self) -> SocketTable:
         if self.edge_mm is not None and self.edge_mm < 0.5 * self.face_edge_mm:
             raise ValueError("edge_mm is shorter than half of face_edge_mm: the face would show its facets")
-        return self

@@ -46,6 +46,7 @@ from .tables import (
     TracesTable,
     UncertaintyTable,
     Vector,
+    find_repeated,
 )
 
 
@@ -265,16 +266,20 @@ class Study(TomlTable):
     @field_validator("sites")
     @classmethod
     def _check_sites(cls, sites: tuple[Site, ...]) -> tuple[Site, ...]:
-        names = [site.name for site in sites]
-        if not names:
+        if not sites:
             raise ValueError("the study has no site")
-        doubled = sorted({name for name in names if names.count(name) > 1})
-        if doubled:
+        if doubled := find_repeated(site.name for site in sites):
             raise ValueError(f"site names must differ; given twice: {', '.join(doubled)}")
         return sites
 
-    @model_validator(mode="after")
-    def _check_records(self) -> Study:
+    def check_keys(self) -> None:
+        self._check_records()
+        self._check_measurements()
+        self._check_indenters()
+        self._check_material()
+        self._check_geometry()
+
+    def _check_records(self) -> None:
         names = [site.name for site in self.sites]
         for table in self.records:
             if table.site not in names:
@@ -282,8 +287,7 @@ class Study(TomlTable):
                     f"records.{table.name}: no site is named {table.site!r}; they are {', '.join(names)}"
                 )
         names += [f"{table.site}-{table.name}" for table in self.records]
-        doubled = [name for name in names if names.count(name) > 1]
-        if doubled:
+        if doubled := find_repeated(names):
             raise ValueError(
                 f"two records, or a record and a site, have the name {doubled[0]!r}; name one anew"
             )
@@ -296,66 +300,43 @@ class Study(TomlTable):
                     f"{place}: give either trace (a record; several: [[records]]) or depth_mm (an "
                     "indentation to be simulated)"
                 )
-        return self
 
-    @model_validator(mode="after")
-    def _check_objective(self) -> Study:
-        if self.calibration.objective != "paper":
-            return self
-        for record in self.recorded:
-            if why := 'control = "force"' if record.forced else record.observed:
-                what = f'{record.name}: {why} is no force, and objective = "paper" adds squares of forces'
-                raise ValueError(f'{what}; use "pointwise"')
-        return self
-
-    @model_validator(mode="after")
-    def _check_control(self) -> Study:
-        forced = [record.name for record in self.recorded if record.forced]
-        material = self.material
-        states = {"clamps": self.clamps, "contraction": material.course, "pre-stretch": material.prestretch}
-        why = [name for name, stated in states.items() if stated]
-        if why and forced:
-            raise ValueError(f'{forced[0]} has control = "force", which goes without {why[0]}; leave one out')
-        return self
-
-    @model_validator(mode="after")
-    def _check_secondary_measurements(self) -> Study:
+    def _check_measurements(self) -> None:
+        """Refuse what is measured where something else in the study rules it out."""
         taut, tense = self.material.prestretch, self.material.course
+        states = {"clamps": self.clamps, "contraction": tense, "pre-stretch": taut}
+        why = [name for name, stated in states.items() if stated]
         for one in self.recorded:
+            kind = 'control = "force"' if one.forced else one.observed
+            if self.calibration.objective == "paper" and kind:
+                what = f'{one.name}: {kind} is no force, and objective = "paper" adds squares of forces'
+                raise ValueError(f'{what}; use "pointwise"')
+            if why and one.forced:
+                raise ValueError(
+                    f'{one.name} has control = "force", which goes without {why[0]}; leave one out'
+                )
             if (taut and one.observed) or (tense and one.shear_waves):
                 key, what = ("prestretch", "pre-stretch") if taut else ("activation", "contraction")
                 seen = one.observed if taut else "shear waves"
                 raise ValueError(f"material.{key}: {one.name} has {seen}, which sees no {what}; leave it out")
-        return self
 
-    @model_validator(mode="after")
-    def _check_indenters(self) -> Study:
+    def _check_indenters(self) -> None:
         named = [(f"sites.{site.name}", site.indenter) for site in self.sites]
         named += [(f"records.{table.site}-{table.name}", table.indenter) for table in self.records]
         for place, name in named:
             if name is not None and name not in self.indenters:
                 known = ", ".join(self.indenters) or "none"
                 raise ValueError(f"{place}: no indenter is named {name!r}; those of [indenters] are {known}")
-        return self
 
-    @model_validator(mode="after")
-    def _check_materials(self) -> Study:
+    def _check_material(self) -> None:
         layers = [layer.name for layer in self.geometry.model_layers]
         self.material.check_tissues(self.tissues, tuple(dict.fromkeys((*layers, *self.fibres))))
-        return self
-
-    @model_validator(mode="after")
-    def _check_parameters(self) -> Study:
         known = [f"{tissue}.{name}" for tissue, name in self.parameters]
         for name in self.calibration.named:
             if name not in known:
                 raise ValueError(f"calibration: no parameter is named {name!r}; they are {', '.join(known)}")
-        return self
-
-    @model_validator(mode="after")
-    def _check_priors(self) -> Study:
         if self.calibration.priors is None:
-            return self
+            return
         if not is_ogden(self.material.law):
             raise ValueError(
                 f'calibration.priors: people are described by the law "{OGDEN}", the study has '
@@ -365,33 +346,26 @@ class Study(TomlTable):
             of_tissues(self.tissues, self.calibration.prior_tissues)
         except InputError as error:
             raise ValueError(f"calibration.prior_tissues: {error}") from None
-        return self
 
-    @model_validator(mode="after")
-    def _check_mesher(self) -> Study:
+    def _check_geometry(self) -> None:
         if self.geometry.regions and self.mesh.engine != "mmg":
             raise ValueError(
                 f'mesh.engine = "{self.mesh.engine}" cannot mesh geometry.regions; choose "mmg", or leave '
                 "the regions out"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _check_source(self) -> Study:
         if (self.image is None) == (self.surfaces is None):
             raise ValueError("give either [image] or [surfaces], not both")
-        if self.surfaces is not None and any(layer.thickness for layer in self.geometry.layers):
-            raise ValueError('a layer with thickness = "map" needs the fat of an [image], not [surfaces]')
-        labelled = [one.name for one in self.geometry.regions if one.label is not None]
-        if self.surfaces is not None and labelled:
-            raise ValueError(
-                f"geometry.regions.{labelled[0]}: [surfaces] has no labels; give surface, a closed surface "
-                "file"
-            )
-        if self.surfaces is not None or (self.image is not None and self.image.markers is None):
-            blind = [site.name for site in self.sites if site.position is None]
-            if blind:
+        if self.surfaces is not None:
+            if any(layer.thickness for layer in self.geometry.layers):
+                raise ValueError('a layer with thickness = "map" needs the fat of an [image], not [surfaces]')
+            labelled = [one.name for one in self.geometry.regions if one.label is not None]
+            if labelled:
                 raise ValueError(
-                    f"site {blind[0]}: 'near' needs image.markers; give 'position' where there are no markers"
+                    f"geometry.regions.{labelled[0]}: [surfaces] has no labels; give surface, a closed "
+                    "surface file"
                 )
-        return self
+        blind = [site.name for site in self.sites if site.position is None]
+        if blind and (self.image is None or self.image.markers is None):
+            raise ValueError(
+                f"site {blind[0]}: 'near' needs image.markers; give 'position' where there are no markers"
+            )

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     BaseModel,
@@ -41,9 +43,22 @@ Friction = Annotated[Literal["frictionless", "sticky"] | float, BeforeValidator(
 
 
 class TomlTable(BaseModel):
-    """A frozen table without unknown keys or numbers that are not finite."""
+    """A frozen table without unknown keys, numbers that are not finite, or contradictions."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _check_keys(self) -> Self:
+        self.check_keys()
+        return self
+
+    def check_keys(self) -> None:
+        """Raise `ValueError` where keys, each of the right type, contradict one another."""
+
+
+def find_repeated(names: Iterable[str]) -> list[str]:
+    """Return the names that are there more than once, in their order."""
+    return [name for name, count in Counter(names).items() if count > 1]
 
 
 class StudyTable(TomlTable):
@@ -65,11 +80,9 @@ class ImageTable(TomlTable):
     markers: Literal["same"] | Path | None = None
     markers_series: str | None = None
 
-    @model_validator(mode="after")
-    def _check_series(self) -> ImageTable:
+    def check_keys(self) -> None:
         if self.markers_series is not None and self.marked is None:
             raise ValueError("markers_series belongs to a second image: give its folder as markers")
-        return self
 
     @property
     def marked(self) -> Path | None:
@@ -90,14 +103,12 @@ class SegmentationTable(TomlTable):
     bias_correction: bool = True
     min_bone_volume_mm3: Positive = 1000.0
 
-    @model_validator(mode="after")
-    def _check_source(self) -> SegmentationTable:
+    def check_keys(self) -> None:
         if self.labels is not None and self.contours is not None:
             raise ValueError("give either labels or contours")
         empty = [name for name, points in self.seeds.items() if not points]
         if empty:
             raise ValueError(f"seeds.{empty[0]}: give at least one point")
-        return self
 
     @property
     def is_given(self) -> bool:
@@ -143,13 +154,11 @@ class Layer(TomlTable):
     thickness: Literal["map"] | None = None
     min_thickness_mm: Positive = 1.0
 
-    @model_validator(mode="after")
-    def _check_thickness(self) -> Layer:
+    def check_keys(self) -> None:
         if (self.thickness_mm is None) == (self.thickness is None):
             raise ValueError('give either thickness_mm or thickness = "map"')
         if self.thickness is None and "min_thickness_mm" in self.model_fields_set:
             raise ValueError('min_thickness_mm belongs to thickness = "map"')
-        return self
 
 
 class RegionTable(TomlTable):
@@ -163,11 +172,9 @@ class RegionTable(TomlTable):
     label: str | None = None
     surface: Path | None = None
 
-    @model_validator(mode="after")
-    def _check_source(self) -> RegionTable:
+    def check_keys(self) -> None:
         if (self.label is None) == (self.surface is None):
             raise ValueError("give either label (of the label map) or surface (a file)")
-        return self
 
 
 class GeometryTable(TomlTable):
@@ -187,8 +194,7 @@ class GeometryTable(TomlTable):
     amputation_pad_mm: Positive = 15.0
     surface_edge_mm: Positive = 3.0
 
-    @model_validator(mode="after")
-    def _check_layers(self) -> GeometryTable:
+    def check_keys(self) -> None:
         if "layers" in self.model_fields_set and not self.layers:
             raise ValueError("layers is empty; a model has one layer of tissue or more over its core")
         if self.layers and "skin_layer_mm" in self.model_fields_set:
@@ -200,7 +206,6 @@ class GeometryTable(TomlTable):
             raise ValueError(f"layers, core and regions need different names, not {', '.join(names)}")
         if sum(layer.thickness == "map" for layer in self.layers) > 1:
             raise ValueError('only one layer can have thickness = "map": that of the fat')
-        return self
 
     @property
     def model_layers(self) -> tuple[Layer, ...]:
@@ -250,8 +255,7 @@ class IndenterTable(TomlTable):
             raise ValidationError.from_exception_data(cls.__name__, errors)
         return usual | content
 
-    @model_validator(mode="after")
-    def _check_edge(self) -> IndenterTable:
+    def check_keys(self) -> None:
         shape = SHAPES[self.shape]
         if (self.file is not None) != shape.needs_file:
             those = " or ".join(f'"{one.name}"' for one in SHAPES if one.needs_file)
@@ -263,7 +267,6 @@ class IndenterTable(TomlTable):
                 shape.of(Size(self.width_mm, self.edge_radius_mm, self.measures))
             except InputError as error:
                 raise ValueError(str(error)) from None
-        return self
 
 
 class TracesTable(TomlTable):
@@ -314,8 +317,7 @@ class CalibrationTable(TomlTable):
     corrections: Annotated[int, Field(ge=1, le=10)] = 6
     correction_tolerance_percent: Positive = 0.1
 
-    @model_validator(mode="after")
-    def _check_constraints(self) -> CalibrationTable:
+    def check_keys(self) -> None:
         if self.answer == "most probable" and self.is_papers:
             raise ValueError('answer = "most probable" is not the paper\'s; leave objective and stopping out')
         names = [name for group in self.tied for name in group]
@@ -327,7 +329,6 @@ class CalibrationTable(TomlTable):
                 raise ValueError(f"tied = {list(group)}: tie two or more parameters of one kind")
         if (self.prior or self.priors) and self.objective == "paper":
             raise ValueError('objective = "paper" has no place for priors; use "pointwise"')
-        return self
 
     @property
     def is_papers(self) -> bool:
@@ -429,26 +430,23 @@ class AcquireTable(TomlTable):
     watchdog_ms: Annotated[float, Field(ge=10, le=500)] = 20.0
     key_gap_ms: Annotated[float, Field(ge=30, le=1000)] = 120.0
 
-    @model_validator(mode="after")
-    def _check_limits(self) -> AcquireTable:
+    def check_keys(self) -> None:
         for name in ("clamp", "approach", "search", "ramp"):
             if getattr(self, f"{name}_speed_mm_s") > self.speed_limit_mm_s:
                 raise ValueError(f"{name}_speed_mm_s is over speed_limit_mm_s")
-        if self.hold_s >= self.time_limit_s:
-            raise ValueError("hold_s is not below time_limit_s: the hold would end in a stop")
-        if self.search_force_N >= self.force_limit_N:
-            raise ValueError("search_force_N is not below force_limit_N: the search would end in a stop")
-        if self.search_depth_mm >= self.depth_limit_mm:
-            raise ValueError("search_depth_mm is not below depth_limit_mm: the search would end in a stop")
-        if self.min_depth_mm >= self.search_depth_mm:
-            raise ValueError("min_depth_mm is not below search_depth_mm")
+        for low, high, why in (
+            ("hold_s", "time_limit_s", ": the hold would end in a stop"),
+            ("search_force_N", "force_limit_N", ": the search would end in a stop"),
+            ("search_depth_mm", "depth_limit_mm", ": the search would end in a stop"),
+            ("min_depth_mm", "search_depth_mm", ""),
+            ("clamp_tolerance_N", "clamp_N", ""),
+        ):
+            if getattr(self, low) >= getattr(self, high):
+                raise ValueError(f"{low} is not below {high}{why}")
         if self.clamp_N + self.clamp_tolerance_N >= self.clamp_limit_N:
             raise ValueError(
                 "clamp_N with its tolerance is not below clamp_limit_N: clamping would end in a stop"
             )
-        if self.clamp_tolerance_N >= self.clamp_N:
-            raise ValueError("clamp_tolerance_N is not below clamp_N")
-        return self
 
 
 class ClampsTable(TomlTable):
@@ -474,14 +472,12 @@ class ClampsTable(TomlTable):
             raise ValueError("0 is where the test pin is; leave it out")
         return angles
 
-    @model_validator(mode="after")
-    def _check_levels(self) -> ClampsTable:
+    def check_keys(self) -> None:
         if len(self.levels_mm) not in (1, len(self.angles)):
             raise ValueError(
                 f"levels_mm has {len(self.levels_mm)} levels for {len(self.angles)} pins; "
                 "give one, or one for each angle"
             )
-        return self
 
     @property
     def angles(self) -> tuple[float, ...]:
