@@ -11,26 +11,15 @@ from ..errors import StudyError
 from ..laws import ACTIVE, FIBRED, POWER, has_fibres
 from ..shapes import SHAPES
 from .meshing import ACCURACIES, CoarseMeshTable, MeshTable
-from .records import Site
 from .study import Study
 
 
 @dataclass(frozen=True)
 class UnusedKeys:
-    """Keys without effect if ``when`` is true of the study: why, and what to do instead."""
+    """Keys without effect if ``when`` is true of the study (and the site): why, and what to do instead."""
 
     keys: tuple[str, ...]
-    when: Callable[[Study], bool]
-    why: str
-    remedy: str = "leave it out"
-
-
-@dataclass(frozen=True)
-class UnusedSiteKey:
-    """A key of a site without effect if ``when`` is true of the study and the site."""
-
-    key: str
-    when: Callable[[Study, Site], bool]
+    when: Callable[..., bool]
     why: str
     remedy: str = "leave it out"
 
@@ -43,9 +32,6 @@ def _is_capped(table: MeshTable | CoarseMeshTable | None) -> bool:
     return table is not None and table.edge_far_mm < table.edge_near_mm
 
 
-_OWN_LABELS = "the study's own labels win over the automatic segmentation"
-_NO_WAVES = "the site has no shear waves"
-_NO_BONES = "[surfaces] has no bones"
 _ONE_LENGTH = "edge_far_mm is no longer than edge_near_mm, so edges have one length"
 _AUTOMATIC_KEYS = ("contrast", "seeds", "bias_correction", "min_bone_volume_mm3")
 _SHAPE_KEYS = (
@@ -59,7 +45,7 @@ UNUSED_KEYS: tuple[UnusedKeys, ...] = (
     UnusedKeys(
         tuple(f"segmentation.{key}" for key in _AUTOMATIC_KEYS),
         lambda s: s.segmentation.is_given,
-        _OWN_LABELS,
+        "the study's own labels win over the automatic segmentation",
     ),
     UnusedKeys(
         ("segmentation.min_bone_volume_mm3",),
@@ -96,7 +82,7 @@ UNUSED_KEYS: tuple[UnusedKeys, ...] = (
     UnusedKeys(
         ("geometry.bone_policy", "geometry.bone_clearance_mm"),
         lambda s: s.surfaces is not None and not s.surfaces.bones,
-        _NO_BONES,
+        "[surfaces] has no bones",
     ),
     UnusedKeys(("mesh.near_radius_mm", "mesh.growth"), lambda s: _is_uniform(s.mesh), _ONE_LENGTH),
     UnusedKeys(
@@ -230,29 +216,31 @@ UNUSED_KEYS: tuple[UnusedKeys, ...] = (
     ),
 )
 
-UNUSED_SITE_KEYS: tuple[UnusedSiteKey, ...] = (
-    UnusedSiteKey("weight", lambda s, site: not s.records_at(site), "the site has no record to be weighted"),
-    UnusedSiteKey(
-        "speed_mm_s",
-        lambda s, site: bool(s.records_at(site)),
-        "the record says how fast the indenter was",
+UNUSED_SITE_KEYS: tuple[UnusedKeys, ...] = (
+    UnusedKeys(("weight",), lambda s, site: not s.records_at(site), "the site has no record to be weighted"),
+    UnusedKeys(
+        ("speed_mm_s",), lambda s, site: bool(s.records_at(site)), "the record says how fast the indenter was"
     ),
-    UnusedSiteKey(
-        "control", lambda s, site: site.trace is None, "it is of the site's trace, and there is none"
+    UnusedKeys(
+        ("control",), lambda s, site: site.trace is None, "it is of the site's trace, and there is none"
     ),
-    UnusedSiteKey("ultrasound_sd_mm", lambda s, site: site.ultrasound is None, "the site has no ultrasound"),
-    UnusedSiteKey("surface_sd_mm", lambda s, site: site.surface is None, "the site has no surface"),
-    UnusedSiteKey("surface_frame", lambda s, site: site.surface is None, "the site has no surface"),
-    UnusedSiteKey("shear_waves_sd_m_s", lambda s, site: site.shear_waves is None, _NO_WAVES),
-    UnusedSiteKey("shear_waves_bias_m_s", lambda s, site: site.shear_waves is None, _NO_WAVES),
-    UnusedSiteKey(
-        "indenter",
+    UnusedKeys(("ultrasound_sd_mm",), lambda s, site: site.ultrasound is None, "the site has no ultrasound"),
+    UnusedKeys(
+        ("surface_sd_mm", "surface_frame"), lambda s, site: site.surface is None, "the site has no surface"
+    ),
+    UnusedKeys(
+        ("shear_waves_sd_m_s", "shear_waves_bias_m_s"),
+        lambda s, site: site.shear_waves is None,
+        "the site has no shear waves",
+    ),
+    UnusedKeys(
+        ("indenter",),
         lambda s, site: site.trace is None and bool(s.records_at(site)),
         "the site's records are stated in [[records]]",
         "give it there",
     ),
-    UnusedSiteKey(
-        "edge",
+    UnusedKeys(
+        ("edge",),
         lambda s, site: (
             all(SHAPES[one.shape].is_round for one in s.indenters_at(site))
             and not any(
@@ -289,9 +277,10 @@ def check_unused_keys(study: Study, content: Mapping[str, Any]) -> None:
         )
     for site, stated in zip(study.sites, content["sites"], strict=True):
         for site_rule in UNUSED_SITE_KEYS:
-            if site_rule.key in stated and site_rule.when(study, site):
-                place = f"sites.{site.name}.{site_rule.key}"
-                raise _build_unused_key_error(study.file, place, site_rule.why, site_rule.remedy)
+            for key in site_rule.keys:
+                if key in stated and site_rule.when(study, site):
+                    place = f"sites.{site.name}.{key}"
+                    raise _build_unused_key_error(study.file, place, site_rule.why, site_rule.remedy)
 
 
 def _is_stated(content: Mapping[str, Any], key: str) -> bool:
