@@ -57,7 +57,7 @@ def read_table(file: Path, columns: Names) -> ColumnTable:
         Where the file cannot be read, or holds no table with these columns.
     """
     if not file.is_file():
-        raise TraceError("no such file", file=file)
+        raise TraceError("no such file")
     suffix = file.suffix.lower()
     if suffix == ".mat":
         return _read_mat(file, columns)
@@ -66,13 +66,13 @@ def read_table(file: Path, columns: Names) -> ColumnTable:
     if suffix in (".xlsx", ".xlsm"):
         return _read_excel(file, columns)
     if suffix == ".xls":
-        raise TraceError("an Excel file from before 2007", file=file, remedy="save it as .xlsx")
+        raise TraceError("an Excel file from before 2007", remedy="save it as .xlsx")
     text, note = _decode(file)
     is_labview = suffix == ".lvm" and text.startswith("LabVIEW Measurement")
     try:
-        table = (_read_lvm if is_labview else _read_text)(text, file, columns)
+        table = (_read_lvm if is_labview else _read_text)(text, columns)
     except csv.Error as error:
-        raise TraceError(f"not a text table ({error})", file=file, remedy="export it again") from None
+        raise TraceError(f"not a text table ({error})", remedy="export it again") from None
     return replace(table, notes=note + table.notes)
 
 
@@ -85,13 +85,12 @@ def is_number(cell: str) -> bool:
     return True
 
 
-def _check_names(names: Sequence[str], columns: Names, file: Path) -> None:
+def _check_names(names: Sequence[str], columns: Names) -> None:
     for key, name in columns.items():
         if name not in names:
             shown = ", ".join(repr(n[:40]) for n in [n for n in names if n][:8])
             raise TraceError(
                 f"no column {name!r}; it has {shown}",
-                file=file,
                 place="header",
                 remedy=f'rename the column, or name it in the study: [traces] {key} = "..."',
             )
@@ -105,12 +104,12 @@ def _decode(file: Path) -> tuple[str, tuple[str, ...]]:
     data = file.read_bytes()
     is_utf16 = data[:2] in (b"\xff\xfe", b"\xfe\xff")
     if b"\0" in data[:4096] and not is_utf16:
-        raise TraceError("not a text table", file=file, remedy="give CSV with one header line, or MAT")
+        raise TraceError("not a text table", remedy="give CSV with one header line, or MAT")
     name, encoding = ("UTF-16", "utf-16") if is_utf16 else ("UTF-8", "utf-8-sig")
     try:
         return data.decode(encoding), ("the text is UTF-16",) if is_utf16 else ()
     except UnicodeDecodeError as error:
-        raise TraceError(f"not {name} text ({error.reason})", file=file, remedy="save as UTF-8") from None
+        raise TraceError(f"not {name} text ({error.reason})", remedy="save as UTF-8") from None
 
 
 def _split(lines: Sequence[str], delimiter: str, start: int = 0) -> list[Row]:
@@ -124,10 +123,10 @@ def _find_delimiter(line: str) -> str:
     return max("\t;,", key=line.count)
 
 
-def _read_text(text: str, file: Path, columns: Names) -> ColumnTable:
+def _read_text(text: str, columns: Names) -> ColumnTable:
     lines = text.splitlines()
     single = [_split([line], _find_delimiter(line), i) for i, line in enumerate(lines[:MAX_PREAMBLE])]
-    header = _find_header([row for rows in single for row in rows], columns, file)
+    header = _find_header([row for rows in single for row in rows], columns)
     number = header[0]
     delimiter = _find_delimiter(lines[number - 1])
     rows = _split(lines[number:], delimiter, number)
@@ -136,7 +135,7 @@ def _read_text(text: str, file: Path, columns: Names) -> ColumnTable:
     return _build_table(header, rows, columns, has_preamble=any(single[: number - 1]))
 
 
-def _find_header(rows: Sequence[Row], columns: Names, file: Path) -> Row:
+def _find_header(rows: Sequence[Row], columns: Names) -> Row:
     """The first row that holds all names.
 
     Raises
@@ -146,12 +145,12 @@ def _find_header(rows: Sequence[Row], columns: Names, file: Path) -> Row:
         that is as wide as the numbers.
     """
     if not rows:
-        raise TraceError("the file is empty", file=file)
+        raise TraceError("the file is empty")
     likely = max(rows, key=lambda row: sum(name in row[1] for name in columns.values()))
     if not set(columns.values()) & set(likely[1]):
         width = next((len(row) for _, row in rows if sum(map(is_number, row)) > 1), len(likely[1]))
         likely = next((row for row in rows if len(row[1]) == width), likely)
-    _check_names(likely[1], columns, file)
+    _check_names(likely[1], columns)
     return likely
 
 
@@ -172,7 +171,7 @@ def _is_word(cell: str) -> bool:
 # --- LabVIEW's measurement files
 
 
-def _read_lvm(text: str, file: Path, columns: Names) -> ColumnTable:
+def _read_lvm(text: str, columns: Names) -> ColumnTable:
     """All segments after each other; ``X_Value`` is the time where no other column is named as that."""
     lines = text.splitlines()
     delimiter = "," if any(line.startswith("Separator,") for line in lines) else "\t"
@@ -191,24 +190,22 @@ def _read_lvm(text: str, file: Path, columns: Names) -> ColumnTable:
         else:
             rows.append((number, [cell.replace(",", ".") for cell in row]))
     with_names = [one for one in segments if one[1]]
-    first = with_names[0][1][0] if with_names else _find_header([], columns, file)
+    first = with_names[0][1][0] if with_names else _find_header([], columns)
     names = first[1]
     if any(rows[0][1] != names for _, rows in with_names):
-        raise TraceError("its segments hold different channels", file=file, remedy="save one segment")
+        raise TraceError("its segments hold different channels", remedy="save one segment")
     notes: tuple[str, ...] = ()
     if columns[TIME] not in names and "Time" in with_names[0][0].get("X_Dimension", ()):
         names = [columns[TIME] if name == _X else name for name in names]
         notes = (f"the times are LabVIEW's {_X}",)
-    rows = [
-        row for tags, rows in with_names for row in _add_times(rows[1:], tags, names, columns[TIME], file)
-    ]
-    _find_header([(first[0], names)], columns, file)
+    rows = [row for tags, rows in with_names for row in _add_times(rows[1:], tags, names, columns[TIME])]
+    _find_header([(first[0], names)], columns)
     units = ["", *with_names[0][0].get("Y_Unit_Label", [])] + [""] * len(names)
     return ColumnTable(names, units[: len(names)], rows, notes=notes)
 
 
 def _add_times(
-    rows: Sequence[Row], tags: Mapping[str, list[str]], names: Sequence[str], time: str, file: Path
+    rows: Sequence[Row], tags: Mapping[str, list[str]], names: Sequence[str], time: str
 ) -> list[Row]:
     """The rows of a segment, their times made of ``X0`` and ``Delta_X`` where the file leaves them out.
 
@@ -223,7 +220,6 @@ def _add_times(
     if len(starts) != 1 or len(steps) != 1 or not all(map(is_number, starts | steps)):
         raise TraceError(
             "its channels are not sampled at the same times",
-            file=file,
             place="X0, Delta_X",
             remedy="save them with one X column, or name a channel of times in the study: [traces] time_s",
         )
@@ -234,30 +230,29 @@ def _add_times(
 # --- files of libraries that are optional
 
 
-def _import(module: str, package: str, extra: str, file: Path) -> Any:
+def _import(module: str, package: str, extra: str, suffix: str) -> Any:
     try:
         return import_module(module)
     except ImportError:
         raise TraceError(
-            f"files {file.suffix} are read by {package}, which is not installed",
-            file=file,
+            f"files {suffix} are read by {package}, which is not installed",
             remedy=f"pip install 'limbfit[{extra}]', or export the record as CSV",
         ) from None
 
 
 def _read_tdms(file: Path, columns: Names) -> ColumnTable:
     """The group that holds the columns, its times by their channel or by the waveform's increment."""
-    nptdms = _import("nptdms", "npTDMS", "tdms", file)
+    nptdms = _import("nptdms", "npTDMS", "tdms", file.suffix)
     try:
         read = nptdms.TdmsFile.read(file)
         groups = [[_Channel.from_tdms(one) for one in group.channels()] for group in read.groups()]
     except Exception as error:  # a broken file can fail anywhere in the parser
-        raise TraceError(f"not a readable TDMS file ({type(error).__name__})", file=file) from None
+        raise TraceError(f"not a readable TDMS file ({type(error).__name__})") from None
     others = {name for key, name in columns.items() if key != TIME} or {columns[TIME]}
     fitting = [group for group in groups if others <= {one.name for one in group}]
     if len(fitting) > 1:
         raise TraceError(
-            f"{len(fitting)} of its groups hold these channels", file=file, remedy="save one group to a file"
+            f"{len(fitting)} of its groups hold these channels", remedy="save one group to a file"
         )
     channels = fitting[0] if fitting else [one for group in groups for one in group]
     notes: tuple[str, ...] = ()
@@ -267,7 +262,7 @@ def _read_tdms(file: Path, columns: Names) -> ColumnTable:
             channels = [_Channel(columns[TIME], "s", tracks[0], None), *channels]
             notes = ("the times are those of the waveform",)
     names = [one.name for one in channels]
-    _check_names(names, columns, file)
+    _check_names(names, columns)
     return ColumnTable(
         names, [one.unit for one in channels], vectors=[one.values for one in channels], notes=notes
     )
@@ -290,20 +285,20 @@ class _Channel(NamedTuple):
 
 def _read_excel(file: Path, columns: Names) -> ColumnTable:
     """The one sheet that holds the columns; times of day are written as ISO 8601 says."""
-    openpyxl = _import("openpyxl", "openpyxl", "excel", file)
+    openpyxl = _import("openpyxl", "openpyxl", "excel", file.suffix)
     try:
         book = openpyxl.load_workbook(file, read_only=True, data_only=True)
         sheets = {sheet.title: _read_sheet_rows(sheet) for sheet in book.worksheets}
         book.close()
     except Exception as error:  # a broken file can fail anywhere in the parser
-        raise TraceError(f"not a readable Excel file ({type(error).__name__})", file=file) from None
+        raise TraceError(f"not a readable Excel file ({type(error).__name__})") from None
     needed = set(columns.values())
     fitting = [name for name, rows in sheets.items() if any(needed <= set(row) for _, row in rows)]
     if len(fitting) > 1:
         shown = ", ".join(fitting)
-        raise TraceError(f"the sheets {shown} all hold these columns", file=file, remedy="keep one of them")
+        raise TraceError(f"the sheets {shown} all hold these columns", remedy="keep one of them")
     rows = sheets[fitting[0]] if fitting else max(sheets.values(), key=len)
-    header = _find_header(rows[:MAX_PREAMBLE], columns, file)
+    header = _find_header(rows[:MAX_PREAMBLE], columns)
     below = [row for row in rows if row[0] > header[0]]
     return _build_table(header, below, columns, has_preamble=rows[0] != header)
 
@@ -326,16 +321,16 @@ def _read_mat(file: Path, columns: Names) -> ColumnTable:
     try:
         sizes = {name: int(np.prod(shape)) for name, shape, _ in whosmat(file)}
         if sum(sizes.values()) > MAX_SAMPLES:
-            raise TraceError(f"larger than {MAX_SAMPLES} numbers", file=file)
+            raise TraceError(f"larger than {MAX_SAMPLES} numbers")
         content = {k: v for k, v in loadmat(file, squeeze_me=True).items() if not k.startswith("__")}
     except TraceError:
         raise
     except NotImplementedError:
-        raise TraceError("MAT version 7.3", file=file, remedy="save it in MATLAB with '-v7'") from None
+        raise TraceError("MAT version 7.3", remedy="save it in MATLAB with '-v7'") from None
     except Exception as error:  # a broken file can fail anywhere in the parser
-        raise TraceError(f"not a readable MAT file ({type(error).__name__})", file=file) from None
+        raise TraceError(f"not a readable MAT file ({type(error).__name__})") from None
     structs = [v for v in content.values() if isinstance(v, np.ndarray) and v.dtype.names and v.shape == ()]
     if columns[TIME] not in content and len(structs) == 1:
         content = {name: structs[0][name].item() for name in structs[0].dtype.names}
-    _check_names(list(content), columns, file)
+    _check_names(list(content), columns)
     return ColumnTable(list(content), [""] * len(content), vectors=list(content.values()))

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import TraceError
+from ..errors import TraceError, add_location
 from .formats import TIME, ColumnTable, Row, is_number, read_table
 from .numerics import Array
 from .record import COLUMNS, Trace, check_trace
@@ -56,17 +56,17 @@ def read_trace(path: str | Path, columns: tuple[str, str, str] = COLUMNS) -> Tra
     TraceError
         With the file, the row or column, and the remedy.
     """
-    file = Path(path)
-    table = read_table(file, dict(zip(COLUMNS, columns)))
-    notes = list(table.notes)
-    time = _read_clock(table, columns[0], file, notes)
-    if time is None:
-        time = _read_column(table, TIME, columns[0], file, "", notes)
-    displacement, force = (
-        _read_column(table, key, name, file, "", notes) for key, name in zip(COLUMNS[1:], columns[1:])
-    )
-    trace = Trace(time, displacement, force, tuple(notes))
-    check_trace(trace, columns=columns, file=file)
+    with add_location(file=path):
+        table = read_table(Path(path), dict(zip(COLUMNS, columns)))
+        notes = list(table.notes)
+        time = _read_clock(table, columns[0], notes)
+        if time is None:
+            time = _read_column(table, TIME, columns[0], "", notes)
+        displacement, force = (
+            _read_column(table, key, name, "", notes) for key, name in zip(COLUMNS[1:], columns[1:])
+        )
+        trace = Trace(time, displacement, force, tuple(notes))
+        check_trace(trace, columns=columns)
     return trace
 
 
@@ -81,7 +81,7 @@ def read_columns(
     Parameters
     ----------
     columns : the name of each column that must be there, by its key; a key ends in its unit, as ``time_s``.
-    wanted : True for the names of others that are read; these are their own keys.
+    select : True for the names of others that are read; these are their own keys.
     gaps : an empty cell of a table is nan.
 
     Raises
@@ -93,10 +93,10 @@ def read_columns(
     named = {name: key for key, name in columns.items()}
     named |= {name: name for name in table.names if select(name) and name not in named}
     empty = "nan" if gaps else ""
-    return {name: _read_column(table, key, name, file, empty, []) for name, key in named.items()}
+    return {name: _read_column(table, key, name, empty, []) for name, key in named.items()}
 
 
-def _read_column(table: ColumnTable, key: str, name: str, file: Path, empty: str, notes: list[str]) -> Array:
+def _read_column(table: ColumnTable, key: str, name: str, empty: str, notes: list[str]) -> Array:
     """The values of a column in the unit of its key.
 
     Raises
@@ -106,23 +106,20 @@ def _read_column(table: ColumnTable, key: str, name: str, file: Path, empty: str
     """
     places = [i for i, known in enumerate(table.names) if known == name]
     if table.vectors:
-        found = [_to_vector(table.vectors[i], name, file) for i in places]
+        found = [_to_vector(table.vectors[i], name) for i in places]
     else:
-        found = [_read_numbers(table.rows, i, name, file, empty) for i in places]
-    found = [
-        values * _find_factor(table.units[i], key, name, file, notes) for i, values in zip(places, found)
-    ]
+        found = [_read_numbers(table.rows, i, name, empty) for i in places]
+    found = [values * _find_factor(table.units[i], key, name, notes) for i, values in zip(places, found)]
     if any(not np.array_equal(values, found[0], equal_nan=True) for values in found):
         raise TraceError(
             f"{len(places)} columns are named {name!r}",
-            file=file,
             place="header",
             remedy=f'rename the one that is meant, and name it in the study: [traces] {key} = "..."',
         )
     return found[0]
 
 
-def _find_factor(unit: str, key: str, name: str, file: Path, notes: list[str]) -> float:
+def _find_factor(unit: str, key: str, name: str, notes: list[str]) -> float:
     """Find the factor that converts the values of a column; 1 if no unit is stated.
 
     Raises
@@ -141,7 +138,6 @@ def _find_factor(unit: str, key: str, name: str, file: Path, notes: list[str]) -
     if not factor or factors:
         raise TraceError(
             f"the unit {' and '.join(units)!r} of column {name!r} is none of {', '.join(known)}",
-            file=file,
             place="units",
             remedy=f'convert the column, or name another in the study: [traces] {key} = "..."',
         )
@@ -156,26 +152,26 @@ def _get_factor(factors: Mapping[str, float], unit: str) -> float:
     return factors.get(unit, factors.get(unit.lower() if len(unit) > 3 else "", 0.0))
 
 
-def _get_cell(row: Row, place: int, file: Path, name: str) -> str:
+def _get_cell(row: Row, place: int, name: str) -> str:
     line, cells = row
     if place >= len(cells):
-        raise TraceError("the row is too short", file=file, place=f"line {line}, column {name}")
+        raise TraceError("the row is too short", place=f"line {line}, column {name}")
     return cells[place]
 
 
-def _read_numbers(rows: Sequence[Row], place: int, name: str, file: Path, empty: str) -> Array:
+def _read_numbers(rows: Sequence[Row], place: int, name: str, empty: str) -> Array:
     try:
         return np.array([float(cells[place] or empty) for _, cells in rows])
     except (ValueError, IndexError):
         for row in rows:
-            cell = _get_cell(row, place, file, name) or empty
+            cell = _get_cell(row, place, name) or empty
             if not is_number(cell) or "," in cell:
                 where = f"line {row[0]}, column {name}"
-                raise TraceError(f"{cell[:40]!r} is not a number", file=file, place=where) from None
+                raise TraceError(f"{cell[:40]!r} is not a number", place=where) from None
         raise
 
 
-def _read_clock(table: ColumnTable, name: str, file: Path, notes: list[str]) -> Array | None:
+def _read_clock(table: ColumnTable, name: str, notes: list[str]) -> Array | None:
     """Seconds from the first of times of day (midnight may pass) or time stamps; None for numbers.
 
     Only of a record: files that go with it share its zero, which they would not know.
@@ -187,30 +183,28 @@ def _read_clock(table: ColumnTable, name: str, file: Path, notes: list[str]) -> 
             return None
         notes.append(f"the time stamps in column {name!r} are counted from the first")
         return np.asarray((stamps - stamps[0]) / np.timedelta64(1, "s"))
-    if not table.rows or not _CLOCK.fullmatch(_get_cell(table.rows[0], place, file, name)):
+    if not table.rows or not _CLOCK.fullmatch(_get_cell(table.rows[0], place, name)):
         return None
     notes.append(f"the times of day in column {name!r} are counted from the first")
-    times = np.array(
-        [_parse_time_of_day(_get_cell(row, place, file, name), row[0], name, file) for row in table.rows]
-    )
+    times = np.array([_parse_time_of_day(_get_cell(row, place, name), row[0], name) for row in table.rows])
     midnights = np.cumsum(np.diff(times, prepend=times[0]) < -_DAY_S / 2)
     return np.asarray(times - times[0] + _DAY_S * midnights)
 
 
-def _parse_time_of_day(cell: str, line: int, name: str, file: Path) -> float:
+def _parse_time_of_day(cell: str, line: int, name: str) -> float:
     """Return the seconds from midnight to a time of day."""
     clock = _CLOCK.fullmatch(cell)
     if clock is None:
         where = f"line {line}, column {name}"
-        raise TraceError(f"{cell[:40]!r} is not a time of day", file=file, place=where)
+        raise TraceError(f"{cell[:40]!r} is not a time of day", place=where)
     hours = int(clock["h"])
     if clock["half"]:
         hours = hours % 12 + 12 * (clock["half"].lower() == "pm")
     return 3600 * hours + 60 * int(clock["m"]) + float(clock["s"].replace(",", "."))
 
 
-def _to_vector(value: Any, name: str, file: Path) -> Array:
+def _to_vector(value: Any, name: str) -> Array:
     array = np.asarray(value).squeeze()
     if array.dtype.kind not in "fiu" or array.ndim != 1:
-        raise TraceError("not a vector of real numbers", file=file, place=name)
+        raise TraceError("not a vector of real numbers", place=name)
     return np.asarray(array, dtype=np.float64)

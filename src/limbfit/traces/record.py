@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -45,17 +44,15 @@ class TraceWarning:
     evidence: Mapping[str, float]
 
 
-def check_finite(values: Array, name: str, file: str | Path | None, remedy: str | None = None) -> None:
+def check_finite(values: Array, name: str, remedy: str | None = None) -> None:
     """Raise `TraceError` at the first of the values (n,) of a column that is not finite."""
     bad = np.flatnonzero(~np.isfinite(values))
     if bad.size:
         what = f"{values[bad[0]]} in sample {bad[0] + 1}"
-        raise TraceError(what, file=file, place=name, remedy=remedy)
+        raise TraceError(what, place=name, remedy=remedy)
 
 
-def check_trace(
-    trace: Trace, *, columns: tuple[str, str, str] = COLUMNS, file: str | Path | None = None
-) -> None:
+def check_trace(trace: Trace, *, columns: tuple[str, str, str] = COLUMNS) -> None:
     """Refuse a record that cannot be an indentation in s, mm and N.
 
     Raises
@@ -67,24 +64,24 @@ def check_trace(
     series = (trace.time_s, trace.displacement_mm, trace.force_N)
     for values, name in zip(series, columns, strict=True):
         if values.shape != trace.time_s.shape or values.ndim != 1:
-            raise TraceError(f"{values.size} values for {trace.time_s.size} times", file=file, place=name)
-        check_finite(values, name, file)
+            raise TraceError(f"{values.size} values for {trace.time_s.size} times", place=name)
+        check_finite(values, name)
     if len(trace.time_s) < MIN_SAMPLES:
         what = f"only {len(trace.time_s)} samples"
-        raise TraceError(what, file=file, remedy=f"a record needs at least {MIN_SAMPLES}")
+        raise TraceError(what, remedy=f"a record needs at least {MIN_SAMPLES}")
     steps = np.diff(trace.time_s)
     back = np.flatnonzero(steps < 0)
     if back.size:
         what = f"time goes back at sample {back[0] + 2}"
-        raise TraceError(what, file=file, place=columns[0], remedy="remove or sort the samples")
+        raise TraceError(what, place=columns[0], remedy="remove or sort the samples")
     if (times := int((steps > 0).sum()) + 1) < MIN_SAMPLES:
         what = f"only {times} different times for {len(trace.time_s)} samples"
-        raise TraceError(what, file=file, place=columns[0], remedy="export times with more digits")
-    _check_contact(trace, columns, file)
-    _check_units(trace, columns, file)
+        raise TraceError(what, place=columns[0], remedy="export times with more digits")
+    _check_contact(trace, columns)
+    _check_units(trace, columns)
 
 
-def _check_contact(trace: Trace, columns: tuple[str, str, str], file: str | Path | None) -> None:
+def _check_contact(trace: Trace, columns: tuple[str, str, str]) -> None:
     noise = estimate_noise_level(trace.force_N)
     _, force, _ = average_in_bins(trace.time_s, trace.force_N, _MAX_BINS)
     travel = np.abs(trace.displacement_mm - np.median(trace.displacement_mm[:_START_SAMPLES]))
@@ -93,27 +90,25 @@ def _check_contact(trace: Trace, columns: tuple[str, str, str], file: str | Path
     rise, fall = float(force.max()) - start, start - float(force.min())
     if rise <= 5 * noise and fall > 5 * noise and fall > 2 * rise:
         remedy = "pushing must be positive: change the sign"
-        raise TraceError(
-            "the force falls when the indenter pushes", file=file, place=columns[2], remedy=remedy
-        )
+        raise TraceError("the force falls when the indenter pushes", place=columns[2], remedy=remedy)
     if rise <= 5 * noise:
         what = f"no contact: the force rises by {rise:.3g} against a noise of {noise:.3g}"
-        raise TraceError(what, file=file, place=columns[2], remedy="check the sensor, or leave the site out")
+        raise TraceError(what, place=columns[2], remedy="check the sensor, or leave the site out")
 
 
-def _check_units(trace: Trace, columns: tuple[str, str, str], file: str | Path | None) -> None:
+def _check_units(trace: Trace, columns: tuple[str, str, str]) -> None:
     start = float(np.median(trace.displacement_mm[:5]))
     inward = float(trace.displacement_mm.max()) - start
     if inward <= 0.5 * (start - float(trace.displacement_mm.min())):
         remedy = "displacement into the limb must be positive: change the sign"
-        raise TraceError("the displacement falls", file=file, place=columns[1], remedy=remedy)
-    _check_range(inward, TRAVEL_RANGE, "travel", "mm", {1e3: "metres", 1e-3: "micrometres"}, columns[1], file)
+        raise TraceError("the displacement falls", place=columns[1], remedy=remedy)
+    _check_range(inward, TRAVEL_RANGE, "travel", "mm", {1e3: "metres", 1e-3: "micrometres"}, columns[1])
     speed = _compute_typical_speed(trace)
     guesses = {1e3: "milliseconds", 1e6: "microseconds", 1 / 60: "minutes"}
-    _check_range(speed, SPEED_RANGE, "speed", "mm/s", guesses, columns[0], file)
+    _check_range(speed, SPEED_RANGE, "speed", "mm/s", guesses, columns[0])
     peak = float(trace.force_N.max())
     guesses = {1e3: "kilonewtons", 1e-3: "millinewtons", 9.81e-3: "grams"}
-    _check_range(peak, PEAK_RANGE, "peak force", "N", guesses, columns[2], file)
+    _check_range(peak, PEAK_RANGE, "peak force", "N", guesses, columns[2])
 
 
 def _compute_typical_speed(trace: Trace) -> float:
@@ -132,7 +127,6 @@ def _check_range(
     unit: str,
     guesses: dict[float, str],
     column: str,
-    file: str | Path | None,
 ) -> None:
     low, high = limits
     if low <= value <= high:
@@ -140,4 +134,4 @@ def _check_range(
     likely = [name for factor, name in guesses.items() if low <= value * factor <= high]
     remedy = f"it looks like {likely[0]}: convert it" if likely else "check the units"
     what = f"a {quantity} of {value:.3g} {unit} is not plausible ({low:g} to {high:g})"
-    raise TraceError(what, file=file, place=column, remedy=remedy)
+    raise TraceError(what, place=column, remedy=remedy)

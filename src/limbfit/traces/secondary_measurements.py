@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import TraceError
+from ..errors import TraceError, add_location
 from .formats import TIME
 from .numerics import Array
 from .reading import read_columns
@@ -78,24 +78,36 @@ def read_layers(path: str | Path, time_name: str) -> Layers:
     TraceError
         With the file, the column and the remedy.
     """
-    file = Path(path)
-    columns = read_columns(file, {TIME: time_name}, select=lambda name: name.endswith(_LAYER_SUFFIX))
+    with add_location(file=path):
+        time, columns = _read_timed_columns(path, time_name, _LAYER_SUFFIX, "thickness of a tissue")
+        for name, values in columns.items():
+            check_finite(values, name)
+            _check_range(values, name, THICKNESS_MM, "mm is no tissue's thickness", "give millimetres")
+    return Layers(time, {name.removesuffix(_LAYER_SUFFIX): values for name, values in columns.items()})
+
+
+def _read_timed_columns(
+    path: str | Path, time_name: str, suffix: str, quantity: str, gaps: bool = False
+) -> tuple[Array, dict[str, Array]]:
+    """Read the times, which must grow, and the columns of a ``quantity``, whose names end in ``suffix``."""
+    columns = read_columns(
+        Path(path), {TIME: time_name}, select=lambda name: name.endswith(suffix), gaps=gaps
+    )
     time = columns.pop(time_name)
     if not columns:
-        raise TraceError(
-            "no thickness of a tissue", file=file, place="header", remedy="name columns such as muscle_mm"
-        )
-    if np.any(np.diff(time) <= 0.0):
-        raise TraceError("time does not increase", file=file, place=time_name, remedy="sort the samples")
-    for name, values in columns.items():
-        check_finite(values, name, file)
-        low, high = THICKNESS_MM
-        if values.min() < low or values.max() > high:
-            what = f"{values.min():.3g} to {values.max():.3g} mm is no tissue's thickness"
-            raise TraceError(
-                f"{what} ({low:g} to {high:g})", file=file, place=name, remedy="give millimetres"
-            )
-    return Layers(time, {name.removesuffix(_LAYER_SUFFIX): values for name, values in columns.items()})
+        remedy = f"name columns such as muscle{suffix}"
+        raise TraceError(f"no {quantity}", place="header", remedy=remedy)
+    if not np.isfinite(time).all() or np.any(np.diff(time) <= 0.0):
+        raise TraceError("time does not increase", place=time_name, remedy="sort the readings")
+    return time, columns
+
+
+def _check_range(values: Array, name: str, limits: tuple[float, float], wrong: str, remedy: str) -> None:
+    """Refuse the values (n,) of a column that lie outside the limits of its quantity."""
+    low, high = limits
+    if values.min() < low or values.max() > high:
+        what = f"{values.min():.3g} to {values.max():.3g} {wrong} ({low:g} to {high:g})"
+        raise TraceError(what, place=name, remedy=remedy)
 
 
 def compute_thinnings(
@@ -198,35 +210,20 @@ def read_wave_speeds(path: str | Path, time_name: str) -> tuple[WaveSpeeds, ...]
     TraceError
         With the file, the column and the remedy.
     """
-    file = Path(path)
-    columns = read_columns(file, {TIME: time_name}, select=lambda name: name.endswith("_m_s"), gaps=True)
-    time = columns.pop(time_name)
-    if not columns:
-        raise TraceError(
-            "no speed of a wave", file=file, place="header", remedy="name columns such as muscle_m_s"
-        )
-    if not np.isfinite(time).all() or np.any(np.diff(time) <= 0.0):
-        raise TraceError("time does not increase", file=file, place=time_name, remedy="sort the readings")
-    return tuple(_read_place(file, name, time, values) for name, values in columns.items())
+    with add_location(file=path):
+        time, columns = _read_timed_columns(path, time_name, "_m_s", "speed of a wave", gaps=True)
+        return tuple(_read_place(name, time, values) for name, values in columns.items())
 
 
-def _read_place(file: Path, name: str, time: Array, values: Array) -> WaveSpeeds:
+def _read_place(name: str, time: Array, values: Array) -> WaveSpeeds:
     match = _WAVE_COLUMN.fullmatch(name)
     is_known = ~np.isnan(values)
-    low, high = WAVE_SPEED_M_S
     if match is None or not is_known.any():
-        raise TraceError(
-            "no speed is given", file=file, place=name, remedy="fill some of its cells, or take it out"
-        )
-    if values[is_known].min() < low or values[is_known].max() > high:
-        what = f"{values[is_known].min():.3g} to {values[is_known].max():.3g} m/s is no soft tissue's speed"
-        raise TraceError(
-            f"{what} ({low:g} to {high:g})", file=file, place=name, remedy="give metres per second"
-        )
+        raise TraceError("no speed is given", place=name, remedy="fill some of its cells, or take it out")
+    time, speed = time[is_known], values[is_known]
+    _check_range(speed, name, WAVE_SPEED_M_S, "m/s is no soft tissue's speed", "give metres per second")
     depth = match["depth"]
-    return WaveSpeeds(
-        name, match["tissue"], float(depth) if depth else None, time[is_known], values[is_known]
-    )
+    return WaveSpeeds(name, match["tissue"], float(depth) if depth else None, time, speed)
 
 
 @dataclass(frozen=True)
@@ -311,52 +308,39 @@ def read_surface_motion(path: str | Path, time_name: str) -> SurfaceMotion:
     TraceError
         With the file, the column and the remedy.
     """
-    file = Path(path)
-    named = {TIME: time_name} | {name: name for name in _POSITION_COLUMNS}
-    columns = read_columns(file, named, select=lambda name: name in _MOTION_COLUMNS, gaps=True)
-    given = [name for name in _MOTION_COLUMNS if name in columns]
-    if not given:
-        raise TraceError(
-            "no displacement of a point", file=file, place="header", remedy="name columns ux_mm, uy_mm, uz_mm"
-        )
-    for name, values in columns.items():
-        if name in _MOTION_COLUMNS:  # whose empty cells are nan
-            check_finite(
-                np.nan_to_num(values, posinf=np.inf, neginf=-np.inf),
-                name,
-                file,
-                "give a number, or leave the cell empty",
-            )
-        else:
-            check_finite(values, name, file, "give a number")
-    place = np.column_stack([columns[name] for name in _POSITION_COLUMNS])
-    nothing = np.full(len(place), np.nan)
-    moved = np.column_stack([columns.get(name, nothing) for name in _MOTION_COLUMNS])
-    _check_sizes(file, place, moved, ", ".join(given))
-    _check_unique_rows(file, time_name, columns[time_name], place)
+    with add_location(file=path):
+        named = {TIME: time_name} | {name: name for name in _POSITION_COLUMNS}
+        columns = read_columns(Path(path), named, select=lambda name: name in _MOTION_COLUMNS, gaps=True)
+        given = [name for name in _MOTION_COLUMNS if name in columns]
+        if not given:
+            remedy = "name columns ux_mm, uy_mm, uz_mm"
+            raise TraceError("no displacement of a point", place="header", remedy=remedy)
+        for name in named.values():
+            check_finite(columns[name], name, "give a number")
+        for name in given:  # whose empty cells are nan
+            values = np.nan_to_num(columns[name], posinf=np.inf, neginf=-np.inf)
+            check_finite(values, name, "give a number, or leave the cell empty")
+        place = np.column_stack([columns[name] for name in _POSITION_COLUMNS])
+        nothing = np.full(len(place), np.nan)
+        moved = np.column_stack([columns.get(name, nothing) for name in _MOTION_COLUMNS])
+        _check_sizes(place, moved, ", ".join(given))
+        _check_unique_rows(time_name, columns[time_name], place)
     return SurfaceMotion.from_rows(columns[time_name], place, moved)
 
 
-def _check_sizes(file: Path, place: Array, moved: Array, given: str) -> None:
+def _check_sizes(place: Array, moved: Array, given: str) -> None:
     """Refuse positions and displacements that cannot be millimetres."""
     if not np.isfinite(moved).any():
-        raise TraceError("no displacement is given", file=file, place=given, remedy="fill some of its cells")
+        raise TraceError("no displacement is given", place=given, remedy="fill some of its cells")
     extent, largest = float(np.ptp(place, axis=0).max()), float(np.nanmax(np.abs(moved)))
     if extent < MIN_EXTENT_MM:
-        raise TraceError(
-            f"all points lie within {extent:.3g} mm",
-            file=file,
-            place=_POSITION_COLUMNS[0],
-            remedy="give millimetres",
-        )
+        what = f"all points lie within {extent:.3g} mm"
+        raise TraceError(what, place=_POSITION_COLUMNS[0], remedy="give millimetres")
     if not MIN_MOTION_MM <= largest <= MAX_MOTION_MM:
-        span = f"{MIN_MOTION_MM:g} to {MAX_MOTION_MM:g} mm"
-        raise TraceError(
-            f"the largest displacement is {largest:.3g} mm, and not {span}",
-            file=file,
-            place=given,
-            remedy="give millimetres",
+        what = (
+            f"the largest displacement is {largest:.3g} mm, and not {MIN_MOTION_MM:g} to {MAX_MOTION_MM:g} mm"
         )
+        raise TraceError(what, place=given, remedy="give millimetres")
 
 
 def _find_points(place: Array) -> tuple[Array, NDArray[np.int64]]:
@@ -366,19 +350,15 @@ def _find_points(place: Array) -> tuple[Array, NDArray[np.int64]]:
     return place[first], point.ravel()
 
 
-def _check_unique_rows(file: Path, time_name: str, time: Array, place: Array) -> None:
+def _check_unique_rows(time_name: str, time: Array, place: Array) -> None:
     """Refuse a point that has two rows at one time."""
     rows = np.column_stack([time, _find_points(place)[1]])
     _, once = np.unique(rows, axis=0, return_index=True)
     if len(once) < len(rows):
         again = int(np.setdiff1d(np.arange(len(rows)), once)[0])
         where = ", ".join(f"{value:g}" for value in place[again])
-        raise TraceError(
-            f"the point ({where}) has two rows at {time[again]:g} s",
-            file=file,
-            place=time_name,
-            remedy="give each point one row for each time",
-        )
+        what = f"the point ({where}) has two rows at {time[again]:g} s"
+        raise TraceError(what, place=time_name, remedy="give each point one row for each time")
 
 
 def select_frames_in_contact(
