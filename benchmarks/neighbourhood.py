@@ -21,7 +21,7 @@ import numpy as np
 
 from limbfit import load_study
 from limbfit.execution import SerialExecutor
-from limbfit.identify.fit.correction import MeshCorrection
+from limbfit.identify.fit.multifidelity import MeshCorrection
 from limbfit.indentation import SimulationJob, build_problem, simulate, to_parameters, to_vector
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.engine.context import Context

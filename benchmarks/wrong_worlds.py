@@ -32,11 +32,10 @@ from scipy.signal import lfilter
 
 from limbfit.autoregressive import compute_block_covariance
 from limbfit.identify.checks.fit_quality import assess_fit, refit_residuals
-from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.calibration import CalibrationSettings, calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import Unknowns, build_space, build_stage_groupings, group_separately
 from limbfit.identify.fit.prediction import MAX_FREEDOM, PredictionModel, compute_error_percent
-from limbfit.identify.fit.state import CalibrationSettings
 from limbfit.identify.uncertainty.intervals import EvaluationStore, sample_uncertainty
 from limbfit.identify.uncertainty.noise import compute_depth_slope, estimate_record_noise
 from limbfit.identify.uncertainty.relaxation import GIVES_WAY, assess_relaxation

@@ -10,10 +10,9 @@ from bars import storing
 from numpy.typing import NDArray
 from scipy.special import bdtr
 
-from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.calibration import CalibrationSettings, calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import Unknowns, build_space, group_separately
-from limbfit.identify.fit.state import CalibrationSettings
 from limbfit.identify.uncertainty.intervals import EvaluationStore, restate_from_samples, sample_uncertainty
 from limbfit.identify.uncertainty.likelihood import ForceSurrogate, Likelihood
 from limbfit.identify.uncertainty.noise import SiteNoise

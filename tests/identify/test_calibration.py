@@ -19,10 +19,9 @@ from bars import (
 )
 
 from limbfit.errors import CalibrationError, ProblemError
-from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.calibration import CalibrationSettings, SearchState, calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import FIXED, Unknowns, build_space, group_by_kind, group_separately
-from limbfit.identify.fit.state import CalibrationSettings, SearchState
 
 
 def test_complex_step_derivatives_agree_with_differences():

@@ -10,7 +10,7 @@ import pytest
 from bars import NAMES, PAPER, SITES, TRUTH, Counted, records, simulate
 
 from limbfit.errors import CalibrationError, ProblemError
-from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.calibration import CalibrationSettings, calibrate
 from limbfit.identify.fit.multistart import describe_starts, draw_starts, run_multistart
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import (
@@ -21,7 +21,6 @@ from limbfit.identify.fit.parameters import (
     group_by_kind,
     group_separately,
 )
-from limbfit.identify.fit.state import CalibrationSettings
 
 GAMMA, TAU = NAMES.index("skin.gamma"), NAMES.index("skin.tau_s")
 

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from bars import NAMES, PAPER, SITES, TRUTH, records, simulate
 
-from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.calibration import CalibrationSettings, calibrate
 from limbfit.identify.fit.objective import SiteResponse, compute_residuals
 from limbfit.identify.fit.parameters import Prior, group_separately
-from limbfit.identify.fit.state import CalibrationSettings
 from limbfit.identify.uncertainty.noise import SiteNoise
 from limbfit.identify.uncertainty.uncertainty import DETERMINED, estimate_uncertainty
 

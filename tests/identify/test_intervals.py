@@ -7,10 +7,9 @@ import pytest
 from bars import NAMES, PAPER, TRUTH, records, simulate, storing
 from coverage_study import coverage_study
 
-from limbfit.identify.fit.calibration import calibrate, move_answer
+from limbfit.identify.fit.calibration import Calibration, calibrate, move_answer
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import Unknowns, build_space, group_separately
-from limbfit.identify.fit.state import Calibration
 from limbfit.identify.uncertainty.intervals import (
     EvaluationStore,
     count_further_evaluations,

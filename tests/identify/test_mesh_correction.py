@@ -10,7 +10,7 @@ import pytest
 from bars import TRUTH, coarsened, plain, simulate
 
 from limbfit.errors import CalibrationError
-from limbfit.identify.fit.correction import MeshCorrection
+from limbfit.identify.fit.multifidelity import MeshCorrection
 from limbfit.identify.fit.objective import SiteResponse
 
 FORCE = np.array([0.0, 1.0, 2.0, 1.0])

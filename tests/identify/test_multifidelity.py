@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from bars import PAPER, SITES, TRUTH, coarsened, plain, records, simulate
 
-from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.calibration import CalibrationSettings, calibrate
 from limbfit.identify.fit.multifidelity import CorrectionSettings, calibrate_with_correction
 from limbfit.identify.fit.objective import SiteResponse
-from limbfit.identify.fit.state import CalibrationSettings
 
 TIGHT = CorrectionSettings(rounds=4, tolerance_percent=0.02)
 

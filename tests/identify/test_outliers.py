@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 from bars import PAPER, TRUTH, Bars
 
-from limbfit.identify.checks.leave_one_out import LeaveOutFits, LogLinearModel
-from limbfit.identify.checks.outliers import approximate_response, find_outliers, guess_force_unit
+from limbfit.identify.checks.outliers import (
+    LeaveOutFits,
+    LogLinearModel,
+    approximate_response,
+    find_outliers,
+    guess_force_unit,
+)
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve
 

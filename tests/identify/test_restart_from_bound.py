@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from bars import NAMES, PAPER, TRUTH, Counted, records
 
-from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.calibration import Calibration, calibrate
 from limbfit.identify.fit.multistart import combine_searches, continue_from_bound, find_start_inside
 from limbfit.identify.fit.parameters import FIXED, build_stage_groupings, group_separately
-from limbfit.identify.fit.state import Calibration
 
 GAMMA = NAMES.index("skin.gamma")
 LOW = replace(PAPER, upper=np.where(np.arange(8) == GAMMA, 1.5, PAPER.upper))  # below the truth of 2

@@ -16,11 +16,11 @@ from ..errors import ProblemError
 from ..fe import Problem, StepControl, System, list_texts
 from ..fe import solve as simulate
 from ..fe.checking import check
+from ..identify.fit.calibration import CalibrationSettings
 from ..identify.fit.calibration import calibrate as search
 from ..identify.fit.objective import MeasuredCurve, SiteResponse
 from ..identify.fit.parameters import Unknowns, group_separately
 from ..identify.fit.prediction import compute_error_percent
-from ..identify.fit.state import CalibrationSettings
 from ..identify.uncertainty.noise import estimate_curve_noise
 from ..identify.uncertainty.uncertainty import Uncertainty, estimate_uncertainty
 from .solution import Solution, announce_compilation, new_axes, solve

@@ -12,7 +12,7 @@ import pytest
 from completing import complete
 from limbfit.errors import StudyError, TraceError
 from limbfit.identify.checks.crossvalidation import Fold, average_by_site, expand_to_records, list_choices
-from limbfit.identify.checks.leave_one_out import LeaveOutFits, list_pairs
+from limbfit.identify.checks.outliers import LeaveOutFits, list_pairs
 from limbfit.identify.checks.plausibility import RecordFacts, check_plausibility
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.prediction import PredictionModel

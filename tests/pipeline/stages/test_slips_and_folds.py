@@ -7,10 +7,9 @@ import pytest
 
 from layered import layered_block
 from limbfit.bench.blocks import build_block_site
-from limbfit.identify.fit.calibration import calibrate
+from limbfit.identify.fit.calibration import CalibrationSettings, calibrate
 from limbfit.identify.fit.objective import MeasuredCurve
 from limbfit.identify.fit.parameters import FIXED, Unknowns
-from limbfit.identify.fit.state import CalibrationSettings
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.pipeline.records.records import to_response
 from limbfit.study import SolverTable

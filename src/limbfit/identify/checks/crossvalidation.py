@@ -21,11 +21,10 @@ import numpy as np
 from ...arrays import Array
 from ...errors import CalibrationError
 from ...results.uncertainty import FoldFit
-from ..fit.calibration import calibrate
+from ..fit.calibration import Calibration, CalibrationSettings, calibrate
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
 from ..fit.parameters import Unknowns, group_separately
 from ..fit.prediction import ErrorSummary, compute_error_percent, summarise_errors
-from ..fit.state import Calibration, CalibrationSettings
 
 Choice = tuple[int, ...]
 Identify = Callable[[Unknowns], Calibration]

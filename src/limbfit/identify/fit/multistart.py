@@ -9,9 +9,9 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import CalibrationError
+from .calibration import Calibration
 from .multifidelity import CorrectionRound
 from .parameters import FIXED, Grouping, Unknowns, build_space, group_by_kind
-from .state import Calibration
 
 _SAME_COST = 0.01  # relative: half a per cent of the error
 # Relative, of every parameter: searches that stop on their last step end so far apart

@@ -20,10 +20,10 @@ import numpy as np
 from scipy.special import stdtrit  # Student quantiles; scipy.stats would take half a second to load
 
 from ...arrays import Array
+from ..fit.calibration import CalibrationSettings
 from ..fit.objective import MeasuredCurve, SiteResponse
 from ..fit.parameters import Grouping, SearchSpace, Unknowns, build_space, group_separately
 from ..fit.prediction import MAX_FREEDOM, combine_freedom
-from ..fit.state import CalibrationSettings
 from .discrepancy import ResidualModel, estimate_discrepancy, estimate_mesh_misfit
 from .estimator import Estimator, PriorPrecision
 from .noise import SiteNoise

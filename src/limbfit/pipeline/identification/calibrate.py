@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from ...identify.fit.calibration import Calibration
 from ...identify.fit.multifidelity import CorrectionRound
 from ...identify.fit.multistart import MultistartResult, describe_starts
 from ...identify.fit.objective import MeasuredCurve
-from ...identify.fit.state import Calibration
 from ...identify.uncertainty.relaxation import RelaxationAssessment, assess_relaxation
 from ...identify.uncertainty.uncertainty import Uncertainty
 from ...indentation import Parameters

@@ -30,10 +30,10 @@ from ...identify.checks.crossvalidation import (
     spread_points,
     summarise_errors_by_site,
 )
+from ...identify.fit.calibration import CalibrationSettings
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
 from ...identify.fit.prediction import compute_error_percent
-from ...identify.fit.state import CalibrationSettings
 from ...identify.uncertainty.emulator import Emulator
 from ...results.uncertainty import CrossvalidateResult, FoldCheck, FoldEmulator, HeldoutSite, OwnFold
 from ...study import Study

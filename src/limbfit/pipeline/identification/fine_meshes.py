@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ...arrays import Array
 from ...errors import RunError
-from ...identify.fit.correction import MeshCorrection
+from ...identify.fit.multifidelity import MeshCorrection
 from ...study.meshing import MeshTable
 from ...study.tables import SolverTable
 from ..engine.context import Context

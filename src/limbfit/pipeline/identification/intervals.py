@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ...arrays import Array
-from ...identify.fit.calibration import move_answer
-from ...identify.fit.state import Calibration
+from ...identify.fit.calibration import Calibration, move_answer
 from ...identify.uncertainty.intervals import EvaluationStore, count_further_evaluations, sample_uncertainty
 from ...identify.uncertainty.uncertainty import LINEARISED, Uncertainty, estimate_uncertainty
 from ..records.deviations import estimate_site_deviation, estimate_site_noise

@@ -13,7 +13,7 @@ import numpy as np
 from ...arrays import Array
 from ...identify.checks.domain import Extent, RecordedRange, describe_outside
 from ...identify.checks.fit_quality import assess_fit, refit_residuals, summarise_fit
-from ...identify.fit.correction import MeshCorrection
+from ...identify.fit.multifidelity import MeshCorrection
 from ...identify.fit.objective import SiteResponse, find_largest_magnitude
 from ...identify.fit.prediction import PredictionModel, compute_error_percent, summarise_errors
 from ...identify.uncertainty.discrepancy import MeshMisfit

@@ -8,6 +8,7 @@ from typing import Literal
 
 from ...arrays import Array
 from ...errors import StudyError
+from ...identify.fit.calibration import CalibrationSettings
 from ...identify.fit.parameters import (
     Grouping,
     Prior,
@@ -17,7 +18,6 @@ from ...identify.fit.parameters import (
     build_stage_groupings,
     constrain,
 )
-from ...identify.fit.state import CalibrationSettings
 from ...study import Study
 
 COUNTS = ("no", "one", "two", "three", "four", "five", "six")

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...identify.fit.calibration import calibrate
+from ...identify.fit.calibration import Calibration, SearchState, calibrate
 from ...identify.fit.multifidelity import CorrectionRound, CorrectionSettings, calibrate_with_correction
 from ...identify.fit.multistart import (
     MultistartResult,
@@ -15,7 +15,6 @@ from ...identify.fit.multistart import (
     run_multistart,
 )
 from ...identify.fit.parameters import Grouping, Unknowns
-from ...identify.fit.state import Calibration, SearchState
 from .problem import CalibrationProblem
 from .record_simulator import RecordSimulator
 

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from ...fe import SimulationWarning
+from ...identify.fit.calibration import Calibration
 from ...identify.fit.objective import SiteResponse
-from ...identify.fit.state import Calibration
 from ...indentation import Simulation
 from ...results.identification import ContactSummary, SearchDoubt, SimulationDoubt, SimulationDoubts
 

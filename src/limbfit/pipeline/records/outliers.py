@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Array
-from ...identify.checks.leave_one_out import LogLinearModel
-from ...identify.checks.outliers import Exchange, approximate_response, find_outliers
+from ...identify.checks.outliers import Exchange, LogLinearModel, approximate_response, find_outliers
 from ...identify.checks.plausibility import explain_warnings
-from ...identify.fit.correction import MeshCorrection
+from ...identify.fit.multifidelity import MeshCorrection
 from ...identify.fit.objective import SiteResponse
 from ...indentation import SimulationJob
 from ...results.identification import LeftOutRecord

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
-from ...identify.fit.correction import MeshCorrection
+from ...identify.fit.multifidelity import MeshCorrection
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import build_space, group_by_kind
 from ...identify.uncertainty.discrepancy import ResidualModel

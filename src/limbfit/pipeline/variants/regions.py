@@ -10,9 +10,9 @@ from typing import Any
 from ...arrays import Array
 from ...errors import InputError, StudyError
 from ...identify.checks.crossvalidation import RegionFit, RegionRecords, average_errors, fit_regions
+from ...identify.fit.calibration import Calibration
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
-from ...identify.fit.state import Calibration
 from ...results.uncertainty import RegionFitted, RegionsResult, WholeLimbFit
 from ...study import Site, Study
 from ..engine.context import Context
