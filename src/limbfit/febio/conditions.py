@@ -6,44 +6,48 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
 from ..errors import ProblemError, RunError
-from ..fe import Motion, Problem
+from ..fe import Motion
 from .reading.rigid import FREEDOMS, find_straight_line, has_same_rotation
 
 FIXED_SET = "held"
 FRAME_BODY = "frame"  # the rigid body that rails are fixed to
 
 
+@dataclass(frozen=True)
+class WrittenCurve:
+    """A load curve: ``points (n, 2)``, time in s and value."""
+
+    name: str
+    interpolate: str
+    points: Array
+
+
 @dataclass
 class CurveList:
     """The load curves of a file; `add` gives a curve its number."""
 
-    all: list[tuple[str, str, Array]] = field(default_factory=list)
+    all: list[WrittenCurve] = field(default_factory=list)
 
     def add(self, name: str, points: Array, interpolate: str = "LINEAR") -> int:
         """Add points (n, 2), time in s and value; return the number of the curve."""
-        self.all.append((name, interpolate, points))
+        self.all.append(WrittenCurve(name, interpolate, points))
         return len(self.all)
-
-    def format_lines(self) -> Iterator[str]:
-        yield "<LoadData>"
-        for i, (name, interpolate, points) in enumerate(self.all, 1):
-            yield f'<load_controller id="{i}" name={quoteattr(name)} type="loadcurve">'
-            yield f"<interpolate>{interpolate}</interpolate><extend>CONSTANT</extend><points>"
-            yield from (f"<pt>{format_row(point)}</pt>" for point in points)
-            yield "</points></load_controller>"
-        yield "</LoadData>"
 
 
 def format_row(values: Iterable[float], separator: str = ",") -> str:
     """Write numbers with commas, so that they are read back exactly."""
     return separator.join(repr(float(value)) for value in values)
+
+
+def find_across(direction: Array) -> Array:
+    """Return the axis of space (3,) that is most across a direction (3,)."""
+    return np.asarray(np.eye(3)[np.argmin(np.abs(direction))])
 
 
 def write_lines(path: str | Path, lines: Iterable[str]) -> None:
@@ -115,24 +119,6 @@ def to_rail_motion(motion: Motion, along: Array) -> Motion:
     return Motion(motion.times, values, under[:, None].repeat(6, axis=1))
 
 
-def format_rail(name: str, motion: Motion, along: Array, centre: Array, width: float) -> Iterator[str]:
-    """Write the joint that lets a body go along a line only, stiff to a thousandth of a mm and of a radian.
-
-    FEBio's own force on the joint is left out, because the body's force stands among its loads.
-    """
-    under = np.append(False, np.asarray(motion.forced)[:, 0])
-    stiff = 1e3 * float(np.linalg.norm(motion.values[under, :3], axis=1).max())
-    across = np.eye(3)[np.argmin(np.abs(along))]
-    yield f'<rigid_connector name="{name}_rail" type="rigid prismatic joint">'
-    yield f"<body_a>{FRAME_BODY}</body_a><body_b>{name}</body_b>"
-    yield "<laugon>PENALTY</laugon><tolerance>0</tolerance>"
-    yield f"<force_penalty>{stiff!r}</force_penalty><moment_penalty>{stiff * width!r}</moment_penalty>"
-    yield f"<joint_origin>{format_row(centre)}</joint_origin>"
-    yield f"<translation_axis>{format_row(along)}</translation_axis>"
-    yield f"<transverse_axis>{format_row(across)}</transverse_axis>"
-    yield "<prescribed_translation>0</prescribed_translation></rigid_connector>"
-
-
 def find_step_ends(motions: Iterable[Motion], end: float, settled: float = 0.0) -> list[float]:
     """Return the times at which FEBio must begin another step, s, and the end.
 
@@ -198,30 +184,3 @@ def _format_drive(label: str, name: str, kind: str, letter: str, curve: int, fac
         f'<{tag} name="{label}_{letter}" type="{kind}"><rb>{name}</rb><dof>{dof}</dof>'
         f'<value lc="{curve}">{float(factor)!r}</value>{more}<relative>0</relative></{tag}>'
     )
-
-
-def format_boundary(problem: Problem, curves: CurveList) -> Iterator[str]:
-    """Write the nodes that are held, and those that follow the history."""
-    if len(problem.fixed):
-        yield f'<bc name="held" node_set="{FIXED_SET}" type="zero displacement">'
-        yield "<x_dof>1</x_dof><y_dof>1</y_dof><z_dof>1</z_dof></bc>"
-    history, number = problem.history, 0
-    for i, support in enumerate(problem.supports, 1):
-        named = f'name="support_{i}" node_set="support_{i}"'
-        if support.factor == 0.0:
-            held = "".join(f"<{x}_dof>{support.component == k:d}</{x}_dof>" for k, x in enumerate("xyz"))
-            yield f'<bc {named} type="zero displacement">{held}</bc>'
-            continue
-        number = number or curves.add("history", np.column_stack([history.times, history.driver]))
-        yield f'<bc {named} type="prescribed displacement"><dof>{FREEDOMS[support.component]}</dof>'
-        yield f'<value lc="{number}">{support.factor!r}</value><relative>0</relative></bc>'
-
-
-def format_pressures(problem: Problem, curves: CurveList) -> Iterator[str]:
-    """Write follower pressures."""
-    for i, one in enumerate(problem.pressures, 1):
-        times = np.asarray(one.times)
-        number = curves.add(f"pressure_{i}", np.column_stack([times, np.asarray(one.values)]))
-        yield f'<surface_load name="pressure_{i}" type="pressure" surface="pressed_{i}">'
-        yield f'<pressure lc="{number}">1.0</pressure><linear>0</linear>'
-        yield "<symmetric_stiffness>0</symmetric_stiffness></surface_load>"

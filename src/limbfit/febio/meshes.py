@@ -8,9 +8,9 @@ FEBio's contact from converging, and the skin under a punch does not reach them.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from xml.sax.saxutils import quoteattr
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +18,12 @@ from ..arrays import Array, Indices
 from ..errors import ProblemError
 from ..fe import Indenter, Motion, OpenSurface, Problem, SmoothSurface, System
 from ..fe.contact.rigid import RigidShape
-from .conditions import FIXED_SET, find_rail, format_row, to_rail_motion, to_space
+from .conditions import FIXED_SET, find_rail, to_rail_motion, to_space
 
 INDENTER, PATCH, FRONT = "indenter", "contact_patch", "indenter_front"
 MIN_EDGE_ROUNDING = 0.05  # edge radius over the width that FEBio's contact goes round without retries
 # FEBio's names of limbfit's elements; hex8 with an uncoupled material is three-field by itself.
 QUADRATURE = {"tet4": "", "tet10": "TET10G4", "tet10p0": "TET10G4", "tet10g8": "TET10G8", "hex8": ""}
-_FACE = {3: "tri3", 4: "quad4", 6: "tri6"}
 
 
 @dataclass(frozen=True)
@@ -84,6 +83,23 @@ class FebBody:
     width: float
     rail: Array | None
 
+    @property
+    def has_friction(self) -> bool:
+        """True if it slides with friction."""
+        return self.friction not in ("frictionless", 0.0)
+
+    @property
+    def reach(self) -> float:
+        """How far FEBio searches for contact, mm: half again as far as the body goes in."""
+        ways = np.where(self.motion.free, 0.0, np.abs(self.motion.values))[:, :3]
+        return max(1.5 * float(ways.max()), 10.0 if self.motion.free.any() else 2.0)
+
+    @property
+    def rail_stiffness(self) -> float:
+        """Stiffness of the joint on its rail, N/mm, which gives way by a thousandth of a mm at most."""
+        under = np.append(False, np.asarray(self.motion.forced)[:, 0])
+        return 1e3 * float(np.linalg.norm(self.motion.values[under, :3], axis=1).max())
+
 
 def build_bodies(problem: Problem, motions: Sequence[Motion] = ()) -> list[FebBody]:
     """Build the rigid bodies of a problem where they start, with other ``motions`` than its own if given.
@@ -133,74 +149,41 @@ def _mesh_shape(shape: RigidShape) -> RigidMesh:
     return RigidMesh(points, faces, "tri3", faces)
 
 
-def format_mesh(problem: Problem, bodies: list[FebBody], meshes: dict[str, RigidMesh]) -> Iterator[str]:
-    """Write the mesh of the tissue and those of rigid bodies by name, with all sets, surfaces and pairs."""
-    mesh = problem.mesh
-    firsts = np.cumsum([len(mesh.points), *(len(rigid.points) for rigid in meshes.values())])
-    yield '<Mesh><Nodes name="all">'
-    for i, point in enumerate(np.vstack([mesh.points, *(rigid.points for rigid in meshes.values())]), 1):
-        yield f'<node id="{i}">{format_row(point)}</node>'
-    yield "</Nodes>"
-    number = 1
-    for r, name in enumerate(mesh.region_names):
-        cells = mesh.cells[mesh.regions == r]
-        yield from _format_elements(name, mesh.cell_type, cells, number)
-        number += len(cells)
-    for (name, rigid), first in zip(meshes.items(), firsts):
-        yield from _format_elements(name, rigid.cell_type, rigid.cells + first, number)
-        number += len(rigid.cells)
-    sets = {FIXED_SET: problem.fixed, **mesh.node_sets}
-    sets |= {f"support_{i}": support.nodes for i, support in enumerate(problem.supports, 1)}
-    for name, nodes in sets.items():
-        if len(nodes):
-            yield f"<NodeSet name={quoteattr(name)}>{_format_ids(nodes)}</NodeSet>"
-    named = {  # FEBio makes an element set of every part
+def list_parts(problem: Problem, rigid: Mapping[str, RigidMesh]) -> Iterator[dict[str, Any]]:
+    """List name, type and cells (m, k) of tissues and rigid bodies, and the number of their first cell."""
+    mesh, first, node = problem.mesh, 1, len(problem.mesh.points)
+    parts = [
+        (name, mesh.cell_type, mesh.cells[mesh.regions == r]) for r, name in enumerate(mesh.region_names)
+    ]
+    for name, body in rigid.items():
+        parts.append((name, body.cell_type, body.cells + node))
+        node += len(body.points)
+    for name, cell_type, cells in parts:
+        yield {"name": name, "cell_type": cell_type, "cells": cells, "first": first}
+        first += len(cells)
+
+
+def name_node_sets(problem: Problem) -> dict[str, Indices]:
+    """Return the sets of nodes of a file by their names there."""
+    supports = {f"support_{i}": support.nodes for i, support in enumerate(problem.supports, 1)}
+    return {FIXED_SET: problem.fixed, **problem.mesh.node_sets, **supports}
+
+
+def name_surfaces(problem: Problem, bodies: Sequence[FebBody]) -> dict[str, Indices]:
+    """Return the faces (f, k) of a file's surfaces by their names there."""
+    mesh, node = problem.mesh, len(problem.mesh.points)
+    found = {body.patch: body.faces for body in bodies}
+    for body in bodies:
+        found[body.front] = body.tool.front + node
+        node += len(body.tool.points)
+    found |= {f"pressed_{i}": np.asarray(one.faces) for i, one in enumerate(problem.pressures, 1)}
+    own = {  # FEBio makes an element set of every part
         f"{name}_surface" if name in mesh.region_names else name: faces
         for name, faces in mesh.face_sets.items()
     }
-    surfaces = {body.patch: body.faces for body in bodies}
-    surfaces |= {body.front: body.tool.front + first for body, first in zip(bodies, firsts)}
-    surfaces |= {f"pressed_{i}": np.asarray(one.faces) for i, one in enumerate(problem.pressures, 1)}
-    for name, faces in {**surfaces, **named}.items():
-        yield from _format_surface(name, faces)
-    for body in bodies:
-        yield f"<SurfacePair name={quoteattr(body.pair)}><primary>{body.patch}</primary>"
-        yield f"<secondary>{body.front}</secondary></SurfacePair>"
-    yield "</Mesh>"
+    return {**found, **own}
 
 
-def _format_elements(name: str, cell_type: str, cells: Indices, first: int) -> Iterator[str]:
-    yield f"<Elements type={quoteattr(cell_type)} name={quoteattr(name)}>"
-    for i, cell in enumerate(cells, first):
-        yield f'<elem id="{i}">{_format_ids(cell)}</elem>'
-    yield "</Elements>"
-
-
-def _format_surface(name: str, faces: Indices) -> Iterator[str]:
-    kind = _FACE[faces.shape[1]]
-    yield f"<Surface name={quoteattr(name)}>"
-    for i, face in enumerate(faces, 1):
-        yield f'<{kind} id="{i}">{_format_ids(face)}</{kind}>'
-    yield "</Surface>"
-
-
-def format_domains(problem: Problem, meshes: dict[str, RigidMesh]) -> Iterator[str]:
-    """Write how the parts are discretised."""
-    rule = QUADRATURE[problem.formulation.name]
-    given = f' elem_type="{rule}"' if rule else ""
-    if problem.formulation.name == "tet10p0":  # one volume ratio and pressure per element
-        given += ' type="three-field-solid"'
-    yield "<MeshDomains>"
-    for name in problem.mesh.region_names:
-        yield f"<SolidDomain name={quoteattr(name)} mat={quoteattr(name)}{given}/>"
-    for name, rigid in meshes.items():
-        names = f"name={quoteattr(name)} mat={quoteattr(name)}"
-        if rigid.cell_type == "hex8":
-            yield f"<SolidDomain {names}/>"
-        else:
-            yield f"<ShellDomain {names}><shell_thickness>0.01</shell_thickness></ShellDomain>"
-    yield "</MeshDomains>"
-
-
-def _format_ids(nodes: Iterable[int]) -> str:
+def format_ids(nodes: Iterable[int]) -> str:
+    """Write nodes as FEBio's numbers, which count from 1."""
     return ",".join(str(int(node) + 1) for node in nodes)

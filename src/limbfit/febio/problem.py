@@ -26,6 +26,7 @@ from .parts import (
 )
 from .penalty import compute_mean_penalty, find_smallest_depth
 from .reading.geometry import find_boundary_faces, is_closed
+from .reading.materials import Prestrain
 from .reading.model import Contact, FebModel
 from .reading.rigid import (
     FREEDOMS,
@@ -70,6 +71,7 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
     fixed, supports = _build_supports(model, tissue.node_index, driven)
     element = next(iter(model.select_parts(model.materials).values())).element
     friction = 0.0 if placed is None else touching[name][0].friction
+    prestrains = {part: _grow_prestrain(model, one) for part, one in model.prestrains.items()}
     return Problem(
         mesh=tissue.mesh,
         materials={
@@ -88,35 +90,29 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
             for name, motion in driven.motions.items()
         ),
         pressures=_build_pressures(model, tissue),
-        fibres=_build_fibres(model, tissue),
+        fibres=_fill_cells(tissue, model.fibres, np.array([1.0, 0.0, 0.0])),
         activation=_build_activation(model),
-        prestretch=_build_prestretch(model, tissue),
+        prestretch=_fill_cells(tissue, prestrains, np.eye(3)),
         **{"element": element, "contact_rule": _choose_contact_rule(model, tissue), **settings},
     )
 
 
-def _build_fibres(model: FebModel, tissue: TissueMesh) -> Array | None:
-    """Return the direction of the fibres in every cell, which is arbitrary where there are none."""
-    if not model.fibres:
+def _fill_cells(tissue: TissueMesh, by_part: Mapping[str, Array], elsewhere: Array) -> Array | None:
+    """Return a value of every cell (m, ...) from those of some parts; None if no part has any."""
+    if not by_part:
         return None
-    found = np.tile([1.0, 0.0, 0.0], (len(tissue.mesh.cells), 1))
+    found = np.tile(elsewhere, (len(tissue.mesh.cells), *np.ones(elsewhere.ndim, dtype=int)))
     for r, name in enumerate(tissue.mesh.region_names):
-        if name in model.fibres:
-            found[tissue.mesh.regions == r] = model.fibres[name]
+        if name in by_part:
+            found[tissue.mesh.regions == r] = by_part[name]
     return found
 
 
-def _build_prestretch(model: FebModel, tissue: TissueMesh) -> Array | None:
-    """Return the pre-strain of every cell, fully grown; the identity where there is none."""
-    if not model.prestrains:
-        return None
-    found = np.tile(np.eye(3), (len(tissue.mesh.cells), 1, 1))
-    for r, name in enumerate(tissue.mesh.region_names):
-        one = model.prestrains.get(name)
-        if one is not None:
-            grown = one.factor * (float(model.curves[one.curve].at(0.0)) if one.curve else 1.0)
-            found[tissue.mesh.regions == r] = (1.0 - grown) * np.eye(3) + grown * one.gradient
-    return found
+def _grow_prestrain(model: FebModel, prestrain: Prestrain) -> Array:
+    """Return the pre-strain of a part's cells (m, 3, 3), fully grown."""
+    curve = prestrain.curve
+    grown = prestrain.factor * (float(model.curves[curve].at(0.0)) if curve else 1.0)
+    return np.asarray((1.0 - grown) * np.eye(3) + grown * prestrain.gradient)
 
 
 def _build_activation(model: FebModel) -> Activation | None:

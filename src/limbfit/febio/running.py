@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array, Indices
-from ..errors import InputError, ProblemError, RunError
+from ..errors import InputError, RunError, add_location
 from ..fe import Result, Step, System, solve
 from ..fe.kernel.laws import Laws
 from ..fe.observables import ElementFields, compute_element_fields, compute_nodal_forces
@@ -55,8 +55,9 @@ def run_feb(
     RunError
         If the tables cannot be written.
     """
-    folder, model = Path(output), read_feb(path)
-    try:
+    folder = Path(output)
+    with add_location(file=path):
+        model = read_feb(path)
         problem = to_problem(model)
         control = build_step_control(model, problem, **settings)
         system = System(problem, control.threads)
@@ -65,8 +66,6 @@ def run_feb(
         if has_penalty(model) and "penalty" not in settings:
             laws = [contacts[0] for contacts in group_contacts(model).values()]
             weights = FacePenalties(system, laws, np.asarray(control.times))
-    except ProblemError as error:
-        raise ProblemError(error.what, file=path, place=error.place, remedy=error.remedy) from None
     assert control.times is not None
     for table in tables.files:
         own = table.exists() and table.samefile(path)

@@ -12,27 +12,29 @@ Source: FEBio User Manual 4.0, chapter 4, and the section on ``MeshData``; ``FEA
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import Indenter, Material, Motion, Problem, StepControl
 from ..fe.solution.control import schedule_steps
+from ..mesh import Mesh
 from .conditions import (
     FIXED_SET,
     FRAME_BODY,
     CurveList,
+    find_across,
     find_step_ends,
-    format_boundary,
     format_conditions,
-    format_pressures,
-    format_rail,
     format_row,
     write_lines,
 )
@@ -45,9 +47,11 @@ from .meshes import (
     RigidMesh,
     build_bodies,
     build_frame_mesh,
-    format_domains,
-    format_mesh,
+    format_ids,
     has_round_edges,
+    list_parts,
+    name_node_sets,
+    name_surfaces,
 )
 from .penalty import compute_explicit_penalty, compute_mean_stiffness
 from .preparation import PRESTRAIN_S, Preparation, prepare_problem
@@ -95,7 +99,7 @@ def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None =
     if forced or Preparation.from_problem(problem).seconds or problem.touch_down_s:
         prepared, motions = prepare_problem(problem, settings.steps)
         bodies = build_bodies(prepared, motions)
-    write_lines(path, _format_file(problem, prepared, bodies, settings))
+    write_lines(path, [_render_file(problem, prepared, bodies, settings)])
     return bodies[0].tool if bodies else None
 
 
@@ -170,7 +174,8 @@ def describe_differences(problem: Problem, settings: FebSettings) -> tuple[str, 
         )
     if any(body.rail is not None for body in build_bodies(problem)):
         lines.append("guides: bodies under a force go along a prismatic joint, held by a penalty")
-    if any(_has_friction(body.friction) and body.sticking == "anchored" for body in problem.rigid_bodies):
+    slides = [body.sticking for body in problem.rigid_bodies if body.friction not in ("frictionless", 0.0)]
+    if "anchored" in slides:
         lines.append(
             "sticking: FEBio anchors what sticks anew in every step, so that it slips on in time; "
             'limbfit does so with sticking = "stepwise"'
@@ -195,85 +200,91 @@ def check_element(problem: Problem, program: str) -> None:
 def check_simple_indentation(problem: Problem, program: str) -> None:
     """Raise `ProblemError` if a problem is more than a frictionless indentation along the axis."""
     check_element(problem, program)
-    if problem.prestretch is not None or problem.touch_down_s or problem.activation is not None:
-        what = f"a limb that clamps, contraction or pre-stretch move first is not written for {program}"
-        raise ProblemError(what, remedy="leave them out of the study, or export for FEBio")
-    if problem.indenter is None or problem.supports:
-        raise ProblemError(f"only indentations with fixed nodes are written for {program}")
-    if problem.history.across is not None:
-        raise ProblemError(f"a move across the indenter's axis is not written for {program}")
-    if problem.history.forced or problem.bodies:
-        raise ProblemError(f"an indenter under force, or further rigid bodies, are not written for {program}")
-    if problem.pressures:
-        raise ProblemError(f"a pressure is not written for {program}")
-    if problem.friction != "frictionless":
-        raise ProblemError(
-            f"friction is not written for {program}", remedy='export with friction = "frictionless"'
-        )
+    moves_first = problem.prestretch is not None or problem.touch_down_s or problem.activation is not None
+    without = "leave them out of the study, or export for FEBio"
+    history = problem.history
+    for is_there, what, remedy in (
+        (moves_first, "a limb that clamps, contraction or pre-stretch move first is", without),
+        (problem.indenter is None or problem.supports, "other than an indentation with fixed nodes is", None),
+        (history.across is not None, "a move across the indenter's axis is", None),
+        (history.forced or problem.bodies, "an indenter under force, or further rigid bodies, are", None),
+        (problem.pressures, "a pressure is", None),
+        (problem.friction != "frictionless", "friction is", 'export with friction = "frictionless"'),
+    ):
+        if is_there:
+            raise ProblemError(f"{what} not written for {program}", remedy=remedy)
     taken = {*problem.mesh.node_sets, *problem.mesh.face_sets} & {PATCH, FRONT, FIXED_SET}
     if taken or INDENTER in problem.mesh.region_names:
         raise ProblemError(f"a set or tissue has the name {(*taken, INDENTER)[0]!r}, which is the indenter's")
 
 
-def _format_file(
-    problem: Problem, prepared: Problem, bodies: list[FebBody], settings: FebSettings
-) -> Iterator[str]:
-    """Write the file of a problem; ``prepared`` is the problem in the file's own time."""
-    yield '<?xml version="1.0" encoding="UTF-8"?>'
-    for remark in (f"limbfit: {settings.title}; mm, N, s, MPa", *describe_differences(problem, settings)):
-        yield f"<!-- {escape(' '.join(remark.replace('--', '-').split()))} -->"
-    curves, regions = CurveList(), problem.mesh.region_names
-    settled = Preparation.from_problem(problem).settling_s
+def _render_file(problem: Problem, prepared: Problem, bodies: list[FebBody], settings: FebSettings) -> str:
+    """Write the file of a problem; ``prepared`` is the problem in the file's own time.
+
+    FEBio's own force on a rail's joint is left out, because the body's force stands among its loads.
+    """
+    curves, settled = CurveList(), Preparation.from_problem(problem).settling_s
     ends = find_step_ends([body.motion for body in bodies], float(prepared.history.times[-1]), settled)
     rigid = [format_conditions(body.name, body.motion, ends, curves) for body in bodies]
-    by_step = [[line for body in rigid for line in body[k]] for k in range(len(ends))]
-    must = curves.add("must_points", _find_must_points(problem, settings), "STEP")
-    boundary = list(format_boundary(prepared, curves))
-    loads = list(format_pressures(prepared, curves))
-    controls = [list(_format_control(problem, settings, must, *span)) for span in pairwise([0.0, *ends])]
-    tissues = list(_format_materials(prepared, curves, settled))
-    rails = [line for body in bodies if body.rail is not None
-             for line in format_rail(body.name, body.motion, body.rail, body.centre, body.width)]  # fmt: skip
-    frame = build_frame_mesh(bodies) if rails else None
-    yield '<febio_spec version="4.0">'
-    yield '<Module type="solid"/>'
-    if len(ends) == 1:
-        yield from controls[0]
-    yield "<Globals><Constants><T>0</T><R>0</R><Fc>0</Fc></Constants></Globals>"
-    yield from ("<Material>", *tissues)
-    rigids = [(body.name, body.centre) for body in bodies]
-    rigids += [] if frame is None else [(FRAME_BODY, frame.points[0])]
-    for i, (name, centre) in enumerate(rigids, len(regions) + 1):
-        yield (
-            f'<material id="{i}" name={quoteattr(name)} type="rigid body"><density>1</density>'
-            f"<center_of_mass>{format_row(centre)}</center_of_mass></material>"
-        )
-    yield "</Material>"
-    meshes = {body.name: body.tool for body in bodies} | ({} if frame is None else {FRAME_BODY: frame})
-    yield from format_mesh(problem, bodies, meshes)
-    yield from format_domains(problem, meshes)
-    data = list(_format_cell_data(problem))
-    if data:
-        yield from ("<MeshData>", *data, "</MeshData>")
-    yield from ("<Boundary>", *boundary, "</Boundary>")
-    everywhere = rails + (by_step[0] if len(ends) == 1 else [])
-    if frame is not None:
-        everywhere += format_conditions(FRAME_BODY, REST, ends[-1:], curves)[0]
-    if everywhere:
-        yield from ("<Rigid>", *everywhere, "</Rigid>")
-    if bodies:
-        contacts = (line for body in bodies for line in _format_contact(problem, body, settings))
-        yield from ("<Contact>", *contacts, "</Contact>")
-    if loads:
-        yield from ("<Loads>", *loads, "</Loads>")
-    yield from curves.format_lines()
-    if len(ends) > 1:
-        yield "<Step>"
-        for k, (control, lines) in enumerate(zip(controls, by_step), 1):
-            yield from (f'<step id="{k}">', *control, "<Rigid>", *lines, "</Rigid>", "</step>")
-        yield "</Step>"
-    yield from _format_output(range(len(regions) + 1, len(regions) + len(bodies) + 1), settings)
-    yield "</febio_spec>"
+    steps = [_find_step_size(problem, settled, *span) for span in pairwise([0.0, *ends])]
+    for k, step in enumerate(steps):
+        step["conditions"] = [Markup(line) for body in rigid for line in body[k]]
+    meshes = {body.name: body.tool for body in bodies}
+    centres = {body.name: body.centre for body in bodies}
+    everywhere = steps[0]["conditions"] if len(steps) == 1 else []
+    if any(body.rail is not None for body in bodies):
+        meshes[FRAME_BODY] = build_frame_mesh(bodies)
+        centres[FRAME_BODY] = meshes[FRAME_BODY].points[0]
+        held = format_conditions(FRAME_BODY, REST, ends[-1:], curves)[0]
+        everywhere = [*everywhere, *map(Markup, held)]
+    remarks = (f"limbfit: {settings.title}; mm, N, s, MPa", *describe_differences(problem, settings))
+    history, axes, prestrains = prepared.history, _find_fibre_directions(problem), _find_prestrains(problem)
+    environment = Environment(
+        loader=PackageLoader("limbfit.febio", "templates"), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters |= {
+        "row": format_row, "ids": format_ids, "across": find_across, "prestrain_map": _name_prestrain_map,
+        "axes": lambda direction: Markup(_format_axes(direction)),
+    }  # fmt: skip
+    return environment.get_template("model.feb.j2").render(
+        problem=problem,
+        bodies=bodies,
+        rigid_meshes=meshes,
+        centres=centres,
+        remarks=[Markup(escape(" ".join(text.replace("--", "-").split()))) for text in remarks],
+        steps=steps,
+        conditions=everywhere,
+        contact=build_contact(problem, settings),
+        is_symmetric=not problem.pressures and not any(body.has_friction for body in bodies),
+        points=np.vstack([problem.mesh.points, *(mesh.points for mesh in meshes.values())]),
+        parts=list(list_parts(problem, meshes)),
+        node_sets=name_node_sets(problem),
+        surfaces=name_surfaces(problem, bodies),
+        quadrature=QUADRATURE[problem.formulation.name],
+        fibre_maps={name: own for name, own in axes.items() if len(own) > 1},
+        prestrain_maps={name: own for name, own in prestrains.items() if len(own) > 1},
+        fixed_set=FIXED_SET,
+        frame_body=FRAME_BODY,
+        force_file=settings.force_file,
+        must_curve=curves.add("must_points", _find_must_points(problem, settings), "STEP"),
+        history_curve=curves.add("history", np.column_stack([history.times, history.driver]))
+        if any(support.factor for support in problem.supports)
+        else 0,
+        pressure_curves=[
+            curves.add(f"pressure_{i}", np.column_stack([one.times, one.values]))
+            for i, one in enumerate(prepared.pressures, 1)
+        ],
+        materials=[Markup(line) for line in _format_materials(prepared, curves, settled)],
+        curves=curves.all,
+    )
+
+
+def _find_step_size(problem: Problem, settled: float, begin: float, end: float) -> dict[str, Any]:
+    """Return number and size, s, of the first steps from ``begin`` to ``end``, which FEBio enlarges."""
+    largest = PRESTRAIN_S / 10.0 if end <= settled else _compute_largest_step(problem)
+    size = _divide_evenly(end - begin, 0.25 * largest)
+    return {"count": round((end - begin) / size), "size": size}
 
 
 def _find_must_points(problem: Problem, settings: FebSettings) -> Array:
@@ -310,37 +321,6 @@ def _format_materials(problem: Problem, curves: CurveList, settled: float) -> It
         yield from _format_material(i, name, problem.materials[name], axis, course, prestrain)
 
 
-def _format_control(
-    problem: Problem, settings: FebSettings, must: int, begin: float, end: float
-) -> Iterator[str]:
-    """Write the steps that FEBio enlarges and halves; stiff contact needs a tangent in every iteration.
-
-    With an explicit penalty quasi-Newton updates stall.
-    """
-    settles = end <= Preparation.from_problem(problem).settling_s
-    size = _divide_evenly(
-        end - begin, 0.25 * (PRESTRAIN_S / 10.0 if settles else _compute_largest_step(problem))
-    )
-    updates, reformations = (0, 60) if settings.penalty is None else (10, 25)
-    yield f"<Control><analysis>STATIC</analysis><time_steps>{round((end - begin) / size)}</time_steps>"
-    yield f"<step_size>{size!r}</step_size>"
-    yield "<plot_level>PLOT_MUST_POINTS</plot_level><output_level>OUTPUT_MAJOR_ITRS</output_level>"
-    yield '<time_stepper type="default"><max_retries>8</max_retries><opt_iter>15</opt_iter>'
-    yield f'<dtmin>{size / 100.0!r}</dtmin><dtmax lc="{must}">1</dtmax><aggressiveness>1</aggressiveness>'
-    yield "</time_stepper>"
-    smooth = not problem.pressures and not any(_has_friction(body.friction) for body in problem.rigid_bodies)
-    matrix = "symmetric" if smooth else "non-symmetric"
-    yield f'<solver type="solid"><symmetric_stiffness>{matrix}</symmetric_stiffness>'
-    yield f"<max_refs>{reformations}</max_refs>"
-    yield "<dtol>0.001</dtol><etol>0.01</etol><rtol>1e-05</rtol><lstol>0.9</lstol>"
-    yield f'<qn_method type="BFGS"><max_ups>{updates}</max_ups></qn_method></solver></Control>'
-
-
-def _has_friction(friction: str | float) -> bool:
-    """True if a body slides with friction."""
-    return friction not in ("frictionless", 0.0)
-
-
 def _compute_largest_step(problem: Problem) -> float:
     """Return the largest step, s: a sixteenth of the first way in, half of that under sharp edges."""
     ways = [] if problem.indenter is None else [problem.history.loading_s - problem.touch_down_s]
@@ -355,32 +335,6 @@ def _compute_largest_step(problem: Problem) -> float:
 def _divide_evenly(span: float, size: float) -> float:
     """Return a whole fraction of a span of time, not above ``size``, s."""
     return span / float(np.ceil(span / size))
-
-
-def _format_contact(problem: Problem, body: FebBody, settings: FebSettings) -> Iterator[str]:
-    """Write the contact as in the reference cases; the search reaches half again as far as a body goes in."""
-    ways = np.where(body.motion.free, 0.0, np.abs(body.motion.values))[:, :3]
-    reach = max(1.5 * float(ways.max()), 10.0 if body.motion.free.any() else 2.0)
-    pair = quoteattr(body.pair)
-    yield f'<contact name={pair} type="sliding-elastic" surface_pair={pair}>'
-    contact = build_contact(problem, settings)
-    yield f"<laugon>PENALTY</laugon><penalty>{contact.penalty!r}</penalty>"
-    yield f"<auto_penalty>{contact.automatic:d}</auto_penalty>"
-    smooth = not _has_friction(body.friction)
-    yield f"<two_pass>0</two_pass><symmetric_stiffness>{smooth:d}</symmetric_stiffness>"
-    yield "<search_tol>0.01</search_tol>"
-    if not smooth:
-        yield f"<fric_coeff>{float(body.friction)!r}</fric_coeff>"
-    yield f"<search_radius>{reach!r}</search_radius></contact>"
-
-
-def _format_output(numbers: Iterable[int], settings: FebSettings) -> Iterator[str]:
-    variables = ("displacement", "stress", "relative volume", "contact pressure", "contact gap")
-    yield '<Output><plotfile type="febio">' + "".join(f'<var type="{name}"/>' for name in variables)
-    items = ",".join(str(number) for number in numbers)
-    table = f'data="Fx;Fy;Fz;x;y;z" file={quoteattr(settings.force_file)} delim=","'
-    rigid = f"<logfile><rigid_body_data {table}>{items}</rigid_body_data></logfile>"
-    yield f"</plotfile>{rigid if items else ''}</Output>"
 
 
 def _format_material(
@@ -441,20 +395,21 @@ def _find_prestrains(problem: Problem) -> dict[str, Array]:
     ProblemError
         If one changes the volume, which FEBio's pressure would not see.
     """
-    if problem.prestretch is None:
-        return {}
-    mesh, found = problem.mesh, {}
-    given = np.broadcast_to(np.asarray(problem.prestretch, dtype=float), (len(mesh.cells), 3, 3))
-    for r, name in enumerate(mesh.region_names):
-        own = given[mesh.regions == r]
+    found = {} if problem.prestretch is None else _divide_by_region(problem.mesh, problem.prestretch, (3, 3))
+    for name, own in found.items():
         if np.abs(np.linalg.det(own) - 1.0).max(initial=0.0) > 1e-9:
             raise ProblemError(
                 f"the pre-stretch of tissue {name!r} changes its volume, which FEBio's pressure does not see",
                 remedy="give one of constant volume (limbfit.fe.isochoric_stretch)",
             )
-        if np.abs(own - np.eye(3)).max(initial=0.0) > 0.0:
-            found[name] = own[:1] if (own == own[0]).all() else own
-    return found
+    return {name: own for name, own in found.items() if np.abs(own - np.eye(3)).max(initial=0.0) > 0.0}
+
+
+def _divide_by_region(mesh: Mesh, values: Any, shape: tuple[int, ...]) -> dict[str, Array]:
+    """Return values of cells (or the one of all), of a ``shape``, by region: (1, ...) where all are alike."""
+    given = np.broadcast_to(np.asarray(values, dtype=float), (len(mesh.cells), *shape))
+    found = {name: given[mesh.regions == r] for r, name in enumerate(mesh.region_names)}
+    return {name: own[:1] if (own == own[:1]).all() else own for name, own in found.items()}
 
 
 def _name_prestrain_map(name: str) -> str:
@@ -462,33 +417,12 @@ def _name_prestrain_map(name: str) -> str:
     return f"prestrain_of_{''.join(c if c.isalnum() else '_' for c in name)}"
 
 
-def _format_cell_data(problem: Problem) -> Iterator[str]:
-    """Write the axes and the pre-strains that differ from cell to cell."""
-    for name, directions in _find_fibre_directions(problem).items():
-        if len(directions) > 1:
-            yield f'<ElementData type="mat_axis" elem_set={quoteattr(name)}>'
-            yield from (f'<elem lid="{i}">{_format_axes(a)}</elem>' for i, a in enumerate(directions, 1))
-            yield "</ElementData>"
-    for name, gradients in _find_prestrains(problem).items():
-        if len(gradients) > 1:
-            map_name = _name_prestrain_map(name)
-            yield f'<ElementData name="{map_name}" data_type="mat3" elem_set={quoteattr(name)}>'
-            yield from (f'<elem lid="{i}">{format_row(G.ravel())}</elem>' for i, G in enumerate(gradients, 1))
-            yield "</ElementData>"
-
-
 def _find_fibre_directions(problem: Problem) -> dict[str, Array]:
     """Return the fibre directions of each region that has some: (1, 3), or one for each of its cells."""
-    mesh, found = problem.mesh, {}
-    for r, name in enumerate(mesh.region_names):
-        if problem.materials[name].table().has_fibres and problem.fibres is not None:
-            given = np.broadcast_to(np.asarray(problem.fibres, dtype=float), (len(mesh.cells), 3))
-            own = given[mesh.regions == r]
-            found[name] = own[:1] if (own == own[0]).all() else own
-    return found
+    found = {} if problem.fibres is None else _divide_by_region(problem.mesh, problem.fibres, (3,))
+    return {name: own for name, own in found.items() if problem.materials[name].table().has_fibres}
 
 
 def _format_axes(direction: Array) -> str:
     """Write the first axis, and a vector that spans a plane with it."""
-    other = np.eye(3)[np.argmin(np.abs(direction))]
-    return f"<a>{format_row(direction)}</a><d>{format_row(other)}</d>"
+    return f"<a>{format_row(direction)}</a><d>{format_row(find_across(direction))}</d>"

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from ...arrays import Array, Indices
-from ...errors import ProblemError
+from ...errors import ProblemError, add_location
 from ...fe import Material
 from .geometry import Geometry, Part, find_node_set, read_geometry
 from .materials import (
@@ -34,15 +34,16 @@ from .rigid import (
     compute_centre_of_mass,
     find_body,
     find_carried_nodes,
-    find_value,
     read_conditions,
+    read_drive,
     read_factor,
+    read_fixed,
     read_rails,
 )
 from .timing import ControlPhase, LoadCurve, compute_step_times, read_curves, read_phases
 from .tree import XmlNode, read_tree
 
-COMPONENTS = ("x", "y", "z")
+COMPONENTS = "xyz"
 CONTACTS = ("sliding-elastic", "sliding-facet-on-facet", "sliding-node-on-facet")
 _UNSUPPORTED_SECTIONS = ("Initial", "Constraints", "Discrete", "MeshAdaptor", "Include")
 _KNOWN_SECTIONS = (
@@ -169,17 +170,14 @@ def read_feb(path: str | Path) -> FebModel:
     ProblemError
         If the file is missing, is not XML, or holds what limbfit does not support; with its line.
     """
-    root = read_tree(path)
-    try:
-        version = root.attributes.get("version", "")
-        if root.tag != "febio_spec" or version.partition(".")[0] not in ("3", "4"):
-            raise root.error("is not an input of FEBio 3 or 4", "save it again with FEBio Studio 2")
-        return _read_model(root)
-    except ProblemError as error:
-        raise ProblemError(error.what, file=path, place=error.place, remedy=error.remedy) from None
+    with add_location(file=path):
+        return _read_model(read_tree(path))
 
 
 def _read_model(root: XmlNode) -> FebModel:
+    version = root.attributes.get("version", "")
+    if root.tag != "febio_spec" or version.partition(".")[0] not in ("3", "4"):
+        raise root.error("is not an input of FEBio 3 or 4", "save it again with FEBio Studio 2")
     for section in root:
         if "from" in section.attributes:
             raise section.error("stands in another file", "write the input as one file")
@@ -228,9 +226,7 @@ def _drop_settling(model: FebModel) -> FebModel:
     others |= {c.curve: f"the rigid body {c.body!r}" for c in model.conditions if c.curve and not c.step}
     others |= {p.curve: f"the pressure on {p.surface!r}" for p in model.pressures}
     others |= {c.curve: f"the contraction of {c.material!r}" for c in model.contractions if c.curve}
-    first = _compute_settling_time_s(
-        model.prestrains, model.materials, model.phases, model.curves, others, model.conditions
-    )
+    first = _compute_settling_time_s(model, others)
     if not first:
         return model
     kept = (c for c in model.conditions if c.step != 0)
@@ -243,36 +239,26 @@ def _drop_settling(model: FebModel) -> FebModel:
     )
 
 
-def _compute_settling_time_s(
-    prestrains: Mapping[str, Prestrain], materials: Mapping[str, Material], phases: tuple[ControlPhase, ...],
-    curves: Mapping[int, LoadCurve], other_curves: Mapping[int, str], conditions: tuple[RigidCondition, ...],
-) -> float:  # fmt: skip
+def _compute_settling_time_s(model: FebModel, other_curves: Mapping[int, str]) -> float:
     """Return the length of the first step, s, in which pre-strained tissue settles; 0 if it needs none.
 
-    Parameters
-    ----------
-    other_curves : the load curves of what else moves tissue, each with a description.
-
-    Raises
-    ------
-    ProblemError
-        If the pre-strain goes on growing, the tissue has not relaxed, or something else moves it.
+    ``other_curves`` are the load curves of what else moves tissue, each with a description. It is an error if
+    the pre-strain goes on growing, the tissue has not relaxed, or something else moves it.
     """
+    conditions, curves = model.conditions, model.curves
     slowest = max(
-        (tau for law in materials.values() for g, tau in law.table().prony if g != 0.0), default=0.0
+        (tau for law in model.materials.values() for g, tau in law.table().prony if g != 0.0), default=0.0
     )
-    growing = [one for one in prestrains.values() if one.curve]
-    steady = [one for one in prestrains.values() if not one.curve]
+    growing = [one for one in model.prestrains.values() if one.curve]
+    steady = [one for one in model.prestrains.values() if not one.curve]
+    remedy = "let its ramp grow in a first step of its own, and rest"
     if steady and slowest > 0.0:
-        remedy = "let its ramp grow in a first step of its own, and rest"
         raise _build_prestrain_error("acts at once in tissue that relaxes", steady[0], remedy)
     if not growing:
         return 0.0
-    first = phases[0].seconds
-    if len(phases) < 2:
-        raise _build_prestrain_error(
-            "grows in the only step", growing[0], "let it grow in a first step of its own, and rest"
-        )
+    first = model.phases[0].seconds
+    if len(model.phases) < 2:
+        raise _build_prestrain_error("grows in the only step", growing[0], remedy)
     rested = max(_compute_rest_start(one, first, slowest, curves) for one in growing)
     times = np.linspace(rested, first, 101)
     for number, description in other_curves.items():
@@ -323,24 +309,12 @@ def _read_node_motions(
         target, kind = bc.attribute("node_set"), bc.attribute("type")
         nodes = find_node_set(geometry, target, bc)
         if kind in ("zero displacement", "fix"):
-            for i, letter in enumerate(COMPONENTS):
-                named = letter in [dof.strip() for dof in bc.string("dofs", "").split(",")]
-                if named or bc.flag(f"{letter}_dof"):
-                    yield NodeMotion(target, nodes, i, 0.0, 0, bc.line)
+            for i in read_fixed(bc, COMPONENTS):
+                yield NodeMotion(target, nodes, i, 0.0, 0, bc.line)
         elif kind in ("prescribed displacement", "prescribe"):
-            yield NodeMotion(target, nodes, *_read_drive(bc, curves), bc.line)
+            yield NodeMotion(target, nodes, *read_drive(bc, COMPONENTS, curves), bc.line)
         elif kind not in _OTHER_CONDITIONS:
             raise bc.error(f"boundary condition {kind!r} is not supported")
-
-
-def _read_drive(bc: XmlNode, curves: Mapping[int, LoadCurve]) -> tuple[int, float, int]:
-    """Read component, factor and load curve of a prescribed displacement."""
-    dof = bc.string("dof").lower().removeprefix("r")  # FEBio 3 calls those of a rigid body RX, ..
-    if dof not in COMPONENTS:
-        raise bc.error(f"degree of freedom {bc.string('dof')!r} is not supported")
-    if bc.flag("relative"):
-        raise bc.child("relative").error("relative displacements are not supported")
-    return COMPONENTS.index(dof), *read_factor(find_value(bc), curves)
 
 
 def _read_pressures(

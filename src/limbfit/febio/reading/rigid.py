@@ -174,21 +174,14 @@ def _read_condition(
         raise node.error(f"rigid condition {kind!r} is not supported")
     name = find_body(node, rigid)
     if kind in _FIXED:
-        listed = [dof.strip().lower().removeprefix("r") for dof in node.string("dofs", "").split(",")]
-        for letter in sorted(FREEDOMS):  # FEBio 3 lists what is fixed, FEBio 4 has a flag for each freedom
-            if letter in listed or node.flag(f"R{letter}_dof"):
-                yield RigidCondition(name, FREEDOMS.index(letter), "fixed", 0.0, 0, step, node.line)
+        for freedom in read_fixed(node, FREEDOMS, "R"):
+            yield RigidCondition(name, freedom, "fixed", 0.0, 0, step, node.line)
         return
-    dof = node.string("dof").lower().removeprefix("r")  # Rx, ..; FEBio 3 has a number for a load's
-    if dof not in tuple(FREEDOMS):
-        raise node.error(f"degree of freedom {node.string('dof')!r} is not supported")
-    if node.flag("relative"):
-        raise node.child("relative").error("relative displacements and forces are not supported")
     if kind in _FORCED and node.string("load_type", "LOAD").upper() not in ("LOAD", "0"):
         raise node.child("load_type").error("a force that follows the body, or ramps up, is not supported")
-    factor, curve = read_factor(find_value(node), curves)
+    freedom, factor, curve = read_drive(node, FREEDOMS, curves)
     yield RigidCondition(
-        name, FREEDOMS.index(dof), "forced" if kind in _FORCED else "moved", factor, curve, step, node.line
+        name, freedom, "forced" if kind in _FORCED else "moved", factor, curve, step, node.line
     )
 
 
@@ -201,10 +194,22 @@ def find_body(condition: XmlNode, rigid: Mapping[str, RigidMaterial], tag: str =
     return name
 
 
-def find_value(condition: XmlNode) -> XmlNode:
-    """Return the element with the value of a prescribed motion; FEBio 3 calls it a scale."""
-    value = condition.find("value")
-    return condition.child("scale") if value is None else value
+def read_fixed(condition: XmlNode, letters: str, prefix: str = "") -> list[int]:
+    """Read which freedoms are held: FEBio 3 lists their letters, FEBio 4 has a flag for each."""
+    listed = [dof.strip().lower().removeprefix("r") for dof in condition.string("dofs", "").split(",")]
+    held = (letter in listed or condition.flag(f"{prefix}{letter}_dof") for letter in letters)
+    return [i for i, is_held in enumerate(held) if is_held]
+
+
+def read_drive(condition: XmlNode, letters: str, curves: Mapping[int, LoadCurve]) -> tuple[int, float, int]:
+    """Read the freedom that is moved, or under a force, with factor and load curve."""
+    dof = condition.string("dof").lower().removeprefix("r")  # Rx, ..; FEBio 3 has a number for a load's
+    if dof not in tuple(letters):
+        raise condition.error(f"degree of freedom {condition.string('dof')!r} is not supported")
+    if condition.flag("relative"):
+        raise condition.child("relative").error("relative displacements and forces are not supported")
+    value = condition.find("value")  # FEBio 3 calls that of a motion its scale
+    return letters.index(dof), *read_factor(condition.child("scale") if value is None else value, curves)
 
 
 def read_factor(value: XmlNode, curves: Mapping[int, LoadCurve]) -> tuple[float, int]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
-from ...errors import ProblemError
+from ...errors import ProblemError, add_location
 
 MAX_BYTES = 256 * 2**20  # some two million nodes
 MAX_DEPTH = 40
@@ -136,22 +136,18 @@ def read_tree(path: str | Path) -> XmlNode:
     """
     file = Path(path)
     builder = _TreeBuilder()
-    try:
-        with file.open("rb") as stream:
-            if file.stat().st_size > MAX_BYTES:
-                raise ProblemError(
-                    f"has {file.stat().st_size / 2**20:.0f} MB; no more than {MAX_BYTES // 2**20} are read"
-                )
-            while chunk := stream.read(_CHUNK):
-                builder.parser.Parse(chunk, False)
-            builder.parser.Parse(b"", True)
-    except ProblemError as error:
-        raise ProblemError(error.what, file=file, place=error.place, remedy=error.remedy) from None
-    except OSError as error:
-        raise ProblemError(error.strerror or "cannot be read", file=file) from error
-    except (expat.ExpatError, LookupError, ValueError) as error:
-        what = f"is not well-formed XML: {error}"
-        raise ProblemError(what, file=file, remedy="export it again") from None
+    with add_location(file=file):
+        try:
+            with file.open("rb") as stream:
+                if file.stat().st_size > MAX_BYTES:
+                    size = f"{file.stat().st_size / 2**20:.0f} MB"
+                    raise ProblemError(f"has {size}; no more than {MAX_BYTES // 2**20} are read")
+                builder.parser.ParseFile(stream)
+        except OSError as error:
+            raise ProblemError(error.strerror or "cannot be read") from error
+        except (expat.ExpatError, LookupError, ValueError) as error:
+            what = f"is not well-formed XML: {error}"
+            raise ProblemError(what, remedy="export it again") from None
     assert builder.root is not None  # expat has refused an empty document
     return builder.root
 
