@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..errors import ProblemError, RunError
+from ..errors import ProblemError
 from ..fe import Motion
 from .reading.rigid import FREEDOMS, find_straight_line, has_same_rotation
 
@@ -38,25 +37,6 @@ class CurveList:
         """Add points (n, 2), time in s and value; return the number of the curve."""
         self.all.append(WrittenCurve(name, interpolate, points))
         return len(self.all)
-
-
-def format_row(values: Iterable[float], separator: str = ",") -> str:
-    """Write numbers with commas, so that they are read back exactly."""
-    return separator.join(repr(float(value)) for value in values)
-
-
-def find_across(direction: Array) -> Array:
-    """Return the axis of space (3,) that is most across a direction (3,)."""
-    return np.asarray(np.eye(3)[np.argmin(np.abs(direction))])
-
-
-def write_lines(path: str | Path, lines: Iterable[str]) -> None:
-    """Write lines into a file; raise `RunError` if it cannot be written."""
-    try:
-        with Path(path).open("w", encoding="utf-8") as stream:
-            stream.writelines(f"{line}\n" for line in lines)
-    except OSError as error:
-        raise RunError(f"{path}: {error.strerror or error}") from error
 
 
 def to_space(name: str, motion: Motion, frame: Array) -> Motion:

@@ -8,7 +8,7 @@ FEBio's contact from converging, and the skin under a punch does not reach them.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -182,8 +182,3 @@ def name_surfaces(problem: Problem, bodies: Sequence[FebBody]) -> dict[str, Indi
         for name, faces in mesh.face_sets.items()
     }
     return {**found, **own}
-
-
-def format_ids(nodes: Iterable[int]) -> str:
-    """Write nodes as FEBio's numbers, which count from 1."""
-    return ",".join(str(int(node) + 1) for node in nodes)

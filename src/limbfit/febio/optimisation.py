@@ -18,8 +18,8 @@ import numpy as np
 from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import Indenter, Problem
-from .conditions import write_lines
 from .meshes import INDENTER
+from .rendering import write_template
 
 MAX_PARAMETERS = 64  # parameters, in FEBio
 
@@ -90,42 +90,29 @@ def write_optimisation(
         raise ProblemError(
             f"FEBio fits at most {MAX_PARAMETERS} parameters, but {len(tissues)} tissues have {count} there"
         )
-    write_lines(path, _format_file(tissues, times, force, iterations))
-
-
-def _format_file(
-    tissues: Mapping[str, ParameterRange], times: Array, force: Array, iterations: int
-) -> Iterator[str]:
-    yield '<?xml version="1.0" encoding="UTF-8"?>'
-    yield "<!-- limbfit: parameters of the tissues from one record; mm, N, s, MPa -->"
-    yield '<febio_optimize version="2.0">'
-    yield '<Options type="constrained levmar"><obj_tol>1e-6</obj_tol><f_diff_scale>0.001</f_diff_scale>'
-    yield f"<max_iter>{iterations}</max_iter><log_level>LOG_NEVER</log_level></Options>"
-    yield "<Parameters>"
-    for name, tissue in tissues.items():
-        for path, start, lower, upper in _list_parameters(tissue):
-            values = f"{start!r},{lower!r},{upper!r},{abs(start)!r}"
-            yield f"<param name=\"fem.material('{name}').{path}\">{values}</param>"
-    yield "</Parameters><Constraints>"
-    counts = [tissue.count for tissue in tissues.values()]
-    for first, tissue in zip(np.cumsum([0, *counts]), tissues.values()):
+    ties = []
+    first = 0
+    for tissue in tissues.values():
         ratio = tissue.kappa_ratio
         # c1 = c2, k = ratio c1 and m1 = -m2
-        for ties in ((1.0, -1.0, 0.0, 0.0, 0.0), (ratio, 0.0, -1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0, 1.0)):
-            row = np.zeros(sum(counts) + 1)
-            row[first : first + len(ties)] = ties
-            yield f"<constraint>{','.join(f'{value:.17g}' for value in row)}</constraint>"
-    yield '</Constraints><Objective type="data-fit">'
-    yield '<fnc type="filter_positive_only"><source type="parameter">'
-    yield f'<param name="fem.rigidbody(\'{INDENTER}\').Fz"/><ordinate name="fem.time"/>'
-    yield "</source></fnc><data>"
-    for t, f in zip(times, force, strict=True):
-        yield f"<pt>{float(t)!r},{max(float(f), 0.0)!r}</pt>"
-    yield "</data></Objective></febio_optimize>"
+        for factors in ((1.0, -1.0, 0.0, 0.0, 0.0), (ratio, 0.0, -1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0, 1.0)):
+            row = np.zeros(count + 1)
+            row[first : first + len(factors)] = factors
+            ties.append(",".join(f"{value:.17g}" for value in row))
+        first += tissue.count
+    write_template(
+        path,
+        "optimise.feb.j2",
+        iterations=iterations,
+        parameters=[one for name, tissue in tissues.items() for one in _list_parameters(name, tissue)],
+        ties=ties,
+        indenter=INDENTER,
+        points=np.column_stack([times, np.maximum(force, 0.0)]),
+    )
 
 
-def _list_parameters(tissue: ParameterRange) -> Iterator[tuple[str, float, float, float]]:
-    """List FEBio's name of each parameter, its start and bounds, in the order of the constraints."""
+def _list_parameters(tissue_name: str, tissue: ParameterRange) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """List FEBio's name of each parameter with start, bounds and scale, in the order of the constraints."""
     paths: Sequence[tuple[str, str, float]] = (
         ("elastic.c1", "c", 1.0),
         ("elastic.c2", "c", 1.0),
@@ -136,4 +123,5 @@ def _list_parameters(tissue: ParameterRange) -> Iterator[tuple[str, float, float
     )
     for path, name, scale in paths:
         low, high = sorted((scale * tissue.lower[name], scale * tissue.upper[name]))
-        yield path, scale * tissue.start[name], low, high
+        start = scale * tissue.start[name]
+        yield f"material('{tissue_name}').{path}", (start, low, high, abs(start))

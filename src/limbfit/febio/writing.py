@@ -20,7 +20,6 @@ from typing import Any
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from ..arrays import Array
@@ -32,11 +31,8 @@ from .conditions import (
     FIXED_SET,
     FRAME_BODY,
     CurveList,
-    find_across,
     find_step_ends,
     format_conditions,
-    format_row,
-    write_lines,
 )
 from .meshes import (
     FRONT,
@@ -47,7 +43,6 @@ from .meshes import (
     RigidMesh,
     build_bodies,
     build_frame_mesh,
-    format_ids,
     has_round_edges,
     list_parts,
     name_node_sets,
@@ -57,6 +52,7 @@ from .penalty import compute_explicit_penalty, compute_mean_stiffness
 from .preparation import PRESTRAIN_S, Preparation, prepare_problem
 from .reading.materials import ACTIVE, FIBRE, GRADIENT, MIXTURE, PRESTRAINED, RELAXED
 from .reading.model import Contact
+from .rendering import find_across, format_row, write_template
 
 REST = Motion(np.array([0.0, 1.0]), np.zeros((2, 6)))
 PRESSURE_MODELS = {0: "default", 1: "NIKE3D", 2: "Abaqus"}
@@ -99,7 +95,7 @@ def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None =
     if forced or Preparation.from_problem(problem).seconds or problem.touch_down_s:
         prepared, motions = prepare_problem(problem, settings.steps)
         bodies = build_bodies(prepared, motions)
-    write_lines(path, [_render_file(problem, prepared, bodies, settings)])
+    write_template(path, "model.feb.j2", **_describe_file(problem, prepared, bodies, settings))
     return bodies[0].tool if bodies else None
 
 
@@ -218,8 +214,10 @@ def check_simple_indentation(problem: Problem, program: str) -> None:
         raise ProblemError(f"a set or tissue has the name {(*taken, INDENTER)[0]!r}, which is the indenter's")
 
 
-def _render_file(problem: Problem, prepared: Problem, bodies: list[FebBody], settings: FebSettings) -> str:
-    """Write the file of a problem; ``prepared`` is the problem in the file's own time.
+def _describe_file(
+    problem: Problem, prepared: Problem, bodies: list[FebBody], settings: FebSettings
+) -> dict[str, Any]:
+    """Return what the template of a file asks for; ``prepared`` is the problem in the file's own time.
 
     FEBio's own force on a rail's joint is left out, because the body's force stands among its loads.
     """
@@ -239,45 +237,38 @@ def _render_file(problem: Problem, prepared: Problem, bodies: list[FebBody], set
         everywhere = [*everywhere, *map(Markup, held)]
     remarks = (f"limbfit: {settings.title}; mm, N, s, MPa", *describe_differences(problem, settings))
     history, axes, prestrains = prepared.history, _find_fibre_directions(problem), _find_prestrains(problem)
-    environment = Environment(
-        loader=PackageLoader("limbfit.febio", "templates"), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters |= {
-        "row": format_row, "ids": format_ids, "across": find_across, "prestrain_map": _name_prestrain_map,
-        "axes": lambda direction: Markup(_format_axes(direction)),
-    }  # fmt: skip
-    return environment.get_template("model.feb.j2").render(
-        problem=problem,
-        bodies=bodies,
-        rigid_meshes=meshes,
-        centres=centres,
-        remarks=[Markup(escape(" ".join(text.replace("--", "-").split()))) for text in remarks],
-        steps=steps,
-        conditions=everywhere,
-        contact=build_contact(problem, settings),
-        is_symmetric=not problem.pressures and not any(body.has_friction for body in bodies),
-        points=np.vstack([problem.mesh.points, *(mesh.points for mesh in meshes.values())]),
-        parts=list(list_parts(problem, meshes)),
-        node_sets=name_node_sets(problem),
-        surfaces=name_surfaces(problem, bodies),
-        quadrature=QUADRATURE[problem.formulation.name],
-        fibre_maps={name: own for name, own in axes.items() if len(own) > 1},
-        prestrain_maps={name: own for name, own in prestrains.items() if len(own) > 1},
-        fixed_set=FIXED_SET,
-        frame_body=FRAME_BODY,
-        force_file=settings.force_file,
-        must_curve=curves.add("must_points", _find_must_points(problem, settings), "STEP"),
-        history_curve=curves.add("history", np.column_stack([history.times, history.driver]))
+    return {
+        "problem": problem,
+        "bodies": bodies,
+        "rigid_meshes": meshes,
+        "centres": centres,
+        "remarks": [Markup(escape(" ".join(text.replace("--", "-").split()))) for text in remarks],
+        "steps": steps,
+        "conditions": everywhere,
+        "contact": build_contact(problem, settings),
+        "is_symmetric": not problem.pressures and not any(body.has_friction for body in bodies),
+        "points": np.vstack([problem.mesh.points, *(mesh.points for mesh in meshes.values())]),
+        "parts": list(list_parts(problem, meshes)),
+        "node_sets": name_node_sets(problem),
+        "surfaces": name_surfaces(problem, bodies),
+        "quadrature": QUADRATURE[problem.formulation.name],
+        "fibre_maps": {name: own for name, own in axes.items() if len(own) > 1},
+        "prestrain_maps": {name: own for name, own in prestrains.items() if len(own) > 1},
+        "prestrain_names": {name: _name_prestrain_map(name) for name in prestrains},
+        "fixed_set": FIXED_SET,
+        "frame_body": FRAME_BODY,
+        "force_file": settings.force_file,
+        "must_curve": curves.add("must_points", _find_must_points(problem, settings), "STEP"),
+        "history_curve": curves.add("history", np.column_stack([history.times, history.driver]))
         if any(support.factor for support in problem.supports)
         else 0,
-        pressure_curves=[
+        "pressure_curves": [
             curves.add(f"pressure_{i}", np.column_stack([one.times, one.values]))
             for i, one in enumerate(prepared.pressures, 1)
         ],
-        materials=[Markup(line) for line in _format_materials(prepared, curves, settled)],
-        curves=curves.all,
-    )
+        "materials": [Markup(line) for line in _format_materials(prepared, curves, settled)],
+        "curves": curves.all,
+    }
 
 
 def _find_step_size(problem: Problem, settled: float, begin: float, end: float) -> dict[str, Any]:
