@@ -16,7 +16,7 @@ assess assign average balance batch begin bench bisect build bump calibrate call
 choose clamp classify clean clear clip close coarsen code collect colour combine compare compile
 compress compute connect constrain continue convolve copy correct count couple create crop cross curve
 cut decode deconvolve deform delay demo derive describe design diagnose die difference differentiate
-dilate divide do draw drop edit embed end ensure equilibrate erode estimate evaluate exchange exclude
+dilate divide do draw drop edit embed end ensure equilibrate erode estimate evaluate exchange
 expand explain explore export extend extract extrapolate extrude fail fill find finish fit flag flatten
 follow format from generate get grade group grow guess halve has head hide hold ignore import impose
 improve insert integrate interpolate interpret interrupt intersect invert is iterate join judge keep

@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+
+import numpy as np
+
+# The triangles of a box whose corners are numbered along x, then y, then z.
+BOX_FACES = np.array(
+    [[0, 2, 3], [0, 3, 1], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4], [2, 6, 7], [2, 7, 3], [0, 4, 6],
+     [0, 6, 2], [1, 3, 7], [1, 7, 5]]
+)  # fmt: skip
 
 # One tetrahedron on the plane z = 0, its other node free; a rigid cube above it comes down on its upper face.
 FEB = """<?xml version="1.0"?>
@@ -39,3 +48,10 @@ def written(folder: Path, text: str, name: str = "model.feb") -> Path:
     file = folder / name
     file.write_text(text)
     return file
+
+
+def changed(text, pattern, by):
+    """The text with the one place of a pattern replaced."""
+    found, count = re.subn(pattern, by, text, count=1)
+    assert count == 1
+    return found

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from febfiles import written
+from febfiles import changed, written
 
 from limbfit import OgdenQLV
 from limbfit.bench.blocks import build_punched_block
@@ -187,12 +187,6 @@ def test_an_indenter_touches_where_limbfit_has_found_it(tmp_path, case):
         found = replace(found, bodies=(tool, *others))
     mine, theirs = pushes(problem, control), pushes(found, control, rest)
     np.testing.assert_allclose(theirs, mine, atol=1e-6 * np.abs(mine).max())
-
-
-def changed(text, pattern, by):
-    found, count = re.subn(pattern, by, text, count=1)
-    assert count == 1
-    return found
 
 
 def test_tables_and_results_tell_the_time_of_each(tmp_path):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from febfiles import written
+from febfiles import changed, written
 
 from limbfit.bench.blocks import build_punched_block
 from limbfit.errors import ProblemError
@@ -209,12 +208,6 @@ def test_turns_that_febio_adds_up_another_way_are_refused(tmp_path):
         ProblemError, match=r"line \d+: the rigid body 'sheet' turns about more than one axis"
     ):
         to_problem(read_feb(written(tmp_path, text.replace("</Rigid>", more + "</Rigid>"))))
-
-
-def changed(text, pattern, by):
-    found, count = re.subn(pattern, by, text, count=1)
-    assert count == 1
-    return found
 
 
 REFUSED = {

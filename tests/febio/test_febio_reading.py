@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from febfiles import FEB, written
+from febfiles import BOX_FACES, FEB, written
 
 from limbfit.bench.blocks import build_punched_block
 from limbfit.errors import ProblemError
@@ -14,10 +14,6 @@ from limbfit.fe import Indenter, RigidSurface
 from limbfit.febio import FebSettings, build_step_control, read_feb, read_log, to_problem, write_feb
 
 BOX = np.array([[x, y, z] for z in (-2.0, 0.0) for y in (-1.0, 1.0) for x in (-1.0, 1.0)])
-BOX_FACES = np.array(
-    [[0, 2, 3], [0, 3, 1], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4], [2, 6, 7], [2, 7, 3], [0, 4, 6],
-     [0, 6, 2], [1, 3, 7], [1, 7, 5]]
-)  # fmt: skip
 LOG = "*Step  = 0\n*Time  = 0\n*Data  = Fz;z\n3,0,5\n*Step  = 1\n*Time  = 0.5\n*Data  = Fz;z\n3,-0.25,4.5\n"
 
 

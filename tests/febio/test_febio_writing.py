@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from febfiles import BOX_FACES
 
 from limbfit.bench.blocks import build_punched_block
 from limbfit.errors import ProblemError
@@ -34,22 +35,6 @@ from limbfit.mesh import Mesh, node_jacobians
 
 AXIS = np.array([0.1, -0.05, -1.0])
 BOX = np.array([[x, y, z] for z in (-6.0, 0.0) for y in (-4.0, 4.0) for x in (-4.0, 4.0)])
-BOX_FACES = np.array(
-    [
-        [0, 2, 3],
-        [0, 3, 1],
-        [4, 5, 7],
-        [4, 7, 6],
-        [0, 1, 5],
-        [0, 5, 4],
-        [2, 6, 7],
-        [2, 7, 3],
-        [0, 4, 6],
-        [0, 6, 2],
-        [1, 3, 7],
-        [1, 7, 5],
-    ]
-)
 INDENTERS = {
     "square": Indenter("square", 20.0, 2.0, (0, 0, 5), AXIS),
     "sharp": Indenter("square", 20.0, 0.0, (0, 0, 5), AXIS, edge=(1.0, 1.0, 0.0)),

@@ -32,13 +32,6 @@ def test_touch_down_does_not_mind_an_offset_or_a_wait_before_the_ramp():
         assert not touch.in_contact_at_start
 
 
-def test_a_record_without_slack_says_so():
-    trace, _ = record(slack=0.0)
-    touch = find_touch_down(trace)
-    assert touch.in_contact_at_start
-    assert touch.displacement_mm < 0.1
-
-
 def test_more_noise_means_more_uncertainty_and_no_bias():
     errors, stated = [], []
     for seed in range(12):

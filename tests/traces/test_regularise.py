@@ -39,16 +39,6 @@ def test_displacement_is_a_line_in_and_a_line_out():
     assert curve.force_N.min() >= 0
 
 
-def test_a_single_smoothing_over_the_corner_would_lose_the_peak():
-    """What treating loading and unloading apart is for."""
-    trace, truth = record()
-    touch = find_touch_down(trace)
-    peak = truth(5.4 / 0.96)
-    window = np.ones(250) / 250
-    over = np.convolve(trace.force_N, window, "same").max()
-    assert peak - over > 5 * abs(peak - regularise(trace, touch).peak_force_N)
-
-
 def test_given_smoothing_is_used():
     trace, _ = record()
     touch = find_touch_down(trace)

@@ -10,7 +10,6 @@ Source: Abaqus Theory Guide, "Hyperelastic material behavior", "Finite-strain vi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from ..fe import Indenter, Material, Problem, System
 from ..mesh import Mesh
 from .conditions import FIXED_SET
 from .meshes import FRONT, INDENTER, PATCH, RigidMesh, build_indenter_mesh
+from .penalty import find_cells_behind
 from .rendering import write_template
 from .writing import FebSettings, check_simple_indentation
 
@@ -107,8 +107,8 @@ def _describe_file(
         ],
         "tool": INDENTER,
         "surfaces": {
-            PATCH: list(_find_sides(PATCH, mesh, np.asarray(problem.contact_faces), numbers)),
-            FRONT: list(_find_sides(FRONT, whole, tool.front, own)),
+            PATCH: _find_sides(mesh, np.asarray(problem.contact_faces), numbers),
+            FRONT: _find_sides(whole, tool.front, own),
         },
         "stiffness": stiffness,  # limbfit's own contact's, MPa per mm
         "advance": np.column_stack([history.times, history.driver]),
@@ -135,16 +135,11 @@ def _describe_material(name: str, material: Material, program: str) -> dict[str,
     }
 
 
-def _find_sides(name: str, mesh: Mesh, faces: Indices, numbers: Indices) -> Iterator[tuple[int, int]]:
-    """Find a surface as element and side; a face of no element is an error of the mesh."""
-    local = _FACES[mesh.cell_type[:3]]
-    corners = len(local[0])
-    wanted = {tuple(sorted(face[:corners].tolist())) for face in faces}
-    found = 0
-    for number, cell in zip(numbers, mesh.cells):
-        for side, at in enumerate(local, 1):
-            if tuple(sorted(cell[list(at)].tolist())) in wanted:
-                found += 1
-                yield int(number), side
-    if found != len(wanted):
-        raise ProblemError(f"{len(wanted)} faces of {name} are sides of {found} elements")
+def _find_sides(mesh: Mesh, faces: Indices, numbers: Indices) -> list[tuple[int, int]]:
+    """Find a surface as number of the element and its side, from 1."""
+    sides = [set(corners) for corners in _FACES[mesh.cell_type[:3]]]
+    found = []
+    for face, cell in zip(faces[:, : mesh.kind.face_corners], find_cells_behind(mesh, faces).tolist()):
+        at = set(np.flatnonzero(np.isin(mesh.cells[cell], face)).tolist())
+        found.append((cell, sides.index(at) + 1))
+    return [(int(numbers[cell]), side) for cell, side in sorted(found)]

@@ -138,7 +138,7 @@ def compute_automatic_penalties(problem: Problem, faces: Indices, dt: float) -> 
     normal lies between the axes. The moduli are those of a step of ``dt`` s.
     """
     mesh = problem.mesh
-    behind = _find_cells_behind(mesh, faces)
+    behind = find_cells_behind(mesh, faces)
     moduli = np.array([_compute_moduli(problem.materials[name], dt) for name in mesh.region_names])
     mu, kappa = moduli[mesh.regions[behind]].T
     squared = _compute_normals(mesh.points, faces) ** 2
@@ -151,7 +151,7 @@ def compute_automatic_penalties(problem: Problem, faces: Indices, dt: float) -> 
 
 def find_smallest_depth(mesh: Mesh, faces: Indices) -> float:
     """Return the smallest depth of the elements behind contact faces: volume over area of the face, mm."""
-    cells = _find_cells_behind(mesh, faces)
+    cells = find_cells_behind(mesh, faces)
     element = ELEMENTS[mesh.cell_type]
     _, areas = build_face_quadrature(element, mesh.points, faces, "gauss")
     _, volumes = compute_reference_gradients(element, mesh.points, mesh.cells[cells])
@@ -190,22 +190,20 @@ def _find_covered_faces(problem: Problem) -> Indices:
     return faces[inside] if inside.any() else faces
 
 
-def _find_cells_behind(mesh: Mesh, faces: Indices) -> Indices:
-    """Return the cell (f,) that each face belongs to."""
-    corners = faces[:, : mesh.kind.face_corners]
+def find_cells_behind(mesh: Mesh, faces: Indices) -> Indices:
+    """Return the cell (f,) that each face belongs to; a face of none, or of several, is an error."""
+    corners = np.sort(faces[:, : mesh.kind.face_corners], axis=1)
     touched = np.flatnonzero(np.isin(mesh.cells, corners).sum(axis=1) >= corners.shape[1])
-    owner = {int(cell): set(mesh.cells[cell].tolist()) for cell in touched}
-    by_node: dict[int, list[int]] = {}
-    for cell, nodes in owner.items():
-        for node in nodes:
-            by_node.setdefault(node, []).append(cell)
-    found = []
-    for face in corners.tolist():
-        cells = [cell for cell in by_node.get(face[0], ()) if set(face) <= owner[cell]]
+    sides = np.sort(mesh.cells[touched][:, mesh.kind.faces[:, : corners.shape[1]]], axis=2)
+    owners: dict[tuple[int, ...], list[int]] = {}
+    for cell, own in zip(touched.tolist(), sides.tolist()):
+        for side in own:
+            owners.setdefault(tuple(side), []).append(cell)
+    found = [owners.get(tuple(face), []) for face in corners.tolist()]
+    for cells in found:
         if len(cells) != 1:
             raise ProblemError(f"a contact face belongs to {len(cells)} elements, not to one")
-        found.append(cells[0])
-    return np.array(found)
+    return np.array([cells[0] for cells in found])
 
 
 def _compute_moduli(material: Material, dt: float) -> tuple[float, float]:

@@ -57,17 +57,15 @@ class BrokenLine:
         """The way that the indenter has gone, in and out, since the first corner, at times (n,) s; mm."""
         return np.interp(at, self.times, np.r_[0.0, np.cumsum(np.abs(np.diff(self.values)))])
 
-    def find_time_at(self, displacement: float, back: bool = False) -> float:
-        """When the line passes a displacement on the first way in, or for the last time ``back`` out (the
-        end where it stays beyond)."""
-        if back:
-            last = int(np.flatnonzero(self.values > displacement)[-1])
-            after = min(last + 1, len(self.times) - 1)
-            return float(np.interp(-displacement, -self.values[[last, after]], self.times[[last, after]]))
-        way = self.times <= self.peak_s
-        t, u = self.times[way], self.values[way]
-        last = int(np.flatnonzero(u <= displacement)[-1]) if (u <= displacement).any() else 0
-        return float(np.interp(displacement, np.maximum.accumulate(u[last:]), t[last:]))
+    def measure_path_mm(self, start_s: float, end_s: float) -> float:
+        """The way that the indenter goes, in and out, between two times, mm."""
+        return float(np.ptp(self.compute_path_mm(np.array([start_s, end_s]))))
+
+    def find_return_s(self, displacement: float) -> float:
+        """When the line comes back to a displacement for the last time (the end where it stays beyond)."""
+        last = int(np.flatnonzero(self.values > displacement)[-1])
+        after = min(last + 1, len(self.times) - 1)
+        return float(np.interp(-displacement, -self.values[[last, after]], self.times[[last, after]]))
 
 
 def fit_broken_line(

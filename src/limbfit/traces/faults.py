@@ -7,6 +7,7 @@ What is certain is mended (times); for the rest a warning says what happened, wh
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -81,21 +82,18 @@ def find_gaps(trace: Trace, line: BrokenLine) -> list[tuple[float, float]]:
     long = np.flatnonzero(steps > _GAP_STEPS * np.percentile(steps, 99))
     travel = float(np.ptp(line.values))
     spans = [(float(trace.time_s[i]), float(trace.time_s[i + 1])) for i in long]
-    return [(a, b) for a, b in spans if np.ptp(line.compute_path_mm(np.array([a, b]))) > _MIN_MOTION * travel]
+    return [(a, b) for a, b in spans if line.measure_path_mm(a, b) > _MIN_MOTION * travel]
 
 
-def report_gaps(gaps: list[tuple[float, float]], line: BrokenLine, met_s: float) -> list[TraceWarning]:
+def report_gaps(gaps: list[tuple[float, float]], line: BrokenLine, met_s: float) -> Iterator[TraceWarning]:
     """Warn of each gap; a skin that is met in one may be met anywhere in it."""
-    warnings = []
     for start, end in gaps:
-        moved = float(np.ptp(line.compute_path_mm(np.array([start, end]))))
+        moved = line.measure_path_mm(start, end)
         what = f"no samples from {start:.2f} s to {end:.2f} s, while the indenter moves by {moved:.2g} mm"
-        numbers = {"start_s": start, "end_s": end, "moved_mm": moved} | _compute_added_deviation(
-            start, end, line, met_s
-        )
+        numbers = {"start_s": start, "end_s": end, "moved_mm": moved}
+        numbers |= _compute_added_deviation(start, end, line, met_s)
         cause = "samples that the logger lost"
-        warnings.append(TraceWarning("gap", what, cause, "record again: the force there is a guess", numbers))
-    return warnings
+        yield TraceWarning("gap", what, cause, "record again: the force there is a guess", numbers)
 
 
 def _compute_added_deviation(start: float, end: float, line: BrokenLine, met_s: float) -> dict[str, float]:
@@ -130,24 +128,17 @@ def find_frozen(trace: Trace, line: BrokenLine, rise_N: float) -> list[slice]:
 
 def report_frozen_force(
     trace: Trace, frozen: list[slice], line: BrokenLine, met_s: float
-) -> list[TraceWarning]:
-    warnings = []
+) -> Iterator[TraceWarning]:
     for run in frozen:
         start, end = float(trace.time_s[run.start]), float(trace.time_s[run.stop - 1])
-        moved, force = (
-            float(np.ptp(line.compute_path_mm(np.array([start, end])))),
-            float(trace.force_N[run.start]),
-        )
+        moved, force = line.measure_path_mm(start, end), float(trace.force_N[run.start])
         what = (
             f"the force stays at exactly {force:.3g} N from {start:.2f} s to {end:.2f} s, while the indenter "
             f"moves by {moved:.2g} mm"
         )
         numbers = {"start_s": start, "end_s": end, "force_N": force, "moved_mm": moved}
         numbers |= _compute_added_deviation(start, end, line, met_s)
-        warnings.append(
-            TraceWarning("frozen", what, "a sensor that froze", "check it, and record again", numbers)
-        )
-    return warnings
+        yield TraceWarning("frozen", what, "a sensor that froze", "check it, and record again", numbers)
 
 
 def find_saturation(
@@ -171,10 +162,8 @@ def find_saturation(
     if any(start < time[b - 1] and end > time[a] for start, end in spans):
         return []
     flat, by_noise, wide = float(path[b - 1] - path[a + 1]), 0.0, max((b - a) // 4, 2)
-    for edge, beyond in (
-        (a, max(a - wide, 0)),
-        *([(b, min(b + wide, len(force) - 1))] if after.size else []),
-    ):
+    ends = [(a, max(a - wide, 0)), (b, min(b + wide, len(force) - 1))]
+    for edge, beyond in ends if after.size else ends[:1]:
         steep = (force[edge] - force[beyond]) / max(abs(path[edge] - path[beyond]), 1e-12)
         by_noise += _TOP_SD * noise / steep if steep > 0.0 else np.inf
     if b - a <= _FLAT_BINS or flat < max(_FLAT_RATIO * by_noise, _FLAT_SHARE * float(np.ptp(line.values))):
@@ -229,24 +218,21 @@ def _compute_jumps(force: Array, m: int) -> Array:
     return jumps
 
 
-def report_steps(steps: list[tuple[float, float]]) -> list[TraceWarning]:
-    warnings = []
+def report_steps(steps: list[tuple[float, float]]) -> Iterator[TraceWarning]:
     for at, size in steps:
         what = f"the force jumps by {size:+.2g} N from one sample to the next, at {at:.2f} s"
         cause = "a slip of the limb, a knock at the sensor or its amplifier's range"
         numbers = {"time_s": at, "step_N": size}
-        warnings.append(
-            TraceWarning("step", what, cause, "record again: nobody knows which part is right", numbers)
-        )
-    return warnings
+        yield TraceWarning("step", what, cause, "record again: nobody knows which part is right", numbers)
 
 
-def find_coarse_steps(trace: Trace, line: BrokenLine, touch: TouchDown, rise_N: float) -> list[TraceWarning]:
+def find_coarse_steps(
+    trace: Trace, line: BrokenLine, touch: TouchDown, rise_N: float
+) -> Iterator[TraceWarning]:
     """Warn of a force or a displacement whose steps are larger than its neighbours scatter.
 
     A touch-down is then known to where the force reaches the standard deviation of what is rounded.
     """
-    warnings = []
     for kind, values, unit, least in (
         ("force", trace.force_N, "N", _FORCE_STEP * rise_N),
         ("displacement", trace.displacement_mm, "mm", _TRAVEL_STEP * float(np.ptp(line.values))),
@@ -260,7 +246,4 @@ def find_coarse_steps(trace: Trace, line: BrokenLine, touch: TouchDown, rise_N: 
         numbers = {f"step_{unit}": size}
         if unit == "N":
             numbers["adds_sd_mm"] = find_depth_at(trace, line, touch, size / float(np.sqrt(12.0)))
-        warnings.append(
-            TraceWarning("resolution", what, cause, "record with a finer range or more digits", numbers)
-        )
-    return warnings
+        yield TraceWarning("resolution", what, cause, "record with a finer range or more digits", numbers)

@@ -173,9 +173,8 @@ def _remove_spikes(trace: Trace) -> tuple[Trace, list[TraceWarning]]:
             "were replaced"
         )
         numbers = {"spikes": float(count), f"largest_{unit}": largest}
-        warnings.append(
-            TraceWarning("spikes", what, "a loose contact or a disturbance", "check the cable", numbers)
-        )
+        cause = "a loose contact or a disturbance"
+        warnings.append(TraceWarning("spikes", what, cause, "check the cable", numbers))
     return trace, warnings
 
 

@@ -89,11 +89,8 @@ def find_lag(
     )
     numbers = {"lag_s": delay, "lag_sd_s": sd, "adds_sd_mm": late_mm}
     cause = "a low-pass filter of the force, or a column that is shifted"
-    return [
-        TraceWarning(
-            "lag", what, cause, "filter both alike, or shift the force back, and import again", numbers
-        )
-    ]
+    remedy = "filter both alike, or shift the force back, and import again"
+    return [TraceWarning("lag", what, cause, remedy, numbers)]
 
 
 def _estimate_delay(time: Array, force: Array, sample_noise: SampleNoise) -> tuple[float, float]:

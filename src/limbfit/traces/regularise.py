@@ -109,7 +109,7 @@ def regularise(
         the way in cannot end where it is stated to.
     """
     line = fit_broken_line(trace.time_s, trace.displacement_mm, peak_s)
-    start, end = touch_down.time_s, line.find_time_at(touch_down.displacement_mm, back=True)
+    start, end = touch_down.time_s, line.find_return_s(touch_down.displacement_mm)
     knots = np.r_[start, line.times[(line.times > start) & (line.times < end)], end]
     knots_mm = line(knots) - touch_down.displacement_mm
     phases = find_phases(knots - start, knots_mm)
@@ -303,7 +303,7 @@ def regularise_creep(
     since = trace.time_s - touch_down.time_s
     force = trace.force_N - touch_down.baseline_N
     line = fit_broken_line(trace.time_s, force, peak_s, quantity="force", unit="N")
-    end = line.find_time_at(END_SHARE * float(line.values.max()), back=True) - touch_down.time_s
+    end = line.find_return_s(END_SHARE * float(line.values.max())) - touch_down.time_s
     corners = line.times - touch_down.time_s
     knots = np.r_[0.0, corners[(corners > 0.0) & (corners < end)], end]
     knots_N = np.maximum(line(knots + touch_down.time_s), 0.0)
@@ -313,7 +313,8 @@ def regularise_creep(
     parts = select_sampled_corners(find_boundaries(of_force), since)
     curve = SmoothCurve(since, moved, parts, smoothing, find_holds(parts, of_force))
     inside = (since >= 0.0) & (since <= end)
-    phases = tuple(_with_displacements(phase, curve) for phase in of_force)
+    ends = [curve(np.array([phase.start_s, phase.end_s])).tolist() for phase in of_force]
+    phases = tuple(replace(phase, start_mm=start, end_mm=end) for phase, (start, end) in zip(of_force, ends))
     time = spread(phases, 1000, knots)
     return Creep(
         time_s=time,
@@ -327,9 +328,3 @@ def regularise_creep(
         curve=curve,
         knots_N=knots_N,
     )
-
-
-def _with_displacements(phase: MotionPhase, curve: SmoothCurve) -> MotionPhase:
-    """A phase of the force with the displacements at its ends."""
-    start, end = curve(np.array([phase.start_s, phase.end_s]))
-    return replace(phase, start_mm=float(start), end_mm=float(end))

@@ -9,7 +9,7 @@ Donev 1992). The bounds replace data where there are none.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 from math import comb, prod
@@ -165,15 +165,15 @@ def choose_design(
     CalibrationError
         If there are fewer sites than ``size``.
     """
-    groups = _group_by_site(candidates)
+    sites = list(dict.fromkeys(c.site for c in candidates))
+    groups = [[i for i, c in enumerate(candidates) if c.site == site] for site in sites]
     if not 0 < size <= len(groups):
         raise CalibrationError(f"{size} sites are wanted of {len(groups)}")
     number = comb(len(groups), size) * max(prod([max(map(len, groups))] * size), 1)
     infos = np.stack([c.information for c in candidates])
     if number <= MAX_EXHAUSTIVE_CHOICES:
-        best = min(
-            _list_choices(groups, size), key=lambda chosen: _compute_cost(infos, chosen, prior, criterion)
-        )
+        choices = (chosen for picked in combinations(groups, size) for chosen in product(*picked))
+        best = min(choices, key=lambda chosen: _compute_cost(infos, chosen, prior, criterion))
         return evaluate_design(candidates, best, prior)
     rng = np.random.default_rng(seed)
     starts = [_choose_greedily(infos, groups, size, prior, criterion)]
@@ -184,16 +184,6 @@ def choose_design(
     end = min(ends, key=lambda chosen: _compute_cost(infos, chosen, prior, criterion))
     found = evaluate_design(candidates, sorted(end), prior)
     return Design(found.chosen, found.covariance, found.log_det, exhaustive=False)
-
-
-def _group_by_site(candidates: Sequence[Candidate]) -> list[list[int]]:
-    sites = list(dict.fromkeys(c.site for c in candidates))
-    return [[i for i, c in enumerate(candidates) if c.site == site] for site in sites]
-
-
-def _list_choices(groups: Sequence[Sequence[int]], size: int) -> Iterator[tuple[int, ...]]:
-    for picked in combinations(groups, size):
-        yield from product(*picked)
 
 
 def _compute_cost(infos: Array, chosen: Sequence[int], prior: Array, criterion: Criterion) -> float:

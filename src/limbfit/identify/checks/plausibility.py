@@ -9,7 +9,7 @@ depth and the time step by known factors, so the hypothesis that explains all fo
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -152,17 +152,14 @@ def check_plausibility(facts: Sequence[RecordFacts]) -> tuple[RecordWarning, ...
     )
 
 
-def _check_places(facts: Sequence[RecordFacts]) -> list[RecordWarning]:
-    warnings: list[RecordWarning] = []
+def _check_places(facts: Sequence[RecordFacts]) -> Iterator[RecordWarning]:
     seen_sites: set[str] = set()  # of a site once, however many records it has
     for f in facts:
         share = f.depth_mm / f.thickness_mm if f.thickness_mm else 0.0
         if share > MAX_DEPTH_SHARE:
             what = f"it goes {f.depth_mm:.1f} mm deep where the soft tissue is {f.thickness_mm:.1f} mm thick"
             cause = "another place, another limb, or a wrong unit of displacement"
-            warnings.append(
-                RecordWarning((f.site,), "depth", what, {"depth_share": share}, cause, "check the record")
-            )
+            yield RecordWarning((f.site,), "depth", what, {"depth_share": share}, cause, "check the record")
         if f.site_name in seen_sites:
             continue
         seen_sites.add(f.site_name)
@@ -171,27 +168,19 @@ def _check_places(facts: Sequence[RecordFacts]) -> list[RecordWarning]:
             what = f"the axis is {f.axis_deg:.0f} degrees from the inward normal of the skin"
             cause = "an axis that points out of the limb" if outward else "an axis of another site or frame"
             remedy = "negate it" if outward else "check it, or leave axis out to take the skin's normal"
-            warnings.append(
-                RecordWarning((f.site_name,), "axis", what, {"axis_deg": f.axis_deg}, cause, remedy)
-            )
+            yield RecordWarning((f.site_name,), "axis", what, {"axis_deg": f.axis_deg}, cause, remedy)
         if f.off_skin_mm is not None and f.off_skin_mm > MAX_OFF_SKIN_MM:
             what = f"the stated position is {f.off_skin_mm:.1f} mm off the skin"
             cause, remedy = "a wrong position or coordinate system", "give LPS millimetres on the skin"
-            warnings.append(
-                RecordWarning((f.site_name,), "place", what, {"off_skin_mm": f.off_skin_mm}, cause, remedy)
-            )
+            yield RecordWarning((f.site_name,), "place", what, {"off_skin_mm": f.off_skin_mm}, cause, remedy)
         if f.hint_mm is not None and f.hint_mm > MAX_HINT_MM:
             what = f"its marker lies {f.hint_mm:.1f} mm from where the study says the site is"
             cause, remedy = "another site's marker", "check 'near' of this site and its neighbours"
-            warnings.append(
-                RecordWarning((f.site_name,), "place", what, {"hint_mm": f.hint_mm}, cause, remedy)
-            )
-    return warnings
+            yield RecordWarning((f.site_name,), "place", what, {"hint_mm": f.hint_mm}, cause, remedy)
 
 
-def _check_shared_places(facts: Sequence[RecordFacts]) -> list[RecordWarning]:
+def _check_shared_places(facts: Sequence[RecordFacts]) -> Iterator[RecordWarning]:
     """Warn of sites at one place whose records differ by more than repeats do."""
-    warnings = []
     for one, two in combinations(facts, 2):
         if one.position_mm is None or two.position_mm is None or one.site_name == two.site_name:
             continue
@@ -205,25 +194,23 @@ def _check_shared_places(facts: Sequence[RecordFacts]) -> list[RecordWarning]:
         )
         numbers = {"apart_mm": apart, "modulus_ratio": ratio}
         remedy = "give each site its own place"
-        warnings.append(
-            RecordWarning((one.site, two.site), "place", what, numbers, "a position given twice", remedy)
-        )
-    return warnings
+        sites = one.site, two.site
+        yield RecordWarning(sites, "place", what, numbers, "a position given twice", remedy)
 
 
-def _check_all_moduli(facts: Sequence[RecordFacts]) -> list[RecordWarning]:
+def _check_all_moduli(facts: Sequence[RecordFacts]) -> Iterator[RecordWarning]:
     """Warn if all records together cannot be those of a limb."""
     known = [f.modulus_kPa for f in facts if f.thickness_mm]
     if len(known) < 2:
-        return []
+        return
     middle = float(np.median(known))
     low, high = MODULUS_KPA
     if low <= middle <= high:
-        return []
+        return
     what = f"an apparent shear modulus of {middle:.3g} kPa is not that of soft tissue ({low:g} to {high:g})"
     wanted = float(np.log(middle / 8.0))
     cause = min(UNITS, key=lambda name: abs(np.log(UNITS[name][0] / UNITS[name][1]) - wanted))
-    return [RecordWarning((), "unit", what, {"modulus_kPa": middle}, cause, "check the units of all records")]
+    yield RecordWarning((), "unit", what, {"modulus_kPa": middle}, cause, "check the units of all records")
 
 
 def _compute_spreads(features: Array, has_thickness: bool) -> Array:
@@ -236,9 +223,9 @@ def _compute_spreads(features: Array, has_thickness: bool) -> Array:
     return np.maximum(floors, deviation) * np.sqrt(1 + 1 / len(features))
 
 
-def _compare_records(facts: Sequence[RecordFacts]) -> list[RecordWarning]:
+def _compare_records(facts: Sequence[RecordFacts]) -> Iterator[RecordWarning]:
     if len(facts) < _MIN_OTHERS + 1:
-        return []
+        return
     known = all(f.thickness_mm for f in facts)
     if not known:
         facts = [replace(f, thickness_mm=None) for f in facts]
@@ -248,20 +235,18 @@ def _compare_records(facts: Sequence[RecordFacts]) -> list[RecordWarning]:
         rest = np.delete(table, i, axis=0)
         away[i], spread[i] = table[i] - np.median(rest, axis=0), _compute_spreads(rest, known)
     swapped = _find_exchange(facts, away[:, 0] / spread[:, 0]) if known else None
-    warnings = [] if swapped is None else [swapped]
-    taken = set() if swapped is None else set(swapped.sites)
+    if swapped is not None:
+        yield swapped
     for f, shift, sd in zip(facts, away, spread):
-        warning = None if f.site in taken else _explain_odd_record(f, shift, sd)
-        if warning is not None:
-            warnings.append(warning)
-    return warnings
+        if swapped is None or f.site not in swapped.sites:
+            yield from _explain_odd_record(f, shift, sd)
 
 
-def _explain_odd_record(f: RecordFacts, shift: Array, sd: Array) -> RecordWarning | None:
+def _explain_odd_record(f: RecordFacts, shift: Array, sd: Array) -> Iterator[RecordWarning]:
     """Explain what is odd about a record: a unit that explains it all, or an unexplained stiffness."""
     null = float(((shift / sd) ** 2).sum())
     if np.abs(shift / sd).max() < _MAX_STANDARDISED:
-        return None
+        return
     name, best = "", null
     for unit, (force, travel, time) in UNITS.items():
         expected = np.log([force / travel, travel / time, time, travel])
@@ -282,13 +267,13 @@ def _explain_odd_record(f: RecordFacts, shift: Array, sd: Array) -> RecordWarnin
         f"{np.exp(shift[1]):.2g} times, its depth {np.exp(shift[3]):.2g} times"
     )
     if name and best < _MAX_CHI2_EXPLAINED and null - best > _MIN_CHI2_DROP:
-        return RecordWarning((f.site,), "unit", what, numbers, name, "convert the column to s, mm and N")
-    if abs(shift[0] / sd[0]) < _MAX_STANDARDISED:
-        return None  # a protocol of its own is no fault
-    cause = "a swapped name, another place or another limb"
-    return RecordWarning(
-        (f.site,), "stiffness", what, numbers, cause, "check which site this record belongs to"
-    )
+        yield RecordWarning((f.site,), "unit", what, numbers, name, "convert the column to s, mm and N")
+    elif abs(shift[0] / sd[0]) >= _MAX_STANDARDISED:  # a protocol of its own is no fault
+        cause, remedy = (
+            "a swapped name, another place or another limb",
+            "check which site this record belongs to",
+        )
+        yield RecordWarning((f.site,), "stiffness", what, numbers, cause, remedy)
 
 
 def _find_exchange(facts: Sequence[RecordFacts], z: Array) -> RecordWarning | None:

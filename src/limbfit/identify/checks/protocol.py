@@ -258,16 +258,11 @@ def _improve_by_exchange(
         trials = []
         for out in found:
             rest = [i for i in found if i != out]
-            without = options[out]
-            others = [option if option is not without else _exclude_option(option) for option in options]
+            endless = replace(options[out], seconds=float("inf"))  # so that it is not chosen again
+            others = [endless if i == out else option for i, option in enumerate(options)]
             trials += [_fill_budget(rest, others, budget, cost, by_time=by_time) for by_time in (True, False)]
         best = min(trials, key=cost, default=found)
         now = cost(best)
         if not now < least - 1e-9 * abs(least):
             return found
         found, least = best, now
-
-
-def _exclude_option(option: RecordOption) -> RecordOption:
-    """Return a record that takes longer than any session, so that it is not chosen again."""
-    return replace(option, seconds=float("inf"))

@@ -30,6 +30,7 @@ from .calibration import (
 )
 from .objective import MeasuredCurve, Simulate, SiteResponse, check_responses, find_new_warnings
 from .parameters import Grouping, Unknowns, build_space, build_stage_groupings
+from .prediction import compute_error_percent
 from .trust_region import FIRST_RADIUS
 
 # Of the coarse and of the fine simulations, in reasons
@@ -69,13 +70,18 @@ class MeshCorrection:
     def scales(self) -> tuple[float | None, ...]:
         """The factor s of each site that takes the coarse curve to the fine one; None where there is none."""
         pairs = zip(self.coarse, self.fine, self.reasons)
-        return tuple(None if reason else _fit_scale(c, f) for c, f, reason in pairs)
+        return tuple(
+            None if reason else float(f.force_N @ c.force_N / (c.force_N @ c.force_N))
+            for c, f, reason in pairs
+        )
 
     @property
     def differences_percent(self) -> tuple[float | None, ...]:
         """Mean absolute difference of fine and coarse force per site, in percent of the largest fine one."""
         pairs = zip(self.coarse, self.fine, self.reasons)
-        return tuple(None if reason else _compute_difference_percent(c, f) for c, f, reason in pairs)
+        return tuple(
+            None if reason else compute_error_percent(c.force_N, f.force_N) for c, f, reason in pairs
+        )
 
     def __call__(self, responses: Sequence[SiteResponse]) -> list[SiteResponse]:
         """Return coarse responses (force and derivatives) as the fine meshes would give them."""
@@ -115,14 +121,6 @@ def _find_fault(response: SiteResponse, where: str) -> str:
 
 def _describe_failure(response: SiteResponse) -> str:
     return response.reason or "simulation failed"
-
-
-def _fit_scale(coarse: SiteResponse, fine: SiteResponse) -> float:
-    return float(fine.force_N @ coarse.force_N / (coarse.force_N @ coarse.force_N))
-
-
-def _compute_difference_percent(coarse: SiteResponse, fine: SiteResponse) -> float:
-    return float(100 * np.mean(np.abs(fine.force_N - coarse.force_N)) / np.max(np.abs(fine.force_N)))
 
 
 def _check_same_sites(responses: Sequence[SiteResponse], expected: Sequence[SiteResponse]) -> None:
@@ -306,7 +304,9 @@ class _CorrectionLoop:
                 reason = f"the correction fails: {reached.reason}"
                 break
             if best is None or self._cost() < best.cost:
-                best = self._get_current()
+                assert self.state is not None
+                assert self.model.correction is not None
+                best = _CorrectedIterate(self.state, self.history[-1], self.model.correction)
             if settled and not (is_last and loose):
                 break
         if best is not None and best.cost < self._cost():
@@ -348,11 +348,6 @@ class _CorrectionLoop:
 
     def _cost(self) -> float:
         return self.history[-1].cost
-
-    def _get_current(self) -> _CorrectedIterate:
-        assert self.state is not None
-        assert self.model.correction is not None
-        return _CorrectedIterate(self.state, self.history[-1], self.model.correction)
 
     def _restore(self, best: _CorrectedIterate) -> None:
         assert self.state is not None
