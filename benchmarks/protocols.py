@@ -29,12 +29,14 @@ from protocols_limb import BALL_TABLE, SLOW, TISSUES, Limb, Take, write_case
 
 from limbfit import load_study, plan_protocol, run_study
 from limbfit.execution import SerialExecutor
-from limbfit.identify.checks.design import NoiseModel, compute_bounds_information, compute_information
-from limbfit.identify.checks.protocol import (
+from limbfit.identify.checks.design import (
     Budget,
     DesignTarget,
+    NoiseModel,
     RecordOption,
+    compute_bounds_information,
     compute_factors_95,
+    compute_information,
     plan_records,
 )
 from limbfit.identify.fit.objective import SiteResponse

@@ -42,11 +42,8 @@ class CurveList:
 def to_space(name: str, motion: Motion, frame: Array) -> Motion:
     """Return a body's motion along and about the axes of space, from that in its ``frame (3, 3)``.
 
-    Raises
-    ------
-    ProblemError
-        If a force drives it along, or about, an axis between those of space, because FEBio holds and drives
-        along its own; if it turns about several axes, grows, or leaves a force open.
+    Raises `ProblemError` if a force drives it along, or about, an axis between those of space, because
+    FEBio holds and drives along its own; if it turns about several axes, grows, or leaves a force open.
     """
     if motion.grows:
         raise ProblemError(f"{name}: a body that grows is not written for FEBio, which has none")

@@ -104,10 +104,7 @@ class FebBody:
 def build_bodies(problem: Problem, motions: Sequence[Motion] = ()) -> list[FebBody]:
     """Build the rigid bodies of a problem where they start, with other ``motions`` than its own if given.
 
-    Raises
-    ------
-    ProblemError
-        For a motion that FEBio cannot be given, and for two bodies of one name.
+    Raises `ProblemError` for a motion that FEBio cannot be given, and for two bodies of one name.
     """
     system = System(problem)
     bodies: list[FebBody] = []

@@ -168,10 +168,7 @@ class TissueMesh:
 def build_tissue(model: FebModel) -> TissueMesh:
     """Build one mesh of the deformable parts.
 
-    Raises
-    ------
-    ProblemError
-        If there is none, if their elements differ, or if one is inverted.
+    Raises `ProblemError` if there is none, if their elements differ, or if one is inverted.
     """
     parts = model.select_parts(model.materials)
     if not parts:

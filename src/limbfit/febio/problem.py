@@ -225,10 +225,7 @@ def build_step_control(model: FebModel, problem: Problem, **settings: Any) -> St
 def has_penalty(model: FebModel) -> bool:
     """True if contact has FEBio's penalty.
 
-    Raises
-    ------
-    ProblemError
-        If some contacts have it, and some have limbfit's own.
+    Raises `ProblemError` if some contacts have it, and some have limbfit's own.
     """
     found = {contact.has_penalty for contact in model.contacts}
     if len(found) == 2:
@@ -269,10 +266,7 @@ class _FollowingCurve:
 def group_contacts(model: FebModel) -> dict[str, tuple[Contact, ...]]:
     """Return the contacts of every rigid body that touches tissue, by its name, in the order of the file.
 
-    Raises
-    ------
-    ProblemError
-        If no rigid body is in a contact, or if the contacts of one body differ.
+    Raises `ProblemError` if no rigid body is in a contact, or if the contacts of one body differ.
     """
     found: dict[str, tuple[Contact, ...]] = {}
     for contact in model.contacts:

@@ -102,10 +102,7 @@ def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None =
 def _check_bodies(problem: Problem) -> list[FebBody]:
     """Return the rigid bodies of a problem that FEBio can be given.
 
-    Raises
-    ------
-    ProblemError
-        If FEBio cannot be given the problem.
+    Raises `ProblemError` if FEBio cannot be given the problem.
     """
     check_element(problem, "FEBio")
     _find_prestrains(problem)
@@ -381,10 +378,7 @@ def _combine_solids(solids: list[tuple[str, str]]) -> tuple[str, str]:
 def _find_prestrains(problem: Problem) -> dict[str, Array]:
     """Return the pre-stretches of each region that has some: (1, 3, 3), or one for each of its cells.
 
-    Raises
-    ------
-    ProblemError
-        If one changes the volume, which FEBio's pressure would not see.
+    Raises `ProblemError` if one changes the volume, which FEBio's pressure would not see.
     """
     found = {} if problem.prestretch is None else _divide_by_region(problem.mesh, problem.prestretch, (3, 3))
     for name, own in found.items():

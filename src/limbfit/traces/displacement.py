@@ -83,10 +83,8 @@ def fit_broken_line(
     Corners are added where the misfit is largest and all of them moved to their least-squares place;
     with ``peak_s`` the end of the way in is put there.
 
-    Raises
-    ------
-    TraceError
-        Where forty pieces do not describe it, it never advances, or the way in cannot end at ``peak_s``.
+    Raises `TraceError` if forty pieces do not describe it, it never advances, or the way in cannot end at
+    ``peak_s``.
     """
     t, u, _ = average_in_bins(time, displacement, 5000)
     at, coarse, n = average_in_bins(t, u, 300)

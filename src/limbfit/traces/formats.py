@@ -51,10 +51,7 @@ class ColumnTable:
 def read_table(file: Path, columns: Names) -> ColumnTable:
     """The table of a file, by its suffix; it has the columns that are named.
 
-    Raises
-    ------
-    TraceError
-        Where the file cannot be read, or holds no table with these columns.
+    Raises `TraceError` if the file cannot be read, or holds no table with these columns.
     """
     if not file.is_file():
         raise TraceError("no such file")
@@ -138,11 +135,8 @@ def _read_text(text: str, columns: Names) -> ColumnTable:
 def _find_header(rows: Sequence[Row], columns: Names) -> Row:
     """The first row that holds all names.
 
-    Raises
-    ------
-    TraceError
-        Where none does. It shows the row that holds the most of them; where none holds any, the first row
-        that is as wide as the numbers.
+    Raises `TraceError` if none does. It shows the row that holds the most of them; where none holds any,
+    the first row that is as wide as the numbers.
     """
     if not rows:
         raise TraceError("the file is empty")
@@ -209,10 +203,7 @@ def _add_times(
 ) -> list[Row]:
     """The rows of a segment, their times made of ``X0`` and ``Delta_X`` where the file leaves them out.
 
-    Raises
-    ------
-    TraceError
-        Where these are not the same for all channels.
+    Raises `TraceError` if these are not the same for all channels.
     """
     if names[0] != time or any(row[0] for _, row in rows):
         return list(rows)

@@ -99,10 +99,7 @@ def read_columns(
 def _read_column(table: ColumnTable, key: str, name: str, empty: str, notes: list[str]) -> Array:
     """The values of a column in the unit of its key.
 
-    Raises
-    ------
-    TraceError
-        For a cell that is no number, or a name that several columns have, which differ.
+    Raises `TraceError` for a cell that is no number, or a name that several columns have, which differ.
     """
     places = [i for i, known in enumerate(table.names) if known == name]
     if table.vectors:
@@ -122,10 +119,8 @@ def _read_column(table: ColumnTable, key: str, name: str, empty: str, notes: lis
 def _find_factor(unit: str, key: str, name: str, notes: list[str]) -> float:
     """Find the factor that converts the values of a column; 1 if no unit is stated.
 
-    Raises
-    ------
-    TraceError
-        For a unit that is not one of the key's quantity, or not that in the column's name.
+    Raises `TraceError` for a unit that is not one of the key's quantity, or not that in the column's
+    name.
     """
     known = next(units for end, units in _UNITS.items() if key.endswith(f"_{end}"))
     beside = _BRACKETED.fullmatch(name)

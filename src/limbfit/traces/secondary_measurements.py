@@ -167,10 +167,7 @@ class WaveSpeeds:
     def average(self, touch_down_s: float, end_s: float) -> WaveMeans:
         """Means over at most `MAX_WAVE_POINTS` spans of time until ``end_s``, and over two before touch-down.
 
-        Raises
-        ------
-        TraceError
-            Where there are not two readings until then.
+        Raises `TraceError` if there are not two readings until then.
         """
         before = np.flatnonzero(self.time_s < touch_down_s)
         inside = np.flatnonzero((self.time_s >= touch_down_s) & (self.time_s <= end_s))

@@ -11,7 +11,7 @@ import pytest
 import limbfit
 from conftest import COARSE
 from limbfit.errors import InputError
-from limbfit.identify.checks.protocol import sample_tissues
+from limbfit.identify.checks.design import sample_tissues
 from limbfit.pipeline.design.protocol import DESIGNED, PLAIN, UNSEEN
 from limbfit.pipeline.identification.problem import build_unknowns
 

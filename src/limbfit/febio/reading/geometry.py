@@ -66,10 +66,7 @@ class Geometry:
 def read_geometry(root: XmlNode, materials: Iterable[str]) -> Geometry:
     """Read ``<Mesh>`` and ``<MeshDomains>``.
 
-    Raises
-    ------
-    ProblemError
-        For a node, element, set or material that does not exist or is there twice.
+    Raises `ProblemError` for a node, element, set or material that does not exist or is there twice.
     """
     mesh = root.child("Mesh")
     nodes = [node for group in mesh.all("Nodes") for node in group]

@@ -60,10 +60,7 @@ def read_materials(
 
     Those are an error if a part is made of one (``used``: their names).
 
-    Raises
-    ------
-    ProblemError
-        For a law, or a parameter of one, that limbfit does not have.
+    Raises `ProblemError` for a law, or a parameter of one, that limbfit does not have.
     """
     soft: dict[str, Material] = {}
     rigid: dict[str, RigidMaterial] = {}
@@ -303,11 +300,8 @@ def read_prestrains(
 ) -> dict[str, Prestrain]:
     """Read the pre-strains of the parts that have some.
 
-    Raises
-    ------
-    ProblemError
-        For generators other than a gradient, and for gradients that change the volume, which FEBio's pressure
-        does not see and limbfit's does.
+    Raises `ProblemError` for generators other than a gradient, and for gradients that change the volume,
+    which FEBio's pressure does not see and limbfit's does.
     """
     matrices = [d for d in root.find("MeshData") or () if d.attributes.get("data_type") == MATRIX]
     maps = {(data.attribute("name"), data.attribute("elem_set")): data for data in matrices}
@@ -348,10 +342,7 @@ def read_fibres(
 ) -> dict[str, Array]:
     """Read the direction of the fibres of each cell (m, 3) of the parts that have some.
 
-    Raises
-    ------
-    ProblemError
-        For axes that are not given by vectors, and for other data of the mesh.
+    Raises `ProblemError` for axes that are not given by vectors, and for other data of the mesh.
     """
     axes = {node.attribute("name"): _read_material_axis(node) for node in root.child("Material")}
     found = {}

@@ -379,10 +379,7 @@ class Request:
 def read_requests(section: XmlNode | None, geometry: Geometry) -> tuple[tuple[Request, ...], tuple[str, ...]]:
     """Read the requests that limbfit can answer, with a note for everything else.
 
-    Raises
-    ------
-    ProblemError
-        For a set that does not exist, and for items that are no numbers.
+    Raises `ProblemError` for a set that does not exist, and for items that are no numbers.
     """
     requests, notes = [], list[str]()
     for output in section or ():

@@ -124,10 +124,7 @@ class RigidRail:
 def read_rails(root: XmlNode, rigid: Mapping[str, RigidMaterial]) -> tuple[RigidRail, ...]:
     """Read the prismatic joints of rigid bodies.
 
-    Raises
-    ------
-    ProblemError
-        For those that move a body themselves, or are there in some steps only.
+    Raises `ProblemError` for those that move a body themselves, or are there in some steps only.
     """
     found: list[RigidRail] = []
     for node in root.find("Rigid") or ():
@@ -149,10 +146,7 @@ def read_conditions(
 ) -> tuple[RigidCondition, ...]:
     """Read the conditions and loads of rigid bodies, those of single steps among them.
 
-    Raises
-    ------
-    ProblemError
-        For connectors, loads that follow, and whatever else limbfit does not support.
+    Raises `ProblemError` for connectors, loads that follow, and whatever else limbfit does not support.
     """
     sections: list[tuple[XmlNode | None, int | None]] = [(root.find("Rigid"), None)]
     sections += [(step.find("Rigid"), number) for number, step in enumerate(root.find("Step") or ())]
@@ -244,10 +238,7 @@ def build_motion(
 
     What is neither held nor moved in a step is free: a force drives it, of 0 if none is given.
 
-    Raises
-    ------
-    ProblemError
-        If a step holds what was free before it, or if it would turn about several axes.
+    Raises `ProblemError` if a step holds what was free before it, or if it would turn about several axes.
     """
     own = [condition for condition in conditions if condition.body == name]
     every, end = compute_step_times(tuple(phases), curves), 0.0
@@ -290,10 +281,7 @@ def restrict_to_rail(motion: Motion, rail: RigidRail) -> Motion:
 
     The joint bears what forces have across it.
 
-    Raises
-    ------
-    ProblemError
-        If something else than forces drives the body.
+    Raises `ProblemError` if something else than forces drives the body.
     """
     forced, values = np.asarray(motion.forced), np.zeros_like(motion.values)
     values[:, 2] = motion.values[:, :3] @ rail.along

@@ -125,10 +125,7 @@ class LoadCurve:
 def read_curves(section: XmlNode | None) -> dict[int, LoadCurve]:
     """Read the load curves by number.
 
-    Raises
-    ------
-    ProblemError
-        For controllers, interpolations and extensions that limbfit does not have.
+    Raises `ProblemError` for controllers, interpolations and extensions that limbfit does not have.
     """
     curves: dict[int, LoadCurve] = {}
     for node in section or ():

@@ -129,10 +129,8 @@ def _shorten(text: str) -> str:
 def read_tree(path: str | Path) -> XmlNode:
     """Read the root of an XML file.
 
-    Raises
-    ------
-    ProblemError
-        If the file is missing, too large or nested too deeply, is not well-formed, or has a document type.
+    Raises `ProblemError` if the file is missing, too large or nested too deeply, is not well-formed, or
+    has a document type.
     """
     file = Path(path)
     builder = _TreeBuilder()

@@ -84,10 +84,7 @@ def list_choices(sites: int, size: int, most: int | None = None, seed: int = 0) 
     """List every choice of ``size`` out of ``sites`` sites, in order, or ``most`` of them drawn without
     repeats.
 
-    Raises
-    ------
-    CalibrationError
-        If no site would be left to be predicted.
+    Raises `CalibrationError` if no site would be left to be predicted.
     """
     if not 0 < size < sites:
         raise CalibrationError(f"{size} of {sites} sites fitted leave none to be predicted")

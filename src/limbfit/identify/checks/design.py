@@ -1,33 +1,43 @@
-"""The choice of sites to test, and of depths: those whose data would determine the parameters best.
+"""The choice of sites to test, of depths, and of records: those whose data would determine parameters best.
 
 At given parameters each candidate indentation has a Fisher information on the logarithms of the parameters,
 ``J' S^-1 J``, from the exact derivatives of its force and a noise model. The information of several
 indentations adds up. D-optimal is the choice with the largest determinant of the sum (the smallest volume of
 the joint confidence region), A-optimal the one with the smallest sum of variances (Fedorov 1972; Atkinson and
 Donev 1992). The bounds replace data where there are none.
+
+Records that have to fit into a patient's time are chosen by Bayesian design (`plan_records`). Their
+information is computed at several samples of the parameters, because what a record tells depends on the
+tissue. A protocol is judged by the covariance of the target parameters, or of quantities that follow from
+them, while the others are unknown, too: by the mean over the samples of the logarithm of its determinant (D)
+or of its trace (A) (Chaloner and Verdinelli, Statistical Science 1995, 10:273).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 from math import comb, prod
 from typing import Literal
 
 import numpy as np
 from scipy.linalg import solve_toeplitz, toeplitz
+from scipy.stats import norm, qmc
 
 from ...arrays import Array
 from ...errors import CalibrationError
 from ..fit.objective import SiteResponse
 from ..fit.parameters import Unknowns
+from ..uncertainty.noise import compute_skin_similarity
 from ..uncertainty.uncertainty import NORMAL_95
 
 Criterion = Literal["D", "A"]
+Cost = Callable[[Sequence[int]], float]
 
 MAX_EXHAUSTIVE_CHOICES = 20_000  # choices that are all looked at; more are searched by exchanges
 _RESTARTS = 20
+_MAX_VARIANCE = 25.0  # of a logarithm: no factor is reported beyond exp(50), however little is known
 
 
 @dataclass(frozen=True)
@@ -71,10 +81,8 @@ def build_candidate(
 ) -> Candidate:
     """Build the candidate of a simulated indentation.
 
-    Raises
-    ------
-    CalibrationError
-        If the simulation is partial: half a record informs differently from the whole.
+    Raises `CalibrationError` if the simulation is partial: half a record informs differently from the
+    whole.
     """
     if not response.completed:
         raise CalibrationError(f"{site}, {depth_mm:g} mm: {response.reason or 'simulation failed'}")
@@ -160,10 +168,7 @@ def choose_design(
     All choices are compared if there are at most 20,000. Otherwise a greedy choice and random ones are
     improved by exchanging one candidate at a time until no exchange helps.
 
-    Raises
-    ------
-    CalibrationError
-        If there are fewer sites than ``size``.
+    Raises `CalibrationError` if there are fewer sites than ``size``.
     """
     sites = list(dict.fromkeys(c.site for c in candidates))
     groups = [[i for i, c in enumerate(candidates) if c.site == site] for site in sites]
@@ -219,3 +224,239 @@ def _improve_by_exchange(
         if not least < cost - 1e-12 * abs(cost):
             return chosen
         chosen, cost = best, least
+
+
+@dataclass(frozen=True)
+class RecordNoise:
+    """The noise of all that a record measures; None where that is not measured.
+
+    ``force`` is that of the force, ``layers`` of the compressions in ultrasound, ``skin`` of the moves that
+    cameras see, and ``waves`` of the speeds of shear waves.
+    """
+
+    force: NoiseModel
+    layers: NoiseModel | None = None
+    skin: NoiseModel | None = None
+    waves: NoiseModel | None = None
+
+    @classmethod
+    def from_sds(
+        cls,
+        force: NoiseModel,
+        ultrasound_sd_mm: float | None = None,
+        surface_sd_mm: float | None = None,
+        shear_waves_sd_m_s: float | None = None,
+    ) -> RecordNoise:
+        """Build it from the standard deviations of one reading at each point of comparison.
+
+        The misfit of the model is the same share as of the force. The speeds of a place have a common error
+        as large as each one's own.
+        """
+        layers, skin, waves = (
+            None if sd is None else replace(force, sensor_N=sd)
+            for sd in (ultrasound_sd_mm, surface_sd_mm, shear_waves_sd_m_s)
+        )
+        return cls(force, layers, skin, None if waves is None else replace(waves, bias_N=waves.sensor_N))
+
+    @property
+    def has_secondary(self) -> bool:
+        """True if anything is measured beside the force."""
+        return any(one is not None for one in (self.layers, self.skin, self.waves))
+
+    def compute_force_information(self, force: SiteResponse, parameters: Array) -> Array:
+        """Return the information (p, p) of a record's force."""
+        return compute_information(force, parameters, self.force)
+
+    def compute_information(
+        self,
+        force: SiteResponse,
+        values: Array,
+        slopes: Array,
+        parts: tuple[int, Array, float],
+        parameters: Array,
+    ) -> Array:
+        """Return the information (p, p) of a record's force and of all that is measured beside it.
+
+        ``values`` (g, n) are measured beside the force, ``slopes`` (g, n, p) are their derivatives. ``parts``
+        says what the values are: first so many of layers, then three components of each of the points (k, 3)
+        mm on the skin, then speeds, of which there are so many readings.
+        """
+        layers, points_mm, readings = parts
+        information, waves = self.compute_force_information(force, parameters), layers + 3 * len(points_mm)
+        if self.layers is not None:
+            information = information + _sum_information(
+                values[:layers], slopes[:layers], parameters, self.layers
+            )
+        if self.skin is not None and len(points_mm):
+            components = np.tile(range(3), len(points_mm))
+            similarity = compute_skin_similarity(np.repeat(points_mm, 3, axis=0), components)
+            skin = values[layers:waves], slopes[layers:waves]
+            information = information + compute_field_information(*skin, similarity, parameters, self.skin)
+        if self.waves is not None:
+            fewer = np.sqrt(max(values.shape[1] / readings, 1.0))  # than points of comparison
+            noise = replace(self.waves, sensor_N=fewer * self.waves.sensor_N)
+            information = information + _sum_information(values[waves:], slopes[waves:], parameters, noise)
+        return information
+
+
+def _sum_information(values: Array, slopes: Array, parameters: Array, noise: NoiseModel) -> Array:
+    """Return the information (p, p) of several curves (g, n) together."""
+    found = np.zeros((len(parameters), len(parameters)))
+    for value, slope in zip(values, slopes, strict=True):
+        found += compute_information(SiteResponse(value, slope), parameters, noise)
+    return found
+
+
+@dataclass(frozen=True)
+class RecordOption:
+    """A record that could be made: ``information`` (d, p, p) on log(parameters) at each sample of tissue.
+
+    ``place`` is what is prepared for it, a site with an indenter; records at one place share that time. The
+    site's tissue may be stiffer as a whole, for all of its records, by a share with standard deviation
+    ``site_share``.
+    """
+
+    place: tuple[str, str]
+    seconds: float
+    information: Array
+    site_share: float = 0.0
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The time of a session: ``seconds`` in all, ``setup_s`` for each place."""
+
+    seconds: float
+    setup_s: float
+
+
+@dataclass(frozen=True)
+class DesignTarget:
+    """What is to be determined: ``rows`` (k, p) times log(parameters), with ``prior`` information (p, p).
+
+    Rows of the unit matrix are parameters; others are quantities that follow from them, such as a pressure's
+    logarithm. ``stiffness`` (p,) is 1 for parameters that are moduli, which change if a site is stiffer;
+    None: no site is.
+    """
+
+    prior: Array
+    rows: Array
+    criterion: Criterion = "D"
+    stiffness: Array | None = None
+
+    def compute_covariances(
+        self, options: Sequence[RecordOption], chosen: Sequence[int], draws: int
+    ) -> Array:
+        """Return the covariance of log(parameters) (d, p, p) at each of the samples of tissue.
+
+        The records of a site share its own stiffness, so they tell less together: that stiffness is one more
+        parameter with a known spread, which is then marginalised.
+        """
+        total = np.repeat(self.prior[None], draws, axis=0)
+        sites: dict[str, list[RecordOption]] = {}
+        for i in chosen:
+            sites.setdefault(options[i].place[0], []).append(options[i])
+        for own in sites.values():
+            informations = np.array([one.information for one in own])
+            total = total + informations.sum(axis=0)
+            if self.stiffness is None:
+                continue
+            share = np.array([one.site_share for one in own])
+            along = np.einsum("r,rdij,j->di", share, informations, self.stiffness)
+            alone = 1.0 + np.einsum("r,rdij,i,j->d", share**2, informations, self.stiffness, self.stiffness)
+            total = total - along[:, :, None] * along[:, None, :] / alone[:, None, None]
+        return np.asarray(np.linalg.inv(total))
+
+    def project(self, covariances: Array) -> Array:
+        """Return the covariance (d, k, k) of the target from that of log(parameters) (d, p, p)."""
+        return np.asarray(self.rows @ covariances @ self.rows.T)
+
+    def compute_cost(self, covariances: Array) -> float:
+        """Return the criterion, which the best protocol makes smallest."""
+        part = self.project(covariances)
+        if self.criterion == "A":
+            return float(np.trace(part, axis1=1, axis2=2).mean())
+        return float(np.linalg.slogdet(part)[1].mean())
+
+
+def sample_tissues(unknowns: Unknowns, centre: Array, draws: int, seed: int) -> Array:
+    """Sample tissues (d, p) that the limb may have: ``centre``, then others about it within the bounds.
+
+    A parameter with a prior scatters by the prior's factor, another by half of what its bounds allow. A Latin
+    hypercube spreads few samples well.
+    """
+    spread = 0.5 * np.log(unknowns.upper / unknowns.lower) / np.sqrt(12.0)
+    for prior in unknowns.priors:
+        spread[unknowns.names.index(prior.name)] = np.log(prior.factor)
+    others = qmc.LatinHypercube(len(centre), rng=seed).random(max(draws - 1, 0))
+    scattered = np.log(centre) + spread * norm.ppf(np.clip(others, 0.05, 0.95))
+    return np.vstack([centre, np.exp(np.clip(scattered, np.log(unknowns.lower), np.log(unknowns.upper)))])
+
+
+def compute_factors_95(covariances: Array) -> Array:
+    """Return (d, p) the factor f of the expected 95 % interval [value / f, value x f] at each sample."""
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    return np.asarray(np.exp(NORMAL_95 * np.sqrt(np.minimum(variances, _MAX_VARIANCE))))
+
+
+def compute_duration_s(options: Sequence[RecordOption], chosen: Sequence[int], budget: Budget) -> float:
+    """Return how long a protocol takes."""
+    places = {options[i].place for i in chosen}
+    return sum(options[i].seconds for i in chosen) + budget.setup_s * len(places)
+
+
+def plan_records(options: Sequence[RecordOption], budget: Budget, target: DesignTarget) -> tuple[int, ...]:
+    """Plan the records to make: added by gain in their time, then exchanged as long as that helps.
+
+    Raises `CalibrationError` if no record fits into the time.
+    """
+    if not options or all(
+        compute_duration_s(options, [i], budget) > budget.seconds for i in range(len(options))
+    ):
+        raise CalibrationError("no record fits into the time")
+    draws = len(options[0].information)
+
+    def cost(chosen: Sequence[int]) -> float:
+        return target.compute_cost(target.compute_covariances(options, chosen, draws))
+
+    starts = [_fill_budget([], options, budget, cost, by_time=by_time) for by_time in (True, False)]
+    best = min((_improve_plan(start, options, budget, cost) for start in starts), key=cost)
+    return tuple(sorted(best))
+
+
+def _fill_budget(
+    chosen: Sequence[int], options: Sequence[RecordOption], budget: Budget, cost: Cost, *, by_time: bool
+) -> list[int]:
+    """Add the record that tells most, for its time or at all, until nothing more fits."""
+    filled = list(chosen)
+    while True:
+        now, spent, best, gain = cost(filled), compute_duration_s(options, filled, budget), -1, 0.0
+        for i in range(len(options)):
+            seconds = compute_duration_s(options, [*filled, i], budget)
+            if i in filled or seconds > budget.seconds:
+                continue
+            gain_rate = (now - cost([*filled, i])) / (seconds - spent if by_time else 1.0)
+            if gain_rate > gain:
+                best, gain = i, gain_rate
+        if best < 0:
+            return filled
+        filled.append(best)
+
+
+def _improve_plan(
+    start: Sequence[int], options: Sequence[RecordOption], budget: Budget, cost: Cost
+) -> list[int]:
+    """Leave one record out and fill the time again, as long as that is better."""
+    found, least = list(start), cost(start)
+    while True:
+        trials = []
+        for out in found:
+            rest = [i for i in found if i != out]
+            endless = replace(options[out], seconds=float("inf"))  # so that it is not chosen again
+            others = [endless if i == out else option for i, option in enumerate(options)]
+            trials += [_fill_budget(rest, others, budget, cost, by_time=by_time) for by_time in (True, False)]
+        best = min(trials, key=cost, default=found)
+        now = cost(best)
+        if not now < least - 1e-9 * abs(least):
+            return found
+        found, least = best, now

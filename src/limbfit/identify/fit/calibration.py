@@ -190,10 +190,7 @@ def evaluate_state(
 ) -> Iterate:
     """Return the iterate at a state, simulated by ``simulate`` and not counted as an evaluation.
 
-    Raises
-    ------
-    CalibrationError
-        If it cannot be simulated.
+    Raises `CalibrationError` if it cannot be simulated.
     """
     run = _Search(simulate, tuple(measured), unknowns, settings, tuple(groupings))
     return run.build_iterate(state.stage, run.restore(state))

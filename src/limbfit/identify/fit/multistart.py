@@ -77,10 +77,7 @@ def run_multistart(
 ) -> MultistartResult:
     """Call ``run(number, unknowns)`` from ``count`` starts; see :func:`draw_starts`.
 
-    Raises
-    ------
-    CalibrationError
-        If no start can be simulated.
+    Raises `CalibrationError` if no start can be simulated.
     """
     starts = draw_starts(unknowns, count, seed, grouping)
     calibrations: dict[int, Calibration] = {}

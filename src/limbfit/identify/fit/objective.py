@@ -117,10 +117,8 @@ def check_responses(
 ) -> str:
     """Return why an evaluation cannot be used, or an empty text.
 
-    Raises
-    ------
-    CalibrationError
-        Where a completed simulation has the wrong shape: an error of the caller, not of the physics.
+    Raises `CalibrationError` if a completed simulation has the wrong shape: an error of the caller, not
+    of the physics.
     """
     if len(responses) != len(measured):
         raise CalibrationError(f"{len(responses)} responses for {len(measured)} sites")

@@ -50,10 +50,8 @@ def constrain(
 ) -> Grouping:
     """Return ``grouping`` with each set of ``tied`` parameters in one group and the ``fixed`` ones in none.
 
-    Raises
-    ------
-    ProblemError
-        For an unknown name, for a tie of parameters of different kinds, or for one that is also fixed.
+    Raises `ProblemError` for an unknown name, for a tie of parameters of different kinds, or for one that
+    is also fixed.
     """
     for name in (*fixed, *(name for group in tied for name in group)):
         if name not in names:

@@ -14,12 +14,13 @@ from ...anatomy.sites.sites import measure_tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...arrays import Array
 from ...errors import InputError, RunError
-from ...identify.checks.design import NoiseModel, compute_bounds_information
-from ...identify.checks.protocol import (
+from ...identify.checks.design import (
     Budget,
     DesignTarget,
+    NoiseModel,
     RecordNoise,
     RecordOption,
+    compute_bounds_information,
     compute_duration_s,
     compute_factors_95,
     plan_records,
