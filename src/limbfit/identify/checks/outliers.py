@@ -90,7 +90,7 @@ class RecordCorrection:
     """One change to the records that makes all sites agree better: names exchanged, or a unit converted.
 
     ``gain`` is the squared misfit of all sites before over after, each refitted. The errors (root mean square
-    over the peak) are those of ``sites``; ``worst_before`` is the largest of any site, because a fit may
+    over the peak) are the largest of ``sites``; ``worst_before`` is that of any site, because a fit may
     follow the bad record and miss the others.
     """
 
@@ -98,14 +98,14 @@ class RecordCorrection:
     sites: tuple[int, ...]
     cause: str
     gain: float
-    errors_before: tuple[float, ...]
-    errors_after: tuple[float, ...]
+    error_before: float
+    error_after: float
     worst_before: float
 
     @property
     def is_convincing(self) -> bool:
         worst = self.worst_before
-        return self.gain > MIN_GAIN and worst > MAX_ERROR_SHARE / 2 and max(self.errors_after) < 0.6 * worst
+        return self.gain > MIN_GAIN and worst > MAX_ERROR_SHARE / 2 and self.error_after < 0.6 * worst
 
 
 class LeaveOutFits:
@@ -453,16 +453,9 @@ def _build_correction(
 ) -> RecordCorrection:
     after = sites.compute_errors(sites.fit_without())
     gain = float(np.sum(before**2) / max(np.sum(after**2), len(after) * (MIN_ERROR_SHARE / 2) ** 2))
-    pairs = [(float(before[i]), float(after[i])) for i in indices]
-    return RecordCorrection(
-        kind,
-        indices,
-        cause,
-        gain,
-        tuple(b for b, _ in pairs),
-        tuple(a for _, a in pairs),
-        float(before.max()),
-    )
+    own = list(indices)
+    errors = float(before[own].max()), float(after[own].max())
+    return RecordCorrection(kind, indices, cause, gain, *errors, float(before.max()))
 
 
 def warn_of_outlier(error: LeaveOneOutError, unit: str = "N") -> RecordWarning:
@@ -493,19 +486,18 @@ def warn_of_correction(correction: RecordCorrection, names: Sequence[str]) -> Re
     sites = tuple(names[i] for i in correction.sites)
     numbers = {
         "misfit_ratio": correction.gain,
-        "error_before_percent": 100 * max(correction.errors_before),
-        "error_after_percent": 100 * max(correction.errors_after),
+        "error_before_percent": 100 * correction.error_before,
+        "error_after_percent": 100 * correction.error_after,
     }
-    done = "their records exchanged" if correction.kind == "swap" else "its force converted"
+    done, remedy = {
+        "swap": ("their records exchanged", "exchange the traces of the two sites, or their names"),
+        "unit": ("its force converted", "convert the force to N"),
+    }[correction.kind]
     what = (
         f"with {done}, the squared misfit of all sites falls {correction.gain:.1f} times and the error here "
         f"from {numbers['error_before_percent']:.0f} to {numbers['error_after_percent']:.0f} % of the peak"
     )
-    remedies = {
-        "swap": "exchange the traces of the two sites, or their names",
-        "unit": "convert the force to N",
-    }
-    return RecordWarning(sites, correction.kind, what, numbers, correction.cause, remedies[correction.kind])
+    return RecordWarning(sites, correction.kind, what, numbers, correction.cause, remedy)
 
 
 def guess_force_unit(ratio: float) -> str:
