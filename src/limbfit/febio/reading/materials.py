@@ -10,7 +10,7 @@ feature manual, ``uncoupled active fiber stress``, ``uncoupled prestrain elastic
 from __future__ import annotations
 
 from collections.abc import Container, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -86,32 +86,42 @@ def read_materials(
     return soft, rigid, tuple(notes)
 
 
+@dataclass(frozen=True)
+class _Surroundings:
+    """What stands around an elastic law: bulk modulus ``k`` (MPa), factor of its moduli, and relaxation."""
+
+    k: float
+    volumetric: str
+    scale: float = 1.0
+    prony: tuple[tuple[float, float], ...] = ()
+
+
 def _read_law(node: XmlNode) -> Material:
-    k, law = node.number("k", 0.0), _read_volumetric(node)
+    around = _Surroundings(node.number("k", 0.0), _read_volumetric(node))
     if node.attribute("type") != PRESTRAINED:
-        return _read_uncoupled(node, k, law)
+        return _read_uncoupled(node, around)
     _check_parameters(node, {"elastic", "prestrain"} | _SHARED)
     inner = node.child("elastic")
     if inner.number("k", 0.0) != 0.0:
         raise inner.error("has a bulk modulus of its own in a pre-strain", "give that of the outer material")
-    return _read_uncoupled(inner, k, _check_volumetric(inner, law))
+    _check_volumetric(inner, around)
+    return _read_uncoupled(inner, around)
 
 
-def _read_uncoupled(node: XmlNode, k: float, law: str) -> Material:
-    """Read the law of a material with bulk modulus ``k`` (MPa)."""
+def _read_uncoupled(node: XmlNode, around: _Surroundings) -> Material:
     kind = node.attribute("type")
     if kind == RELAXED:
-        return _read_relaxing(node, k, law)
+        return _read_relaxing(node, around)
     if kind not in (*ELASTIC, MIXTURE):
         raise _build_kind_error(node, kind)
     if kind == MIXTURE:
         active = [one for one in node.all("solid") if one.attribute("type") == ACTIVE]
         if active:
-            return _read_contractile(node, active, k, law)
-    return _read_hyperelastic(node, 1.0, (), k, law)
+            return _read_contractile(node, active, around)
+    return _read_hyperelastic(node, around)
 
 
-def _read_relaxing(node: XmlNode, k: float, law: str) -> Material:
+def _read_relaxing(node: XmlNode, around: _Surroundings) -> Material:
     elastic = node.child("elastic")
     if elastic.attribute("type") not in (*ELASTIC, MIXTURE):
         raise _build_kind_error(elastic, elastic.attribute("type"))
@@ -121,19 +131,18 @@ def _read_relaxing(node: XmlNode, k: float, law: str) -> Material:
         raise node.error("g0 is not positive: nothing would hold the tissue in the long term")
     prony = [(node.number(f"g{i}", 0.0), i) for i in range(1, 7)]
     terms = tuple((g / g0, node.number(f"t{i}", 1.0)) for g, i in prony if g != 0.0)
+    _check_volumetric(elastic, around)
     # The wrapper adds its own k to the elastic material's; g0 scales the deviatoric part only.
-    return _read_hyperelastic(
-        elastic, g0, terms, k + elastic.number("k", 0.0), _check_volumetric(elastic, law)
-    )
+    k = around.k + elastic.number("k", 0.0)
+    return _read_hyperelastic(elastic, replace(around, k=k, scale=g0, prony=terms))
 
 
-def _check_volumetric(inner: XmlNode, law: str) -> str:
-    if inner.find("pressure_model") is not None and _read_volumetric(inner) != law:
+def _check_volumetric(inner: XmlNode, around: _Surroundings) -> None:
+    if inner.find("pressure_model") is not None and _read_volumetric(inner) != around.volumetric:
         raise inner.error("its pressure_model differs from that of the material around it")
-    return law
 
 
-def _read_contractile(node: XmlNode, active: list[XmlNode], k: float, law: str) -> Contractile:
+def _read_contractile(node: XmlNode, active: list[XmlNode], around: _Surroundings) -> Contractile:
     """Read what a mixture bears passively, and the stress of its fibres at full activation."""
     if len(active) > 1:
         raise active[1].error("a mixture is read with one contraction")
@@ -142,35 +151,27 @@ def _read_contractile(node: XmlNode, active: list[XmlNode], k: float, law: str) 
     _check_parameters(active_stress, {"smax", "activation", "k", "density"})
     rest = [one for one in node.all("solid") if one is not active_stress]
     if [one.attribute("type") for one in rest] == [RELAXED]:
-        passive = _read_relaxing(rest[0], k, _check_volumetric(rest[0], law))
+        _check_volumetric(rest[0], around)
+        passive = _read_relaxing(rest[0], around)
     elif len(rest) == 1 and rest[0].attribute("type") in ELASTIC:
-        passive = _read_hyperelastic(rest[0], 1.0, (), k, law)
+        passive = _read_elastic(rest[0], around)
     else:
-        passive = _read_mixture(node, rest, 1.0, (), k, law)
+        passive = _read_mixture(node, rest, around)
     if not isinstance(passive, Fibred):
         assert isinstance(passive, Uncoupled)
         passive = Fibred(passive, 0.0, 1.0)
     return Contractile(passive, active_stress.number("smax") * active_stress.number("activation"))
 
 
-def _read_hyperelastic(
-    node: XmlNode, scale: float, prony: tuple[tuple[float, float], ...], k: float, law: str
-) -> Material:
+def _read_hyperelastic(node: XmlNode, around: _Surroundings) -> Material:
     """Read an elastic law, and the fibres beside it if it is a mixture."""
     if node.attribute("type") != MIXTURE:
-        return _read_elastic(node, scale, prony, k, law)
+        return _read_elastic(node, around)
     _check_parameters(node, {"solid"} | _SHARED)
-    return _read_mixture(node, node.all("solid"), scale, prony, k, law)
+    return _read_mixture(node, node.all("solid"), around)
 
 
-def _read_mixture(
-    node: XmlNode,
-    solids: list[XmlNode],
-    scale: float,
-    prony: tuple[tuple[float, float], ...],
-    k: float,
-    law: str,
-) -> Fibred:
+def _read_mixture(node: XmlNode, solids: list[XmlNode], around: _Surroundings) -> Fibred:
     """Read the ground and the fibres among the ``solids`` of a mixture."""
     fibres = [one for one in solids if one.attribute("type") == FIBRE]
     grounds = [one for one in solids if one.attribute("type") in ELASTIC]
@@ -185,8 +186,7 @@ def _read_mixture(
     _check_parameters(fibre, {"ksi", "alpha", "beta", "k", "density"})
     if fibre.number("beta") != 2.0:
         raise fibre.child("beta").error("limbfit's fibres have beta = 2")
-    made = _read_elastic(ground, scale, prony, k, law)
-    return Fibred(made, scale * fibre.number("ksi"), fibre.number("alpha"))
+    return Fibred(_read_elastic(ground, around), around.scale * fibre.number("ksi"), fibre.number("alpha"))
 
 
 def _build_kind_error(node: XmlNode, kind: str) -> ProblemError:
@@ -214,15 +214,12 @@ def _check_parameters(node: XmlNode, allowed: set[str]) -> None:
         raise node.child("laugon").error("augmented incompressibility is not supported")
 
 
-def _read_elastic(
-    node: XmlNode, scale: float, prony: tuple[tuple[float, float], ...], k: float, law: str
-) -> Uncoupled:
-    """Read the law of ``node``, its moduli times ``scale``, with bulk modulus ``k`` (MPa)."""
-    kind = node.attribute("type")
+def _read_elastic(node: XmlNode, around: _Surroundings) -> Uncoupled:
+    kind, k, scale, prony = node.attribute("type"), around.k, around.scale, around.prony
     _check_parameters(node, ELASTIC[kind] | _SHARED)
     if not k > 0.0:
         raise node.error("has no positive bulk modulus k")
-    shared: dict[str, Any] = {"prony": prony, "volumetric": law}
+    shared: dict[str, Any] = {"prony": prony, "volumetric": around.volumetric}
     if kind == "incomp neo-Hookean":
         mu = scale * node.number("G")
         return NeoHookean(mu, kappa_ratio=k / _check_modulus(node, mu), **shared)
@@ -232,7 +229,7 @@ def _read_elastic(
     terms = [(scale * node.number(f"c{i}", 0.0), node.number(f"m{i}", 1.0)) for i in range(1, 7)]
     terms = [term for term in terms if term[0] != 0.0]
     ratio = k / _check_modulus(node, sum(c for c, _ in terms) / 2.0)
-    if len(terms) == 2 and law == "log":
+    if len(terms) == 2 and around.volumetric == "log":
         (c, m), (other, minus) = terms
         if (c, m) == (other, -minus) and m > 0.0:
             gamma, tau = zip(*prony or ((0.0, 1.0),), strict=True)
