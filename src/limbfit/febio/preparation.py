@@ -59,15 +59,12 @@ def prepare_problem(problem: Problem, steps: StepControl) -> tuple[Problem, tupl
 
     The indenter stands clear of the tissue until limbfit's touch-down.
 
+    Raises `ProblemError` if these places are not found.
+
     Parameters
     ----------
     steps : step control with which limbfit finds where the indenter touches, and where bodies under a force
         are at the end of the first step.
-
-    Raises
-    ------
-    ProblemError
-        If these places are not found.
     """
     preparation, waits = Preparation.from_problem(problem), IndenterStart.of(problem).waits
     motions = [body.motion for body in problem.rigid_bodies]

@@ -293,15 +293,12 @@ def find_touching_body(model: FebModel, contact: Contact) -> str:
 def find_drive(model: FebModel, shaped: bool = False) -> Drive:
     """Find what drives the problem of an input.
 
+    Raises `ProblemError` if nodes, or bodies that carry tissue, move by load curves that are not
+    multiples of one another, and for motions that limbfit does not support.
+
     Parameters
     ----------
     shaped : True if a shape is given for the body that goes straight in, whose own faces may then be open.
-
-    Raises
-    ------
-    ProblemError
-        If nodes, or bodies that carry tissue, move by load curves that are not multiples of one another, and
-        for motions that limbfit does not support.
     """
     touching, motions = group_contacts(model), _read_body_motions(model)
     bodies = {name: motions[name] for name in touching}

@@ -330,15 +330,12 @@ def _format_material(
 ) -> Iterator[str]:
     """Write a tissue with its axis of fibres.
 
+    Raises `ProblemError` for more terms than FEBio takes.
+
     Parameters
     ----------
     course : number of the load curve of its contraction.
     prestrain : its pre-strain, as it is written.
-
-    Raises
-    ------
-    ProblemError
-        For more terms than FEBio takes.
     """
     table = material.table()
     prony = [(float(g), float(tau)) for g, tau in table.prony if g != 0.0]

@@ -69,15 +69,12 @@ def find_carried_nodes(
 ) -> dict[str, Indices]:
     """Find the nodes of tissue that move with each rigid body: those of its own parts, and sets tied to it.
 
+    Raises `ProblemError` for a node that two bodies would carry.
+
     Parameters
     ----------
     soft, bodies : names of the deformable and of the rigid materials.
     conditions : rigid body and ``<bc type="rigid">`` of every set that is tied.
-
-    Raises
-    ------
-    ProblemError
-        For a node that two bodies would carry.
     """
     parts = geometry.parts.values()
     owned = {

@@ -196,24 +196,21 @@ def evaluate_state(
     return run.build_iterate(state.stage, run.restore(state))
 
 
+@dataclass
 class _Search:
     """A calibration in progress: counts evaluations and keeps the responses of the last accepted point."""
 
-    def __init__(
-        self,
-        simulate: Simulate,
-        measured: tuple[MeasuredCurve, ...],
-        unknowns: Unknowns,
-        settings: CalibrationSettings,
-        stages: tuple[Grouping, ...],
-    ) -> None:
-        self.simulate, self.measured, self.unknowns = simulate, measured, unknowns
-        self.settings, self.stages = settings, stages
-        self.evaluations = self.failures = 0
-        self.failure = ""  # why the last one failed
-        self.fold_refusals = 0  # trials of this stage that were refused for what folds in them
-        self._accepted: tuple[SiteResponse, ...] = ()  # at the last accepted point
-        self._stored: dict[bytes, tuple[SiteResponse, ...]] = {}
+    simulate: Simulate
+    measured: tuple[MeasuredCurve, ...]
+    unknowns: Unknowns
+    settings: CalibrationSettings
+    stages: tuple[Grouping, ...]
+    evaluations: int = 0
+    failures: int = 0
+    failure: str = ""  # why the last one failed
+    fold_refusals: int = 0  # trials of this stage that were refused for what folds in them
+    _accepted: tuple[SiteResponse, ...] = ()  # at the last accepted point
+    _stored: dict[bytes, tuple[SiteResponse, ...]] = field(default_factory=dict)
 
     def build_space(self, stage: int) -> SearchSpace:
         return build_space(self.unknowns, self.stages[stage])
