@@ -29,7 +29,7 @@ from limbfit.anatomy.grid import BONES, FAT, LabelMap
 from limbfit.anatomy.labels.quality import assess_labels
 from limbfit.anatomy.segmentation.body import check_one_limb
 from limbfit.anatomy.segmentation.segmentation import segment
-from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy, compute_signed_distance
+from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy
 from limbfit.phantom.geometry import Limb, compute_gradient, make_limb
 from limbfit.phantom.mri import CONTRASTS, DETAIL_GRIDS, ScanGrid, build_image, make_grid
 from limbfit.phantom.surfaces import build_true_anatomy
@@ -82,7 +82,7 @@ def surface_errors(anatomy: Anatomy, limb: Limb) -> dict[str, dict[str, float]]:
         low = (anatomy.height(there) < -BELOW_CUT_MM) & (
             (there - true.cut_point) @ true.cut_normal < -BELOW_CUT_MM
         )
-        back = np.abs(compute_signed_distance(found[name], there[low]))
+        back = np.abs(found[name].signed_distance(there[low]))
         errors[name] = {
             "rms_mm": float(np.sqrt(np.mean(off**2))),
             "p95_mm": float(np.percentile(off, 95)),

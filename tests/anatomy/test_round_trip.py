@@ -19,7 +19,6 @@ from limbfit.anatomy.sites.sites import compute_indenter_axis
 from limbfit.anatomy.surfaces.surfaces import (
     Anatomy,
     build_anatomy,
-    compute_signed_distance,
     load_anatomy,
     save_anatomy,
 )
@@ -137,9 +136,9 @@ def test_the_mesh_on_disk_lies_where_the_body_lies(tmp_path, body, reference):
     seen = pv.read(tmp_path / "mesh.vtu")
     assert np.abs(seen.points - mesh.points).max() < TOLERANCE_MM
     outer = seen.points[np.unique(mesh.face_sets["skin"])]
-    assert np.abs(compute_signed_distance(reference.skin, outer)).max() < 1.0
+    assert np.abs(reference.skin.signed_distance(outer)).max() < 1.0
     for bone in reference.bones.values():
-        assert compute_signed_distance(bone, seen.points).min() > -1.0
+        assert bone.signed_distance(seen.points).min() > -1.0
 
 
 def _sorted_like(triangles: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ def test_signed_distance_of_a_cube(cube) -> None:
     wanted = np.where(
         (beyond < 0).all(axis=1), beyond.max(axis=1), np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
     )
-    distance, face, foot = cube.search.signed(points)
+    distance, face, foot = cube.find_signed(points)
     np.testing.assert_allclose(distance, wanted, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(points - foot, axis=1), np.abs(wanted), atol=1e-12)
     corners = cube.triangles[face]
@@ -31,15 +31,16 @@ def test_signed_distance_of_a_cube(cube) -> None:
 
 
 def test_no_points_have_no_distance(cube) -> None:
-    assert [len(part) for part in cube.search.signed(np.zeros((0, 3)))] == [0, 0, 0]
+    assert [len(part) for part in cube.find_signed(np.zeros((0, 3)))] == [0, 0, 0]
 
 
 def test_trees_are_built_once_and_stay_behind(cube) -> None:
-    assert cube.search is cube.search
-    cube.search.signed(np.zeros((1, 3)))
+    cube.find_signed(np.zeros((1, 3)))
+    assert cube._boxes is cube._boxes
+    assert cube._windings is cube._windings
     sent = pickle.loads(pickle.dumps(cube))
     np.testing.assert_array_equal(sent.points, cube.points)
-    assert sent.search.signed(np.zeros((1, 3)))[0] == pytest.approx([-10.0])
+    assert sent.signed_distance(np.zeros((1, 3))) == pytest.approx([-10.0])
 
 
 @pytest.mark.parametrize("corner", range(4))

@@ -10,7 +10,7 @@ import pytest
 from socket_limbs import CUT_NORMAL, FILES, TOP, real_limb, revolved, round_limb
 
 from limbfit.anatomy.frame import Frame, build_limb_frame
-from limbfit.anatomy.surfaces.surfaces import Anatomy, compute_signed_distance
+from limbfit.anatomy.surfaces.surfaces import Anatomy
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
 from limbfit.socket import Area, Recipe, Socket, measure_circumference, rectify_limb
@@ -50,10 +50,10 @@ def check_face(socket: Socket, anatomy: Anatomy) -> None:
     # Clear of the limb: from points on the face, and from the limb's points.
     weights = np.array([[1, 0, 0], [0.5, 0.5, 0], [1 / 3, 1 / 3, 1 / 3], [0.2, 0.2, 0.6], [0.6, 0.2, 0.2]])
     on = np.einsum("wc,mcd->mwd", weights, clear.triangles).reshape(-1, 3)
-    assert compute_signed_distance(skin, on).min() > 0.49
+    assert skin.signed_distance(on).min() > 0.49
     apart = igl.point_mesh_squared_distance(skin.points, socket.clear, socket.faces)[0]
     assert np.sqrt(apart.min()) > 0.49
-    assert compute_signed_distance(closed_above(clear, anatomy), skin.points).max() < 0.0
+    assert closed_above(clear, anatomy).signed_distance(skin.points).max() < 0.0
 
 
 def closed_above(clear: Surface, anatomy: Anatomy) -> Surface:

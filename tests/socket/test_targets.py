@@ -9,7 +9,6 @@ import pytest
 from socket_limbs import CUT_NORMAL, round_limb
 
 from limbfit.anatomy.frame import build_limb_frame
-from limbfit.anatomy.surfaces.surfaces import compute_signed_distance
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, rectify_limb
 from limbfit.socket.landmarks import build_default_regions, find_directions
@@ -51,7 +50,7 @@ def test_presets_relieve_the_prominences(kind: str) -> None:
 
 def test_pressure_goes_with_the_tissue_over_the_bones() -> None:
     found = at(Target(TISSUE_DEPTH, 10.0))
-    depth = np.min([compute_signed_distance(bone, POINTS) for bone in LIMB.bones.values()], axis=0)
+    depth = np.min([bone.signed_distance(POINTS) for bone in LIMB.bones.values()], axis=0)
     np.testing.assert_allclose(found[UNDER], 10.0 * np.clip(depth[UNDER] / 20.0, 0.0, 1.0), atol=0.03)
     with pytest.raises(SurfaceError, match="the limb has no bones"):
         Target(TISSUE_DEPTH, 10.0).at(POINTS, replace(LIMB, bones={}), REGIONS, FACE)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from ..anatomy.frame import Frame
-from ..anatomy.surfaces.surfaces import compute_signed_distance
 from ..anatomy.surfaces.triangles import Surface, find_half_edges
 from ..arrays import Array
 from ..errors import SurfaceError
@@ -57,10 +56,10 @@ def apply_clearance(points: Array, faces: Ints, limb: LimbProfile, outer: Surfac
 
 def _compute_moves(points: Array, faces: Ints, limb: Surface) -> Array:
     """Compute by how much each point (n,) should move out so that all measured near it is clear, mm."""
-    need = np.maximum(TARGET_MM - compute_signed_distance(limb, points), 0.0)
+    need = np.maximum(TARGET_MM - limb.signed_distance(points), 0.0)
     for corners in ((0, 1), (1, 2), (2, 0), (0, 1, 2)):
         ends = faces[:, list(corners)]
-        short = np.maximum(TARGET_MM - compute_signed_distance(limb, points[ends].mean(axis=1)), 0.0)
+        short = np.maximum(TARGET_MM - limb.signed_distance(points[ends].mean(axis=1)), 0.0)
         for end in ends.T:
             np.maximum.at(need, end, short)
     squared, nearest, _ = igl.point_mesh_squared_distance(limb.points, points, faces)
@@ -105,6 +104,6 @@ def refuse_bones(
         below = local[local[:, 2] < lowest - BONE_ROUGHNESS_MM]
         if not len(below):
             continue
-        out = float(compute_signed_distance(closed, below).max()) - spare_mm
+        out = float(closed.signed_distance(below).max()) - spare_mm
         if out > BONE_ROUGHNESS_MM:
             raise SurfaceError(f"the socket cuts {out:.1f} mm into the bone {name}", remedy=remedy)

@@ -15,8 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
-from vtkmodules.vtkCommonCore import vtkIdList, vtkPoints
-from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
 from ..anatomy.frame import Frame
 from ..anatomy.surfaces.triangles import Surface
@@ -166,21 +164,6 @@ def _build_rays(local: Surface) -> Rays:
     return Rays(line, centre_z, float(mean_radius[rounded]), -centre_z)
 
 
-def find_ray_hits(surface: Surface, starts: Array, ways: Array) -> list[Array]:
-    """Find the distances, ascending, at which rays from points (n, 3) along unit vectors meet a surface."""
-    locator = vtkStaticCellLocator()
-    locator.SetDataSet(surface.to_pyvista())
-    locator.BuildLocator()
-    far = 2.0 * float(np.linalg.norm(np.ptp(np.vstack([surface.points, starts]), axis=0)))
-    hits, cells = vtkPoints(), vtkIdList()
-    found = []
-    for start, way in zip(starts, ways):
-        locator.IntersectWithLine(start, start + far * way, 1e-6, hits, cells)
-        met = [(np.array(hits.GetPoint(i)) - start) @ way for i in range(hits.GetNumberOfPoints())]
-        found.append(np.sort(np.array(met)))
-    return found
-
-
 def compute_radii(local: Surface, rays: Rays, stations: Array, angles: Array) -> tuple[Array, Array]:
     """Compute where each ray leaves a surface (limb frame) for good, and how far in it left it before.
 
@@ -191,7 +174,7 @@ def compute_radii(local: Surface, rays: Rays, stations: Array, angles: Array) ->
     """
     ways = rays.direction(angles[None, :], stations[:, None])
     starts = np.broadcast_to(rays.middle(stations)[:, None], ways.shape)
-    hits = find_ray_hits(local, starts.reshape(-1, 3), ways.reshape(-1, 3))
+    hits = local.find_ray_hits(starts.reshape(-1, 3), ways.reshape(-1, 3))
     radius = np.array([met[-1] if len(met) else np.nan for met in hits])
     folds = np.array([met[-1] - met[0] if len(met) else 0.0 for met in hits])
     return radius.reshape(ways.shape[:2]), folds.reshape(ways.shape[:2])

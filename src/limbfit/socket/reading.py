@@ -22,7 +22,7 @@ from ..anatomy.surfaces.triangles import (
 from ..arrays import Array
 from ..errors import SurfaceError
 from .clearance import apply_clearance, refuse_bones
-from .rays import Rays, compute_profile, find_ray_hits
+from .rays import Rays, compute_profile
 from .shape import Socket
 
 Ints = NDArray[np.int64]
@@ -192,7 +192,7 @@ def _select_inner_face(wall: Surface, rays: Rays) -> tuple[Surface, float]:
     """Select the faces of a closed wall that the middle line sees; also return its median thickness, mm."""
     middles = wall.triangles.mean(axis=1)
     angle, station, radius = rays.coordinates(middles)
-    hits = find_ray_hits(wall, rays.middle(station), rays.direction(angle, station))
+    hits = wall.find_ray_hits(rays.middle(station), rays.direction(angle, station))
     first = np.array([met[0] if len(met) else np.inf for met in hits])
     facing = np.einsum("ij,ij->i", wall.face_normals, rays.direction(angle, station)) < 0.0
     is_inner = facing & (np.abs(first - radius) < 1e-2)

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..anatomy.surfaces.mending import open_loops
-from ..anatomy.surfaces.surfaces import compute_signed_distance
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 
@@ -58,7 +57,7 @@ class Socket:
 
     def offset(self, limb: Surface) -> Array:
         """(n,) how deep each point lies inside a closed limb surface, mm; negative outside."""
-        return -compute_signed_distance(limb, self.points)
+        return -limb.signed_distance(self.points)
 
 
 def close_by_fans(surface: Surface) -> Surface:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError
-from .rays import find_ray_hits
 from .shape import Socket
 
 Ints = NDArray[np.int64]
@@ -71,7 +70,7 @@ def measure_thickness(body: Surface, socket: Socket) -> Array:
     """
     outwards = -socket.surface.face_normals
     starts = socket.surface.triangles.mean(axis=1) + START_BEHIND_MM * outwards
-    return np.array([met[0] for met in find_ray_hits(body, starts, outwards)]) + START_BEHIND_MM
+    return np.array([met[0] for met in body.find_ray_hits(starts, outwards)]) + START_BEHIND_MM
 
 
 def _build_shell(socket: Socket, thickness: float) -> Surface:

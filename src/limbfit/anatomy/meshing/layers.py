@@ -242,7 +242,7 @@ def _thin_layers(fields: LimbFields) -> LimbFields:
 
 def evaluate_distance(surface: Surface, points: Array) -> Level:
     """Signed distance (n,) of points (n, 3) to a closed outward surface, negative inside, and gradient."""
-    distance, face, nearest = surface.search.signed(points)
+    distance, face, nearest = surface.find_signed(points)
     close = np.abs(distance) < NORMAL_WITHIN_MM
     gradient = (points - nearest) / np.where(close, 1.0, distance)[:, None]
     a, b, c = np.moveaxis(surface.triangles[face[close]], 1, 0)

@@ -46,7 +46,7 @@ class SmoothingMoves:
     @classmethod
     def of(cls, points: Array, normals: Array, in_layers: Mask, fields: LimbFields) -> SmoothingMoves:
         depth = np.full(len(points), np.nan)
-        depth[in_layers] = np.sqrt(fields.skin.search.nearest(points[in_layers])[0])
+        depth[in_layers] = np.sqrt(fields.skin.find_nearest(points[in_layers])[0])
         return cls(normals, depth, fields.skin)
 
     def propose_places(self, node: int, here: Array, moves: Array) -> Array:
@@ -55,7 +55,7 @@ class SmoothingMoves:
         places = here + moves - (moves @ normal)[:, None] * normal
         if np.isnan(depth):
             return np.asarray(places)
-        squared, _, nearest = self.skin.search.nearest(places)
+        squared, _, nearest = self.skin.find_nearest(places)
         share = depth / np.maximum(np.sqrt(squared), 1e-12)
         return np.asarray(nearest + share[:, None] * (places - nearest))
 

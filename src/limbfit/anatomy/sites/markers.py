@@ -62,7 +62,7 @@ def find_markers(
     tuple[Marker, ...]
         Highest first; empty where nothing stands out.
     """
-    height = skin_without.search.signed(skin_with.points)[0]
+    height = skin_without.signed_distance(skin_with.points)
     cap = find_cap_faces(skin_without)
     height[find_near_cap(skin_without, cap, skin_with.points)] = 0.0
     areas = _compute_vertex_areas(skin_with)
@@ -152,7 +152,7 @@ def _describe_spare(names: list[str], pairs: Mapping[int, int], distance: Array)
 def _find_foot(skin: Surface, points: Array, weights: Array) -> tuple[Array, Array]:
     """Where the weighted centroid of points (n, 3) stands on the skin, and the mean normal around it."""
     centre = np.average(points, axis=0, weights=weights)[None]
-    (foot,) = skin.search.nearest(centre)[2]
+    (foot,) = skin.find_nearest(centre)[2]
     distance = np.linalg.norm(skin.triangles.mean(axis=1) - foot, axis=1)
     near = distance < NORMAL_RADIUS_MM
     if not near.any():

@@ -31,7 +31,7 @@ def project_to_skin(anatomy: Anatomy, position: ArrayLike, name: str | None = No
     if query.shape != (3,) or not np.isfinite(query).all():
         raise SiteError("a position has three finite coordinates", place=name, remedy="give LPS millimetres")
     skin = anatomy.skin
-    squared, _, nearest = skin.search.nearest(query[None])
+    squared, _, nearest = skin.find_nearest(query[None])
     distance = float(np.sqrt(squared[0]))
     if distance > MAX_OFF_SKIN_MM:
         raise SiteError(
@@ -71,7 +71,7 @@ def compute_indenter_axis(
     """
     centre = np.asarray(position, dtype=float)
     points, normals = _sample_faces(skin, centre, width)
-    face = skin.search.nearest(centre[None])[1]
+    face = skin.find_nearest(centre[None])[1]
     axis = _normalise(-_compute_area_vectors(skin.points[skin.faces[face]])[0])
     for _ in range(AXIS_STEPS):
         across = compute_square_edges(axis, edge) @ (points - centre).T
@@ -142,32 +142,15 @@ def measure_tissue_under(anatomy: Anatomy, position: ArrayLike, axis: ArrayLike,
     u, v = np.meshgrid(width * _TICKS, width * _TICKS)
     # From outside: at its edges the footprint may lie off a curved skin.
     starts = centre + u.reshape(-1, 1) * along + v.reshape(-1, 1) * across - width * direction
-    skin = _find_first_hits(starts, direction, anatomy.skin.points[anatomy.skin.faces])
+    ways = np.broadcast_to(direction, starts.shape)
+
+    def find_first_hits(surface: Surface) -> Array:
+        return np.array([met.min(initial=np.inf) for met in surface.find_ray_hits(starts, ways)])
+
+    skin = find_first_hits(anatomy.skin)
     least = MAX_DEPTH_MM
     for bone in anatomy.bones.values():
-        hits = _find_first_hits(starts, direction, bone.points[bone.faces])
+        hits = find_first_hits(bone)
         through = np.isfinite(hits) & np.isfinite(skin) & (hits > skin)
-        depth = hits[through] - skin[through]
-        least = min(least, float(depth.min(initial=least)))
+        least = min(least, float((hits - skin)[through].min(initial=least)))
     return least
-
-
-def _find_first_hits(starts: Array, direction: Array, triangles: Array) -> Array:
-    """Distance (n,) along one direction from each start to the nearest triangle (m, 3, 3); inf for none.
-
-    Möller and Trumbore 1997.
-    """
-    a, e1, e2 = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    normal = np.cross(direction, e2)
-    det = np.einsum("mi,mi->m", e1, normal)
-    facing = np.abs(det) > 1e-12
-    a, e1, e2, normal, inverse = a[facing], e1[facing], e2[facing], normal[facing], 1 / det[facing]
-    found = np.full(len(starts), np.inf)
-    for i, start in enumerate(starts):
-        offset = start - a
-        q = np.cross(offset, e1)
-        u, v = np.einsum("mi,mi->m", offset, normal) * inverse, q @ direction * inverse
-        t = np.einsum("mi,mi->m", e2, q) * inverse
-        inside = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
-        found[i] = t[inside].min(initial=np.inf)
-    return found

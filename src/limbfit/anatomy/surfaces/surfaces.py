@@ -251,7 +251,7 @@ def _check_region(anatomy: Anatomy, name: str, file: Path | None) -> None:
             place=place,
             remedy="leave it out or move the cut",
         )
-    outside = float(compute_signed_distance(anatomy.skin, points).max())
+    outside = float(anatomy.skin.signed_distance(points).max())
     if outside > _OVERLAP_MM:
         raise SurfaceError(
             f"the region lies outside the limb by up to {outside:.1f} mm",
@@ -260,9 +260,7 @@ def _check_region(anatomy: Anatomy, name: str, file: Path | None) -> None:
             remedy="check that it is in the same coordinates (LPS or RAS) and unit as the skin",
         )
     for bone, body in anatomy.bones.items():
-        deep = max(
-            -compute_signed_distance(body, points).min(), -compute_signed_distance(region, body.points).min()
-        )
+        deep = max(-body.signed_distance(points).min(), -region.signed_distance(body.points).min())
         if deep > _OVERLAP_MM:
             raise SurfaceError(
                 f"the region and the bone {bone} overlap by up to {deep:.1f} mm",
@@ -279,7 +277,7 @@ def _check_inside(anatomy: Anatomy, name: str, file: Path | None) -> None:
         raise SurfaceError(
             f"{name} lies wholly beyond the proximal cut", file=file, remedy="leave it out or move the cut"
         )
-    distance = compute_signed_distance(anatomy.skin, inner)
+    distance = anatomy.skin.signed_distance(inner)
     outside = distance > _SKIN_TOLERANCE_MM
     if outside.any():
         what = (
@@ -300,11 +298,6 @@ def _is_at_one_end(skin: Surface, points: Array) -> bool:
     along, here = (skin.points - middle) @ axis, (points - middle) @ axis
     margin = _END_SHARE * np.ptp(along)
     return bool(here.min() > along.max() - margin or here.max() < along.min() + margin)
-
-
-def compute_signed_distance(surface: Surface, points: ArrayLike) -> Array:
-    """(n,) distance of points to a closed surface, mm, negative inside."""
-    return surface.search.signed(points)[0]
 
 
 def save_anatomy(folder: str | Path, anatomy: Anatomy, notes: Sequence[str] = ()) -> None:

@@ -14,7 +14,7 @@ from ...errors import LabelError, SurfaceError
 from ..grid import FAT, LabelMap
 from ..morphology import find_largest_piece, open_mask
 from .extraction import extract_surface
-from .surfaces import Anatomy, compute_signed_distance
+from .surfaces import Anatomy
 from .triangles import Surface, find_half_edges
 
 FAT_DEPTH = "fat_depth_mm"
@@ -79,10 +79,10 @@ def _build_core(labels: LabelMap) -> LabelMap:
 def _measure_along_normals(skin: Surface, inner: Surface) -> Array:
     """Distance (n,) from the skin's vertices along their inward normals to an inner surface, mm."""
     inward, origin = -skin.vertex_normals, skin.points
-    nearest = np.maximum(compute_signed_distance(inner, origin), 0.0)
+    nearest = np.maximum(inner.signed_distance(origin), 0.0)
     along = nearest.copy()
     for _ in range(MARCHES):  # steps that cannot cross the surface
-        along += compute_signed_distance(inner, origin + along[:, None] * inward)
+        along += inner.signed_distance(origin + along[:, None] * inward)
     return np.clip(along, 0.0, OBLIQUE * nearest)
 
 
@@ -113,7 +113,7 @@ def limit_slope(surface: Surface, values: Array, slope: float) -> Array:
 
 def transfer_values(surface: Surface, values: Array, points: Array) -> Array:
     """Values (k, n) at a surface's vertices, interpolated at the surface points nearest to points (m, 3)."""
-    _, face, nearest = surface.search.nearest(points)
+    _, face, nearest = surface.find_nearest(points)
     a, b, c = np.moveaxis(surface.triangles[face], 1, 0)
     normal = np.cross(b - a, c - a)
     parts = [np.cross(c - b, nearest - b), np.cross(a - c, nearest - c), np.cross(b - a, nearest - a)]

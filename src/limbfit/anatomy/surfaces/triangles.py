@@ -10,12 +10,14 @@ from typing import Any
 import igl
 import numpy as np
 import pyvista as pv
+from igl.predicates import find_self_intersections
 from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from vtkmodules.vtkCommonCore import vtkIdList, vtkPoints
+from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
-from ...arrays import Array, Indices, Mask
+from ...arrays import Array, Indices
 from ...errors import SurfaceError
 
 # Diagonals of the bounding box: a limb and a bone from a file are larger; in inches or centimetres they are
@@ -23,37 +25,85 @@ from ...errors import SurfaceError
 _SMALLEST_MM = {"skin": 60.0, "tibia": 30.0, "fibula": 30.0, "femur": 30.0}
 _SMALLEST_OTHER_MM = 15.0
 _LARGEST_MM = 3000.0
-_LARGE_RATIO = 4.0  # of the median face's size: larger ones are looked for in pieces
-_BATCH = 20_000  # faces whose neighbours are held in memory
 
 
 @dataclass(frozen=True)
 class Surface:
     """Triangles in LPS mm: ``points`` (n, 3), ``faces`` (m, 3), counter-clockwise seen from outside.
 
-    Neither may be changed in place: ``search`` would not follow.
+    Neither may be changed in place: the trees for nearest points and distances would not follow.
     """
 
     points: Array
     faces: Indices
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "points", np.asarray(self.points, dtype=np.float64))
-        object.__setattr__(self, "faces", np.asarray(self.faces, dtype=np.int64))
+        object.__setattr__(self, "points", np.ascontiguousarray(self.points, dtype=np.float64))
+        object.__setattr__(self, "faces", np.ascontiguousarray(self.faces, dtype=np.int64))
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the trees, which cannot be sent to another process."""
         return {"points": self.points, "faces": self.faces}
 
     @cached_property
-    def search(self) -> SurfaceSearch:
-        """Its trees for nearest points and signed distances."""
-        return SurfaceSearch(self.points, self.faces)
+    def _boxes(self) -> igl.AABB:
+        tree = igl.AABB()
+        tree.init(self.points, self.faces)
+        return tree
+
+    @cached_property
+    def _windings(self) -> igl.FastWindingNumberBVH:
+        tree = igl.FastWindingNumberBVH()
+        tree.init(self.points, self.faces)
+        return tree
+
+    def find_nearest(self, points: ArrayLike) -> tuple[Array, Indices, Array]:
+        """Squared distance (k,) of points (k, 3), mm^2, the nearest face (k,), and where on it (k, 3)."""
+        query = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+        if not len(query):
+            return np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+        squared, face, foot = self._boxes.squared_distance(self.points, self.faces, query)
+        return squared, face, foot
+
+    def find_signed(self, points: ArrayLike) -> tuple[Array, Indices, Array]:
+        """As `find_nearest`, with the distance (k,) to a closed outward surface, mm, negative inside.
+
+        Inside is where the fast winding number says so (Barill et al. 2018, ACM Trans Graph 37, 43), which
+        small holes and crossing faces do not mislead.
+        """
+        squared, face, foot = self.find_nearest(points)
+        if not len(face):
+            return squared, face, foot
+        query = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+        inside = self._windings.winding_number(query) > 0.5
+        return np.where(inside, -1.0, 1.0) * np.sqrt(squared), face, foot
+
+    def signed_distance(self, points: ArrayLike) -> Array:
+        """Distance (k,) of points (k, 3) to a closed outward surface, mm, negative inside."""
+        return self.find_signed(points)[0]
+
+    def find_ray_hits(self, starts: Array, ways: Array) -> list[Array]:
+        """Distances, ascending, at which rays from points (n, 3) along unit vectors (n, 3) meet it, mm."""
+        locator = vtkStaticCellLocator()
+        locator.SetDataSet(self.to_pyvista())
+        locator.BuildLocator()
+        far = 2.0 * float(np.linalg.norm(np.ptp(np.vstack([self.points, starts]), axis=0)))
+        hits, cells = vtkPoints(), vtkIdList()
+        found = []
+        for start, way in zip(starts, ways):
+            locator.IntersectWithLine(start, start + far * way, 1e-6, hits, cells)
+            met = [(np.array(hits.GetPoint(i)) - start) @ way for i in range(hits.GetNumberOfPoints())]
+            found.append(np.sort(np.array(met)))
+        return found
 
     @cached_property
     def self_intersections(self) -> Indices:
         """(p, 2) pairs of faces without a common point of which an edge of one pierces the other."""
-        return _find_crossings(self)
+        _, pairs, coplanar = find_self_intersections(self.points, self.faces)
+        pairs = np.sort(pairs[~coplanar.astype(bool).ravel()], axis=1)
+        first, second = self.faces[pairs[:, 0]], self.faces[pairs[:, 1]]
+        apart = ~(first[:, :, None] == second[:, None, :]).any(axis=(1, 2))
+        return np.unique(pairs[apart], axis=0)
 
     @property
     def triangles(self) -> Array:
@@ -249,133 +299,3 @@ def check_sides(surface: Surface, name: str, file: str | Path | None = None) -> 
             file=file,
             remedy="orient the normals consistently outward",
         )
-
-
-def _find_crossings(surface: Surface) -> Indices:
-    pairs = _find_near_pairs(surface)
-    triangles = surface.triangles
-    crossing = np.zeros(len(pairs), dtype=bool)
-    for first, second in ((0, 1), (1, 0)):
-        a, b = triangles[pairs[:, first]], triangles[pairs[:, second]]
-        for corner in range(3):
-            crossing |= _find_piercing(a[:, corner], a[:, (corner + 1) % 3], b)
-    return pairs[crossing]
-
-
-def _find_near_pairs(surface: Surface) -> Indices:
-    """Pairs (p, 2) of faces that share no point and may cross: bounding boxes of pieces of them overlap.
-
-    Pieces whose spheres meet are looked up in trees, one for each octave of sizes, some pieces at a time.
-    """
-    owner, pieces = _split_large(surface.triangles)
-    low, high, centre = pieces.min(axis=1), pieces.max(axis=1), pieces.mean(axis=1)
-    radius = _compute_radii(pieces)
-    octave = np.floor(np.log2(np.maximum(radius, 1e-6 * radius.max()))).astype(int)
-    groups = [np.flatnonzero(octave == n) for n in np.unique(octave)]
-    trees = [cKDTree(centre[group]) for group in groups]
-    found = []
-    for n, group in enumerate(groups):
-        for part in np.array_split(group, -(-len(group) // _BATCH)):
-            tree = cKDTree(centre[part])
-            for other, larger in zip(groups[n:], trees[n:]):
-                reach = float(radius[part].max() + radius[other].max())
-                near = tree.sparse_distance_matrix(larger, reach, output_type="ndarray")
-                i, j = part[near["i"]], other[near["j"]]
-                apart = np.any((low[i] > high[j]) | (low[j] > high[i]), axis=1)
-                found.append(_select_distinct_pairs(owner[i[~apart]], owner[j[~apart]], surface.faces))
-    return np.unique(np.concatenate(found), axis=0)
-
-
-def _select_distinct_pairs(i: Indices, j: Indices, faces: Indices) -> Indices:
-    """Pairs (p, 2) of faces, the lower number first, each once, without those that share a point."""
-    keys = np.unique(np.minimum(i, j) * len(faces) + np.maximum(i, j))
-    pairs = np.column_stack(np.divmod(keys, len(faces)))
-    first, second = faces[pairs[:, 0]], faces[pairs[:, 1]]
-    return pairs[~(first[:, :, None] == second[:, None, :]).any(axis=(1, 2))]
-
-
-def _split_large(triangles: Array) -> tuple[Indices, Array]:
-    """Triangles (m, 3, 3) with the large ones halved until they are of a usual size, and whose each is.
-
-    The flat caps of scans consist of long slivers, to each of which thousands of small faces are near.
-    """
-    owner = np.arange(len(triangles))
-    usual = _LARGE_RATIO * float(np.median(_compute_radii(triangles)))
-    owners, pieces = [], []
-    while len(owner):
-        large = _compute_radii(triangles) > usual
-        owners.append(owner[~large])
-        pieces.append(triangles[~large])
-        owner, triangles = np.repeat(owner[large], 2), _halve(triangles[large])
-    return np.concatenate(owners), np.concatenate(pieces)
-
-
-def _halve(triangles: Array) -> Array:
-    """(2 m, 3, 3) halves of triangles (m, 3, 3), cut at the middle of the longest edge."""
-    longest = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2).argmax(axis=1)
-    order = (longest[:, None] + np.arange(3)) % 3
-    a, b, c = np.moveaxis(np.take_along_axis(triangles, order[:, :, None], axis=1), 1, 0)
-    middle = (a + b) / 2
-    halves = np.stack([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)], axis=1)
-    return halves.reshape(-1, 3, 3)
-
-
-def _compute_radii(triangles: Array) -> Array:
-    """(m,) largest distance of a corner from the centroid."""
-    return np.linalg.norm(triangles - triangles.mean(axis=1, keepdims=True), axis=2).max(axis=1)
-
-
-def _find_piercing(start: Array, end: Array, triangle: Array) -> Mask:
-    """True for each segment that passes through the inside of its triangle (signed volumes)."""
-    a, b, c = np.moveaxis(triangle, 1, 0)
-
-    def side(p: Array, q: Array, r: Array, s: Array) -> Array:
-        return np.einsum("ij,ij->i", np.cross(q - p, r - p), s - p)
-
-    above, below = side(a, b, c, start), side(a, b, c, end)
-    u, v, w = side(start, end, a, b), side(start, end, b, c), side(start, end, c, a)
-    same = ((u > 0) & (v > 0) & (w > 0)) | ((u < 0) & (v < 0) & (w < 0))
-    return same & (above * below < 0)
-
-
-class SurfaceSearch:
-    """The trees of a surface: ``points`` (n, 3) mm and ``faces`` (m, 3), which must not change any more."""
-
-    def __init__(self, points: Array, faces: Indices) -> None:
-        self._surface = np.ascontiguousarray(points), np.ascontiguousarray(faces)
-
-    def nearest(self, points: ArrayLike) -> tuple[Array, Indices, Array]:
-        """Squared distance (k,) of points (k, 3), mm^2, the nearest face (k,), and where on it (k, 3)."""
-        query = _to_query(points)
-        if not len(query):
-            return np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-        squared, face, foot = self._boxes.squared_distance(*self._surface, query)
-        return squared, face, foot
-
-    def signed(self, points: ArrayLike) -> tuple[Array, Indices, Array]:
-        """As `nearest`, with the distance (k,) to a closed outward surface, mm, negative inside.
-
-        Inside is where the fast winding number says so (Barill et al. 2018, ACM Trans Graph 37, 43), which
-        small holes and crossing faces do not mislead.
-        """
-        squared, face, foot = self.nearest(points)
-        if not len(face):
-            return squared, face, foot
-        inside = self._windings.winding_number(_to_query(points)) > 0.5
-        return np.where(inside, -1.0, 1.0) * np.sqrt(squared), face, foot
-
-    @cached_property
-    def _boxes(self) -> igl.AABB:
-        tree = igl.AABB()
-        tree.init(*self._surface)
-        return tree
-
-    @cached_property
-    def _windings(self) -> igl.FastWindingNumberBVH:
-        tree = igl.FastWindingNumberBVH()
-        tree.init(*self._surface)
-        return tree
-
-
-def _to_query(points: ArrayLike) -> Array:
-    return np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
