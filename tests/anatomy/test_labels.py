@@ -133,7 +133,7 @@ def test_plain_image_without_names_takes_the_default_ones(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "expected"),
     [
-        ("labels.seg.nrrd", "no nrrd", "not a readable"),
+        ("labels.seg.nrrd", "no nrrd", "cannot be read"),
         ("labels.nii.gz", "no nifti", "cut short"),
         ("none.nrrd", None, "no such image"),
     ],

@@ -124,9 +124,8 @@ def _read_label_file(path: Path, like: Volume | None) -> LabelMap:
     dicom = find_dicom_labels(path)
     if dicom is not None:
         return read_dicom_labels(dicom, like)
-    if is_seg_nrrd(path) and path.is_file():
-        return read_seg_nrrd(path)
-    return read_label_image(path, read_image(path))
+    read = read_seg_nrrd if is_seg_nrrd(path) else read_label_image
+    return read(path, read_image(path))
 
 
 def write_labels(path: str | Path, labels: LabelMap) -> None:

@@ -160,7 +160,7 @@ def test_a_bomb_in_a_label_map_is_refused_unread(tmp_path, size):
     file = tmp_path / "labels.seg.nrrd"
     file.write_bytes(HUGE % size + gzip.compress(bytes(200_000_000), 1))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(LabelError, match=r"unpack to more|more than 1e"):
+    with pytest.raises(LabelError, match=r"names no segment|more than 1e"):
         read_labels(file)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
 

@@ -7,23 +7,18 @@ Header fields: https://slicer.readthedocs.io/en/latest/developer_guide/modules/s
 
 from __future__ import annotations
 
-import bz2
 import json
 import re
-import zlib
 from collections.abc import Mapping, Sequence
-from math import prod
 from pathlib import Path
-from typing import Any
 
-import nrrd
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
 
-from ...arrays import Array, Mask
+from ...arrays import Mask
 from ...errors import LabelError, add_location
-from ..grid import DEFAULT_NAMES, LabelMap, check_voxel_count
+from ..grid import DEFAULT_NAMES, LabelMap, read_geometry
 
 COLOURS: Mapping[str, tuple[float, float, float]] = {
     "soft tissue": (0.85, 0.55, 0.45),
@@ -34,14 +29,6 @@ COLOURS: Mapping[str, tuple[float, float, float]] = {
     "fat": (0.98, 0.90, 0.55),
 }
 _OTHER_COLOURS = ((0.9, 0.6, 0.2), (0.4, 0.6, 0.9), (0.5, 0.8, 0.7), (0.8, 0.5, 0.6))
-_LARGEST_TYPE = 8  # bytes of a voxel
-_BLOCK = 1 << 20
-_SPACES = {
-    "left-posterior-superior": np.ones(3),
-    "lps": np.ones(3),
-    "right-anterior-superior": np.array([-1.0, -1.0, 1.0]),
-    "ras": np.array([-1.0, -1.0, 1.0]),
-}
 
 
 def colour_of(name: str, number: int) -> tuple[float, float, float]:
@@ -53,63 +40,21 @@ def is_seg_nrrd(path: Path) -> bool:
     return path.name.lower().endswith((".seg.nrrd", ".seg.nhdr"))
 
 
-def read_seg_nrrd(path: Path) -> LabelMap:
-    """A ``.seg.nrrd`` on its own, maybe cropped, grid."""
-    try:
-        _check_packed(path, nrrd.read_header(str(path)))
-        voxels, header = nrrd.read(str(path))
-    except (nrrd.NRRDError, OSError, ValueError, EOFError, KeyError, zlib.error):
-        raise LabelError(
-            "not a readable .seg.nrrd", file=path, remedy="save it again from 3D Slicer"
-        ) from None
-    layers = voxels if voxels.ndim == 4 else voxels[None]
-    spacing, origin, direction = _read_nrrd_geometry(header, path)
-    segments = _read_segments(header, layers, path)
-    masks = [layers[layer] == value for _, layer, value in segments]
+def read_seg_nrrd(path: Path, image: sitk.Image) -> LabelMap:
+    """The segments of a ``.seg.nrrd`` that was read as an image, on its own, maybe cropped, grid."""
+    voxels = sitk.GetArrayFromImage(image)
+    layers = np.moveaxis(voxels, -1, 0) if image.GetNumberOfComponentsPerPixel() > 1 else voxels[None]
+    segments = _read_segments(image, len(layers), path)
     with add_location(file=path):
-        flat, names = flatten(masks, [name for name, _, _ in segments])
-    return LabelMap(np.transpose(flat, (2, 1, 0)), spacing, origin, direction, names)
-
-
-def _check_packed(path: Path, header: Mapping[str, Any]) -> None:
-    """Refuse a NRRD of too many voxels, or whose data unpack to more than these can take."""
-    check_voxel_count(header["sizes"], path)
-    encoding = str(header.get("encoding", "raw")).lower()
-    if encoding in ("gzip", "gz", "bzip2", "bz2"):
-        data_file = header.get("data file", header.get("datafile"))
-        unpacker = zlib.decompressobj(47) if encoding.startswith("g") else bz2.BZ2Decompressor()
-        place = path if data_file is None else path.parent / str(data_file)
-        limit = _LARGEST_TYPE * prod(int(n) for n in header["sizes"])
-        if _is_larger_unpacked(place, data_file is None, unpacker, limit):
-            raise LabelError(
-                "its data unpack to more than its header states", file=path, remedy="save it again"
-            )
-
-
-def _is_larger_unpacked(path: Path, after_header: bool, unpacker: Any, limit: int) -> bool:
-    """True if compressed data come to more than ``limit`` bytes; they are not kept."""
-    total, waiting = 0, b""
-    with path.open("rb") as stream:
-        while after_header and stream.readline().strip():  # a header ends with an empty line
-            pass
-        while total <= limit and not unpacker.eof:
-            if not waiting and getattr(unpacker, "needs_input", True):
-                waiting = stream.read(_BLOCK)
-                if not waiting:
-                    break
-            total += len(unpacker.decompress(waiting, _BLOCK))
-            waiting = getattr(unpacker, "unconsumed_tail", b"")
-    return total > limit
+        array, names = flatten(
+            [layers[layer] == value for _, layer, value in segments], [name for name, _, _ in segments]
+        )
+        return LabelMap(array, *read_geometry(image), names)
 
 
 def write_seg_nrrd(path: Path, labels: LabelMap) -> None:
     """A ``.seg.nrrd`` in LPS with a segment per name; 3D Slicer shows names and colours."""
-    header: dict[str, Any] = {
-        "space": "left-posterior-superior",
-        "kinds": ["domain", "domain", "domain"],
-        "space directions": (labels.direction * labels.spacing).T,
-        "space origin": labels.origin,
-        "encoding": "gzip",
+    header = {
         "Segmentation_ContainedRepresentationNames": "Binary labelmap|",
         "Segmentation_MasterRepresentation": "Binary labelmap",
         "Segmentation_ReferenceImageExtentOffset": "0 0 0",
@@ -127,7 +72,10 @@ def write_seg_nrrd(path: Path, labels: LabelMap) -> None:
             f"Segment{n}_Layer": "0",
             f"Segment{n}_Extent": extent,
         }
-    nrrd.write(str(path), np.transpose(labels.array, (2, 1, 0)), header, index_order="F", compression_level=4)
+    image = labels.to_sitk()
+    for key, text in header.items():
+        image.SetMetaData(key, text)
+    sitk.WriteImage(image, str(path), useCompression=True, compressionLevel=4)
 
 
 def read_label_image(path: Path, image: sitk.Image) -> LabelMap:
@@ -163,29 +111,17 @@ def _read_sidecar_names(path: Path) -> dict[int, str]:
         ) from None
 
 
-def _read_nrrd_geometry(header: Mapping[str, Any], path: Path) -> tuple[Array, Array, Array]:
-    sign = _SPACES.get(str(header.get("space", "")).lower())
-    if sign is None or "space directions" not in header or "space origin" not in header:
-        raise LabelError(
-            "the file does not say where it lies in the patient (NRRD space, directions, origin)",
-            file=path,
-            remedy="save it again from 3D Slicer",
-        )
-    steps = np.asarray(header["space directions"], dtype=float)[-3:].T * sign[:, None]
-    spacing = np.linalg.norm(steps, axis=0)
-    return spacing, np.asarray(header["space origin"], dtype=float) * sign, steps / spacing
-
-
-def _read_segments(header: Mapping[str, Any], layers: NDArray[Any], path: Path) -> list[tuple[str, int, int]]:
-    """Name, layer and value of each segment of the header."""
+def _read_segments(image: sitk.Image, layers: int, path: Path) -> list[tuple[str, int, int]]:
+    """Name, layer and value of each segment that the header of an image names."""
+    header = {key: image.GetMetaData(key) for key in image.GetMetaDataKeys() if key.startswith("Segment")}
     found = []
     for n in range(256):
         if f"Segment{n}_ID" not in header and f"Segment{n}_Name" not in header:
             break
-        name = str(header.get(f"Segment{n}_Name", f"segment {n + 1}")).strip()
+        name = header.get(f"Segment{n}_Name", f"segment {n + 1}").strip()
         layer = int(header.get(f"Segment{n}_Layer", 0))
         value = int(header.get(f"Segment{n}_LabelValue", 1))
-        if not 0 <= layer < len(layers):
+        if not 0 <= layer < layers:
             raise LabelError(f"segment {name!r} is in a layer that the file does not have", file=path)
         found.append((normalise_name(name), layer, value))
     return found
