@@ -22,7 +22,6 @@ import sys
 import tempfile
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -56,7 +55,6 @@ from limbfit.acquire.line_protocol import (
     parse_command,
 )
 from limbfit.acquire.session import prioritise
-from limbfit.study.tables import AcquireTable
 
 SITE = "bench"
 WATCHDOG_S = 60.0  # a machine that stalls is to be measured, not to end the measurement
@@ -75,8 +73,8 @@ def hold(study: Path, minutes: float, site: str) -> dict[str, Any]:
 
 
 def _held(address: str, minutes: float, site: str) -> dict[str, Any]:
-    table = AcquireTable(repeats=50, search_depth_mm=4.0)
-    settings = replace(Settings(**table.model_dump()), watchdog_ms=1000 * WATCHDOG_S)
+    settings = Settings(repeats=50, search_depth_mm=4.0)
+    settings = settings.model_copy(update={"watchdog_ms": 1000 * WATCHDOG_S})
     events: SimpleQueue[Event] = SimpleQueue()
     file = Path(tempfile.mkdtemp()) / "record.csv"
     device = LineDevice(connect(address))
@@ -125,7 +123,7 @@ def react(trials: int) -> dict[str, Any]:
     process = multiprocessing.get_context("spawn").Process(target=peer, args=(there, trials))
     process.start()
     address = here.recv()
-    settings = Settings(**AcquireTable().model_dump())
+    settings = Settings()
     for _ in range(trials):
         session = Session(settings, LineDevice(connect(address)), site=SITE)
         run_session(session, SimpleQueue())
@@ -172,7 +170,7 @@ def _trial(connection: socket.socket, random: np.random.Generator) -> float:
                 command = parse_command(line.body)
                 if isinstance(command, Hello):
                     who = Identity(
-                        "0" * 16, PINS, 500, 60_000, 50_000, 12_500, "real", "Peer", "1", "2000-01-01"
+                        1, "0" * 16, PINS, 500, 60_000, 50_000, 12_500, "real", "Peer", "1", "2000-01-01"
                     )
                     connection.sendall(Encoder(first=0).encode(who.body)[1])
                     salt = derive_salt(command.nonce, who.nonce)

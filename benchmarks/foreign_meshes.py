@@ -145,7 +145,7 @@ def faults(mesh: Mesh, report: Any) -> list[str]:
     if abs(report.volume_error) > VOLUME:
         found.append(f"volume off by {100 * report.volume_error:.2f} %")
     wanted = SKIN_MM if "fat" in mesh.region_names else 3.0
-    skin = report.layer_thickness_mm["skin"]["mean"]
+    skin = report.layer_thickness_mm["skin"].mean
     if abs(skin - wanted) > THICKNESS_MM:
         found.append(f"skin of {skin:.2f} mm")
     return found
@@ -167,7 +167,7 @@ def site_row(limb: Limb, base: BaseMesh, settings: MeshSettings, site: tuple[Arr
         "angle": report.min_dihedral_deg,
         "volume_error": report.volume_error,
         "layer_mm": report.layer_mean_mm,
-        "repairs": [repair.text for repair in report.repairs],
+        "repairs": list(report.repairs),
         "seconds": measure_cpu_seconds() - start,
         "mesh": mesh,
     }

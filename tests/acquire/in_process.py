@@ -8,13 +8,12 @@ from __future__ import annotations
 import numpy as np
 
 from acquiring import indentation
-from limbfit.acquire.device import HostConnection
+from limbfit.acquire.device import LineDevice
 from limbfit.acquire.events import PINS, Confirm, KeyDown, KeyUp, Settings
 from limbfit.acquire.protocol import Phase
 from limbfit.acquire.session import Session
 from limbfit.acquire.virtual import Fault, VirtualFitSocket, VirtualLimb, fit_surrogate
 from limbfit.acquire.virtual.pins import BRAKING
-from limbfit.study.tables import AcquireTable
 
 FAST = {
     "clamp_speed_mm_s": 8.0,
@@ -33,7 +32,7 @@ OVER_MS = 20
 
 
 def settings(**changes: float) -> Settings:
-    return Settings(**AcquireTable(**(FAST | changes)).model_dump())
+    return Settings(**(FAST | changes))
 
 
 SURROGATE = fit_surrogate(*indentation())
@@ -45,38 +44,30 @@ def device(seed: int = 0, faults: tuple[Fault, ...] = (), gap_mm=(3.5, 5.0)) -> 
 
 
 class Direct:
-    """The device as a session sees it, with bytes handed over instead of sent."""
+    """A wire on which bytes are handed over instead of sent."""
 
-    def __init__(self, device: VirtualFitSocket) -> None:
-        self.far, self.end = device, HostConnection()
+    def __init__(self, far: VirtualFitSocket) -> None:
+        self.far = far
         self.inbox = b""
         self.sent: list[bytes] = []
-        self.identity = self.end.greet(device.feed(self.end.hello()))
-        assert self.identity is not None
 
-    @property
-    def refused(self):
-        return self.end.refused
+    def wait(self, timeout_s: float) -> None:
+        """Answers are there at once."""
 
-    def send(self, command, now: float) -> None:
-        self._give(self.end.send(command, now))
-
-    def resend(self, now: float) -> str:
-        lines, reason = self.end.resend(now)
-        if lines:
-            self._give(lines)
-        return reason
-
-    def receive(self, timeout_s: float = 0.0):
+    def read(self) -> bytes:
         data, self.inbox = self.inbox, b""
-        return self.end.feed(data)
+        return data
+
+    def write(self, data: bytes) -> None:
+        self.sent.append(data)
+        self.inbox += self.far.feed(data)
 
     def close(self) -> None:
         """Nothing to close."""
 
-    def _give(self, lines: bytes) -> None:
-        self.sent.append(lines)
-        self.inbox += self.far.feed(lines)
+
+def connect(far: VirtualFitSocket) -> LineDevice:
+    return LineDevice(Direct(far))
 
 
 class Bench:
@@ -87,7 +78,8 @@ class Bench:
     ) -> None:
         self.settings = settings(**changes)
         self.device = device(seed, faults)
-        self.wire = Direct(self.device)
+        self.wire = connect(self.device)
+        self.link = self.wire._link
         self.told: list = []
         self.session = Session(self.settings, self.wire, site="1", listener=self.told.append)
         self.depth_mm, self.ms = depth_mm, 0
@@ -111,7 +103,7 @@ class Bench:
         """A millisecond passes; an end that hangs does nothing in it."""
         self.ms += 1
         if device:
-            self.wire.inbox += self.device.step()
+            self.link.inbox += self.device.step()
             self._check()
         if host:
             reports = self.wire.receive()

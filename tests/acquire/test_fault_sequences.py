@@ -102,7 +102,7 @@ class Sequences(RuleBasedStateMachine):
     def somebody_else_talks(self, which: int, noise: bytes) -> None:
         """Old lines again, and noise: refused, and nothing moves for it."""
         bench, motors = self.bench, self.bench.device.motors
-        old = bench.wire.sent[which % len(bench.wire.sent)]
+        old = bench.link.sent[which % len(bench.link.sent)]
         before = motors.driving.tolist(), motors._target.tolist(), bench.device.stopped
         bench.device.feed(b"\n" + old + noise.replace(b"\n", b" ") + b"\n")
         assert (motors.driving.tolist(), motors._target.tolist(), bench.device.stopped) == before

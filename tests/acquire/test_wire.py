@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from in_process import Bench, Direct, device
+from in_process import Bench, connect, device
 
 from limbfit.acquire.events import PINS, Fence, Hold, Move, Sample, Stop
 from limbfit.acquire.line_protocol import (
@@ -22,11 +22,11 @@ from limbfit.acquire.line_protocol import (
     Hello,
     Identity,
     LimitTripped,
-    NoteCommand,
+    NotePhase,
+    NoteSite,
     OutOfReach,
     SetLimits,
     derive_salt,
-    format_command,
     format_sample,
     parse_command,
     parse_report,
@@ -34,10 +34,10 @@ from limbfit.acquire.line_protocol import (
 from limbfit.acquire.protocol import Phase
 
 COMMANDS = [
-    Hello("0123456789abcdef"),
+    Hello(1, "0123456789abcdef"),
     SetLimits(3, 25_000, 25_000, 60_000, 8000, 20),
-    NoteCommand("SITE", "patella-1"),
-    NoteCommand("PHASE", "clamp"),
+    NoteSite("patella-1"),
+    NotePhase("clamp"),
     Heartbeat(123_456_789),
     Bye(),
     Move(14, 12_345, 960, 18_000),
@@ -45,14 +45,14 @@ COMMANDS = [
     Stop(""),
     Fence(2, 30_000),
 ]
-WHO = Identity("f" * 16, 14, 500, 60_000, 50_000, 12_500, "real", "FitSocket-2", "SN.12", "2024-05-01")
+WHO = Identity(1, "f" * 16, 14, 500, 60_000, 50_000, 12_500, "real", "FitSocket-2", "SN.12", "2024-05-01")
 SAMPLE = Sample(7, 123_456, 8, 5, tuple(range(PINS)), tuple(range(-7, 7)), tuple(range(100, 114)))
 REPORTS = [WHO, Accepted(5), Declined(6, "speed"), LimitTripped("watchdog", 0), OutOfReach(0b101), SAMPLE]
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda c: type(c).__name__)
 def test_commands_survive_the_wire(command) -> None:
-    number, line = Encoder(salt=9, first=41).encode(format_command(command))
+    number, line = Encoder(salt=9, first=41).encode(command.body)
     assert len(line) <= HOST_LINE
     (found,) = Decoder(HOST_LINE, salt=9, last=40).feed(line)
     assert found.number == number == 41
@@ -150,9 +150,9 @@ def test_every_refusal_is_counted() -> None:
 
 def hostile(bench: Bench) -> dict[str, bytes]:
     """Lines that would move pin 1 in, were they believed."""
-    move = format_command(Move(1, 50_000, 8000))
-    end = bench.wire.end._encoder
-    again = next(line for line in reversed(bench.wire.sent) if b"MOVE" in line)
+    move = Move(1, 50_000, 8000).body
+    end = bench.wire._encoder
+    again = next(line for line in reversed(bench.link.sent) if b"MOVE" in line)
     return {
         "malformed": move.encode() + b"\n",
         "checksum": f"{end.next + 5} {move}*00000000\n".encode(),
@@ -177,7 +177,7 @@ def test_the_device_acts_on_none_of_them(kind: str) -> None:
 
 
 def test_moves_beyond_the_limits_are_declined() -> None:
-    wire = Direct(device())
+    wire = connect(device())
     wire.send(SetLimits(1, 25_000, 25_000, 30_000, 8000, 500), 0.0)
     for move, code in ((Move(1, 40_000, 1000), "position"), (Move(1, 20_000, 9000), "speed")):
         wire.send(move, 0.0)
@@ -185,14 +185,14 @@ def test_moves_beyond_the_limits_are_declined() -> None:
     wire.send(Stop(""), 0.0)
     wire.send(Move(1, 20_000, 1000), 0.0)
     assert [r.code for r in wire.receive() if isinstance(r, Declined)] == ["stopped"]
-    assert not wire.far.motors.driving.any()
+    assert not wire._link.far.motors.driving.any()
 
 
 def test_nothing_moves_without_a_session() -> None:
     far = device()
-    assert far.feed(Encoder().encode(format_command(Move(1, 20_000, 1000)))[1]) == b""
+    assert far.feed(Encoder().encode(Move(1, 20_000, 1000).body)[1]) == b""
     assert not far.motors.driving.any()
-    wire = Direct(far)
+    wire = connect(far)
     wire.send(Move(1, 20_000, 1000), 0.0)
     assert [r.code for r in wire.receive() if isinstance(r, Declined)] == ["not-armed"]
 

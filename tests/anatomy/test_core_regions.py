@@ -82,8 +82,8 @@ def test_the_mesh_conforms_to_a_region(meshed: tuple) -> None:
 def test_its_volume_is_that_of_its_surface(meshed: tuple) -> None:
     anatomy, _, report = meshed
     assert report.region_volumes_mm3["scar"] == pytest.approx(anatomy.regions["scar"].volume, rel=0.03)
-    assert report.regions["scar"]["enclosed_mm3"] == pytest.approx(anatomy.regions["scar"].volume, rel=0.01)
-    assert report.regions["scar"]["mean_mm"] < 0.5
+    assert report.regions["scar"].enclosed_mm3 == pytest.approx(anatomy.regions["scar"].volume, rel=0.01)
+    assert report.regions["scar"].mean_mm < 0.5
     assert report.volume_mm3 == pytest.approx(sum(report.region_volumes_mm3.values()))
 
 
@@ -95,7 +95,7 @@ def test_it_joins_bone_and_layer_at_right_angles() -> None:
     assert np.isin(own, mesh.cells[mesh.regions == 0]).sum() > 10
     assert report.min_dihedral_deg > 8.0
     assert report.region_volumes_mm3["tendon"] == pytest.approx(
-        report.regions["tendon"]["enclosed_mm3"], rel=0.05
+        report.regions["tendon"].enclosed_mm3, rel=0.05
     )
 
 
@@ -128,9 +128,7 @@ def test_two_that_overlap_share_one_face() -> None:
 def test_the_mesh_of_a_whole_limb_has_it_too() -> None:
     mesh, report = mesh_limb(with_regions(scar=INSIDE), replace(COARSE, edge_near_mm=8.0), 30.0)
     assert mesh.region_names == ("skin", "scar", "muscle")
-    assert report.region_volumes_mm3["scar"] == pytest.approx(
-        report.regions["scar"]["enclosed_mm3"], rel=0.05
-    )
+    assert report.region_volumes_mm3["scar"] == pytest.approx(report.regions["scar"].enclosed_mm3, rel=0.05)
 
 
 @pytest.mark.parametrize(

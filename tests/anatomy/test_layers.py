@@ -62,8 +62,8 @@ def test_three_layers_are_as_thick_as_asked() -> None:
     assert mesh.region_names == ("skin", "fat", "muscle")
     assert np.unique(mesh.regions).tolist() == [0, 1, 2]
     conforms(mesh)
-    assert report.layer_thickness_mm["skin"]["mean"] == pytest.approx(1.5, abs=0.05)
-    assert report.layer_thickness_mm["fat"]["mean"] == pytest.approx(6.0, abs=0.1)
+    assert report.layer_thickness_mm["skin"].mean == pytest.approx(1.5, abs=0.05)
+    assert report.layer_thickness_mm["fat"].mean == pytest.approx(6.0, abs=0.1)
     assert report.min_dihedral_deg >= 7.0
     assert report.min_scaled_jacobian > 0.1
     assert report.region_cells["fat"] > report.region_cells["skin"]
@@ -81,9 +81,9 @@ def test_layers_are_thinned_over_bone_instead_of_trimming_it() -> None:
     assert trimmed.volume_mm3 > 0
     assert base.trimmed["tibia"].volume_mm3 < 0.2 * trimmed.volume_mm3
     thickness = report.layer_thickness_mm["skin"]
-    assert 1.0 - 0.1 <= thickness["min"] < 2.8
-    assert thickness["max"] == pytest.approx(3.0, abs=0.1)
-    assert report.thinned_skin.thinnest_mm == pytest.approx(thickness["min"], abs=0.3)
+    assert 1.0 - 0.1 <= thickness.min < 2.8
+    assert thickness.max == pytest.approx(3.0, abs=0.1)
+    assert report.thinned_skin.thinnest_mm == pytest.approx(thickness.min, abs=0.3)
     assert report.thinned_skin.volume_mm3 > 0
     assert report.min_dihedral_deg >= 7.0
     assert abs(report.volume_error) < 0.005
@@ -135,12 +135,12 @@ def test_a_map_makes_a_layer_of_that_thickness(fatty: tuple, tmp_path: Path) -> 
     mesh, report = mesh_site(anatomy, position, axis, settings, base)
     conforms(mesh)
     assert report.min_dihedral_deg >= 7.0
-    assert report.interface_error_mm["mean"] < 0.1
+    assert report.interface_error_mm.mean < 0.1
     assert abs(report.volume_error) < 0.005
     fat = report.layer_thickness_mm["fat"]
-    assert fat["min"] == pytest.approx(2.5, abs=0.5)
+    assert fat.min == pytest.approx(2.5, abs=0.5)
     # Of the map itself, whose own error (see the test above) depends on how the skin was remeshed.
-    assert fat["max"] == pytest.approx(again.max() - 1.5, abs=0.6)
+    assert fat.max == pytest.approx(again.max() - 1.5, abs=0.6)
 
 
 def test_a_map_needs_fat(fatty: tuple) -> None:

@@ -52,8 +52,8 @@ def test_a_whole_limb_is_fine_all_around(oblique: Anatomy, lined: Anatomy) -> No
     mesh, report = mesh_limb(lined, SETTINGS, fine_to_mm=30.0)
     assert measure_quality(mesh).inverted == 0
     assert mesh.region_names == ("liner", "skin", "muscle")
-    assert report.layer_thickness_mm["liner"]["mean"] == pytest.approx(THICKNESS, rel=0.02)
-    assert report.layer_thickness_mm["skin"]["mean"] == pytest.approx(3.0, rel=0.03)
+    assert report.layer_thickness_mm["liner"].mean == pytest.approx(THICKNESS, rel=0.02)
+    assert report.layer_thickness_mm["skin"].mean == pytest.approx(3.0, rel=0.03)
     assert report.volume_error < 0.02
     faces = mesh.face_sets["skin"][:, :3]
     corners = mesh.points[faces]

@@ -71,7 +71,7 @@ def test_volume_layer_and_quality(meshed: tuple) -> None:
     assert report.min_dihedral_deg >= 8.0
     assert report.min_scaled_jacobian > 0.1
     assert measure_quality(mesh).inverted == 0
-    assert report.interface_error_mm["mean"] < 0.1
+    assert report.interface_error_mm.mean < 0.1
     assert report.warnings == ()
     assert sum(report.region_cells.values()) == report.cells == len(mesh.cells)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +20,8 @@ from keyed_studies import (
     loaded,
     prepare,
 )
-from test_study_docs import KEYS
 
 import limbfit
-from limbfit.acquire import Settings
 from limbfit.pipeline.commands.experiments import EXPERIMENTS, compute_experiment_key
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.keys import Keys
@@ -57,12 +54,6 @@ def test_a_key_of_no_stage_is_read(key: str) -> None:
     read = {node.attr for node in nodes if isinstance(node, ast.Attribute)}
     read |= {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
     assert key.rpartition(".")[2] in read
-
-
-def test_a_session_takes_every_key_of_acquire(folder: Path) -> None:
-    assert asdict(Settings(**loaded(folder, GIVEN).acquire.model_dump())) == {
-        key.removeprefix("acquire."): value for key, value in KEYS.items() if key.startswith("acquire.")
-    }
 
 
 def test_the_design_of_a_socket_is_no_reason_to_put_it_on_again(folder: Path) -> None:

@@ -5,10 +5,11 @@ withdrawn, positive towards the limb; its *force* is positive when the limb push
 rises as its head comes near the skin.  On the wire and inside all three are integers: um, mN and fF; times
 of the device are us of its own clock.
 
-Nothing here knows a study, a mesh or a solver: `limbfit.pipeline` puts them together.
+Nothing here knows a mesh or a solver, and of the study the table ``[acquire]`` alone: `limbfit.pipeline` puts
+them together.
 """
 
-from .device import DEFAULT_ADDRESS, DEFAULT_PORT, Device, LineDevice, connect
+from .device import DEFAULT_ADDRESS, DEFAULT_PORT, LineDevice, connect
 from .events import Event, Settings
 from .operator import Keyboard, NoOperator
 from .quality import RecordedRamp, Verdict, check_record, find_ramps
@@ -18,7 +19,6 @@ from .session import Ending, Listener, LiveUpdate, PhaseUpdate, Session, Update,
 __all__ = [
     "DEFAULT_ADDRESS",
     "DEFAULT_PORT",
-    "Device",
     "Ending",
     "Event",
     "Keyboard",

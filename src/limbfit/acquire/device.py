@@ -1,10 +1,6 @@
-"""The device as a session sees it, the wires to it, and its one driver: the line protocol over a wire.
+"""The device as a session sees it: the line protocol over a wire.
 
 A wire is a TCP connection, or a serial port (with ``pip install 'limbfit[serial]'``).
-
-`HostConnection` is limbfit's end of the protocol without a wire: bytes in, reports out; commands in, bytes
-out. A command that the device does not answer is sent again under a new number; one that is replaced by a
-newer one for the same pin is not. It reads no clock: times are given, in s.
 """
 
 from __future__ import annotations
@@ -39,7 +35,6 @@ from .line_protocol import (
     Refusals,
     Report,
     derive_salt,
-    format_command,
     parse_report,
 )
 
@@ -67,6 +62,10 @@ class Link(Protocol):
     def fileno(self) -> int:
         """For ``select``."""
 
+    def wait(self, timeout_s: float) -> None:
+        """Wait for something to read, at most so long."""
+        select.select([self], [], [], timeout_s)
+
     def read(self) -> bytes:
         """What has come, or nothing."""
 
@@ -76,7 +75,7 @@ class Link(Protocol):
     def close(self) -> None: ...
 
 
-class TcpLink:
+class TcpLink(Link):
     """A connected socket."""
 
     def __init__(self, connection: socket.socket) -> None:
@@ -112,7 +111,7 @@ class TcpLink:
             self._socket.close()
 
 
-class SerialLink:
+class SerialLink(Link):
     """A serial port, 8N1, without flow control."""
 
     def __init__(self, port: str, baud: int) -> None:
@@ -191,27 +190,6 @@ def connect(address: str, timeout_s: float = 5.0) -> Link:
     )
 
 
-class Device(Protocol):
-    """What a session needs of a device; times are s of the caller's clock."""
-
-    @property
-    def identity(self) -> Identity: ...
-
-    @property
-    def refused(self) -> Refusals: ...
-
-    def send(self, command: Command, now: float) -> None:
-        """Give a command; raises `RunError` where the device is gone."""
-
-    def receive(self, timeout_s: float) -> list[Sample | Declined | LimitTripped | OutOfReach]:
-        """Wait for the device for at most so long; raises `RunError` where it is gone."""
-
-    def resend(self, now: float) -> str:
-        """Repeat commands that went unanswered; a reason to stop, or nothing."""
-
-    def close(self) -> None: ...
-
-
 @dataclass
 class _PendingCommand:
     command: Command
@@ -219,66 +197,84 @@ class _PendingCommand:
     attempts: int = 1
 
 
-class HostConnection:
-    """Encodes, decodes, numbers, repeats; one per session."""
+class LineDevice:
+    """A device that speaks the line protocol (docs/device-protocol.md); times are s of the caller's clock.
 
-    def __init__(self) -> None:
-        self.nonce = secrets.token_hex(8)
-        self.identity: Identity | None = None
+    A command that the device does not answer is sent again under a new number; one that is replaced by a
+    newer one for the same pin is not.
+
+    Raises
+    ------
+    RunError
+        Where nobody answers, or it is another version, has other pins or another rate than limbfit knows;
+        from each of its methods, where the device is gone.
+    """
+
+    def __init__(self, link: Link) -> None:
+        self._link, self._nonce = link, secrets.token_hex(8)
         self._encoder = Encoder(first=0)
         self._decoder = Decoder(DEVICE_LINE, numbered=False)
         self._pending: dict[int, _PendingCommand] = {}
-        self._answer_time_s = ANSWER_S
+        self.identity = self._greet()
+        self._answer_time_s = PACED_ANSWER_S if self.identity.clock == "paced" else ANSWER_S
 
     @property
     def refused(self) -> Refusals:
         return self._decoder.refused
 
-    def hello(self) -> bytes:
-        """The greeting; its answer comes out of `greet`."""
-        return self._encoder.encode(Hello(self.nonce).body)[1]
+    def _greet(self) -> Identity:
+        end = time.monotonic() + GREETING_S
+        try:
+            while time.monotonic() < end:
+                self._link.write(self._encoder.encode(Hello(VERSION, self._nonce).body)[1])
+                self._link.wait(GREETING_INTERVAL_S)
+                if identity := self._find_identity(self._link.read()):
+                    return identity
+        except RunError as error:
+            self._link.close()
+            raise RunError(
+                f"no greeting from the device: {error}; it takes one host at a time: does another have it?"
+            ) from None
+        self._link.close()
+        raise RunError(
+            f"no greeting from the device within {GREETING_S:g} s; does it speak docs/device-protocol.md?"
+        )
 
-    def greet(self, data: bytes) -> Identity | None:
-        """Bytes until the device has said who it is.
-
-        Raises
-        ------
-        RunError
-            Where it is another version, has other pins or another rate than limbfit knows.
-        """
+    def _find_identity(self, data: bytes) -> Identity | None:
+        """Who the device is, once it has said so; from then on lines are numbered and salted."""
         for line in self._decoder.feed(data):
             report = parse_report(line.body, line.number)
-            if not isinstance(report, Identity):
-                self.refused.unknown += 1
-                continue
-            _check_identity(report)
-            salt = derive_salt(self.nonce, report.nonce)
-            self._encoder = Encoder(salt)
-            self._decoder.restart(salt)
-            self.identity = report
-            self._answer_time_s = PACED_ANSWER_S if report.clock == "paced" else ANSWER_S
-            return report
+            if isinstance(report, Identity):
+                _check_identity(report)
+                salt = derive_salt(self._nonce, report.nonce)
+                self._encoder = Encoder(salt)
+                self._decoder.restart(salt)
+                return report
+            self.refused.unknown += 1
         return None
 
-    def send(self, command: Command, now: float) -> bytes:
-        """The line of a command; one that needs an answer is remembered until it comes."""
-        number, line = self._encoder.encode(format_command(command))
+    def send(self, command: Command, now: float) -> None:
+        """Give a command; one that needs an answer is remembered until it comes."""
         match command:  # what a newer command makes void: the older ones for its pin; a stop, all
-            case Heartbeat() | Bye():
-                return line
             case Stop():
                 self._pending.clear()
             case Move(pin=pin) | Hold(pin=pin):
                 for older, waiting in list(self._pending.items()):
                     if isinstance(waiting.command, (Move, Hold)) and waiting.command.pin == pin:
                         del self._pending[older]
-        self._pending[number] = _PendingCommand(command, now + self._answer_time_s)
-        return line
+        self._write(command, now, attempts=1)
 
-    def feed(self, data: bytes) -> list[Sample | Declined | LimitTripped | OutOfReach]:
-        """What the device says that concerns the session, in order."""
+    def _write(self, command: Command, now: float, attempts: int) -> None:
+        number, line = self._encoder.encode(command.body)
+        if not isinstance(command, (Heartbeat, Bye)):
+            self._pending[number] = _PendingCommand(command, now + self._answer_time_s, attempts)
+        self._link.write(line)
+
+    def receive(self, timeout_s: float = 0.0) -> list[Sample | Declined | LimitTripped | OutOfReach]:
+        """Wait for the device for at most so long; what it says that concerns the session, in order."""
+        self._link.wait(timeout_s)
         found: list[Sample | Declined | LimitTripped | OutOfReach] = []
-        for line in self._decoder.feed(data):
+        for line in self._decoder.feed(self._link.read()):
             report: Report | None = parse_report(line.body, line.number)
             match report:
                 case None | Identity():
@@ -292,22 +288,21 @@ class HostConnection:
                     found.append(report)
         return found
 
-    def resend(self, now: float) -> tuple[bytes, str]:
-        """Lines of commands that went unanswered; and, where one did too often, what to stop for."""
-        lines, reason = b"", ""
+    def resend(self, now: float) -> str:
+        """Repeat commands that went unanswered; where one did too often, what to stop for, or nothing."""
+        reason = ""
         for number, waiting in list(self._pending.items()):
             if now < waiting.due:
                 continue
             del self._pending[number]
             if waiting.attempts >= MAX_ATTEMPTS and not isinstance(waiting.command, Stop):
                 reason = "the device does not answer commands"
-                continue
-            fresh, line = self._encoder.encode(format_command(waiting.command))
-            self._pending[fresh] = _PendingCommand(
-                waiting.command, now + self._answer_time_s, waiting.attempts + 1
-            )
-            lines += line
-        return lines, reason
+            else:
+                self._write(waiting.command, now, waiting.attempts + 1)
+        return reason
+
+    def close(self) -> None:
+        self._link.close()
 
 
 def _check_identity(identity: Identity) -> None:
@@ -319,49 +314,3 @@ def _check_identity(identity: Identity) -> None:
     if (identity.pins, identity.rate_hz) != (PINS, RATE_HZ):
         found = f"{identity.pins} pins at {identity.rate_hz} Hz"
         raise RunError(f"the device has {found}; limbfit knows {PINS} at {RATE_HZ} Hz")
-
-
-class LineDevice:
-    """A device that speaks the line protocol (docs/device-protocol.md)."""
-
-    def __init__(self, link: Link) -> None:
-        self._link, self._connection = link, HostConnection()
-        self.identity = self._greet()
-
-    @property
-    def refused(self) -> Refusals:
-        return self._connection.refused
-
-    def _greet(self) -> Identity:
-        end = time.monotonic() + GREETING_S
-        try:
-            while time.monotonic() < end:
-                self._link.write(self._connection.hello())
-                select.select([self._link], [], [], GREETING_INTERVAL_S)
-                if identity := self._connection.greet(self._link.read()):
-                    return identity
-        except RunError as error:
-            self._link.close()
-            raise RunError(
-                f"no greeting from the device: {error}; it takes one host at a time: does another have it?"
-            ) from None
-        self._link.close()
-        raise RunError(
-            f"no greeting from the device within {GREETING_S:g} s; does it speak docs/device-protocol.md?"
-        )
-
-    def send(self, command: Command, now: float) -> None:
-        self._link.write(self._connection.send(command, now))
-
-    def receive(self, timeout_s: float) -> list[Sample | Declined | LimitTripped | OutOfReach]:
-        select.select([self._link], [], [], timeout_s)
-        return self._connection.feed(self._link.read())
-
-    def resend(self, now: float) -> str:
-        lines, reason = self._connection.resend(now)
-        if lines:
-            self._link.write(lines)
-        return reason
-
-    def close(self) -> None:
-        self._link.close()

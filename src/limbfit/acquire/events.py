@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntFlag
+from typing import ClassVar
+
+from ..study import AcquireTable
 
 PINS = 14
 RATE_HZ = 500
@@ -82,71 +85,91 @@ class Tick:
 Event = Sample | Begin | Confirm | KeyDown | KeyUp | Abort | LinkLost | Tick
 
 
+class Message:
+    """What a line of the wire says: a verb and its words, which are the fields in their order."""
+
+    __slots__ = ()
+    verb: ClassVar[str]
+
+    @classmethod
+    def words(cls) -> dict[str, str]:
+        """The fields that go on the wire, and their types."""
+        return {name: cls.__annotations__[name] for name in cls.__match_args__}  # type: ignore[attr-defined]
+
+    @property
+    def body(self) -> str:
+        return " ".join((self.verb, *(str(getattr(self, name)) for name in self.words())))
+
+    @property
+    def is_sound(self) -> bool:
+        """False where a value has no meaning, such as a pin that no device has."""
+        return True
+
+
+def is_pin(number: int) -> bool:
+    return 1 <= number <= PINS
+
+
 @dataclass(frozen=True, slots=True)
-class Move:
+class Move(Message):
     """Drive a pin (1 to 14) to a position; it halts by itself at a force (0: at none)."""
 
+    verb: ClassVar[str] = "MOVE"
     pin: int
     target_um: int
     speed_um_s: int
     halt_mN: int = 0
 
+    @property
+    def is_sound(self) -> bool:
+        return is_pin(self.pin) and self.target_um >= 0 and self.speed_um_s > 0 and self.halt_mN >= 0
+
 
 @dataclass(frozen=True, slots=True)
-class Hold:
+class Hold(Message):
     """Halt a pin where it is."""
 
+    verb: ClassVar[str] = "HOLD"
     pin: int
 
-
-@dataclass(frozen=True, slots=True)
-class Stop:
-    """Halt everything at once, then bring every pin home; stays until the session ends."""
-
-    reason: str
+    @property
+    def is_sound(self) -> bool:
+        return is_pin(self.pin)
 
 
 @dataclass(frozen=True, slots=True)
-class Fence:
+class Stop(Message):
+    """Halt everything at once, then bring every pin home; stays until the session ends.
+
+    The reason holds what devices said, and stays off the wire.
+    """
+
+    verb: ClassVar[str] = "STOP"
+    reason: str = ""
+
+    @classmethod
+    def words(cls) -> dict[str, str]:
+        return {}
+
+
+@dataclass(frozen=True, slots=True)
+class Fence(Message):
     """From now on a pin may not go beyond a position."""
 
+    verb: ClassVar[str] = "FENCE"
     pin: int
     position_um: int
+
+    @property
+    def is_sound(self) -> bool:
+        return is_pin(self.pin) and self.position_um > 0
 
 
 Action = Move | Hold | Stop | Fence
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Speeds mm/s, forces N, lengths mm, times s; documented with the study's table ``[acquire]``."""
-
-    pin: int
-    clamp_N: float
-    clamp_tolerance_N: float
-    clamp_speed_mm_s: float
-    settle_s: float
-    approach_speed_mm_s: float
-    touch_N: float
-    start_gap_mm: float
-    search_speed_mm_s: float
-    search_force_N: float
-    search_depth_mm: float
-    min_depth_mm: float
-    pause_s: float
-    precondition: int
-    repeats: int
-    ramp_speed_mm_s: float
-    hold_s: float
-    retract_speed_mm_s: float
-    force_limit_N: float
-    clamp_limit_N: float
-    depth_limit_mm: float
-    speed_limit_mm_s: float
-    time_limit_s: float
-    operator_limit_s: float
-    watchdog_ms: float
-    key_gap_ms: float
+class Settings(AcquireTable):
+    """The study's table ``[acquire]``, and which pins hold the limb."""
 
     @property
     def withdrawn(self) -> tuple[int, ...]:

@@ -16,17 +16,16 @@ from __future__ import annotations
 import re
 from binascii import crc32
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar, get_args
 
-from .events import PINS, Fence, Hold, Move, Sample, Stop
+from .events import PINS, Fence, Hold, Message, Move, Sample, Stop, is_pin
 
 VERSION = 1
 HOST_LINE = 128  # bytes, newline included: the longest that a device must take
 DEVICE_LINE = 768  # the longest that limbfit takes
 MAX_NUMBER = 2**31 - 1
 _LINE = re.compile(rb"([0-9]{1,10}) ([\x20-\x29\x2b-\x7e]+)\*([0-9A-F]{8})\Z")
-WORD = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,39}"
-_WORD = re.compile(rf"{WORD}\Z", re.ASCII)
+_WORD = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,39}\Z", re.ASCII)
 _INTEGER = re.compile(r"-?[0-9]{1,9}\Z", re.ASCII)
 _NONCE = re.compile(r"[0-9a-f]{16}\Z")
 _SAMPLE = re.compile(
@@ -145,31 +144,20 @@ class Decoder:
         return Line(count, body.decode("ascii"))
 
 
-class Message:
-    """A verb and its words: the fields in their order."""
-
-    __slots__ = ()
-    verb: ClassVar[str]
-
-    @property
-    def body(self) -> str:
-        words = (str(getattr(self, name)) for name in self.__match_args__)  # type: ignore[attr-defined]
-        return " ".join((self.verb, *words))
-
-
 # -- from limbfit to the device
 
 
 @dataclass(frozen=True, slots=True)
-class Hello:
+class Hello(Message):
     """Opens a session; the only line without salt."""
 
+    verb: ClassVar[str] = "HELLO"
+    version: int
     nonce: str
-    version: int = VERSION
 
     @property
-    def body(self) -> str:
-        return f"HELLO {self.version} {self.nonce}"
+    def is_sound(self) -> bool:
+        return _NONCE.match(self.nonce) is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,17 +172,25 @@ class SetLimits(Message):
     speed_um_s: int
     watchdog_ms: int
 
+    @property
+    def is_sound(self) -> bool:
+        return is_pin(self.pin) and min(getattr(self, name) for name in self.words()) > 0
+
 
 @dataclass(frozen=True, slots=True)
-class NoteCommand:
-    """What the session is at, for the device's display and log: ``SITE`` or ``PHASE`` and a word."""
+class NoteSite(Message):
+    """The site at which the session is."""
 
-    kind: str
-    word: str
+    verb: ClassVar[str] = "SITE"
+    name: str
 
-    @property
-    def body(self) -> str:
-        return f"{self.kind} {self.word}"
+
+@dataclass(frozen=True, slots=True)
+class NotePhase(Message):
+    """The phase in which the session is, for the device's display and log."""
+
+    verb: ClassVar[str] = "PHASE"
+    name: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,77 +202,25 @@ class Heartbeat(Message):
 
 
 @dataclass(frozen=True, slots=True)
-class Bye:
+class Bye(Message):
     """Ends the session."""
 
-    body = "BYE"
-
-
-Command = Hello | SetLimits | NoteCommand | Heartbeat | Bye | Move | Hold | Stop | Fence
-
-
-def format_command(command: Command) -> str:
-    """The body of a command; the reason of a stop becomes a word, since reasons hold what devices said."""
-    match command:
-        case Move(pin, target, speed, halt):
-            return f"MOVE {pin} {target} {speed} {halt}"
-        case Hold(pin):
-            return f"HOLD {pin}"
-        case Fence(pin, position):
-            return f"FENCE {pin} {position}"
-        case Stop():
-            return "STOP"
-    return command.body
-
-
-def parse_command(body: str) -> Command | None:
-    """The command that a body states, or None."""
-    verb, *words = body.split(" ")
-    if verb in ("SITE", "PHASE") and len(words) == 1:
-        return NoteCommand(verb, words[0]) if _WORD.match(words[0]) else None
-    if verb == "HELLO" and len(words) == 2:
-        version = _read_integers(words[:1])
-        return Hello(words[1], version[0]) if version and _NONCE.match(words[1]) else None
-    numbers = _read_integers(words)
-    if numbers is None or any(abs(n) > MAX_VALUE for n in numbers if verb != "BEAT"):
-        return None
-    match verb, numbers:
-        case "BEAT", [number]:
-            return Heartbeat(number)
-        case "MOVE", [pin, target, speed, halt] if _is_pin(pin) and target >= 0 < speed and halt >= 0:
-            return Move(pin, target, speed, halt)
-        case "HOLD", [pin] if _is_pin(pin):
-            return Hold(pin)
-        case "FENCE", [pin, position] if _is_pin(pin) and position > 0:
-            return Fence(pin, position)
-        case "STOP", []:
-            return Stop("")
-        case "BYE", []:
-            return Bye()
-        case "LIMITS", [pin, force, clamp, position, speed, watchdog] if _is_pin(pin) and min(numbers) > 0:
-            return SetLimits(pin, force, clamp, position, speed, watchdog)
-    return None
-
-
-def _is_pin(pin: int) -> bool:
-    return 1 <= pin <= PINS
-
-
-def _read_integers(words: list[str]) -> list[int] | None:
-    return [int(word) for word in words] if all(_INTEGER.match(word) for word in words) else None
+    verb: ClassVar[str] = "BYE"
 
 
 # -- from the device to limbfit
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class Identity(Message):
     """What a device says of itself when greeted.
 
     ``clock`` is ``real``, or ``paced``: the device's time waits for limbfit, which then lives by it.
     ``touch_fF`` is the capacitance of a head that touches skin; ``calibrated`` the day of its calibration.
     """
 
+    verb: ClassVar[str] = "ID"
+    version: int
     nonce: str
     pins: int
     rate_hz: int
@@ -287,14 +231,11 @@ class Identity:
     model: str
     serial: str
     calibrated: str
-    version: int = VERSION
 
     @property
-    def body(self) -> str:
-        return (
-            f"ID {self.version} {self.nonce} {self.pins} {self.rate_hz} {self.stroke_um} {self.range_mN} "
-            f"{self.touch_fF} {self.clock} {self.model} {self.serial} {self.calibrated}"
-        )
+    def is_sound(self) -> bool:
+        numbers = [getattr(self, name) for name, kind in self.words().items() if kind == "int"]
+        return _NONCE.match(self.nonce) is not None and self.clock in ("real", "paced") and min(numbers) > 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,6 +263,10 @@ class LimitTripped(Message):
     code: str
     pin: int
 
+    @property
+    def is_sound(self) -> bool:
+        return self.pin == 0 or is_pin(self.pin)
+
 
 @dataclass(frozen=True, slots=True)
 class OutOfReach(Message):
@@ -330,8 +275,46 @@ class OutOfReach(Message):
     verb: ClassVar[str] = "STUCK"
     pins: int
 
+    @property
+    def is_sound(self) -> bool:
+        return 0 <= self.pins < 1 << PINS
 
+
+Command = Hello | SetLimits | NoteSite | NotePhase | Heartbeat | Bye | Move | Hold | Stop | Fence
 Report = Identity | Accepted | Declined | LimitTripped | OutOfReach | Sample
+_COMMANDS: dict[str, Any] = {kind.verb: kind for kind in get_args(Command)}
+_REPORTS: dict[str, Any] = {kind.verb: kind for kind in get_args(Report) if kind is not Sample}
+
+
+def parse_command(body: str) -> Command | None:
+    """The command that a body states, or None."""
+    return _parse(body, _COMMANDS)
+
+
+def parse_report(body: str, number: int) -> Report | None:
+    """The report that a body states, or None; ``number`` is its line's."""
+    return _parse_sample(body, number) if body.startswith("S ") else _parse(body, _REPORTS)
+
+
+def _parse(body: str, kinds: dict[str, Any]) -> Any:
+    """The message that a body states, of the kinds by their verbs; None where it is exactly none of them."""
+    verb, *words = body.split(" ")
+    kind = kinds.get(verb)
+    if kind is None or len(words) != len(kind.words()):
+        return None
+    values = [_parse_word(word, *field) for word, field in zip(words, kind.words().items(), strict=True)]
+    if None in values:
+        return None
+    message = kind(*values)
+    return message if message.is_sound else None
+
+
+def _parse_word(word: str, name: str, kind: str) -> str | int | None:
+    """The value of a field; the number of a line may be larger than any length, speed or force."""
+    if kind == "str":
+        return word if _WORD.match(word) else None
+    number = int(word) if _INTEGER.match(word) else None
+    return number if number is None or name == "number" or abs(number) <= MAX_VALUE else None
 
 
 def format_sample(sample: Sample) -> str:
@@ -339,42 +322,11 @@ def format_sample(sample: Sample) -> str:
     return f"S {sample.time_us},{sample.flags},{sample.moving}," + ",".join(map(str, channels))
 
 
-def parse_report(body: str, number: int) -> Report | None:
-    """The report that a body states, or None; ``number`` is its line's."""
-    if body.startswith("S "):
-        match = _SAMPLE.match(body)
-        if match is None:
-            return None
-        time, flags, moving = (int(word) for word in match.groups()[:3])
-        values = tuple(map(int, match[4][1:].split(",")))
-        position, force, capacitance = values[:PINS], values[PINS : 2 * PINS], values[2 * PINS :]
-        return Sample(number, time, flags, moving, position, force, capacitance)
-    verb, *words = body.split(" ")
-    if verb == "ID" and len(words) == 11:
-        return _read_identity(words)
-    if verb == "NO" and len(words) == 2 and _INTEGER.match(words[0]) and _WORD.match(words[1]):
-        return Declined(int(words[0]), words[1])
-    if verb == "FAULT" and len(words) == 2 and _WORD.match(words[0]) and _INTEGER.match(words[1]):
-        pin = int(words[1])
-        return LimitTripped(words[0], pin) if pin == 0 or _is_pin(pin) else None
-    numbers = _read_integers(words)
-    match verb, numbers:
-        case "OK", [done]:
-            return Accepted(done)
-        case "STUCK", [pins] if 0 <= pins < 1 << PINS:
-            return OutOfReach(pins)
-    return None
-
-
-def _read_identity(words: list[str]) -> Identity | None:
-    numbers = _read_integers([words[0], *words[2:7]])
-    names = words[8:]
-    if numbers is None or not _NONCE.match(words[1]) or not all(map(_WORD.match, names)):
+def _parse_sample(body: str, number: int) -> Sample | None:
+    match = _SAMPLE.match(body)
+    if match is None:
         return None
-    if min(numbers) <= 0 or words[7] not in ("real", "paced"):
-        return None
-    version, pins, rate, stroke, range_mN, touch = numbers
-    model, serial, calibrated = names
-    return Identity(
-        words[1], pins, rate, stroke, range_mN, touch, words[7], model, serial, calibrated, version
-    )
+    time, flags, moving = (int(word) for word in match.groups()[:3])
+    values = tuple(map(int, match[4][1:].split(",")))
+    position, force, capacitance = values[:PINS], values[PINS : 2 * PINS], values[2 * PINS :]
+    return Sample(number, time, flags, moving, position, force, capacitance)

@@ -18,7 +18,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from ..errors import RunError
-from .device import Device
+from .device import LineDevice
 from .events import (
     PERIOD_US,
     Abort,
@@ -39,7 +39,8 @@ from .line_protocol import (
     Declined,
     Heartbeat,
     LimitTripped,
-    NoteCommand,
+    NotePhase,
+    NoteSite,
     OutOfReach,
     SetLimits,
 )
@@ -132,7 +133,7 @@ class Session:
     def __init__(
         self,
         settings: Settings,
-        device: Device,
+        device: LineDevice,
         *,
         site: str,
         recorder: Recorder | None = None,
@@ -160,7 +161,7 @@ class Session:
         self._last_fresh_s = now + FIRST_SAMPLE_S
         with self._guard_link(now):
             self.device.send(limits, now)
-            self.device.send(NoteCommand("SITE", self._site), now)
+            self.device.send(NoteSite(self._site), now)
         self.handle(Begin(), now)
 
     def handle_reports(
@@ -261,7 +262,7 @@ class Session:
         self._record("phase", now, **facts)
         if not protocol.is_over:
             with self._guard_link(now):
-                self.device.send(NoteCommand("PHASE", phase), now)
+                self.device.send(NotePhase(phase), now)
         if self.listener is not None:
             self.listener(PhaseUpdate(phase, now, protocol.reason, protocol.cycle))
 

@@ -40,6 +40,11 @@ def build_limb_frame(cut_point: Array, cut_normal: Array) -> Frame:
     return Frame(np.array([x, np.cross(z, x), z]), np.asarray(cut_point, dtype=float))
 
 
+def format_place(point: Array, digits: int = 1) -> str:
+    """A point (3,) in mm as messages give it."""
+    return "(" + ", ".join(f"{x:.{digits}f}" for x in point) + ") mm"
+
+
 @dataclass(frozen=True)
 class ProximalEnd:
     """The proximal end of a limb on its grid.

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 
-from ..anatomy.frame import Frame
+from ..anatomy.frame import Frame, format_place
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError
@@ -138,9 +138,9 @@ def compute_profile(outer: Surface, frame: Frame) -> LimbProfile:
     radius, folds = compute_radii(local, rays, stations, angles)
     if np.isnan(radius).any():
         k = int(np.isnan(radius).any(axis=1).argmax())
-        place = ", ".join(f"{x:.0f}" for x in frame.to_patient(rays.middle(stations[k])))
+        place = format_place(frame.to_patient(rays.middle(stations[k])), 0)
         raise SurfaceError(
-            f"a ray from the limb's middle line at ({place}) mm never meets the limb",
+            f"a ray from the limb's middle line at {place} never meets the limb",
             remedy="close the surface, or move the proximal cut nearer to the knee",
         )
     radius = smooth(radius, stations, float(np.median(radius)), SMOOTH_MM)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from ..anatomy.frame import Frame
+from ..anatomy.frame import Frame, format_place
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError
@@ -130,11 +130,10 @@ def _refuse_folds(limb: LimbProfile, lines: TrimmedLimb, frame: Frame) -> None:
     folds = np.where(inside, limb.folds, 0.0)
     if folds.max() > FOLD_MM:
         k, j = np.unravel_index(np.argmax(folds), folds.shape)
-        at = limb.rays.points(limb.angles[j], limb.stations[k], limb.radius[k, j])
-        place = ", ".join(f"{x:.0f}" for x in frame.to_patient(at))
+        at = frame.to_patient(limb.rays.points(limb.angles[j], limb.stations[k], limb.radius[k, j]))
         raise SurfaceError(
-            f"the limb is folded by {folds.max():.1f} mm at ({place}) mm, and a socket is drawn on rays "
-            "from its middle line",
+            f"the limb is folded by {folds.max():.1f} mm at {format_place(at, 0)}, and a socket is "
+            "drawn on rays from its middle line",
             remedy="smooth the fold, trim below it, or give the socket as a file",
         )
 
@@ -228,8 +227,7 @@ def _refuse_crossing(face: Surface, recipe: Recipe) -> None:
     remedy = "lower reduction_percent or flare_mm"
     if near is not None:
         remedy = f"lower the depth of {near.name!r} or make it wider"
-    words = ", ".join(f"{x:.0f}" for x in place)
-    raise SurfaceError(f"the socket's face would cross itself at ({words}) mm", remedy=remedy)
+    raise SurfaceError(f"the socket's face would cross itself at {format_place(place, 0)}", remedy=remedy)
 
 
 def _resample_ring(ring: Array, count: int, turn: float) -> tuple[Array, Array]:

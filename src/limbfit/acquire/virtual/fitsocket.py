@@ -26,7 +26,8 @@ from ..line_protocol import (
     Hello,
     Identity,
     LimitTripped,
-    NoteCommand,
+    NotePhase,
+    NoteSite,
     OutOfReach,
     SetLimits,
     derive_salt,
@@ -158,6 +159,7 @@ class VirtualFitSocket:
             self.stopped, self._given_up = "", False
         sensors = self.sensors
         identity = Identity(
+            VERSION,
             secrets.token_hex(8),
             PINS,
             RATE_HZ,
@@ -180,10 +182,10 @@ class VirtualFitSocket:
         match command:
             case SetLimits():
                 return self._arm(command)
-            case NoteCommand(kind="SITE", word=word):
-                return "" if self.limb.place_site(word, self._test_pin) else "unknown-site"
-            case NoteCommand(word=word):
-                self.faults.enter(word)
+            case NoteSite(name=site):
+                return "" if self.limb.place_site(site, self._test_pin) else "unknown-site"
+            case NotePhase(name=phase):
+                self.faults.enter(phase)
                 return ""
             case Stop():
                 self._stop("asked")

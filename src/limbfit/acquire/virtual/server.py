@@ -24,7 +24,7 @@ MAX_CATCH_UP_S = 0.25  # a device that could not run for so long does not make u
 IDLE_S = 0.02
 
 
-class PtyLink:
+class PtyLink(Link):
     """The master of a pseudo terminal; its slave looks like a serial port."""
 
     def __init__(self) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.ndimage import binary_fill_holes
 from scipy.ndimage import label as connected
@@ -21,43 +19,28 @@ _CENTRE_MM = 1.5  # smaller distances of a slice's centroid are never odd
 _END_MM = 12.0  # a bone's end is round: its first and last slices may change quickly
 
 
-@dataclass(frozen=True)
-class SliceWarning:
-    """A slice (counted from 0 along ``axis``) in which a label looks wrong, and why."""
+def assess_labels(labels: LabelMap) -> QualityResult:
+    """Measure every label and the limb as a whole, and name the slices that do not fit their neighbours.
 
-    label: str
-    slice: int
-    what: str
-
-
-@dataclass(frozen=True)
-class LabelQuality:
-    """Measures of each label, and slices to look at; ``axis`` 0, 1, 2 (i, j, k) is the limb's."""
-
-    axis: int
-    labels: dict[str, LabelMeasures]
-    suspects: tuple[SliceWarning, ...]
-
-    def summarise(self) -> QualityResult:
-        """Return what is stored."""
-        suspects = [SuspectSlice.model_validate(suspect) for suspect in self.suspects]
-        return QualityResult(axis="ijk"[self.axis], labels=self.labels, suspects=suspects)
-
-
-def assess_labels(labels: LabelMap) -> LabelQuality:
-    """Measure every label and the limb as a whole, and name the slices that do not fit their neighbours."""
+    Slices are counted from 0 along the grid axis of the limb.
+    """
     axis = find_longest_axis(labels.limb, labels)
     order = [*(n for n in range(3) if n != axis), axis]
     turned = labels.permute_axes(order)
     masks = {LIMB: turned.limb} | {
         name: turned.mask(name) for _, name in sorted(labels.names.items()) if turned.mask(name).any()
     }
-    suspects: list[SliceWarning] = []
-    for name, mask in masks.items():
-        if name != SOFT_TISSUE:
-            suspects += _find_odd_slices(name, mask, turned.spacing)
-    facts = {name: _measure_label(mask, turned) for name, mask in masks.items()}
-    return LabelQuality(axis, facts, tuple(sorted(suspects, key=lambda s: (s.slice, s.label))))
+    suspects = [
+        SuspectSlice(label=name, slice=k, what=what)
+        for name, mask in masks.items()
+        if name != SOFT_TISSUE
+        for k, what in _find_odd_slices(mask, turned.spacing)
+    ]
+    return QualityResult(
+        axis="ijk"[axis],
+        labels={name: _measure_label(mask, turned) for name, mask in masks.items()},
+        suspects=sorted(suspects, key=lambda suspect: (suspect.slice, suspect.label)),
+    )
 
 
 def _measure_label(mask: Mask, labels: LabelMap) -> LabelMeasures:
@@ -79,11 +62,12 @@ def _measure_label(mask: Mask, labels: LabelMap) -> LabelMeasures:
     )
 
 
-def _find_odd_slices(name: str, mask: Mask, spacing: Array) -> list[SliceWarning]:
+def _find_odd_slices(mask: Mask, spacing: Array) -> list[tuple[int, str]]:
+    """The slices in which a label looks wrong, and why."""
     areas = mask.sum(axis=(1, 2)) * float(spacing[0] * spacing[1])
     filled = np.flatnonzero(areas)
     first, last = int(filled[0]), int(filled[-1])
-    empty = [SliceWarning(name, k, "missing between others") for k in range(first, last) if areas[k] == 0]
+    empty = [(k, "missing between others") for k in range(first, last) if areas[k] == 0]
     if empty or last - first < 6:
         return empty
     area, centre = areas[first : last + 1], _compute_centroids(mask[first : last + 1], spacing)
@@ -92,10 +76,10 @@ def _find_odd_slices(name: str, mask: Mask, spacing: Array) -> list[SliceWarning
     high = len(area) - (reach if last < len(areas) - 1 else 1)
     inner = np.zeros(len(area), dtype=bool)
     inner[low:high] = True
-    found = _find_outlying_slices(name, area, centre, inner)
-    known = {s.slice + step for s in found for step in (-1, 0, 1)}
-    found += [jump for jump in _find_area_jumps(name, area, inner) if jump.slice not in known]
-    return [SliceWarning(s.label, s.slice + first, s.what) for s in found]
+    found = _find_outlying_slices(area, centre, inner)
+    known = {k + step for k, _ in found for step in (-1, 0, 1)}
+    found += [jump for jump in _find_area_jumps(area, inner) if jump[0] not in known]
+    return [(first + k, what) for k, what in found]
 
 
 def _compute_centroids(mask: Mask, spacing: Array) -> Array:
@@ -107,27 +91,24 @@ def _compute_centroids(mask: Mask, spacing: Array) -> Array:
     return np.column_stack([x, y])
 
 
-def _find_outlying_slices(name: str, area: Array, centre: Array, inner: Mask) -> list[SliceWarning]:
+def _find_outlying_slices(area: Array, centre: Array, inner: Mask) -> list[tuple[int, str]]:
     """Slices off the mean of the slice before and the slice after."""
     expected = (area[:-2] + area[2:]) / 2
     off = np.pad((area[1:-1] - expected) / expected, 1)
     aside = np.pad(np.linalg.norm(centre[1:-1] - (centre[:-2] + centre[2:]) / 2, axis=1), 1)
     found = []
     for k in _find_peaks(np.abs(off), np.maximum(_MIN_AREA_CHANGE, _OUTLIER * _spread(off[inner])), inner):
-        found.append(SliceWarning(name, k, f"area {off[k]:+.0%} of what its neighbours have"))
+        found.append((k, f"area {off[k]:+.0%} of what its neighbours have"))
     for k in _find_peaks(aside, max(_CENTRE_MM, _OUTLIER * _spread(aside[inner])), inner):
-        found.append(SliceWarning(name, k, f"{aside[k]:.1f} mm beside its neighbours"))
+        found.append((k, f"{aside[k]:.1f} mm beside its neighbours"))
     return found
 
 
-def _find_area_jumps(name: str, area: Array, inner: Mask) -> list[SliceWarning]:
+def _find_area_jumps(area: Array, inner: Mask) -> list[tuple[int, str]]:
     """Slices at which the area changes for good."""
     change = np.pad(np.diff(area) / np.maximum(area[1:], area[:-1]), (1, 0))
     limit = max(_MIN_AREA_JUMP, _OUTLIER * _spread(change[inner]))
-    return [
-        SliceWarning(name, k, f"area jumps by {change[k]:+.0%}")
-        for k in _find_peaks(np.abs(change), limit, inner)
-    ]
+    return [(k, f"area jumps by {change[k]:+.0%}") for k in _find_peaks(np.abs(change), limit, inner)]
 
 
 def _spread(values: Array) -> float:

@@ -24,6 +24,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import SurfaceError
+from ...results.limb import BoneLoss, SkinLoss
 from ..frame import Frame, build_limb_frame
 from ..surfaces.surfaces import Anatomy
 from ..surfaces.thickness import SLOPE, limit_slope, transfer_values
@@ -51,22 +52,6 @@ class LayerSpec:
 
 
 @dataclass(frozen=True)
-class ThinnedSkin:
-    """What ``thin-skin`` took from the layers: volume (mm3) and the least thickness that is left (mm)."""
-
-    volume_mm3: float
-    thinnest_mm: float
-
-
-@dataclass(frozen=True)
-class TrimmedBone:
-    """What was taken from one bone to keep it below the layers: volume (mm3) and greatest depth (mm)."""
-
-    volume_mm3: float
-    depth_mm: float
-
-
-@dataclass(frozen=True)
 class LimbFields:
     """Fields of a limb in its frame; build it with :func:`build_limb_fields`.
 
@@ -80,7 +65,7 @@ class LimbFields:
     bones: Mapping[str, Surface]
     depths: Array
     bone_clearance_mm: float
-    thinned: ThinnedSkin | None = None
+    thinned: SkinLoss | None = None
     regions: Mapping[str, Surface] = field(default_factory=dict)
 
     @property
@@ -137,16 +122,16 @@ class LimbFields:
             value[candidates[nearer]], gradient[candidates[nearer]] = distance[nearer], slope[nearer]
         return value, gradient
 
-    def measure_trimmed_bones(self) -> dict[str, TrimmedBone]:
+    def measure_trimmed_bones(self) -> dict[str, BoneLoss]:
         """What trimming took from each bone."""
         return {name: self._measure_trimmed_bone(bone) for name, bone in self.bones.items()}
 
-    def _measure_trimmed_bone(self, bone: Surface) -> TrimmedBone:
+    def _measure_trimmed_bone(self, bone: Surface) -> BoneLoss:
         below = bone.points[bone.points[:, 2] <= 0.0]
         excess = self.bone_clearance_mm - self.layer(below)[0] if len(below) else np.zeros(0)
         shallow = below[excess > 0]
         if not len(shallow):
-            return TrimmedBone(0.0, 0.0)
+            return BoneLoss(volume_mm3=0.0, depth_mm=0.0)
         # A bone's shallow part spans at most its own edge length beyond its shallow vertices.
         pad = _measure_longest_edge(bone)
         low, high = shallow.min(axis=0) - pad, shallow.max(axis=0) + pad
@@ -155,7 +140,8 @@ class LimbFields:
         samples = sample_box(low, high, spacing)
         inside = evaluate_distance(bone, samples)[0] < 0
         cut = self.layer(samples[inside])[0] < self.bone_clearance_mm
-        return TrimmedBone(float(cut.sum() * np.prod(high - low) / len(samples)), float(excess.max()))
+        volume = cut.sum() * np.prod(high - low) / len(samples)
+        return BoneLoss(volume_mm3=volume, depth_mm=excess.max())
 
 
 def build_limb_fields(
@@ -233,10 +219,10 @@ def _thin_layers(fields: LimbFields) -> LimbFields:
     room = np.maximum(fields._bone(skin.points)[0] - fields.bone_clearance_mm, MIN_LAYER_SHARE * whole)
     left = np.minimum(whole, limit_slope(skin, np.minimum(whole, room), SLOPE))
     if (left == whole).all():
-        return replace(fields, thinned=ThinnedSkin(0.0, float(whole.min())))
+        return replace(fields, thinned=SkinLoss(volume_mm3=0.0, thinnest_mm=whole.min()))
     below = skin.points[:, 2] <= 0.0
     lost = np.where(below, whole - left, 0.0)[skin.faces].mean(axis=1)
-    thinned = ThinnedSkin(float(lost @ skin.face_areas), float(left[below].min()))
+    thinned = SkinLoss(volume_mm3=lost @ skin.face_areas, thinnest_mm=left[below].min())
     return replace(fields, depths=depths * (left / whole), thinned=thinned)
 
 

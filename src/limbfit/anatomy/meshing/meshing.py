@@ -26,14 +26,15 @@ from scipy.spatial import KDTree
 from ...arrays import Array, Mask
 from ...errors import MeshingError, ProblemError
 from ...mesh import Mesh, boundary_faces, check, node_jacobians, to_tet10
+from ...results.limb import BoneLoss, MeshMeasures
 from ..surfaces.surfaces import Anatomy
 from . import background
 from .background import BONE, LAYER, PLANE, REGION, TetGrid, compute_volumes
 from .curving import balance_bone_faces, compute_curved_target, curve_diagonals, curve_mesh
 from .engines import ENGINES, MesherError, VolumeMesh, VolumeTask
 from .extrusion import build_core_mesh, extrude_layers
-from .layers import BonePolicy, LayerSpec, LimbFields, TrimmedBone, build_limb_fields, evaluate_distance
-from .meshreport import GOOD_DIHEDRAL_DEG, MeshReport, compute_enclosed_volume, measure_mesh
+from .layers import BonePolicy, LayerSpec, LimbFields, build_limb_fields, evaluate_distance
+from .meshreport import GOOD_DIHEDRAL_DEG, compute_enclosed_volume, measure_mesh
 from .projection import project_safely, project_to_level
 from .regions import (
     build_region_level,
@@ -113,7 +114,7 @@ class BaseMesh:
     fields: LimbFields
     grid: TetGrid
     size_limit: Array
-    trimmed: Mapping[str, TrimmedBone]
+    trimmed: Mapping[str, BoneLoss]
     enclosed_mm3: float
     regions_mm3: Mapping[str, float]
 
@@ -194,7 +195,7 @@ def mesh_site(
     axis: Array,
     settings: MeshSettings,
     base: BaseMesh | None = None,
-) -> tuple[Mesh, MeshReport]:
+) -> tuple[Mesh, MeshMeasures]:
     """A conforming mesh graded about an indentation site.
 
     Parameters
@@ -209,7 +210,7 @@ def mesh_site(
     -------
     mesh : regions named as the layers, the anatomy's regions and the core; node sets ``fixed_bone`` (on
         bones) and ``fixed_proximal`` (on the cut plane); face set ``skin`` (outward, without the cut plane).
-    report : quality and what was trimmed.
+    measures : its quality and what was trimmed.
 
     Raises
     ------
@@ -225,7 +226,7 @@ def mesh_site(
 
 def mesh_limb(
     anatomy: Anatomy, settings: MeshSettings, fine_to_mm: float, fat_depth_mm: Array | None = None
-) -> tuple[Mesh, MeshReport]:
+) -> tuple[Mesh, MeshMeasures]:
     """A mesh of the whole limb, as for :func:`mesh_site`, that is fine all around it.
 
     Parameters
@@ -240,7 +241,7 @@ def mesh_limb(
 
 def _mesh_base(
     base: BaseMesh, size: Array, settings: MeshSettings, near: tuple[Array, float] | None = None
-) -> tuple[Mesh, MeshReport]:
+) -> tuple[Mesh, MeshMeasures]:
     """The mesh of a base in patient space, graded by the edge length (n,) at its grid's points; ``near``: as
     for `measure_mesh`."""
     start = time.perf_counter()
@@ -260,11 +261,19 @@ def _mesh_base(
             )
             mesh = balance_bone_faces(mesh, fields, straight)
     _check_usable(mesh, fields)
-    seconds = time.perf_counter() - start
-    report = measure_mesh(
-        mesh, fields, base.trimmed, base.enclosed_mm3, base.regions_mm3, seconds, settings.engine, near
+    measures = measure_mesh(
+        mesh,
+        fields,
+        base.trimmed,
+        base.enclosed_mm3,
+        base.regions_mm3,
+        near,
+        seconds=time.perf_counter() - start,
+        engine=settings.engine,
+        element=settings.element,
+        repairs=repairs,
     )
-    return mesh.with_points(fields.frame.to_patient(mesh.points)), replace(report, repairs=repairs)
+    return mesh.with_points(fields.frame.to_patient(mesh.points)), measures
 
 
 def _adapt_core(task: VolumeTask, fields: LimbFields, settings: MeshSettings) -> VolumeMesh:

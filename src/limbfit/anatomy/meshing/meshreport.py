@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from typing import Any
 
 import igl
 import numpy as np
 
 from ...arrays import Array, Indices
 from ...mesh import Mesh, MeshQuality, compute_dihedral_angles, measure_quality
+from ...results.limb import BoneLoss, InterfaceError, MeshMeasures, RegionError, ThicknessMeasures
 from ..surfaces.surfaces import Anatomy, Surface
 from .extrusion import find_bone_faces, find_inner_faces
-from .layers import LimbFields, ThinnedSkin, TrimmedBone
+from .layers import LimbFields
 from .regions import build_region_level, find_interfaces
-from .untangling import Repair
 
 # Smallest angle near the indenter, and anywhere: far off, layers are thin beside the edges and strain little.
 GOOD_DIHEDRAL_DEG, SOUND_DIHEDRAL_DEG = 8.0, 3.0
@@ -24,55 +24,25 @@ SEEN_RADII = 1.5  # of the zone whose elements have to be good: bone that bears 
 GOOD_VOLUME = 0.02  # long edges far from the indenter cut across a round limb by up to a hundredth
 
 
-@dataclass(frozen=True)
-class MeshReport:
-    """What a mesh is like: counts, angles (degrees), volumes (mm3), lengths (mm), time (s).
-
-    ``volume_error`` is relative to the volume that the surfaces enclose.
-    ``layer_mean_mm`` and ``layer_std_mm`` are the thickness of all layers together, measured from points all
-    over their meshed inner face to the meshed skin; ``layer_thickness_mm`` gives mean, deviation, least and
-    greatest of each. ``interface_error_mm`` is how far that inner face is from where it was asked for.
-    ``regions`` gives of each region inside the core the volume that its surface encloses there, mm3, and how
-    far its meshed surface is from that, mean and max, mm.
-    ``repairs`` made inverted cells sound.
-    """
-
-    nodes: int
-    cells: int
-    region_cells: Mapping[str, int]
-    min_dihedral_deg: float
-    dihedral_percentiles_deg: Mapping[str, float]
-    min_scaled_jacobian: float
-    volume_mm3: float
-    region_volumes_mm3: Mapping[str, float]
-    volume_error: float
-    layer_mean_mm: float
-    layer_std_mm: float
-    layer_thickness_mm: Mapping[str, Mapping[str, float]]
-    interface_error_mm: Mapping[str, float]
-    regions: Mapping[str, Mapping[str, float]]
-    trimmed_bone: Mapping[str, TrimmedBone]
-    thinned_skin: ThinnedSkin | None
-    seconds: float
-    engine: str
-    warnings: tuple[str, ...] = field(default_factory=tuple)
-    repairs: tuple[Repair, ...] = field(default_factory=tuple)
-
-
 def measure_mesh(
     mesh: Mesh,
     fields: LimbFields,
-    trimmed: Mapping[str, TrimmedBone],
+    trimmed: Mapping[str, BoneLoss],
     enclosed_mm3: float,
     regions_mm3: Mapping[str, float],
-    seconds: float,
-    engine: str,
     near: tuple[Array, float] | None = None,
-) -> MeshReport:
-    """Measure a mesh in the limb frame; ``enclosed_mm3`` is the volume that it should have, ``regions_mm3``
-    that of each region inside the core.
+    **stated: Any,
+) -> MeshMeasures:
+    """Measure a mesh in the limb frame: what is stored of it.
 
-    ``near``: the place (3,) and radius (mm) within which elements have to be good.
+    The thickness of all layers together is measured from points all over their meshed inner face to the
+    meshed skin.
+
+    Parameters
+    ----------
+    enclosed_mm3, regions_mm3 : volume that the mesh, and each region inside its core, should have.
+    near : the place (3,) and radius (mm) within which elements have to be good.
+    stated : what the mesh does not tell: ``seconds``, ``engine``, ``element``, ``repairs``.
     """
     quality = measure_quality(mesh)
     volume_error = quality.volume_mm3 / enclosed_mm3 - 1.0
@@ -87,7 +57,7 @@ def measure_mesh(
         for i, name in enumerate(mesh.region_names[:layers])
     }
     error = np.abs(fields.layer(mesh.points[faces[-1]].mean(axis=1))[0])
-    return MeshReport(
+    return MeshMeasures(
         nodes=len(mesh.points),
         cells=len(mesh.cells),
         region_cells={name: int((mesh.regions == i).sum()) for i, name in enumerate(mesh.region_names)},
@@ -97,31 +67,30 @@ def measure_mesh(
         volume_mm3=quality.volume_mm3,
         region_volumes_mm3=quality.region_volumes_mm3,
         volume_error=volume_error,
-        layer_mean_mm=float(whole.mean()),
-        layer_std_mm=float(whole.std()),
+        layer_mean_mm=whole.mean(),
+        layer_std_mm=whole.std(),
         layer_thickness_mm=each,
-        interface_error_mm={"mean": float(error.mean()), "max": float(error.max())},
+        interface_error_mm=InterfaceError(mean=error.mean(), max=error.max()),
         regions=_measure_regions(mesh, fields, regions_mm3),
         trimmed_bone=trimmed,
         thinned_skin=fields.thinned,
-        seconds=seconds,
-        engine=engine,
         warnings=check_quality(mesh, quality, volume_error, near) + warn_of_lost_bone(mesh, fields, near),
+        **stated,
     )
 
 
 def _measure_regions(
     mesh: Mesh, fields: LimbFields, regions_mm3: Mapping[str, float]
-) -> dict[str, dict[str, float]]:
+) -> dict[str, RegionError]:
     found = {}
     for number, faces in enumerate(find_interfaces(mesh, len(fields.depths))):
         error = np.abs(build_region_level(fields, number)(mesh.points[faces[:, :3]].mean(axis=1))[0])
         name = mesh.region_names[len(fields.depths) + number]
-        found[name] = {
-            "enclosed_mm3": regions_mm3[name],
-            "mean_mm": float(error.mean()) if len(error) else 0.0,
-            "max_mm": float(error.max(initial=0.0)),
-        }
+        found[name] = RegionError(
+            enclosed_mm3=regions_mm3[name],
+            mean_mm=error.mean() if len(error) else 0.0,
+            max_mm=error.max(initial=0.0),
+        )
     return found
 
 
@@ -185,9 +154,8 @@ def _measure_thickness(mesh: Mesh, inner: Indices, outer: Indices) -> Array:
     return np.asarray(np.sqrt(squared))
 
 
-def _summarise(values: Array) -> dict[str, float]:
-    parts = {"mean": values.mean(), "std": values.std(), "min": values.min(), "max": values.max()}
-    return {name: float(value) for name, value in parts.items()}
+def _summarise(values: Array) -> ThicknessMeasures:
+    return ThicknessMeasures(mean=values.mean(), std=values.std(), min=values.min(), max=values.max())
 
 
 def _split_into_facets(faces: Indices) -> Indices:
@@ -197,9 +165,7 @@ def _split_into_facets(faces: Indices) -> Indices:
     return faces[:, [0, 3, 5, 3, 1, 4, 5, 4, 2, 3, 4, 5]].reshape(-1, 3)
 
 
-def compute_enclosed_volume(
-    anatomy: Anatomy, fields: LimbFields, trimmed: Mapping[str, TrimmedBone]
-) -> float:
+def compute_enclosed_volume(anatomy: Anatomy, fields: LimbFields, trimmed: Mapping[str, BoneLoss]) -> float:
     """Volume (mm3) below the cut that the skin encloses, less the bones as trimmed."""
     parts = [
         Surface(fields.frame.to_limb(part.points), part.faces)

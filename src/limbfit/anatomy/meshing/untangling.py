@@ -7,12 +7,12 @@ made thinner from below, where their columns cross; nodes moved off their surfac
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from ...arrays import Array, Indices, Mask
 from ...mesh import Mesh, node_jacobians
+from ..frame import format_place
 from .background import compute_volumes
 from .extrusion import Columns
 from .layers import LimbFields, evaluate_distance
@@ -26,25 +26,11 @@ THINNING_FACTOR = 0.5  # what a layer keeps of its thickness at first, and again
 _REGULAR = 6.0 * np.sqrt(2.0)  # cube of the edge over volume
 
 
-@dataclass(frozen=True)
-class Repair:
-    """What made inverted cells sound: how many, by what, where (LPS mm), moving nodes how far (mm)."""
+def repair_mesh(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Mesh, tuple[str, ...]]:
+    """A tet4 mesh in the limb frame with its inverted cells mended as far as they can be.
 
-    cells: int
-    what: str
-    place_mm: tuple[float, float, float]
-    moved_mm: float
-
-    @property
-    def text(self) -> str:
-        place = ", ".join(f"{x:.1f}" for x in self.place_mm)
-        return (
-            f"{self.cells} inverted cells at ({place}) mm mended: {self.what} by up to {self.moved_mm:.2f} mm"
-        )
-
-
-def repair_mesh(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Mesh, tuple[Repair, ...]]:
-    """A tet4 mesh in the limb frame with its inverted cells mended as far as they can be, and the repairs."""
+    Also what mended how many of them, where (LPS mm), moving nodes how far (mm), in words.
+    """
     normals, movable = find_constraints(mesh, fields, stack)
     on_plane = mesh.points[:, 2] == 0.0
     free = np.where(on_plane[:, None], [0.0, 0.0, 1.0], np.zeros((len(mesh.points), 3)))
@@ -67,9 +53,10 @@ def repair_mesh(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Mesh, t
         tried = attempt(points)
         left = compute_volumes(tried, mesh.cells) <= 0.0
         if left.sum() < bad.sum():
-            x, y, z = fields.frame.to_patient(points[mesh.cells[bad]].reshape(-1, 3).mean(axis=0)).tolist()
-            moved = float(np.linalg.norm(tried - points, axis=1).max())
-            repairs.append(Repair(int(bad.sum() - left.sum()), what, (x, y, z), moved))
+            where = format_place(fields.frame.to_patient(points[mesh.cells[bad]].reshape(-1, 3).mean(axis=0)))
+            moved = np.linalg.norm(tried - points, axis=1).max()
+            cells = bad.sum() - left.sum()
+            repairs.append(f"{cells} inverted cells at {where} mended: {what} by up to {moved:.2f} mm")
             points, bad = tried, left
     return mesh.with_points(points), tuple(repairs)
 
@@ -182,5 +169,4 @@ def _place(point: Array, fields: LimbFields) -> str:
     bones = {name: abs(evaluate_distance(bone, where)[0][0]) for name, bone in fields.bones.items()}
     near |= {f"the bone {name}": distance for name, distance in bones.items()}
     surface = min(near, key=lambda name: near[name])
-    place = ", ".join(f"{x:.1f}" for x in fields.frame.to_patient(point))
-    return f"at ({place}) mm, {near[surface]:.1f} mm from {surface}"
+    return f"at {format_place(fields.frame.to_patient(point))}, {near[surface]:.1f} mm from {surface}"

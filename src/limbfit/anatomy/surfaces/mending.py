@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, Indices
 from ...errors import SurfaceError
+from ..frame import format_place
 from .extraction import untangle_surface
 from .surfaces import Anatomy, check_anatomy
 from .triangles import (
@@ -89,7 +90,7 @@ def repair_surface(surface: Surface, name: str, file: Path | None = None) -> Rep
     small = [loop for loop in loops if _is_small(surface, loop)]
     large = [loop for loop in loops if not _is_small(surface, loop)]
     if len(large) > 1:
-        places = " and ".join(_place(surface.points[loop].mean(axis=0)) for loop in large[:3])
+        places = " and ".join(format_place(surface.points[loop].mean(axis=0)) for loop in large[:3])
         raise SurfaceError(
             f"{name}: {len(large)} open ends or large holes, at {places}",
             file=file,
@@ -97,7 +98,7 @@ def repair_surface(surface: Surface, name: str, file: Path | None = None) -> Rep
         )
     for loop in small:
         surface, area = _fill_hole(surface, loop)
-        where = _place(surface.points[loop].mean(axis=0))
+        where = format_place(surface.points[loop].mean(axis=0))
         notes += (f"{name}: a hole of {len(loop)} edges at {where} filled, {area:.1f} mm2",)
     surface, crossing = _smooth_crossings(surface, name)
     notes += crossing
@@ -107,7 +108,7 @@ def repair_surface(surface: Surface, name: str, file: Path | None = None) -> Rep
     surface, cap, area = _cap_open_end(surface, rim, name, file)
     note = (
         f"{name}: open at one end, cut flat {np.ptp(rim @ cap.normal) + INSIDE_MM:.1f} mm below its highest "
-        f"edge and closed by a cap at {_place(cap.outline.mean(axis=0))}, {area:.0f} mm2"
+        f"edge and closed by a cap at {format_place(cap.outline.mean(axis=0))}, {area:.0f} mm2"
     )
     return RepairReport(surface, cap, (*notes, note))
 
@@ -172,9 +173,8 @@ def _choose_closed_cut(
     if len(chosen) != 1 or chosen[0][1] @ up > 1.0 - 1e-6:
         return (skin.points[:, 2].max() * up, up), ()
     point, normal = chosen[0]
-    note = (
-        f"skin: the proximal cut is its flat end at {_place(point)}, as geometry.proximal_cut does not say it"
-    )
+    place = format_place(point)
+    note = f"skin: the proximal cut is its flat end at {place}, as geometry.proximal_cut does not say it"
     return (point, normal), (note,)
 
 
@@ -222,10 +222,6 @@ def count_turned(before: Surface, after: Surface) -> int:
     return int((np.einsum("ij,ij->i", before.face_normals, after.face_normals) < 0.0).sum())
 
 
-def _place(point: Array) -> str:
-    return "(" + ", ".join(f"{x:.1f}" for x in point) + ") mm"
-
-
 def _remove_loose_pieces(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
     """Leave out small open pieces beside the largest body; a small closed one may be meant and stays."""
     main, *others = find_bodies(surface)
@@ -236,7 +232,7 @@ def _remove_loose_pieces(surface: Surface, name: str) -> tuple[Surface, tuple[st
     kept = [main, *(part for part in others if not any(part is piece for piece in loose))]
     starts = np.cumsum([0, *(len(part.points) for part in kept)])
     faces = np.concatenate([part.faces + start for part, start in zip(kept, starts)])
-    count, where = sum(len(part.faces) for part in loose), _place(loose[0].points.mean(axis=0))
+    count, where = sum(len(part.faces) for part in loose), format_place(loose[0].points.mean(axis=0))
     note = f"{name}: {len(loose)} loose pieces of {count} triangles left out, the first at {where}"
     return Surface(np.concatenate([part.points for part in kept]), faces), (note,)
 
@@ -308,7 +304,7 @@ def _cap_open_end(surface: Surface, rim: Array, name: str, file: Path | None) ->
     flat = _triangulate_polygon(body.points[loops[0]][::-1], normal) if len(loops) == 1 else None
     if flat is None or Surface(body.points, loops[0][::-1][flat]).area > MAX_CAP_RATIO * _compute_area(rim):
         raise SurfaceError(
-            f"{name}: its open end at {_place(rim.mean(axis=0))} cannot be closed by a plane",
+            f"{name}: its open end at {format_place(rim.mean(axis=0))} cannot be closed by a plane",
             file=file,
             remedy="cut the end off straight, or close it",
         )
@@ -341,7 +337,7 @@ def _smooth_crossings(surface: Surface, name: str) -> tuple[Surface, tuple[str, 
             break
     else:
         return surface, ()
-    where = _place(surface.triangles[crossing[0, 0]].mean(axis=0))
+    where = format_place(surface.triangles[crossing[0, 0]].mean(axis=0))
     note = (
         f"{name}: {len(crossing)} pairs of crossing faces, the first at {where}, smoothed by {moved:.1f} mm"
     )

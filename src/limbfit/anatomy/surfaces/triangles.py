@@ -19,6 +19,7 @@ from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
 from ...arrays import Array, Indices
 from ...errors import SurfaceError
+from ..frame import format_place
 
 # Diagonals of the bounding box: a limb and a bone from a file are larger; in inches or centimetres they are
 # not. What is left of a bone after a virtual amputation may be small.
@@ -256,9 +257,9 @@ def check_closed(
         )
     crossing = surface.self_intersections
     if len(crossing):
-        place = ", ".join(f"{x:.1f}" for x in surface.triangles[crossing[0, 0]].mean(axis=0))
+        place = format_place(surface.triangles[crossing[0, 0]].mean(axis=0))
         raise SurfaceError(
-            f"{name}: the surface crosses itself ({len(crossing)} pairs of faces, the first at ({place}) mm)",
+            f"{name}: the surface crosses itself ({len(crossing)} pairs of faces, the first at {place})",
             file=file,
             remedy="remesh, smooth or repair it",
         )

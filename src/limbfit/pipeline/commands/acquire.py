@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from datetime import UTC, datetime
 from itertools import product
 from pathlib import Path
@@ -34,7 +34,7 @@ from ...acquire import (
 from ...acquire.virtual import Fault, Serving, Surrogate, VirtualFitSocket, VirtualLimb, fit_surrogate, serve
 from ...errors import InputError, TraceError
 from ...results.records import TracesResult
-from ...study import AcquireTable, Indentation, Record, Site, Study
+from ...study import Indentation, Record, Site, Study
 from ..engine.storage import read_curves, write_curves, write_json
 from ..engine.store import translate_disk_errors
 
@@ -209,11 +209,10 @@ def build_device_settings(
     own = {"ramp_speed_mm_s": one.speed_mm_s, "hold_s": one.hold_s} if isinstance(one, Record) else {}
     stated = {key: value for key, value in own.items() if value is not None}
     try:
-        table = AcquireTable(**(study.acquire.model_dump() | stated))
+        settings = Settings(**(study.acquire.model_dump() | stated))
     except ValidationError as error:
         what = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
         raise InputError(what, file=study.file, place=_place(one).removesuffix(".trace")) from None
-    settings = Settings(**table.model_dump())
     if depth_mm is None and isinstance(one, Record):
         depth_mm = one.depth_mm
     if depth_mm is None and unattended:
@@ -234,7 +233,7 @@ def build_device_settings(
             f"acquire.depth_limit_mm ({settings.depth_limit_mm:g})",
             place="--depth, or depth_mm",
         )
-    return replace(settings, search_depth_mm=depth_mm)
+    return settings.model_copy(update={"search_depth_mm": depth_mm})
 
 
 def _find_recorded_depth(study: Study, one: Indentation) -> float | None:
@@ -264,7 +263,7 @@ def _head(
         "unattended": unattended,
         "priority": prioritise(),
         "device": identity,
-        "settings": asdict(settings),
+        "settings": settings.model_dump(),
     }
 
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from ...anatomy.meshing.layers import LayerSpec
 from ...anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
-from ...anatomy.meshing.meshreport import MeshReport
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...anatomy.surfaces.thickness import read_thickness
 from ...arrays import Array
@@ -79,17 +78,15 @@ def make_mesh(job: MeshJob) -> MeshMeasures:
     """Mesh one site and store it; returns the facts that ``mesh.json`` holds."""
     shared = replace(job.settings, near_radius_mm=0.0)
     anatomy, base = _build_base(job.surfaces, job.surfaces_key, shared)
-    mesh, report = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.settings, base)
-    return keep_mesh(mesh, report, job.settings, job.file)
-
-
-def keep_mesh(mesh: Mesh, report: MeshReport, settings: MeshSettings, file: Path) -> MeshMeasures:
-    """Write a mesh, and beside it the facts that are returned."""
-    write_vtu(mesh, file)
-    repairs = [repair.text for repair in report.repairs]
-    facts = MeshMeasures(**asdict(report) | {"element": settings.element, "repairs": repairs})
-    write_result(file.with_suffix(".json"), facts)
+    mesh, facts = mesh_site(anatomy, np.array(job.position), np.array(job.axis), job.settings, base)
+    keep_mesh(mesh, facts, job.file)
     return facts
+
+
+def keep_mesh(mesh: Mesh, facts: MeshMeasures, file: Path) -> None:
+    """Write a mesh, and beside it the facts of it."""
+    write_vtu(mesh, file)
+    write_result(file.with_suffix(".json"), facts)
 
 
 def read_mesh_facts(file: Path) -> MeshMeasures:

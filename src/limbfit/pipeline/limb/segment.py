@@ -44,7 +44,7 @@ def run_segment(context: Context, folder: Path) -> dict[str, Any]:
     write_labels(folder / LABELS, labels)
     write_contours(folder / "contours.csv", labels)
     quality = assess_labels(labels)
-    write_result(folder / "quality.json", quality.summarise())
+    write_result(folder / "quality.json", quality)
     draw_sheet(folder / "quality.png", volume, labels, quality)
     context.tell("segment", 2, 3, "outlining the skin with markers")
     found = SegmentResult(

@@ -101,8 +101,8 @@ class SocketLimb:
             context.tell(name, 0, 0, "a mesh of the whole limb")
             fine = BELOW_BRIM_MM - float(self.outer.height(brim.points).max())
             settings = self._settings(mesh_edge_mm(self.study, brim))
-            mesh, report = mesh_limb(self.outer, settings, max(fine, 0.0), self.depth)
-            keep_mesh(mesh, report, settings, file)
+            mesh, facts = mesh_limb(self.outer, settings, max(fine, 0.0), self.depth)
+            keep_mesh(mesh, facts, file)
         return read_vtu(file), read_mesh_facts(file)
 
     def _settings(self, edge_mm: float) -> MeshSettings:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ...anatomy.grid import FAT, SOFT_TISSUE, LabelMap, Volume
 from ...anatomy.labels.contours import find_outlines
-from ...anatomy.labels.quality import LIMB, LabelQuality
+from ...anatomy.labels.quality import LIMB
+from ...results.limb import QualityResult
 
 Mask = NDArray[np.bool_]
 
@@ -25,9 +26,10 @@ _MAX_SUSPECTS = 6  # suspects drawn
 _MARGIN = 4  # voxels around the limb
 
 
-def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: LabelQuality) -> None:
+def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: QualityResult) -> None:
     """Write the picture (PNG): slices from end to end, below them the suspects of the measures."""
-    order = [*(n for n in range(3) if n != quality.axis), quality.axis]
+    axis = "ijk".index(quality.axis)
+    order = [*(n for n in range(3) if n != axis), axis]
     image, turned = volume.permute_axes(order), labels.permute_axes(order)
     window = _find_window(turned.limb)
     masks = {LIMB: turned.limb} | {
@@ -85,7 +87,7 @@ def _choose_slices(limb: Mask) -> list[int]:
     return [int(filled[n]) for n in np.unique(np.linspace(0, len(filled) - 1, count).round().astype(int))]
 
 
-def _choose_suspects(quality: LabelQuality) -> list[tuple[int, str]]:
+def _choose_suspects(quality: QualityResult) -> list[tuple[int, str]]:
     """Slices to look at with what is odd there, at most six, evenly taken from all."""
     texts: dict[int, list[str]] = {}
     for suspect in quality.suspects:
