@@ -25,6 +25,7 @@ import numpy as np
 from scipy.interpolate import interp1d
 
 from ..anatomy.surfaces.surfaces import Anatomy, save_anatomy
+from ..arrays import Array
 from ..errors import InputError
 from ..indentation import Parameters
 from .forces import (
@@ -223,37 +224,29 @@ def _write_traces(
 
 
 def _record_site(traces: Path, site: TrueSite, simulated: TrueForce, seed: int) -> dict[str, Any]:
-    random = np.random.default_rng([seed, 8, int(site.name)])
-    made = record(site.ramp, lambda t: np.interp(t, simulated.times, simulated.force), random)
+    def follow(values: Array) -> Callable[[Array], Array]:
+        return lambda t: np.interp(t, simulated.times, values)
+
+    def draw(purpose: int) -> np.random.Generator:
+        return np.random.default_rng([seed, purpose, int(site.name)])
+
+    made = record(site.ramp, follow(simulated.force), draw(8))
     made.write(traces / f"site-{site.name}.csv")
     if simulated.layers:
-        write_ultrasound(
-            traces / f"site-{site.name}-layers.csv",
-            made,
-            {
-                tissue: (thickness, lambda t, lost=lost: np.interp(t, simulated.times, lost))  # type: ignore[misc]
-                for tissue, (thickness, lost) in simulated.layers.items()
-            },
-            np.random.default_rng([seed, 11, int(site.name)]),
-        )
+        layers = {tissue: (rest, follow(lost)) for tissue, (rest, lost) in simulated.layers.items()}
+        write_ultrasound(traces / f"site-{site.name}-layers.csv", made, layers, draw(11))
     if len(simulated.skin_points):
+        moves = interp1d(simulated.times, simulated.skin_moves)
         write_surface(
             traces / f"site-{site.name}-surface.csv",
             made,
             simulated.skin_points,
-            lambda t: interp1d(simulated.times, simulated.skin_moves)(np.minimum(t, simulated.times[-1])),
-            np.random.default_rng([seed, 12, int(site.name)]),
+            lambda t: moves(np.minimum(t, simulated.times[-1])),
+            draw(12),
         )
     if simulated.speeds:
-        write_waves(
-            traces / f"site-{site.name}-waves.csv",
-            made,
-            {
-                tissue: lambda t, speed=speed: np.interp(t, simulated.times, speed)  # type: ignore[misc]
-                for tissue, speed in simulated.speeds.items()
-            },
-            np.random.default_rng([seed, 13, int(site.name)]),
-        )
+        speeds = {tissue: follow(speed) for tissue, speed in simulated.speeds.items()}
+        write_waves(traces / f"site-{site.name}-waves.csv", made, speeds, draw(13))
     return {
         **_site_to_dict(site),
         "depth_mm": site.depth,

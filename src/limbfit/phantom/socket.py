@@ -95,7 +95,7 @@ def write_socket(folder: Path, limb: Limb, anatomy: Anatomy) -> dict[str, Any]:
         "areas": [
             {
                 "name": a.name,
-                "position_mm": list(a.position),
+                "position_mm": a.position.tolist(),
                 "radius_mm": a.radius_mm,
                 "depth_mm": a.depth_mm,
             }

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar, Self
 
-import igl
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -18,20 +18,15 @@ MAX_OFF_FACE_MM = 25.0  # the thickest liner between skin and socket, and some
 MAX_BESIDE_MM = 5.0  # a place so far beside the face is not on it
 
 
-def compute_area_weight(apart: Array, reach: float) -> Array:
-    """``(1 - r^2/R^2)^3`` of distances r (n,) within a reach R, 0 beyond: no kink in slope or curvature."""
-    return np.asarray(np.maximum(1.0 - (apart / reach) ** 2, 0.0) ** 3)
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Area:
     """A round area of the face that presses in (positive depth) or gives relief.
 
     Attributes
     ----------
-    position : (3,) its middle, LPS mm, on the limb or near it.
-    radius_mm : where its depth has faded to nothing.
-    depth_mm : at its middle, along the limb's normal.
+    points : its middle (3,), LPS mm, on the limb or near it; kept as (1, 3).
+    radius_mm : how far from there its depth has faded to nothing.
+    depth_mm : there, along the limb's normal.
 
     Raises
     ------
@@ -39,64 +34,27 @@ class Area:
         Where its sides would be steeper than 45 degrees.
     """
 
+    kind: ClassVar[str] = "area"
+    width: ClassVar[str] = "a radius"
+
     name: str
-    position: Array
+    points: Array
     radius_mm: float
     depth_mm: float
 
     def __post_init__(self) -> None:
-        _check_sides(f"area {self.name!r}", "a radius", self.depth_mm, self.radius_mm)
-
-    def depth(self, points: Array) -> Array:
-        """(n,) mm at points (n, 3)."""
-        apart = np.linalg.norm(points - np.asarray(self.position, dtype=float), axis=1)
-        return self.depth_mm * compute_area_weight(apart, self.radius_mm)
-
-    def project_to(self, face: Surface) -> Area:
-        """Put its middle on the drawn face (LPS), which a liner keeps off the skin.
-
-        Raises
-        ------
-        SurfaceError
-            Where the area lies off the face.
-        """
-        position = np.asarray(self.position, dtype=float)
-        foot, beside, off = _project_to_face(position[None], face)
-        if beside[0] > max(MAX_BESIDE_MM, 0.25 * self.radius_mm) or off[0] > MAX_OFF_FACE_MM:
+        object.__setattr__(self, "points", np.atleast_2d(np.asarray(self.points, dtype=float)))
+        least = MAX_SIDE_SLOPE * abs(self.depth_mm)
+        if least > self.radius_mm:
             raise SurfaceError(
-                f"area {self.name!r} lies {np.linalg.norm(position - foot[0]):.0f} mm off the socket's face",
-                remedy="give a position on the limb below the brim (LPS, mm), or move the trimline up",
+                f"the sides of {self.kind} {self.name!r} would be steeper than 45 degrees",
+                remedy=f"give {self.width} of {least:.1f} mm or more, or less depth",
             )
-        return replace(self, position=foot[0])
 
-    def compute_relative_distance(self, point: Array) -> float:
-        """Distance of a point (3,) from its middle over its radius."""
-        return float(np.linalg.norm(point - np.asarray(self.position)) / self.radius_mm)
-
-
-@dataclass(frozen=True, eq=False)
-class Zone:
-    """A whole region of the limb that presses in (positive depth) or gives relief.
-
-    Attributes
-    ----------
-    points : (n, 3) that cover the region, LPS mm, on the limb or near it.
-    reach_mm : how far beyond them its depth has faded to nothing.
-    depth_mm : on them, along the limb's normal.
-
-    Raises
-    ------
-    SurfaceError
-        Where its sides would be steeper than 45 degrees.
-    """
-
-    name: str
-    points: Array
-    reach_mm: float
-    depth_mm: float
-
-    def __post_init__(self) -> None:
-        _check_sides(f"region {self.name!r}", "a reach", self.depth_mm, self.reach_mm)
+    @property
+    def position(self) -> Array:
+        """(3,) the middle, LPS mm."""
+        return self.points.mean(axis=0)
 
     @cached_property
     def _tree(self) -> KDTree:
@@ -107,43 +65,44 @@ class Zone:
         return self.depth_mm * self.share(points)
 
     def share(self, points: Array) -> Array:
-        """(n,) of its depth at points (n, 3): 1 on the region, 0 beyond its reach."""
-        return compute_area_weight(self._tree.query(points)[0], self.reach_mm)
+        """(n,) of its depth at points (n, 3), which fades without a kink in slope or curvature."""
+        apart = self._tree.query(points)[0] / self.radius_mm
+        return np.asarray(np.maximum(1.0 - apart**2, 0.0) ** 3)
 
-    def project_to(self, face: Surface) -> Zone:
-        """Put its points on the drawn face (LPS); leave out those beyond the brim.
+    def project_to(self, face: Surface) -> Self:
+        """Put its points on the drawn face (LPS), which a liner keeps off the skin; leave out those off it.
 
         Raises
         ------
         SurfaceError
-            Where the whole region lies off the face.
+            Where all of it lies off the face.
         """
-        feet, beside, off = _project_to_face(self.points, face)
-        under = (beside <= MAX_BESIDE_MM) & (off <= MAX_OFF_FACE_MM)
+        _, near, feet = face.find_nearest(self.points)
+        apart, normals = self.points - feet, face.face_normals[near]
+        off = np.einsum("ij,ij->i", apart, normals)
+        beside = np.linalg.norm(apart - off[:, None] * normals, axis=1)
+        under = (beside <= self.max_beside_mm) & (np.abs(off) <= MAX_OFF_FACE_MM)
         if not under.any():
+            least = np.linalg.norm(apart, axis=1).min()
             raise SurfaceError(
-                f"region {self.name!r} lies off the socket's face",
-                remedy="name a region below the brim, or move the trimline up",
+                f"{self.kind} {self.name!r} lies {least:.0f} mm off the socket's face",
+                remedy="choose a place on the limb below the brim (LPS, mm), or move the trimline up",
             )
         return replace(self, points=feet[under])
 
+    @property
+    def max_beside_mm(self) -> float:
+        """How far beside the face a point may lie."""
+        return max(MAX_BESIDE_MM, 0.25 * self.radius_mm)
+
     def compute_relative_distance(self, point: Array) -> float:
-        """Distance of a point (3,) from the region over its reach."""
-        return float(self._tree.query(point)[0] / self.reach_mm)
+        """Distance of a point (3,) from it over its radius."""
+        return float(self._tree.query(point)[0] / self.radius_mm)
 
 
-def _check_sides(name: str, width: str, depth_mm: float, reach_mm: float) -> None:
-    least = MAX_SIDE_SLOPE * abs(depth_mm)
-    if least > reach_mm:
-        raise SurfaceError(
-            f"the sides of {name} would be steeper than 45 degrees",
-            remedy=f"give {width} of {least:.1f} mm or more, or less depth",
-        )
+class Zone(Area):
+    """A whole region of the limb: ``points`` (n, 3) cover it, and its radius is the reach beyond them."""
 
-
-def _project_to_face(points: Array, face: Surface) -> tuple[Array, Array, Array]:
-    """Nearest points (n, 3) of a face, and how far (n,) points lie beside it and off it, mm."""
-    _, near, feet = igl.point_mesh_squared_distance(points, face.points, face.faces)
-    normals, apart = face.face_normals[near], points - feet
-    off = np.einsum("ij,ij->i", apart, normals)
-    return feet, np.linalg.norm(apart - off[:, None] * normals, axis=1), np.abs(off)
+    kind = "region"
+    width = "a reach"
+    max_beside_mm = MAX_BESIDE_MM

@@ -17,7 +17,7 @@ from ..anatomy.frame import Frame, format_place
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError
-from .areas import Area, Zone
+from .areas import Area
 from .clearance import apply_clearance
 from .rays import FOLD_MM, LimbProfile, Offsets, compute_profile
 from .shape import Socket
@@ -52,7 +52,7 @@ class Recipe:
 
     trim: Trim
     reduction_percent: float = 3.0
-    areas: Sequence[Area | Zone] = ()
+    areas: Sequence[Area] = ()
     flare_mm: float = 6.0
     distal: Literal["clearance", "bearing"] = "clearance"
     distal_clearance_mm: float = 5.0

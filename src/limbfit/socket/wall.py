@@ -9,6 +9,7 @@ import manifold3d
 import numpy as np
 from numpy.typing import NDArray
 
+from ..anatomy.frame import build_limb_frame
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError
@@ -58,7 +59,7 @@ def build_wall(
     axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     block = _build_adapter(socket, axis, adapter_diameter_mm, max(adapter_mm, thickness_mm))
     cavity = _to_manifold(socket.closed, "cavity")
-    return _to_surface((shell + (_to_manifold(block, "adapter") - cavity)).set_tolerance(SLIVER_MM))
+    return _to_surface((shell + (block - cavity)).set_tolerance(SLIVER_MM))
 
 
 def measure_thickness(body: Surface, socket: Socket) -> Array:
@@ -110,7 +111,7 @@ def _build_sides(socket: Socket, outer: Array, outwards: Array, thickness: float
     return Surface(np.vstack([socket.points, outer, *added]), faces)
 
 
-def _build_adapter(socket: Socket, axis: Array, diameter: float, below: float) -> Surface:
+def _build_adapter(socket: Socket, axis: Array, diameter: float, below: float) -> manifold3d.Manifold:
     """Build the adapter's cylinder under the middle of the distal end, up into the wall around it."""
     height = socket.points @ axis
     bottom, length = float(height.min()), float(np.ptp(height))
@@ -127,22 +128,10 @@ def _build_adapter(socket: Socket, axis: Array, diameter: float, below: float) -
         )
     # At no point's own height, where faces would lie in each other.
     top = float(height[low & (across < diameter / 2)].max()) + 0.1 * below
-    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    first /= np.linalg.norm(first)
-    second = np.cross(axis, first)
-    angle = 2 * np.pi * np.arange(ADAPTER_EDGES) / ADAPTER_EDGES
-    ring = diameter / 2 * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
-    foot, head = lowest - below * axis, lowest + (top - bottom) * axis
-    points = np.vstack([foot + ring, head + ring, foot, head])
-    here, there = np.arange(ADAPTER_EDGES), np.roll(np.arange(ADAPTER_EDGES), -1)
-    base, lid = np.full(ADAPTER_EDGES, 2 * ADAPTER_EDGES), np.full(ADAPTER_EDGES, 2 * ADAPTER_EDGES + 1)
-    corners = (
-        (here, there, there + ADAPTER_EDGES),
-        (here, there + ADAPTER_EDGES, here + ADAPTER_EDGES),
-        (there, here, base),
-        (here + ADAPTER_EDGES, there + ADAPTER_EDGES, lid),
-    )
-    return Surface(points, np.vstack([np.column_stack(columns) for columns in corners]))
+    foot, length = lowest - below * axis, below + top - bottom
+    along = build_limb_frame(foot, axis).rotation.T  # columns: two directions across, and the axis
+    cylinder = manifold3d.Manifold.cylinder(length, diameter / 2, circular_segments=ADAPTER_EDGES)
+    return cylinder.transform(np.column_stack([along, foot]))
 
 
 def _to_manifold(surface: Surface, name: str) -> manifold3d.Manifold:
