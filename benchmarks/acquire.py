@@ -94,7 +94,7 @@ def _held(address: str, minutes: float, site: str) -> dict[str, Any]:
         "ended": ending.reason,
         "seconds": round(seconds, 1),
         "samples": len(late),
-        "lost": session.counts.lost,
+        "lost": session.lost,
         "late_2ms_percent": round(100 * float((late > 2).mean()), 4),
         "late_10ms_percent": round(100 * float((late > 10).mean()), 4),
         "late_20ms": int((late > 20).sum()),

@@ -1,7 +1,7 @@
 """The public names and where they live: `__init__.py` finds them by this file, type checkers their types."""
 
 from ._version import __version__ as __version__
-from .anatomy.imaging import describe_series as describe_series
+from .anatomy.images.dicom import describe_series as describe_series
 from .anatomy.images.formats import register_image_format as register_image_format
 from .bench.meshing import bench_meshing as bench_meshing
 from .bench.parity import bench_febio_parity as bench_febio_parity

@@ -130,7 +130,7 @@ def test_a_short_disturbance_is_outlived(ms: int) -> None:
     bench = Bench(faults=(fault,))
     bench.until()
     assert bench.phase is Phase.DONE
-    assert bench.session.counts.lost == pytest.approx(ms / 2, abs=1)
+    assert bench.session.lost == pytest.approx(ms / 2, abs=1)
 
 
 def test_a_pin_that_stays_stuck_is_reported() -> None:

@@ -7,7 +7,8 @@ import pytest
 from limbs import CALF, DIRECTIONS, IDENTITY, volume, write_dicom
 from pydicom.uid import generate_uid
 
-from limbfit.anatomy.imaging import list_series, read_volume
+from limbfit.anatomy.images.dicom import list_series
+from limbfit.anatomy.imaging import read_volume
 from limbfit.errors import ImageError
 
 

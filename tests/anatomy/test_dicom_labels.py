@@ -9,7 +9,8 @@ from damaging import write_rtstruct, write_seg
 from limbs import DIRECTIONS, volume, write_dicom
 from test_labels import labels_on
 
-from limbfit.anatomy.imaging import SOFT_TISSUE, LabelMap, read_labels
+from limbfit.anatomy.grid import SOFT_TISSUE
+from limbfit.anatomy.imaging import LabelMap, read_labels
 from limbfit.anatomy.labels.contours import fill_even_odd
 from limbfit.errors import LabelError
 

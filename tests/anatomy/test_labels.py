@@ -8,7 +8,8 @@ import pytest
 import slicerio
 from limbs import DIRECTIONS, volume
 
-from limbfit.anatomy.imaging import SOFT_TISSUE, LabelMap, read_labels, write_labels, write_volume
+from limbfit.anatomy.grid import SOFT_TISSUE
+from limbfit.anatomy.imaging import LabelMap, read_labels, write_labels, write_volume
 from limbfit.errors import LabelError
 
 NAMES = {1: SOFT_TISSUE, 2: "tibia", 3: "fibula", 9: "bone-1"}

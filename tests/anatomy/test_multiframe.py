@@ -12,7 +12,8 @@ from limbs import DIRECTIONS, IDENTITY, volume, write_dicom
 from pydicom.dataset import Dataset
 from pydicom.uid import EnhancedCTImageStorage
 
-from limbfit.anatomy.imaging import describe_series, read_volume
+from limbfit.anatomy.images.dicom import describe_series
+from limbfit.anatomy.imaging import read_volume
 from limbfit.cli import main
 from limbfit.errors import ImageError
 

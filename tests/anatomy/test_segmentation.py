@@ -7,7 +7,8 @@ import pytest
 from limbs import CALF, DIRECTIONS, leg_image
 from scipy.ndimage import label
 
-from limbfit.anatomy.imaging import BONES, LabelMap, Volume, read_volume
+from limbfit.anatomy.grid import BONES
+from limbfit.anatomy.imaging import LabelMap, Volume, read_volume
 from limbfit.anatomy.segmentation.body import estimate_bias_field, find_limb_mask, smooth_image
 from limbfit.anatomy.segmentation.bones import compute_escape_level, find_bones, name_bones
 from limbfit.anatomy.segmentation.segmentation import segment

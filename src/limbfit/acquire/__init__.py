@@ -14,12 +14,11 @@ from .events import Event, Settings
 from .operator import Keyboard, NoOperator
 from .quality import RecordedRamp, Verdict, check_record, find_ramps
 from .recording import Recorder, Recording, follow_recording, read_recording
-from .session import Ending, Listener, LiveUpdate, PhaseUpdate, Session, Update, prioritise, run_session
+from .session import Listener, LiveUpdate, PhaseUpdate, Session, Update, prioritise, run_session
 
 __all__ = [
     "DEFAULT_ADDRESS",
     "DEFAULT_PORT",
-    "Ending",
     "Event",
     "Keyboard",
     "LineDevice",

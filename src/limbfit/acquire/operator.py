@@ -11,11 +11,12 @@ from .session import PhaseUpdate, Update
 FIRST_REPEAT_S = 0.75  # a keyboard waits before a held key repeats
 
 
-class DeadMansKey:
-    """A terminal tells of no release: a key that is held repeats, one that is released does not.
+class Keyboard:
+    """Characters of a terminal to events: Enter confirms, the space bar is the key, anything else stops.
 
-    The key counts as held from its second character on, so that a touch moves nothing, and as released once
-    ``gap_s`` has passed without another.
+    A terminal tells of no release: a key that is held repeats, one that is released does not. The key counts
+    as held from its second character on, so that a touch moves nothing, and as released once ``gap_s`` has
+    passed without another.
     """
 
     def __init__(self, gap_s: float) -> None:
@@ -23,44 +24,26 @@ class DeadMansKey:
         self.is_held = False
         self._last: float | None = None
 
-    def press(self, now: float) -> Event | None:
-        before, self._last = self._last, now
-        if not self.is_held and before is not None and now - before <= FIRST_REPEAT_S:
-            self.is_held = True
-            return KeyDown()
-        return None
-
-    def check_release(self, now: float) -> Event | None:
-        """The release of the key, reported once; ask often."""
-        if self._last is None:
-            return None
-        if self.is_held and now - self._last > self.gap_s:
-            self.is_held, self._last = False, None
-            return KeyUp()
-        return None
-
-
-class Keyboard:
-    """Characters of a terminal to events: Enter confirms, the space bar is the key, anything else stops."""
-
-    def __init__(self, gap_s: float) -> None:
-        self.key = DeadMansKey(gap_s)
-
     def read(self, characters: bytes, now: float) -> list[Event]:
         found: list[Event] = []
         for one in characters:
             if one in b"\r\n":
                 found.append(Confirm())
             elif one == 0x20:
-                if event := self.key.press(now):
-                    found.append(event)
+                before, self._last = self._last, now
+                if not self.is_held and before is not None and now - before <= FIRST_REPEAT_S:
+                    self.is_held = True
+                    found.append(KeyDown())
             else:
                 found.append(Abort("the operator stopped it by a key"))
         return found
 
     def check_release(self, now: float) -> list[Event]:
-        event = self.key.check_release(now)
-        return [event] if event else []
+        """The release of the key, reported once; ask often."""
+        if self._last is None or not self.is_held or now - self._last <= self.gap_s:
+            return []
+        self.is_held, self._last = False, None
+        return [KeyUp()]
 
 
 class NoOperator:

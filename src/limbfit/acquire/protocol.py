@@ -160,6 +160,10 @@ class Protocol:
     def is_over(self) -> bool:
         return self.phase in FINAL
 
+    @property
+    def is_completed(self) -> bool:
+        return self.phase is Phase.DONE
+
     def handle(self, event: Event, now: float) -> tuple[Action, ...]:
         """Return the actions that an event leads to.
 

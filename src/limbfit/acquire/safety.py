@@ -7,7 +7,7 @@ moved in the clamps, that a sensor does not answer to a push, that a step takes 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from .events import PINS, Flags, Sample, Settings, to_thousandths
 
@@ -72,10 +72,7 @@ class Guard:
         """From now on a pin may not go beyond a position."""
         position = list(self.limits.position_um)
         position[pin - 1] = min(position_um, position[pin - 1])
-        old = self.limits
-        self.limits = SafetyLimits(
-            old.force_mN, tuple(position), old.speed_um_s, old.range_mN, old.max_unchanged_samples
-        )
+        self.limits = replace(self.limits, position_um=tuple(position))
 
     def check(self, sample: Sample) -> Violation | None:
         """Return the first limit that the sample passes, if any."""

@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -101,34 +101,14 @@ Update = PhaseUpdate | LiveUpdate
 Listener = Callable[[Update], None]
 
 
-@dataclass(frozen=True)
-class Ending:
-    """How a session ended."""
-
-    phase: Phase
-    reason: str
-    touch_um: int
-    start_um: int
-    depth_um: int
-    samples: int
-    unreachable: tuple[int, ...]
-
-    @property
-    def completed(self) -> bool:
-        return self.phase is Phase.DONE
-
-
-@dataclass
-class Counts:
-    """What is counted while a session runs."""
-
-    samples: int = 0
-    lost: int = 0
-    declined: dict[str, int] = field(default_factory=dict)
-
-
 class Session:
-    """A protocol bound to a device, a record and a listener; times are s of a clock that never goes back."""
+    """A protocol bound to a device, a record and a listener; times are s of a clock that never goes back.
+
+    Attributes
+    ----------
+    samples, lost : how many came, and how many never did.
+    unreachable : pins that did not come home.
+    """
 
     def __init__(
         self,
@@ -141,7 +121,7 @@ class Session:
     ) -> None:
         self.settings, self.device, self.recorder, self.listener = settings, device, recorder, listener
         self.protocol = Protocol(settings, device.identity)
-        self.counts = Counts()
+        self.samples = self.lost = 0
         self.unreachable: tuple[int, ...] = ()
         self._paced = device.identity.clock == "paced"
         self._site = site
@@ -175,7 +155,6 @@ class Session:
                     newest = report
                     self._handle_sample(report, now)
                 case Declined(code=code):
-                    self.counts.declined[code] = self.counts.declined.get(code, 0) + 1
                     self._record("declined", now, code=code)
                     if not self.protocol.is_over and self.protocol.phase is not Phase.STOPPING:
                         self.handle(Abort(f"the device declined a command: {code}{_explain_code(code)}"), now)
@@ -215,28 +194,21 @@ class Session:
         """End the session because the wire is gone."""
         self.handle(LinkLost(reason), now)
 
-    def build_ending(self) -> Ending:
-        p = self.protocol
-        return Ending(
-            p.phase, p.reason, p.touch_um, p.start_um, p.depth_um, self.counts.samples, self.unreachable
-        )
-
     # -- out
 
     def _handle_sample(self, sample: Sample, now: float) -> None:
         if self.recorder is not None:
             self.recorder.sample(sample, round(now * 1e6))
-        counts = self.counts
-        counts.samples += 1
+        self.samples += 1
         if self._last_sample is not None:
-            counts.lost += max((sample.time_us - self._last_sample.time_us) // PERIOD_US - 1, 0)
+            self.lost += max((sample.time_us - self._last_sample.time_us) // PERIOD_US - 1, 0)
         self._last_sample = sample
         lead = now - sample.time_us / 1e6
         self._smallest_lead_s = min(self._smallest_lead_s + CLOCK_DRIFT_S, lead)
         if (lead - self._smallest_lead_s) * 1000 <= self.settings.watchdog_ms:
             self._last_fresh_s = now
         self.handle(sample, now)
-        if self.listener is not None and counts.samples % SAMPLES_PER_LIVE_UPDATE == 0:
+        if self.listener is not None and self.samples % SAMPLES_PER_LIVE_UPDATE == 0:
             self.listener(self._make_live_update(sample, now))
 
     def _make_live_update(self, sample: Sample, now: float) -> LiveUpdate:
@@ -303,8 +275,8 @@ def prioritise() -> str:
     return "real-time"
 
 
-def run_session(session: Session, operator: SimpleQueue[Event]) -> Ending:
-    """Run a session to its end in this thread.
+def run_session(session: Session, operator: SimpleQueue[Event]) -> Protocol:
+    """Run a session to its end in this thread; returns its protocol, which says how it ended.
 
     Parameters
     ----------
@@ -327,7 +299,7 @@ def run_session(session: Session, operator: SimpleQueue[Event]) -> Ending:
         with suppress(RunError):
             session.device.send(Bye(), 0.0)
         session.device.close()
-    return session.build_ending()
+    return session.protocol
 
 
 def _run_loop(session: Session, operator: SimpleQueue[Event]) -> None:

@@ -13,11 +13,11 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 
 from ..errors import ImageError, LabelError, add_location
-from .grid import BONES, DEFAULT_NAMES, SOFT_TISSUE, LabelMap, Volume
-from .images.dicom import Series, describe_series, list_series, read_series
+from .grid import LabelMap, Volume
+from .images.dicom import read_series
 from .images.formats import describe_forms, format_of, read_image
 from .labels.dicom_labels import find_dicom_labels, read_dicom_labels
-from .labels.labelcheck import clean_labels, place_on_grid
+from .labels.labelcheck import place_on_grid
 from .labels.labelfiles import (
     is_seg_nrrd,
     read_label_image,
@@ -25,23 +25,6 @@ from .labels.labelfiles import (
     write_seg_nrrd,
     write_sidecar,
 )
-
-__all__ = [
-    "BONES",
-    "DEFAULT_NAMES",
-    "SOFT_TISSUE",
-    "LabelMap",
-    "Series",
-    "Volume",
-    "check_image",
-    "clean_labels",
-    "describe_series",
-    "list_series",
-    "read_labels",
-    "read_volume",
-    "write_labels",
-    "write_volume",
-]
 
 _SMALLEST_MM, _LARGEST_MM = 60.0, 3000.0  # of the longest side of an image
 

@@ -186,20 +186,17 @@ class VirtualFitSocket:
                 return "" if self.limb.place_site(site, self._test_pin) else "unknown-site"
             case NotePhase(name=phase):
                 self.faults.enter(phase)
-                return ""
             case Stop():
                 self._stop("asked")
-                return ""
-        if not self.is_armed:
-            return "not-armed"
-        if isinstance(command, Hold):
-            self.motors.halt(command.pin - 1)
-            return ""
-        if isinstance(command, Fence):
-            self._guard.set_depth(command.pin, command.position_um)
-            return ""
-        assert isinstance(command, Move)
-        return self._move(command)
+            case _ if not self.is_armed:
+                return "not-armed"
+            case Hold(pin=pin):
+                self.motors.halt(pin - 1)
+            case Fence(pin=pin, position_um=position):
+                self._guard.set_depth(pin, position)
+            case Move():
+                return self._move(command)
+        return ""
 
     _test_pin = 1
 

@@ -9,7 +9,6 @@ memory, makes voxels that are not numbers zero, and takes one of the qform and t
 from __future__ import annotations
 
 import gzip
-import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,9 +26,13 @@ from ..grid import check_voxel_count
 from .dicom import mute_libraries
 
 Read = Callable[[Path], sitk.Image]
-_HEADER = 348  # bytes
+# What is read of the header of NIfTI-1: names, types and offsets in bytes.
+_NAMES = ("length", "dim", "datatype", "bitpix", "pixdim", "vox_offset", "units", "codes", "qform", "sform")
+_TYPES = ("i4", "8i2", "i2", "i2", "8f4", "f4", "u1", "2i2", "6f4", "12f4")
+_OFFSETS = (0, 40, 70, 72, 76, 108, 123, 252, 256, 280)
+_HEADER = np.dtype({"names": _NAMES, "formats": _TYPES, "offsets": _OFFSETS, "itemsize": 348})
 _CHUNK = 1 << 22
-_FLOATS = {16: "f4", 64: "f8"}  # codes of datatype
+_FLOATS: dict[int, np.dtype[np.floating]] = {16: np.dtype("f4"), 64: np.dtype("f8")}  # codes of datatype
 _SAME_VOXELS = 0.5  # within which two statements of a voxel's place are one
 _UNITS_MM = {1: 1000.0, 2: 1.0, 3: 1e-3}  # by the code of the unit of length
 
@@ -167,10 +170,12 @@ def check_nifti(path: Path) -> None:
     statements of its place differ in left and right."""
     try:
         with _open(path) as stream:
-            header = stream.read(_HEADER)
+            header = _read_header(stream)
             length, bad = _count_bytes_and_nans(stream, header)
-        whole = length >= _compute_length(header)
-    except (OSError, EOFError, zlib.error, struct.error, ValueError, OverflowError):
+        dim = header["dim"].astype(float)
+        count = np.prod(dim[1 : 1 + max(int(dim[0]), 0)])
+        whole = length >= header["vox_offset"] + count * header["bitpix"] / 8
+    except (OSError, EOFError, zlib.error, ValueError, OverflowError):
         whole, bad = False, 0
     if not whole:
         raise ImageError("the image is cut short or damaged", file=path, remedy="copy or export it again")
@@ -219,60 +224,43 @@ def describe_forms(path: Path, affine: Array) -> tuple[str, ...]:
 def _read_forms(path: Path) -> _HeaderForms | None:
     """The qform and the sform of a file; None where it does not state both."""
     with _open(path) as stream:
-        header = stream.read(_HEADER)
-    if len(header) < _HEADER:
-        return None
-    parts = (
-        (40, "8h"),
-        (76, "8f"),
-        (123, "B"),
-        (252, "2h"),
-        (256, "6f"),
-        (280, "12f"),
-    )  # offset in bytes, type
-    dim, pixdim, (unit,), codes, place, rows = (
-        np.array(struct.unpack_from(_order(header) + kind, header, offset), dtype=np.float64)
-        for offset, kind in parts
-    )
-    if not codes.all() or not np.isfinite(np.concatenate([pixdim, place, rows])).all():
+        header = _read_header(stream)
+    pixdim, place, rows = (header[name].astype(float) for name in ("pixdim", "qform", "sform"))
+    if not header["codes"].all() or not np.isfinite(np.concatenate([pixdim, place, rows])).all():
         return None
     b, c, d = place[:3]
     turn = Rotation.from_quat([b, c, d, np.sqrt(max(0.0, 1.0 - b * b - c * c - d * d))]).as_matrix()
     qform, sform = np.eye(4), np.vstack([rows.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
     qform[:3, :3] = turn * pixdim[1:4] * [1.0, 1.0, -1.0 if pixdim[0] < 0.0 else 1.0]
     qform[:3, 3] = place[3:]
-    scale = np.diag([*[_UNITS_MM.get(int(unit) & 7, 1.0)] * 3, 1.0])
-    return _HeaderForms(scale @ qform, scale @ sform, dim[1:4])
+    scale = np.diag([*[_UNITS_MM.get(int(header["units"]) & 7, 1.0)] * 3, 1.0])
+    return _HeaderForms(scale @ qform, scale @ sform, header["dim"][1:4].astype(float))
 
 
 def _open(path: Path) -> IO[bytes] | gzip.GzipFile:
     return gzip.open(path) if path.name.lower().endswith(".gz") else path.open("rb")
 
 
-def _count_bytes_and_nans(stream: IO[bytes] | gzip.GzipFile, header: bytes) -> tuple[int, int]:
+def _read_header(stream: IO[bytes] | gzip.GzipFile) -> np.void:
+    """The header of a NIfTI-1 file, in either order of bytes; `ValueError` for anything else."""
+    data = stream.read(_HEADER.itemsize)
+    for kind in (_HEADER, _HEADER.newbyteorder()):
+        header = np.frombuffer(data, kind, count=1)[0]
+        if header["length"] == _HEADER.itemsize:
+            return header
+    raise ValueError("NIfTI-2, or not NIfTI at all")
+
+
+def _count_bytes_and_nans(stream: IO[bytes] | gzip.GzipFile, header: np.void) -> tuple[int, int]:
     """Length of the file in bytes, and how many of its voxels are not numbers."""
-    length, bad = len(header), 0
-    kind = _FLOATS.get(struct.unpack(f"{_order(header)}h", header[70:72])[0])
-    first = max(int(struct.unpack(f"{_order(header)}f", header[108:112])[0]), _HEADER)
-    length += len(stream.read(first - length))
+    length, bad = _HEADER.itemsize, 0
+    kind = _FLOATS.get(int(header["datatype"]))
+    length += len(stream.read(max(int(header["vox_offset"]), length) - length))
     while chunk := stream.read(_CHUNK):
         length += len(chunk)
         if kind is not None:
-            whole = len(chunk) - len(chunk) % int(kind[1])
-            bad += int((~np.isfinite(np.frombuffer(chunk[:whole], _order(header) + kind))).sum())
+            values = np.frombuffer(chunk[: len(chunk) - len(chunk) % kind.itemsize], kind)
+            if not header["length"].dtype.isnative:
+                values = values.byteswap()
+            bad += int((~np.isfinite(values)).sum())
     return length, bad
-
-
-def _order(header: bytes) -> str:
-    return "<" if header[:4] == struct.pack("<i", _HEADER) else ">"
-
-
-def _compute_length(header: bytes) -> float:
-    """Bytes that a NIfTI-1 file of this header holds (dim at 40, bitpix at 72, vox_offset at 108)."""
-    order = _order(header)
-    if struct.unpack(f"{order}i", header[:4])[0] != _HEADER:
-        return 0.0  # NIfTI-2 or not NIfTI at all: for ITK to say
-    dim = struct.unpack(f"{order}8h", header[40:56])
-    bits = struct.unpack(f"{order}h", header[72:74])[0]
-    offset = struct.unpack(f"{order}f", header[108:112])[0]
-    return offset + float(np.prod(dim[1 : 1 + max(dim[0], 0)], dtype=float)) * bits / 8

@@ -30,19 +30,6 @@ from .triangles import (
     from_pyvista,
 )
 
-__all__ = [
-    "Anatomy",
-    "Surface",
-    "build_anatomy",
-    "check_anatomy",
-    "check_closed",
-    "extract_surface",
-    "find_bodies",
-    "load_anatomy",
-    "read_surface",
-    "save_anatomy",
-    "write_surface",
-]
 _CUT_INSIDE_MM = 2.0  # of the image's proximal end
 _STICK_OUT_MM = 6.0  # of the bones beyond the cut
 _SKIN_TOLERANCE_MM = 0.05  # how far a bone may lie outside the skin: rounding of files

@@ -111,16 +111,16 @@ def acquire_site(
     found = {
         "name": one.name,
         "site": site.name,
-        "completed": ending.completed,
+        "completed": ending.is_completed,
         "phase": str(ending.phase),
         "reason": ending.reason,
-        "unreachable": list(ending.unreachable),
-        "samples": ending.samples,
-        "lost": session.counts.lost,
+        "unreachable": list(session.unreachable),
+        "samples": session.samples,
+        "lost": session.lost,
         "refused": asdict(device.refused),
-        "depth_mm": (ending.depth_um - ending.touch_um) / 1000 if ending.completed else None,
+        "depth_mm": (ending.depth_um - ending.touch_um) / 1000 if ending.is_completed else None,
     }
-    return found | _keep(study, one, folder, ending.completed)
+    return found | _keep(study, one, folder, ending.is_completed)
 
 
 def check_recording(
