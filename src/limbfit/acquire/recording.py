@@ -161,8 +161,7 @@ def read_recording(file: str | Path) -> Recording:
     data = path.read_bytes()
     blocks = _read_first_block(data, path)
     whole = _read_whole_blocks(data, blocks)
-    head, events, rows = _sort_lines(blocks.content + whole.content, path)
-    return _make_recording(head, events, rows, len(data) - whole.end, path)
+    return _parse_content(blocks.content + whole.content, len(data) - whole.end, path)
 
 
 def follow_recording(file: str | Path, offset: int = 0, *, every: int = 1) -> tuple[Recording, int]:
@@ -195,10 +194,8 @@ def follow_recording(file: str | Path, offset: int = 0, *, every: int = 1) -> tu
         remedy = "limbfit recording says what can be read of it"
         place = f"byte {before.end + found.end}"
         raise TraceError("this part is damaged", file=path, place=place, remedy=remedy)
-    content = found.content if offset else first.content + found.content
-    _, events, rows = _sort_lines(content, path)
-    head, _, _ = _sort_lines(first.content, path)
-    recording = _make_recording(head, events, rows[every - 1 :: every], len(data) - found.end, path)
+    # The first block holds the head alone.
+    recording = _parse_content(first.content + found.content, len(data) - found.end, path, every)
     return recording, before.end + found.end
 
 
@@ -249,20 +246,8 @@ def _read_whole_blocks(data: bytes, before: _WholeBlocks, most: int = sys.maxsiz
     return _WholeBlocks(b"".join(parts), at, crc, before.next + len(parts), is_damaged)
 
 
-def _make_recording(
-    head: dict[str, Any], events: tuple[dict[str, Any], ...], rows: list[str], lost: int, path: Path
-) -> Recording:
-    table = _read_table(rows, path)
-    first = len(_NAMES)
-    position, force, capacitance = np.split(table[:, first:], 3, axis=1)
-    host_us, device_us, number, flags, moving = table[:, :first].T
-    return Recording(
-        head, events, host_us, device_us, number, flags, moving, position, force, capacitance, lost
-    )
-
-
-def _sort_lines(content: bytes, path: Path) -> tuple[dict[str, Any], tuple[dict[str, Any], ...], list[str]]:
-    """Head, events and rows."""
+def _parse_content(content: bytes, lost_bytes: int, path: Path, every: int = 1) -> Recording:
+    """Head, events and each ``every``-th sample of whole blocks."""
     head: dict[str, Any] = {}
     events, rows = [], []
     try:
@@ -279,7 +264,22 @@ def _sort_lines(content: bytes, path: Path) -> tuple[dict[str, Any], tuple[dict[
         raise TraceError("it has a line that no record holds", file=path) from None
     if not isinstance(head, dict):
         raise TraceError("its head is not a table", file=path)
-    return head, tuple(events), rows
+    table = _read_table(rows[every - 1 :: every], path)
+    host_us, device_us, number, flags, moving = table[:, : len(_NAMES)].T
+    position, force, capacitance = np.split(table[:, len(_NAMES) :], 3, axis=1)
+    return Recording(
+        head,
+        tuple(events),
+        host_us,
+        device_us,
+        number,
+        flags,
+        moving,
+        position,
+        force,
+        capacitance,
+        lost_bytes,
+    )
 
 
 def _read_table(rows: list[str], path: Path) -> Indices:

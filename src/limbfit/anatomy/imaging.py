@@ -96,19 +96,21 @@ def read_labels(path: str | Path, like: Volume | None = None) -> LabelMap:
     path = Path(path)
     try:
         labels = _read_label_file(path, like)
-    except ImageError as error:  # of a label map it is an error of labels
-        raise LabelError(error.what, file=path, place=error.place, remedy=error.remedy) from None
-    if not labels.array.any():
-        raise LabelError("the label map is empty", file=path, remedy="give one with the limb labelled")
-    return labels if like is None else place_on_grid(labels, like, path)
+        if not labels.array.any():
+            raise LabelError("the label map is empty", remedy="give one with the limb labelled")
+        return labels if like is None else place_on_grid(labels, like)
+    except (ImageError, LabelError) as error:  # of a label map an image's error is one of labels
+        file = error.file or path
+        raise LabelError(error.what, file=file, place=error.place, remedy=error.remedy) from None
 
 
 def _read_label_file(path: Path, like: Volume | None) -> LabelMap:
     dicom = find_dicom_labels(path)
     if dicom is not None:
-        return read_dicom_labels(dicom, like)
-    read = read_seg_nrrd if is_seg_nrrd(path) else read_label_image
-    return read(path, read_image(path))
+        with add_location(file=dicom):
+            return read_dicom_labels(dicom, like)
+    image = read_image(path)
+    return read_seg_nrrd(image) if is_seg_nrrd(path) else read_label_image(path, image)
 
 
 def write_labels(path: str | Path, labels: LabelMap) -> None:

@@ -116,7 +116,12 @@ def read_contours(path: str | Path, like: Volume) -> LabelMap:
     LabelError
         With the file and the line or the structure.
     """
-    path = Path(path)
+    with add_location(file=path):
+        return build_labels(_read_polygons(Path(path)), like)
+
+
+def _read_polygons(path: Path) -> dict[str, list[Array]]:
+    """The contours (n, 3) of each structure of a file, LPS mm."""
     found: dict[str, dict[tuple[int, int], list[list[float]]]] = defaultdict(lambda: defaultdict(list))
     for line, row in _read_rows(path):
         try:
@@ -125,32 +130,28 @@ def read_contours(path: str | Path, like: Volume) -> LabelMap:
         except (TypeError, ValueError):
             point = []
         if not point or not np.all(np.isfinite(point)):
-            raise LabelError("not a point of a contour", file=path, place=f"line {line}", remedy=_FORMAT)
+            raise LabelError("not a point of a contour", place=f"line {line}", remedy=_FORMAT)
         found[name][key].append(point)
     for name, contours in found.items():
         short = [key for key, points in contours.items() if len(points) < 3]
         if short:
-            raise LabelError(
-                "a contour of fewer than 3 points", file=path, place=f"{name}, slice {short[0][0]}"
-            )
-    polygons = {name: [np.array(points) for points in contours.values()] for name, contours in found.items()}
-    return build_labels(polygons, like, path)
+            raise LabelError("a contour of fewer than 3 points", place=f"{name}, slice {short[0][0]}")
+    return {name: [np.array(points) for points in contours.values()] for name, contours in found.items()}
 
 
-def build_labels(contours: Mapping[str, Sequence[Array]], like: Grid, path: Path) -> LabelMap:
-    """Contours, LPS mm, of each structure as a label map on the grid of ``like``; ``path`` is for the error.
+def build_labels(contours: Mapping[str, Sequence[Array]], like: Grid) -> LabelMap:
+    """Contours, LPS mm, of each structure as a label map on the grid of ``like``.
 
     Raises
     ------
     LabelError
-        With the file, and the structure that cannot be rasterised.
+        With the structure that cannot be rasterised.
     """
     masks = []
     for name, polygons in contours.items():
-        with add_location(file=path, place=name):
+        with add_location(place=name):
             masks.append(rasterise_polygons(polygons, like))
-    with add_location(file=path):
-        array, names = flatten(masks, list(contours))
+    array, names = flatten(masks, list(contours))
     return LabelMap(array, like.spacing, like.origin, like.direction, names)
 
 
@@ -160,8 +161,8 @@ def _read_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             rows = csv.DictReader(stream)
             if rows.fieldnames is None or any(name not in rows.fieldnames for name in COLUMNS):
-                raise LabelError("not a file of contours", file=path, remedy=_FORMAT)
+                raise LabelError("not a file of contours", remedy=_FORMAT)
             for row in rows:
                 yield rows.line_num, row
     except (OSError, UnicodeDecodeError, csv.Error):
-        raise LabelError("the contours cannot be read", file=path, remedy=_FORMAT) from None
+        raise LabelError("the contours cannot be read", remedy=_FORMAT) from None

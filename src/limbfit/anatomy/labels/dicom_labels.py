@@ -46,7 +46,6 @@ def find_dicom_labels(path: Path) -> Path | None:
         if len(found) != 1:
             raise LabelError(
                 f"{len(found) or 'no'} DICOM segmentations or structure sets in this folder",
-                file=path,
                 remedy="name the file",
             )
         return found[0]
@@ -55,7 +54,6 @@ def find_dicom_labels(path: Path) -> Path | None:
     if _find_storage_class(path) is None:
         raise LabelError(
             "DICOM, but no segmentation and no structure set",
-            file=path,
             remedy="give a DICOM-SEG or RTSTRUCT file",
         )
     return path
@@ -79,7 +77,7 @@ def _find_storage_class(path: Path) -> str | None:
     except (InvalidDicomError, OSError):
         return None
     except Exception:  # pydicom's texts quote values of tags
-        raise LabelError("a damaged DICOM file", file=path, remedy="export it again") from None
+        raise LabelError("a damaged DICOM file", remedy="export it again") from None
     return kind if kind in (*SEGMENTATION, STRUCTURE_SET) else None
 
 
@@ -110,11 +108,11 @@ def read_dicom_seg(path: Path) -> LabelMap:
         grid, index = _stack_frames(frames)
         masks = [_build_mask(frames, grid, index, number) for number in frames.names]
         array, names = flatten(masks, list(frames.names.values()))
-    except LabelError as error:
-        raise LabelError(error.what, file=path, remedy=error.remedy) from None
+    except LabelError:
+        raise
     except Exception:  # pydicom's texts quote values of tags
         raise LabelError(
-            "the DICOM segmentation is damaged or cannot be decoded", file=path, remedy="export it again"
+            "the DICOM segmentation is damaged or cannot be decoded", remedy="export it again"
         ) from None
     return LabelMap(array, grid.spacing, grid.origin, grid.direction, names)
 
@@ -205,13 +203,13 @@ def read_rtstruct(path: Path, like: Volume | None) -> LabelMap:
         Without an image, for contours that do not lie on its slices or leave slices out, or a damaged file.
     """
     if like is None:
-        raise LabelError("contours need the image on which they were drawn", file=path)
+        raise LabelError("contours need the image on which they were drawn")
     try:
         with silence_readers():
             contours = _read_contours(pydicom.dcmread(path))
     except Exception:  # pydicom's texts quote values of tags
-        raise LabelError("the structure set is damaged", file=path, remedy="export it again") from None
-    return build_labels(contours, like, path)
+        raise LabelError("the structure set is damaged", remedy="export it again") from None
+    return build_labels(contours, like)
 
 
 def _read_contours(data: FileDataset) -> dict[str, list[Array]]:

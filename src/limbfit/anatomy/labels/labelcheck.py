@@ -107,7 +107,7 @@ def _describe_pieces(count: int, mask: Mask, labels: LabelMap, noun: str = "piec
     return f"{count} {noun}{'s' if count != 1 else ''} ({volume:.2g} cm3)"
 
 
-def place_on_grid(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
+def place_on_grid(labels: LabelMap, like: Volume) -> LabelMap:
     """A map of any extent, order and sense of axes on the whole grid of ``like``, voxel by voxel.
 
     Raises
@@ -122,7 +122,6 @@ def place_on_grid(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
     if offset is None:
         raise LabelError(
             "the label map is on a different grid from the image",
-            file=path,
             remedy=f"image {_format_shape(like)}, labels {_format_shape(original)}: "
             "export it with the image as reference geometry",
         )
@@ -130,7 +129,6 @@ def place_on_grid(labels: LabelMap, like: Volume, path: Path) -> LabelMap:
     if np.any(offset < 0) or np.any(last > np.array(like.size)):
         raise LabelError(
             "the label map is on a different grid from the image: labelled voxels lie outside the image",
-            file=path,
             remedy="give the image that was labelled, or export the labels with it as reference geometry",
         )
     full = np.zeros(like.array.shape, dtype=np.uint8)

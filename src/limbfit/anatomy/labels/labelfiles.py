@@ -17,7 +17,7 @@ import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
 
 from ...arrays import Mask
-from ...errors import LabelError, add_location
+from ...errors import LabelError
 from ..grid import DEFAULT_NAMES, LabelMap, read_geometry
 
 COLOURS: Mapping[str, tuple[float, float, float]] = {
@@ -40,16 +40,14 @@ def is_seg_nrrd(path: Path) -> bool:
     return path.name.lower().endswith((".seg.nrrd", ".seg.nhdr"))
 
 
-def read_seg_nrrd(path: Path, image: sitk.Image) -> LabelMap:
+def read_seg_nrrd(image: sitk.Image) -> LabelMap:
     """The segments of a ``.seg.nrrd`` that was read as an image, on its own, maybe cropped, grid."""
     voxels = sitk.GetArrayFromImage(image)
     layers = np.moveaxis(voxels, -1, 0) if image.GetNumberOfComponentsPerPixel() > 1 else voxels[None]
-    segments = _read_segments(image, len(layers), path)
-    with add_location(file=path):
-        array, names = flatten(
-            [layers[layer] == value for _, layer, value in segments], [name for name, _, _ in segments]
-        )
-        return LabelMap(array, *read_geometry(image), names)
+    segments = _read_segments(image, len(layers))
+    masks = [layers[layer] == value for _, layer, value in segments]
+    array, names = flatten(masks, [name for name, _, _ in segments])
+    return LabelMap(array, *read_geometry(image), names)
 
 
 def write_seg_nrrd(path: Path, labels: LabelMap) -> None:
@@ -81,10 +79,8 @@ def write_seg_nrrd(path: Path, labels: LabelMap) -> None:
 def read_label_image(path: Path, image: sitk.Image) -> LabelMap:
     """Any scalar label image; names from ``<file>.json`` (``{"2": "tibia"}``) or the default ones."""
     if image.GetNumberOfComponentsPerPixel() != 1:
-        raise LabelError("a label image has one value per voxel", file=path)
-    names = _read_sidecar_names(path)
-    with add_location(file=path):
-        return LabelMap.from_sitk(image, names)
+        raise LabelError("a label image has one value per voxel")
+    return LabelMap.from_sitk(image, _read_sidecar_names(path))
 
 
 def find_sidecar(path: Path) -> Path:
@@ -111,7 +107,7 @@ def _read_sidecar_names(path: Path) -> dict[int, str]:
         ) from None
 
 
-def _read_segments(image: sitk.Image, layers: int, path: Path) -> list[tuple[str, int, int]]:
+def _read_segments(image: sitk.Image, layers: int) -> list[tuple[str, int, int]]:
     """Name, layer and value of each segment that the header of an image names."""
     header = {key: image.GetMetaData(key) for key in image.GetMetaDataKeys() if key.startswith("Segment")}
     found = []
@@ -122,7 +118,7 @@ def _read_segments(image: sitk.Image, layers: int, path: Path) -> list[tuple[str
         layer = int(header.get(f"Segment{n}_Layer", 0))
         value = int(header.get(f"Segment{n}_LabelValue", 1))
         if not 0 <= layer < layers:
-            raise LabelError(f"segment {name!r} is in a layer that the file does not have", file=path)
+            raise LabelError(f"segment {name!r} is in a layer that the file does not have")
         found.append((normalise_name(name), layer, value))
     return found
 

@@ -1,5 +1,7 @@
 """A tetrahedral grid under the proximal cut plane, cut along level sets into conforming regions.
 
+Also how nodes are put on level sets again, exactly or as far as their elements allow.
+
 Cutting bisects every tetrahedron at its crossed edges in one global order of edges. Two tetrahedra that share
 a face see that face's edges in the same order, so the result conforms without a table of cases.
 
@@ -15,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...arrays import Array, Indices, Mask
+from ...mesh import compute_dihedral_angles
 from ...mesh.boxes import SIX_TETS
 
 Field = Callable[[Array], tuple[Array, Array]]
@@ -27,6 +30,7 @@ LONGEST_EDGE = 1.8  # of the spacing: the cubes' diagonal; both ends of a crosse
 SNAP_FRACTION = 0.15
 ROOT_STEPS = 2  # the mesher's nodes are put on the surfaces again
 SMALLEST_VOLUME = 1e-3  # of a grid tetrahedron: a snap that leaves less is undone
+NEWTON_STEPS, BISECTIONS = 4, 4  # of nodes put on a surface
 
 
 @dataclass(frozen=True)
@@ -241,3 +245,32 @@ def _find_first_crossed(tets: Indices, edges: Indices, offset: int) -> Indices:
     )  # new nodes are on the level
     place = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
     return np.where(keys[place] == key, place, len(edges)).min(axis=1)
+
+
+def project_to_level(field: Field, points: Array, z_freedom: Array) -> Array:
+    """Points (n, 3) moved to ``field = 0`` along its gradient with the z component weighted.
+
+    ``z_freedom`` (n,) is 1 for free points and 0 for those that must keep their z (on the cut plane).
+    """
+    points = points.copy()
+    for _ in range(NEWTON_STEPS):
+        value, slope = field(points)
+        way = slope * np.column_stack([np.ones((len(points), 2)), z_freedom])
+        rate = np.maximum(np.einsum("ij,ij->i", slope, way), 0.05)  # a kink must not send a point away
+        points -= (value / rate)[:, None] * way
+    return points
+
+
+def project_safely(points: Array, target: Array, tets: Indices, floor_deg: float) -> Array:
+    """Points moved towards ``target`` as far as no dihedral angle falls below the floor or sinks under it."""
+    share = np.ones(len(points))
+    before = np.minimum(compute_dihedral_angles(points, tets).min(axis=1), floor_deg)
+    for attempt in range(BISECTIONS + 1):
+        moved = points + share[:, None] * (target - points)
+        sound = compute_volumes(moved, tets) > 0
+        after = np.where(sound, compute_dihedral_angles(moved, tets).min(axis=1), -1.0)
+        bad = np.unique(tets[after < before - 1e-6])
+        if not len(bad):
+            return moved
+        share[bad] = share[bad] / 2 if attempt < BISECTIONS - 1 else 0.0
+    return points

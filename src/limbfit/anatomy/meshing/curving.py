@@ -16,9 +16,9 @@ import numpy as np
 from ...arrays import Array, Indices
 from ...mesh import TET10_EDGES, Mesh, node_jacobians
 from ...mesh.cells import quadratic_simplex
+from .background import project_to_level
 from .extrusion import Columns, find_bone_faces, find_inner_faces
 from .layers import LimbFields
-from .projection import project_to_level
 from .regions import build_region_level, find_interfaces
 
 SMALLEST_JACOBIAN = 0.3  # of the straight element's, at every node

@@ -20,10 +20,9 @@ import numpy as np
 
 from ...arrays import Array, Indices
 from ...mesh import Mesh, boundary_faces
-from .background import BONE, LAYER
+from .background import BONE, LAYER, project_to_level
 from .engines import VolumeMesh
 from .layers import LimbFields
-from .projection import project_to_level
 from .regions import find_same_faces, mesh_numbers
 
 RIM_LAYERS = 3.0  # depth below the cut plane, in thicknesses, over which the extrusion turns sideways

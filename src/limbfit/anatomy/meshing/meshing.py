@@ -29,13 +29,12 @@ from ...mesh import Mesh, boundary_faces, check, node_jacobians, to_tet10
 from ...results.limb import BoneLoss, MeshMeasures
 from ..surfaces.surfaces import Anatomy
 from . import background
-from .background import BONE, LAYER, PLANE, REGION, TetGrid, compute_volumes
+from .background import BONE, LAYER, PLANE, REGION, TetGrid, compute_volumes, project_safely, project_to_level
 from .curving import balance_bone_faces, compute_curved_target, curve_diagonals, curve_mesh
 from .engines import ENGINES, MesherError, VolumeMesh, VolumeTask
 from .extrusion import build_core_mesh, extrude_layers
 from .layers import BonePolicy, LayerSpec, LimbFields, build_limb_fields, evaluate_distance
 from .meshreport import GOOD_DIHEDRAL_DEG, compute_enclosed_volume, measure_mesh
-from .projection import project_safely, project_to_level
 from .regions import (
     build_region_level,
     check_regions,

@@ -9,10 +9,9 @@ import numpy as np
 from ...arrays import Array, Indices, Mask
 from ...mesh import Mesh
 from ..surfaces.triangles import Surface
-from .background import Field
+from .background import Field, project_safely, project_to_level
 from .extrusion import Columns
 from .layers import LimbFields
-from .projection import project_safely, project_to_level
 from .regions import build_region_level, find_interfaces
 
 GOOD_DEG = 9.0

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, Indices
-from ...errors import SurfaceError
+from ...errors import SurfaceError, add_location
 from ..frame import format_place
 from .extraction import untangle_surface
 from .surfaces import Anatomy, check_anatomy
@@ -71,7 +71,7 @@ class RepairReport:
     notes: tuple[str, ...]
 
 
-def repair_surface(surface: Surface, name: str, file: Path | None = None) -> RepairReport:
+def repair_surface(surface: Surface, name: str) -> RepairReport:
     """A surface whose faces look outward, without loose pieces and small holes, its one open end capped.
 
     Few crossing faces are smoothed.
@@ -93,7 +93,6 @@ def repair_surface(surface: Surface, name: str, file: Path | None = None) -> Rep
         places = " and ".join(format_place(surface.points[loop].mean(axis=0)) for loop in large[:3])
         raise SurfaceError(
             f"{name}: {len(large)} open ends or large holes, at {places}",
-            file=file,
             remedy="close all but the proximal end",
         )
     for loop in small:
@@ -105,7 +104,7 @@ def repair_surface(surface: Surface, name: str, file: Path | None = None) -> Rep
     if not large:
         return RepairReport(surface, None, notes)
     rim = surface.points[large[0]]
-    surface, cap, area = _cap_open_end(surface, rim, name, file)
+    surface, cap, area = _cap_open_end(surface, rim, name)
     note = (
         f"{name}: open at one end, cut flat {np.ptp(rim @ cap.normal) + INSIDE_MM:.1f} mm below its highest "
         f"edge and closed by a cap at {format_place(cap.outline.mean(axis=0))}, {area:.0f} mm2"
@@ -134,8 +133,11 @@ def build_closed_anatomy(
         For a surface that cannot be mended, or an anatomy that :func:`check_anatomy` refuses.
     """
     files = files or {}
-    outer = repair_surface(skin, "skin", files.get("skin"))
-    inner = {name: repair_surface(bone, name, files.get(name)) for name, bone in bones.items()}
+    mended = {}
+    for name, surface in {"skin": skin, **bones}.items():
+        with add_location(file=files.get(name)):
+            mended[name] = repair_surface(surface, name)
+    outer, inner = mended.pop("skin"), mended
     found: tuple[str, ...] = ()
     if cut is None:
         cut, found = _choose_default_cut(outer, list(inner.values()))
@@ -290,7 +292,7 @@ def _fill_hole(surface: Surface, loop: Indices) -> tuple[Surface, float]:
     return Surface(points, np.vstack([surface.faces, fan])), area
 
 
-def _cap_open_end(surface: Surface, rim: Array, name: str, file: Path | None) -> tuple[Surface, Cap, float]:
+def _cap_open_end(surface: Surface, rim: Array, name: str) -> tuple[Surface, Cap, float]:
     """Cut off just inside an open end with the points ``rim`` and closed there; the area of the cap (mm2)."""
     vector = _compute_area_vector(rim)
     normal = vector / np.linalg.norm(vector)
@@ -305,7 +307,6 @@ def _cap_open_end(surface: Surface, rim: Array, name: str, file: Path | None) ->
     if flat is None or Surface(body.points, loops[0][::-1][flat]).area > MAX_CAP_RATIO * _compute_area(rim):
         raise SurfaceError(
             f"{name}: its open end at {format_place(rim.mean(axis=0))} cannot be closed by a plane",
-            file=file,
             remedy="cut the end off straight, or close it",
         )
     faces = loops[0][::-1][flat]

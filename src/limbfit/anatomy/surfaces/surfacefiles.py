@@ -13,7 +13,7 @@ import numpy as np
 import pyvista as pv
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
-from ...errors import SurfaceError
+from ...errors import SurfaceError, add_location
 from ...mesh import silence_vtk
 from .triangles import Surface, from_pyvista, remove_unused_points
 
@@ -48,22 +48,26 @@ def read_surface(
         Closedness and size are for :func:`~limbfit.anatomy.surfaces.triangles.check_closed`.
     """
     path = Path(path)
+    with add_location(file=path):
+        return _read_surface(path, coordinates, UNITS_MM[unit], key)
+
+
+def _read_surface(path: Path, coordinates: str | None, unit_mm: float, key: str) -> Surface:
     if not path.is_file():
-        raise SurfaceError("no such surface", file=path)
+        raise SurfaceError("no such surface")
     _check_suffix(path)
     poly = _read_poly(path)
     surface = from_pyvista(poly.triangulate())
     if not np.all(np.isfinite(surface.points)):
-        raise SurfaceError("points that are not numbers", file=path, remedy="export the surface again")
+        raise SurfaceError("points that are not numbers", remedy="export the surface again")
     stated = _read_stated_space(path, poly)
     if coordinates and stated and coordinates != stated:
         raise SurfaceError(
             f"the file says that it is in {stated}, the study says {coordinates}",
-            file=path,
             remedy=f"correct {key}, or export the surface again",
         )
     sign = np.array([-1.0, -1.0, 1.0]) if (coordinates or stated) == "RAS" else np.ones(3)
-    return _merge_points(Surface(surface.points * sign * UNITS_MM[unit], surface.faces))
+    return _merge_points(Surface(surface.points * sign * unit_mm, surface.faces))
 
 
 def _read_stated_space(path: Path, poly: pv.PolyData) -> str | None:
@@ -79,7 +83,7 @@ def _read_stated_space(path: Path, poly: pv.PolyData) -> str | None:
 def _check_suffix(path: Path) -> None:
     if path.suffix.lower() not in SUFFIXES:
         raise SurfaceError(
-            f"unknown kind of surface {path.suffix!r}", file=path, remedy="use one of " + " ".join(SUFFIXES)
+            f"unknown kind of surface {path.suffix!r}", remedy="use one of " + " ".join(SUFFIXES)
         )
 
 
@@ -91,14 +95,12 @@ def _read_poly(path: Path) -> pv.PolyData:
             warnings.simplefilter("ignore")
             poly = _read_ply(path) if path.suffix.lower() == ".ply" else pv.read(str(path))
     except Exception:  # readers raise many kinds; all mean the same to the user
-        raise SurfaceError(
-            "the surface cannot be read", file=path, remedy="export the surface again"
-        ) from None
+        raise SurfaceError("the surface cannot be read", remedy="export the surface again") from None
     if not isinstance(poly, pv.PolyData) or poly.n_cells == 0:
-        raise SurfaceError("the file holds no triangles", file=path, remedy="export the surface again")
+        raise SurfaceError("the file holds no triangles", remedy="export the surface again")
     corners = vtk_to_numpy(poly.GetPolys().GetConnectivityArray())
     if len(corners) and not 0 <= corners.min() <= corners.max() < poly.n_points:  # VTK would take any memory
-        raise SurfaceError("faces of points that are not there", file=path, remedy="export the surface again")
+        raise SurfaceError("faces of points that are not there", remedy="export the surface again")
     return poly
 
 
@@ -111,7 +113,6 @@ def _check_stated_counts(path: Path) -> None:
             if any(int(match[1][:20]) > MAX_ITEMS for match in _STATED.finditer(text)):
                 raise SurfaceError(
                     f"it states more than {MAX_ITEMS:.0e} points or faces",
-                    file=path,
                     remedy="export the surface again, with fewer triangles",
                 )
             rest = text[-64:]
@@ -135,6 +136,6 @@ def _merge_points(surface: Surface) -> Surface:
 def write_surface(path: str | Path, surface: Surface) -> None:
     """Write .stl (binary), .ply, .vtp or .obj by the suffix, in LPS mm."""
     path = Path(path)
-    _check_suffix(path)
-    with silence_vtk():
+    with silence_vtk(), add_location(file=path):
+        _check_suffix(path)
         surface.to_pyvista().save(str(path), recompute_normals=False)

@@ -16,7 +16,7 @@ import pyvista as pv
 from numpy.typing import ArrayLike
 
 from ...arrays import Array, Indices, Mask
-from ...errors import InputError, LabelError, SurfaceError
+from ...errors import InputError, LabelError, SurfaceError, add_location
 from ...results.limb import SurfaceMeasures, SurfacesResult
 from ..frame import ProximalEnd, find_proximal_end, select_layer
 from ..grid import LabelMap
@@ -221,29 +221,26 @@ def check_anatomy(anatomy: Anatomy, files: Mapping[str, Path] | None = None) -> 
     check_closed(anatomy.skin, "skin", files.get("skin"))
     for name, bone in anatomy.bones.items():
         check_closed(bone, name, files.get(name))
-        _check_inside(anatomy, name, files.get(name))
+        with add_location(file=files.get(name)):
+            _check_inside(anatomy, name)
     for name, region in anatomy.regions.items():
         check_closed(region, name, files.get(name), smallest_mm=0.0)
-        _check_region(anatomy, name, files.get(name))
+        with add_location(file=files.get(name), place=f"geometry.regions.{name}"):
+            _check_region(anatomy, region)
 
 
-def _check_region(anatomy: Anatomy, name: str, file: Path | None) -> None:
+def _check_region(anatomy: Anatomy, region: Surface) -> None:
     """Refuse a region that lies beyond the cut, outside the skin or in a bone by more than voxels explain."""
-    region, place = anatomy.regions[name], f"geometry.regions.{name}"
     points = region.points[anatomy.height(region.points) < 0.0]
     if not len(points):
         raise SurfaceError(
             "the region lies wholly beyond the proximal cut",
-            file=file,
-            place=place,
             remedy="leave it out or move the cut",
         )
     outside = float(anatomy.skin.signed_distance(points).max())
     if outside > _OVERLAP_MM:
         raise SurfaceError(
             f"the region lies outside the limb by up to {outside:.1f} mm",
-            file=file,
-            place=place,
             remedy="check that it is in the same coordinates (LPS or RAS) and unit as the skin",
         )
     for bone, body in anatomy.bones.items():
@@ -251,18 +248,16 @@ def _check_region(anatomy: Anatomy, name: str, file: Path | None) -> None:
         if deep > _OVERLAP_MM:
             raise SurfaceError(
                 f"the region and the bone {bone} overlap by up to {deep:.1f} mm",
-                file=file,
-                place=place,
                 remedy="let the region end at the bone's surface",
             )
 
 
-def _check_inside(anatomy: Anatomy, name: str, file: Path | None) -> None:
+def _check_inside(anatomy: Anatomy, name: str) -> None:
     points = anatomy.bones[name].points
     inner = points[anatomy.height(points) < -_SKIN_TOLERANCE_MM]
     if len(inner) == 0:
         raise SurfaceError(
-            f"{name} lies wholly beyond the proximal cut", file=file, remedy="leave it out or move the cut"
+            f"{name} lies wholly beyond the proximal cut", remedy="leave it out or move the cut"
         )
     distance = anatomy.skin.signed_distance(inner)
     outside = distance > _SKIN_TOLERANCE_MM
@@ -275,7 +270,7 @@ def _check_inside(anatomy: Anatomy, name: str, file: Path | None) -> None:
         if _is_at_one_end(anatomy.skin, inner[outside]):
             what += ", all at one end of the limb"
             remedy = f"if the bone is cut there, say where: geometry.proximal_cut; else {remedy}"
-        raise SurfaceError(what, file=file, remedy=remedy)
+        raise SurfaceError(what, remedy=remedy)
 
 
 def _is_at_one_end(skin: Surface, points: Array) -> bool:

@@ -18,7 +18,7 @@ from vtkmodules.vtkCommonCore import vtkIdList, vtkPoints
 from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
 from ...arrays import Array, Indices
-from ...errors import SurfaceError
+from ...errors import SurfaceError, add_location
 from ..frame import format_place
 
 # Diagonals of the bounding box: a limb and a bone from a file are larger; in inches or centimetres they are
@@ -233,26 +233,28 @@ def check_closed(
     """
     if smallest_mm is None:
         smallest_mm = _SMALLEST_MM.get(name, _SMALLEST_OTHER_MM) if file or name == "skin" else 0.0
-    _check_size(surface, name, file, smallest_mm)
+    with add_location(file=file):
+        _check_bounds_body(surface, name, smallest_mm)
+
+
+def _check_bounds_body(surface: Surface, name: str, smallest_mm: float) -> None:
+    _check_size(surface, name, smallest_mm)
     open_edges = len(find_open_edges(surface.faces))
     if open_edges:
         raise SurfaceError(
             f"{name}: the surface is open, {open_edges} edges have a face on one side only",
-            file=file,
             remedy="close its holes",
         )
-    check_sides(surface, name, file)
+    check_sides(surface, name)
     parts = len(find_bodies(surface))
     if parts > 1:
         raise SurfaceError(
             f"{name}: {parts} separate bodies in one surface",
-            file=file,
             remedy="keep one closed body in each file",
         )
     if surface.volume <= 0:
         raise SurfaceError(
             f"{name}: the surface is inverted, its faces look inward",
-            file=file,
             remedy="flip the normals so that they point outward",
         )
     crossing = surface.self_intersections
@@ -260,25 +262,23 @@ def check_closed(
         place = format_place(surface.triangles[crossing[0, 0]].mean(axis=0))
         raise SurfaceError(
             f"{name}: the surface crosses itself ({len(crossing)} pairs of faces, the first at {place})",
-            file=file,
             remedy="remesh, smooth or repair it",
         )
 
 
-def _check_size(surface: Surface, name: str, file: str | Path | None, smallest: float) -> None:
+def _check_size(surface: Surface, name: str, smallest: float) -> None:
     if len(surface.faces) < 4:
-        raise SurfaceError(f"{name}: only {len(surface.faces)} faces", file=file)
+        raise SurfaceError(f"{name}: only {len(surface.faces)} faces")
     diagonal = float(np.linalg.norm(np.ptp(surface.points, axis=0)))
     if diagonal < smallest or diagonal > _LARGEST_MM:
         units = "metres, centimetres or inches" if diagonal < smallest else "another unit"
         raise SurfaceError(
             f"{name}: {diagonal:.3g} mm from end to end",
-            file=file,
             remedy=f"if it is in {units}, say so (surfaces.unit in study.toml) or scale it to millimetres",
         )
 
 
-def check_sides(surface: Surface, name: str, file: str | Path | None = None) -> None:
+def check_sides(surface: Surface, name: str) -> None:
     """Refuse a surface, open or closed, whose triangles do not agree on a side.
 
     Raises
@@ -291,12 +291,10 @@ def check_sides(surface: Surface, name: str, file: str | Path | None = None) -> 
     if counts.max() > 2:
         raise SurfaceError(
             f"{name}: {int((counts > 2).sum())} edges join more than two faces",
-            file=file,
             remedy="remove inner walls and doubled faces",
         )
     if has_turned_faces(surface.faces):
         raise SurfaceError(
             f"{name}: neighbouring faces are oriented against each other",
-            file=file,
             remedy="orient the normals consistently outward",
         )

@@ -82,9 +82,8 @@ def segment_automatically(study: Study, volume: Volume) -> LabelMap:
                 for name, points in table.seeds.items()
             },
         )
-    return place_on_grid(
-        LabelMap(found.array, near.spacing, near.origin, near.direction, found.names), volume, path
-    )
+    labels = LabelMap(found.array, near.spacing, near.origin, near.direction, found.names)
+    return place_on_grid(labels, volume)
 
 
 def check_labels(study: Study, labels: LabelMap) -> None:
