@@ -139,6 +139,10 @@ class Grid:
         start = [part.start for part in box][::-1]
         return replace(self, array=self.array[tuple(box)], origin=self.index_to_point(start))
 
+    def turn_along(self, axis: int) -> Self:
+        """Return the samples with the index axis 0, 1, 2 (i, j, k) last: slices lie across it."""
+        return self.permute_axes([*(n for n in range(3) if n != axis), axis])
+
     def align_with_lps(self) -> Self:
         """Return the samples with right-handed index axes in the order and sense nearest to x, y, z.
 
@@ -293,6 +297,24 @@ def check_voxel_count(size: Sequence[int], path: str | Path) -> None:
         raise ImageError(
             f"{shape} voxels are more than {MAX_VOXELS:.0e}", file=path, remedy="crop or resample the image"
         )
+
+
+def resample_cubic(
+    image: sitk.Image, grid: Grid, edge_mm: float, interpolator: int, outside: float
+) -> sitk.Image:
+    """An image on cubic voxels along the axes of its grid; ``outside`` is the value beyond its samples."""
+    size = np.maximum(np.floor((np.array(grid.size) - 1) * grid.spacing / edge_mm).astype(int) + 1, 1)
+    return sitk.Resample(
+        image,
+        size.tolist(),
+        sitk.Transform(),
+        interpolator,
+        grid.origin.tolist(),
+        [edge_mm] * 3,
+        grid.direction.ravel().tolist(),
+        outside,
+        sitk.sitkFloat32,
+    )
 
 
 def read_geometry(image: sitk.Image) -> tuple[Array, Array, Array]:

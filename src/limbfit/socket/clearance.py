@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
@@ -62,7 +61,7 @@ def _compute_moves(points: Array, faces: Ints, limb: Surface) -> Array:
         short = np.maximum(TARGET_MM - limb.signed_distance(points[ends].mean(axis=1)), 0.0)
         for end in ends.T:
             np.maximum.at(need, end, short)
-    squared, nearest, _ = igl.point_mesh_squared_distance(limb.points, points, faces)
+    squared, nearest, _ = Surface(points, faces).find_nearest(limb.points)
     short = np.maximum(TARGET_MM - np.sqrt(squared), 0.0)
     for end in faces[nearest].T:
         np.maximum.at(need, end, short)
@@ -73,9 +72,8 @@ BONE_ROUGHNESS_MM = 0.5  # by which a bone may reach through the face: roughness
 
 
 def refuse_bones(
-    points: NDArray[np.float64],
-    faces: NDArray[np.int64],
-    brim: NDArray[np.int64],
+    face: Surface,
+    brim: Ints,
     frame: Frame,
     bones: Mapping[str, Surface],
     *,
@@ -86,7 +84,7 @@ def refuse_bones(
 
     Parameters
     ----------
-    points, faces, brim : of a `Socket`, LPS mm.
+    face, brim : of a `Socket`, LPS mm.
     frame : of the limb.
     bones : closed surfaces, LPS mm.
     spare_mm : how far a bone may do so besides roughness: a liner that the face was drawn without.
@@ -96,7 +94,7 @@ def refuse_bones(
     SurfaceError
         With the bone, how far it reaches through, and the remedy.
     """
-    face = Surface(frame.to_limb(points), faces)
+    face = Surface(frame.to_limb(face.points), face.faces)
     closed = close_by_fans(face.flipped)
     lowest = float(face.points[brim, 2].min())
     for name, bone in bones.items():

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 
@@ -163,7 +162,7 @@ def build_stated_region(anatomy: Anatomy, name: str, position: Array, radius_mm:
         Where the position is off the skin.
     """
     skin = anatomy.skin
-    squared, face, foot = igl.point_mesh_squared_distance(np.atleast_2d(position), skin.points, skin.faces)
+    squared, face, foot = skin.find_nearest(np.atleast_2d(position))
     if squared[0] > MAX_OFFSET_MM**2:
         raise SurfaceError(
             f"region {name!r} lies {np.sqrt(squared[0]):.0f} mm off the skin",
@@ -248,8 +247,7 @@ def _select_crest(anatomy: Anatomy, directions: Directions, tibia: Surface) -> M
     if not shaft.any():
         return shaft
     depth = np.full(len(middles), np.inf)
-    squared, _, _ = igl.point_mesh_squared_distance(middles[shaft], tibia.points, tibia.faces)
-    depth[shaft] = np.sqrt(squared)
+    depth[shaft] = np.sqrt(tibia.find_nearest(middles[shaft])[0])
     slabs = np.linspace(lower, upper, max(2, round((upper - lower) / 5.0)) + 1)
     line = []
     for low, high in pairwise(slabs):

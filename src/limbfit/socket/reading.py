@@ -99,8 +99,7 @@ def _build_socket(surface: Surface, outer: Surface, frame: Frame, bones: Mapping
             remedy="remesh, smooth or repair it",
         )
     refuse_bones(
-        frame.to_patient(face.points),
-        face.faces,
+        Surface(frame.to_patient(face.points), face.faces),
         brim,
         frame,
         bones,

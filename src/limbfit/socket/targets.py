@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import igl
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -73,7 +72,7 @@ class Target:
             For a region that the limb does not have, and tissue depth of a limb without bones.
         """
         skin = anatomy.skin
-        below = igl.point_mesh_squared_distance(points, skin.points, skin.faces)[2]  # a liner
+        below = skin.find_nearest(points)[2]  # a liner
         if self.kind == TISSUE_DEPTH:
             found = self.pressure_kPa * _compute_depth_share(below, anatomy)
             values: dict[str, float] = {}
@@ -110,15 +109,13 @@ def _compute_depth_share(points: Array, anatomy: Anatomy) -> Array:
             "the depth of tissue is not known: the limb has no bones",
             remedy=f"choose another socket.design.pressure: {', '.join(PRESETS)}",
         )
-    squared = [
-        igl.point_mesh_squared_distance(points, bone.points, bone.faces)[0] for bone in anatomy.bones.values()
-    ]
+    squared = [bone.find_nearest(points)[0] for bone in anatomy.bones.values()]
     return np.asarray(np.clip(np.sqrt(np.min(squared, axis=0)) / FULL_DEPTH_MM, 0.0, 1.0))
 
 
 def _compute_brim_share(points: Array, socket: Socket) -> Array:
     """Compute the share (n,) of the pressure at points: 0 beyond the brim, growing smoothly below it."""
-    nearest = igl.point_mesh_squared_distance(points, socket.points, socket.faces)[1]
+    nearest = socket.surface.find_nearest(points)[1]
     covered = ~np.isin(socket.faces[nearest], socket.brim).any(axis=1)
     t = np.clip(KDTree(socket.points[socket.brim]).query(points)[0] / BRIM_MM, 0.0, 1.0)
     return np.where(covered, t**2 * (3.0 - 2.0 * t), 0.0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import igl
 import manifold3d
 import numpy as np
 from numpy.typing import NDArray
@@ -78,8 +77,7 @@ def _build_shell(socket: Socket, thickness: float) -> Surface:
     """Build both sides and the half circle that joins them along the brim."""
     inner, outwards = socket.points, -socket.surface.vertex_normals
     outer = inner + thickness * outwards
-    squared = igl.point_mesh_squared_distance(outer, inner, socket.faces)[0]
-    least = float(np.sqrt(squared.min()))
+    least = float(np.sqrt(socket.surface.find_nearest(outer)[0].min()))
     body = _build_sides(socket, outer, outwards, thickness)
     if least < MIN_THICKNESS_SHARE * thickness or len(body.self_intersections):
         raise SurfaceError(

@@ -51,7 +51,13 @@ class Series:
 
 
 def list_series(folder: str | Path) -> list[Series]:
-    """The image series in a folder and those below it, ordered by UID; other files are passed over."""
+    """The image series in a folder and those below it, ordered by UID; other files are passed over.
+
+    Raises
+    ------
+    ImageError
+        For a folder without images, or a damaged file in it.
+    """
     groups: dict[str, list[SliceHeader]] = defaultdict(list)
     files = [path for path in sorted(Path(folder).rglob("*")) if path.is_file()]
     for number, path in enumerate(files, 1):
@@ -60,6 +66,10 @@ def list_series(folder: str | Path) -> list[Series]:
             headers = read_headers(path)
         for header in headers or ():
             groups[header.series_uid].append(header)
+    if not groups:
+        raise ImageError(
+            "no DICOM images in this folder", file=folder, remedy="give the folder that holds the slices"
+        )
     series = [Series(uid, tuple(slices)) for uid, slices in sorted(groups.items())]
     if _is_one_stack(series):
         return [Series(series[0].uid, tuple(single.slices[0] for single in series))]
@@ -90,10 +100,7 @@ def describe_series(folder: str | Path) -> list[dict[str, Any]]:
     folder = Path(folder)
     if not folder.is_dir():
         raise ImageError("no such folder", file=folder, remedy="give the folder that holds the DICOM files")
-    found = list_series(folder)
-    if not found:
-        raise _build_none_error(folder)
-    return [_collect_facts(series) for series in found]
+    return [_collect_facts(series) for series in list_series(folder)]
 
 
 def _collect_facts(series: Series) -> dict[str, Any]:
@@ -139,15 +146,7 @@ def read_series(folder: str | Path, series_uid: str | None = None) -> Volume:
         return Volume(read_pixels(slices), spacing, first.position, direction, first.modality)
 
 
-def _build_none_error(folder: Path) -> ImageError:
-    return ImageError(
-        "no DICOM images in this folder", file=folder, remedy="give the folder that holds the slices"
-    )
-
-
 def _choose(folder: Path, found: list[Series], uid: str | None) -> Series:
-    if not found:
-        raise _build_none_error(folder)
     if uid is not None:
         chosen = [series for series in found if series.uid == uid]
         if chosen:

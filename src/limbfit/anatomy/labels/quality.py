@@ -25,8 +25,7 @@ def assess_labels(labels: LabelMap) -> QualityResult:
     Slices are counted from 0 along the grid axis of the limb.
     """
     axis = find_longest_axis(labels.limb, labels)
-    order = [*(n for n in range(3) if n != axis), axis]
-    turned = labels.permute_axes(order)
+    turned = labels.turn_along(axis)
     masks = {LIMB: turned.limb} | {
         name: turned.mask(name) for _, name in sorted(labels.names.items()) if turned.mask(name).any()
     }

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
-from scipy.ndimage import label as connected
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkImagingStencil import vtkImageStencilToImage, vtkPolyDataToImageStencil
 
@@ -20,6 +19,7 @@ from ...arrays import Array, Mask
 from ...errors import LabelError
 from ..frame import build_limb_frame, find_proximal_end
 from ..grid import SOFT_TISSUE, Grid, LabelMap
+from ..morphology import find_largest_piece
 from ..surfaces.extraction import compute_signed_distance_to
 from ..surfaces.surfaces import Anatomy, build_anatomy
 from ..surfaces.triangles import Surface
@@ -186,10 +186,9 @@ def _cut_section(labels: LabelMap, point: Array, normal: Array) -> _Section:
         labels.limb.astype(np.float32), np.moveaxis(index, -1, 0), order=1, mode="constant", cval=0.0
     )
     inside = gaussian_filter(cover, _SMOOTH_MM / _STEP_MM) > 0.5
-    parts, count = connected(inside)
-    if count == 0:
+    if not inside.any():
         raise LabelError("the amputation plane misses the limb", remedy="move its point into the limb")
-    inside = parts == int(np.argmax(np.bincount(parts.ravel())[1:])) + 1
+    inside = find_largest_piece(inside)
     image = np.all((index > -0.5) & (index < np.array(labels.array.shape) - 0.5), axis=-1)
     rim = inside & (distance_transform_edt(image) <= 1.0)
     return _Section(point + axes @ low, axes, distance_transform_edt(inside) * _STEP_MM, not rim.any())

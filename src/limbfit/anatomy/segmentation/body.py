@@ -23,7 +23,7 @@ from scipy.spatial import ConvexHull, QhullError
 from ...arrays import Array, Mask
 from ...errors import ImageError
 from ..frame import find_longest_axis
-from ..grid import Grid, Volume
+from ..grid import Grid, Volume, resample_cubic
 from ..labels.contours import fill_even_odd
 from ..morphology import (
     Field,
@@ -210,19 +210,8 @@ def check_one_limb(volume: Volume) -> None:
 def _find_tissue(volume: Volume) -> tuple[Mask, float]:
     """What is brighter than air (Otsu) on coarse cubic voxels, closed over thin dark bone; their edge, mm."""
     step = max(_COARSE_MM, float(volume.spacing.max()))
-    size = np.maximum(np.floor((np.array(volume.size) - 1) * volume.spacing / step).astype(int) + 1, 1)
     image = sitk.SmoothingRecursiveGaussian(volume.to_sitk(), step / 2)
-    coarse = sitk.Resample(
-        image,
-        size.tolist(),
-        sitk.Transform(),
-        sitk.sitkLinear,
-        volume.origin.tolist(),
-        [step] * 3,
-        volume.direction.ravel().tolist(),
-        0.0,
-        sitk.sitkFloat32,
-    )
+    coarse = resample_cubic(image, volume, step, sitk.sitkLinear, 0.0)
     tissue = sitk.GetArrayFromImage(sitk.OtsuThreshold(coarse, 0, 1)).astype(bool)
     padded = binary_closing(np.pad(tissue, 2), np.ones((3, 3, 3)))
     return padded[2:-2, 2:-2, 2:-2] | tissue, step

@@ -17,7 +17,7 @@ from scipy.ndimage import binary_fill_holes, gaussian_filter
 
 from ...arrays import Indices, Mask
 from ...errors import LabelError
-from ..grid import Grid, LabelMap, Volume
+from ..grid import Grid, LabelMap, Volume, resample_cubic
 from ..morphology import Field, compute_distance, find_box, find_largest_piece
 from .triangles import Surface, find_bodies, find_half_edges, from_pyvista
 
@@ -86,7 +86,11 @@ def smooth_field(body: Mask, grid: Grid, edge_mm: float) -> tuple[Volume, float]
     smooth = Volume(
         gaussian_filter(distance, _SIGMA_VOXELS, mode="nearest"), grid.spacing, grid.origin, grid.direction
     )
-    cubic = _resample_cubic(smooth, edge_mm)
+    # Fine enough for triangles of that edge.
+    fine = resample_cubic(
+        smooth.to_sitk(), smooth, edge_mm / 2.5, sitk.sitkBSpline3, float(smooth.array.min())
+    )
+    cubic = Volume.from_sitk(fine)
     count = round(float(body.sum()) * grid.voxel_mm3 / cubic.voxel_mm3)
     values = cubic.array.ravel()
     place = len(values) - min(count, len(values) - 1)
@@ -98,24 +102,6 @@ def compute_signed_distance_to(body: Mask, grid: Grid) -> Field:
     reach = 3 * grid.spacing.max()
     inside, outside = (compute_distance(mask, grid.spacing) for mask in (~body, body))
     return np.minimum(inside, reach, out=inside) - np.minimum(outside, reach, out=outside)
-
-
-def _resample_cubic(field: Volume, edge_mm: float) -> Volume:
-    """The field on cubic voxels fine enough for triangles of ``edge_mm``."""
-    h = edge_mm / 2.5
-    size = np.floor((np.array(field.size) - 1) * field.spacing / h).astype(int) + 1
-    resampled = sitk.Resample(
-        field.to_sitk(),
-        size.tolist(),
-        sitk.Transform(),
-        sitk.sitkBSpline3,
-        field.origin.tolist(),
-        [h, h, h],
-        field.direction.ravel().tolist(),
-        float(field.array.min()),
-        sitk.sitkFloat32,
-    )
-    return Volume.from_sitk(resampled)
 
 
 def extract_contour(values: NDArray[np.floating], level: float) -> Surface:

@@ -96,9 +96,8 @@ def build_anatomy(
         end = find_proximal_end(labels.limb, labels)
         point, normal = _choose_default_cut(labels, end)
     else:
-        point, normal = _normalise_plane(
-            *proximal_cut
-        )  # a short limb may be wider than long: its axis follows from the cut
+        # A short limb may be wider than long: its axis follows from the cut.
+        point, normal = _normalise_plane(*proximal_cut)
         end = find_proximal_end(labels.limb, labels, int(np.abs(normal @ labels.direction).argmax()))
     own_point = np.round(labels.direction.T @ (point - labels.origin), 4)
     own_normal = np.round(labels.direction.T @ normal, 6)

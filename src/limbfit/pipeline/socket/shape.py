@@ -64,8 +64,7 @@ def build_socket(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
         areas = [_build_area(study, area, regions) for area in table.areas]
         socket = rectify_limb(outer, frame, replace(build_recipe(study, anatomy), areas=areas))
         refuse_bones(
-            socket.points,
-            socket.faces,
+            socket.surface,
             socket.brim,
             frame,
             anatomy.bones,

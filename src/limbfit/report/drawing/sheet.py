@@ -29,8 +29,7 @@ _MARGIN = 4  # voxels around the limb
 def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: QualityResult) -> None:
     """Write the picture (PNG): slices from end to end, below them the suspects of the measures."""
     axis = "ijk".index(quality.axis)
-    order = [*(n for n in range(3) if n != axis), axis]
-    image, turned = volume.permute_axes(order), labels.permute_axes(order)
+    image, turned = volume.turn_along(axis), labels.turn_along(axis)
     window = _find_window(turned.limb)
     masks = {LIMB: turned.limb} | {
         name: turned.mask(name) for name in turned.names.values() if name != SOFT_TISSUE
