@@ -159,31 +159,24 @@ def checks(recording) -> dict[str, bool | None]:
     return {check.name: check.passed for check in check_record(recording).checks}
 
 
-def test_a_good_session_is_called_good(tmp_path) -> None:
+def test_a_good_session_is_called_good_and_its_ramps_are_kept_with_their_holds(tmp_path) -> None:
     bench, recording = session(
-        tmp_path, repeats=2, precondition=1, ramp_speed_mm_s=1.4, pause_s=3.0, settle_s=0.5
+        tmp_path, repeats=2, precondition=1, ramp_speed_mm_s=1.4, hold_s=1.0, pause_s=3.0, settle_s=0.5
     )
     verdict = check_record(recording)
     assert verdict.is_good, verdict
     found = find_ramps(recording)
     assert [ramp.cycle for ramp in found] == [1, 2, 3]
+    protocol = bench.session.protocol
+    depth = (protocol.depth_um - protocol.start_um) / 1000
     for ramp in found:
-        protocol = bench.session.protocol
-        assert ramp.trace.displacement_mm.max() == pytest.approx(
-            (protocol.depth_um - protocol.start_um) / 1000, abs=0.02
-        )
+        assert ramp.trace.displacement_mm.max() == pytest.approx(depth, abs=0.02)
         assert np.allclose(np.diff(ramp.trace.time_s), 0.002)
         assert abs(ramp.trace.displacement_mm[[0, -1]]).max() < 0.1
-
-
-def test_a_ramp_is_kept_with_its_hold(tmp_path) -> None:
-    _, recording = session(tmp_path, ramp_speed_mm_s=1.4, hold_s=2.0, pause_s=3.0, settle_s=0.5)
-    assert check_record(recording).is_good
-    (ramp,) = find_ramps(recording)
-    curve = regularise(ramp.trace, find_touch_down(ramp.trace))
+    curve = regularise(found[1].trace, find_touch_down(found[1].trace))
     assert [phase.kind for phase in curve.phases] == ["load", "hold", "unload"]
     hold = curve.phases[1]
-    assert hold.duration_s == pytest.approx(2.0, abs=0.15)
+    assert hold.duration_s == pytest.approx(1.0, abs=0.15)
     inside = (curve.time_s > hold.start_s + 0.1) & (curve.time_s < hold.end_s - 0.1)
     assert np.diff(curve.force_N[inside])[[0, -1]].max() < 0.0  # it relaxes
 

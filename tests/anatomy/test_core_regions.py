@@ -51,11 +51,12 @@ def limb_without() -> Anatomy:
 
 
 INSIDE = ([-14.0, 0.0, -40.0], [5.0, 9.0, 16.0])
+THROUGH = ([23.0, 0.0, -40.0], [8.0, 9.0, 16.0])  # the sheet of muscle between bone and layer
 
 
 @pytest.fixture(scope="module")
 def meshed() -> tuple:
-    anatomy = with_regions(scar=INSIDE)
+    anatomy = with_regions(scar=INSIDE, tendon=THROUGH)
     return anatomy, *mesh_site(anatomy, *SITE, COARSE)
 
 
@@ -66,7 +67,7 @@ def find_nodes_between(mesh: Mesh) -> np.ndarray:
 
 def test_the_mesh_conforms_to_a_region(meshed: tuple) -> None:
     anatomy, mesh, report = meshed
-    assert mesh.region_names == ("skin", "scar", "muscle")
+    assert mesh.region_names == ("skin", "scar", "tendon", "muscle")
     assert len(boundary_faces(mesh)) < 4 * len(mesh.cells)  # raises where a face has three cells
     depth = -evaluate_distance(anatomy.regions["scar"], mesh.points)[0]
     between, scar = find_nodes_between(mesh), mesh.regions == 1
@@ -87,10 +88,10 @@ def test_its_volume_is_that_of_its_surface(meshed: tuple) -> None:
     assert report.volume_mm3 == pytest.approx(sum(report.region_volumes_mm3.values()))
 
 
-def test_it_joins_bone_and_layer_at_right_angles() -> None:
+def test_it_joins_bone_and_layer_at_right_angles(meshed: tuple) -> None:
     """An ellipsoid through the sheet of muscle between bone and layer leaves no wedge at either."""
-    mesh, report = mesh_site(with_regions(tendon=([23.0, 0.0, -40.0], [8.0, 9.0, 16.0])), *SITE, COARSE)
-    own = np.unique(mesh.cells[mesh.regions == 1])
+    _, mesh, report = meshed
+    own = np.unique(mesh.cells[mesh.regions == 2])
     assert np.isin(own, mesh.node_sets["fixed_bone"]).sum() > 10
     assert np.isin(own, mesh.cells[mesh.regions == 0]).sum() > 10
     assert report.min_dihedral_deg > 8.0

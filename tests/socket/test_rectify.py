@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import igl
 import numpy as np
@@ -27,6 +28,11 @@ def frame_of(anatomy: Anatomy) -> Frame:
 def made(recipe: Recipe = PLAIN, anatomy: Anatomy | None = None) -> Socket:
     anatomy = anatomy or round_limb()
     return rectify_limb(anatomy.skin, frame_of(anatomy), recipe)
+
+
+@cache
+def made_plain() -> Socket:
+    return made()
 
 
 def ratio(socket: Socket, anatomy: Anatomy, height: float) -> float:
@@ -69,7 +75,7 @@ def closed_above(clear: Surface, anatomy: Anatomy) -> Surface:
     return Surface(points, closed.faces)
 
 
-@pytest.mark.parametrize("percent", [-2.0, 0.0, 3.0, 6.0])
+@pytest.mark.parametrize("percent", [-2.0, 6.0])
 def test_circumference_is_reduced_by_what_was_asked(percent: float) -> None:
     socket = made(replace(PLAIN, reduction_percent=percent))
     for height in (-100.0, -80.0, -60.0, -45.0):
@@ -88,7 +94,7 @@ def test_volume_and_brim_of_a_round_limb() -> None:
 
 
 def test_triangles_are_even() -> None:
-    corners = made().surface.triangles
+    corners = made_plain().surface.triangles
     lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     assert 2.5 < np.percentile(lengths, 1) < 4.0 < np.percentile(lengths, 99) < 6.5
     ratio = lengths.max(axis=1) / lengths.min(axis=1)
@@ -99,7 +105,7 @@ def test_triangles_are_even() -> None:
 def test_an_area_is_as_deep_as_asked(depth: float) -> None:
     limb = round_limb()
     at = np.array([0.0, -44.0, 80.0])
-    plain, socket = made(), made(replace(PLAIN, areas=[Area("front", at, 25.0, depth)]))
+    plain, socket = made_plain(), made(replace(PLAIN, areas=[Area("front", at, 25.0, depth)]))
     change = socket.offset(limb.skin) - plain.offset(limb.skin)
     moved = np.linalg.norm(socket.points - plain.points, axis=1)
     apart = np.linalg.norm(plain.points - at, axis=1)
@@ -123,7 +129,7 @@ def test_a_position_on_the_skin_means_the_liner_outside_it() -> None:
 
 def test_distal_clearance_and_bearing() -> None:
     limb = round_limb()
-    bearing, clear = made(), made(replace(PLAIN, distal="clearance", distal_clearance_mm=8.0))
+    bearing, clear = made_plain(), made(replace(PLAIN, distal="clearance", distal_clearance_mm=8.0))
     assert bearing.points[:, 2].min() == pytest.approx(0.0, abs=0.1)
     assert clear.points[:, 2].min() == pytest.approx(-8.0, abs=0.1)
     assert -clear.offset(limb.skin).min() == pytest.approx(8.0, abs=0.15)
@@ -132,7 +138,7 @@ def test_distal_clearance_and_bearing() -> None:
 
 
 def test_the_brim_is_flared_along_an_arc() -> None:
-    plain, flared = made(), made(replace(PLAIN, flare_mm=10.0))
+    plain, flared = made_plain(), made(replace(PLAIN, flare_mm=10.0))
     out = np.hypot(*flared.points[flared.brim][:, :2].T) - np.hypot(*plain.points[plain.brim][:, :2].T)
     np.testing.assert_allclose(out, 10.0 * (1 - np.cos(np.pi / 3)), atol=0.9)
     low = flared.points[:, 2] < 100.0
@@ -174,7 +180,7 @@ def test_where_the_limb_lies_does_not_matter() -> None:
     skin = Surface(limb.skin.points @ turn.T + shift, limb.skin.faces)
     recipe = replace(PLAIN, trim=Trim([(turn @ [0.0, 0.0, 115.0] + shift, turn @ CUT_NORMAL)]))
     moved = rectify_limb(skin, build_limb_frame(turn @ limb.cut_point + shift, turn @ CUT_NORMAL), recipe)
-    assert moved.volume_mm3 == pytest.approx(made().volume_mm3, rel=1e-4)
+    assert moved.volume_mm3 == pytest.approx(made_plain().volume_mm3, rel=1e-4)
     assert moved.closed.volume > 0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,7 @@ def with_file(folder: Path, text: str) -> Path:
     return folder
 
 
+@cache
 def drawn() -> Surface:
     anatomy = limb()
     trim = Trim([(anatomy.cut_point - [0.0, 0.0, 26.0], anatomy.cut_normal)])
