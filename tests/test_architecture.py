@@ -43,7 +43,7 @@ INNER_FLOORS = {
         "limb",
         "engine",
     ],
-    "report": ["__init__ build", "sections", "drawing", "page store tables formats"],
+    "report": ["__init__ build", "sections", "drawing", "page store tables formats words"],
 }
 # ``report`` reads stored results only; ``phantom`` makes inputs: neither may know the other.
 

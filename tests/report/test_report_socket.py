@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import pytest
 
+from completing import complete
 from limbfit.cli.socket import show_socket
 from limbfit.report.page import Table
 from limbfit.report.sections.socket import make_interval_table, make_published_blocks, make_published_table
+from limbfit.results.socket import SocketLoad, SocketResult, SocketState
 from limbfit.socket.published import FINDINGS, WHOLE, select_published_findings
 
 SHARES = {"skin.c_kPa": 80.0, "muscle.tau_s": 12.4}
@@ -21,6 +25,7 @@ REGION = {
 }
 HELD = {
     "name": "stance",
+    "mean_kPa": 12.0,
     "peak_kPa": 60.0,
     "contact_area_mm2": 3e4,
     "settling_mm": 9.0,
@@ -29,10 +34,15 @@ HELD = {
     "settling_change_mm": {"liner.c_kPa": -0.25},
     "regions": [REGION],
 }
+STANCE = SocketLoad.model_validate(complete(SocketLoad, deepcopy(HELD)))
+
+
+def don(region: dict) -> SocketState:
+    return SocketState.model_validate(complete(SocketState, {"regions": [dict(region)]}))
 
 
 def test_the_table_of_intervals_names_parameters_and_what_the_liner_changes():
-    table = make_interval_table(HELD, "stance")
+    table = make_interval_table(STANCE, "stance")
     assert isinstance(table, Table)
     assert table.head[3:] == ("muscle τ (%)", "skin c (%)", "Change, liner c 10 % larger")
     rows = [[cell.text for cell in row.cells] for row in table.rows]
@@ -44,7 +54,7 @@ def test_the_table_of_intervals_names_parameters_and_what_the_liner_changes():
 
 def test_a_simulated_change_of_friction_has_a_column_of_its_own():
     rougher = {**REGION, "change_kPa": {**REGION["change_kPa"], "friction": 1.25}}
-    table = make_interval_table({"regions": [rougher]}, "stance")
+    table = make_interval_table(don(rougher), "stance")
     assert isinstance(table, Table)
     assert table.head[-1] == "Change, friction 10 % larger"
     assert table.rows[0].cells[-1].text == "1.2 kPa"
@@ -52,24 +62,22 @@ def test_a_simulated_change_of_friction_has_a_column_of_its_own():
 
 def test_without_identified_tissues_there_is_no_such_table():
     unknown = {**REGION, "interval_kPa": None, "interval_from": None, "change_kPa": None}
-    assert make_interval_table({"regions": [unknown]}, "donning") is None
+    assert make_interval_table(don(unknown), "donning") is None
 
 
 def test_the_command_says_what_most_of_an_interval_comes_from(capsys):
-    donning = {**HELD, "name": "donning"}
-    del donning["settling_mm"]
-    show_socket(
-        {
-            "donning": donning,
-            "loads": [HELD],
-            "socket": {"notes": ["its triangles looked away from the tissue and were turned"]},
-            "parameters_from": "identified",
-            "balance_percent": 0.01,
-            "outside_text": ["the load 'stance' lasts 3600 s; the records last 13 s"],
-            "samples": {"simulated": 5, "failed": ["the load could not be carried"]},
-            "worn_s": 3600.0,
-        }
-    )
+    content = {
+        "donning": {key: HELD[key] for key in ("peak_kPa", "contact_area_mm2", "regions")},
+        "loads": [HELD],
+        "socket": {"notes": ["its triangles looked away from the tissue and were turned"]},
+        "parameters_from": "identified",
+        "friction": "sticky",
+        "balance_percent": 0.01,
+        "outside_text": ["the load 'stance' lasts 3600 s; the records last 13 s"],
+        "samples": {"simulated": 5, "failed": ["the load could not be carried"]},
+        "worn_s": 3600.0,
+    }
+    show_socket(SocketResult.model_validate(complete(SocketResult, deepcopy(content))))
     printed = capsys.readouterr()
     assert "warning: the load 'stance' lasts 3600 s; the records last 13 s" in printed.err
     out = " ".join(printed.out.split())
@@ -83,9 +91,7 @@ def test_the_command_says_what_most_of_an_interval_comes_from(capsys):
 def test_every_finding_is_told_of_its_regions_with_its_source(finding):
     rows = select_published_findings([*finding.regions, "another"])
     assert finding.source in {row.source for row in rows}
-    table = make_published_table(
-        {"published": [row.to_plain() for row in rows]}, HELD | {"mean_kPa": 12.0}, "stance"
-    )
+    table = make_published_table(rows, STANCE, "stance")
     assert any(finding.found in {cell.text for cell in row.cells} for row in table.rows)
     assert all(set(row.regions) <= {*finding.regions, WHOLE} for row in rows)
 
@@ -93,11 +99,9 @@ def test_every_finding_is_told_of_its_regions_with_its_source(finding):
 def test_what_others_found_stands_beside_the_regions_own_pressures():
     """By region; what was found over the whole limb beside the whole limb's."""
     rows = select_published_findings(["tibial crest"])
-    table = make_published_table(
-        {"published": [row.to_plain() for row in rows]}, HELD | {"mean_kPa": 12.0}, "stance"
-    )
+    table = make_published_table(rows, STANCE, "stance")
     own = {tuple(cell.text for cell in row.cells[:3]) for row in table.rows}
     assert own == {("tibial crest", "30.0", "60.0"), (WHOLE, "12.0", "60.0")}
     assert len(table.rows) == sum("tibial crest" in one.regions or WHOLE in one.regions for one in FINDINGS)
     assert "stance" in table.caption
-    assert make_published_blocks({"published": []}, HELD, "stance") == ()
+    assert make_published_blocks([], STANCE, "stance") == ()

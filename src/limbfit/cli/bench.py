@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,7 +13,7 @@ import limbfit
 
 from ..bench.timing import UNKNOWNS
 from ..execution import count_usable_cores
-from .console import STDOUT, AsJson, Column, Row, listen_on_console, print_line, print_result, print_table
+from .console import STDOUT, AsJson, Column, listen_on_console, print_line, print_result, print_table
 
 app = typer.Typer(
     help="Benchmarks of solver, meshes and identification.", no_args_is_help=True, rich_markup_mode=None
@@ -49,7 +49,7 @@ def show_parity(rows: list[dict[str, Any]]) -> None:
     print_table(rows, columns)
 
 
-def format_peak(row: Row, start: str) -> str:
+def format_peak(row: Mapping[str, Any], start: str) -> str:
     """The first value whose key begins with ``start``, with the unit at the end of the key."""
     key = next((key for key in row if key.startswith(start)), None)
     return "-" if key is None else f"{row[key]:.4g} {key.rpartition('_')[2]}"

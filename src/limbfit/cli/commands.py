@@ -17,7 +17,6 @@ from ..study import Study
 from .console import (
     AsJson,
     Column,
-    Row,
     format_parameter_heads,
     format_use,
     listen_on_console,
@@ -423,7 +422,7 @@ def show_placed_sites(result: dict[str, Any]) -> None:
 
 
 def show_meshes(result: dict[str, Any]) -> None:
-    def format_trimmed(row: Row) -> str:
+    def format_trimmed(row: Any) -> str:
         bones = (f"{bone} {cut['volume_mm3'] / 1000:.2f}" for bone, cut in row["trimmed_bone"].items())
         return ", ".join(bones) or "none"
 

@@ -36,8 +36,7 @@ CLEARING_TIME_S = 15.0  # for what heard it to end its workers and files
 STDOUT = Console(highlight=False, markup=False)
 STDERR = Console(stderr=True, highlight=False, markup=False)
 Result = TypeVar("Result")
-Row = Mapping[str, Any]
-Column = str | tuple[str, str] | Callable[[Row], str]
+Column = str | tuple[str, str] | Callable[[Any], str]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
 
 
@@ -53,12 +52,16 @@ def print_result(content: Result, show: Callable[[Result], None], as_json: bool)
         show(content)
 
 
-def print_stored(content: dict[str, Any], show: Callable[[dict[str, Any]], None], as_json: bool) -> None:
-    """Print what an experiment found; in words, where it is stored comes last."""
-    print_result(content, show, as_json)
-    if not as_json:
-        place = f"report: {content['report']}" if "report" in content else "limbfit report shows it"
-        print_line(f"stored in {content['folder']}; {place}")
+def print_stored(
+    content: dict[str, Any], study: limbfit.Study, name: str, show: Callable[[Any], None], as_json: bool
+) -> None:
+    """Print what a study has stored by ``name``: as JSON, or as ``show`` prints it, and where it is."""
+    if as_json:
+        print_json(content)
+        return
+    show(getattr(limbfit.load_results(study), name))
+    place = f"report: {content['report']}" if "report" in content else "limbfit report shows it"
+    print_line(f"stored in {content['folder']}; {place}")
 
 
 def print_line(text: str) -> None:
@@ -76,12 +79,12 @@ def print_warning(text: str) -> None:
 
 
 def print_table(
-    rows: Iterable[Row], columns: Mapping[str, Column], *, dash: str = "-", unwrapped: Container[str] = ()
+    rows: Iterable[Any], columns: Mapping[str, Column], *, dash: str = "-", unwrapped: Container[str] = ()
 ) -> None:
     """Print rows as a table of columns by their heads, each with what stands below it.
 
-    A column is a key of the rows, a key with a format, or a function of the row. A value that is not there is
-    a ``dash``. The cells of ``unwrapped`` columns stay on one line.
+    A column is an attribute or key of the rows, one with a format, or a function of the row. A value that is
+    not there is a ``dash``. The cells of ``unwrapped`` columns stay on one line.
     """
     table = Table(box=None)
     for head in columns:
@@ -91,17 +94,18 @@ def print_table(
     STDOUT.print(table)
 
 
-def _format_cell(row: Row, column: Column, dash: str) -> str:
+def _format_cell(row: Any, column: Column, dash: str) -> str:
     if callable(column):
         return column(row)
     key, form = (column, "") if isinstance(column, str) else column
-    value = row.get(key)
+    value = row.get(key) if isinstance(row, Mapping) else getattr(row, key)
     return dash if value is None else format(value, form)
 
 
-def format_use(row: Row) -> str:
+def format_use(row: Any) -> str:
     """The words for a site or record that was fitted, or held out."""
-    return "fitted" if row["fitted"] else "held out"
+    fitted = row["fitted"] if isinstance(row, Mapping) else row.fitted
+    return "fitted" if fitted else "held out"
 
 
 @contextmanager

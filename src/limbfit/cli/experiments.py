@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,6 +13,10 @@ import typer
 import limbfit
 
 from ..errors import InputError
+from ..results.models import ModelsResult
+from ..results.planning import DesignResult, ProtocolResult
+from ..results.uncertainty import CrossvalidateResult, RegionsResult, UncertaintyResult
+from ..results.variants import CubeResult, RefinementResult, VolumeResult
 from .commands import StudyPath, parse_parameters
 from .console import (
     AsJson,
@@ -29,12 +33,13 @@ from .console import (
 
 
 def _run_and_print(
-    study: Path, name: str, show: Callable[[dict[str, Any]], None], *, as_json: bool, **options: Any
+    study: Path, name: str, show: Callable[[Any], None], as_json: bool, **options: Any
 ) -> None:
     """Do the experiment ``name`` with ``options``, print what it found and where it is stored."""
+    checked = limbfit.load_study(study)
     with listen_on_console() as listener:
-        result = limbfit.run_experiment(limbfit.load_study(study), name, listener=listener, **options)
-    print_stored(result, show, as_json)
+        result = limbfit.run_experiment(checked, name, listener=listener, **options)
+    print_stored(result, checked, name, show, as_json)
 
 
 def cube(
@@ -50,25 +55,25 @@ def cube(
     if study is not None:
         if output is not None:
             raise InputError("a study has its own folder", place="--output", remedy="leave it out")
-        _run_and_print(study, "cube", show_cube, as_json=as_json, compression_percent=compression)
+        _run_and_print(study, "cube", show_cube, as_json, compression_percent=compression)
         return
     folder = output or Path("cube")
     result = limbfit.compress_cube(folder, compression_percent=compression)
     if as_json:
         print_json(result | {"folder": str(folder)})
         return
-    show_cube(result)
+    show_cube(CubeResult.model_validate(result))
     print_line(f"stored in {folder}: cube.json, cube.csv, cube.svg")
 
 
-def show_cube(result: dict[str, Any]) -> None:
+def show_cube(found: CubeResult) -> None:
     columns: dict[str, Column] = {
         "tissue": "tissue",
         "peak (kPa)": ("peak_kPa", ".3g"),
         "back (kPa)": ("back_kPa", ".2f"),
         "least J": ("J_min", ".4f"),
     }
-    print_table(result["tissues"], columns, unwrapped=("tissue",))
+    print_table(found.tissues, columns, unwrapped=("tissue",))
 
 
 class RegionSites(StrEnum):
@@ -85,22 +90,32 @@ def regions(
     as_json: AsJson = False,
 ) -> None:
     """Identify each region separately, beside the model of the whole limb (the paper's table 3)."""
-    _run_and_print(study, "regions", show_regions, as_json=as_json, sites=sites.value)
+    _run_and_print(study, "regions", show_regions, as_json, sites=sites.value)
 
 
-def show_regions(result: dict[str, Any]) -> None:
-    rows = []
-    for fit in ({"region": "whole limb"} | result["whole"], *result["regions"]):
-        head = fit | {"sites": ", ".join(fit["fitted_sites"])}
-        for tissue, values in fit["parameters"].items():
+def show_regions(found: RegionsResult) -> None:
+    whole = found.whole
+    fits: list[tuple[Any, ...]] = [("whole limb", whole.fitted_sites, whole.parameters, None, None)]
+    fits += [
+        (one.region, one.fitted_sites, one.parameters, one.own_error_percent, one.whole_error_percent)
+        for one in found.regions
+    ]
+    rows: list[dict[str, Any]] = []
+    for region, sites, parameters, own, error in fits:
+        head = {"region": region, "sites": ", ".join(sites), "own": own, "whole": error}
+        for tissue, values in parameters.items():
             rows.append(head | values | {"tissue": tissue})
             head = {"region": "", "sites": ""}
-    keys = list(next(iter(result["whole"]["parameters"].values())))
+    keys = list(next(iter(whole.parameters.values())))
     columns: dict[str, Column] = {"region": "region", "sites": "sites", "tissue": "tissue"}
     columns |= {head: (key, ".3g") for head, key in zip(format_parameter_heads(keys), keys)}
-    columns |= {"error (%)": ("own_error_percent", ".2f"), "whole (%)": ("whole_error_percent", ".2f")}
+    columns |= {"error (%)": ("own", ".2f"), "whole (%)": ("whole", ".2f")}
     print_table(rows, columns, dash="")
-    for text in result["left_out"]:
+    _show_left_out(found.left_out)
+
+
+def _show_left_out(texts: Iterable[str]) -> None:
+    for text in texts:
         print_line(f"left out: {text}")
 
 
@@ -118,50 +133,50 @@ def uncertainty(
 ) -> None:
     """Find what the records determine, what else changes the answer, and how far to trust predictions."""
     if models is None:
-        _run_and_print(study, "uncertainty", show_uncertainty, as_json=as_json)
+        _run_and_print(study, "uncertainty", show_uncertainty, as_json)
         return
+    checked = limbfit.load_study(study)
     names = [name.strip() for name in models.split(",") if name.strip()]
     with listen_on_console() as listener:
-        result = limbfit.compare_models(limbfit.load_study(study), names, listener=listener)
-    print_stored(result, show_models, as_json)
+        result = limbfit.compare_models(checked, names, listener=listener)
+    print_stored(result, checked, "models", show_models, as_json)
 
 
-def show_models(result: dict[str, Any]) -> None:
+def show_models(found: ModelsResult) -> None:
     """The weight of each model, and the interval of each record's peak with all of them."""
     columns: dict[str, Column] = {
         "model": "words",
         "fitted (%)": ("error_fitted_percent", ".2f"),
         "held out (%)": ("error_heldout_percent", ".2f"),
         "2 ln B against the study's": ("evidence", "+.1f"),
-        "weight (%)": lambda row: f"{100 * row['weight']:.0f}",
+        "weight (%)": lambda row: f"{100 * row.weight:.0f}",
     }
-    print_table(result["models"], columns, dash="")
+    print_table(found.models, columns, dash="")
     columns = {
         "record": "record",
         "": format_use,
-        "measured peak": lambda row: f"{row['peak']:.3g} {row['unit']}",
-        "95 % by the study's model": lambda row: f"{_format_ends(row['own_interval_95'])} {row['unit']}",
-        "95 % by all models": lambda row: f"{_format_ends(row['interval_95'])} {row['unit']}",
+        "measured peak": lambda row: f"{row.peak:.3g} {row.unit}",
+        "95 % by the study's model": lambda row: f"{_format_ends(row.own_interval_95)} {row.unit}",
+        "95 % by all models": lambda row: f"{_format_ends(row.interval_95)} {row.unit}",
     }
-    print_table(result["records"], columns)
-    for text in result["left_out"].values():
-        print_line(f"left out: {text}")
+    print_table(found.records, columns)
+    _show_left_out(found.left_out.values())
 
 
 def _format_ends(interval: Sequence[float]) -> str:
     return f"{interval[0]:.3g} to {interval[1]:.3g}"
 
 
-def show_uncertainty(result: dict[str, Any]) -> None:
+def show_uncertainty(found: UncertaintyResult) -> None:
     columns: dict[str, Column] = {
         "parameter": "name",
         "identified": ("calibrated", ".3g"),
-        "95 % by the records": lambda row: _format_ends(row["posterior_95"]),
-        "95 % with all sources": lambda row: _format_ends(row["with_sources_95"]),
+        "95 % by the records": lambda row: _format_ends(row.posterior_95),
+        "95 % with all sources": lambda row: _format_ends(row.with_sources_95),
         "verdict": "verdict",
     }
-    print_table(result["parameters"], columns)
-    for text in result["verdict"]:
+    print_table(found.parameters, columns)
+    for text in found.verdict:
         print_line(text)
 
 
@@ -193,7 +208,8 @@ def sensitivity(
                 checked, f"sensitivity-{name}", listener=listener, sites=site or []
             )
             if not as_json:
-                show_sensitivity(name, results[name])
+                show_sensitivity(name, getattr(limbfit.load_results(checked), f"sensitivity_{name}"))
+                print_line(f"stored in {results[name]['folder']}; limbfit report shows it")
     if as_json:
         print_json(results)
 
@@ -208,7 +224,7 @@ def parse_sensitivities(only: str | None) -> list[str]:
     return names
 
 
-def show_sensitivity(name: str, result: dict[str, Any]) -> None:
+def show_sensitivity(name: str, found: Any) -> None:
     columns: dict[str, Column] = {
         f"sensitivity to {name}": "label",
         "site": "site",
@@ -216,18 +232,16 @@ def show_sensitivity(name: str, result: dict[str, Any]) -> None:
         "change (%)": ("peak_change_percent", ".2f"),
         "mean (%)": ("mean_change_percent", ".2f"),
     }
-    if name == "kappa":
+    if isinstance(found, VolumeResult):
         columns |= {"least J": ("J_min", ".4f"), "largest J": ("J_max", ".4f")}
-    print_table(result["runs"], columns)
-    if name == "mesh":
-        for row in result["sites"]:
-            if row["limit_N"] is not None:
-                text = f"site {row['site']}: tends to {row['limit_N']:.3f} N, order {row['order']:.2g}"
-                print_line(f"{text}; the study's mesh is {row['error_percent']:+.2f} % off")
-    for row in result["runs"]:
-        if not row["completed"]:
-            print_warning(f"partial: site {row['site']}, {row['label']}: {row['reason']}")
-    print_line(f"stored in {result['folder']}; limbfit report shows it")
+    print_table(found.runs, columns)
+    for row in found.sites if isinstance(found, RefinementResult) else ():
+        if row.limit_N is not None:
+            text = f"site {row.site}: tends to {row.limit_N:.3f} N, order {row.order:.2g}"
+            print_line(f"{text}; the study's mesh is {row.error_percent:+.2f} % off")
+    for row in found.runs:
+        if not row.completed:
+            print_warning(f"partial: site {row.site}, {row.label}: {row.reason}")
 
 
 def experiment(
@@ -239,7 +253,13 @@ def experiment(
     as_json: AsJson = False,
 ) -> None:
     """Run an experiment that has no command of its own."""
-    _run_and_print(study, name, print_json, as_json=as_json, **parse_options(option or ()))
+    with listen_on_console() as listener:
+        result = limbfit.run_experiment(
+            limbfit.load_study(study), name, listener=listener, **parse_options(option or ())
+        )
+    print_json(result)
+    if not as_json:
+        print_line(f"stored in {result['folder']}; limbfit report shows it")
 
 
 def parse_options(words: Iterable[str]) -> dict[str, Any]:
@@ -266,28 +286,26 @@ def crossvalidate(
 ) -> None:
     """Fit other choices of sites and predict the rest; leave out whole regions."""
     options = {"fit": fit, "choices": choices, "seed": seed, "runs": runs}
-    _run_and_print(study, "crossvalidate", show_crossvalidation, as_json=as_json, **options)
+    _run_and_print(study, "crossvalidate", show_crossvalidation, as_json, **options)
 
 
-def show_crossvalidation(result: dict[str, Any]) -> None:
-    own = result["own"]
+def show_crossvalidation(found: CrossvalidateResult) -> None:
+    own, checks = found.own, found.emulator.checks
     print_line(
-        f"{result['choices']} of {result['choices_possible']} choices of {result['fitted_sites']} sites: "
-        f"mean held-out error {own['median_percent']:.2f} % (median; 5 to 95 %: {own['low_percent']:.2f} to "
-        f"{own['high_percent']:.2f} %)\n"
-        f"the study's own choice ({', '.join(own['fitted'])}): {own['mean_error_heldout_percent']:.2f} %; "
-        f"{100 * own['share_better']:.0f} % of the choices do better"
+        f"{found.choices} of {found.choices_possible} choices of {found.fitted_sites} sites: "
+        f"mean held-out error {own.median_percent:.2f} % (median; 5 to 95 %: {own.low_percent:.2f} to "
+        f"{own.high_percent:.2f} %)\n"
+        f"the study's own choice ({', '.join(own.fitted)}): {own.mean_error_heldout_percent:.2f} %; "
+        f"{100 * own.share_better:.0f} % of the choices do better"
     )
-    sites = ({"name": f"site {row['site']}", "error": row["mean_percent"]} for row in result["sites"])
-    rows = [row for row in sites if row["error"] is not None]
-    for row in result["regions"]:
-        rows.append({"name": f"region {row['label']}", "error": row["mean_error_heldout_percent"]})
+    known = [row for row in found.sites if row.mean_percent is not None]
+    rows = [{"name": f"site {row.site}", "error": row.mean_percent} for row in known]
+    for fit in found.regions:
+        rows.append({"name": f"region {fit.label}", "error": fit.mean_error_heldout_percent})
     print_table(rows, {"left out": "name", "error (%)": ("error", ".2f")})
-    checks = [row["emulator_error_percent"] for row in result["emulator"]["checks"]]
     if checks:
-        print_line(
-            f"the emulator at {len(checks)} of the fits, against the solver: within {max(checks):.2f} %"
-        )
+        largest = max(row.emulator_error_percent for row in checks)
+        print_line(f"the emulator at {len(checks)} of the fits, against the solver: within {largest:.2f} %")
 
 
 def design(
@@ -375,7 +393,8 @@ def design(
                 parameters=values,
                 listener=listener,
             )
-    print_stored(result, show_protocol if protocol else show_design, as_json)
+    name, show = ("protocol", show_protocol) if protocol else ("design", show_design)
+    print_stored(result, checked, name, show, as_json)
 
 
 def parse_list(text: str | None, place: str, remedy: str, least: float = 1e-3) -> tuple[float, ...]:
@@ -391,20 +410,19 @@ def parse_list(text: str | None, place: str, remedy: str, least: float = 1e-3) -
     return values
 
 
-def show_design(result: dict[str, Any]) -> None:
+def show_design(found: DesignResult) -> None:
     columns: dict[str, Column] = {
         "design": "design",
-        "sites (depth in mm)": lambda row: ", ".join(
-            f"{site['site']} ({site['depth_mm']:.1f})" for site in row["sites"]
-        ),
-        "D (%)": lambda row: f"{100 * row['d_efficiency']:.0f}",
-        "A (%)": lambda row: f"{100 * row['a_efficiency']:.0f}",
+        "sites (depth in mm)": lambda row: ", ".join(f"{one.site} ({one.depth_mm:.1f})" for one in row.sites),
+        "D (%)": lambda row: f"{100 * row.d_efficiency:.0f}",
+        "A (%)": lambda row: f"{100 * row.a_efficiency:.0f}",
     }
-    print_table(result["designs"], columns)
-    _show_expected(result, result["designs"])
+    print_table(found.designs, columns)
+    _show_expected({one.design: one.factor_95 for one in found.designs}, found.verdict)
+    _show_left_out(found.left_out)
 
 
-def show_protocol(result: dict[str, Any]) -> None:
+def show_protocol(found: ProtocolResult) -> None:
     """The records, then what each protocol would determine."""
     columns: dict[str, Column] = {
         "site": "site",
@@ -414,21 +432,21 @@ def show_protocol(result: dict[str, Any]) -> None:
         "hold (s)": ("hold_s", ".3g"),
         "force (N)": ("peak_force_N", ".3g"),
     }
-    print_table(result["records"], columns)
-    _show_expected(result, result["protocols"])
+    print_table(found.records, columns)
+    expected = {one.design: {**one.factor_95, **one.pressures_95} for one in found.protocols}
+    _show_expected(expected, found.verdict)
+    for text in found.left_out:
+        print_line(f"told: {text}")
 
 
-def _show_expected(result: dict[str, Any], choices: list[dict[str, Any]]) -> None:
+def _show_expected(choices: Mapping[str, Mapping[str, float]], verdict: str) -> None:
     """The factors of the 95 % intervals that each choice promises, and the verdict."""
-    rows = []
-    for kind in ("factor_95", "pressures_95"):
-        for name in choices[0].get(kind, {}):
-            factors = {choice["design"]: f"x/ {min(choice[kind][name], 999):.3g}" for choice in choices}
-            rows.append(factors | {"parameter": name})
-    print_table(rows, {head: head for head in ("parameter", *(choice["design"] for choice in choices))})
-    print_line(result["verdict"])
-    for text in result["left_out"]:
-        print_line(f"told: {text}" if "protocols" in result else f"left out: {text}")
+    rows = [
+        {"parameter": name, **{choice: f"x/ {min(of[name], 999):.3g}" for choice, of in choices.items()}}
+        for name in next(iter(choices.values()))
+    ]
+    print_table(rows, {head: head for head in ("parameter", *choices)})
+    print_line(verdict)
 
 
 VERBS = (cube, regions, sensitivity, uncertainty, experiment, crossvalidate, design)

@@ -12,6 +12,8 @@ import limbfit
 
 from ..errors import InputError
 from ..laws import split_key
+from ..results.models import SocketOfModels
+from ..results.socket import SocketDesignResult, SocketLoad, SocketResult
 from .commands import StudyPath, parse_parameters, show_outside
 from .console import AsJson, Column, listen_on_console, print_line, print_stored, print_table
 from .runs import add_execution_options
@@ -69,7 +71,7 @@ def fit(
             )
         with listen_on_console() as listener:
             result = limbfit.fit_socket_of_models(checked, listener=listener)
-        print_stored(result, show_socket_models, as_json)
+        print_stored(result, checked, "models_socket", show_socket_models, as_json)
         return
     with listen_on_console() as listener:
         result = limbfit.fit_socket(
@@ -80,52 +82,48 @@ def fit(
             listener=listener,
         )
         result["report"] = limbfit.report_study(checked, listener=listener)["report"]
-    print_stored(result, show_socket, as_json)
+    print_stored(result, checked, "socket", show_socket, as_json)
 
 
-def show_socket_models(result: dict[str, Any]) -> None:
+def show_socket_models(found: SocketOfModels) -> None:
     """The mean pressure of each region by every model, and the interval of all, for donning and each load."""
     columns: dict[str, Column] = {"region, mean (kPa)": "region"}
-    for number, model in enumerate(result["models"]):
-        head = f"{model['words']}, {100 * model['weight']:.0f} %"
-        columns[head] = lambda row, number=number: f"{row['mean_kPa'][number]:.1f}"  # type: ignore[misc]
-    columns["95 % by all models"] = lambda row: _format_ends(row["interval_kPa"])
-    for load in result["loads"]:
-        print_line(f"{load['name']}:")
-        print_table(load["regions"], columns)
+    for number, model in enumerate(found.models):
+        head = f"{model.words}, {100 * model.weight:.0f} %"
+        columns[head] = lambda row, number=number: f"{row.mean_kPa[number]:.1f}"  # type: ignore[misc]
+    columns["95 % by all models"] = lambda row: _format_ends(row.interval_kPa)
+    for load in found.loads:
+        print_line(f"{load.name}:")
+        print_table(load.regions, columns)
 
 
 def _format_ends(interval: Sequence[float] | None) -> str:
     return "" if interval is None else f"{interval[0]:.1f} to {interval[1]:.1f}"
 
 
-def show_socket(result: dict[str, Any]) -> None:
+def show_socket(found: SocketResult) -> None:
     """A table for donning and each load."""
-    for note in result["socket"]["notes"]:
+    for note in found.socket.notes:
         print_line(f"socket: {note}")
-    for load in ({"name": "donning"} | result["donning"], *result["loads"]):
-        settled = (
-            f", settled by {load['settling_mm']:.1f} mm{_format_interval(load)}"
-            if "settling_mm" in load
-            else ""
-        )
+    for name, state in found.states.items():
+        settled = ""
+        if isinstance(state, SocketLoad):
+            settled = f", settled by {state.settling_mm:.1f} mm{_format_interval(state)}"
         print_line(
-            f"{load['name']}: {load['peak_kPa']:.0f} kPa at most, in touch over "
-            f"{load['contact_area_mm2'] / 100:.0f} cm2{settled}"
+            f"{name}: {state.peak_kPa:.0f} kPa at most, in touch over "
+            f"{state.contact_area_mm2 / 100:.0f} cm2{settled}"
         )
-        print_table(load["regions"], LOAD_COLUMNS)
-    if result["samples"]:
-        words = "".join(f"; another failed: {reason}" for reason in result["samples"]["failed"])
-        print_line(f"95 %: by derivatives and {result['samples']['simulated']} simulated draws{words}")
-    if result["worn_s"]:
-        print_line(
-            f"95 %: with what relaxation may do until the socket has been worn for {result['worn_s']:g} s"
-        )
+        print_table(state.regions, LOAD_COLUMNS)
+    if found.samples:
+        words = "".join(f"; another failed: {reason}" for reason in found.samples.failed)
+        print_line(f"95 %: by derivatives and {found.samples.simulated} simulated draws{words}")
+    if found.worn_s:
+        print_line(f"95 %: with what relaxation may do until the socket has been worn for {found.worn_s:g} s")
     print_line(
-        f"tissues: {result['parameters_from']}; contact balances the loads within "
-        f"{result['balance_percent']:.2g} %; not a medical device"
+        f"tissues: {found.parameters_from}; contact balances the loads within "
+        f"{found.balance_percent:.2g} %; not a medical device"
     )
-    show_outside(result["outside_text"])
+    show_outside(found.outside_text)
 
 
 def _format_main_cause(shares: Mapping[str, float] | None) -> str:
@@ -137,17 +135,17 @@ def _format_main_cause(shares: Mapping[str, float] | None) -> str:
     return f"{tissue} {split_key(key)[0]} {percent:.0f} %"
 
 
-def _format_interval(load: Mapping[str, Any]) -> str:
-    interval = _format_ends(load["settling_interval_mm"])
-    cause = _format_main_cause(load["settling_interval_from"])
+def _format_interval(load: SocketLoad) -> str:
+    interval = _format_ends(load.settling_interval_mm)
+    cause = _format_main_cause(load.settling_interval_from)
     return f" (95 %: {interval}, mostly from {cause})" if interval else ""
 
 
 LOAD_COLUMNS: dict[str, Column] = {
     "region": "region",
     "mean (kPa)": ("mean_kPa", ".1f"),
-    "95 % (kPa)": lambda row: _format_ends(row["interval_kPa"]),
-    "mostly from": lambda row: _format_main_cause(row["interval_from"]),
+    "95 % (kPa)": lambda row: _format_ends(row.interval_kPa),
+    "mostly from": lambda row: _format_main_cause(row.interval_from),
     "peak (kPa)": ("peak_kPa", ".1f"),
     "shear (kPa)": ("shear_kPa", ".1f"),
 }
@@ -178,38 +176,38 @@ def design(
             literature=literature,
             listener=listener,
         )
-    print_stored(result, show_design, as_json)
+    print_stored(result, checked, "socket_design", show_design, as_json)
 
 
-def show_design(result: dict[str, Any]) -> None:
+def show_design(found: SocketDesignResult) -> None:
     """Peaks of all regions in each design."""
-    designs, optimisation = result["designs"], result["optimisation"]
-    for row in designs:
-        low, high = row["offset_mm"]
-        reduced = f", {row['reduction_percent']:.2f} % less around" if "reduction_percent" in row else ""
+    designs, optimisation, wall = found.designs, found.optimisation, found.wall
+    columns: dict[str, Column] = {}
+    for design in designs:
+        low, high = design.offset_mm
+        reduced = design.reduction_percent
+        around = f", {reduced:.2f} % less around" if reduced is not None else ""
         print_line(
-            f"{row['name']}: {row['volume_cm3']:.0f} cm3, {low:.1f} to {high:.1f} mm from the unloaded "
-            f"limb{reduced}"
+            f"{design.name}: {design.volume_cm3:.0f} cm3, {low:.1f} to {high:.1f} mm from the unloaded "
+            f"limb{around}"
         )
-    starred = optimisation["regions"] if optimisation else ()
+        columns[design.name] = (design.name, ".0f")
+    starred = optimisation.regions if optimisation else ()
     rows = [
         {"region": f"{name} *" if name in starred else name}
-        | {design["name"]: design["peaks_kPa"].get(name) for design in designs}
-        for name in designs[0]["peaks_kPa"]
+        | {design.name: design.peaks_kPa.get(name) for design in designs}
+        for name in designs[0].peaks_kPa
     ]
-    columns: dict[str, Column] = {"region, peak (kPa)": "region"}
-    columns |= {design["name"]: (design["name"], ".0f") for design in designs}
-    print_table(rows, columns, dash="")
-    if starred:
-        beyond = ", ".join(optimisation["beyond_limits"])
+    print_table(rows, {"region, peak (kPa)": "region", **columns}, dash="")
+    if optimisation:
+        beyond = ", ".join(optimisation.beyond_limits)
         print_line(
-            f"* optimised in {len(optimisation['trials']) - 1} simulations; "
+            f"* optimised in {len(optimisation.trials) - 1} simulations; "
             + (f"beyond its limit: {beyond}" if beyond else "all others within their limits")
         )
-    wall = result["wall"]
     print_line(
-        f"socket.stl: the {wall['of']} with a wall of {wall['stated_mm']:g} mm, measured "
-        f"{wall['least_mm']:.2f} mm at least; not a medical device"
+        f"socket.stl: the {wall.of} with a wall of {wall.stated_mm:g} mm, measured "
+        f"{wall.least_mm:.2f} mm at least; not a medical device"
     )
 
 

@@ -1,18 +1,18 @@
-"""Tables of stored rows, told by their columns."""
+"""Tables of stored rows, whose columns stand in ``templates/words.j2``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
-from .formats import NOTHING, format_fixed
 from .page import Cell, Row, Table
+from .words import write_columns, write_words
 
 
-def to_numeric(text: Any, share: float | None = None) -> Cell:
+def to_numeric(text: Any) -> Cell:
     """A cell that holds a number."""
-    return Cell(str(text), number=True, share=share)
+    return Cell(str(text), number=True)
 
 
 def make_row(first: Any, *others: Any, marked: Any = False) -> Row:
@@ -22,38 +22,32 @@ def make_row(first: Any, *others: Any, marked: Any = False) -> Row:
     return Row(tuple(cells), bool(marked))
 
 
-Path = str | tuple[str, ...]  # a key of a row, or the keys that lead to a value within it
-# A head with what stands below it: the path of a text; the path and the decimals of a number; or a function
-# of the row that returns a cell or its text.
-Column = tuple[str, Path] | tuple[str, Path, int] | tuple[str, Callable[[Any], Any]]
-
-
 def make_table(
     name: str,
-    caption: str,
-    columns: Sequence[Column],
     rows: Iterable[Any],
     *,
     marked: str | Callable[[Any], Any] | None = None,
     foot: Iterable[Row] = (),
     folded: bool = False,
+    headed: bool = True,
+    words: str = "",
+    **facts: Any,
 ) -> Table:
-    """A table of stored rows by columns, the first of which holds the headings of the rows.
+    """A table of stored rows; caption and columns are those of ``table <name>``, or of other ``words``.
 
-    ``marked`` tells which rows stand out: by a key, or by a function of the row.
+    ``marked`` tells which rows stand out: by an attribute that is true, or by a function of the row;
+    ``headed``: the first cell is the heading of its row. Caption and columns may name ``facts``.
     """
+    head: tuple[str, ...] = ()
     body = []
     for row in rows:
-        stands_out = _read_cell(row, marked) is True if isinstance(marked, str) else marked and marked(row)
-        body.append(make_row(*(_read_cell(row, *column[1:]) for column in columns), marked=stands_out))
-    return Table(name, caption, tuple(column[0] for column in columns), tuple(body), tuple(foot), folded)
-
-
-def _read_cell(row: Any, what: Path | Callable[[Any], Any], decimals: int | None = None) -> Any:
-    if callable(what):
-        return what(row)
-    for key in (what,) if isinstance(what, str) else what:
-        row = row.get(key) if isinstance(row, Mapping) else getattr(row, key, None)
-    if decimals is not None:
-        return to_numeric(format_fixed(row, decimals))
-    return NOTHING if row is None or row == "" else row
+        columns = write_columns(f"table {words or name}", row=row, **facts)
+        head = tuple(column[0] for column in columns)
+        cells = [
+            Cell(text, number=kind == "=", share=float(share) if share else None)
+            for _, kind, text, share in columns
+        ]
+        stands_out = getattr(row, marked) if isinstance(marked, str) else marked and marked(row)
+        body.append(Row((replace(cells[0], header=headed), *cells[1:]), bool(stands_out)))
+    caption = write_words(f"table {words or name}", **facts)
+    return Table(name, caption, head, tuple(body), tuple(foot), folded)

@@ -126,6 +126,11 @@ class SocketSimulation(ResultPart):
     warnings: Sequence[str] = Field(description="What is doubtful, in words.")
     statistics: SolverStatistics = Field(description="What the solver did.")
 
+    @property
+    def states(self) -> dict[str, SocketState]:
+        """Donning and each load, by their names."""
+        return {"donning": self.donning, **{load.name: load for load in self.loads}}
+
 
 class LinerFacts(ResultPart):
     """The liner."""

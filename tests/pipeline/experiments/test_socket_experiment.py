@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from limbfit import fit_socket, load_study, report_study
+from limbfit import fit_socket, load_results, load_study, report_study
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.cli.socket import show_socket
@@ -230,7 +230,7 @@ def test_simulated_draws_widen_the_intervals_and_are_kept(folder, tmp_path, caps
         assert "friction" not in one["change_kPa"]
         assert 0.0 < abs(other["change_kPa"]["friction"]) < 0.1 * other["mean_kPa"]
     assert three["loads"][0]["settling_change_mm"]["friction"] < 0.0  # more friction holds the limb
-    show_socket(three)
+    show_socket(load_results(study).socket)
     assert "95 %: by derivatives and 3 simulated draws" in capsys.readouterr().out
     assert "by derivatives and 3 simulated draws" in Path(report_study(study)["report"]).read_text()
 

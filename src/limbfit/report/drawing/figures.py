@@ -59,12 +59,8 @@ def draw_force_figure(
         if (quantity := find_compared_quantity(curves)) != ("force", "N"):
             ax.set_ylabel(f"{quantity[0].capitalize()} ({quantity[1]})")
     plots.add_legend(drawing, max(axes, key=lambda ax: len(ax.get_legend_handles_labels()[1])))
-    sites = ", ".join(f"{row.record} ({format_fixed(row.error_percent)} %)" for row, _ in pairs)
-    alt = f"Measured and simulated force against {words}; site and error: {sites}"
-    kind = "fitted" if all(row.fitted for row, _ in pairs) else "held-out"
-    paper = "Figure 7 of the paper for this study: m" if name == "forces-fitted" else "M"
-    caption = f"{paper}easured and simulated force against {words} at the {kind} sites, with the error."
-    return plots.make_figure(drawing, name, alt, caption)
+    shown, paper = [row for row, _ in pairs], name == "forces-fitted"
+    return plots.make_figure(drawing, name, words="forces", rows=shown, against=words, paper=paper)
 
 
 def _make_site_title(row: RecordPrediction, columns: int) -> str:
@@ -118,13 +114,7 @@ def draw_domain_figure(store: Results) -> Figure | None:
         ax.set_title(tissue)
     handles = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
     drawing.legend(list(handles.values()), list(handles), loc="outside upper left", ncols=4, labelcolor=INK)
-    caption = (
-        "Where the answer ends: each line is a record, or a load of the socket, from its shortest ramp to "
-        "its end (from the first touch), at the shear strain that 1 % of the tissue near the load exceeds. "
-        "The identified parameters are tested inside the shaded area alone."
-    )
-    alt = "Time and shear strain of records, predictions and socket loads, by tissue"
-    return plots.make_figure(drawing, "domain", alt, caption)
+    return plots.make_figure(drawing, "domain")
 
 
 def _read_extents(loading: Iterable[QuantityRange]) -> dict[tuple[str, str | None], tuple[float, float]]:
@@ -146,9 +136,7 @@ def draw_simulated_figure(store: Results) -> Figure | None:
     for ax, label in zip(axes, ("Time (s)", "Displacement (mm)"), strict=True):
         ax.set(xlabel=label, ylabel="Force (N)")
     plots.add_legend(drawing, axes[0])
-    names = ", ".join(row.site for row, _ in pairs)
-    alt = f"Simulated force against time and displacement, sites {names}"
-    return plots.make_figure(drawing, "simulated", alt, "Force of the simulated indentations.")
+    return plots.make_figure(drawing, "simulated", rows=[row for row, _ in pairs])
 
 
 @plots.styled
@@ -165,14 +153,8 @@ def draw_convergence_figure(store: Results) -> Figure | None:
     _finish_convergence(axes, store)
     count = sum(len(ax.get_legend_handles_labels()[0]) for ax in axes[:2])
     plots.add_legend(drawing, *axes[:2], columns=math.ceil(count / math.ceil(count / MAX_LEGEND_ROW)))
-    last = format_fixed(stages[-1].iterations[-1].error_percent, 2)
-    alt = f"Error and parameters against iteration; the error ends at {last} %"
-    caption = (
-        "The paper's two steps (figure 5) as they went: the mean error at the fitted sites (thin lines: "
-        "each site) and the parameters, "
-        "over the accepted iterates. The vertical line is where the second stage begins."
-    )
-    return plots.make_figure(drawing, "convergence", alt, caption)
+    error = stages[-1].iterations[-1].error_percent
+    return plots.make_figure(drawing, "convergence", error=error)
 
 
 def _draw_stage(axes: Sequence[Axes], store: Results, stage: SearchStage, offset: int) -> None:
@@ -219,9 +201,7 @@ def draw_error_figure(store: Results) -> Figure | None:
         ax.text(error, at, f" {format_fixed(error)}", va="center", fontsize=8)
     plots.set_rows(ax, [f"{row.record} ({'fitted' if row.fitted else 'held out'})" for row, _ in rows])
     ax.set_xlabel("Mean absolute error over largest force (%)")
-    sites = ", ".join(f"{row.record} {format_fixed(error)} %" for row, error in rows)
-    caption = "Force error of each site. Plain bars: sites that were fitted; hatched: held out."
-    return plots.make_figure(drawing, "errors", f"Error of each site: {sites}", caption)
+    return plots.make_figure(drawing, "errors", rows=[row for row, _ in rows])
 
 
 @plots.styled
@@ -238,12 +218,7 @@ def draw_interval_figure(store: Results) -> Figure | None:
     ax.set_xlabel("Ratio to the identified value (–)")
     ax.axvline(1, color=MUTED, lw=0.8)
     plots.add_legend(drawing, ax)
-    caption = (
-        "The identified parameters with their 95 % intervals, on a logarithmic scale so that all can be "
-        "compared. A long bar is a parameter that the data leave open."
-    )
-    alt = "Intervals of the parameters as ratios to the identified values; the numbers are in table 1"
-    return plots.make_figure(drawing, "intervals", alt, caption)
+    return plots.make_figure(drawing, "intervals")
 
 
 def _draw_ratios(ax: Axes, store: Results, at: int, tissue: str, name: str) -> None:
@@ -268,27 +243,17 @@ def _draw_ratios(ax: Axes, store: Results, at: int, tissue: str, name: str) -> N
 
 def draw_layer_figure(store: Results, fitted: bool) -> Figure | None:
     """Compression of each layer against time at the fitted or held-out sites; None where none was seen."""
-    caption = (
-        "Compression of the tissues on the indenter's axis at the {} sites, as ultrasound saw it and as "
-        "predicted; errors are means over the record, in percent of the largest compression."
-    )
-    words, quantity = "compression", ("compression", "mm")
-    return _draw_time_figure(store, fitted, "ultrasound", "layers", quantity, words, caption)
+    return _draw_time_figure(store, fitted, "ultrasound", "layers", ("compression", "mm"))
 
 
 def draw_wave_figure(store: Results, fitted: bool) -> Figure | None:
     """Speed of shear waves against time at the fitted or held-out sites; None where none was read."""
-    caption = (
-        "Speed of shear waves under the indenter at the {} sites, read and predicted: that of small, sudden "
-        "shear on the strain that the indenter makes; errors are means in percent of the largest speed."
-    )
-    words, quantity = "speed of shear waves", ("speed", "m_s")
-    return _draw_time_figure(store, fitted, "shear waves", "waves", quantity, words, caption)
+    return _draw_time_figure(store, fitted, "shear waves", "waves", ("speed", "m_s"))
 
 
 @plots.styled
 def _draw_time_figure(
-    store: Results, fitted: bool, kind: str, stem: str, quantity: tuple[str, str], words: str, caption: str
+    store: Results, fitted: bool, kind: str, stem: str, quantity: tuple[str, str]
 ) -> Figure | None:
     """What was seen of a kind against time; ``quantity`` and its unit are in the heads of the curves."""
     rows, (what, unit) = _read_curves(store, fitted, kind), quantity
@@ -308,8 +273,7 @@ def _draw_time_figure(
     plots.add_legend(drawing, axes[0])
     use = "fitted" if fitted else "held-out"
     records = ", ".join(f"{row.record} {layer.what}" for row, layer, _ in rows)
-    alt = f"Measured and predicted {words}: {records}"
-    return plots.make_figure(drawing, f"{stem}-{use}", alt, caption.format(use))
+    return plots.make_figure(drawing, f"{stem}-{use}", words=stem, use=use, records=records)
 
 
 @plots.styled
@@ -327,13 +291,7 @@ def draw_skin_figure(store: Results, fitted: bool) -> Figure | None:
     plots.add_legend(drawing, axes[0])
     use = "fitted" if fitted else "held-out"
     records = ", ".join(row.record for row, _, _ in rows)
-    caption = (
-        f"Displacement of the skin around the indenter at the {use} sites: predicted against "
-        "measured, for every point, component and span of time that is compared, with its 95 % interval. On "
-        "the line both agree; errors are means in percent of the largest displacement."
-    )
-    alt = f"Measured and predicted displacement of skin: {records}"
-    return plots.make_figure(drawing, f"surface-{use}", alt, caption)
+    return plots.make_figure(drawing, f"surface-{use}", words="surface", use=use, records=records)
 
 
 def _draw_pairs(ax: Axes, curves: Curves, components: Sequence[str]) -> None:

@@ -24,6 +24,7 @@ from ...web.shapes import extract_interface, read_shell, to_shell, to_volume_sha
 from ..formats import format_symbol, get_unit
 from ..page import Interactive
 from ..store import Curves, Json, Results
+from ..words import write_words
 from .pictures import (
     FITTED,
     HELD_OUT,
@@ -59,11 +60,7 @@ def make_explorer(store: Results) -> Interactive | None:
         "arrays": base64.b64encode(pack(arrays, facts)).decode("ascii"),
         "curves": {site: curves for site in store.site_names if (curves := _read_site_curves(store, site))},
     }
-    caption = (
-        "Skin, layers, bones and sites of the model; choose a site to see its forces and, where stored, the "
-        f"deformed cut at its deepest point, up to {FIELD_RADIUS_MM:.0f} mm around it. Filled marks: sites "
-        "that were fitted; open: held out. Pictures of the same stand below."
-    )
+    caption = write_words("figure explorer", radius_mm=FIELD_RADIUS_MM)
     return Interactive("explorer", "model", "The limb in three dimensions.", caption, content)
 
 
@@ -200,10 +197,7 @@ def record_curves(store: Results, sites: Sequence[str]) -> Interactive | None:
         }
     if not choices:
         return None
-    caption = (
-        "Every record, raw and regularised; vertical lines are the touch-down that was found and the ends "
-        "of the indenter's phases."
-    )
+    caption = write_words("figure records")
     return Interactive("records", "records", "Records of all sites.", caption, {"sites": choices})
 
 
@@ -221,7 +215,7 @@ def draw_convergence_curves(store: Results) -> Interactive | None:
         make_panels.append(
             {"title": format_symbol(name), "unit": get_unit(name), "log": False, "series": series}
         )
-    caption = "The same, to read values from; iterates are counted through all stages."
+    caption = write_words("figure iterates")
     return Interactive(
         "iterates", "iterates", "Error and parameters over the iterates.", caption, {"panels": make_panels}
     )

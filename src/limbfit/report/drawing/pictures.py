@@ -34,6 +34,7 @@ from ...web.shapes import build_patient_frame
 from ..formats import number
 from ..page import Figure
 from ..store import Results
+from ..words import make_picture, write_words
 
 PAPER, INK = "#f6f5f1", "#222222"
 FIELD_MAP = "viridis"
@@ -378,11 +379,7 @@ def draw_surface_figure(store: Results) -> Figure | None:
     views = make_four_views(store, skin)
     shots = render_views(make_limb_plotter(store, skin), views, lambda view: _mark_facing_sites(store, view))
     alt = "The limb model from four sides with its indentation sites: " + ", ".join(store.site_names)
-    caption = (
-        "Skin (translucent), bones, and the indentation sites from four sides of the patient. "
-        "Filled: sites that were fitted; open: held out."
-    )
-    return Figure("model", build_picture_row(shots, SIDES, alt), caption)
+    return make_picture("model", build_picture_row(shots, SIDES, alt))
 
 
 @silence_display_warning()
@@ -397,12 +394,8 @@ def draw_marker_figure(store: Results) -> Figure | None:
     plotter = make_field_plotter(marked, "implicit_distance", limits, **MATT)
     shots = render_views(plotter, make_four_views(store, plain), lambda view: _mark_facing_sites(store, view))
     alt = "Skin of the image with markers from four sides, coloured by the distance to the skin without"
-    caption = (
-        "Figure 1 of the paper for this study: skin with markers, coloured by its distance from the skin "
-        "without: each site of the study was matched to one of the bumps."
-    )
     bar = make_colour_bar(limits, "distance (mm)")
-    return Figure("markers", build_picture_row(shots, SIDES, alt) + bar, caption)
+    return make_picture("markers", build_picture_row(shots, SIDES, alt) + bar)
 
 
 def draw_slices_figure(store: Results) -> Figure | None:
@@ -410,12 +403,8 @@ def draw_slices_figure(store: Results) -> Figure | None:
     file = store.folder / "segment" / "quality.png"
     if not file.is_file():
         return None
-    caption = (
-        "Outlines of the limb and of its labels over slices from end to end; enlarged below: slices in which "
-        "an area or a centroid does not fit its neighbours."
-    )
-    markup = f'<img src="{embed_png(file.read_bytes())}" alt="{escape(caption)}" style="width:100%">'
-    return Figure("slices", markup, caption)
+    picture, words = embed_png(file.read_bytes()), escape(write_words("figure slices"))
+    return make_picture("slices", f'<img src="{picture}" alt="{words}" style="width:100%">')
 
 
 def make_four_views(store: Results, skin: Any) -> list[View]:
@@ -465,18 +454,13 @@ def draw_mesh_figure(store: Results, sites: Sequence[str]) -> Figure | None:
     key = build_legend(
         (*((words[name], colour) for name, colour in colours.items()), ("wall of a bone", BONE))
     )
-    caption = (
-        "Figures 4 and 6 of the paper for this study: the mesh of each fitted site, cut along the limb "
-        "through the site (above), and near the indenter "
-        "(below). Bones are voids with fixed surfaces; the arrow is the axis of the indenter."
-    )
     titles = [f"site {name}" for name in names]
     markup = (
         build_picture_row(whole, titles, alt)
         + build_picture_row(near, [f"{t}, near" for t in titles], alt)
         + key
     )
-    return Figure("mesh-cut", markup, caption)
+    return make_picture("mesh-cut", markup)
 
 
 @silence_display_warning()
@@ -493,11 +477,10 @@ def draw_field_figure(store: Results, sites: Sequence[str], stage: str, name: st
     shots = [render_field(cut, view, field[0], limits) for view, cut in zip(views, cuts, strict=True)]
     names = [row.site for row, _, _ in grids]
     alt = f"Deformed cut at the peak, coloured by {field[1]}, sites " + ", ".join(names)
-    caption = f"Deformed cut through each site at the largest indentation; colour: {field[1]}."
     markup = build_picture_row(shots, [f"site {name}" for name in names], alt) + make_colour_bar(
         limits, field[1]
     )
-    return Figure(name, markup, caption)
+    return make_picture(name, markup, words="field", title=field[1])
 
 
 def render_field(cut: Grid, view: View, field: str, limits: tuple[float, float]) -> Shot:

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure as Drawing
 
 from ...arrays import Array
 from ..page import Figure
+from ..words import make_picture, write_words
 from .colours import GRID, INK, MUTED, SIMULATED, VARIABLES
 
 PANEL_WIDTH_IN = 9.6
@@ -103,11 +104,15 @@ def plot_band(ax: Axes, x: Array, low: Array, high: Array) -> None:
     ax.fill_between(x, low, high, color=SIMULATED, alpha=0.22, lw=0, label="95 % interval")
 
 
-def make_figure(drawing: Drawing, name: str, alt: str, caption: str) -> Figure:
-    """The drawing as a figure of the page: inline ``<svg>`` whose identifiers are unique to ``name``."""
+def make_figure(drawing: Drawing, name: str, *, words: str = "", **facts: Any) -> Figure:
+    """The drawing as a figure of the page: inline ``<svg>`` whose identifiers are unique to ``name``.
+
+    What it shows is told by ``alt <name>`` and ``figure <name>``, or those of other ``words``.
+    """
     buffer = io.StringIO()
     FigureCanvasSVG(drawing).print_svg(buffer, metadata={"Date": None, "Creator": None})
-    return Figure(name, _make_inline(buffer.getvalue(), name, alt), caption)
+    alt = write_words(f"alt {words or name}", **facts)
+    return make_picture(name, _make_inline(buffer.getvalue(), name, alt), words=words, **facts)
 
 
 def _make_inline(text: str, name: str, alt: str) -> str:

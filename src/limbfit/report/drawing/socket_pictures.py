@@ -9,8 +9,10 @@ import numpy as np
 import pyvista as pv
 
 from ...arrays import Array
+from ...results.socket import SocketResult, TissueStrainInside
 from ..page import Figure
-from ..store import Json, Results
+from ..store import Results
+from ..words import make_picture
 from .colours import MUTED, SIMULATED, THIRD
 from .pictures import (
     FIELD_MAP,
@@ -50,10 +52,8 @@ def draw_pressure_figures(store: Results, files: Mapping[str, Path], name: str) 
         top = max(float(np.max(surface.point_data[field])) for surface in surfaces.values())
         alt = f"The limb coloured by {words}"
         markup = _render_surfaces(store, surfaces, field, (0.0, max(top, 1e-6)), FIELD_MAP, alt, words)
-        caption = (
-            f"What the socket does to the limb when it has been held: {words}, one colour scale for all."
-        )
-        figures.append(Figure(f"{name}-{field.removesuffix('_kPa')}", markup, caption))
+        title = f"{name}-{field.removesuffix('_kPa')}"
+        figures.append(make_picture(title, markup, words="socket surface", field=words))
     return tuple(figures)
 
 
@@ -100,19 +100,18 @@ def draw_offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | No
     words = "offset from the unloaded limb (mm)"
     alt = f"Face of the socket coloured by {words}"
     markup = _render_surfaces(store, faces, OFFSET, limits, OFFSET_MAP, alt, words)
-    caption = (
-        "Faces of the sockets: offset from the unloaded limb under its liner, negative where pressed in."
-    )
-    return Figure("socket-design-offset", markup, caption)
+    return make_picture("socket-design-offset", markup)
 
 
 @silence_display_warning()
-def draw_inside_figure(store: Results, title: str, inside: Sequence[Json], file: Path) -> tuple[Figure, ...]:
+def draw_inside_figure(
+    store: Results, title: str, inside: Sequence[TissueStrainInside], file: Path
+) -> tuple[Figure, ...]:
     """Cuts along and across the limb through the place of the largest shear, coloured by it."""
     if not file.is_file():
         return ()
-    grid, worst = read_linear(file), max(inside, key=lambda place: place["shear"])
-    place = np.asarray(worst["place_mm"], dtype=float)
+    grid, worst = read_linear(file), max(inside, key=lambda tissue: tissue.shear)
+    place = np.asarray(worst.place_mm, dtype=float)
     shear, words = np.asarray(grid.cell_data[SHEAR]), "shear strain"
     limits = (0.0, max(float(np.percentile(shear, 99.5)), 1e-6))
     nearest = np.argmin(np.linalg.norm(np.asarray(grid.points) - place, axis=1))
@@ -121,15 +120,11 @@ def draw_inside_figure(store: Results, title: str, inside: Sequence[Json], file:
     for view in _make_cut_views(store, grid, place):
         pixels = render_field(cut_behind(grid, view, smooth=True), view, SHEAR, limits)[0]
         shots.append((pixels, view, [mark]))
-    near = f", near {worst['near']}" if worst["near"] else ""
-    caption = (
-        f"Inside the limb, {title}: cuts along and across it through the largest shear "
-        f"({worst['tissue']}{near}), deformed; colour: largest shear strain of each element."
-    )
     markup = build_picture_row(
         shots, ("along the limb", "across the limb"), f"Cuts coloured by {words}, {title}"
     )
-    return (Figure("socket-inside", markup + make_colour_bar(limits, words), caption),)
+    bar = make_colour_bar(limits, words)
+    return (make_picture("socket-inside", markup + bar, title=title, worst=worst),)
 
 
 def _make_cut_views(store: Results, grid: Grid, place: Array) -> tuple[View, View]:
@@ -153,23 +148,21 @@ def _make_cut_views(store: Results, grid: Grid, place: Array) -> tuple[View, Vie
 
 
 @styled
-def draw_settling_figure(content: Json) -> Figure:
+def draw_settling_figure(content: SocketResult) -> Figure:
     """Force on the socket and its move along the limb, largest and mean pressure, over time."""
     drawing, axes = make_panels(3, 3, 2.5)
-    steps = content["steps"]
-    time = np.array([row["time_s"] for row in steps])
-    force = np.linalg.norm([row["force_N"] for row in steps], axis=1)
+    steps = content.steps
+    time = np.array([row.time_s for row in steps])
+    force = np.linalg.norm([row.force_N for row in steps], axis=1)
     axes[0].plot(time, force, color=SIMULATED)
-    axes[1].plot(time, [row["move_mm"][2] for row in steps], color=SIMULATED)
-    axes[2].plot(time, [row["peak_kPa"] for row in steps], color=SIMULATED, label="largest")
-    axes[2].plot(time, [row["mean_kPa"] for row in steps], "--", color=THIRD, label="mean")
+    axes[1].plot(time, [row.move_mm[2] for row in steps], color=SIMULATED)
+    axes[2].plot(time, [row.peak_kPa for row in steps], color=SIMULATED, label="largest")
+    axes[2].plot(time, [row.mean_kPa for row in steps], "--", color=THIRD, label="mean")
     labels = ("Force on the socket (N)", "Move towards the body (mm)", "Pressure (kPa)")
     for ax, label in zip(axes, labels, strict=True):
         ax.set(xlabel="Time (s)", ylabel=label)
-        for end in [content["donning"]["time_s"], *(load["time_s"] for load in content["loads"])]:
+        for end in [content.donning.time_s, *(load.time_s for load in content.loads)]:
             ax.axvline(end, color=MUTED, lw=0.6)
         ax.margins(x=0.01)
     add_legend(drawing, axes[2])
-    alt = "Force on the socket, its move and the pressure over time, from donning to the last load"
-    caption = "The socket over time; lines: the end of donning and of each load, held."
-    return make_figure(drawing, "socket-time", alt, caption)
+    return make_figure(drawing, "socket-time")

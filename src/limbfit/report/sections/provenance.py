@@ -9,7 +9,8 @@ from ...results.runs import StageRecord
 from ..formats import NOTHING, format_duration, format_fixed
 from ..page import Prose, Section, Table, make_section
 from ..store import Results
-from ..tables import Column, make_row, make_table, to_numeric
+from ..tables import make_row, make_table, to_numeric
+from ..words import write_words
 
 
 def make_timing_section(store: Results) -> Section:
@@ -29,21 +30,14 @@ def make_timing_section(store: Results) -> Section:
 def make_timing_table(stages: Mapping[str, StageRecord]) -> Table:
     """How long each stage took, with bars."""
     seconds = [stage.seconds for stage in stages.values()]
-    longest = max([*seconds, 1e-9])
-    columns: tuple[Column, ...] = (
-        ("Stage", lambda row: row[0]),
-        ("Time", lambda row: to_numeric(format_duration(row[1].seconds), share=row[1].seconds / longest)),
-        ("Finished", lambda row: row[1].finished[:16].replace("T", " ")),
-    )
     total = make_row("Total", to_numeric(format_duration(sum(seconds))), "")
-    return make_table("timing", "How long each stage took.", columns, stages.items(), foot=(total,))
+    return make_table("timing", stages.items(), foot=(total,), longest=max([*seconds, 1e-9]))
 
 
 def make_settings_section(store: Results) -> Section:
     """Every setting of the study file."""
     flat = flatten_settings(store.run.settings if store.run else {})
-    caption = "Every setting of the study, defaults included."
-    table = make_pair_table("all-settings", caption, ("Key", "Value"), flat)
+    table = make_pair_table("all-settings", ("Key", "Value"), flat)
     return make_section("settings", "Settings", table, otherwise="No settings are stored.")
 
 
@@ -54,15 +48,16 @@ def make_provenance_section(store: Results) -> Section:
     return make_section(
         "provenance",
         "Versions and inputs",
-        make_pair_table("versions", "Software.", ("Library", "Version"), versions),
-        make_pair_table("inputs", "Inputs and their SHA-256.", head, run.inputs if run else {}),
+        make_pair_table("versions", ("Library", "Version"), versions),
+        make_pair_table("inputs", head, run.inputs if run else {}),
         otherwise="No versions and input hashes are stored.",
     )
 
 
-def make_pair_table(name: str, caption: str, head: tuple[str, str], pairs: Mapping[str, Any]) -> Table | None:
+def make_pair_table(name: str, head: tuple[str, str], pairs: Mapping[str, Any]) -> Table | None:
     """A table of keys and values; a long one is folded on the screen; None where there are none."""
     rows = tuple(make_row(*pair) for pair in pairs.items())
+    caption = write_words(f"table {name}")
     return Table(name, caption, head, rows, folded=len(rows) > 12) if rows else None
 
 

@@ -7,15 +7,15 @@ from collections.abc import Sequence
 from matplotlib.axes import Axes
 
 from ...results.identification import LeftOutRecord
-from ...results.records import RecordFlag, RecordPhase
+from ...results.records import RecordPhase
 from ..drawing.colours import GRID, INK, MUTED, SIMULATED
 from ..drawing.figures import thin_curves
 from ..drawing.interactive import record_curves
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
-from ..formats import format_fixed, number
-from ..page import Figure, Note, Prose, Section, Table, make_bullets, make_section
+from ..page import Figure, Note, Section, Table, make_bullets, make_section
 from ..store import Curves, Results
-from ..tables import make_table, to_numeric
+from ..tables import make_table
+from ..words import make_prose
 
 MAX_NAMED_PHASES = 6  # whose names have room in a panel
 MARKED_ERROR = 4.0  # standardised errors from here on are marked
@@ -47,15 +47,7 @@ def draw_record_figure(store: Results, site: str) -> Figure | None:
     for ax in axes[:2]:
         _mark_phases(ax, facts.phases)
     add_legend(drawing, axes[0])
-    peak, depth = format_fixed(facts.peak_force_N, 2), format_fixed(facts.depth_mm, 2)
-    phases = f"the indenter's phases are {facts.phases_in_words} (holds are shaded); "
-    alt = f"Record of site {site}: displacement and force against time, and force against displacement"
-    caption = (
-        f"Figure 3 of the paper for this study: record of site {site}, raw and regularised. The dashed "
-        f"line is the touch-down that was found; {phases}every phase is regularised by itself and the "
-        f"peak is kept ({peak} N at {depth} mm)."
-    )
-    return make_figure(drawing, "record", alt, caption)
+    return make_figure(drawing, "record", site=site, facts=facts)
 
 
 def _draw_record(axes: Sequence[Axes], raw: Curves, regular: Curves, touch_down: tuple[float, float]) -> None:
@@ -83,36 +75,19 @@ def _mark_phases(ax: Axes, phases: Sequence[RecordPhase]) -> None:
 
 def make_trace_table(store: Results) -> Table:
     """Touch-down, peak, noise and phases of every record."""
-    columns = (
-        ("Site", "record"),
-        ("Touch-down (s)", "touch_down_s", 3),
-        ("Touch-down (mm)", "touch_down_mm", 3),
-        ("± (mm)", "touch_down_uncertainty_mm", 3),
-        ("Depth (mm)", "depth_mm", 2),
-        ("Largest force (N)", "peak_force_N", 2),
-        ("Noise (N)", "noise_N", 3),
-        ("Loading (mm/s)", "speed_load_mm_s", 3),
-        ("Unloading (mm/s)", "speed_unload_mm_s", 3),
-        ("Phases", "phases_in_words"),
-    )
-    rows = [facts.to_plain() | {"record": name} for name, facts in store.traces.items()]
-    caption = "What was found in each indentation record."
-    return make_table("trace-facts", caption, columns, rows, marked=lambda row: row["site"] in store.fitted)
+    return make_table("trace-facts", store.traces.items(), marked=lambda row: row[1].site in store.fitted)
 
 
 def make_record_check_section(store: Results) -> Section:
     """What looks wrong with records, the evidence for it, and each site as predicted from all others."""
     flags, left_out = (store.predict.flags, store.predict.left_out) if store.predict else ((), ())
-    nothing = Prose(
-        "Nothing looks wrong: units, names, axes and places of the records agree with one another, and "
-        "every site is predicted from the others about as well as they are."
-    )
     return make_section(
         "doubts",
         "Records in doubt",
         _list_failures(store),
-        make_bullets(f"{flag.text[:1].upper()}{flag.text[1:]}." for flag in flags) or nothing,
-        _make_flag_table(flags) if flags else None,
+        make_bullets(f"{flag.text[:1].upper()}{flag.text[1:]}." for flag in flags)
+        or make_prose("nothing doubtful"),
+        make_table("flags", flags, format_words=_format_words) if flags else None,
         _make_left_out_table(store, left_out) if left_out else None,
     )
 
@@ -125,20 +100,6 @@ def _list_failures(store: Results) -> Note | None:
     return Note(" ".join(failed)) if failed else None
 
 
-def _make_flag_table(flags: Sequence[RecordFlag]) -> Table:
-    columns = (
-        ("Sites", lambda flag: ", ".join(flag.sites) or "all"),
-        ("Kind", "kind"),
-        ("Found", "found"),
-        (
-            "Evidence",
-            lambda flag: "; ".join(f"{_format_words(k)} {number(v)}" for k, v in flag.evidence.items()),
-        ),
-        ("Likely cause", "cause"),
-    )
-    return make_table("flags", "What looks wrong, and the numbers that say so.", columns, flags)
-
-
 def _format_words(name: str) -> str:
     for unit, shown in (("_percent", " (%)"), ("_kPa", " (kPa)"), ("_mm", " (mm)"), ("_deg", " (°)")):
         if name.endswith(unit):
@@ -148,20 +109,4 @@ def _format_words(name: str) -> str:
 
 def _make_left_out_table(store: Results, left_out: Sequence[LeftOutRecord]) -> Table:
     fitted = [name for site in store.fitted for name in (site, *store.records_of(site))]
-    columns = (
-        ("Site", "site"),
-        ("Use", lambda row: "fitted" if row.site in fitted else "held out"),
-        ("Error without it (%)", lambda row: to_numeric(format_fixed(100 * row.error))),
-        ("Of others (%)", lambda row: to_numeric(format_fixed(100 * row.expected))),
-        ("Standardised", "standardised", 1),
-        ("Measured over predicted force", "ratio", 2),
-        ("Cook's distance", "cook", 2),
-    )
-    caption = (
-        "Every site predicted from all others: root mean square error over the peak; that of the others when "
-        "the site is left out; their ratio; the best factor from predicted to measured force; and how far "
-        "the site moves the fit, against the misfit. Computed on the first-order expansion about the answer."
-    )
-    return make_table(
-        "left-out", caption, columns, left_out, marked=lambda row: row.standardised > MARKED_ERROR
-    )
+    return make_table("left-out", left_out, marked=lambda row: row.standardised > MARKED_ERROR, fitted=fitted)

@@ -5,41 +5,29 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ...results.identification import MeshCorrectionRound, RecordPrediction
-from ...results.runs import CompareResult, SimulateResult
+from ...results.runs import SimulateResult
 from ..drawing.colours import MEASURED, SIMULATED, TRUTH
 from ..drawing.figures import draw_simulated_figure
 from ..drawing.pictures import draw_field_figure
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
-from ..formats import count
-from ..page import Bullets, Figure, Note, Prose, Section, Table, make_bullets, make_section
+from ..page import Bullets, Figure, Note, Section, make_bullets, make_section
 from ..store import Results
-from ..tables import make_table, to_numeric
+from ..tables import make_table
+from ..words import make_prose
 from .provenance import make_pair_table
 
 
 def make_simulated_section(store: Results) -> Section:
     """Indentations that were simulated one by one."""
     sites = [row.site for row in store.simulated]
-    columns = (
-        ("Site", "site"),
-        ("Depth (mm)", "depth_mm", 2),
-        ("Largest force (N)", "peak_force_N", 2),
-        ("Largest penetration (mm)", "penetration_mm", 3),
-        ("Parameters", "parameters_from"),
-        ("Completed", _describe_end),
-    )
     return make_section(
         "simulated",
         "Simulated indentations",
         _list_warnings(store.simulated),
         draw_simulated_figure(store),
         draw_field_figure(store, sites[:4], "simulate", "field-simulated"),
-        make_table("simulated", "Indentations simulated one by one.", columns, store.simulated),
+        make_table("simulated", store.simulated),
     )
-
-
-def _describe_end(row: SimulateResult | RecordPrediction) -> str:
-    return "yes" if row.completed else f"no: {row.reason}"
 
 
 def _list_warnings(rows: Sequence[SimulateResult | RecordPrediction]) -> Bullets | None:
@@ -49,26 +37,13 @@ def _list_warnings(rows: Sequence[SimulateResult | RecordPrediction]) -> Bullets
 
 def make_comparison_section(store: Results) -> Section:
     """Curves and differences of the sites that ``limbfit compare`` solved."""
-    words = Prose(
-        "The same mesh, materials and history by FEBio and by limbfit: once with limbfit's own contact, "
-        "which keeps the penetration below 1 % of the depth, and once with FEBio's penalty and steps; what "
-        "lies between the two is how far the indenter sinks in. Differences are in percent of FEBio's "
-        "largest force."
+    return make_section(
+        "comparison",
+        "Comparison with FEBio",
+        make_prose("comparison"),
+        draw_compared_figure(store),
+        make_table("compared", store.compared),
     )
-    columns = (
-        ("Site", "site"),
-        ("FEBio (N)", ("febio", "peak_force_N"), 3),
-        ("limbfit (N)", ("limbfit", "peak_force_N"), 3),
-        ("Largest difference (%)", ("limbfit", "difference", "max_percent"), 2),
-        ("With FEBio's penalty (%)", ("limbfit_matched", "difference", "max_percent"), 2),
-        ("FEBio", _describe_febio_end),
-    )
-    table = make_table("compared", "Largest forces and differences.", columns, store.compared)
-    return make_section("comparison", "Comparison with FEBio", words, draw_compared_figure(store), table)
-
-
-def _describe_febio_end(row: CompareResult) -> str:
-    return f"{row.febio.version}, {'completed' if row.febio.completed else row.febio.reason}"
 
 
 @styled
@@ -85,8 +60,7 @@ def draw_compared_figure(store: Results) -> Figure | None:
         ax.plot(at, curves["limbfit_matched_N"], "--", color=TRUTH, label="with FEBio's contact penalty")
         ax.set(title=f"Site {row.site}", xlabel="Time (s)", ylabel="Force (N)")
     add_legend(drawing, axes[0])
-    alt = f"Force by FEBio and by limbfit against time, sites {', '.join(row.site for row, _ in found)}"
-    return make_figure(drawing, "compared", alt, "Force of the same indentation by FEBio and by limbfit.")
+    return make_figure(drawing, "compared", sites=[row.site for row, _ in found])
 
 
 def make_solver_section(store: Results) -> Section:
@@ -108,8 +82,8 @@ def make_solver_section(store: Results) -> Section:
         "Solver",
         Note(f"The simulation did not reach the end of the record at: {failed}.") if failed else None,
         _list_warnings(store.predicted),
-        make_solver_table(store) if store.predicted else None,
-        make_pair_table("solver-facts", "The identification's solver.", ("Fact", "Value"), known),
+        make_table("solver", store.predicted, marked="fitted") if store.predicted else None,
+        make_pair_table("solver-facts", ("Fact", "Value"), known),
         otherwise="No simulations are stored yet.",
     )
 
@@ -123,21 +97,3 @@ def _describe_corrections(rounds: Sequence[MeshCorrectionRound]) -> str | None:
         return f"{len(rounds)}; the last failed: {last.reason}"
     left = max(change or 0.0 for change in last.change_percent_by_site.values())
     return f"{len(rounds)}; the last changed no force by more than {left:.2g} % of its largest"
-
-
-def make_solver_table(store: Results) -> Table:
-    """How each prediction went: steps, penetration, and the reason where one stopped early."""
-    columns = (
-        ("Site", "record"),
-        ("Element", "element"),
-        ("Steps", lambda row: to_numeric(count(row.steps))),
-        ("Largest penetration (mm)", "penetration_mm", 3),
-        ("Completed", _describe_end),
-        ("Not predicted", _list_not_predicted),
-    )
-    caption = "The simulation of each site with the identified parameters."
-    return make_table("solver", caption, columns, store.predicted, marked="fitted")
-
-
-def _list_not_predicted(row: RecordPrediction) -> str:
-    return "; ".join(f"{what.replace('_', ' ')}: {why}" for what, why in row.not_predicted.items())

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import statistics
 
-from ..formats import format_fixed, format_limits, format_symbol, label, number
-from ..page import Block, KeyNumber, Prose, make_bullets
+from ..formats import format_limits, format_symbol, label, number
+from ..page import Block, KeyNumber, make_bullets, make_section
 from ..store import Results
+from ..words import make_prose
 
 _RANKS = {"determined": 0, "weakly": 1, "not": 2}
 
@@ -36,60 +37,18 @@ def _label_modulus(store: Results, tissue: str) -> str:
 
 def build_summary(store: Results) -> tuple[Block, ...]:
     """One paragraph in plain words, then the verdict."""
-    sentences = [_describe_study(store), _describe_errors(store), _compare_materials(store)]
-    prose = Prose(" ".join(sentence for sentence in sentences if sentence))
-    verdict = make_bullets(_list_verdicts(store))
-    return (prose, verdict) if verdict else (prose,)
-
-
-def _describe_study(store: Results) -> str:
-    names, fitted = store.site_names, store.fitted
-    if not names:
-        return "Nothing has been computed yet for this study."
-    if not store.stages:
-        sites = f"{len(names)} indentation site{'s' if len(names) > 1 else ''}"
-        simulated = ", each simulated with the parameters of the study" if store.predicted else ""
-        return f"The study has {sites}{simulated}; no parameters have been identified."
-    start = (
-        f"The soft tissue of this limb was identified from robotic indentations at {len(fitted)} of "
-        f"{len(names)} sites ({', '.join(fitted)})"
+    heldout = [row for row in store.predicted if not row.fitted]
+    pairs = [(row.error_one_material_percent, row.error_percent) for row in heldout]
+    known = [(one, several) for one, several in pairs if one is not None and several is not None]
+    prose = make_prose(
+        "summary",
+        store=store,
+        heldout=heldout,
+        sites=len({row.site for row in heldout}),
+        errors=[row.error_percent for row in heldout if row.error_percent is not None],
+        means=[statistics.fmean(column) for column in zip(*known, strict=True)],
     )
-    if len(store.stages) == 1:
-        return f"{start} as one material."
-    parts = "a skin–adipose layer and the muscle–soft tissue beneath it"
-    if not store.has_paper_tissues:
-        parts = " and ".join(filter(None, [", ".join(store.tissues[:-1]), store.tissues[-1]]))
-    return f"{start}: first as one material, then as {parts}."
-
-
-def _describe_errors(store: Results) -> str:
-    held = [row for row in store.predicted if not row.fitted]
-    if not store.predict:
-        return ""
-    if not held:
-        return f"At the fitted sites the force error is {store.mean_error('fitted')} %."
-    sites = len({row.site for row in held})
-    places = "the one site that was" if sites == 1 else f"the {sites} sites that were"
-    errors = [row.error_percent for row in held if row.error_percent is not None]
-    worst = f" (largest {format_fixed(max(errors))} %)" if errors else ""
-    return (
-        f"At {places} not used, the model predicts the force with a mean error of "
-        f"{store.mean_error('heldout')} % of the largest force{worst}; at the fitted "
-        f"sites it is {store.mean_error('fitted')} %."
-    )
-
-
-def _compare_materials(store: Results) -> str:
-    held = [row for row in store.predicted if not row.fitted]
-    pairs = [(row.error_one_material_percent, row.error_percent) for row in held]
-    known = [(one, two) for one, two in pairs if one is not None and two is not None]
-    if not known:
-        return ""
-    first, second = (statistics.fmean(column) for column in zip(*known, strict=True))
-    start = f"With one material for all soft tissue the held-out error is {format_fixed(first)} %: "
-    if abs(first - second) < 0.1 * max(first, second):
-        return start + f"here {store.materials} predict no better than one."
-    return start + f"{store.materials} predict {'better' if second < first else 'worse'}."
+    return make_section("summary", "Summary", prose, make_bullets(_list_verdicts(store))).blocks
 
 
 def _list_verdicts(store: Results) -> tuple[str, ...]:

@@ -1,0 +1,94 @@
+"""The words of the report, from ``templates/words.j2``: paragraphs, captions, what pictures show."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template, Undefined
+
+from . import formats
+from .page import Figure, Prose
+
+TEMPLATES = PackageLoader("limbfit.report", "templates")
+_COLUMN = re.compile(r"\| (.*?) \|([|=])(.*?)(?:\|%(.*))?")
+_BAR = "\ue000"  # for a "|" in a value, until columns are apart
+
+
+def make_environment(undefined: type[Undefined] = StrictUndefined, **options: Any) -> Environment:
+    """Templates that read attributes of stored results and write numbers as the report does."""
+    environment = Environment(
+        loader=TEMPLATES, undefined=undefined, trim_blocks=True, lstrip_blocks=True, **options
+    )
+    environment.filters |= {
+        "fixed": formats.format_fixed,
+        "number": formats.number,
+        "limits": formats.format_limits,
+        "label": formats.label,
+        "symbol": formats.format_symbol,
+        "friction": formats.format_friction,
+        "unit": formats.get_unit,
+        "with_unit": formats.format_with_unit,
+        "count": formats.count,
+        "duration": formats.format_duration,
+        "form": format,
+        "sentence": _make_sentence,
+    }
+    return environment
+
+
+def write_words(name: str, **facts: Any) -> str:
+    """The paragraph with this name; what it says of results is read from ``facts``."""
+    return _join_lines(_read_templates()[name][0].render(facts))
+
+
+def write_columns(name: str, **facts: Any) -> list[tuple[str, str, str, str]]:
+    """A row of a table: of each column its head, ``=`` for a number, the text, and the share of its bar."""
+    lines = _read_templates()[name][1].render(facts).split("\n")
+    return [_split_column(line) for line in lines if line]
+
+
+def _split_column(line: str) -> tuple[str, str, str, str]:
+    found = _COLUMN.fullmatch(line)
+    assert found is not None, line
+    head, kind, text, share = map(_join_lines, found.groups(default=""))
+    return head, kind, text, share
+
+
+def make_prose(name: str, **facts: Any) -> Prose | None:
+    """The paragraph with this name as a block; None where it has nothing to say."""
+    text = write_words(name, **facts)
+    return Prose(text) if text else None
+
+
+def make_picture(name: str, markup: str, *, words: str = "", **facts: Any) -> Figure:
+    """A drawing with the caption ``figure <name>``, or of other ``words``."""
+    return Figure(name, markup, write_words(f"figure {words or name}", **facts))
+
+
+@cache
+def _read_templates() -> dict[str, list[Template]]:
+    """By its name, which stands above it after ``##``: a paragraph, and what follows after a blank line."""
+    words, columns = make_environment(), make_environment(finalize=_finish_value)
+    source = TEMPLATES.get_source(words, "words.j2")[0]
+    found = re.findall(r"^## (.*)\n((?:(?!## ).*\n?)*)", source, flags=re.MULTILINE)
+    parts = ((name, text.partition("\n\n")) for name, text in found)
+    return {name: [words.from_string(first), columns.from_string(last)] for name, (first, _, last) in parts}
+
+
+def _finish_value(value: Any) -> str:
+    """A value in a column: a dash for nothing, and without what would begin another column or line."""
+    text = formats.NOTHING if value is None or value == "" else str(value)
+    return text.replace("|", _BAR).replace("\n", " ")
+
+
+def _make_sentence(clauses: str) -> str:
+    """Clauses with a capital letter and a full stop; nothing where there are none."""
+    text = _join_lines(clauses)
+    return f"{text[:1].upper()}{text[1:]}." if text else ""
+
+
+def _join_lines(text: str) -> str:
+    """One line: white space is free in a template, but the narrow spaces of numbers stay."""
+    return re.sub(r"[ \n]+", " ", text).strip(" ").replace(_BAR, "|")
