@@ -8,6 +8,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,7 +17,8 @@ from page_outline import Outline, section_of, without_scripts
 from stored_results import SITES, write_results
 
 from limbfit.report import build_report
-from limbfit.report.sections.methods import describe_preload
+from limbfit.report.sections.methods import write_method_parts
+from limbfit.report.store import load_store
 from limbfit.web.arrays import unpack
 
 
@@ -215,10 +217,28 @@ def test_methods_say_what_was_done_and_name_nobody(results, report):
     assert "nan" not in text.lower().replace("nanometre", "")
 
 
-def test_methods_say_what_moved_the_limb_before():
-    assert describe_preload(None, {"law": "ogden", "prestretch": {}}) == ""
+def methods_of(results: Path, **settings: object) -> str:
+    """The methods of the study with other settings."""
+    store = load_store(results)
+    run = store.run.model_copy(update={"settings": {**store.run.settings, **settings}})
+    return "\n".join(text for _, text in write_method_parts(replace(store, run=run)))
+
+
+def test_methods_say_what_moved_the_limb_before(results):
+    assert "Before the indenter" not in methods_of(results, material={"law": "ogden", "prestretch": {}})
     clamps = {"force_N": 15.0, "width_mm": 20.0, "clamping_s": 2.0, "settling_s": 5.0}
-    assert describe_preload(clamps, {"law": "ogden-active", "prestretch": {"skin": 1.1}}) == (
+    material = {"law": "ogden-active", "prestretch": {"skin": 1.1, "muscle": 1.2}}
+    assert (
         "Before the indenter touched the limb, pins of 20.0 mm clamped it with 15.0 N each for 7.0 s and "
-        "muscle contracted and tissue was pre-stretched (skin by 1.1)."
-    )
+        "muscle contracted and tissue was pre-stretched (skin by 1.1, muscle by 1.2)."
+    ) in methods_of(results, clamps=clamps, material=material)
+
+
+def test_methods_say_what_was_held_and_that_people_were_asked(results):
+    prior = {"muscle.m": {"median": 3.0, "factor": 1.25}}
+    held = {"fixed": ["skin.m", "skin.tau_s"], "tied": [["skin.gamma", "muscle.gamma"]]}
+    told = methods_of(results, calibration={**held, "priors": "population", "prior": prior})
+    assert (
+        "Skin.m, skin.tau_s stayed at the start; skin.gamma and muscle.gamma were kept equal; lognormal "
+        "priors of c and m were those of people; lognormal priors were put on muscle.m: median 3.0, factor 1.25."
+    ) in told

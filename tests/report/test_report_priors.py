@@ -11,7 +11,6 @@ from stored_results import NAMES, write_results
 from completing import complete
 from limbfit.priors import SOURCE
 from limbfit.report.page import Prose, Table
-from limbfit.report.sections.methods import describe_constraints
 from limbfit.report.sections.parameters import describe_priors, describe_relaxation, make_parameter_section
 from limbfit.report.store import load_store
 from limbfit.results.identification import CalibrationResult
@@ -60,16 +59,6 @@ def test_the_section_of_parameters_has_the_table_where_there_are_priors(results:
     assert "priors" not in tables()
     add_priors(results)
     assert "priors" in tables()
-
-
-def test_the_methods_say_that_people_were_asked() -> None:
-    told = describe_constraints(
-        {"priors": "population", "prior": {"muscle.m": {"median": 3.0, "factor": 1.25}}}
-    )
-    assert told == (
-        "Lognormal priors of c and m were those of people; "
-        "lognormal priors were put on muscle.m: median 3.0, factor 1.25."
-    )
 
 
 def test_moduli_at_several_times_are_shown_with_what_the_records_prefer(results: Path) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-from jinja2 import ChainableUndefined, Environment, PackageLoader
+from jinja2 import ChainableUndefined
 
 from ...laws import ACTIVE, OGDEN, split_key
 from ...results.base import Parameters, ResultPart
@@ -18,14 +18,13 @@ from ...shapes import SHAPES
 from ..formats import (
     NOTHING,
     format_fixed,
-    format_friction,
     format_limits,
     format_symbol,
     format_with_value,
-    number,
 )
 from ..page import Prose, Section
 from ..store import Json, Results
+from ..words import make_environment
 from .parameters import describe_residuals
 from .provenance import flatten_settings
 
@@ -60,12 +59,9 @@ def write_method_markdown(store: Results) -> str:
 def write_method_parts(store: Results) -> tuple[Part, ...]:
     """Heading and paragraph of every part of which something is stored."""
     # Prose, not HTML: the page escapes it.
-    environment = Environment(
-        loader=PackageLoader("limbfit.report", "templates"),
-        undefined=ChainableUndefined,
+    environment = make_environment(
+        ChainableUndefined,
         finalize=lambda value: NOTHING if isinstance(value, ChainableUndefined) else value,
-        trim_blocks=True,
-        lstrip_blocks=True,
     )
     records, contact = store.traces, store.calibration.contact.values() if store.calibration else ()
     text = environment.get_template("methods.j2").render(
@@ -82,17 +78,10 @@ def write_method_parts(store: Results) -> tuple[Part, ...]:
         heldout={row.site for row in store.predicted if not row.fitted},
         experiments=_list_experiments(store),
         seconds=sum(stage.seconds for stage in store.run.stages.values()) if store.run else 0.0,
-        **{"NOTHING": NOTHING, "OGDEN": OGDEN, "elements": ELEMENTS},
-        **{
-            "fixed": format_fixed,
-            "number": number,
-            "friction": format_friction,
-            "span": _format_span,
-            "pairs": _format_pairs,
-        },
+        **{"NOTHING": NOTHING, "OGDEN": OGDEN, "ACTIVE": ACTIVE, "elements": ELEMENTS},
+        span=_format_span,
+        pairs=_format_pairs,
         describe_indenter=lambda one: SHAPES[one["shape"]].describe(one),
-        describe_preload=describe_preload,
-        describe_constraints=describe_constraints,
         describe_residuals=describe_residuals,
         describe_start=_format_start,
         describe_bounds=_format_bounds,
@@ -136,39 +125,6 @@ def _join_tissues(texts: dict[str, str]) -> str:
     if len(set(texts.values())) == 1:
         return next(iter(texts.values()))
     return "; ".join(f"{tissue} {text}" for tissue, text in texts.items()) or NOTHING
-
-
-def describe_preload(clamps: Json | None, material: Json | None) -> str:
-    """What moved the limb before the indenter touched, by the study's tables; nothing where nothing did."""
-    parts, material = [], material or {}
-    if clamps:
-        waited = clamps["clamping_s"] + clamps["settling_s"]
-        parts.append(
-            f"pins of {clamps['width_mm']} mm clamped it with {clamps['force_N']} N each for {waited} s"
-        )
-    if material.get("law") == ACTIVE:
-        parts.append("muscle contracted")
-    taut = ", ".join(f"{tissue} by {stretch}" for tissue, stretch in material.get("prestretch", {}).items())
-    if taut:
-        parts.append(f"tissue was pre-stretched ({taut})")
-    return f"Before the indenter touched the limb, {' and '.join(parts)}." if parts else ""
-
-
-def describe_constraints(table: Json | None) -> str:
-    """What the study held, tied or knew beforehand, as a sentence of the methods."""
-    table = table or {}
-    held, tied, prior = (table.get(key) or () for key in ("fixed", "tied", "prior"))
-    words = [f"{', '.join(held)} stayed at the start"] if held else []
-    words += [f"{' and '.join(group)} were kept equal" for group in tied]
-    if table.get("priors"):
-        words.append(
-            f"lognormal priors of {format_symbol('c')} and {format_symbol('m')} were those of people"
-        )
-    if prior:
-        known = (f"{name}: median {p['median']}, factor {p['factor']}" for name, p in dict(prior).items())
-        words.append(f"lognormal priors were put on {'; '.join(known)}")
-    text = "; ".join(words)
-    return text[:1].upper() + text[1:] + "." if text else ""
 
 
 def _list_experiments(store: Results) -> list[str]:
