@@ -10,7 +10,6 @@ from typing import Any
 
 from ..errors import InputError
 from ..pipeline.commands.acquire import FOLDER as ACQUIRED
-from ..pipeline.engine.storage import read_json
 from ..pipeline.engine.store import Store
 from ..study import Study, load_study
 
@@ -79,11 +78,6 @@ def resolve_inside(root: Path, *parts: str) -> Path:
     if not path.is_file():
         raise FileNotFoundError("/".join(parts))
     return path
-
-
-def read_stored(file: Path) -> dict[str, Any]:
-    """The content of a JSON file; an empty dictionary where there is no such file."""
-    return dict(read_json(file)) if file.is_file() else {}
 
 
 def compute_fingerprint(files: Iterable[Path]) -> str:

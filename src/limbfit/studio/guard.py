@@ -8,13 +8,13 @@ requests carry another ``Host`` or ``Origin``, and no cookie, since ours is ``Sa
 from __future__ import annotations
 
 import hmac
-import json
 import secrets
 from dataclasses import dataclass, field
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LARGEST_BODY = 16 << 20  # bytes of a request: a day's painting has less
@@ -98,7 +98,8 @@ class GuardMiddleware:
         is_entry = scope["path"] == "/" and scope["method"] in _SAFE_METHODS
         refused = self._refusal(scope, headers, token if is_entry else "")
         if refused:
-            await _answer(send, *refused)
+            status, reason = refused
+            await JSONResponse({"error": reason}, status)(scope, receive, _add_headers(send, ""))
             return
         cookie = ""
         if is_entry and self.guard.opens(token):
@@ -165,10 +166,3 @@ def _add_headers(send: Send, cookie: str) -> Send:
         await send(message)
 
     return dressed
-
-
-async def _answer(send: Send, status: int, reason: str) -> None:
-    body = json.dumps({"error": reason}).encode()
-    raw = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
-    await _add_headers(send, "")({"type": "http.response.start", "status": status, "headers": raw})
-    await send({"type": "http.response.body", "body": body})

@@ -95,23 +95,19 @@ def _answer(folder: StudyFolder) -> dict[str, Any] | None:
     calibration = CalibrationResult.find(folder.results)
     if calibration is None:
         return None
-    plain = calibration.to_plain()
-    uncertainty, stages = plain["uncertainty"], plain["stages"]
-    keys = ("name", "cost", "evaluations", "converged", "reason", "parameters")
-    rows = ("parameters", "cost", "error_percent", "error_percent_by_site")
+    keys = {"name", "cost", "evaluations", "converged", "reason", "parameters"}
+    rows = {"parameters", "cost", "error_percent", "error_percent_by_site"}
+    known = {"intervals_95", "correlation", "verdict", "at_bound", "combinations"}
     return {
-        "stages": [{key: stage[key] for key in keys} for stage in stages],
+        "stages": [stage.model_dump(include=keys) for stage in calibration.stages],
         "parameters": calibration.parameters,
-        "warnings": plain["warnings"],
+        "warnings": calibration.warnings,
         "iterates": [
-            {"of": stage["name"], **{key: row[key] for key in rows}}
-            for stage in stages
-            for row in stage["iterations"]
+            {"of": stage.name, **row.model_dump(include=rows)}
+            for stage in calibration.stages
+            for row in stage.iterations
         ],
-        **{
-            key: uncertainty[key]
-            for key in ("intervals_95", "correlation", "verdict", "at_bound", "combinations")
-        },
+        **calibration.uncertainty.model_dump(include=known),
     }
 
 

@@ -19,11 +19,11 @@ from ..mesh import read_vtu
 from ..pipeline.engine.digests import compute_digest
 from ..pipeline.limb.sites import place_site
 from ..pipeline.limb.surfaces import read_given_anatomy
-from ..results.limb import PlacedSite, SitesResult
+from ..results.limb import MeshResult, PlacedSite, SitesResult, SurfacesResult
 from ..study import Site, Study
 from ..web.shapes import Shell, build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape
 from .editing import add_site, remove_site, set_site
-from .folder import StudyFolder, compute_fingerprint, read_stored
+from .folder import StudyFolder, compute_fingerprint
 from .study_routes import Folder, StrictModel, respond_block
 
 router = APIRouter(prefix="/api/model")
@@ -62,6 +62,7 @@ def get_scene(folder: Folder) -> dict[str, Any]:
     anatomy = read_anatomy(folder, study)
     stored = SitesResult.find(folder.results)
     placed = {row.site: row for row in stored.sites} if stored else {}
+    meshed = MeshResult.find(folder.results)
     meshes = {site.name: folder.results / "mesh" / f"{site.name}.vtu" for site in study.sites}
     return {
         "surfaces": {} if anatomy is None else _mark_each_surface(folder, study, anatomy),
@@ -69,7 +70,7 @@ def get_scene(folder: Folder) -> dict[str, Any]:
         "sites": [_describe_site(site, study, anatomy, placed.get(site.name)) for site in study.sites],
         "meshes": {name: compute_fingerprint([file]) for name, file in meshes.items() if file.is_file()},
         "layers": [layer.name for layer in study.geometry.model_layers],
-        "quality": read_stored(folder.results / "mesh" / "mesh.json").get("sites", {}),
+        "quality": meshed.sites if meshed else {},
     }
 
 
@@ -219,9 +220,9 @@ def _describe_site(
 
 def _read_one_surface(folder: StudyFolder, name: str) -> Surface | None:
     """One surface; where surfaces are stored, only its file is read."""
-    if _has_made_surfaces(folder):
-        bones = read_stored(folder.results / "surfaces" / "surfaces.json").get("bones", ())
-        return read_surface(_find_surface_file(folder, name)) if name == SKIN or name in bones else None
+    if stored := SurfacesResult.find(folder.results):
+        known = name in (SKIN, *stored.bones)
+        return read_surface(_find_surface_file(folder, name)) if known else None
     anatomy = read_anatomy(folder, folder.load())
     return None if anatomy is None else {SKIN: anatomy.skin, **anatomy.bones}.get(name)
 

@@ -15,8 +15,9 @@ from ..errors import InputError
 from ..mesh import read_grid, read_vtu
 from ..phases import find_loading_end, find_phases
 from ..pipeline.engine.storage import read_curves
+from ..results.runs import SimulateResult
 from ..web.shapes import to_volume_shape
-from .folder import StudyFolder, compute_fingerprint, read_stored
+from .folder import StudyFolder, compute_fingerprint
 
 Block = tuple[dict[str, NDArray[Any]], dict[str, Any]]  # arrays and facts, see `limbfit.web.arrays`
 _FRAME = re.compile(r'<DataSet timestep="([^"]+)" part="0" file="[^"/]+/(step-\d{4,}\.vtu)"/>')
@@ -59,14 +60,14 @@ def list_sources(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
     moments = _list_moments(folder, site)
     if moments:
         times_s = [time for time, _ in moments]
-        origin = read_stored(folder.results / "simulate" / f"{site}.json").get("parameters_from")
+        simulated = SimulateResult.find(folder.results, site)
         sources.append(
             {
                 "source": "simulate",
                 "title": "every step, simulated",
                 "times_s": times_s,
                 "deepest": _find_deepest(folder, site, times_s),
-                "parameters_from": origin,
+                "parameters_from": simulated and simulated.parameters_from,
                 "mark": compute_fingerprint(file for _, file in moments),
             }
         )

@@ -14,24 +14,22 @@ from pydantic import Field
 
 from ..errors import InputError, RunError
 from ..pipeline import export_study
-from ..pipeline.engine.storage import read_curves, write_json
+from ..pipeline.engine.storage import read_curves, read_json, write_json
+from ..results.identification import CalibrationResult, PredictResult
 from ..study import Record
 from . import playback, processes
-from .folder import StudyFolder, read_stored
+from .folder import StudyFolder
 from .study_routes import Folder, StrictModel, list_stage_states, respond_block
 
 router = APIRouter(prefix="/api/results")
 KEPT, ABOUT = "kept", "kept.json"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_. -]{0,39}")
-_FILES = ("calibrate/calibration.json", "predict/predict.json")
-_COLUMNS = (
-    "error_percent",
-    "error_one_material_percent",
-    "peak_force_N",
-    "penetration_mm",
-    "completed",
-    "warnings",
-)
+_FILES = (CalibrationResult.FILE, PredictResult.FILE)
+_SITE_KEYS = {
+    *("site", "record", "region", "fitted", "completed", "warnings"),
+    *("error_percent", "error_one_material_percent", "peak_force_N", "penetration_mm"),
+}
+_MEAN_KEYS = {f"{kind}_error_{use}_percent" for kind in ("mean", "sd") for use in ("fitted", "heldout")}
 
 
 class KeptRunName(StrictModel):
@@ -48,22 +46,18 @@ def get_outcome(folder: Folder, kept: str | None = None) -> dict[str, Any]:
     where nothing is stored. The names of kept runs and the files to download come with them.
     """
     place = folder.results if kept is None else _find_kept_run(folder, kept)
-    calibration, predicted = (read_stored(place / name) for name in _FILES)
-    uncertainty = calibration.get("uncertainty") or {}
+    calibration, predicted = CalibrationResult.find(place), PredictResult.find(place)
     return {
         "stages": [
-            {key: stage.get(key) for key in ("name", "parameters", "converged", "reason")}
-            | {"iterates": len(stage.get("iterations") or ())}
-            for stage in calibration.get("stages", [])
+            stage.model_dump(include={"name", "parameters", "converged", "reason"})
+            | {"iterates": len(stage.iterations)}
+            for stage in (calibration.stages if calibration else ())
         ],
-        "intervals_95": uncertainty.get("intervals_95") or {},
-        "verdict": uncertainty.get("verdict") or {},
-        "sites": [
-            {key: row.get(key) for key in ("site", "record", "region", "fitted", *_COLUMNS)}
-            for row in predicted.get("sites", [])
-        ],
-        "outside": predicted.get("outside_text", []),
-        "means": {key: value for key, value in predicted.items() if key.endswith("_percent")},
+        "intervals_95": calibration.uncertainty.intervals_95 if calibration else {},
+        "verdict": calibration.uncertainty.verdict if calibration else {},
+        "sites": [row.model_dump(include=_SITE_KEYS) for row in (predicted.sites if predicted else ())],
+        "outside": predicted.outside_text if predicted else [],
+        "means": predicted.model_dump(include=_MEAN_KEYS) if predicted else {},
         "kept": _list_kept_runs(folder),
         "downloads": _list_downloads(folder),
     }
@@ -181,11 +175,9 @@ def post_drop(folder: Folder, run: KeptRunName) -> dict[str, Any]:
 
 def _list_kept_runs(folder: StudyFolder) -> list[dict[str, Any]]:
     """``name`` and ``since`` of the runs that were kept, newest first."""
-    runs = [
-        {"name": file.parent.name, "since": read_stored(file).get("since", "")}
-        for file in (folder.results / KEPT).glob(f"*/{ABOUT}")
-    ]
-    return sorted(runs, key=lambda row: str(row["since"]), reverse=True)
+    files = (folder.results / KEPT).glob(f"*/{ABOUT}")
+    runs = [{"name": file.parent.name, "since": read_json(file)["since"]} for file in files]
+    return sorted(runs, key=lambda row: row["since"], reverse=True)
 
 
 def _find_kept_run(folder: StudyFolder, name: str) -> Path:

@@ -11,7 +11,6 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 from threading import Timer
-from typing import Any
 
 import uvicorn
 from fastapi import FastAPI, Request
@@ -116,12 +115,15 @@ def create_app(folder: StudyFolder, guard: AccessGuard) -> FastAPI:
     app.state.folder = folder
     for routes in ROUTES:
         app.include_router(routes.router)
-    for kind, status in ((InputError, 422), (LimbfitError, 409), (FileNotFoundError, 404)):
-        app.add_exception_handler(kind, _to_json(status))
-    app.add_exception_handler(TooLargeError, _to_json(413))
-    app.add_exception_handler(HTTPException, _respond_refused)
-    app.add_exception_handler(Exception, _respond_internal)
-    app.add_exception_handler(RequestValidationError, _respond_unusable)
+    for kind in (
+        LimbfitError,
+        FileNotFoundError,
+        TooLargeError,
+        HTTPException,
+        RequestValidationError,
+        Exception,
+    ):
+        app.add_exception_handler(kind, _respond_error)
     app.add_api_route("/", _page, include_in_schema=False)
     app.mount("/static", StaticFiles(directory=STATIC))
     app.mount("/web", StaticFiles(directory=SHARED))
@@ -133,29 +135,25 @@ def _page() -> FileResponse:
     return FileResponse(STATIC / "index.html")
 
 
-def _to_json(status: int) -> Any:
-    def handler(request: Request, error: Exception) -> JSONResponse:
-        text = str(error) or "the request is too large"
-        if isinstance(error, FileNotFoundError):
-            text = f"not there (yet): {error.args[0] if len(error.args) == 1 else 'a file of the study'}"
-        return JSONResponse({"error": text}, status)
-
-    return handler
+def _respond_error(request: Request, error: Exception) -> JSONResponse:
+    status, text = _describe_error(error)
+    return JSONResponse({"error": text}, status)
 
 
-def _respond_refused(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, HTTPException)
-    return JSONResponse({"error": error.detail}, error.status_code)
-
-
-def _respond_internal(request: Request, error: Exception) -> JSONResponse:
+def _describe_error(error: Exception) -> tuple[int, str]:
+    """Status and text of the answer to a request that failed."""
+    match error:
+        case LimbfitError():
+            return (422 if isinstance(error, InputError) else 409), str(error)
+        case FileNotFoundError():
+            return 404, f"not there (yet): {error.args[0] if len(error.args) == 1 else 'a file of the study'}"
+        case TooLargeError():
+            return 413, "the request is too large"
+        case HTTPException():
+            return error.status_code, error.detail
+        case RequestValidationError():
+            first = error.errors()[0]
+            place = ".".join(str(part) for part in first["loc"][1:])
+            return 422, f"{place}: {first['msg']}" if place else first["msg"]
     name = type(error).__name__
-    text = f"internal error: {name}; set LIMBFIT_TRACEBACK=1 to see where, and please report it"
-    return JSONResponse({"error": text}, 500)
-
-
-def _respond_unusable(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, RequestValidationError)
-    first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"][1:])
-    return JSONResponse({"error": f"{place}: {first['msg']}" if place else first["msg"]}, 422)
+    return 500, f"internal error: {name}; set LIMBFIT_TRACEBACK=1 to see where, and please report it"

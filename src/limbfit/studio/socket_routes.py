@@ -17,13 +17,14 @@ from ..errors import InputError, SurfaceError
 from ..mesh import read_vtu
 from ..pipeline.engine.digests import compute_digest
 from ..pipeline.socket.shape import build_regions, build_socket, place_errors, trim_of
+from ..results.socket import SocketDesignResult, SocketLoad, SocketResult, SocketSimulation, SocketState
 from ..socket import Socket
 from ..socket.rays import LimbProfile, compute_profile
 from ..socket.trim import Trim, find_brim, trim_limb, wrap_trimline
 from ..study import Study
 from ..web.shapes import build_patient_frame, to_volume_shape
 from .editing import remove_area, set_area, set_trimline
-from .folder import StudyFolder, compute_fingerprint, read_stored
+from .folder import StudyFolder, compute_fingerprint
 from .identification_routes import describe_last_run
 from .model_routes import Place, Text, mark_surfaces, project_to_skin_of_study, read_anatomy
 from .playback import read_arrays
@@ -65,30 +66,25 @@ def list_runs(folder: StudyFolder) -> list[dict[str, Any]]:
 
     ``outside``: what it does to the tissue that no fitted record did, in words.
     """
-    single = read_stored(folder.results / "socket" / "socket.json")
-    runs = {SOCKET: single} if single else {}
-    designed = read_stored(folder.results / "socket_design" / "socket_design.json")
-    runs |= {design["name"]: design["simulation"] for design in designed.get("designs", [])}
-    rows = []
-    for name, content in runs.items():
-        steps = [{"name": "donning"} | content["donning"], *content["loads"]]
-        files = [_find_file(folder, name, i) for i in range(len(steps))]
-        outside = content.get("outside_text", [])
-        rows.append(
-            {
-                "run": name,
-                "steps": [*map(_step, steps)],
-                "outside": outside,
-                "mark": compute_fingerprint(files),
-            }
-        )
-    return rows
+    single, designed = SocketResult.find(folder.results), SocketDesignResult.find(folder.results)
+    runs: dict[str, SocketSimulation] = {SOCKET: single} if single else {}
+    runs |= {one.name: one.simulation for one in designed.designs} if designed else {}
+    return [
+        {
+            "run": name,
+            "steps": [_describe_step(title, state) for title, state in run.states.items()],
+            "outside": run.outside_text if isinstance(run, SocketResult) else [],
+            "mark": compute_fingerprint(_find_file(folder, name, i) for i in range(len(run.states))),
+        }
+        for name, run in runs.items()
+    ]
 
 
-def _step(held: dict[str, Any]) -> dict[str, Any]:
-    keys = ("region", "mean_kPa", "peak_kPa", "shear_kPa", "interval_kPa")
-    regions = [{key: row[key] for key in keys} for row in held["regions"]]
-    return {"name": held["name"], "settling_mm": held.get("settling_mm"), "regions": regions}
+def _describe_step(name: str, state: SocketState) -> dict[str, Any]:
+    keys = {"region", "mean_kPa", "peak_kPa", "shear_kPa", "interval_kPa"}
+    settling_mm = state.settling_mm if isinstance(state, SocketLoad) else None
+    regions = [row.model_dump(include=keys) for row in state.regions]
+    return {"name": name, "settling_mm": settling_mm, "regions": regions}
 
 
 def _find_file(folder: StudyFolder, run: str, step: int) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from threading import Lock
 from typing import Annotated, Any
 
@@ -92,48 +93,28 @@ def get_changes(folder: Folder) -> dict[str, Any]:
     return {**folder.changes(), "run": find_running(folder)}
 
 
-@router.get("/files/{stage}/{name}")
-def get_file(folder: Folder, stage: str, name: str, download: bool = False) -> FileResponse:
-    """A stored artefact ``results/<stage>/<name>``; with ``download`` as a file to keep."""
-    return _respond_file(folder, (stage, name), download)
-
-
-@router.get("/files/{stage}/{group}/{name}")
-def get_file_of_group(
-    folder: Folder, stage: str, group: str, name: str, download: bool = False
-) -> FileResponse:
-    """A stored artefact ``results/<stage>/<group>/<name>``, such as a table of the report."""
-    return _respond_file(folder, (stage, group, name), download)
-
-
-def _respond_file(folder: StudyFolder, parts: tuple[str, ...], download: bool) -> FileResponse:
-    path = folder.artefact(*parts)
+@router.get("/files/{path:path}")
+def get_file(folder: Folder, path: str, download: bool = False) -> FileResponse:
+    """A stored artefact ``results/<path>``, such as ``report/tables/sites.csv``; ``download``: to keep."""
+    file = folder.artefact(*path.split("/"))
     headers = {}
-    if path.suffix.lower() in (".html", ".htm", ".svg", ".xml"):
+    if file.suffix.lower() in (".html", ".htm", ".svg", ".xml"):
         headers["Content-Security-Policy"] = REPORT_POLICY
-    return FileResponse(path, filename=parts[-1] if download else None, headers=headers)
+    return FileResponse(file, filename=file.name if download else None, headers=headers)
 
 
-class _Remembered:
-    """The states of the stages as last computed, with the mark of the files they depend on."""
-
-    def __init__(self) -> None:
-        self.lock = Lock()
-        self.mark, self.rows = "", []  # type: str, list[dict[str, Any]]
-
-
-_remembered = _Remembered()
+_LOCK = Lock()  # one request computes them while others wait
 
 
 def list_stages(folder: StudyFolder) -> list[dict[str, Any]]:
     """The rows of `study_status`; they are computed again only when an input or a result has changed."""
-    study = folder.load()
-    mark = _mark(folder, study)
-    with _remembered.lock:
-        if _remembered.mark != mark:
-            _remembered.rows = study_status(study)
-            _remembered.mark = mark
-        return _remembered.rows
+    with _LOCK:
+        return _read_marked_stages(folder, _mark(folder, folder.load()))
+
+
+@lru_cache(maxsize=1)
+def _read_marked_stages(folder: StudyFolder, mark: str) -> list[dict[str, Any]]:
+    return study_status(folder.load())
 
 
 def list_stage_states(folder: StudyFolder) -> dict[str, str]:
