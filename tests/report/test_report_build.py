@@ -240,5 +240,6 @@ def test_methods_say_what_was_held_and_that_people_were_asked(results):
     told = methods_of(results, calibration={**held, "priors": "population", "prior": prior})
     assert (
         "Skin.m, skin.tau_s stayed at the start; skin.gamma and muscle.gamma were kept equal; lognormal "
-        "priors of c and m were those of people; lognormal priors were put on muscle.m: median 3.0, factor 1.25."
+        "priors of c and m were those of people; lognormal priors were put on muscle.m: median 3.0, factor "
+        "1.25."
     ) in told

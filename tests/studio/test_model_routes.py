@@ -10,8 +10,10 @@ import pytest
 import pyvista as pv
 from fastapi.testclient import TestClient
 
+from completing import complete
 from limbfit import load_study
 from limbfit.mesh import Mesh, boundary_faces, measure_quality, write_vtu
+from limbfit.results.limb import MeshResult
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import AccessGuard
 from limbfit.studio.model_routes import read_anatomy
@@ -154,7 +156,8 @@ def _meshed(study) -> Mesh:
     folder = study / "results" / "mesh"
     folder.mkdir(parents=True)
     write_vtu(mesh, folder / "1.vtu")
-    (folder / "mesh.json").write_text(json.dumps({"sites": {"1": {"min_dihedral_deg": 54.7}}}))
+    stored = complete(MeshResult, {"sites": {"1": {"min_dihedral_deg": 54.7}}})
+    (folder / "mesh.json").write_text(json.dumps(stored))
     return mesh
 
 

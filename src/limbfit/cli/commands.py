@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from enum import StrEnum
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 import limbfit
 
 from ..errors import InputError
+from ..results.limb import MeshMeasures
+from ..results.study_results import StudyResults
 from ..study import Study
 from .console import (
     AsJson,
@@ -33,19 +34,14 @@ StudyPath = Annotated[
 ]
 
 
-class Detail(StrEnum):
-    coarse = "coarse"
-    paper = "paper"
-
-
-class LimbKind(StrEnum):
-    transtibial = "transtibial"
-    transfemoral = "transfemoral"
-
-
-class SolverName(StrEnum):
-    limbfit = "limbfit"
-    febio = "febio"
+Parameters = Annotated[
+    str | None,
+    typer.Option(
+        help="the law's parameters of each tissue (c_kPa,m,gamma,tau_s unless the study has another), "
+        "outermost first (skin, then muscle, unless the study has layers); default: identified, or the "
+        "study's start where nothing is"
+    ),
+]
 
 
 def list_stage_names() -> list[str]:
@@ -73,10 +69,12 @@ def demo(
 def phantom(
     folder: Annotated[Path, typer.Argument(help="a folder that does not exist yet", show_default=False)],
     detail: Annotated[
-        Detail, typer.Option(help="coarse: 6 sites, minutes; paper: 256^3, 18 sites")
-    ] = Detail.coarse,
+        Literal["coarse", "paper"], typer.Option(help="coarse: 6 sites, minutes; paper: 256^3, 18 sites")
+    ] = "coarse",
     seed: Annotated[int, typer.Option(help="which synthetic patient")] = 0,
-    limb: Annotated[LimbKind, typer.Option(help="which limb was amputated")] = LimbKind.transtibial,
+    limb: Annotated[
+        Literal["transtibial", "transfemoral"], typer.Option(help="which limb was amputated")
+    ] = "transtibial",
     fat: Annotated[bool, typer.Option("--fat", help="three tissues: skin, fat and muscle")] = False,
     tendon: Annotated[
         bool, typer.Option("--tendon", help="also a patellar tendon, a tissue of its own in the muscle")
@@ -97,7 +95,7 @@ def phantom(
     with listen_on_console() as listener:
         truth = limbfit.make_phantom_study(
             folder,
-            detail=detail.value,
+            detail=detail,
             seed=seed,
             fat=fat,
             socket=socket,
@@ -105,7 +103,7 @@ def phantom(
             surface=surface,
             shear_waves=shear_waves,
             tendon=tendon,
-            limb=limb.value,
+            limb=limb,
             listener=listener,
         )
     if as_json:
@@ -198,19 +196,13 @@ def show_states(result: dict[str, Any]) -> None:
 def simulate(
     study: StudyPath,
     site: Annotated[str, typer.Option(help="name of the site", show_default=False)],
-    parameters: Annotated[
-        str | None,
-        typer.Option(
-            help="the law's parameters of each tissue (c_kPa,m,gamma,tau_s unless the study has another), "
-            "outermost first (skin, then muscle, unless the study has layers); default: identified, or the "
-            "study's start where nothing is"
-        ),
-    ] = None,
+    parameters: Parameters = None,
     animation: Annotated[
         bool, typer.Option("--animation", help="also store the fields of every step, for ParaView")
     ] = False,
     solver: Annotated[
-        SolverName | None, typer.Option(help="limbfit's own or FEBio; default: what the study says")
+        Literal["limbfit", "febio"] | None,
+        typer.Option(help="limbfit's own or FEBio; default: what the study says"),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -222,7 +214,7 @@ def simulate(
             site,
             parameters=parse_parameters(parameters, checked),
             animation=animation,
-            solver=None if solver is None else solver.value,
+            solver=solver,
             listener=listener,
         )
     if as_json:
@@ -356,35 +348,39 @@ def mesh(study: StudyPath, as_json: AsJson = False) -> None:
 
 
 def _run_until(
-    study: StudyPath, stage: str, show_words: Callable[[dict[str, Any]], None], as_json: bool
+    study: StudyPath, stage: str, show: Callable[[StudyResults, dict[str, Any]], None], as_json: bool
 ) -> None:
     """Run the study until a stage, print what it made and where its picture is."""
+    checked = limbfit.load_study(study)
     with listen_on_console() as listener:
-        result = limbfit.show_stage(limbfit.load_study(study), stage, listener=listener)
-    print_result(result, show_words, as_json)
-    if result["picture"] and not as_json:
+        result = limbfit.show_stage(checked, stage, listener=listener)
+    if as_json:
+        print_json(result)
+        return
+    show(limbfit.load_results(checked), result)
+    if result["picture"]:
         print_line(f"picture: {result['picture']}")
 
 
-def show_labels(result: dict[str, Any]) -> None:
-    volumes = ", ".join(f"{name} {value:.1f}" for name, value in result["volumes_cm3"].items())
-    print_line(f"{result['method']}; volumes in cm3: {volumes}")
-    for repair in result.get("repairs", ()):
+def show_labels(results: StudyResults, facts: dict[str, Any]) -> None:
+    found = results.segment
+    volumes = ", ".join(f"{name} {value:.1f}" for name, value in found.volumes_cm3.items())
+    print_line(f"{found.method}; volumes in cm3: {volumes}")
+    for repair in found.repairs:
         print_line(f"repaired: {repair}")
-    for warning in result.get("warnings", ()):
+    for warning in found.warnings:
         print_line(f"warning: {warning}")
-    if "markers_removed" in result:
-        print_line(f"markers taken off the skin: {result['markers_removed']}")
-    if "motion" in result:
-        motion = result["motion"]
+    if found.markers_removed is not None:
+        print_line(f"markers taken off the skin: {found.markers_removed}")
+    if motion := found.motion:
         print_line(
-            f"between the images the limb moved by {motion['shift_mm']:.1f} mm and {motion['turn_deg']:.1f} "
-            f"degrees (correlation {motion['correlation']:.2f})"
+            f"between the images the limb moved by {motion.shift_mm:.1f} mm and {motion.turn_deg:.1f} "
+            f"degrees (correlation {motion.correlation:.2f})"
         )
-    print_line(f"labels: {result['labels']}")
+    print_line(f"labels: {facts['labels']}")
 
 
-def show_surfaces(result: dict[str, Any]) -> None:
+def show_surfaces(results: StudyResults, result: dict[str, Any]) -> None:
     rows = []
     for name, volume in result["volumes_cm3"].items():
         thinnest = result["thinnest_mm"].get(name) or {}
@@ -407,37 +403,36 @@ def show_surfaces(result: dict[str, Any]) -> None:
         )
 
 
-def show_placed_sites(result: dict[str, Any]) -> None:
-    rows = ((site["marker"] or {}) | site for site in result["sites"])
+def show_placed_sites(results: StudyResults, facts: dict[str, Any]) -> None:
     columns: dict[str, Column] = {
         "site": "site",
         "region": "region",
         "used": format_use,
-        "at (LPS mm)": lambda row: format_point(row["position_mm"]),
-        "off skin": lambda row: f"{row['off_skin_mm']:.2f} mm",
-        "marker": lambda row: f"{row['height_mm']:.1f} mm" if row["marker"] else "",
-        "from 'near'": lambda row: f"{row['distance_to_hint_mm']:.1f} mm" if row["marker"] else "",
+        "at (LPS mm)": lambda row: format_point(row.position_mm),
+        "off skin": lambda row: f"{row.off_skin_mm:.2f} mm",
+        "marker": lambda row: f"{row.marker.height_mm:.1f} mm" if row.marker else "",
+        "from 'near'": lambda row: f"{row.marker.distance_to_hint_mm:.1f} mm" if row.marker else "",
     }
-    print_table(rows, columns, unwrapped=columns.keys() - {"region"})
+    print_table(results.sites.sites, columns, unwrapped=columns.keys() - {"region"})
 
 
-def show_meshes(result: dict[str, Any]) -> None:
-    def format_trimmed(row: Any) -> str:
-        bones = (f"{bone} {cut['volume_mm3'] / 1000:.2f}" for bone, cut in row["trimmed_bone"].items())
+def show_meshes(results: StudyResults, facts: dict[str, Any]) -> None:
+    def format_trimmed(row: tuple[str, MeshMeasures]) -> str:
+        bones = (f"{bone} {cut.volume_mm3 / 1000:.2f}" for bone, cut in row[1].trimmed_bone.items())
         return ", ".join(bones) or "none"
 
     columns: dict[str, Column] = {
-        "site": "site",
-        "nodes": "nodes",
-        "elements": "cells",
-        "least angle": lambda row: f"{row['min_dihedral_deg']:.1f} deg",
-        "layers (mm)": lambda row: f"{row['layer_mean_mm']:.2f} +- {row['layer_std_mm']:.2f}",
+        "site": lambda row: row[0],
+        "nodes": lambda row: str(row[1].nodes),
+        "elements": lambda row: str(row[1].cells),
+        "least angle": lambda row: f"{row[1].min_dihedral_deg:.1f} deg",
+        "layers (mm)": lambda row: f"{row[1].layer_mean_mm:.2f} +- {row[1].layer_std_mm:.2f}",
         "trimmed bone (cm3)": format_trimmed,
     }
-    rows = ({"site": name} | row for name, row in result["sites"].items())
-    print_table(rows, columns, unwrapped=columns.keys() - {"trimmed bone (cm3)"})
-    for name, row in result["sites"].items():
-        for warning in row["warnings"]:
+    meshes = results.mesh.sites
+    print_table(meshes.items(), columns, unwrapped=columns.keys() - {"trimmed bone (cm3)"})
+    for name, mesh in meshes.items():
+        for warning in mesh.warnings:
             print_line(f"warning: site {name}: {warning}")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,7 +16,7 @@ from ..results.models import ModelsResult
 from ..results.planning import DesignResult, ProtocolResult
 from ..results.uncertainty import CrossvalidateResult, RegionsResult, UncertaintyResult
 from ..results.variants import CubeResult, RefinementResult, VolumeResult
-from .commands import StudyPath, parse_parameters
+from .commands import Parameters, StudyPath, parse_parameters
 from .console import (
     AsJson,
     Column,
@@ -76,21 +75,16 @@ def show_cube(found: CubeResult) -> None:
     print_table(found.tissues, columns, unwrapped=("tissue",))
 
 
-class RegionSites(StrEnum):
-    all = "all"
-    fitted = "fitted"
-
-
 def regions(
     study: StudyPath,
     sites: Annotated[
-        RegionSites,
+        Literal["all", "fitted"],
         typer.Option(help="fit all recorded sites of a region, as the paper, or the study's fitted ones"),
-    ] = RegionSites.all,
+    ] = "all",
     as_json: AsJson = False,
 ) -> None:
     """Identify each region separately, beside the model of the whole limb (the paper's table 3)."""
-    _run_and_print(study, "regions", show_regions, as_json, sites=sites.value)
+    _run_and_print(study, "regions", show_regions, as_json, sites=sites)
 
 
 def show_regions(found: RegionsResult) -> None:
@@ -180,12 +174,7 @@ def show_uncertainty(found: UncertaintyResult) -> None:
         print_line(text)
 
 
-class Sensitivity(StrEnum):
-    c = "c"
-    kappa = "kappa"
-    contact = "contact"
-    indenter = "indenter"
-    mesh = "mesh"
+SENSITIVITIES = ("c", "kappa", "contact", "indenter", "mesh")
 
 
 def sensitivity(
@@ -216,11 +205,11 @@ def sensitivity(
 
 def parse_sensitivities(only: str | None) -> list[str]:
     """``--only``: names of what is changed."""
-    known = [kind.value for kind in Sensitivity]
-    names = known if only is None else [name.strip() for name in only.split(",")]
-    wrong = [name for name in names if name not in known]
+    names = list(SENSITIVITIES) if only is None else [name.strip() for name in only.split(",")]
+    wrong = [name for name in names if name not in SENSITIVITIES]
     if wrong:
-        raise InputError(f"{wrong[0]!r} cannot be changed", place="--only", remedy=f"use {', '.join(known)}")
+        remedy = f"use {', '.join(SENSITIVITIES)}"
+        raise InputError(f"{wrong[0]!r} cannot be changed", place="--only", remedy=remedy)
     return names
 
 
@@ -315,10 +304,7 @@ def design(
         str | None,
         typer.Option(help="depths in mm to choose from, such as 3,5,7; default: the study's"),
     ] = None,
-    parameters: Annotated[
-        str | None,
-        typer.Option(help="the law's parameters of each tissue; default: identified, or the study's start"),
-    ] = None,
+    parameters: Parameters = None,
     protocol: Annotated[
         bool, typer.Option("--protocol", help="choose the records of a whole session instead")
     ] = False,

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 import limbfit
 
-from .commands import StudyPath, parse_parameters
+from .commands import Parameters, StudyPath, parse_parameters
 from .console import (
     AsJson,
     listen_on_console,
@@ -19,18 +18,6 @@ from .console import (
     print_line,
     print_warning,
 )
-
-Parameters = Annotated[
-    str | None,
-    typer.Option(help="as in limbfit simulate; default: identified, or the study's start where nothing is"),
-]
-
-
-class Format(StrEnum):
-    feb = "feb"
-    optimize = "febio-optimize"
-    inp = "inp"
-    calculix = "calculix"
 
 
 def febio(
@@ -64,7 +51,7 @@ def febio(
 def export(
     study: StudyPath,
     to: Annotated[
-        Format,
+        Literal["feb", "febio-optimize", "inp", "calculix"],
         typer.Option(
             help="feb: FEBio 4; febio-optimize: FEBio's fit of the parameters; inp: Abaqus; calculix",
             show_default=False,
@@ -82,7 +69,7 @@ def export(
     with listen_on_console() as listener:
         result = limbfit.export_study(
             checked,
-            to.value,
+            to,
             site=site,
             output=output,
             parameters=parse_parameters(parameters, checked),
@@ -96,7 +83,7 @@ def export(
         print_line(f"{head}: {', '.join(row['files'])}")
         for note in row["notes"]:
             print_aside(f"note: {note}")
-    if to is Format.optimize:
+    if to == "febio-optimize":
         print_line("run: febio4 -i SITE-model.feb -s SITE-optimize.feb; FEBio fits one site at a time")
 
 

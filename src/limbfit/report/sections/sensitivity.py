@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,17 +33,23 @@ Compared = StiffnessResult | VolumeResult | FrictionResult | IndenterResult | Re
 _RANGE = ("J_min", "J_low", "J_high", "J_max")
 
 
-def make_stiffness_section(store: Results, content: StiffnessResult) -> Section:
-    """Force against c of each tissue at equal m, at thin and thick sites, and its derivatives everywhere."""
-    name = "sensitivity-c"
+def make_sensitivity_section(store: Results, content: Compared, name: str) -> Section:
+    """Force with one thing changed at a time: in words, in curves, and in a table of the simulations."""
+    title, draw_figure = _SECTIONS[name]
+    stiffness = content if isinstance(content, StiffnessResult) else None
+    facts = {
+        "element": store.calibration.element if store.calibration else None,
+        "changes": write_words("changes of the force", runs=content.runs),
+    }
+    words = "compared models" if draw_figure is _draw_site_curves else ""
     return make_section(
         name,
-        "Sensitivity to the stiffness of the tissues",
-        make_prose(name, content=content),
-        make_prose("leading tissues", found=_find_leading_tissues(content)),
-        _draw_stiffness_figure(store, content),
-        make_table(name, content.runs, marked="base"),
-        make_table("sensitivity-c-local", content.local, content=content),
+        title,
+        make_prose(name, content=content, **facts),
+        make_prose("leading tissues", found=_find_leading_tissues(stiffness)) if stiffness else None,
+        draw_figure(store, content),
+        make_table(name, content.runs, marked="base", words=words, title=title),
+        make_table("sensitivity-c-local", stiffness.local, content=content) if stiffness else None,
         _list_warnings(content),
     )
 
@@ -100,21 +107,8 @@ def _draw_derivatives(ax: Axes, content: StiffnessResult, tissues: Sequence[str]
     ax.legend(fontsize=8)
 
 
-def make_kappa_section(store: Results, content: VolumeResult) -> Section:
-    """The ratio of bulk modulus to c, and the change of volume that it allows."""
-    name, element = "sensitivity-kappa", store.calibration.element if store.calibration else None
-    return make_section(
-        name,
-        "Sensitivity to the bulk modulus",
-        make_prose(name, content=content, element=element),
-        _draw_kappa_figure(content),
-        make_table(name, content.runs, marked="base"),
-        _list_warnings(content),
-    )
-
-
 @styled
-def _draw_kappa_figure(content: VolumeResult) -> Figure:
+def _draw_kappa_figure(store: Results, content: VolumeResult) -> Figure:
     drawing, axes = make_panels(2, 2, 2.7)
     for i, site in enumerate(content.sites):
         color, line = _STYLES[i % len(_STYLES)]
@@ -136,29 +130,6 @@ def _draw_kappa_figure(content: VolumeResult) -> Figure:
         ax.axvline(content.kappa_ratio, color=MUTED, lw=0.8, ls="--")
     add_legend(drawing, axes[0])
     return make_figure(drawing, "sensitivity-kappa")
-
-
-def make_contact_section(store: Results, content: FrictionResult) -> Section:
-    """Sticky against frictionless contact."""
-    return _compare_models(store, "sensitivity-contact", "Sensitivity to friction", content)
-
-
-def make_indenter_section(store: Results, content: IndenterResult) -> Section:
-    """The square against a sphere and others."""
-    return _compare_models(store, "sensitivity-indenter", "Sensitivity to the indenter", content)
-
-
-def make_mesh_section(store: Results, content: RefinementResult) -> Section:
-    """Mesh independence."""
-    name = "sensitivity-mesh"
-    return make_section(
-        name,
-        "Mesh independence",
-        make_prose(name, content=content),
-        _draw_mesh_figure(store, content),
-        make_table(name, content.runs, marked="base"),
-        _list_warnings(content),
-    )
 
 
 @styled
@@ -184,24 +155,14 @@ def _draw_mesh_figure(store: Results, content: RefinementResult) -> Figure:
 
 
 @styled
-def _compare_models(
-    store: Results, name: str, title: str, content: FrictionResult | IndenterResult
-) -> Section:
-    """Curves of every site, and the table of its runs."""
+def _draw_site_curves(store: Results, content: FrictionResult | IndenterResult) -> Figure:
+    name = "sensitivity-contact" if isinstance(content, FrictionResult) else "sensitivity-indenter"
     drawing, axes = make_panels(len(content.sites), 2, 2.7)
     for ax, site in zip(axes, content.sites, strict=True):
         _draw_curves(ax, store, name, site, content)
         ax.set_ylabel("Force (N)")
     add_legend(drawing, axes[0])
-    words: dict[str, Any] = {"words": "compared models", "title": title}
-    return make_section(
-        name,
-        title,
-        make_prose(name, content=content, changes=write_words("changes of the force", runs=content.runs)),
-        make_figure(drawing, name, **words),
-        make_table(name, content.runs, marked="base", **words),
-        _list_warnings(content),
-    )
+    return make_figure(drawing, name, words="compared models", title=_SECTIONS[name][0])
 
 
 def _name_model(row: VariantRun) -> str:
@@ -216,10 +177,12 @@ def _list_warnings(content: Compared) -> Bullets | None:
     return make_bullets(f"Site {row.site}, {row.label}: {text}" for row, text in texts)
 
 
-SENSITIVITIES: dict[str, Callable[[Results, Any], Section]] = {
-    "sensitivity-c": make_stiffness_section,
-    "sensitivity-kappa": make_kappa_section,
-    "sensitivity-contact": make_contact_section,
-    "sensitivity-indenter": make_indenter_section,
-    "sensitivity-mesh": make_mesh_section,
+# Of each experiment by its name: the title of its section, and what draws its figure.
+_SECTIONS: dict[str, tuple[str, Callable[[Results, Any], Figure]]] = {
+    "sensitivity-c": ("Sensitivity to the stiffness of the tissues", _draw_stiffness_figure),
+    "sensitivity-kappa": ("Sensitivity to the bulk modulus", _draw_kappa_figure),
+    "sensitivity-contact": ("Sensitivity to friction", _draw_site_curves),
+    "sensitivity-indenter": ("Sensitivity to the indenter", _draw_site_curves),
+    "sensitivity-mesh": ("Mesh independence", _draw_mesh_figure),
 }
+SENSITIVITIES = {name: partial(make_sensitivity_section, name=name) for name in _SECTIONS}
