@@ -15,6 +15,8 @@ from completing import complete
 from limbfit import compress_cube
 from limbfit.errors import InputError
 from limbfit.report import build_report
+from limbfit.report.store import load_store
+from limbfit.results.models import ModelsResult
 from limbfit.results.runs import RunResult, SimulateResult
 
 SKIN = {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.5}
@@ -202,3 +204,19 @@ def test_experiments_are_shown_unless_stale(copy, tmp_path):
     assert "pig skin, along the spine" in page
     assert '<section id="regions"' not in page
     assert "limbfit regions” are left out" in page
+
+
+def test_other_models_are_left_out_once_the_study_was_identified_anew(copy, tmp_path):
+    """They have no stamp of their own."""
+    calibration = json.loads((copy / "calibrate" / "calibration.json").read_text())
+    models = {"models": [{"model": "the study's own", "parameters": calibration["stages"][-1]["parameters"]}]}
+    (copy / "models").mkdir()
+    (copy / "models" / "models.json").write_text(json.dumps(complete(ModelsResult, models)))
+    assert load_store(copy).models is not None
+    calibration["stages"][-1]["parameters"]["skin"]["c_kPa"] *= 1.001
+    (copy / "calibrate" / "calibration.json").write_text(json.dumps(calibration))
+    store = load_store(copy)
+    assert (store.models, store.outdated) == (None, ("uncertainty --models",))
+    page = build_report(copy, tmp_path / "out").read_text(encoding="utf-8")
+    assert '<section id="models"' not in page
+    assert "limbfit uncertainty --models” are left out" in page

@@ -11,7 +11,11 @@ from stored_results import NAMES, write_results
 from completing import complete
 from limbfit.priors import SOURCE
 from limbfit.report.page import Prose, Table
-from limbfit.report.sections.parameters import describe_priors, describe_relaxation, make_parameter_section
+from limbfit.report.sections.identification import (
+    describe_priors,
+    describe_relaxation,
+    make_parameter_section,
+)
 from limbfit.report.store import load_store
 from limbfit.results.identification import CalibrationResult
 

@@ -7,7 +7,7 @@ import select
 import signal
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,7 +38,6 @@ from ..acquire import (
 from ..acquire.events import Abort
 from ..acquire.virtual import Serving, read_faults
 from ..errors import InputError
-from ..study.tables import AcquireTable
 from .commands import StudyPath
 from .console import STDERR, AsJson, print_aside, print_json, print_line, print_result
 
@@ -111,9 +110,9 @@ def _acquire_one(
 ) -> dict[str, Any]:
     events: SimpleQueue[Event] = SimpleQueue()
     prioritise()  # before the threads of the display and the keys start
-    shown = Live(name, study.acquire) if STDERR.is_terminal else PlainLines(name)
+    shown = draw_session(name) if STDERR.is_terminal else nullcontext(print_phases(name))
     operated = nullcontext() if unattended else read_keys(events, study.acquire.key_gap_ms / 1000)
-    with _stop_on_signals(events), operated, shown:
+    with _stop_on_signals(events), operated, shown as listen:
         return limbfit.acquire_site(
             study,
             name,
@@ -122,7 +121,7 @@ def _acquire_one(
             stops=events,
             depth_mm=depth,
             replace_record=again,
-            listener=shown.listen,
+            listener=listen,
         )
 
 
@@ -216,73 +215,53 @@ def virtual_fitsocket(
     signal.set_wakeup_fd(wakeup)
 
 
-class PlainLines:
-    """Phases as lines on standard error, with the time since the first."""
+def print_phases(site: str) -> Callable[[Update], None]:
+    """A listener that prints phases as lines on standard error, with the time since the first."""
+    began: list[float] = []
 
-    def __init__(self, site: str) -> None:
-        self.site = site
-        self._began: float | None = None
-
-    def __enter__(self) -> PlainLines:
-        return self
-
-    def __exit__(self, *what: object) -> None:
-        """Nothing to take down."""
-
-    def listen(self, update: Update) -> None:
+    def listen(update: Update) -> None:
         if isinstance(update, PhaseUpdate):
-            self._began = update.time_s if self._began is None else self._began
+            began.append(update.time_s)
             cycle = f" (ramp {update.cycle})" if update.phase in ("load", "hold", "unload") else ""
             reason = f": {update.reason}" if update.reason else ""
-            since = update.time_s - self._began
-            print_aside(f"[{since:8.3f} s] site {self.site}: {update.phase}{cycle}{reason}")
+            print_aside(f"[{update.time_s - began[0]:8.3f} s] site {site}: {update.phase}{cycle}{reason}")
+
+    return listen
 
 
-class Live:
-    """Two plots drawn with characters, eight times a second, by a thread of rich's."""
+@contextmanager
+def draw_session(site: str) -> Iterator[Callable[[Update], None]]:
+    """A listener that draws two plots with characters, eight times a second, by a thread of rich's."""
+    phases = [PhaseUpdate("idle", 0.0)]
+    samples: deque[LiveUpdate] = deque(maxlen=MAX_SAMPLES)
 
-    def __init__(self, site: str, settings: AcquireTable) -> None:
-        self.site, self.settings = site, settings
-        self._phase = PhaseUpdate("idle", 0.0)
-        self._samples: deque[LiveUpdate] = deque(maxlen=MAX_SAMPLES)
-        self._shown = RichLive(console=STDERR, refresh_per_second=8, get_renderable=self._draw)
-
-    def __enter__(self) -> Live:
-        self._shown.start()
-        return self
-
-    def __exit__(self, *what: object) -> None:
-        self._shown.stop()
-
-    def listen(self, update: Update) -> None:
+    def listen(update: Update) -> None:
         if isinstance(update, PhaseUpdate):
-            self._phase = update
+            phases.append(update)
         else:
-            self._samples.append(update)
+            samples.append(update)
 
-    def _draw(self) -> Any:
-        samples = list(self._samples)
-        phase = self._phase
-        head = Text(f"site {self.site}   {phase.phase}   ", style="bold")
-        if samples:
-            last = samples[-1]
-            head.append(
-                f"{last.displacement_mm:7.2f} mm {last.force_N:7.2f} N {last.capacitance_pF:6.1f} pF   "
-                f"clamps {last.clamp_N:5.1f} N"
-            )
-        hint = phase.reason or HINTS.get(phase.phase, "any other key: emergency stop")
-        touched = [s for s in samples if s.phase in ("search", "return", "load", "hold", "unload")]
-        plots = [
-            Panel(
-                plot([s.displacement_mm for s in touched], [s.force_N for s in touched]),
-                title="N over mm",
-                width=66,
-            ),
-            Panel(
-                plot([s.time_s for s in samples], [s.force_N for s in samples]), title="N over s", width=66
-            ),
-        ]
-        return Group(head, Text(hint), *plots)
+    def draw() -> Group:
+        return _draw_plots(site, phases[-1], list(samples))
+
+    with RichLive(console=STDERR, refresh_per_second=8, get_renderable=draw):
+        yield listen
+
+
+def _draw_plots(site: str, phase: PhaseUpdate, samples: list[LiveUpdate]) -> Group:
+    head = Text(f"site {site}   {phase.phase}   ", style="bold")
+    if samples:
+        last = samples[-1]
+        head.append(
+            f"{last.displacement_mm:7.2f} mm {last.force_N:7.2f} N {last.capacitance_pF:6.1f} pF   "
+            f"clamps {last.clamp_N:5.1f} N"
+        )
+    hint = phase.reason or HINTS.get(phase.phase, "any other key: emergency stop")
+    touched = [s for s in samples if s.phase in ("search", "return", "load", "hold", "unload")]
+    over_mm = plot([s.displacement_mm for s in touched], [s.force_N for s in touched])
+    over_s = plot([s.time_s for s in samples], [s.force_N for s in samples])
+    plots = (Panel(over_mm, title="N over mm", width=66), Panel(over_s, title="N over s", width=66))
+    return Group(head, Text(hint), *plots)
 
 
 def plot(x: list[float], y: list[float], width: int = WIDTH, height: int = HEIGHT) -> str:

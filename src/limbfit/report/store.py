@@ -48,7 +48,7 @@ class Results:
     """A results folder; what is not there (yet) is None or empty.
 
     ``experiments``: what each finished experiment stored, by its name (of an extension as its file has it);
-    ``outdated``: those that are stale. ``models``: other models of the same records.
+    ``outdated``: those that are stale. ``models``: other models of the same records, unless they are stale.
     """
 
     folder: Path
@@ -205,10 +205,20 @@ def load_store(results: Path) -> Results:
     """
     if not results.is_dir():
         raise InputError("no results there", file=results, remedy="run the study first")
-    run, sites = RunResult.find(results), SitesResult.find(results)
+    run, sites, calibration = (
+        RunResult.find(results),
+        SitesResult.find(results),
+        CalibrationResult.find(results),
+    )
     traces, mesh = TracesResult.find(results), MeshResult.find(results)
     experiments = run.experiments if run else {}
     done = [name for name, row in experiments.items() if row.state == "done"]
+    outdated = [name for name, row in experiments.items() if row.state == "stale"]
+    models = ModelsResult.find(results)
+    # Other models have no stamp: they belong to the identification whose parameters stand beside theirs.
+    if models and not (calibration and models.models[0].parameters == calibration.parameters):
+        models = None
+        outdated.append("uncertainty --models")
     return Results(
         folder=results,
         run=run,
@@ -217,14 +227,14 @@ def load_store(results: Path) -> Results:
         sites=sites.sites if sites else (),
         traces=traces.sites if traces else {},
         mesh=mesh.sites if mesh else {},
-        calibration=CalibrationResult.find(results),
+        calibration=calibration,
         predict=PredictResult.find(results),
         simulated=tuple(SimulateResult.find_all(results).values()),
         compared=tuple(CompareResult.find_all(results).values()),
         truth=_read_json(results / "truth.json"),
         experiments={name: _read_experiment(results, name) for name in done},
-        outdated=tuple(name for name, row in experiments.items() if row.state == "stale"),
-        models=ModelsResult.find(results),
+        outdated=tuple(outdated),
+        models=models,
     )
 
 

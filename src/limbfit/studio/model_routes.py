@@ -13,13 +13,13 @@ from fastapi import APIRouter, Response
 from pydantic import Field
 
 from ..anatomy.sites.sites import project_to_skin
-from ..anatomy.surfaces.surfaces import Anatomy, Surface, load_anatomy, read_surface
+from ..anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ..errors import InputError, SiteError
 from ..mesh import read_vtu
 from ..pipeline.engine.digests import compute_digest
 from ..pipeline.limb.sites import place_site
 from ..pipeline.limb.surfaces import read_given_anatomy
-from ..results.limb import MeshResult, PlacedSite, SitesResult, SurfacesResult
+from ..results.limb import MeshResult, PlacedSite, SitesResult
 from ..study import Site, Study
 from ..web.shapes import Shell, build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape
 from .editing import add_site, remove_site, set_site
@@ -83,7 +83,8 @@ def get_surface(folder: Folder, name: str) -> Response:
     InputError
         For a name that the model does not have.
     """
-    surface = _read_one_surface(folder, name)
+    anatomy = read_anatomy(folder, folder.load())
+    surface = {SKIN: anatomy.skin, **anatomy.bones}.get(name) if anatomy else None
     if surface is None:
         raise InputError("the model has no such surface", remedy="run the stages until surfaces")
     return _respond_shell(Shell(surface.points.astype(np.float32), surface.faces.astype(np.uint32)))
@@ -216,15 +217,6 @@ def _describe_site(
     except SiteError as error:
         row["problem"] = error.what
     return row
-
-
-def _read_one_surface(folder: StudyFolder, name: str) -> Surface | None:
-    """One surface; where surfaces are stored, only its file is read."""
-    if stored := SurfacesResult.find(folder.results):
-        known = name in (SKIN, *stored.bones)
-        return read_surface(_find_surface_file(folder, name)) if known else None
-    anatomy = read_anatomy(folder, folder.load())
-    return None if anatomy is None else {SKIN: anatomy.skin, **anatomy.bones}.get(name)
 
 
 def _respond_shell(shell: Shell) -> Response:

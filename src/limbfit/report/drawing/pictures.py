@@ -34,7 +34,7 @@ from ...web.shapes import build_patient_frame
 from ..formats import number
 from ..page import Figure
 from ..store import Results
-from ..words import make_picture, write_words
+from ..words import make_environment, make_picture, write_words
 
 PAPER, INK = "#f6f5f1", "#222222"
 FIELD_MAP = "viridis"
@@ -89,60 +89,46 @@ _GAP, _TITLE = 14, 46
 
 def build_picture_row(shots: Sequence[Shot], titles: Sequence[str], alt: str) -> str:
     """Pictures side by side in one SVG, with titles, labelled marks and a scale bar in each."""
-    width = sum(view.size[0] for _, view, _ in shots) + _GAP * (len(shots) - 1)
-    height = max(view.size[1] for _, view, _ in shots) + _TITLE
-    parts, x = [], 0
+    panels, x = [], 0
     for (pixels, view, marks), title in zip(shots, titles, strict=True):
-        parts.append(f'<g transform="translate({x} 0)">{_draw_svg_panel(pixels, view, marks, title)}</g>')
+        buffer = io.BytesIO()
+        matplotlib.image.imsave(buffer, pixels, format="png")
+        ordered, heights = _place_labels(view, [mark for mark in marks if mark.axis is None])
+        panels.append(
+            {
+                "x": x,
+                "title": title,
+                "view": view,
+                "image": embed_png(buffer.getvalue()),
+                "arrows": [_shape_arrow(view, mark) for mark in marks if mark.axis is not None],
+                "dots": [
+                    (mark, *view.project(mark.position)[0], at)
+                    for mark, at in zip(ordered, heights, strict=True)
+                ],
+                "scale_mm": _choose_scale_mm(view),
+            }
+        )
         x += view.size[0] + _GAP
-    head = f'<svg class="picture" viewBox="0 0 {width} {height}" role="img"><title>{escape(alt)}</title>'
-    return head + "".join(parts) + "</svg>"
+    height = max(view.size[1] for _, view, _ in shots)
+    template = make_environment(autoescape=True).get_template("pictures.html.j2")
+    return template.render(
+        panels=panels, alt=alt, width=x - _GAP, height=height, title_height=_TITLE, paper=PAPER
+    )
 
 
-def _draw_svg_panel(pixels: Array, view: View, marks: list[Mark], title: str) -> str:
-    w, h = view.size
-    buffer = io.BytesIO()
-    matplotlib.image.imsave(buffer, pixels, format="png")
-    image = f'<image href="{embed_png(buffer.getvalue())}" width="{w}" height="{h}"/>'
-    text = f'<text class="panel-title" x="2" y="{_TITLE - 12}">{escape(title)}</text>'
-    over = _draw_labels(view, marks) + _draw_scale_bar(view)
-    return f'{text}<g transform="translate(0 {_TITLE})">{image}{over}</g>'
-
-
-def _draw_labels(view: View, marks: list[Mark]) -> str:
-    """Dots, arrows and names; names stand right of their dot and give way to each other downwards."""
-    parts = [_draw_arrow(view, mark) for mark in marks if mark.axis is not None]
-    dots = [mark for mark in marks if mark.axis is None]
-    for mark, name_y in zip(*_place_labels(view, dots), strict=True):
-        x, y = (float(v) for v in view.project(mark.position)[0])
-        fill = mark.color if mark.filled else PAPER
-        parts.append(f'<circle cx="{x:.0f}" cy="{y:.0f}" r="9" fill="{fill}" stroke="{mark.color}"/>')
-        parts.append(f'<text class="site" x="{x + 15:.0f}" y="{name_y + 11:.0f}">{escape(mark.text)}</text>')
-    return "".join(parts)
-
-
-def _draw_arrow(view: View, mark: Mark) -> str:
+def _shape_arrow(view: View, mark: Mark) -> tuple[Mark, Array, Array, Array]:
+    """The mark, where its arrow begins and where its head does, and the head's corners (3, 2), in pixels."""
     assert mark.axis is not None
     tip = view.project(mark.position)[0]
     step = view.project(mark.position + mark.axis)[0] - tip
     step = step / np.linalg.norm(step)
     side = np.array([-step[1], step[0]])
-    tail, wing = tip - 70 * step, tip - 22 * step
-    head = " ".join(f"{p[0]:.0f},{p[1]:.0f}" for p in (tip, wing + 10 * side, wing - 10 * side))
-    shaft = f'x1="{tail[0]:.0f}" y1="{tail[1]:.0f}" x2="{wing[0]:.0f}" y2="{wing[1]:.0f}"'
-    line = f'<line {shaft} stroke="{mark.color}" stroke-width="6"/>'
-    return f'{line}<polygon points="{head}" fill="{mark.color}"/>'
+    wing = tip - 22 * step
+    return mark, tip - 70 * step, wing, np.array([tip, wing + 10 * side, wing - 10 * side])
 
 
 def _choose_scale_mm(view: View) -> int:
     return next(mm for mm in (50, 20, 10, 5) if mm * view.pixels_per_mm < 0.4 * view.size[0])
-
-
-def _draw_scale_bar(view: View) -> str:
-    length = _choose_scale_mm(view)
-    w, (right, bottom) = length * view.pixels_per_mm, (view.size[0] - 14, view.size[1] - 14)
-    line = f'<line x1="{right - w:.1f}" y1="{bottom}" x2="{right}" y2="{bottom}" class="scale"/>'
-    return f'{line}<text class="scale-text" x="{right}" y="{bottom - 10}">{length} mm</text>'
 
 
 def build_legend(entries: Iterable[tuple[str, str]]) -> str:

@@ -1,28 +1,28 @@
-"""The whole page: every section in the order in which a reader asks."""
+"""The whole page: its summary, and every section in the order in which a reader asks."""
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Callable
 from typing import Any
 
 from ...extensions import Registry
-from ..page import Note, Page, Section, make_section
+from ..formats import format_limits, format_symbol, label, number
+from ..page import Block, KeyNumber, Note, Page, Section, make_bullets, make_section
 from ..store import Results
-from .convergence import make_convergence_section
-from .crossvalidation import make_crossvalidation_section
+from ..words import make_prose
 from .cube import make_cube_section
 from .design import make_design_section, make_protocol_section
+from .identification import make_convergence_section, make_parameter_section
 from .methods import make_method_section
 from .model import make_mesh_section, make_model_section
-from .parameters import make_parameter_section
+from .other_fits import make_crossvalidation_section, make_regions_section
 from .prediction import make_domain_section, make_fit_section, make_prediction_section
 from .provenance import make_provenance_section, make_settings_section, make_timing_section
 from .records import make_record_check_section, make_record_section
-from .regions import make_regions_section
 from .sensitivity import SENSITIVITIES
 from .simulations import make_comparison_section, make_simulated_section, make_solver_section
 from .socket import make_socket_design_section, make_socket_section
-from .summary import build_summary, list_key_numbers
 from .uncertainty import make_models_section, make_uncertainty_section
 
 Maker = Callable[[Results, Any], Section]
@@ -41,6 +41,7 @@ _OWN: dict[str, Maker] = {
 }
 SECTIONS = Registry("report section", _OWN)
 
+_RANKS = {"determined": 0, "weakly": 1, "not": 2}
 PRIVACY = (
     "This report holds no name, date of birth or other identity from the images. It does show the shape of "
     "a limb and how it responds, which is health data: handle it as the study's consent allows."
@@ -99,3 +100,58 @@ def _describe_outdated(name: str) -> Note:
         f"The stored results of “limbfit {verb}” are left out: they were made from other inputs, settings or "
         "code. Run it again to see them here."
     )
+
+
+def list_key_numbers(store: Results) -> tuple[KeyNumber, ...]:
+    """The numbers that a reader looks for first."""
+    found = []
+    if store.predict:
+        found.append(KeyNumber(store.mean_error("heldout"), "%", "mean force error at the held-out sites"))
+        found.append(KeyNumber(store.mean_error("fitted"), "%", "mean force error at the fitted sites"))
+    for tissue in store.tissues:
+        modulus = number(store.stages[-1].parameters[tissue][store.law.moduli[0]])
+        found.append(KeyNumber(modulus, "kPa", _label_modulus(store, tissue)))
+    seconds = [stage.seconds for stage in store.run.stages.values()] if store.run else []
+    if seconds:
+        size, unit = (1, "s") if sum(seconds) < 120 else (60, "min")
+        found.append(KeyNumber(f"{sum(seconds) / size:.0f}", unit, "computing time, all stages"))
+    return tuple(found)
+
+
+def _label_modulus(store: Results, tissue: str) -> str:
+    first = next(p for p in store.law.parameters if p.key == store.law.moduli[0])
+    interval = store.interval(tissue, first.key)
+    text = f"{tissue}, {first.words} {format_symbol(first.key)}"
+    return f"{text} ({format_limits(interval)} kPa)" if interval else text
+
+
+def build_summary(store: Results) -> tuple[Block, ...]:
+    """One paragraph in plain words, then the verdict."""
+    heldout = [row for row in store.predicted if not row.fitted]
+    pairs = [(row.error_one_material_percent, row.error_percent) for row in heldout]
+    known = [(one, several) for one, several in pairs if one is not None and several is not None]
+    prose = make_prose(
+        "summary",
+        store=store,
+        heldout=heldout,
+        sites=len({row.site for row in heldout}),
+        errors=[row.error_percent for row in heldout if row.error_percent is not None],
+        means=[statistics.fmean(column) for column in zip(*known, strict=True)],
+    )
+    return make_section("summary", "Summary", prose, make_bullets(_list_verdicts(store))).blocks
+
+
+def _list_verdicts(store: Results) -> tuple[str, ...]:
+    """Which parameters the data determine, best first, and how many combinations of them."""
+    if store.uncertainty is None:
+        return ()
+    groups: dict[str, list[str]] = {}
+    for name, word in store.uncertainty.verdict.items():
+        groups.setdefault(word, []).append(label(name))
+    best_first = sorted(groups, key=lambda word: _RANKS.get(word.split()[0], 1))
+    words = [f"{word.capitalize()}: {', '.join(groups[word])}." for word in best_first]
+    combinations = store.uncertainty.combinations
+    known = sum(sentence.endswith(": determined") for sentence in combinations)
+    if not known:
+        return tuple(words)
+    return (*words, f"Determined together: {known} of {len(combinations)} products of them (see Parameters).")

@@ -25,7 +25,7 @@ from ..formats import (
 from ..page import Prose, Section
 from ..store import Json, Results
 from ..words import make_environment
-from .parameters import describe_residuals
+from .identification import describe_residuals
 from .provenance import flatten_settings
 
 Part = tuple[str, str]  # a heading and its paragraph
