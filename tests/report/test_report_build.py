@@ -19,7 +19,7 @@ from stored_results import SITES, write_results
 from limbfit.report import build_report
 from limbfit.report.sections.methods import write_method_parts
 from limbfit.report.store import load_store
-from limbfit.web.arrays import unpack
+from unpacking import unpack
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import AccessGuard
 from limbfit.studio.model_routes import read_anatomy
 from limbfit.studio.server import create_app
-from limbfit.web.arrays import unpack
+from unpacking import unpack
 
 ORIGIN = "http://127.0.0.1:8123"
 

@@ -14,7 +14,7 @@ from limbfit.studio.guard import AccessGuard
 from limbfit.studio.playback import FIELDS
 from limbfit.studio.processes import find_simulating
 from limbfit.studio.server import create_app
-from limbfit.web.arrays import unpack
+from unpacking import unpack
 
 ORIGIN = "http://127.0.0.1:8123"
 

@@ -10,7 +10,7 @@ from limbfit import load_study
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import AccessGuard
 from limbfit.studio.server import create_app
-from limbfit.web.arrays import unpack
+from unpacking import unpack
 
 ORIGIN = "http://127.0.0.1:8123"
 AREA = {"name": "front", "position": [0.0, -41.0, 60.0], "radius_mm": 25.0, "depth_mm": 4.0}

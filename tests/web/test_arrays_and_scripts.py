@@ -11,8 +11,9 @@ import pyvista as pv
 
 from limbfit.mesh import Mesh, boundary_faces, to_tet10
 from limbfit.web import STATIC, build_inline_script
-from limbfit.web.arrays import pack, unpack
+from limbfit.web.arrays import pack
 from limbfit.web.shapes import compute_cell_quality, extract_interface, read_shell, to_volume_shape
+from unpacking import unpack
 
 
 def _block(n: int = 3) -> Mesh:

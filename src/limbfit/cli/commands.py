@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from time import perf_counter
@@ -21,6 +22,7 @@ from .console import (
     format_parameter_heads,
     format_use,
     listen_on_console,
+    parse_numbers,
     print_aside,
     print_json,
     print_line,
@@ -246,12 +248,9 @@ def parse_parameters(text: str | None, study: Study) -> dict[str, dict[str, floa
     """``--parameters``: the numbers of each tissue, in the order of the study's tissues."""
     if text is None:
         return None
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
+    values = parse_numbers(text, 0.0, sys.float_info.max)
     wanted, keys = len(study.parameters), ",".join(study.law.keys)
-    if len(values) != wanted or not all(0 <= v < float("inf") for v in values):
+    if len(values) != wanted:
         raise InputError(
             f"{text!r} is not {wanted} numbers",
             place="--parameters",

@@ -7,7 +7,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from threading import Event, Thread
 from time import perf_counter, sleep
@@ -196,6 +196,20 @@ def format_parameter_heads(keys: Iterable[str]) -> list[str]:
     """Parameters as heads of columns: ``tau_s`` is ``tau (s)``."""
     split = [split_key(key) for key in keys]
     return [f"{name} ({unit})" if unit else name for name, unit in split]
+
+
+def format_ends(interval: Sequence[float] | None, form: str = ".3g") -> str:
+    """Both ends of an interval; nothing where there is none."""
+    return "" if interval is None else " to ".join(format(end, form) for end in interval)
+
+
+def parse_numbers(text: str, least: float, most: float) -> list[float]:
+    """Numbers with commas between them; none at all where one is none, or out of range."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        return []
+    return values if all(least <= value <= most for value in values) else []
 
 
 def fail(text: str, code: int) -> None:

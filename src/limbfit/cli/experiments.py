@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,9 +20,11 @@ from .commands import Parameters, StudyPath, parse_parameters
 from .console import (
     AsJson,
     Column,
+    format_ends,
     format_parameter_heads,
     format_use,
     listen_on_console,
+    parse_numbers,
     print_json,
     print_line,
     print_stored,
@@ -150,23 +152,19 @@ def show_models(found: ModelsResult) -> None:
         "record": "record",
         "": format_use,
         "measured peak": lambda row: f"{row.peak:.3g} {row.unit}",
-        "95 % by the study's model": lambda row: f"{_format_ends(row.own_interval_95)} {row.unit}",
-        "95 % by all models": lambda row: f"{_format_ends(row.interval_95)} {row.unit}",
+        "95 % by the study's model": lambda row: f"{format_ends(row.own_interval_95)} {row.unit}",
+        "95 % by all models": lambda row: f"{format_ends(row.interval_95)} {row.unit}",
     }
     print_table(found.records, columns)
     _show_left_out(found.left_out.values())
-
-
-def _format_ends(interval: Sequence[float]) -> str:
-    return f"{interval[0]:.3g} to {interval[1]:.3g}"
 
 
 def show_uncertainty(found: UncertaintyResult) -> None:
     columns: dict[str, Column] = {
         "parameter": "name",
         "identified": ("calibrated", ".3g"),
-        "95 % by the records": lambda row: _format_ends(row.posterior_95),
-        "95 % with all sources": lambda row: _format_ends(row.with_sources_95),
+        "95 % by the records": lambda row: format_ends(row.posterior_95),
+        "95 % with all sources": lambda row: format_ends(row.with_sources_95),
         "verdict": "verdict",
     }
     print_table(found.parameters, columns)
@@ -387,13 +385,10 @@ def parse_list(text: str | None, place: str, remedy: str, least: float = 1e-3) -
     """Numbers with commas between them, from ``least`` to 600; none where nothing is given."""
     if text is None:
         return ()
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if not values or not all(least <= value <= 600 for value in values):
+    values = parse_numbers(text, least, 600.0)
+    if not values:
         raise InputError(f"{text!r} will not do", place=place, remedy=remedy)
-    return values
+    return tuple(values)
 
 
 def show_design(found: DesignResult) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import typer
@@ -15,7 +15,7 @@ from ..laws import split_key
 from ..results.models import SocketOfModels
 from ..results.socket import SocketDesignResult, SocketLoad, SocketResult
 from .commands import StudyPath, parse_parameters, show_outside
-from .console import AsJson, Column, listen_on_console, print_line, print_stored, print_table
+from .console import AsJson, Column, format_ends, listen_on_console, print_line, print_stored, print_table
 from .runs import add_execution_options
 
 
@@ -91,14 +91,10 @@ def show_socket_models(found: SocketOfModels) -> None:
     for number, model in enumerate(found.models):
         head = f"{model.words}, {100 * model.weight:.0f} %"
         columns[head] = lambda row, number=number: f"{row.mean_kPa[number]:.1f}"  # type: ignore[misc]
-    columns["95 % by all models"] = lambda row: _format_ends(row.interval_kPa)
+    columns["95 % by all models"] = lambda row: format_ends(row.interval_kPa, ".1f")
     for load in found.loads:
         print_line(f"{load.name}:")
         print_table(load.regions, columns)
-
-
-def _format_ends(interval: Sequence[float] | None) -> str:
-    return "" if interval is None else f"{interval[0]:.1f} to {interval[1]:.1f}"
 
 
 def show_socket(found: SocketResult) -> None:
@@ -136,7 +132,7 @@ def _format_main_cause(shares: Mapping[str, float] | None) -> str:
 
 
 def _format_interval(load: SocketLoad) -> str:
-    interval = _format_ends(load.settling_interval_mm)
+    interval = format_ends(load.settling_interval_mm, ".1f")
     cause = _format_main_cause(load.settling_interval_from)
     return f" (95 %: {interval}, mostly from {cause})" if interval else ""
 
@@ -144,7 +140,7 @@ def _format_interval(load: SocketLoad) -> str:
 LOAD_COLUMNS: dict[str, Column] = {
     "region": "region",
     "mean (kPa)": ("mean_kPa", ".1f"),
-    "95 % (kPa)": lambda row: _format_ends(row.interval_kPa),
+    "95 % (kPa)": lambda row: format_ends(row.interval_kPa, ".1f"),
     "mostly from": lambda row: _format_main_cause(row.interval_from),
     "peak (kPa)": ("peak_kPa", ".1f"),
     "shear (kPa)": ("shear_kPa", ".1f"),

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from fastapi import APIRouter, Response
+from matplotlib.colors import to_hex
 from pydantic import BaseModel, Field
 
 from ..anatomy.imaging import LabelMap, Volume, read_labels, write_labels
@@ -63,7 +64,7 @@ def get_facts(folder: Folder) -> dict[str, Any]:
             "base": shown.digest,
             "saved_to": shown.name_target(study),
             "names": [
-                {"value": value, "name": name, "colour": _format_hex(colour_of(name, n))}
+                {"value": value, "name": name, "colour": to_hex(colour_of(name, n))}
                 for n, (value, name) in enumerate(sorted(labels.names.items()))
             ],
         }
@@ -208,7 +209,3 @@ def _respond_nifti(grid: Volume | LabelMap) -> Response:
         file = Path(place) / "image.nii"
         sitk.WriteImage(image, str(file))
         return Response(file.read_bytes(), media_type="application/octet-stream")
-
-
-def _format_hex(colour: tuple[float, float, float]) -> str:
-    return "#" + "".join(f"{round(255 * part):02x}" for part in colour)

@@ -196,12 +196,9 @@ def _describe_site(
     site: Site, study: Study, anatomy: Anatomy | None, placed: PlacedSite | None
 ) -> dict[str, Any]:
     row: dict[str, Any] = {
-        "name": site.name,
-        "region": site.region,
-        "fitted": site.fitted,
+        **site.model_dump(include={"name", "region", "fitted", "depth_mm"}),
         "has_trace": bool(study.records_at(site)),
         "records": [record.name for record in study.records_at(site)],
-        "depth_mm": site.depth_mm,
         "given": "position" if site.position is not None else "near",
         "position_mm": None,
         "axis": None,

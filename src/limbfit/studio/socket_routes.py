@@ -156,13 +156,8 @@ def get_shape(folder: Folder) -> dict[str, Any]:
         "reduction_percent": table.reduction_percent,
         "trim": {"points": _find_handles(folder, study), "is_line": bool(table.trimline)},
         "areas": [
-            {
-                "name": area.name,
-                "position_mm": _place(area.position, area.region, regions),
-                "region": area.region,
-                "radius_mm": area.radius_mm,
-                "depth_mm": area.depth_mm,
-            }
+            area.model_dump(include={"name", "region", "radius_mm", "depth_mm"})
+            | {"position_mm": _place(area.position, area.region, regions)}
             for area in table.areas
         ],
         "regions": list(regions),

@@ -1,4 +1,4 @@
-"""Named arrays as one block of bytes that a script reads without copying, and back.
+"""Named arrays as one block of bytes that a script reads without copying.
 
 The block is: 8 bytes ``LFARRAY1``; the length of the head, uint32; the head, JSON padded with spaces so that
 what follows stands at a multiple of 8; the arrays, each at a multiple of 8 from there on. All numbers are
@@ -40,23 +40,3 @@ def pack(arrays: Mapping[str, NDArray[Any]], facts: Mapping[str, Any] | None = N
     head = json.dumps({"arrays": table, "facts": dict(facts or {})}, allow_nan=False).encode()
     head += b" " * (-(len(MAGIC) + 4 + len(head)) % _STEP)
     return b"".join([MAGIC, len(head).to_bytes(4, "little"), head, *parts])
-
-
-def unpack(block: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """The arrays and facts of a block.
-
-    Raises
-    ------
-    ValueError
-        When it is not such a block.
-    """
-    if block[: len(MAGIC)] != MAGIC:
-        raise ValueError("not a block of arrays")
-    start = len(MAGIC) + 4 + int.from_bytes(block[len(MAGIC) : len(MAGIC) + 4], "little")
-    head = json.loads(block[len(MAGIC) + 4 : start])
-    arrays = {}
-    for name, row in head["arrays"].items():
-        count = int(np.prod(row["shape"]))
-        values = np.frombuffer(block, np.dtype("<" + row["type"]), count, start + row["at"])
-        arrays[name] = values.reshape(row["shape"])
-    return arrays, head["facts"]

@@ -20,7 +20,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import Normalize, to_hex
 from matplotlib.figure import Figure as Drawing
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -140,10 +140,7 @@ def build_legend(entries: Iterable[tuple[str, str]]) -> str:
 
 
 def make_colour_bar(limits: tuple[float, float], title: str, colours: str = FIELD_MAP) -> str:
-    stops = ", ".join(
-        "#" + "".join(f"{round(255 * v):02x}" for v in colormaps[colours](t)[:3])
-        for t in np.linspace(0, 1, 9)
-    )
+    stops = ", ".join(to_hex(colormaps[colours](t)) for t in np.linspace(0, 1, 9))
     bar = f'<i class="colour-bar" style="background:linear-gradient(90deg, {stops})"></i>'
     low, high = (number(value) for value in limits)
     return f'<div class="legend"><span>{low}</span>{bar}<span>{high}</span><span>{escape(title)}</span></div>'
@@ -178,35 +175,25 @@ def build_figure_sheet(
 ) -> Drawing:
     """Rows of pictures on one sheet with a title and a legend; every picture has a scale and its sides.
 
-    ``spare_in`` inches above the legend are left free.
+    ``spare_in`` inches above the legend are left free: the last of the drawing's ``subfigs``.
     """
-    widths = [sum(view.size[0] / view.size[1] for _, view, _ in row.shots) for row in rows]
-    height = _PANEL_IN * len(rows) + 0.9 + spare_in
-    width = _PANEL_IN * max(widths) + (0.9 if any(row.bar for row in rows) else 0.1)
-    margin = 0.85 / width if any(row.bar for row in rows) else 0.01
-    drawing = Drawing(figsize=(width, height), dpi=_DPI, facecolor="white")
+    shares = [[view.size[0] / view.size[1] for _, view, _ in row.shots] for row in rows]
+    width = _PANEL_IN * max(map(sum, shares)) + (0.9 if any(row.bar for row in rows) else 0.1)
+    heights = [_PANEL_IN] * len(rows) + [spare_in] * (spare_in > 0)
+    drawing = Drawing(figsize=(width, sum(heights) + 0.9), dpi=_DPI, facecolor="white", layout="constrained")
     FigureCanvasAgg(drawing)
-    drawing.suptitle(title, x=0.01, y=1 - 0.1 / height, ha="left", va="top", fontsize=13)
-    inside = {
-        "left": 0.01,
-        "right": 1 - margin,
-        "top": 1 - 0.55 / height,
-        "bottom": (0.4 + spare_in) / height,
-    }
-    grid = drawing.add_gridspec(len(rows), 1, hspace=0.07, **inside)
-    for at, row in enumerate(rows):
-        shares = [view.size[0] / view.size[1] for _, view, _ in row.shots]
-        inner = grid[at].subgridspec(1, len(shares), width_ratios=shares, wspace=0.03)
-        axes = [drawing.add_subplot(inner[0, column]) for column in range(len(shares))]
+    drawing.suptitle(title, x=0.01, ha="left", fontsize=13)
+    parts = drawing.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for part, row, ratios in zip(parts, rows, shares, strict=False):
+        axes = part.subplots(1, len(ratios), squeeze=False, width_ratios=ratios)[0]
         for ax, (pixels, view, marks), name in zip(axes, row.shots, row.titles, strict=True):
             _draw_panel(ax, pixels, view, marks, name)
         if row.bar is not None:
             shades = ScalarMappable(Normalize(*row.bar[0]), FIELD_MAP)
-            box = axes[-1].get_position()
-            place = (1 - margin + 0.006, box.y0 + 0.1 * box.height, 0.011, 0.8 * box.height)
-            drawing.colorbar(shades, cax=drawing.add_axes(place), label=row.bar[1])
+            part.colorbar(shades, ax=axes, label=row.bar[1], fraction=0.02, shrink=0.8, pad=0.01)
     if keys:
-        drawing.legend(handles=list(keys), loc="lower left", ncols=len(keys), frameon=False, fontsize=10)
+        handles = list(keys)
+        drawing.legend(handles=handles, loc="outside lower left", ncols=len(keys), frameon=False, fontsize=10)
     return drawing
 
 
@@ -419,21 +406,13 @@ def _mark_site(row: PlacedSite, axis: bool = False) -> Mark:
 @silence_display_warning()
 def draw_mesh_figure(store: Results, sites: Sequence[str]) -> Figure | None:
     """Figures 4 and 6: whole meshes of some sites cut through the site, and the refinement near it."""
-    whole: list[Shot] = []
-    near: list[Shot] = []
-    colours: dict[str, str] = {}
-    names: list[str] = []
-    for row, file in find_placed_meshes(store, sites, "mesh"):
-        grid, views = read_linear(file), make_cut_views(store, row, file)
-        plotter = make_plotter()
-        add_regions(plotter, cut_behind(grid, views[0]))
-        (picture, view, _), close = render_views(plotter, views)
-        whole.append((picture, view, [_mark_site(row, axis=True)]))
-        near.append(close)
-        colours |= choose_region_colours(grid)
-        names.append(row.site)
-    if not names:
+    found = render_cut_meshes(store, sites)
+    if not found:
         return None
+    whole = [(pixels, view, [_mark_site(row, axis=True)]) for row, _, (pixels, view, _), _ in found]
+    near = [close for *_, close in found]
+    names = [row.site for row, *_ in found]
+    colours = {name: colour for _, grid, *_ in found for name, colour in choose_region_colours(grid).items()}
     alt = "Meshes cut through the sites " + ", ".join(names) + f": {', '.join(colours)} and bone voids"
     paper = {"skin": "skin–adipose layer", "muscle": "muscle–soft tissue"}
     words = paper if tuple(colours) == tuple(paper) else {name: name for name in colours}
@@ -447,6 +426,18 @@ def draw_mesh_figure(store: Results, sites: Sequence[str]) -> Figure | None:
         + key
     )
     return make_picture("mesh-cut", markup)
+
+
+def render_cut_meshes(store: Results, sites: Sequence[str]) -> list[tuple[PlacedSite, Grid, Shot, Shot]]:
+    """Sites with their meshes: the whole mesh, cut through the site, and what is near the site."""
+    found = []
+    for row, file in find_placed_meshes(store, sites, "mesh"):
+        grid, views = read_linear(file), make_cut_views(store, row, file)
+        plotter = make_plotter()
+        add_regions(plotter, cut_behind(grid, views[0]))
+        whole, near = render_views(plotter, views)
+        found.append((row, grid, whole, near))
+    return found
 
 
 @silence_display_warning()

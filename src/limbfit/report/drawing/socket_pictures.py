@@ -106,10 +106,10 @@ def draw_offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | No
 @silence_display_warning()
 def draw_inside_figure(
     store: Results, title: str, inside: Sequence[TissueStrainInside], file: Path
-) -> tuple[Figure, ...]:
+) -> Figure | None:
     """Cuts along and across the limb through the place of the largest shear, coloured by it."""
     if not file.is_file():
-        return ()
+        return None
     grid, worst = read_linear(file), max(inside, key=lambda tissue: tissue.shear)
     place = np.asarray(worst.place_mm, dtype=float)
     shear, words = np.asarray(grid.cell_data[SHEAR]), "shear strain"
@@ -124,7 +124,7 @@ def draw_inside_figure(
         shots, ("along the limb", "across the limb"), f"Cuts coloured by {words}, {title}"
     )
     bar = make_colour_bar(limits, words)
-    return (make_picture("socket-inside", markup + bar, title=title, worst=worst),)
+    return make_picture("socket-inside", markup + bar, title=title, worst=worst)
 
 
 def _make_cut_views(store: Results, grid: Grid, place: Array) -> tuple[View, View]:

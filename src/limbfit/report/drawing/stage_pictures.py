@@ -23,20 +23,15 @@ from .pictures import (
     PictureRow,
     Shot,
     View,
-    add_regions,
     build_figure_sheet,
     choose_inner_colour,
     choose_region_colours,
-    cut_behind,
-    find_placed_meshes,
-    make_cut_views,
     make_field_plotter,
     make_four_views,
     make_key,
     make_limb_plotter,
-    make_plotter,
     normalise,
-    read_linear,
+    render_cut_meshes,
     render_views,
     silence_display_warning,
     write_png,
@@ -121,15 +116,11 @@ def draw_mesh_sheet(store: Results) -> Drawing:
     near: list[Shot] = []
     angles: dict[str, Any] = {}
     colours: dict[str, str] = {}
-    for row, file in find_placed_meshes(store, names, "mesh"):
-        grid, views = read_linear(file), make_cut_views(store, row, file)
+    for row, grid, *shots in render_cut_meshes(store, names):
         colours |= choose_region_colours(grid)
-        plotter = make_plotter()
-        add_regions(plotter, cut_behind(grid, views[0]))
         mark = Mark(row.site, np.array(row.position_mm), CUT_PLANE, True, normalise(row.axis))
-        shots = [(picture, view, [mark]) for picture, view, _ in render_views(plotter, views)]
-        whole.append(shots[0])
-        near.append(shots[1])
+        for pictures, (pixels, view, _) in zip((whole, near), shots, strict=True):
+            pictures.append((pixels, view, [mark]))
         tets = grid.cell_connectivity.reshape(-1, 4)
         angles[row.site] = compute_dihedral_angles(np.asarray(grid.points, float), tets).min(axis=1)
     titles = [f"site {name}" for name in angles]
@@ -146,8 +137,7 @@ def draw_mesh_sheet(store: Results) -> Drawing:
 
 def _draw_histogram(drawing: Drawing, angles: dict[str, Any]) -> None:
     """The smallest dihedral angle of every element, in the spare space at the bottom of a sheet."""
-    height = drawing.get_figheight()
-    ax = drawing.add_axes((0.09, 0.95 / height, 0.86, 1.35 / height))
+    ax = drawing.subfigs[-1].subplots()
     shades = [REGIONS[i % len(REGIONS)] for i in range(len(angles))]
     ax.hist(
         list(angles.values()), bins=36, range=ANGLES_DEG, histtype="step", color=shades, label=list(angles)

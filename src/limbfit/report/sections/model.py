@@ -12,9 +12,10 @@ from ..tables import make_table
 def make_model_section(store: Results) -> Section:
     """Surfaces, sites and volumes."""
     segment, surfaces = store.segment, store.surfaces
-    section = make_section(
+    return make_section(
         "model",
         "The model",
+        Prose(f"Segmentation: {segment.method}.") if segment else None,
         make_explorer(store),
         pictures.draw_slices_figure(store),
         pictures.draw_surface_figure(store),
@@ -24,8 +25,6 @@ def make_model_section(store: Results) -> Section:
         make_bullets((*(segment.warnings if segment else ()), *(surfaces.notes if surfaces else ()))),
         otherwise="No surfaces and sites are stored yet.",
     )
-    method = Prose(f"Segmentation: {segment.method}.") if segment else None
-    return make_section(section.name, section.title, method, section.blocks)
 
 
 def make_volume_table(store: Results) -> Table | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ...results.base import Interval
 from ...results.socket import (
     LoadedRegion,
     PublishedFindings,
@@ -20,11 +19,11 @@ from ..drawing.socket_pictures import (
     draw_pressure_figures,
     draw_settling_figure,
 )
-from ..formats import format_fixed, format_symbol, label
+from ..formats import format_symbol
 from ..page import Block, Note, Row, Section, Table, make_section
 from ..store import Results
 from ..tables import make_row, make_table, to_numeric
-from ..words import make_prose, write_words
+from ..words import make_prose
 
 # What counts as known, and how its change is headed.
 KNOWN = {
@@ -91,30 +90,15 @@ def make_interval_table(held: SocketState, title: str) -> Table | None:
     first = held.regions[0]
     if first.interval_from is None:
         return None
-    names = sorted(first.interval_from)
-    known = [name for name in KNOWN if name in (first.change_kPa or {})]
-
-    def make_line(
-        head: str, unit: str, decimals: int, value: float, interval: Interval | None, *shares: Any
-    ) -> Row:
-        low, high = interval or (value, value)
-        causes, changes = shares
-        cells = [f"{format_fixed(value)} {unit}", f"{format_fixed(max(value - low, high - value), 2)} {unit}"]
-        cells += [format_fixed(causes[name], 0) for name in names]
-        cells += [f"{format_fixed(changes[name], decimals)} {unit}" for name in known]
-        return make_row(head, *map(to_numeric, cells))
-
     rows = [
-        make_line(one.region, "kPa", 1, one.mean_kPa, one.interval_kPa, one.interval_from, one.change_kPa)
+        (one.region, "kPa", one.mean_kPa, one.interval_kPa, one.interval_from, one.change_kPa)
         for one in held.regions
     ]
     if isinstance(held, SocketLoad):
-        causes, changes = held.settling_interval_from, held.settling_change_mm
-        interval = held.settling_interval_mm
-        rows.append(make_line("settling", "mm", 2, held.settling_mm, interval, causes, changes))
-    heads = [*(f"{label(name)} (%)" for name in names), *(KNOWN[name] for name in known)]
-    caption = write_words("table socket-intervals", title=title)
-    return Table("socket-intervals", caption, ("", "Value", "95 %, half", *heads), tuple(rows))
+        interval, causes = held.settling_interval_mm, held.settling_interval_from
+        rows.append(("settling", "mm", held.settling_mm, interval, causes, held.settling_change_mm))
+    known = {name: head for name, head in KNOWN.items() if name in (first.change_kPa or {})}
+    return make_table("socket-intervals", rows, names=sorted(first.interval_from), known=known, title=title)
 
 
 def make_published_blocks(

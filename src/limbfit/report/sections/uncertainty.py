@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure as Drawing
 from matplotlib.ticker import MaxNLocator
 
-from ...results.models import MixedPrediction, ModelsResult
+from ...results.models import ModelsResult
 from ...results.uncertainty import (
     LikelihoodProfile,
     ParameterUncertainty,
@@ -213,22 +212,20 @@ def make_models_section(store: Results, content: ModelsResult) -> Section:
     )
 
 
+@styled
 def _draw_model_figure(store: Results, content: ModelsResult) -> Figure | None:
     rows = [row for row in content.records if not row.fitted] or content.records
-    drawn = store.with_curves("models", rows[:_MAX_PANELS])
-    return _draw_model_bands(drawn, [one.model for one in content.models[1:]]) if drawn else None
-
-
-@styled
-def _draw_model_bands(found: Sequence[tuple[MixedPrediction, Curves]], models: Sequence[str]) -> Figure:
+    found = store.with_curves("models", rows[:_MAX_PANELS])
+    if not found:
+        return None
     drawing, axes = make_panels(len(found), min(len(found), 2), 2.8)
     for ax, (row, curves) in zip(axes, found, strict=False):
         what, unit = find_compared_quantity(curves)
         time = curves["time_s"]
         low, high = (curves[f"{what}_{end}_{unit}"] for end in ("low", "high"))
         ax.fill_between(time, low, high, color=SIMULATED, alpha=0.25, lw=0, label="95 % by all models")
-        for model in models:
-            ax.plot(time, curves[f"{what}_{model}_{unit}"], color=MUTED, lw=0.8)
+        for model in content.models[1:]:
+            ax.plot(time, curves[f"{what}_{model.model}_{unit}"], color=MUTED, lw=0.8)
         ax.plot(time, curves[f"{what}_own_{unit}"], color=SIMULATED, label="own model")
         ax.plot(time, curves[f"{what}_measured_{unit}"], color=INK, lw=1.0, label="measured")
         ax.set(title=f"site {row.record}", xlabel="time (s)", ylabel=f"{what} ({unit})")
