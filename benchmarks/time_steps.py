@@ -15,8 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from material_point import compute_curve_error, solve_layer, solve_reference_layer
 
-from limbfit.bench.layer import compute_curve_error, solve_layer, solve_reference_layer
 from limbfit.fe import History, StepControl, solve
 from limbfit.indentation import SiteModel, build_problem
 from limbfit.mesh import read_vtu

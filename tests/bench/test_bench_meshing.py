@@ -8,8 +8,7 @@ import pytest
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings
 from limbfit.anatomy.surfaces.surfaces import Anatomy
-from limbfit.bench import bench_meshing
-from limbfit.bench.meshing import draw_random_sites, make_phantom_limb
+from limbfit.bench.meshing import bench_meshing, draw_random_sites, make_phantom_limb
 from limbfit.errors import InputError
 
 COARSE = MeshSettings(edge_near_mm=6.0, edge_far_mm=24.0, near_radius_mm=8.0, growth=0.9, flatness=1.6)

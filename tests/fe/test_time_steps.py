@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from blocks import punch
 
-from limbfit.bench.layer import compute_curve_error, solve_layer, solve_reference_layer
 from limbfit.fe import History, StepControl, solve
 from limbfit.fe.materials import compute_prony_factors
 from limbfit.fe.solution.control import grade_steps, predict_remaining_times
 from limbfit.phantom.forces import DISCRETISATIONS
 from limbfit.study import SolverTable
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from material_point import compute_curve_error, solve_layer, solve_reference_layer
 
 T = 10.0
 HISTORIES = {

@@ -28,24 +28,6 @@ from .base import (
 from .cluster import QUEUES, DaskExecutor
 from .processes import ProcessExecutor, run_in_background
 
-__all__ = [
-    "QUEUES",
-    "SAFE_PATH",
-    "THREAD_VARIABLES",
-    "DaskExecutor",
-    "Executor",
-    "Limits",
-    "Placement",
-    "ProcessExecutor",
-    "SerialExecutor",
-    "count_usable_cores",
-    "make_executor",
-    "place_jobs",
-    "report_progress",
-    "run_in_background",
-    "share_executor",
-]
-
 
 @dataclass(frozen=True)
 class Placement:

@@ -27,7 +27,6 @@ from .simulating import (
     store_job_fields,
 )
 from .sites import (
-    Array,
     SiteModel,
     build_materials,
     build_problem,
@@ -36,43 +35,6 @@ from .sites import (
     read_indenter,
 )
 from .waves import WavePlace, to_vector3
-
-__all__ = [
-    "OFF_SKIN_MM",
-    "Array",
-    "Direction",
-    "Extension",
-    "Parameters",
-    "Simulation",
-    "SimulationJob",
-    "SiteModel",
-    "WavePlace",
-    "build_clamping_pins",
-    "build_fibre_field",
-    "build_first_steps",
-    "build_materials",
-    "build_problem",
-    "build_steps",
-    "choose_points_around",
-    "clamp_problem",
-    "compute_contact_radius",
-    "cut_neighbourhood",
-    "find_layers_under",
-    "find_nearby_skin_points",
-    "find_nearest_points",
-    "find_skin_points",
-    "is_under",
-    "list_flat_names",
-    "observe_result",
-    "place_waves_under",
-    "read_indenter",
-    "simulate",
-    "simulate_fields",
-    "store_job_fields",
-    "to_parameters",
-    "to_vector",
-    "to_vector3",
-]
 
 
 def __getattr__(name: str) -> Any:

@@ -2,5 +2,3 @@
 
 from .fitting import Fit, calibrate
 from .solution import Solution, solve
-
-__all__ = ["Fit", "Solution", "calibrate", "solve"]

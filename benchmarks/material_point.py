@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Array
-from ..fe import History, StepControl
-from ..fe.memory import Memory
-from ..fe.motion import Drives
-from ..fe.result import interpolate
-from ..fe.solution.control import predict_remaining_times, schedule_steps
+from limbfit.arrays import Array
+from limbfit.fe import History, StepControl
+from limbfit.fe.memory import Memory
+from limbfit.fe.motion import Drives
+from limbfit.fe.result import interpolate
+from limbfit.fe.solution.control import predict_remaining_times, schedule_steps
 
 
 @dataclass(frozen=True)
