@@ -85,13 +85,6 @@ class FungQLV(Uncoupled):
     def elastic_parameters(self) -> tuple[float, ...]:
         return self.c, self.b
 
-    def numbers(self) -> Array:
-        """c, b."""
-        return np.array([self.c, self.b])
-
-    def number_derivatives(self) -> Array:
-        return np.eye(2)
-
     @property
     def shear_modulus(self) -> float:
         return self.c

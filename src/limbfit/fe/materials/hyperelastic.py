@@ -14,47 +14,71 @@ Source: FEBio user manual, uncoupled materials.
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
 from ...errors import ProblemError
 from ...relaxation import DEFAULT_SPAN_S, choose_relaxation_times, compute_power_law_terms
-from .material import Array, PronyTerms, Uncoupled, check_finite, check_not_negative, check_positive, to_pairs
+from .elastic import VOLUMETRIC_LAWS
+from .material import Array, PronyTerms, Uncoupled, check_finite, check_not_negative, check_positive
 
 MAX_OGDEN_TERMS = 6  # as FEBio
 
 
 class OgdenSum(Uncoupled):
-    """A law that says which Ogden terms it is made of."""
+    """A sum of Ogden terms, moduli c_k (MPa) and exponents m_k, that are linear in its elastic parameters.
 
-    @abstractmethod
-    def ogden_terms(self) -> Array:
-        """Moduli c_k (MPa) and exponents m_k (k, 2)."""
+    ``fixed_terms (k, 2)`` are the terms where the parameters are zero, ``term_slopes (p, k, 2)`` their
+    derivatives.
+    """
 
-    @abstractmethod
-    def ogden_term_derivatives(self) -> Array:
-        """Derivative (p, k, 2) of `ogden_terms` with respect to each elastic parameter."""
+    elastic_names: ClassVar[tuple[str, ...]]
+    fixed_terms: ClassVar[Array]
+    term_slopes: ClassVar[Array]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "prony", _to_pairs("the Prony terms", self.prony))
+        for name, value in zip(self.parameter_names, self.elastic_parameters):
+            check_finite(name, value)
+        check_positive("kappa_ratio", self.kappa_ratio)
+        if self.volumetric not in VOLUMETRIC_LAWS:
+            known = ", ".join(VOLUMETRIC_LAWS)
+            raise ProblemError(f"unknown volumetric law {self.volumetric!r}", remedy=f"use one of {known}")
+        for l, (g, tau) in enumerate(self.prony, 1):
+            check_not_negative(f"g{l}", g)
+            check_positive(f"tau{l}", tau)
+        if not self.shear_modulus > 0:
+            raise ProblemError(
+                f"the shear modulus of small strains is {self.shear_modulus:.4g} MPa, not positive",
+                remedy="check the signs of the moduli",
+            )
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        return *self.elastic_names, *_number_names(("g", "tau"), len(self.prony))
+
+    @property
+    def elastic_parameters(self) -> tuple[float, ...]:
+        return tuple(getattr(self, name) for name in self.elastic_names)
 
     def numbers(self) -> Array:
         """c_1, m_1, c_2, ..."""
-        return self.ogden_terms().ravel()
+        return (self.fixed_terms + np.tensordot(self.elastic_parameters, self.term_slopes, 1)).ravel()
 
     def number_derivatives(self) -> Array:
-        slopes = self.ogden_term_derivatives()
-        return slopes.reshape(len(slopes), -1)
+        return self.term_slopes.reshape(len(self.term_slopes), -1)
 
     @property
     def shear_modulus(self) -> float:
         """``sum c_k / 2``, MPa."""
-        return float(self.ogden_terms()[:, 0].sum() / 2.0)
+        return float(self.numbers()[::2].sum() / 2.0)
 
     @property
     def shear_modulus_gradient(self) -> Array:
-        return np.asarray(self.ogden_term_derivatives()[:, :, 0].sum(axis=1) / 2.0)
+        return np.asarray(self.term_slopes[:, :, 0].sum(axis=1) / 2.0)
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
         named = dict(zip(self.parameter_names, self.parameters, strict=True)) | dict(values)
@@ -65,25 +89,16 @@ class OgdenSum(Uncoupled):
 
     def _fields(self, elastic: tuple[float, ...], prony: PronyTerms) -> dict[str, Any]:
         """The fields of the class that hold these parameters."""
-        return {**dict(zip(self.parameter_names, elastic, strict=False)), "prony": prony}
+        return {**dict(zip(self.elastic_names, elastic, strict=True)), "prony": prony}
 
 
 class SymmetricOgden(OgdenSum):
     """The elastic law of the paper's tissue, with a modulus ``c`` (MPa) and an exponent ``m``."""
 
-    c: float
-    m: float
     volumetric = "log"
-
-    @property
-    def elastic_parameters(self) -> tuple[float, ...]:
-        return self.c, self.m
-
-    def ogden_terms(self) -> Array:
-        return np.array([[self.c, self.m], [self.c, -self.m]])
-
-    def ogden_term_derivatives(self) -> Array:
-        return np.array([[[1.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [0.0, -1.0]]])
+    elastic_names = ("c", "m")
+    fixed_terms = np.zeros((2, 2))
+    term_slopes = np.array([[[1.0, 0.0], [1.0, 0.0]], [[0.0, 1.0], [0.0, -1.0]]])
 
 
 @dataclass(frozen=True)
@@ -218,29 +233,28 @@ class Ogden(OgdenSum):
     volumetric: str = "log"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "terms", to_pairs("the terms", self.terms))
-        object.__setattr__(self, "prony", to_pairs("the Prony terms", self.prony))
+        object.__setattr__(self, "terms", _to_pairs("the terms", self.terms))
         if not 1 <= len(self.terms) <= MAX_OGDEN_TERMS:
             raise ProblemError(f"an Ogden material has 1 to {MAX_OGDEN_TERMS} terms, not {len(self.terms)}")
-        for k, (c, m) in enumerate(self.terms, 1):
-            check_finite(f"c{k}", c)
-            check_finite(f"m{k}", m)
+        super().__post_init__()
+        for k, (_, m) in enumerate(self.terms, 1):
             if m == 0.0:
                 raise ProblemError(f"material parameter m{k} is zero")
-        self._check_shared()
 
     @property
-    def parameter_names(self) -> tuple[str, ...]:
-        return *_number_names(("c", "m"), len(self.terms)), *_list_prony_names(self)
+    def elastic_names(self) -> tuple[str, ...]:  # type: ignore[override]
+        return _number_names(("c", "m"), len(self.terms))
 
     @property
     def elastic_parameters(self) -> tuple[float, ...]:
         return tuple(value for term in self.terms for value in term)
 
-    def ogden_terms(self) -> Array:
-        return np.array(self.terms, dtype=float)
+    @property
+    def fixed_terms(self) -> Array:  # type: ignore[override]
+        return np.zeros((len(self.terms), 2))
 
-    def ogden_term_derivatives(self) -> Array:
+    @property
+    def term_slopes(self) -> Array:  # type: ignore[override]
         count = 2 * len(self.terms)
         return np.eye(count).reshape(count, -1, 2)
 
@@ -263,24 +277,13 @@ class NeoHookean(OgdenSum):
     kappa_ratio: float = 100.0
     volumetric: str = "log"
 
+    elastic_names: ClassVar = ("mu",)
+    fixed_terms: ClassVar = np.array([[0.0, 2.0]])
+    term_slopes: ClassVar = np.array([[[2.0, 0.0]]])
+
     def __post_init__(self) -> None:
-        object.__setattr__(self, "prony", to_pairs("the Prony terms", self.prony))
         check_positive("mu", self.mu)
-        self._check_shared()
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        return "mu", *_list_prony_names(self)
-
-    @property
-    def elastic_parameters(self) -> tuple[float, ...]:
-        return (self.mu,)
-
-    def ogden_terms(self) -> Array:
-        return np.array([[2.0 * self.mu, 2.0]])
-
-    def ogden_term_derivatives(self) -> Array:
-        return np.array([[[2.0, 0.0]]])
+        super().__post_init__()
 
 
 @dataclass(frozen=True)
@@ -299,25 +302,9 @@ class MooneyRivlin(OgdenSum):
     kappa_ratio: float = 100.0
     volumetric: str = "log"
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "prony", to_pairs("the Prony terms", self.prony))
-        check_finite("c1", self.c1)
-        check_finite("c2", self.c2)
-        self._check_shared()
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        return "c1", "c2", *_list_prony_names(self)
-
-    @property
-    def elastic_parameters(self) -> tuple[float, ...]:
-        return self.c1, self.c2
-
-    def ogden_terms(self) -> Array:
-        return np.array([[4.0 * self.c1, 2.0], [4.0 * self.c2, -2.0]])
-
-    def ogden_term_derivatives(self) -> Array:
-        return np.array([[[4.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [4.0, 0.0]]])
+    elastic_names: ClassVar = ("c1", "c2")
+    fixed_terms: ClassVar = np.array([[0.0, 2.0], [0.0, -2.0]])
+    term_slopes: ClassVar = np.array([[[4.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [4.0, 0.0]]])
 
 
 def _to_one_or_several(name: str, values: float | Sequence[float]) -> float | tuple[float, ...]:
@@ -331,9 +318,13 @@ def _to_one_or_several(name: str, values: float | Sequence[float]) -> float | tu
     return float(found.reshape(-1)[0]) if found.size == 1 else tuple(found.tolist())
 
 
-def _list_prony_names(material: Uncoupled) -> tuple[str, ...]:
-    return _number_names(("g", "tau"), len(material.prony))
-
-
 def _number_names(names: tuple[str, ...], count: int) -> tuple[str, ...]:
     return tuple(f"{name}{k}" for k in range(1, count + 1) for name in names)
+
+
+def _to_pairs(name: str, values: Sequence[Sequence[float]]) -> tuple[tuple[float, float], ...]:
+    """``values`` as a tuple of pairs of numbers."""
+    try:
+        return tuple((float(a), float(b)) for a, b in values)
+    except (TypeError, ValueError):
+        raise ProblemError(f"{name} of a material are not pairs of numbers") from None

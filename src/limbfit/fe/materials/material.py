@@ -136,13 +136,13 @@ class Uncoupled(Material):
     def elastic_parameters(self) -> tuple[float, ...]:
         """The parameters before those of relaxation."""
 
-    @abstractmethod
     def numbers(self) -> Array:
-        """What `elastic` is given (k,), moduli in MPa."""
+        """What `elastic` is given (k,), moduli in MPa: its parameters, unless a law says otherwise."""
+        return np.array(self.elastic_parameters)
 
-    @abstractmethod
     def number_derivatives(self) -> Array:
         """Derivative (p, k) of `numbers` with respect to each elastic parameter."""
+        return np.eye(len(self.elastic_parameters))
 
     @property
     @abstractmethod
@@ -201,21 +201,6 @@ class Uncoupled(Material):
     def with_parameters(self, values: Mapping[str, float]) -> Self:
         return cast("Self", replace(cast("Any", self), **values))
 
-    def _check_shared(self) -> None:
-        """Raise `ProblemError` where what all laws share is impossible."""
-        check_positive("kappa_ratio", self.kappa_ratio)
-        if self.volumetric not in VOLUMETRIC_LAWS:
-            known = ", ".join(VOLUMETRIC_LAWS)
-            raise ProblemError(f"unknown volumetric law {self.volumetric!r}", remedy=f"use one of {known}")
-        for l, (g, tau) in enumerate(self.prony, 1):
-            check_not_negative(f"g{l}", g)
-            check_positive(f"tau{l}", tau)
-        if not self.shear_modulus > 0:
-            raise ProblemError(
-                f"the shear modulus of small strains is {self.shear_modulus:.4g} MPa, not positive",
-                remedy="check the signs of the moduli",
-            )
-
 
 def check_finite(name: str, value: float) -> None:
     """Raise `ProblemError` unless ``value`` is a finite number."""
@@ -235,11 +220,3 @@ def check_not_negative(name: str, value: float) -> None:
     check_finite(name, value)
     if value < 0:
         raise ProblemError(f"material parameter {name} = {value} is negative")
-
-
-def to_pairs(name: str, values: Sequence[Sequence[float]]) -> tuple[tuple[float, float], ...]:
-    """``values`` as a tuple of pairs of numbers."""
-    try:
-        return tuple((float(a), float(b)) for a, b in values)
-    except (TypeError, ValueError):
-        raise ProblemError(f"{name} of a material are not pairs of numbers") from None
