@@ -124,101 +124,89 @@ _AMPLITUDE = Parameter("gamma", 1.2, 0.01, 10.0, "", "relaxation amplitude")
 _TIME = Parameter("tau", 2.0, 0.01, 10.0, "s", "relaxation time")
 
 
-def _build_ogden(terms: int) -> TissueLaw:
-    """The paper's law with so many relaxation terms.
-
-    Several share out the bounds of the one time in equal ratios, so that none can change places with another,
-    and the start of the one amplitude.
-    """
-    name, words, series = OGDEN, OGDEN_WORDS, "γ exp(−t/τ)"
-    relaxation: tuple[Parameter, ...] = (_AMPLITUDE, _TIME)
-    if terms > 1:
-        name, words = f"{OGDEN}-prony{terms}", f"{OGDEN_WORDS} with {terms} relaxation terms"
-        series = "Σ γᵢ exp(−t/τᵢ)"
-        ratio = (_TIME.upper / _TIME.lower) ** (1.0 / terms)
-        relaxation = ()
-        for k in range(terms):
-            lower, start, upper = (float(f"{_TIME.lower * ratio**x:.3g}") for x in (k, k + 0.5, k + 1))
-            amplitude = replace(_AMPLITUDE, name=f"gamma{k + 1}", start=round(_AMPLITUDE.start / terms, 2))
-            relaxation += (
-                amplitude, replace(_TIME, name=f"tau{k + 1}", start=start, lower=lower, upper=upper)
-            )  # fmt: skip
-    return TissueLaw(name, words, _describe_energy(series), (_MODULUS, _EXPONENT, *relaxation))
-
-
 def _describe_energy(series: str) -> str:
-    """The energy of a law with so written a relaxation."""
+    """The energy of the paper's law with so written a relaxation."""
     return (
         "the strain energy Ψ = c/m² Σ(λ̃ᵢᵐ + λ̃ᵢ⁻ᵐ − 2) + κ/2 (ln J)² with quasi-linear viscoelasticity, "
         f"G(t) = 1 + {series} acting on the deviatoric stress"
     )
 
 
-# The thigh muscle of seven people has a slope of 0.25 at 25 to 62.5 Hz (Klatt et al. 2010, Phys. Med. Biol.
-# 55:6445), what relaxes with the logarithm of time one of 0 (Fung 1993, Biomechanics, chapter 7). The upper
-# bound is twice the first. G falls from 2.5 at the start of both, with the paper's single term from 2.2.
-_POWER_RELAXATION = (
-    replace(_AMPLITUDE, start=0.3),
-    Parameter("slope", 0.2, 0.01, 0.5, "", "slope of relaxation"),
+_PLAIN = TissueLaw(
+    OGDEN, OGDEN_WORDS, _describe_energy("γ exp(−t/τ)"), (_MODULUS, _EXPONENT, _AMPLITUDE, _TIME)
 )
 
 
-def _build_power() -> TissueLaw:
-    """The paper's law with relaxation as a power of time."""
-    energy = _describe_energy("γ Σ (τᵢ/1 s)^(−slope) exp(−t/τᵢ)")
-    words = f"{OGDEN_WORDS} with relaxation as a power of time"
-    return TissueLaw(POWER, words, energy, (_MODULUS, _EXPONENT, *_POWER_RELAXATION))
+def _build_ogden(terms: int) -> TissueLaw:
+    """The paper's law with several relaxation terms.
+
+    They share out the bounds of the one time in equal ratios, so that none can change places with another,
+    and the start of the one amplitude.
+    """
+    ratio = (_TIME.upper / _TIME.lower) ** (1.0 / terms)
+    relaxation: list[Parameter] = []
+    for k in range(terms):
+        lower, start, upper = (float(f"{_TIME.lower * ratio**x:.3g}") for x in (k, k + 0.5, k + 1))
+        relaxation.append(replace(_AMPLITUDE, name=f"gamma{k + 1}", start=round(_AMPLITUDE.start / terms, 2)))
+        relaxation.append(replace(_TIME, name=f"tau{k + 1}", start=start, lower=lower, upper=upper))
+    name, words = f"{OGDEN}-prony{terms}", f"{OGDEN_WORDS} with {terms} relaxation terms"
+    energy = _describe_energy("Σ γᵢ exp(−t/τᵢ)")
+    return TissueLaw(name, words, energy, (_MODULUS, _EXPONENT, *relaxation))
 
 
+# The thigh muscle of seven people has a slope of 0.25 at 25 to 62.5 Hz (Klatt et al. 2010, Phys. Med. Biol.
+# 55:6445), what relaxes with the logarithm of time one of 0 (Fung 1993, Biomechanics, chapter 7). The upper
+# bound is twice the first. G falls from 2.5 at the start of both, with the paper's single term from 2.2.
+_POWER = TissueLaw(
+    POWER,
+    f"{OGDEN_WORDS} with relaxation as a power of time",
+    _describe_energy("γ Σ (τᵢ/1 s)^(−slope) exp(−t/τᵢ)"),
+    (
+        _MODULUS,
+        _EXPONENT,
+        replace(_AMPLITUDE, start=0.3),
+        Parameter("slope", 0.2, 0.01, 0.5, "", "slope of relaxation"),
+    ),
+)
 # Forces of a deep indentation grow by some 40 % from b = 0 to 1; under 0.02 the law is neo-Hookean.
 _STIFFENING = Parameter("b", 1.0, 0.02, 20.0, "", "exponential stiffening")
-
-
-def _build_fung() -> TissueLaw:
-    """The exponential law with one relaxation term."""
-    energy = (
-        "the strain energy Ψ = c/(2b) (exp(b (Ĩ₁ − 3)) − 1) + κ/2 (ln J)² with quasi-linear viscoelasticity, "
-        "G(t) = 1 + γ exp(−t/τ) acting on the deviatoric stress"
-    )
-    return TissueLaw(FUNG, "exponential law of Fung", energy, (_MODULUS, _STIFFENING, _AMPLITUDE, _TIME))
-
-
+_FUNG = TissueLaw(
+    FUNG,
+    "exponential law of Fung",
+    "the strain energy Ψ = c/(2b) (exp(b (Ĩ₁ − 3)) − 1) + κ/2 (ln J)² with quasi-linear viscoelasticity, "
+    "G(t) = 1 + γ exp(−t/τ) acting on the deviatoric stress",
+    (_MODULUS, _STIFFENING, _AMPLITUDE, _TIME),
+)
 # Bounds are wide, for nobody has identified fibres so: passive muscle is near its ground along them or some
 # ten times as stiff; the fibres' modulus of small stretch is 4 k1.
 _FIBRES = (
     Parameter("k1", 5.0, 0.05, 500.0, "kPa", "stiffness of the fibres"),
     Parameter("k2", 1.0, 0.01, 100.0, "", "stiffening of the fibres"),
 )
+_FIBRED = TissueLaw(
+    FIBRED,
+    f"{OGDEN_WORDS} with fibres",
+    f"{_PLAIN.energy}; where fibres are stretched (I₄ > 1), "
+    "k₁/(2 k₂) (exp(k₂ (I₄ − 1)²) − 1) is added to Ψ, I₄ the isochoric squared stretch along them",
+    (*_PLAIN.parameters, *_FIBRES),
+)
 # Living muscle tenses up to some 300 kPa; a limb that is indented is held as loose as can be.
 _TENSION = Parameter("active", 5.0, 0.05, 200.0, "kPa", "active stress along the fibres")
-
-
-def _build_fibred() -> TissueLaw:
-    """The paper's law with fibres."""
-    plain = _build_ogden(1)
-    words, energy = f"{plain.words} with fibres", f"{plain.energy}; where fibres are stretched (I₄ > 1), "
-    energy += "k₁/(2 k₂) (exp(k₂ (I₄ − 1)²) − 1) is added to Ψ, I₄ the isochoric squared stretch along them"
-    return TissueLaw(FIBRED, words, energy, (*plain.parameters, *_FIBRES))
-
-
-def _build_active() -> TissueLaw:
-    """The paper's law with fibres that contract."""
-    plain = _build_fibred()
-    energy = f"{plain.energy}; along them acts the active stress times the share s(t) of its activation"
-    return TissueLaw(ACTIVE, f"{plain.words} that contract", energy, (*plain.parameters, _TENSION))
-
+_ACTIVE = TissueLaw(
+    ACTIVE,
+    f"{_FIBRED.words} that contract",
+    f"{_FIBRED.energy}; along them acts the active stress times the share s(t) of its activation",
+    (*_FIBRED.parameters, _TENSION),
+)
 
 FIBRE_KEYS = tuple(parameter.key for parameter in (*_FIBRES, _TENSION))
-_OWN = {law.name: law for law in map(_build_ogden, range(1, MOST_RELAXATIONS + 1))}
-LAWS = Registry(
-    "tissue law",
-    _OWN | {POWER: _build_power(), FUNG: _build_fung(), FIBRED: _build_fibred(), ACTIVE: _build_active()},
-)
+_OGDEN_LAWS = {law.name: law for law in (_PLAIN, *map(_build_ogden, range(2, MOST_RELAXATIONS + 1)))}
+LAWS = Registry("tissue law", _OGDEN_LAWS | {law.name: law for law in (_POWER, _FUNG, _FIBRED, _ACTIVE)})
 
 
 def is_ogden(name: str) -> bool:
     """Whether a law is the paper's, with however many relaxation terms."""
-    return name in _OWN
+    return name in _OGDEN_LAWS
 
 
 def has_fibres(name: str) -> bool:

@@ -7,7 +7,7 @@ order of the jobs whatever runs them, so a caller cannot tell one executor from 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +24,7 @@ from .base import (
     SerialExecutor,
     count_usable_cores,
     report_progress,
+    set_in_block,
 )
 from .cluster import QUEUES, DaskExecutor
 from .processes import ProcessExecutor, run_in_background
@@ -54,24 +55,14 @@ _placement: ContextVar[Placement | None] = ContextVar("_placement", default=None
 _shared: ContextVar[Executor | None] = ContextVar("_shared", default=None)
 
 
-@contextmanager
-def place_jobs(placement: Placement) -> Iterator[None]:
+def place_jobs(placement: Placement) -> AbstractContextManager[None]:
     """Make executors that are created in this block run where ``placement`` says."""
-    token = _placement.set(placement)
-    try:
-        yield
-    finally:
-        _placement.reset(token)
+    return set_in_block(_placement, placement)
 
 
-@contextmanager
-def share_executor(executor: Executor) -> Iterator[None]:
+def share_executor(executor: Executor) -> AbstractContextManager[None]:
     """Make `make_executor` return ``executor`` in this block; whoever asks for it leaves it running."""
-    token = _shared.set(executor)
-    try:
-        yield
-    finally:
-        _shared.reset(token)
+    return set_in_block(_shared, executor)
 
 
 def make_executor(workers: int = 0, limits: Limits = NO_LIMITS) -> Executor:

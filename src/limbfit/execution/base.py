@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import partial
@@ -14,6 +14,7 @@ from typing import Any, Self, TypeVar
 
 Job = TypeVar("Job")
 Answer = TypeVar("Answer")
+Setting = TypeVar("Setting")
 
 # Read by the numerical libraries when they load: hence set before a worker starts, not in it.
 THREAD_VARIABLES = (
@@ -49,14 +50,19 @@ def report_progress(message: Any) -> None:
         listener(message)
 
 
-@contextmanager
-def send_reports_to(listener: Callable[[Any], None] | None) -> Iterator[None]:
+def send_reports_to(listener: Callable[[Any], None] | None) -> AbstractContextManager[None]:
     """Send what `report_progress` is given in this block to ``listener``."""
-    token = _listener.set(listener)
+    return set_in_block(_listener, listener)
+
+
+@contextmanager
+def set_in_block(variable: ContextVar[Setting], value: Setting) -> Iterator[None]:
+    """Give a variable another value in this block."""
+    token = variable.set(value)
     try:
         yield
     finally:
-        _listener.reset(token)
+        variable.reset(token)
 
 
 @dataclass(frozen=True)
@@ -139,9 +145,7 @@ def count_usable_cores() -> int:
 class SerialExecutor(Executor):
     """Runs jobs one after the other in this process; no limit can end them."""
 
-    @property
-    def workers(self) -> int:
-        return 1
+    workers = 1
 
     def threads_for(self, jobs: int) -> int:
         return count_usable_cores()

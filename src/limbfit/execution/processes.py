@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
@@ -75,7 +75,10 @@ class ProcessExecutor(Executor):
                         elif batch.on_lost is not None:
                             answers[job] = JobOutcome(batch.on_lost(batch.jobs[job], f"{outcome}, twice"))
                         else:
-                            raise RunError(_describe_death(batch.function, job, batch.keys[job]))
+                            key = batch.keys[job]
+                            name = f"number {job + 1}" if key is None else f"{key!r}"
+                            what = f"a worker process died twice in {batch.function.__name__} of {name}"
+                            raise RunError(f"{what}: out of memory, killed or crashed")
                 yield answers.pop(index).result()
         finally:
             self._mapping = False
@@ -139,20 +142,17 @@ class ProcessExecutor(Executor):
             worker.end(until)
 
 
-def _describe_death(function: Callable, job: int, key: str | None) -> str:
-    name = f"{key!r}" if key is not None else f"number {job + 1}"
-    return f"a worker process died twice in {function.__name__} of {name}: out of memory, killed or crashed"
-
-
 GRACE_S = 2.0  # for workers to end when they are asked to
 READY = "ready"  # a worker's first word: its start is not its first job's time
 
 
+@dataclass(frozen=True)
 class JobOutcome:
     """The outcome of a job: an answer, or an exception with the worker's traceback."""
 
-    def __init__(self, answer: Any = None, error: BaseException | None = None, trace: str = "") -> None:
-        self.answer, self.error, self.trace = answer, error, trace
+    answer: Any = None
+    error: BaseException | None = None
+    trace: str = ""
 
     def result(self) -> Any:
         if self.error is not None:
@@ -176,7 +176,15 @@ class Worker:
         self.process = context.Process(target=serve_jobs, args=(far,), daemon=True)
         self.began: float | None = None  # its job; None before it is ready
         variables = dict.fromkeys(THREAD_VARIABLES, str(threads)) | SAFE_PATH
-        with _set_environment(variables), _hide_main(), _allow_children():
+        # A spawned process would import the caller's main script, and so run it if it is unguarded.
+        main = {"__main__": ModuleType("__main__")}
+        # Dask's workers are daemons, which may have no children; these end with their parent.
+        config, no_daemon = multiprocessing.current_process()._config, {"daemon": False}  # type: ignore[attr-defined]
+        with (
+            _replace_items(os.environ, variables),
+            _replace_items(sys.modules, main),
+            _replace_items(config, no_daemon),
+        ):
             self.process.start()
         far.close()
 
@@ -231,40 +239,16 @@ class Worker:
 
 
 @contextmanager
-def _set_environment(variables: dict[str, str]) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
+def _replace_items(mapping: MutableMapping[str, Any], changes: Mapping[str, Any]) -> Iterator[None]:
+    """Give some items of a mapping other values in this block."""
+    before = {name: mapping[name] for name in changes if name in mapping}
+    mapping.update(changes)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-@contextmanager
-def _hide_main() -> Iterator[None]:
-    """Hide the caller's main script, which a spawned process would import, and so run if it is unguarded."""
-    main = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = main
-
-
-@contextmanager
-def _allow_children() -> Iterator[None]:
-    """Allow children in Dask's workers, which are daemons; the children end with their parent."""
-    config = multiprocessing.current_process()._config  # type: ignore[attr-defined]
-    before = config.get("daemon")
-    config["daemon"] = False
-    try:
-        yield
-    finally:
-        config["daemon"] = before
+        for name in changes.keys() - before.keys():
+            del mapping[name]
+        mapping.update(before)
 
 
 def serve_jobs(connection: Connection) -> None:
@@ -280,7 +264,7 @@ def serve_jobs(connection: Connection) -> None:
         except (EOFError, ConnectionError):
             return
         except Exception as error:  # a function or job that this process cannot import
-            outcome = _build_failure(error)
+            outcome = JobOutcome(error=error, trace=traceback.format_exc())
         _send_outcome(connection, outcome)
 
 
@@ -290,11 +274,7 @@ def _run_job(function: Callable, job: Any) -> JobOutcome:
     except MemoryError:
         os._exit(1)  # the parent tries once more in a fresh process
     except Exception as error:
-        return _build_failure(error)
-
-
-def _build_failure(error: Exception) -> JobOutcome:
-    return JobOutcome(error=error, trace=traceback.format_exc())
+        return JobOutcome(error=error, trace=traceback.format_exc())
 
 
 def _send_outcome(connection: Connection, outcome: JobOutcome) -> None:
