@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import limbfit
+from limbfit.shapes import SHAPES
 
 
 def test_all_public_names_exist():
@@ -81,3 +82,9 @@ def test_documented_names_that_became_others_keep_working(module, old, new):
         assert getattr(room, old) is getattr(room, new)
     with pytest.raises(AttributeError, match="nothing"):
         room.nothing  # noqa: B018
+
+
+def test_the_former_name_of_a_shape_in_words_keeps_working():
+    sphere, settings = SHAPES["sphere"], {"width_mm": 10}
+    with pytest.warns(FutureWarning, match="said is now called describe"):
+        assert sphere.said(settings) == sphere.describe(settings)

@@ -7,6 +7,7 @@ edge; the body lies at ``z <= 0``.
 from __future__ import annotations
 
 import math
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -145,6 +146,12 @@ class Shape(ABC):
         own = [f"{measure.words or measure.key} {settings.get(measure.key)}" for measure in cls.measures]
         inside = ", ".join([edge] * cls.has_edge + own)
         return f"{cls.words} of {settings.get('width_mm')} mm" + (f" ({inside})" if inside else "")
+
+    @classmethod
+    def said(cls, settings: Mapping[str, Any]) -> str:
+        """The former name of `describe`."""
+        warnings.warn("Shape.said is now called describe", FutureWarning, stacklevel=2)
+        return cls.describe(settings)
 
     @abstractmethod
     def distance(self, points: Array) -> Distance:
