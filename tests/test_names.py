@@ -11,14 +11,14 @@ import limbfit
 PACKAGE = Path(limbfit.__file__).parent
 VERBS = frozenset(
     """
-acquire adapt add advance allow amputate announce answer append apply approach approximate assemble
+acquire adapt add advance amputate announce answer append apply approach approximate assemble
 assess assign average balance batch begin bench bisect build bump calibrate call cap chain change check
 choose clamp classify clean clear clip close coarsen code collect colour combine compare compile
 compress compute connect constrain continue convolve copy correct count couple create crop cross curve
 cut decode deconvolve deform delay demo derive describe design diagnose die difference differentiate
 dilate divide do draw drop edit embed end ensure equilibrate erode estimate evaluate exchange
 expand explain explore export extend extract extrapolate extrude fail fill find finish fit flag flatten
-follow format from generate get grade group grow guess has head hide hold ignore import impose
+follow format from generate get grade group grow guess halve has head hide hold ignore import impose
 improve insert integrate interpolate interpret interrupt intersect invert is iterate join judge keep
 label level limit link list listen load locate lock log lump main make mark match measure mend merge
 mesh minimise mix move multiply mute name normalise number observe open optimise order orient outline

@@ -79,9 +79,9 @@ def find_phases(
     corners = _find_corners(times, displacement, allowed)
     found: list[MotionPhase] = []
     for a, b in pairwise(corners):
-        piece = _build_piece(
-            float(times[a]), float(times[b]), float(displacement[a]), float(displacement[b]), allowed
-        )
+        start, end = float(displacement[a]), float(displacement[b])
+        kind: Kind = "hold" if abs(end - start) <= allowed else "load" if end > start else "unload"
+        piece = MotionPhase(kind, float(times[a]), float(times[b]), start, end)
         if found and piece.kind == found[-1].kind == "hold":
             piece = replace(found.pop(), end_s=piece.end_s, end_mm=piece.end_mm)
         found.append(piece)
@@ -170,12 +170,6 @@ def _describe_phase(phase: MotionPhase) -> str:
     if phase.kind == "hold":
         return f"hold for {phase.duration_s:.3g} s"
     return f"{phase.kind} at {abs(phase.rate_mm_s):.3g} mm/s"
-
-
-def _build_piece(start_s: float, end_s: float, start_mm: float, end_mm: float, allowed: float) -> MotionPhase:
-    change = end_mm - start_mm
-    kind: Kind = "hold" if abs(change) <= allowed else "load" if change > 0.0 else "unload"
-    return MotionPhase(kind, start_s, end_s, start_mm, end_mm)
 
 
 def _from_contact(phases: Sequence[MotionPhase], contact_s: float) -> tuple[MotionPhase, ...]:

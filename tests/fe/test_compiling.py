@@ -9,7 +9,7 @@ import pytest
 SCRIPT = """
 from numba.core import event
 
-from limbfit.bench.blocks import punched_block
+from limbfit.bench.blocks import build_punched_block
 from limbfit.fe import StepControl, are_compiled, compile_kernels, solve
 
 assert not are_compiled()
@@ -26,7 +26,7 @@ class Listener(event.Listener):
 
 event.register("numba:compile", Listener())
 for element in ("tet10p0", "tet10g8p0"):
-    solve(punched_block(element, 3), steps=StepControl(times=(0.5, 1.0)), sensitivities=True)
+    solve(build_punched_block(element, 3), steps=StepControl(times=(0.5, 1.0)), sensitivities=True)
 print(*made)
 """
 

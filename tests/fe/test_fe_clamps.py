@@ -9,11 +9,11 @@ import pytest
 from blocks import boundary
 
 from limbfit import History, Indenter, OgdenQLV, Problem
-from limbfit.bench.blocks import SIX_TETS, build_boxes, turn_upright
 from limbfit.errors import ProblemError
 from limbfit.fe import StepControl, System, solve
 from limbfit.indentation import build_clamping_pins, clamp_problem
 from limbfit.mesh import Mesh
+from limbfit.mesh.boxes import SIX_TETS, build_boxes, turn_upright
 from limbfit.study import ClampsTable
 
 INNER, OUTER, LENGTH = 15.0, 45.0, 100.0  # mm

@@ -147,23 +147,6 @@ def test_elastic_stress_is_that_of_each_point(name):
         np.testing.assert_allclose(stress[el, q], expected, atol=1e-13 * np.abs(stress).max())
 
 
-@every_element
-def test_residual_and_tangent_are_derivatives(name):
-    system, laws, scale, K, u = deformed(name)
-    d = np.random.default_rng(12).normal(size=u.shape) * ~system.supported
-    h = 1e-6
-    every = slice(0, len(system.cells))
-    ahead, back = (assembled((system, laws, scale, K, u + s * h * d), every, False) for s in (1, -1))
-    _, residual, data = assembled((system, laws, scale, K, u), every, True)
-    tangent = np.zeros((system.unknowns, system.unknowns))
-    tangent[np.repeat(np.arange(system.unknowns), np.diff(system.indptr)), system.indices] = data
-    tangent += np.triu(tangent, 1).T
-    size = np.abs(tangent).max()
-    assert (ahead[0] - back[0]) / (2 * h) == pytest.approx((residual * d).sum(), abs=1e-7 * size)
-    change = ((ahead[1] - back[1]) / (2 * h)).ravel()[system.free]
-    np.testing.assert_allclose(tangent @ d.ravel()[system.free], change, atol=1e-7 * size)
-
-
 def test_an_inverted_element_is_infinite():
     system, laws, scale, K, u = deformed("tet10")
     u = u.copy()

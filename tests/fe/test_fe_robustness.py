@@ -17,6 +17,7 @@ from limbfit.errors import ProblemError
 from limbfit.fe import History, OgdenQLV, Problem, Result, StepControl, Support, solve
 from limbfit.fe.diagnostics import find_slip
 from limbfit.fe.solution.control import StepController
+from limbfit.mesh import Mesh
 from limbfit.study import MaterialTable
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
@@ -277,6 +278,10 @@ def test_summary_counts_what_happened(robustness):
     assert found["costs"]["cuts"]["max"] == 8.0
 
 
+def doubled_cell(mesh: Mesh) -> Mesh:
+    return replace(mesh, cells=np.vstack([mesh.cells, mesh.cells[:1]]), regions=np.append(mesh.regions, 0))
+
+
 BAD: list[tuple[Callable[[Problem], dict], str]] = [
     (lambda p: {"fixed": np.array([len(p.mesh.points)])}, "fixed nodes refer to nodes"),
     (lambda p: {"contact_faces": p.contact_faces + len(p.mesh.points)}, "contact faces refer to nodes"),
@@ -289,6 +294,11 @@ BAD: list[tuple[Callable[[Problem], dict], str]] = [
     (lambda p: {"mesh": p.mesh.with_points(np.vstack([p.mesh.points, [[0, 0, 9]]]))}, "belong to no cell"),
     (lambda p: {"mesh": p.mesh.with_points(np.where(p.mesh.points > 29, np.nan, p.mesh.points))}, "finite"),
     (lambda p: {"mesh": p.mesh.with_points(p.mesh.points * [1, 1, 0])}, "inverted or flat"),
+    (lambda p: {"mesh": replace(p.mesh, cells=p.mesh.cells[:, [1, 0, *range(2, 10)]])}, "inverted or flat"),
+    (lambda p: {"mesh": doubled_cell(p.mesh)}, "1 cells are there twice"),
+    (lambda p: {"contact_faces": np.zeros((0, 6), dtype=int)}, "contact faces"),
+    (lambda p: {"fixed": np.zeros(0, dtype=int)}, "nothing is held in place"),
+    (lambda p: {"element": "hex8"}, "no element"),
     (lambda p: {"materials": {"muscle": SKIN}}, "region 'skin' has no material"),
 ]
 

@@ -34,14 +34,6 @@ def test_schedule_hits_knots_and_peak():
     assert times[0] > 0
 
 
-def test_default_steps_give_the_force_within_half_a_percent(problem, result):
-    fine = solve(problem, StepControl(load_steps=60, unload_steps=48))
-    t = np.linspace(0.0, problem.history.times[-1], 400)
-    error = np.abs(result.force_at(t) - fine.force_at(t))
-    assert error.mean() < 0.003 * fine.peak_force
-    assert error.max() < 0.01 * fine.peak_force
-
-
 def test_interpolation_passes_through_the_steps_and_is_never_negative(result):
     np.testing.assert_allclose(result.force_at(result.times), result.force, atol=1e-10)
     assert (result.force_at(np.linspace(-1.0, 20.0, 500)) >= 0).all()
@@ -129,11 +121,10 @@ def test_results_travel_between_processes(result):
     assert copy.system is None
 
 
-@pytest.mark.parametrize("name", ["superlu", "multigrid"])
-def test_linear_solvers_give_the_same_simulation(problem, result, name):
-    other = solve(problem, StepControl(linear_solver=name), sensitivities=True)
+def test_another_linear_solver_gives_the_same_simulation(problem, result):
+    other = solve(problem, StepControl(linear_solver="superlu"), sensitivities=True)
     np.testing.assert_allclose(other.force, result.force, atol=1e-4 * result.peak_force)
-    assert other.statistics["linear_solver"] == name
+    assert other.statistics["linear_solver"] == "superlu"
     most = np.abs(result.force_sensitivity).max(axis=0)
     np.testing.assert_allclose(other.force_sensitivity / most, result.force_sensitivity / most, atol=1e-3)
 
@@ -141,8 +132,8 @@ def test_linear_solvers_give_the_same_simulation(problem, result, name):
 @pytest.mark.parametrize(
     ("times", "displacement", "what"),
     [
-        ([0.0, 1.0, 1.0], [0.0, 1.0, 2.0], "backwards in time"),
-        ([0.5, 1.0], [0.0, 1.0], "starts at 0.5 s"),
+        ([0.0, 2.0, 1.0], [0.0, 1.0, 0.0], "do not grow from 0: 0, 2, 1"),
+        ([0.5, 1.0], [0.0, 1.0], "displacement history do not grow from 0: 0.5, 1"),
         ([0.0, np.nan], [0.0, 1.0], "not finite"),
         ([0.0, 1.0], [0.0, np.inf], "not finite"),
         ([0.0, 1.0], [0.0, 1.0, 0.0], "as many displacements"),

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from blocks import MUSCLE, SKIN, block, drive, punch, slope_and_difference, symmetry
 
-from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, NeoHookean, Problem, StepControl, System, iterate, solve
 from limbfit.fe.contact.friction import Anchors
 from limbfit.fe.kernel.laws import Laws
@@ -116,8 +115,3 @@ def test_sticking_stiffens_a_flat_punch_as_in_theory(nu):
     """Spence (1968): ``F_stuck / F_free = (1 - nu) ln(3 - 4 nu) / (1 - 2 nu)``, 1.099 at 0 and 1 at 1/2."""
     theory = (1.0 - nu) * np.log(3.0 - 4.0 * nu) / (1.0 - 2.0 * nu)
     assert stiffening(nu) == pytest.approx(theory, abs=0.01)
-
-
-def test_unknown_friction_is_refused():
-    with pytest.raises(ProblemError, match="unknown friction 'rough'"):
-        solve(punch("tet4", 2, 1, friction="rough"))

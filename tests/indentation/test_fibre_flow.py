@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limbfit.bench.blocks import HEX, SIX_TETS, build_boxes, turn_upright
 from limbfit.errors import ProblemError
 from limbfit.indentation import build_fibre_field, cut_neighbourhood
 from limbfit.indentation.cell_fields import compute_flow_directions
 from limbfit.mesh import Mesh
+from limbfit.mesh.boxes import HEX, SIX_TETS, build_boxes, turn_upright
 
 
 def bar(bent: bool = False) -> Mesh:

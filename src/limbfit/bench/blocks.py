@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,8 @@ import numpy as np
 from ..errors import ProblemError
 from ..fe import ELEMENTS, History, Indenter, OgdenQLV, Problem
 from ..indentation import SiteModel
-from ..mesh import Mesh, boundary_faces, to_tet10, write_vtu
-from ..mesh.boxes import HEX, SIX_TETS, build_boxes, turn_upright
+from ..mesh import Mesh, to_tet10, write_vtu
+from ..mesh.boxes import HEX, SIX_TETS, build_boxes
 from ..study import SolverTable
 
 SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, 3.0, 0.3)
@@ -65,18 +66,11 @@ def build_layered_block(cell_type: str, divisions: int) -> Mesh:
     n_below, n_above = _divide_depth(divisions)
     below, above = np.linspace(-DEPTH, -LAYER, n_below + 1), np.linspace(-LAYER, 0.0, n_above + 1)
     points, corners = build_boxes(side, side, np.concatenate([below, above[1:]]))
-    cells = (
-        corners[:, HEX] if cell_type == "hex8" else turn_upright(points, corners[:, SIX_TETS].reshape(-1, 4))
-    )
-    skin = points[cells][:, :, 2].mean(axis=1) > -LAYER
-    linear = "hex8" if cell_type == "hex8" else "tet4"
-    mesh = Mesh(points, cells, linear, np.where(skin, 0, 1), ("skin", "muscle"))
-    faces = boundary_faces(mesh)
-    mesh = Mesh(
-        points, cells, linear, mesh.regions, mesh.region_names,
-        {"bottom": np.flatnonzero(points[:, 2] <= -DEPTH)},
-        {"skin": faces[(points[faces][:, :, 2] >= 0.0).all(axis=1)]},
-    )  # fmt: skip
+    cells = corners[:, HEX] if cell_type == "hex8" else corners[:, SIX_TETS].reshape(-1, 4)
+    below_skin = points[cells][:, :, 2].mean(axis=1) <= -LAYER
+    mesh = Mesh.from_arrays(points, cells, below_skin.astype(int), {0: "skin", 1: "muscle"})
+    bottom, top = mesh.nodes_where(lambda p: p[:, 2] <= -DEPTH), mesh.faces_where(lambda p: p[:, 2] >= 0.0)
+    mesh = replace(mesh, node_sets={"bottom": bottom}, face_sets={"skin": top})
     return to_tet10(mesh) if cell_type == "tet10" else mesh
 
 

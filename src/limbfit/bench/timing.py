@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..execution import ProcessExecutor
 from ..fe import Problem, StepControl, solve
 from .blocks import build_punched_block, choose_divisions
-from .parity import PUNCHED, ReferenceCase, Tell, find_reference, load_case
+from .parity import PUNCHED, Tell, find_reference, load_case
 
 Answer = TypeVar("Answer")
 # FEBio 4.11 with PARDISO, alone on 2 cores (Intel Xeon, 2.5 GHz), 2 threads.
@@ -59,11 +59,11 @@ def bench_forward(
     named = CASES[case] if as_febio else replace(CASES[case], problem={}, control={})
     problem = {**named.problem, "element": element} if element else named.problem
     control = {**named.control, "threads": threads}
-    chosen = replace(named, problem=problem, control=control)
+    posed, stepped, _ = load_case(replace(named, problem=problem, control=control), folder)
     tell(0, 2, f"{case}, plain")
-    plain = run_in_fresh_process(run_forward, threads, chosen, folder, False)
+    plain = run_in_fresh_process(solve_timed, threads, posed, stepped, False)
     tell(1, 2, f"{plain['seconds']:.1f} s plain; with sensitivities")
-    full = run_in_fresh_process(run_forward, threads, chosen, folder, True)
+    full = run_in_fresh_process(solve_timed, threads, posed, stepped, True)
     tell(2, 2, f"{full['seconds']:.1f} s with sensitivities")
     febio = FEBIO_SECONDS.get(case)
     return {
@@ -78,11 +78,6 @@ def bench_forward(
         "febio_seconds": febio,
         "ratio": None if febio is None else febio / plain["seconds"],
     }
-
-
-def run_forward(case: ReferenceCase, folder: Path, sensitivities: bool) -> dict[str, Any]:
-    problem, control, _ = load_case(case, folder)
-    return solve_timed(problem, control, sensitivities)
 
 
 def bench_scaling(
@@ -113,7 +108,9 @@ def bench_scaling(
     rows = []
     for i, (kind, divisions) in enumerate(blocks):
         tell(i, len(blocks), f"{kind}, {divisions} cells along 60 mm")
-        rows.append(run_in_fresh_process(run_block, threads, kind, divisions, control))
+        problem = build_punched_block(kind, divisions)
+        timed = run_in_fresh_process(solve_timed, threads, problem, control, False)
+        rows.append({"cells": len(problem.mesh.cells), **timed})
     tell(len(blocks), len(blocks), "done")
     *curve, paper = rows
     return {
@@ -124,11 +121,6 @@ def bench_scaling(
         "memory_exponent": fit_exponent(curve, "max_rss_MB"),
         "paper_sized": paper,
     }
-
-
-def run_block(element: str, divisions: int, control: StepControl) -> dict[str, Any]:
-    problem = build_punched_block(element, divisions)
-    return {"cells": len(problem.mesh.cells), **solve_timed(problem, control, sensitivities=False)}
 
 
 def fit_exponent(rows: list[dict[str, Any]], key: str) -> float:

@@ -3,7 +3,15 @@
 Also the reverse: a limb under a stated pressure, whose deformed surface is the shape of a socket.
 """
 
-from .model import Load, SocketFit, build_socket_problem, build_socket_steps
+from .model import (
+    Load,
+    SocketFit,
+    build_pressed_problem,
+    build_socket_problem,
+    build_socket_steps,
+    extract_outer_surface,
+    press_limb,
+)
 from .outcome import (
     SETTLING,
     SHEAR_LEVELS,
@@ -16,4 +24,3 @@ from .outcome import (
     simulate_donning,
     unpack,
 )
-from .pressing import build_pressed_problem, extract_outer_surface, press_limb

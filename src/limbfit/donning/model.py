@@ -1,16 +1,32 @@
-"""A limb in its socket as a problem for the solver, and when that steps."""
+"""A limb in its socket, or under a stated pressure, as a problem for the solver, and when that steps.
+
+The deformed surface of a limb under pressure is the shape of a socket.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import ProblemError
 from ..execution import count_usable_cores
-from ..fe import History, Motion, Problem, RigidBody, SmoothSurface, StepControl
+from ..fe import (
+    History,
+    Motion,
+    Pressure,
+    Problem,
+    Result,
+    RigidBody,
+    SmoothSurface,
+    Step,
+    StepControl,
+    solve,
+)
 from ..fe.materials import Material
 from ..fe.motion import COORDINATES
 from ..mesh import Mesh
@@ -23,6 +39,8 @@ RAMP_STEPS, HOLD_STEPS, LOAD_STEPS = 8, 6, 6
 HOLD_POWER = 2.0  # power of the step's number that the time in a hold goes with
 # The stiffness of contact, MPa/mm: where pressures are the largest, 0.2 MPa, the wall is met to 0.1 mm.
 CONTACT_STIFFNESS = 2.0
+PRESSURE_LEVELS = 32  # of pressure, up to the largest: what a face has is rounded to them
+PRESSING_STEPS, PRESSED_STEPS = 6, 4  # while the pressure comes on, and is held
 MAX_THREADS = 4  # of one simulation; more wait for memory
 
 
@@ -72,10 +90,8 @@ class SocketFit:
     def ends(self) -> tuple[tuple[str, float, float], ...]:
         """Name, end of coming on and end of the hold, s, of donning and of every load."""
         ends, start = [], 0.0
-        for name, ramp, hold in (
-            ("donning", self.donning_s, self.hold_s),
-            *((load.name, load.ramp_s, load.hold_s) for load in self.loads),
-        ):
+        loads = ((load.name, load.ramp_s, load.hold_s) for load in self.loads)
+        for name, ramp, hold in (("donning", self.donning_s, self.hold_s), *loads):
             ends.append((name, start + ramp, start + ramp + hold))
             start += ramp + hold
         return tuple(ends)
@@ -103,15 +119,20 @@ def build_socket_problem(
         after = _build_wrench(load, fit)
         motion, before = motion.then(_build_loading(load, before, after)), after
     body = RigidBody(shape, mesh.face_sets[OUTER], motion, fit.friction, name="socket")
+    return build_limb_problem(mesh, materials, motion.times[-1], bodies=(body,))
+
+
+def build_limb_problem(mesh: Mesh, materials: Mapping[str, Material], end_s: float, **loads: Any) -> Problem:
+    """A limb without an indenter, bones and proximal cut held; ``loads``: what else acts (see `Problem`)."""
     return Problem(
         mesh=mesh,
         materials=materials,
         fixed=mesh.held,
         contact_faces=np.zeros((0, mesh.kind.faces.shape[1]), dtype=np.int64),
         indenter=None,
-        history=History(np.array([0.0, motion.times[-1]]), np.zeros(2)),
-        bodies=(body,),
+        history=History(np.array([0.0, end_s]), np.zeros(2)),
         element=ELEMENT,
+        **loads,
     )
 
 
@@ -170,3 +191,55 @@ def grade_ramp_and_hold(start: float, on: float, off: float, ramp_steps: int, ho
 def choose_threads(available: int | None = None) -> int:
     """Threads of one simulation, of those that are ``available``; by default all of the machine's."""
     return min(available or count_usable_cores(), MAX_THREADS)
+
+
+def build_pressed_problem(
+    mesh: Mesh, materials: Mapping[str, Material], pressure_kPa: Array, on_s: float, hold_s: float
+) -> Problem:
+    """A limb whose outer surface bears a pressure that follows it; bones and proximal cut are held.
+
+    Parameters
+    ----------
+    mesh : LPS mm, with the face set ``skin`` and node sets ``fixed_*``.
+    materials : by region.
+    pressure_kPa : (f,) of the faces of that set, 0 or more; rounded to `PRESSURE_LEVELS`
+        parts of the largest.
+    on_s, hold_s : how long the pressure comes on and then stays.
+
+    Raises
+    ------
+    ProblemError
+        Where no face bears any.
+    """
+    top = float(pressure_kPa.max())
+    if not top > 0.0:
+        raise ProblemError("no pressure is stated anywhere on the limb", remedy="state one below the brim")
+    faces, levels = mesh.face_sets[OUTER], np.round(PRESSURE_LEVELS * pressure_kPa / top)
+    times = [0.0, on_s, on_s + hold_s] if hold_s > 0.0 else [0.0, on_s]
+    pressures = []
+    for level in np.unique(levels[levels > 0.0]):
+        value = 1e-3 * top * level / PRESSURE_LEVELS
+        pressures.append(Pressure(faces[levels == level], times, [0.0, *(value for _ in times[1:])]))
+    return build_limb_problem(mesh, materials, times[-1], pressures=tuple(pressures))
+
+
+def press_limb(problem: Problem, on_step: Callable[[Step], None] | None = None) -> Result:
+    """Simulate a problem of `build_pressed_problem`; the last state is kept."""
+    _, on, *hold = map(float, problem.pressures[0].times)
+    times = grade_ramp_and_hold(0.0, on, hold[-1] if hold else on, PRESSING_STEPS, PRESSED_STEPS)
+    control = StepControl(times=tuple(times), threads=choose_threads())
+    return solve(problem, control, on_step=on_step, store="all")
+
+
+def extract_outer_surface(mesh: Mesh, displacement: Array | None = None) -> Surface:
+    """The limb's outer surface, open at the proximal cut, LPS mm, moved by a displacement (n, 3) of nodes.
+
+    The faces of quadratic cells are each four triangles.
+    """
+    faces = mesh.face_sets[OUTER]
+    if faces.shape[1] == 6:
+        corners = [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]
+        faces = np.vstack([faces[:, list(corner)] for corner in corners])
+    nodes, local = np.unique(faces, return_inverse=True)
+    points = mesh.points if displacement is None else mesh.points + displacement
+    return Surface(points[nodes], local.reshape(-1, 3))

@@ -236,7 +236,7 @@ class Strains:
     def of(cls, system: System, laws: Laws, state: State) -> Self:
         """Of a state that kept its memory."""
         fields = compute_element_fields(system, laws, state)
-        most, least = fields.stretches[:, 0] ** 2, fields.stretches[:, 2] ** 2
+        most, _, least = fields.stretches.T**2
         volume = system.weights.sum(axis=1)
         return cls((most - least) / 4.0, (1.0 - least) / 2.0, 1e3 * fields.energy, volume)
 

@@ -59,9 +59,10 @@ class Relief:
 
     def __post_init__(self) -> None:
         depths = np.zeros(len(self.named))
-        self.trials = [SocketTrial(depths, self.start, self.merit(self.start))]
+        self._others = np.setdiff1d(np.arange(len(self.start)), self.named)
         self._slopes = np.zeros((len(self.start), len(self.named)))
         self._slopes[list(self.named), np.arange(len(self.named))] = GUESSED_SLOPE_PER_MM
+        self.trials = [SocketTrial(depths, self.start, self.merit(self.start))]
 
     @property
     def best(self) -> SocketTrial:
@@ -72,9 +73,8 @@ class Relief:
         return self._compute_merit(_log(pressures))
 
     def _compute_merit(self, y: Array) -> float:
-        named = list(self.named)
+        named, others = list(self.named), self._others
         gain = y[named] - _log(self.reference)[named]
-        others = np.setdiff1d(np.arange(len(y)), named)
         excess = np.maximum(y[others] - np.log(self.limits[others]), 0.0).max(initial=0.0)
         return float(gain.max() + MEAN_WEIGHT * gain.mean() + LIMIT_WEIGHT * excess)
 
@@ -99,7 +99,9 @@ class Relief:
                 self.trust_mm = min(2.0 * self.trust_mm, MAX_TRUST_MM)
             elif share < POOR:
                 self.trust_mm /= 2.0
-            self._update_slopes(depths, pressures)
+            step = depths - self.best.depths
+            wrong = _log(pressures) - self._predict_pressures(depths)
+            self._slopes += np.outer(wrong, step) / (step @ step)
         self.trials.append(trial)
         return trial
 
@@ -109,18 +111,12 @@ class Relief:
         assert best.pressures is not None
         return np.asarray(_log(best.pressures) + self._slopes @ (depths - best.depths))
 
-    def _update_slopes(self, depths: Array, pressures: Array) -> None:
-        step = depths - self.best.depths
-        wrong = _log(pressures) - self._predict_pressures(depths)
-        self._slopes += np.outer(wrong, step) / (step @ step)
-
     def _solve_linear_program(self) -> Array:
         """The linear program's depths: unknowns are the depths, the worst gain and the excess."""
-        named, k = list(self.named), len(self.named)
+        named, others, k = list(self.named), self._others, len(self.named)
         best = self.best
         assert best.pressures is not None
         rest = _log(best.pressures) - self._slopes @ best.depths
-        others = np.setdiff1d(np.arange(len(rest)), named)
         gains = np.column_stack([self._slopes[named], -np.ones(k), np.zeros(k)])
         beyond = np.column_stack([self._slopes[others], np.zeros(len(others)), -np.ones(len(others))])
         cost = np.concatenate([MEAN_WEIGHT * self._slopes[named].mean(axis=0), [1.0, LIMIT_WEIGHT]])
@@ -129,9 +125,8 @@ class Relief:
         found = linprog(
             cost,
             A_ub=np.vstack([gains, beyond]),
-            b_ub=np.concatenate(
-                [_log(self.reference)[named] - rest[named], np.log(self.limits[others]) - rest[others]]
-            ),
+            b_ub=np.concatenate([_log(self.reference)[named], np.log(self.limits[others])])
+            - np.concatenate([rest[named], rest[others]]),
             bounds=[*zip(low, high, strict=True), (None, None), (0.0, None)],
         )
         assert found.success, found.message  # the excess is free to grow

@@ -216,11 +216,9 @@ class DaskExecutor(Executor):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with suppress(Exception):  # nothing more is wanted of either
-            self._client.close(timeout=2)
-        if self._cluster is not None:
-            with suppress(Exception):
-                self._cluster.close(timeout=2)
+        for one in (self._client, self._cluster):
+            with suppress(Exception):  # nothing more is wanted of either, and there may be no cluster
+                one.close(timeout=2)
 
 
 def _import_dask(module: str) -> Any:

@@ -23,8 +23,8 @@ the same mesh with other materials is quicker with ``warm_start=result`` of a ru
 from __future__ import annotations
 
 from ..shapes import RigidSurface
-from .contact.indenter import Indenter
 from .contact.open_surface import OpenSurface
+from .contact.rigid import Indenter
 from .contact.smooth_surface import SmoothSurface
 from .diagnostics import SimulationWarning, list_texts
 from .kernel.elements import ELEMENTS

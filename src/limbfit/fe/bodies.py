@@ -27,7 +27,7 @@ from .contact.friction import StickyContact
 from .contact.tool import Distances, Pose, Tool
 from .kernel.elements import Element
 from .motion import Drives, Motion, RigidBody
-from .pattern import Pattern, find_places, find_positions
+from .pattern import Pattern, find_positions
 from .problem import Problem, ProblemError
 
 Index = NDArray[np.int32]
@@ -140,24 +140,18 @@ class Bodies:
     def _build_shares(self, surface: ContactSurface) -> sp.csr_matrix:
         """Shares (unknowns, 3 c) of the unknowns in the position of every contact point."""
         whole = sp.kron(surface.shares, sp.eye(3), format="csr")
-        numbers = self.pattern.numbers[: self.nodes].ravel()
-        picked = np.flatnonzero(numbers >= 0)
-        place = sp.csr_matrix(
-            (np.ones(len(picked)), (numbers[picked], picked)), shape=(self.unknowns, numbers.size)
-        )
-        return place @ whole
+        own = whole[np.flatnonzero(self.pattern.numbers[: self.nodes].ravel() >= 0)]
+        own.resize(self.unknowns, whole.shape[1])  # the coordinates of bodies are the last unknowns
+        return own
 
     def _locate_border(self) -> None:
         """Where the entries of the bodies' coordinates are in the matrix."""
         start = self.unknowns - self.free
-        own = np.arange(start, self.unknowns)
-        touching = np.flatnonzero(np.diff(self._spread.indptr))
-        pairs = np.array([(r, c) for r in touching for c in own], dtype=np.int64).reshape(-1, 2)
-        places = find_places(self.pattern.indptr, self.pattern.indices, pairs)
-        self._beside = pairs[places >= 0] - [0, start], places[places >= 0]
-        corner = np.array([(r, c) for r in own for c in own if c >= r], dtype=np.int64).reshape(-1, 2)
-        places = find_places(self.pattern.indptr, self.pattern.indices, corner)
-        self._corner = corner[places >= 0] - start, places[places >= 0]
+        places = np.flatnonzero(self.pattern.indices >= start)
+        rows = np.searchsorted(self.pattern.indptr, places, side="right") - 1
+        columns, above = self.pattern.indices[places] - start, rows < start
+        self._beside = rows[above], columns[above], places[above]
+        self._corner = rows[~above] - start, columns[~above], places[~above]
 
     @property
     def first(self) -> _Body:
@@ -272,10 +266,8 @@ class Bodies:
     def _add_border(self, columns: Array, corner: Array, data: Array) -> None:
         """Add what points feel of the coordinates (c, 3, k), and coordinates of each other (k, k)."""
         beside = self._spread @ columns.reshape(-1, self.free)
-        pairs, places = self._beside
-        data[places] += beside[pairs[:, 0], pairs[:, 1]]
-        pairs, places = self._corner
-        data[places] += corner[pairs[:, 0], pairs[:, 1]]
+        for values, (rows, own, places) in ((beside, self._beside), (corner, self._corner)):
+            data[places] += values[rows, own]
 
     def differentiate_advance(self, found: Contacts) -> Array:
         """Mixed derivative (r, 3) with respect to displacement and advance of the first body, times -1."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..arrays import Array
 from ..errors import ProblemError
+from ..mesh import check as check_mesh
 from .contact.friction import LAWS_OF_STICKING
 from .kernel.elements import ELEMENTS, compute_reference_gradients
 from .problem import Problem
@@ -14,11 +16,8 @@ def check(problem: Problem) -> None:
     """Raise `ProblemError` where the problem is impossible as stated."""
     _check_choices(problem)
     mesh, n = problem.mesh, len(problem.mesh.points)
-    if not np.isfinite(mesh.points).all():
-        raise ProblemError("the mesh has points that are not finite")
-    if not len(mesh.cells):
-        raise ProblemError("the mesh has no cells")
-    indices = [("cells", mesh.cells), ("fixed nodes", problem.fixed)]
+    check_mesh(mesh, lambda _: _measure_cells(problem))
+    indices = [("fixed nodes", problem.fixed)]
     indices += [("contact faces", np.asarray(body.faces)) for body in problem.rigid_bodies]
     indices += [("pressed faces", np.asarray(one.faces)) for one in problem.pressures]
     indices += [("support nodes", support.nodes) for support in problem.supports]
@@ -28,7 +27,6 @@ def check(problem: Problem) -> None:
             raise ProblemError(f"the {name} are a mask", remedy="give node numbers: numpy.flatnonzero(mask)")
         if value.size and (value.min() < 0 or value.max() >= n):
             raise ProblemError(f"the {name} refer to nodes that the mesh does not have")
-    _check_cells(problem)
     _check_fibres(problem)
     _check_prestretch(problem)
     _check_bodies(problem)
@@ -73,38 +71,29 @@ def _check_friction(friction: str | float, sticking: str) -> None:
         )
 
 
-def _check_cells(problem: Problem) -> None:
+def _measure_cells(problem: Problem) -> Array:
+    """What is positive in upright cells (m, k), at their quadrature points and of their corners."""
     mesh = problem.mesh
-    unique = np.unique(np.sort(mesh.cells, axis=1), axis=0)
-    if len(unique) != len(mesh.cells):
-        raise ProblemError(f"the mesh has {len(mesh.cells) - len(unique)} duplicate cells")
     _, weights = compute_reference_gradients(problem.formulation, mesh.points, mesh.cells)
-    upright = (weights > 0).all(axis=1)
+    if not mesh.kind.is_tetrahedron:
+        return weights
     # A quadratic map may be upright at its points and its corners not.
-    if mesh.kind.is_tetrahedron and len(mesh.kind.nodes) > mesh.kind.corners:
-        corners = mesh.points[mesh.corners]
-        upright &= np.linalg.det(corners[:, 1:] - corners[:, :1]) > 0
-    bad = np.flatnonzero(~upright)
-    if len(bad):
-        raise ProblemError(f"{len(bad)} cells are inverted or flat, the first is cell {bad[0]}")
-    used = np.zeros(len(mesh.points), dtype=bool)
-    used[mesh.cells] = True
-    if not used.all():
-        raise ProblemError(f"{(~used).sum()} nodes belong to no cell", remedy="drop them from the mesh")
+    corners = mesh.points[mesh.corners]
+    return np.column_stack([weights, np.linalg.det(corners[:, 1:] - corners[:, :1])])
 
 
 def _check_fibres(problem: Problem) -> None:
     for region in problem.mesh.region_names:
-        if problem.activation is None and problem.materials[region].table().active > 0.0:
+        table = problem.materials[region].table()
+        if problem.activation is None and table.active > 0.0:
             raise ProblemError(
                 f"the active stress of {region!r} acts at no stated time", remedy="state Problem.activation"
             )
+        if problem.fibres is None and table.has_fibres:
+            raise ProblemError(
+                f"the fibres of {region!r} have no direction", remedy="state fibres, (3,) or (cells, 3)"
+            )
     if problem.fibres is None:
-        for region in problem.mesh.region_names:
-            if problem.materials[region].table().has_fibres:
-                raise ProblemError(
-                    f"the fibres of {region!r} have no direction", remedy="state fibres, (3,) or (cells, 3)"
-                )
         return
     given = np.asarray(problem.fibres, dtype=float)
     if given.shape not in ((3,), (len(problem.mesh.cells), 3)):

@@ -118,37 +118,27 @@ def find_penetration(
     return _build_warning("sunk", text, len(deep), displacement[deep[0]], displacement)
 
 
-def find_unbalanced_steps(
-    displacement: Array, steps: Sequence[tuple[float, float]], tolerance: float
+def find_inexact_steps(
+    kind: Literal["unbalanced", "unsettled"],
+    displacement: Array,
+    steps: Sequence[tuple[float, float]],
+    tolerance: float,
 ) -> tuple[SimulationWarning, ...]:
-    """Steps, as (mm, residual over reactions), that were accepted at more than the tolerance."""
+    """Steps, as (mm, residual over reactions), that were accepted at more than the tolerance, or whose
+    friction did not settle with the normal force."""
     if not steps:
         return ()
-    worst = max(residual for _, residual in steps)
-    text = (
-        f"{len(steps)} steps are in equilibrium to {worst:.2g} of the reactions only, not to "
-        f"{tolerance:.2g}, first at {steps[0][0]:.3g} mm: the force may be off by as much"
-    )
-    return _build_warning("unbalanced", text, len(steps), steps[0][0], displacement)
-
-
-def find_unconverged_friction(
-    displacement: Array, steps: Sequence[tuple[float, float]]
-) -> tuple[SimulationWarning, ...]:
-    """Steps, as (mm, residual over reactions), whose friction did not settle with the normal force."""
-    if not steps:
-        return ()
-    worst = max(residual for _, residual in steps)
-    text = (
-        f"the friction of {len(steps)} steps belongs to a normal force that is off by up to {worst:.2g} of "
-        f"the reactions, first at {steps[0][0]:.3g} mm: use more steps"
-    )
-    return _build_warning("unsettled", text, len(steps), steps[0][0], displacement)
+    count, worst, first = len(steps), max(residual for _, residual in steps), f"first at {steps[0][0]:.3g} mm"
+    texts = {
+        "unbalanced": f"{count} steps are in equilibrium to {worst:.2g} of the reactions only, not to "
+        f"{tolerance:.2g}, {first}: the force may be off by as much",
+        "unsettled": f"the friction of {count} steps belongs to a normal force that is off by up to "
+        f"{worst:.2g} of the reactions, {first}: use more steps",
+    }
+    return _build_warning(kind, texts[kind], count, steps[0][0], displacement)
 
 
 def find_inexact_sensitivities(displacement: Array, count: int) -> tuple[SimulationWarning, ...]:
     """Sensitivities of unstable equilibria that could not be solved for."""
-    if not count:
-        return ()
     text = f"{count} sensitivities at unstable equilibria are inexact"
-    return _build_warning("inexact", text, count, 0.0, displacement)
+    return _build_warning("inexact", text, count, 0.0, displacement) if count else ()

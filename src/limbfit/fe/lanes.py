@@ -42,11 +42,8 @@ POINT = np.dtype(
         ("n", "f8", (3, 3, _L)),  # columns: spatial principal directions
         ("e", "f8", (3, _L)),  # isochoric logarithmic stretches
         ("energy", "f8", _L),
-        (
-            "beta",
-            "f8",
-            (3, _L),
-        ),  # this and the next two as `materials.elastic` says; then see `kernel.response`
+        # The next three as `materials.elastic` says; then see `kernel.response`.
+        ("beta", "f8", (3, _L)),
         ("slope", "f8", (6, _L)),
         ("quotient", "f8", (3, _L)),
         ("volumetric", "f8", _L),  # U

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Array
 from ..errors import ProblemError
@@ -157,10 +157,8 @@ class Motion:
         """Times between the ends at which a rate, or what drives a coordinate, changes, s."""
         steps = np.diff(self.times)
         kept = steps > 0.0
-        rates, forced = (
-            np.diff(np.nan_to_num(self._driven), axis=0)[kept] / steps[kept, None],
-            np.asarray(self.forced)[kept],
-        )
+        rates = np.diff(np.nan_to_num(self._driven), axis=0)[kept] / steps[kept, None]
+        forced = np.asarray(self.forced)[kept]
         size = np.abs(rates).max(axis=0, initial=0.0)
         changed = (np.abs(np.diff(rates, axis=0)) > 1e-9 * size).any(axis=1)
         changed |= (forced[1:] != forced[:-1]).any(axis=1)
@@ -236,6 +234,24 @@ class RigidBody:
         return np.asarray(self.shape.centre if self.pivot is None else self.pivot, dtype=float)
 
 
+def read_course(what: str, of: str, times: ArrayLike, values: ArrayLike) -> tuple[Array, Array]:
+    """Times (n,) s and values (n,) that are piecewise linear between them.
+
+    Raises
+    ------
+    ProblemError
+        Where there are not as many of both, two or more, some are not finite, or times do not grow from 0.
+    """
+    t, v = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
+    if t.ndim != 1 or t.shape != v.shape or len(t) < 2:
+        raise ProblemError(f"{what} needs two or more times and as many {of}")
+    if not (np.isfinite(t).all() and np.isfinite(v).all()):
+        raise ProblemError(f"{what} holds {of} or times that are not finite")
+    if t[0] != 0.0 or not (np.diff(t) > 0).all():
+        raise ProblemError(f"the times of {what} do not grow from 0: {', '.join(f'{x:g}' for x in t[:4])}")
+    return t, v
+
+
 @dataclass(frozen=True)
 class Activation:
     """The share of full activation over time, piecewise linear; the last one holds on.
@@ -255,12 +271,8 @@ class Activation:
     shares: Sequence[float] | Array
 
     def __post_init__(self) -> None:
-        times, shares = np.asarray(self.times, dtype=float), np.asarray(self.shares, dtype=float)
-        if times.ndim != 1 or times.shape != shares.shape or len(times) < 2:
-            raise ProblemError("an activation needs two or more times and as many shares")
-        if not np.isfinite(times).all() or times[0] != 0.0 or not (np.diff(times) > 0).all():
-            raise ProblemError("the times of an activation do not grow from 0")
-        if not (np.isfinite(shares).all() and (shares >= 0.0).all()):
+        times, shares = read_course("an activation", "shares", self.times, self.shares)
+        if not (shares >= 0.0).all():
             raise ProblemError("a share of an activation is negative or not finite")
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "shares", shares)

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from .kernel.elements import Element
+from .kernel.elements import compute_face_areas
 from .kernel.laws import Laws
 from .kernel.response import add_fibre_stress, elastic_response, kirchhoff_stress, pressures
 from .lanes import LANES, workspace
@@ -87,7 +87,9 @@ def compute_contact_pressure(system: System, laws: Laws, state: State) -> Array:
     force = system.contact_force(state.rows, increment)[: system.nodes]
     faces = np.concatenate([np.asarray(body.faces) for body in system.problem.rigid_bodies])
     faces = faces[np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])]  # each once
-    share = _compute_nodal_areas(system.element, system.points + state.u, faces)
+    N, areas = compute_face_areas(system.element, system.points + state.u, faces, "gauss")
+    parts = np.einsum("fqi,qk->fki", areas, N).reshape(-1, 3)
+    share = np.stack([np.bincount(faces.ravel(), part, len(pressure)) for part in parts.T], axis=1)
     to_middles = _build_corner_mean(len(pressure), faces) if faces.shape[1] == 6 else None
     if to_middles is not None:
         force, share = (values + to_middles.T @ values for values in (force, share))
@@ -105,16 +107,6 @@ def _build_corner_mean(n: int, faces: NDArray[np.int64]) -> sp.csr_matrix:
     corners, beside = faces[:, [0, 0, 1, 1, 2, 2]].ravel(), faces[:, [3, 5, 3, 4, 4, 5]].ravel()
     count = np.bincount(corners, minlength=n)
     return sp.csr_matrix((1.0 / count[corners], (corners, beside)), shape=(n, n))
-
-
-def _compute_nodal_areas(element: Element, points: Array, faces: NDArray[np.int64]) -> Array:
-    """Each node's share (n, 3) of the area of the faces (f, k), outward, mm^2."""
-    at, weights = element.face_rules["gauss"]
-    N, dN = element.face_shape(at)
-    tangents = np.einsum("fki,qkj->fqij", points[faces], dN)
-    normals = np.cross(tangents[..., 0], tangents[..., 1])
-    shares = np.einsum("fqi,q,qk->fki", normals, weights, N).reshape(-1, 3)
-    return np.stack([np.bincount(faces.ravel(), part, len(points)) for part in shares.T], axis=1)
 
 
 def average_at_nodes(system: System, values: Array) -> Array:

@@ -52,31 +52,15 @@ def append_rows(graph: sp.csr_matrix, borders: Sequence[NDArray[np.int64]]) -> s
     return whole
 
 
-@njit(cache=True)
-def build_upper_pattern(numbers, start, neighbours, n):  # type: ignore[no-untyped-def]
-    """Upper triangle of the unknowns' graph, rows sorted, from the sorted graph of the nodes."""
-    indptr = np.zeros(n + 1, dtype=np.int32)
-    for sweep in range(2):
-        if sweep == 1:
-            for i in range(n):
-                indptr[i + 1] += indptr[i]
-            indices = np.empty(indptr[n], dtype=np.int32)
-        for a in range(numbers.shape[0]):
-            for i in range(3):
-                row = numbers[a, i]
-                if row < 0:
-                    continue
-                count = 0
-                for p in range(start[a], start[a + 1]):
-                    for j in range(3):
-                        column = numbers[neighbours[p], j]
-                        if column >= row:
-                            if sweep == 1:
-                                indices[indptr[row] + count] = column
-                            count += 1
-                if sweep == 0:
-                    indptr[row + 1] = count
-    return indptr, indices
+def build_upper_pattern(
+    numbers: NDArray[np.int32], graph: sp.csr_matrix
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Upper triangle (indptr, indices) of the unknowns' graph, rows sorted, from that of the nodes."""
+    kept = np.flatnonzero(numbers.ravel() >= 0)
+    whole = sp.kron(graph.astype(np.int8), np.ones((3, 3), dtype=np.int8), format="bsr").tocsr()
+    upper = sp.triu(whole[kept][:, kept], format="csr")
+    upper.sort_indices()
+    return upper.indptr.astype(np.int32), upper.indices.astype(np.int32)
 
 
 @njit(cache=True)
@@ -108,16 +92,4 @@ def find_positions(cells, numbers, indptr, indices):  # type: ignore[no-untyped-
                 if low >= 0:
                     out[e, at] = place_of(indices, indptr[low], indptr[low + 1], high)
                 at += 1
-    return out
-
-
-@njit(cache=True)
-def find_places(indptr, indices, pairs):  # type: ignore[no-untyped-def]
-    """Place (k,) in the data of the entries at ``pairs (k, 2)`` of row and column; -1 where there is none."""
-    out = np.full(len(pairs), -1, dtype=np.int64)
-    for i in range(len(pairs)):
-        end = indptr[pairs[i, 0] + 1]
-        at = place_of(indices, indptr[pairs[i, 0]], end, pairs[i, 1])
-        if at < end and indices[at] == pairs[i, 1]:
-            out[i] = at
     return out

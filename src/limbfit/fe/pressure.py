@@ -16,8 +16,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from ..arrays import Array
-from ..errors import ProblemError
 from .kernel.elements import Element
+from .motion import read_course
 from .pattern import Pattern, find_positions
 
 
@@ -37,13 +37,7 @@ class Pressure:
     values: Sequence[float] | Array
 
     def __post_init__(self) -> None:
-        times, values = np.asarray(self.times, dtype=float), np.asarray(self.values, dtype=float)
-        if times.ndim != 1 or times.shape != values.shape or len(times) < 2:
-            raise ProblemError("a pressure needs two or more times and as many values")
-        if not (np.isfinite(times).all() and np.isfinite(values).all()):
-            raise ProblemError("a pressure holds values that are not finite")
-        if times[0] != 0.0 or not (np.diff(times) > 0).all():
-            raise ProblemError("the times of a pressure do not grow from 0")
+        times, values = read_course("a pressure", "values", self.times, self.values)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
 

@@ -13,10 +13,10 @@ from ..arrays import Array
 from ..errors import ProblemError
 from ..mesh import Mesh
 from ..phases import MotionPhase, find_boundaries, find_loading_end, find_phases
-from .contact.indenter import Indenter
+from .contact.rigid import Indenter
 from .kernel.elements import ELEMENTS, Element
 from .materials import Material
-from .motion import Activation, Drives, Motion, RigidBody
+from .motion import Activation, Drives, Motion, RigidBody, read_course
 from .pressure import Pressure
 
 
@@ -37,20 +37,12 @@ class History:
         if (self.displacement is None) == (self.force is None):
             raise ProblemError("a history is one of displacement or one of force, not both or none")
         driver = "displacement" if self.force is None else "force"
-        times, values = np.asarray(self.times, dtype=float), np.asarray(getattr(self, driver), dtype=float)
+        times, values = read_course(f"a {driver} history", f"{driver}s", self.times, getattr(self, driver))
         if self.across is not None:
             across = np.asarray(self.across, dtype=float)
             if across.shape != (len(times), 2) or not np.isfinite(across).all():
                 raise ProblemError("a move across the axis needs two finite numbers for each time")
             object.__setattr__(self, "across", across)
-        if times.ndim != 1 or times.shape != values.shape or len(times) < 2:
-            raise ProblemError(f"a {driver} history needs two or more times and as many {driver}s")
-        if not (np.isfinite(times).all() and np.isfinite(values).all()):
-            raise ProblemError(f"the {driver} history holds values that are not finite")
-        if times[0] != 0.0:
-            raise ProblemError(f"the {driver} history starts at {times[0]} s, not at 0")
-        if not (np.diff(times) > 0).all():
-            raise ProblemError(f"the {driver} history goes backwards in time")
         object.__setattr__(self, "times", times)
         object.__setattr__(self, driver, values)
 

@@ -169,24 +169,23 @@ class Result:
         """The kept state with stresses: where loading ends, or as far as the simulation came."""
         return next((state for state in self.states if state.memory is not None), None)
 
-    def _interpolate(self, values: Array, t: Array) -> Array:
-        return interpolate(self.times, self.force, self.problem.history.kinks, values, t)
-
-    def _clip_times(self, t: Array) -> Array:
-        return np.clip(t, self.times[0], self.times[-1])
+    def _interpolate(self, values: Array | None, t: Array) -> Array:
+        if values is None:
+            raise ValueError("the simulation ran without sensitivities")
+        at = np.clip(np.asarray(t, dtype=float), self.times[0], self.times[-1])
+        return interpolate(self.times, self.force, self.problem.history.kinks, values, at)
 
     def force_at(self, t: Array) -> Array:
         """Force (k,) at times ``t (k,)``, N; interpolated between steps, never negative."""
-        at = self._clip_times(np.asarray(t, dtype=float))
-        return self._interpolate(self.force, at)
+        return self._interpolate(self.force, t)
 
     def displacement_at(self, t: Array) -> Array:
         """Displacement (k,) at times ``t (k,)``, mm, between steps as `force_at`."""
-        return self._interpolate(self.displacement, self._clip_times(np.asarray(t, dtype=float)))
+        return self._interpolate(self.displacement, t)
 
     def sensitivity_at(self, t: Array) -> Array:
         """Derivative (k, p) of `force_at` with respect to the parameters."""
-        return self._slope_at(self.force_sensitivity, t)
+        return self._interpolate(self.force_sensitivity, t)
 
     def response_at(self, t: Array) -> Array:
         """What answers to the drive at times ``t (k,)``: force, N, or displacement, mm, under a force."""
@@ -195,12 +194,7 @@ class Result:
     def response_sensitivity_at(self, t: Array) -> Array:
         """Derivative (k, p) of `response_at` with respect to the parameters."""
         forced = self.problem.history.forced
-        return self._slope_at(self.displacement_sensitivity if forced else self.force_sensitivity, t)
-
-    def _slope_at(self, slopes: Array | None, t: Array) -> Array:
-        if slopes is None:
-            raise ValueError("the simulation ran without sensitivities")
-        return self._interpolate(slopes, self._clip_times(np.asarray(t, dtype=float)))
+        return self._interpolate(self.displacement_sensitivity if forced else self.force_sensitivity, t)
 
 
 def interpolate(times: Array, force: Array, kinks: Array, values: Array, at: Array) -> Array:

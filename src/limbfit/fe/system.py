@@ -19,7 +19,7 @@ from .bodies import Bodies, Contacts, count_body_rows
 from .checking import check
 from .contact.contact import ContactSurface, Touch
 from .contact.friction import StickyContact
-from .contact.indenter import Indenter
+from .contact.rigid import Indenter
 from .contact.tool import Tool
 from .kernel.assembly import Elements, assemble
 from .kernel.elements import Element, compute_reference_gradients
@@ -188,9 +188,9 @@ class System:
 
     def _build_pattern(self, problem: Problem) -> None:
         moved = [np.unique(body.faces) for body in problem.rigid_bodies if body.motion.free.any()]
-        graph, numbers = append_rows(build_node_graph(self.cells, self.nodes), moved), self.numbers
-        self.indptr, self.indices = build_upper_pattern(numbers, graph.indptr, graph.indices, len(self.free))
-        self.cell_positions = find_positions(self.cells, numbers, self.indptr, self.indices)
+        graph = append_rows(build_node_graph(self.cells, self.nodes), moved)
+        self.indptr, self.indices = build_upper_pattern(self.numbers, graph)
+        self.cell_positions = find_positions(self.cells, self.numbers, self.indptr, self.indices)
 
     @property
     def unknowns(self) -> int:
@@ -199,19 +199,12 @@ class System:
     def fits(self, problem: Problem) -> bool:
         """True if this discretisation is also that of ``problem`` (the same mesh, supports and indenter)."""
         mine = self.problem
+        shared = "mesh", "fixed", "contact_faces", "indenter", "bodies", "pressures", "fibres", "prestretch"
+        equal = "supports", "element", "start", "contact_rule"
         return (
-            mine.mesh is problem.mesh
-            and mine.fixed is problem.fixed
-            and mine.contact_faces is problem.contact_faces
-            and mine.indenter is problem.indenter
-            and mine.bodies is problem.bodies
-            and mine.pressures is problem.pressures
-            and mine.fibres is problem.fibres
-            and mine.prestretch is problem.prestretch
+            all(getattr(mine, name) is getattr(problem, name) for name in shared)
+            and all(getattr(mine, name) == getattr(problem, name) for name in equal)
             and mine.history.forced == problem.history.forced
-            and mine.supports == problem.supports
-            and (mine.element, mine.start, mine.contact_rule)
-            == (problem.element, problem.start, problem.contact_rule)
         )
 
     def impose(self, u: Array, increment: Increment) -> Array:

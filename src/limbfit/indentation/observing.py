@@ -22,7 +22,7 @@ from ..mesh.cells import linear_simplex, quadratic_simplex
 from ..shapes.triangles import build_tree, closest_point
 from ..study import Vector
 from .sites import SiteModel, read_indenter
-from .waves import WavePlace, compute_wave_speeds, place_waves, to_vector3
+from .waves import WavePlace, compute_wave_speeds, to_vector3
 
 OFF_SKIN_MM = 5.0  # a point farther from the skin than this is not on it
 RINGS_MM, DIRECTIONS = (3.0, 8.0, 15.0), 8
@@ -93,10 +93,39 @@ def find_layers_under(model: SiteModel) -> tuple[str, ...]:
 def place_waves_under(
     model: SiteModel, mesh: Mesh, wanted: Sequence[tuple[str, float | None]] | None = None
 ) -> tuple[WavePlace, ...]:
-    """Places of shear waves under a site's indenter, which run along its edge; see `place_waves`."""
-    indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
-    edge, _, axis = indenter.frame
-    return place_waves(mesh, np.array(model.position), axis, edge, wanted)
+    """Places of shear waves under the middle of a site's indenter.
+
+    Tissue moves along the indenter's axis, and the waves run along its edge.
+
+    ``wanted``: tissues, each so deep below the skin, mm, or in its own middle; by default the middle of every
+    tissue.
+
+    Raises
+    ------
+    ProblemError
+        For a tissue that is not there, or not so deep.
+    """
+    way, _, axis = read_indenter(model.indenter, model.position, model.axis, model.edge).frame
+    position, top, spans = np.array(model.position), 0.0, {}
+    for gauge in find_gauges_along(mesh, position, axis):
+        spans[gauge.region] = (top, top + gauge.thickness_mm)
+        top += gauge.thickness_mm
+    found = []
+    for tissue, depth in [(name, None) for name in spans] if wanted is None else wanted:
+        if tissue not in spans:
+            raise ProblemError(
+                f"no {tissue} lies under the indenter's axis, only {', '.join(spans)}",
+                remedy="take its column out of the record's file of shear waves",
+            )
+        first, last = spans[tissue]
+        if depth is not None and not first <= depth <= last:
+            raise ProblemError(
+                f"{tissue} lies {first:.1f} to {last:.1f} mm deep, and not at {depth:g} mm",
+                remedy="name the column after the tissue that is there, or leave the depth out",
+            )
+        point = position + (0.5 * (first + last) if depth is None else depth) * axis
+        found.append(WavePlace(tissue, *map(to_vector3, (point, axis, way))))
+    return tuple(found)
 
 
 def find_nearby_skin_points(model: SiteModel) -> tuple[Vector, ...]:

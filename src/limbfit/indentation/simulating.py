@@ -17,7 +17,7 @@ import psutil
 
 from ..arrays import Array
 from ..execution import count_usable_cores
-from ..fe import Problem, Result, SimulationWarning, State, StepControl, System, solve
+from ..fe import Problem, Result, SimulationWarning, StepControl, System, solve
 from ..fields import Animation, write_fields
 from ..laws import LAWS, OGDEN, to_parameters
 from ..mesh import read_vtu
@@ -110,18 +110,16 @@ class Prepared:
     """What a process keeps of a site for its next simulations.
 
     ``problem``, ``system`` and ``penalty`` (of contact, 1/mm; None: the solver's first) follow from the site
-    alone. ``rested``: the newest simulation from rest with its parameters, ``latest``: the newest one from
-    first guesses with its job, ``link`` the newest of those that gave such to others; with all of their
-    states where they have sensitivities, else the deepest.
-    ``extension``: from a neighbourhood of that radius to the whole.
+    alone. ``kept``: the newest simulations with their jobs: from rest with sensitivities and without, from
+    first guesses, and of those that gave such to others; with all states where they have sensitivities or
+    more than the force is read from them, else the deepest. ``extension``: from a neighbourhood of that
+    radius to the whole.
     """
 
     problem: Problem
     system: System
     penalty: float | None
-    rested: dict[bool, tuple[tuple[float, ...], Result]] = field(default_factory=dict)
-    latest: tuple[SimulationJob, Result] | None = None
-    link: tuple[SimulationJob, Result] | None = None
+    kept: dict[str, tuple[SimulationJob, Result]] = field(default_factory=dict)
     extension: tuple[float, Extension] | None = None
 
 
@@ -132,9 +130,7 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
     """The site's discretisation and contact penalty; sites not used for longest are forgotten."""
     known = _prepared.get((model, tissues))
     if known is None:
-        problem = build_problem(
-            replace(model, law=OGDEN), read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE)
-        )
+        problem = _build_reference_problem(model, tissues)
         control = build_steps(model)
         penalty, system = control.penalty, System(problem, control.threads)
         if penalty is None:
@@ -153,6 +149,10 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
     return known
 
 
+def _build_reference_problem(model: SiteModel, tissues: tuple[str, ...]) -> Problem:
+    return build_problem(replace(model, law=OGDEN), read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE))
+
+
 def count_stored_nodes(memory: float, cores: int) -> int:
     """Nodes of the sites that a process keeps on a machine with so many bytes and cores."""
     return min(_KEPT_NODES, int(_SHARE * memory / (cores * _BYTES)))
@@ -167,8 +167,7 @@ def _estimate_yielding(model: SiteModel, tissues: tuple[str, ...]) -> float:
     taken over from the simulation before makes the answer depend on what that was.  Where other tissue lets
     the indenter sink in farther, the result says so.  Zero where the reference goes nowhere.
     """
-    mesh = read_vtu(model.mesh)
-    problem = build_problem(replace(model, law=OGDEN), mesh, dict.fromkeys(tissues, _REFERENCE))
+    problem = _build_reference_problem(model, tissues)
     deepest = problem.history.peak or float(problem.history.times[-1])
     times = tuple(deepest * np.arange(1, _REFERENCE_STEPS + 1) / _REFERENCE_STEPS)
     found = solve(problem, steps=replace(build_steps(model), times=times), store="peak")
@@ -188,47 +187,27 @@ def _solve(model: SiteModel, parameters: Parameters, **how: Any) -> Result:
     )
 
 
-def _solve_from_rest(
-    model: SiteModel, tissues: tuple[str, ...], parameters: tuple[float, ...], sensitivities: bool = True
-) -> Result:
-    """Simulate a site and keep that (see `Prepared`), unless this was the newest such simulation."""
-    known = _prepare(model, tissues)
-    kept = known.rested.get(sensitivities)
-    if kept is None or kept[0] != parameters:
-        values = to_parameters(np.array(parameters), tissues, model.law)
-        found = _solve(
-            model, values, sensitivities=sensitivities, store=_choose_stored_states(model, sensitivities)
-        )
-        kept = parameters, replace(found, states=tuple(map(_reduce_precision, found.states)))
-        known.rested[sensitivities] = kept
-    return kept[1]
-
-
-def _choose_stored_states(model: SiteModel, sensitivities: bool) -> str:
-    """Which states are kept: all, where they give first guesses or more than the force is read from them."""
-    return "all" if sensitivities or model.gauges else "peak"
-
-
-def _reduce_precision(state: State) -> State:
-    """Sensitivities are most of a state's memory; a first guess needs few digits of them."""
-    single = None if state.sensitivity is None else state.sensitivity.astype(np.float32)
-    return replace(state, sensitivity=single)  # type: ignore[arg-type]
-
-
 def _solve_job(job: SimulationJob) -> Result:
-    """A job's simulation, from the first guesses that it states; not done again if it was the newest one."""
-    model, tissues = job.model, job.tissues
-    if not job.starts and job.nested_mm is None:
-        return _solve_from_rest(model, tissues, job.parameters, job.sensitivities)
-    known, wanted = _prepare(model, tissues), replace(job, times_s=())
-    if known.link is not None and known.link[0] == wanted:
-        return known.link[1]
-    if known.latest is None or known.latest[0] != wanted:
-        values, with_slopes = to_parameters(np.array(job.parameters), tissues, model.law), job.sensitivities
-        store, warm = _choose_stored_states(model, with_slopes), _prepare_guesses(job, known)
-        found = _solve(model, values, sensitivities=with_slopes, warm_start=warm, store=store)
-        known.latest = wanted, replace(found, states=tuple(map(_reduce_precision, found.states)))
-    return known.latest[1]
+    """A job's simulation, from the first guesses that it states; not done again where that is kept."""
+    model, known, wanted = job.model, _prepare(job.model, job.tissues), replace(job, times_s=())
+    for one, kept in known.kept.values():
+        if one == wanted:
+            return kept
+    from_rest = not job.starts and job.nested_mm is None
+    found = _solve(
+        model,
+        to_parameters(np.array(job.parameters), job.tissues, model.law),
+        sensitivities=job.sensitivities,
+        warm_start=None if from_rest else _prepare_guesses(job, known),
+        store="all" if job.sensitivities or model.gauges else "peak",
+    )
+    # Sensitivities are most of a state's memory; a first guess needs few digits of them.
+    single = [None if s.sensitivity is None else s.sensitivity.astype(np.float32) for s in found.states]
+    pairs = zip(found.states, single, strict=True)
+    states = (replace(state, sensitivity=d) for state, d in pairs)  # type: ignore[arg-type]
+    found = replace(found, states=tuple(states))
+    known.kept[f"from rest, {job.sensitivities}" if from_rest else "from guesses"] = wanted, found
+    return found
 
 
 def _prepare_guesses(job: SimulationJob, known: Prepared) -> Result:
@@ -236,7 +215,7 @@ def _prepare_guesses(job: SimulationJob, known: Prepared) -> Result:
     if job.nested is None:
         found = _solve_job(job.before)
         if job.before.starts:
-            known.link = replace(job.before, times_s=()), found
+            known.kept["of guesses"] = replace(job.before, times_s=()), found
         return found
     near = _solve_job(job.nested)
     radius, centre = job.nested_mm, np.array(job.model.position)

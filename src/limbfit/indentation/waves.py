@@ -29,7 +29,7 @@ from ..fe import Material, Result
 from ..fe.kernel.evaluation_points import EvaluationPoints, evaluate_elastic_at
 from ..fe.kernel.laws import Laws
 from ..fe.memory import Memory
-from ..mesh import Mesh, find_gauges_along, locate
+from ..mesh import Mesh, locate
 from ..study import Vector
 
 DENSITY = 1000.0  # kg/m^3, as elastography takes it for all soft tissue
@@ -55,40 +55,6 @@ class WavePlace:
     point: Vector
     motion: Vector
     way: Vector
-
-
-def place_waves(
-    mesh: Mesh, position: Array, axis: Array, way: Array, wanted: Sequence[tuple[str, float | None]] | None
-) -> tuple[WavePlace, ...]:
-    """Places under the middle of an indenter: of each tissue so deep below the skin, mm, or its own middle.
-
-    None ``wanted``: the middle of every tissue. ``axis`` is the indenter's, along which the tissue moves;
-    waves run along ``way``.
-
-    Raises
-    ------
-    ProblemError
-        For a tissue that is not there, or not so deep.
-    """
-    found, top, spans = [], 0.0, {}
-    for gauge in find_gauges_along(mesh, position, axis):
-        spans[gauge.region] = (top, top + gauge.thickness_mm)
-        top += gauge.thickness_mm
-    for tissue, depth in [(name, None) for name in spans] if wanted is None else wanted:
-        if tissue not in spans:
-            raise ProblemError(
-                f"no {tissue} lies under the indenter's axis, only {', '.join(spans)}",
-                remedy="take its column out of the record's file of shear waves",
-            )
-        first, last = spans[tissue]
-        if depth is not None and not first <= depth <= last:
-            raise ProblemError(
-                f"{tissue} lies {first:.1f} to {last:.1f} mm deep, and not at {depth:g} mm",
-                remedy="name the column after the tissue that is there, or leave the depth out",
-            )
-        point = position + (0.5 * (first + last) if depth is None else depth) * axis
-        found.append(WavePlace(tissue, to_vector3(point), to_vector3(axis), to_vector3(way)))
-    return tuple(found)
 
 
 def to_vector3(values: Array) -> Vector:
@@ -125,10 +91,6 @@ class _Regions:
         motion, way = (np.array([getattr(one, name) for one in places])[number] for name in ("motion", "way"))
         return cls(points, nodes.astype(np.int64), number, motion, way)
 
-    def mean(self, values: Array) -> Array:
-        """Means (k,) of values (m,) over the points of each place."""
-        return np.bincount(self.place, values) / np.bincount(self.place)
-
     def speeds(self, laws: Laws, steps: Sequence[Array], seconds: Array, turned: NDArray[np.bool_]) -> Array:
         """Speeds (k, s) m/s after the ``steps``: displacements (n, 3) of the nodes, mm, since rest.
 
@@ -147,7 +109,8 @@ class _Regions:
             g = _build_contraction(A, N)
             stiffness = (1.0 + gamma.sum(axis=1))[of] * np.einsum("mr,mrs,ms->m", g, moduli, g)
             tension = np.einsum("mr,mr->m", _build_contraction(N, N), stress)
-            found.append(self.mean((stiffness + tension) / np.linalg.det(F)))
+            values = (stiffness + tension) / np.linalg.det(F)
+            found.append(np.bincount(self.place, values) / np.bincount(self.place))
         return 1e3 * np.sqrt(np.maximum(np.array(found).T, _LEAST) / DENSITY)
 
 

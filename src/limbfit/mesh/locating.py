@@ -42,18 +42,15 @@ def locate(mesh: Mesh, points: Array, region: int) -> tuple[Indices, Array, Arra
         what = f"the mesh has no cell of {mesh.region_names[region]}"
         raise ProblemError(what, remedy="mesh the site anew")
     middles = mesh.points[mesh.corners[candidates]].mean(axis=1)
-    cells, local, off = (
-        np.empty(len(points), dtype=np.int64),
-        np.empty((len(points), 3)),
-        np.empty(len(points)),
-    )
-    for k, point in enumerate(points):
+    found = []
+    for point in points:
         near = candidates[np.argsort(np.linalg.norm(middles - point, axis=1))[:MAX_CANDIDATES]]
         inside = _clip_into_cell(mesh, _find_local_coordinates(mesh, near, point))
         values, _ = mesh.kind.shape(inside)
         away = np.linalg.norm(np.einsum("mk,mki->mi", values, mesh.points[mesh.cells[near]]) - point, axis=1)
         best = int(np.argmin(away))
-        cells[k], local[k], off[k] = near[best], inside[best], away[best]
+        found.append((near[best], inside[best], away[best]))
+    cells, local, off = map(np.array, zip(*found, strict=True))
     return cells, local, off
 
 

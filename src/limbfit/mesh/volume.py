@@ -186,23 +186,29 @@ def _compute_determinants(mesh: Mesh, where: Array) -> Array:
     return np.linalg.det(np.einsum("mki,qkj->mqij", mesh.points[mesh.cells], gradients))
 
 
-def check(mesh: Mesh) -> None:
-    """Raise ``ProblemError`` when a mesh cannot be computed with: inverted, doubled or dangling cells."""
+def check(mesh: Mesh, measure: Callable[[Mesh], Array] | None = None) -> None:
+    """Raise ``ProblemError`` when a mesh cannot be computed with: inverted, doubled or dangling cells.
+
+    ``measure``: what must be positive of upright cells, (m, k); by default `node_jacobians`.
+    """
     if not np.isfinite(mesh.points).all():
-        raise ProblemError("mesh points are not finite")
+        raise ProblemError("the mesh has points that are not finite")
     if len(mesh.cells) == 0:
         raise ProblemError("the mesh has no cells")
     if mesh.cells.min() < 0 or mesh.cells.max() >= len(mesh.points):
         raise ProblemError("cells name nodes that do not exist")
-    if len(np.unique(mesh.cells)) != len(mesh.points):
-        raise ProblemError("some mesh points belong to no cell", remedy="drop unused points")
+    unused = len(mesh.points) - len(np.unique(mesh.cells))
+    if unused:
+        raise ProblemError(f"{unused} nodes belong to no cell", remedy="drop them from the mesh")
     corners = np.sort(mesh.corners, axis=1)
     corners = corners[np.lexsort(corners.T)]
-    if (corners[1:] == corners[:-1]).all(axis=1).any():
-        raise ProblemError("some cells are there twice")
-    inverted = int((node_jacobians(mesh).min(axis=1) <= 0).sum())
-    if inverted:
-        raise ProblemError(f"{inverted} of {len(mesh.cells)} cells are inverted", remedy="mesh again, finer")
+    doubled = int((corners[1:] == corners[:-1]).all(axis=1).sum())
+    if doubled:
+        raise ProblemError(f"{doubled} cells are there twice")
+    bad = np.flatnonzero(~((measure or node_jacobians)(mesh) > 0).all(axis=1))
+    if len(bad):
+        what = f"{len(bad)} of {len(mesh.cells)} cells are inverted or flat, the first is cell {bad[0]}"
+        raise ProblemError(what, remedy="mesh again, finer")
 
 
 def boundary_faces(mesh: Mesh, chosen: Mask | None = None) -> Indices:

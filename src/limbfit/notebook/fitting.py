@@ -83,14 +83,10 @@ class Fit:
         for number, ((times, force), response) in enumerate(zip(self.curves, self.responses, strict=True)):
             axes.plot(times, force, ".", color=f"C{number}", label=f"curve {number + 1}")
             axes.plot(times, response.force_N, color=f"C{number}")
-        axes.set(xlabel="time, s", ylabel=" or ".join(dict.fromkeys(map(response_label, self.problems))))
+        kinds = ("displacement, mm" if one.history.forced else "force, N" for one in self.problems)
+        axes.set(xlabel="time, s", ylabel=" or ".join(dict.fromkeys(kinds)))
         axes.legend()
         return axes
-
-
-def response_label(problem: Problem) -> str:
-    """What a curve of the problem shows."""
-    return "displacement, mm" if problem.history.forced else "force, N"
 
 
 def calibrate(
@@ -124,9 +120,8 @@ def calibrate(
         Where no simulation completes at the start.
     """
     cases = (problems,) if isinstance(problems, Problem) else tuple(problems)
-    pairs = _pair_curves(
-        cast("Sequence[Curve]", (curves,) if isinstance(problems, Problem) else curves), cases
-    )
+    given = cast("Sequence[Curve]", (curves,) if isinstance(problems, Problem) else curves)
+    pairs = _pair_curves(given, cases)
     unknowns = _build_unknowns(cases, start, bounds or {})
     announce_compilation()
     model = _Model(cases, pairs, unknowns.names, steps or StepControl(), listener)

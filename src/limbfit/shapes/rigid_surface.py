@@ -152,14 +152,8 @@ def _build_body(points: Array, faces: Indices) -> Body:
     solid = np.flatnonzero(areas > 1e-12 * areas.max())
     facing = normals[solid, 2] > min(MIN_FRONT_COSINE, 0.5 * normals[solid, 2].max())
     trees = build_tree(corners, solid), build_tree(corners, solid[facing])
-    return (
-        corners,
-        normals,
-        normals[:, None] + normals[find_neighbours(faces)],
-        sums[faces],
-        along[faces],
-        *trees,
-    )
+    edges = normals[:, None] + normals[find_neighbours(faces)]
+    return corners, normals, edges, sums[faces], along[faces], *trees
 
 
 @njit(cache=True)

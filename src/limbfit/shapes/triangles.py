@@ -37,17 +37,12 @@ def compute_triangle_normals(corners: Array) -> tuple[Array, Array]:
     return np.where(flat[:, None], 0.0, vectors / np.where(flat, 1.0, length)[:, None]), 0.5 * length
 
 
-def _compute_angles(corners: Array) -> Array:
-    """Angles (m, 3) of triangles at their corners."""
-    ahead = np.roll(corners, -1, axis=1) - corners
-    back = np.roll(corners, 1, axis=1) - corners
-    sine = np.linalg.norm(np.cross(ahead, back), axis=2)
-    return np.arctan2(sine, np.einsum("mij,mij->mi", ahead, back))
-
-
 def compute_normal_spread(points: Array, faces: Indices, normals: Array) -> tuple[Array, Array]:
     """Sums over the faces at each point, weighted by angle, of ``n n^T (n, 3, 3)`` and ``n (n, 3)``."""
-    weights = _compute_angles(points[faces])
+    corners = points[faces]
+    ahead, back = (np.roll(corners, by, axis=1) - corners for by in (-1, 1))
+    sine = np.linalg.norm(np.cross(ahead, back), axis=2)
+    weights = np.arctan2(sine, np.einsum("mij,mij->mi", ahead, back))
     outer, sums = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
     for corner in range(3):
         w = weights[:, corner, None] * normals

@@ -56,9 +56,7 @@ class ContactSurface:
 
     def at(self, nodes: Array) -> Array:
         """The quadrature points (f, q, 3) of nodes that are at ``nodes (n, 3)``, mm."""
-        out = np.empty((*self.areas.shape, 3))
-        place_points(self.faces, self.N, nodes, out)
-        return out
+        return np.einsum("qk,fki->fqi", self.N, nodes[self.faces], optimize=True)
 
     @cached_property
     def shares(self) -> sp.csr_matrix:
@@ -67,17 +65,6 @@ class ContactSurface:
         nodes, shares = np.broadcast_arrays(self.faces[:, None], self.N[None])
         columns = np.repeat(np.arange(f * q), k)
         return sp.csr_matrix((shares.ravel(), (nodes.ravel(), columns)), shape=(len(self.points), f * q))
-
-
-@njit(cache=True)
-def place_points(faces, N, x, out):  # type: ignore[no-untyped-def]
-    """Fill ``out (f, q, 3)`` with the contact points of nodes that are at ``x (n, 3)``."""
-    out[:] = 0.0
-    for f in range(faces.shape[0]):
-        for q in range(N.shape[0]):
-            for a in range(faces.shape[1]):
-                for i in range(3):
-                    out[f, q, i] += N[q, a] * x[faces[f, a], i]
 
 
 @dataclass(frozen=True)

@@ -128,17 +128,12 @@ class Anchors(StickyContact):
 
     def advance(self, tool: Tool, du: Array | None) -> Anchors:
         """The anchors at the end of a step: points that touch for the first time are held where they are."""
-        local = tool.local
-        near = Distances.of(tool)
-        closed, normals = np.zeros_like(self.held), np.zeros_like(self.normals)
-        closed.ravel()[near.points] = near.gaps < 0.0
-        normals.reshape(-1, 3)[near.points] = near.normals
+        local, near, shape = tool.local, Distances.of(tool), self.held.shape
+        closed, normals = near.scatter(near.gaps, shape) < 0.0, near.scatter(near.normals, shape)
         new = (closed & ~self.held)[..., None]
         d_places, d_normals = self.d_places, self.d_normals
         if du is not None:
-            moved = tool.relative_motion(du)
-            curvatures = np.zeros((*normals.shape, 3))
-            curvatures.reshape(-1, 3, 3)[near.points] = near.tilts
+            moved, curvatures = tool.relative_motion(du), near.scatter(near.tilts, shape)
             d_places = np.where(new[..., None], moved, d_places)
             d_normals = np.where(new[..., None], curvatures @ moved, d_normals)
         places, normals = np.where(new, local, self.places), np.where(new, normals, self.normals)
@@ -180,20 +175,17 @@ class Coulomb(StickyContact):
     def predict(self, tool: Tool, du: Array) -> Self:
         slip = _Slip.of(self, tool.local)
         moved = tool.relative_motion(du[..., None])[..., 0]
-        lead = (
-            _shorten_to_bounds(self.pulls, self.bounds)
-            / np.where(self.bounds > 0.0, self.bounds, 1.0)[..., None]
-        )
+        some = np.where(self.bounds > 0.0, self.bounds, 1.0)[..., None]
+        lead = _shorten_to_bounds(self.pulls, self.bounds) / some
         across = moved - np.einsum("fqi,fqi->fq", self.normals, moved)[..., None] * self.normals
         along = np.einsum("fqi,fqi->fq", slip.unit, across)[..., None]
         change = slip.share[..., 0] * (across - np.where(slip.stuck[..., None], 0.0, along * lead))
         return replace(self, pulls=_shorten_to_bounds(slip.elastic + change, self.bounds))
 
     def _at(self, near: Distances) -> Self:
-        normals, bounds = np.zeros_like(self.normals), np.zeros_like(self.bounds)
-        normals.reshape(-1, 3)[near.points] = near.normals
-        bounds.ravel()[near.points] = self.mu / self.hardness * np.maximum(-near.gaps, 0.0) * near.steepness
-        return replace(self, normals=normals, bounds=bounds)
+        bounds = self.mu / self.hardness * np.maximum(-near.gaps, 0.0) * near.steepness
+        normals = near.scatter(near.normals, self.held.shape)
+        return replace(self, normals=normals, bounds=near.scatter(bounds, self.held.shape))
 
     def advance(self, tool: Tool, du: Array | None) -> Coulomb:
         """The anchors at the end of a step: those of new points where they are, those of slipping ones drawn
@@ -225,9 +217,7 @@ class Coulomb(StickyContact):
 
     def _coupling(self, near: Distances, slip: _Slip) -> Array:
         """That of the elastic part of the slip."""
-        bends, deeper = np.zeros(slip.tangent.shape), np.zeros(slip.move.shape)
-        bends.reshape(-1, 3, 3)[near.points] = near.tilts
-        deeper.reshape(-1, 3)[near.points] = near.pressing
+        bends, deeper = (near.scatter(values, self.held.shape) for values in (near.tilts, near.pressing))
         n, move = self.normals, slip.move
         across = np.einsum("fqi,fqi->fq", n, move)[..., None, None]
         turned = -(across * bends + n[..., None] * np.einsum("fqi,fqij->fqj", move, bends)[:, :, None])

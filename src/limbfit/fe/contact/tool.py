@@ -215,6 +215,12 @@ class Distances:
         points = np.flatnonzero(near)
         return cls(points, local[points], *tool.body.local_distance(local[points]))
 
+    def scatter(self, values: Array, shape: tuple[int, ...]) -> Array:
+        """Values (k, ...) at their places among all contact points, of this ``shape`` (f, q); 0 elsewhere."""
+        out = np.zeros((*shape, *values.shape[1:]))
+        out.reshape(-1, *values.shape[1:])[self.points] = values
+        return out
+
     @cached_property
     def steepness(self) -> Array:
         """(k,) length of the gradients: one where gaps are distances, less where a surface fades."""

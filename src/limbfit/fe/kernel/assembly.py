@@ -131,11 +131,8 @@ def _load_lanes(elements, start, past, points, at_points):  # type: ignore[no-un
             p = points[q]
             for a in range(k):
                 to = at_points[q * k + a]
-                to.g[0, l], to.g[1, l], to.g[2, l] = (
-                    grads[el, q, 0, a],
-                    grads[el, q, 1, a],
-                    grads[el, q, 2, a],
-                )
+                for i in range(3):
+                    to.g[i, l] = grads[el, q, i, a]
             p.weight[l] = weights[el, q] if start + l < m else 0.0
             p.scale[l] = scale[regions[el]]
             for i in range(6):

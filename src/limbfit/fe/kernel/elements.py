@@ -129,9 +129,16 @@ def compute_reference_gradients(
 def build_face_quadrature(
     element: Element, points: Array, faces: NDArray[np.int64], rule: str
 ) -> tuple[Array, Array]:
-    """Shape values (q, k) and reference areas (f, q), mm^2, at the points of a face rule."""
+    """Shape values (q, k) and areas (f, q), mm^2, at the points of a face rule."""
+    N, areas = compute_face_areas(element, points, faces, rule)
+    return N, np.linalg.norm(areas, axis=-1)
+
+
+def compute_face_areas(
+    element: Element, points: Array, faces: NDArray[np.int64], rule: str
+) -> tuple[Array, Array]:
+    """Shape values (q, k) and areas (f, q, 3) as outward vectors, mm^2, at the points of a face rule."""
     at, weights = element.face_rules[rule]
     N, dN = element.face_shape(at)
     tangents = np.einsum("fki,qkj->fqij", points[faces], dN, optimize=True)
-    normal = np.cross(tangents[..., 0], tangents[..., 1])
-    return N, np.linalg.norm(normal, axis=-1) * weights
+    return N, np.cross(tangents[..., 0], tangents[..., 1]) * weights[:, None]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from .elastic import VOLUMETRIC_LAWS, ElasticLaw, lane_function, mean_exponential
 from .fibred import Contractile, Fibred
-from .fung import FungQLV
-from .hyperelastic import MooneyRivlin, NeoHookean, Ogden, OgdenPower, OgdenQLV
+from .hyperelastic import FungQLV, MooneyRivlin, NeoHookean, Ogden, OgdenPower, OgdenQLV
 from .material import LawTable, Material, PronyTerms, Uncoupled
 from .viscoelastic import ORDER_IN_TIME, compute_prony_factors
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...mesh import Mesh, boundary_faces, to_tet10
-from ..contact.indenter import Indenter
+from ...mesh import Mesh, to_tet10
+from ...mesh.boxes import SIX_TETS, build_boxes
+from ..contact.rigid import Indenter
 from ..kernel.assembly import is_compiled
 from ..kernel.laws import Laws
 from ..materials import OgdenQLV
@@ -18,8 +19,6 @@ from .sensitivity import explicit_derivatives
 from .stepping import solve
 
 _SIDE_MM, _DEPTH_MM = 20.0, 0.2
-# Kuhn's six tetrahedra of a box whose corners are numbered 4 i + 2 j + k.
-_TETS = np.array([[0, 3, 1, 7], [0, 2, 3, 7], [0, 6, 2, 7], [0, 4, 6, 7], [0, 5, 4, 7], [0, 1, 5, 7]])
 
 
 def are_compiled() -> bool:
@@ -33,18 +32,14 @@ def compile_kernels() -> None:
 
     That takes half a minute.  Kernels hold for every element and law: one small block meets them all.
     """
-    corners = _SIDE_MM * np.stack(np.meshgrid(*[[0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    regions = np.array([0, 1, 0, 1, 0, 1])
-    linear = Mesh(corners, _TETS, "tet4", regions, ("skin", "muscle"), {}, {})
-    faces = boundary_faces(linear)
-    top = (corners[faces][:, :, 2] == _SIDE_MM).all(axis=1)
-    mesh = to_tet10(Mesh(corners, _TETS, "tet4", regions, ("skin", "muscle"), {}, {"skin": faces[top]}))
+    corners, _ = build_boxes(*[np.array([0.0, _SIDE_MM])] * 3)
+    mesh = to_tet10(Mesh.from_arrays(corners, SIX_TETS, ["skin", "muscle"] * 3))
     tissue = OgdenQLV(c=0.005, m=5.0, gamma=1.0, tau=0.5)
     problem = Problem(
         mesh=mesh,
         materials={"skin": tissue, "muscle": tissue},
         fixed=np.flatnonzero(mesh.points[:, 2] == 0.0),
-        contact_faces=mesh.face_sets["skin"],
+        contact_faces=mesh.faces_where(lambda points: points[:, 2] == _SIDE_MM),
         indenter=Indenter("square", _SIDE_MM, 2.0, (10.0, 10.0, _SIDE_MM), (0.0, 0.0, -1.0)),
         history=History(np.array([0.0, 1.0]), np.array([0.0, _DEPTH_MM])),
         element="tet10p0",

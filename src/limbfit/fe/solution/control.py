@@ -145,9 +145,10 @@ def predict_remaining_times(
     one step leads to the end of the history: there are no more steps than planned and one.
     """
     targets, now = list(left), times[-1]
-    if history.forced:  # contact ends where the force is stated to
+    if history.forced or not targets:  # contact ends where the force is stated to
         return targets
-    phase = _find_phase(history, now, targets[0]) if targets else None
+    middle = 0.5 * (now + targets[0])
+    phase = next((phase for phase in history.phases if phase.start_s <= middle <= phase.end_s), None)
     if phase is None or phase.kind != "unload":
         return targets
     if forces[-1] <= 0.0 and now > phase.start_s:
@@ -167,12 +168,6 @@ def _count(phase: MotionPhase, times: Array) -> int:
     """How many of the times lie in a phase, its start left out."""
     little = 1e-9 * phase.end_s
     return int(((times > phase.start_s + little) & (times <= phase.end_s + little)).sum())
-
-
-def _find_phase(history: History, now: float, target: float) -> MotionPhase | None:
-    """The phase of the step from ``now`` to ``target``."""
-    middle = 0.5 * (now + target)
-    return next((phase for phase in history.phases if phase.start_s <= middle <= phase.end_s), None)
 
 
 def _predict_contact_end(phase: MotionPhase, times: Array, forces: Array) -> float:

@@ -19,7 +19,7 @@ import scipy.sparse.linalg as spla
 from ...arrays import Array
 from ..kernel.laws import Laws
 from ..system import Evaluation, Increment, System
-from .direction import build_preconditioner, find_touching_bodies
+from .direction import find_touching_bodies, update_springs
 from .factor import Factor
 from .linear import NotPositiveDefiniteError
 from .newton import Equilibrium, NewtonControl, compute_reaction_scale, compute_residual_norm
@@ -99,14 +99,16 @@ def _solve_gmres(
     at: Evaluation, factor: Factor, coupling: Coupling, b: Array, guess: Array, tolerance: float
 ) -> Array:
     """Solutions (n, p) of ``(K + C) x = b``; columns that are not within the tolerance count as inexact."""
-    apply, shape = build_preconditioner(at, factor), (len(b), len(b))
+    springs, shape = update_springs(at, factor), (len(b), len(b))
 
     def product(x: Array) -> Array:
         x = x.reshape(-1, 1)
         return (factor.multiply(at.tangent, x) + coupling(x)).ravel()
 
-    A = spla.LinearOperator(shape, matvec=product, dtype=float)
-    M = spla.LinearOperator(shape, matvec=lambda r: apply(r.reshape(-1, 1)).ravel(), dtype=float)
+    def precondition(r: Array) -> Array:
+        return factor.precondition(r.reshape(-1, 1), springs).ravel()
+
+    A, M = (spla.LinearOperator(shape, matvec=apply, dtype=float) for apply in (product, precondition))
     out = guess.copy()
     for i in range(b.shape[1]):
         out[:, i], failed = spla.gmres(
@@ -142,9 +144,8 @@ def couple(
     for iteration in range(MAX_ITERATIONS):
         norm, scale = compute_residual_norm(system, here), compute_reaction_scale(system, here, floor)
         if norm <= control.tolerance * scale:
-            now, here = (
-                evaluate_at(u) if control.tangent else (now, here)
-            )  # derivatives take the slip as it is
+            if control.tangent:  # derivatives take the slip as it is
+                now, here = evaluate_at(u)
             return (Equilibrium(u, here, iteration, residual=norm / max(scale, 1e-300)), now), iteration
         vain = 0 if norm <= (1.0 - MIN_REDUCTION) * lowest else vain + 1
         lowest = min(norm, lowest)

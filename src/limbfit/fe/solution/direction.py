@@ -7,7 +7,6 @@ solution.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -150,7 +149,7 @@ def _predict_closed(
 
 def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: float) -> Array:
     """Solution (n, r) of the tangent at an equilibrium for ``b (n, r)``, from the guess ``x``."""
-    springs = _update_springs(at, factor)
+    springs = update_springs(at, factor)
     found = factor.solve(at.tangent, b, springs, tolerance, x)
     if not found.converged:
         blocks = None if at.touch is None else at.touch.blocks
@@ -160,13 +159,7 @@ def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: floa
     return found.x
 
 
-def build_preconditioner(at: Evaluation, factor: Factor) -> Callable[[Array], Array]:
-    """The factor's solution of vectors (n, r), with the contact springs of an evaluation."""
-    springs = _update_springs(at, factor)
-    return lambda r: factor.precondition(r, springs)
-
-
-def _update_springs(at: Evaluation, factor: Factor) -> SpringChange | None:
+def update_springs(at: Evaluation, factor: Factor) -> SpringChange | None:
     """The springs by which an evaluation differs from what is factorised; what does not last is made anew."""
     if not factor.ready or not factor.lasting:
         refactor_at(at, factor)

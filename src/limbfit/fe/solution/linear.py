@@ -135,17 +135,14 @@ class Pardiso(LinearSolver):
         self._mkl = _load_mkl()
         # The factor lives outside Python's memory.
         self._release = weakref.finalize(self, _release, self._mkl, self._handle, self._parameters, self._n)
-        self._checked(self._call(11, np.zeros(1), np.zeros(1), 1))
+        self._call(11, np.zeros(1), np.zeros(1), 1)
         silence_openmp()  # loaded by the first call
         self._parameters[PARTIAL] = 0
         self.worth = max((float(self._parameters[17]) / self._n.value) ** (4 / 3) / ROW_PER_SOLUTION, 2.0)
 
     def factorise(self, data: Array) -> None:
         self._data = np.array(data, dtype=self._type)
-        code = self._call(22, np.zeros(1), np.zeros(1), 1)
-        if code == -4:
-            raise NotPositiveDefiniteError
-        self._checked(code)
+        self._call(22, np.zeros(1), np.zeros(1), 1)
 
     def solve(self, b: Array) -> Array:
         return self._solved(33, b, False).astype(np.float64)
@@ -161,7 +158,7 @@ class Pardiso(LinearSolver):
             return self._among_last(phase, b)
         right = np.asfortranarray(b, dtype=self._type)
         x = np.zeros_like(right, order="F")
-        self._checked(self._call(phase, right, x, 1 if b.ndim == 1 else b.shape[1]))
+        self._call(phase, right, x, 1 if b.ndim == 1 else b.shape[1])
         return x
 
     def _among_last(self, phase: int, b: Array) -> Array:
@@ -174,22 +171,21 @@ class Pardiso(LinearSolver):
         for at in range(0, b.shape[1], COLUMNS):
             part = b[:, at : at + COLUMNS]
             right[self.last, : part.shape[1]] = part
-            self._checked(self._call(phase, right, x, part.shape[1]))
+            self._call(phase, right, x, part.shape[1])
             out[:, at : at + COLUMNS] = x[self.last, : part.shape[1]]
         self._parameters[PARTIAL] = 0
         return out
 
-    @staticmethod
-    def _checked(code: int) -> None:
-        if code:
-            raise MemoryError(f"PARDISO failed with code {code}")
-
-    def _call(self, phase: int, b: Array, x: Array, count: int) -> int:
+    def _call(self, phase: int, b: Array, x: Array, count: int) -> None:
         self._mkl.MKL_Set_Num_Threads(self._threads)
-        return _call_pardiso(
+        code = _call_pardiso(
             self._mkl, self._handle, self._parameters, self._n, phase, count,
             self._data, self._indptr, self._indices, self._marks, b, x,
         )  # fmt: skip
+        if code == -4:
+            raise NotPositiveDefiniteError
+        if code:
+            raise MemoryError(f"PARDISO failed with code {code}")
 
 
 @functools.cache
@@ -237,9 +233,7 @@ class _ByPattern(LinearSolver):
 
     lasting = True
 
-    def __init__(
-        self, indptr: Index, indices: Index, threads: int = 1, single: bool = False, last: Index = NONE
-    ) -> None:
+    def __init__(self, indptr: Index, indices: Index, *unused: Any) -> None:
         self._pattern = (np.asarray(indices), np.asarray(indptr))
         self._n = len(indptr) - 1
 
@@ -366,16 +360,8 @@ def _multiply_eight_columns(indptr, indices, data, x, y, start, stop):  # type: 
     """`_multiply_one_column` for ``x (n, 8)``, the row's numbers kept in registers."""
     for i in range(start, stop):
         a = data[indptr[i]]
-        x0, x1, x2, x3, x4, x5, x6, x7 = (
-            x[i, 0],
-            x[i, 1],
-            x[i, 2],
-            x[i, 3],
-            x[i, 4],
-            x[i, 5],
-            x[i, 6],
-            x[i, 7],
-        )
+        x0, x1, x2, x3 = x[i, 0], x[i, 1], x[i, 2], x[i, 3]
+        x4, x5, x6, x7 = x[i, 4], x[i, 5], x[i, 6], x[i, 7]
         y0, y1, y2, y3, y4, y5, y6, y7 = a * x0, a * x1, a * x2, a * x3, a * x4, a * x5, a * x6, a * x7
         for p in range(indptr[i] + 1, indptr[i + 1]):
             a, xj, yj = data[p], x[indices[p]], y[indices[p]]

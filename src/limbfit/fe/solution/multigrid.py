@@ -43,18 +43,25 @@ class Multigrid(LinearSolver):
         moving[corners] = system.numbers[corners] >= 0
         linear, coarse_slots = _number_nodes(moving)
         self._coarse_slots = coarse_slots
+        active = fine >= 0
         self._fine, self._places = _group_into_blocks(
-            system.cells, fine, system.indptr, system.indices, self._slots
+            system.indptr, system.indices, self._slots, int(active.sum())
         )
         numbers = np.full(moving.shape, -1, dtype=np.int32)
         numbers[moving] = np.arange(len(coarse_slots), dtype=np.int32)
         graph = build_node_graph(linear_cells, len(numbers))
-        indptr, indices = build_upper_pattern(numbers, graph.indptr, graph.indices, len(coarse_slots))
+        indptr, indices = build_upper_pattern(numbers, graph)
         self._coarse, self._coarse_places = _group_into_blocks(
-            system.cells[:, :4], linear, indptr, indices, coarse_slots
+            indptr, indices, coarse_slots, int((linear >= 0).sum())
         )
-        self._parents = linear[_find_ends(system.cells, len(fine))][fine >= 0]
-        self._free = (system.numbers >= 0)[fine >= 0]
+        self._parents = linear[_find_ends(system.cells, len(fine))][active]
+        self._free = (system.numbers >= 0)[active]
+        rows, ends = np.nonzero(self._parents >= 0)
+        halves = np.full(len(rows), 0.5)
+        # (nodes, coarse nodes): each node moves by the mean of its parents, and shares its residual so.
+        self._mean = sp.csr_matrix(
+            (halves, (rows, self._parents[rows, ends])), shape=(len(self._parents), len(self._coarse[0]) - 1)
+        )
         self._targets = _coarse_targets(*self._fine, self._parents, *self._coarse)
         self._solver = build_linear_solver(indptr, indices, threads=threads, single=True)
 
@@ -82,11 +89,10 @@ class Multigrid(LinearSolver):
         r.ravel()[self._slots] = b
         x, q = np.empty_like(r), np.empty_like(r)
         _forward(ptr, cols, self._blocks, self._inverse, r, x, q)
-        right = np.zeros((len(self._coarse[0]) - 1, 3))
-        _restrict(self._parents, q, right)
-        moved = np.zeros_like(right, dtype=np.float32)
+        right = self._mean.T @ q
+        moved = np.zeros(right.shape)
         moved.ravel()[self._coarse_slots] = self._solver.solve(right.ravel()[self._coarse_slots])
-        _prolong(self._parents, self._free, moved, r)
+        r = np.where(self._free, self._mean @ moved, 0.0).astype(np.float32)
         _backward(ptr, cols, self._blocks, self._inverse, r, x, q)
         return x.ravel()[self._slots].astype(np.float64)
 
@@ -99,14 +105,17 @@ def _number_nodes(moving: NDArray[np.bool_]) -> tuple[Index, NDArray[np.int64]]:
 
 
 def _group_into_blocks(
-    cells: NDArray, number: Index, indptr: Index, indices: Index, slots: NDArray[np.int64]
+    indptr: Index, indices: Index, slots: NDArray[np.int64], nodes: int
 ) -> tuple[tuple[Index, Index], NDArray[np.int64]]:
     """Rows and columns of the blocks, and the place in them of every entry of the matrix by unknowns."""
-    graph = sp.triu(build_node_graph(cells, len(number))[number >= 0][:, number >= 0], format="csr")
-    graph.sort_indices()
-    rows = np.repeat(slots, np.diff(indptr))
-    blocks = graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
-    return blocks, _places(rows, slots[indices], *blocks)
+    rows, count = np.repeat(slots, np.diff(indptr)), len(indices)
+    numbered = sp.csr_matrix((np.arange(1, count + 1), (rows, slots[indices])), shape=(3 * nodes,) * 2)
+    blocks = numbered.tobsr((3, 3))
+    blocks.sort_indices()
+    filled = np.flatnonzero(blocks.data)
+    places = np.empty(count, dtype=np.int64)
+    places[blocks.data.ravel()[filled] - 1] = filled
+    return (blocks.indptr.astype(np.int32), blocks.indices.astype(np.int32)), places
 
 
 def _find_ends(cells: NDArray, nodes: int) -> NDArray[np.int64]:
@@ -114,15 +123,6 @@ def _find_ends(cells: NDArray, nodes: int) -> NDArray[np.int64]:
     ends = np.stack([np.arange(nodes)] * 2, axis=1)
     ends[cells[:, 4:].ravel()] = cells[:, TET10_EDGES].reshape(-1, 2)
     return ends
-
-
-@njit(cache=True)
-def _places(rows, columns, ptr, cols):  # type: ignore[no-untyped-def]
-    out = np.empty(len(rows), dtype=np.int64)
-    for e in range(len(rows)):
-        i, j = rows[e] // 3, columns[e] // 3
-        out[e] = 9 * place_of(cols, ptr[i], ptr[i + 1], j) + 3 * (rows[e] % 3) + columns[e] % 3
-    return out
 
 
 @njit(cache=True)
@@ -248,24 +248,3 @@ def _backward(ptr, cols, blocks, inverse, e, x, q):  # type: ignore[no-untyped-d
         for a in range(3):
             e[i, a] = D[a, 0] * q0 + D[a, 1] * q1 + D[a, 2] * q2
             x[i, a] += e[i, a]
-
-
-@njit(cache=True)
-def _restrict(parents, q, right):  # type: ignore[no-untyped-def]
-    """Share each node's residual between its parents."""
-    for i in range(len(parents)):
-        for a in range(2):
-            if parents[i, a] >= 0:
-                for c in range(3):
-                    right[parents[i, a], c] += 0.5 * q[i, c]
-
-
-@njit(cache=True)
-def _prolong(parents, free, moved, e):  # type: ignore[no-untyped-def]
-    """Each node moves by the mean of its parents, where it is free to."""
-    for i in range(len(parents)):
-        for c in range(3):
-            e[i, c] = 0.0
-            for a in range(2):
-                if parents[i, a] >= 0 and free[i, c]:
-                    e[i, c] += np.float32(0.5) * moved[parents[i, a], c]

@@ -28,11 +28,12 @@ from .sensitivity import Explicit, ForceTakeover, MemoryDerivative
 from .springs import find_touched_unknowns
 from .start import (
     IndenterStart,
+    WarmStart,
     build_grips,
     compute_elastic_residual,
+    compute_extrapolation,
     measure_indenter_travel,
 )
-from .warm_start import WarmStart, compute_extrapolation
 
 # Penetration over the allowed one that a few more iterations will not mend; how often a penalty is raised.
 UNBEARABLE_DEPTH, MAX_RAISES = 1.2, 5
@@ -69,7 +70,9 @@ class SteppedRun:
     ) -> None:
         started = time.perf_counter()
         self.problem, self.control = problem, control
-        self.system = _find_system(problem, warm_start, system, control.threads)
+        known = (system, None if warm_start is None else warm_start.system)
+        fitting = (one for one in known if one is not None and one.fits(problem))
+        self.system = next(fitting, None) or System(problem, control.threads)
         self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
         self.seconds: defaultdict[str, float] = defaultdict(float)
         moduli, threads, last = self.laws.moduli, control.threads, find_touched_unknowns(self.system, problem)
@@ -264,16 +267,13 @@ class SteppedRun:
     def _predict(self, t: float) -> Array:
         warm, last = self.warm.at(t), self.warm.at(self.states[-1].time)
         if warm is not None:  # what it missed by in the step before, it will miss by in this one, by depth
-            return (
-                warm if last is None else warm + self._compute_depth_ratio(t) * (self.states[-1].rows - last)
-            )
+            if last is None:
+                return warm
+            now, then = self.problem.history.displacement_at(t), self.states[-1].displacement
+            deeper = min(now / then, MAX_DEPTH_RATIO) if now > 0.0 and then > 0.0 else 1.0
+            return warm + deeper * (self.states[-1].rows - last)
         weights = self._compute_guess_weights(t)
         return np.asarray(sum(w * state.rows for w, state in zip(weights, self.states)))
-
-    def _compute_depth_ratio(self, t: float) -> float:
-        """The depth at time ``t`` over that of the last state; one where it says nothing."""
-        now, then = self.problem.history.displacement_at(t), self.states[-1].displacement
-        return min(now / then, MAX_DEPTH_RATIO) if now > 0.0 and then > 0.0 else 1.0
 
     def _compute_guess_weights(self, t: float) -> Array:
         """Weights of the last states in a guess of the one at time ``t``; those before a further body turned
@@ -306,10 +306,7 @@ class SteppedRun:
             self.slope = self.slope.advance(self.system, self.laws, self.memory, explicit, du, dt)
         after = self.memory.advance(self.system, self.laws, stress, dt)
         if self._has_turned(increment.time, at.force):
-            after, self.slope = (
-                after.drop_past(),
-                None if self.slope is None else self.slope.drop_past(),
-            )
+            after, self.slope = after.drop_past(), self.slope and self.slope.drop_past()
         tools = self.system.tools(u, increment)
         apart = [self.touch.relative_to_touch(self.system, du), *[du] * len(tools)]
         self.grips = tuple(g and g.advance(tool, d) for g, tool, d in zip(increment.grips, tools, apart))
@@ -384,9 +381,8 @@ class SteppedRun:
         for i, (grip, tool) in enumerate(zip(increment.grips, system.tools(u, increment))):
             if grip is None:
                 continue
-            held = (increment.penalty * tool.surface.areas)[..., None, None] * grip.differentiate_anchors(
-                tool
-            )
+            stiff = (increment.penalty * tool.surface.areas)[..., None, None]
+            held = stiff * grip.differentiate_anchors(tool)
             change += tool.distribute_body_forces(held)
             if i == 0:
                 d_reaction -= held[:, :, 2].sum(axis=(0, 1))
@@ -409,11 +405,3 @@ class SteppedRun:
         if self.problem.history.forced:  # the force is what is stated
             return du, np.zeros(laws.count)
         return du, at.force * d_penalty + d_reaction + d_force
-
-
-def _find_system(problem: Problem, warm_start: Result | None, system: System | None, threads: int) -> System:
-    """The discretisation that is at hand, where it fits the problem, or a new one."""
-    for known in (system, warm_start.system if warm_start is not None else None):
-        if known is not None and known.fits(problem):
-            return known
-    return System(problem, threads)

@@ -20,11 +20,10 @@ from ...errors import ProblemError
 from ..diagnostics import (
     SimulationWarning,
     find_inexact_sensitivities,
+    find_inexact_steps,
     find_inverted_elements,
     find_penetration,
     find_slip,
-    find_unbalanced_steps,
-    find_unconverged_friction,
 )
 from ..observables import compute_element_fields
 from ..problem import Problem
@@ -91,7 +90,12 @@ def solve(
         raise ProblemError("only a simulation without an indenter and with stated times can be resumed")
     started = time.perf_counter()
     run = SteppedRun(problem, steps, sensitivities, warm_start, system)
-    rows: list[Step] = []
+    nothing = np.zeros(run.laws.count) if sensitivities else None
+    rest = Step(
+        0.0, problem.history.displacement_at(0.0), 0.0, 0.0, 0.0, 0, nothing, np.zeros_like(run.rest),
+        run.rest, nothing if problem.history.forced else None, run.states[0],
+    )  # fmt: skip
+    rows = [rest]
     if begin is not None:
         rows = _resume_run(run, begin)
         started -= begin["seconds"]
@@ -115,20 +119,17 @@ def solve(
             checkpoints.keep(_take_snapshot(run, rows, time.perf_counter() - started))
             for factor in {id(one): one for one in (run.factor, run.slopes)}.values():
                 factor.reset()  # as that of a run that begins here does
-    return _build_result(
-        problem, run, rows, kept, deepest_state, sensitivities, time.perf_counter() - started
-    )
+    return _build_result(run, rows, kept, deepest_state, time.perf_counter() - started)
 
 
 def _take_snapshot(run: SteppedRun, rows: list[Step], seconds: float) -> Snapshot:
     """All that the further steps of a run, and its result, depend on."""
-    columns = {name: [getattr(row, name) for row in rows] for name in _COLUMNS}
     return Snapshot.of(
         states=[replace(state, memory=None, grips=()) for state in run.states],
         driven=[body.motion.values for body in run.problem.bodies],
         grips=run.grips,
         count=len(run.states),
-        **{name: None if values[0] is None else np.array(values) for name, values in columns.items()},
+        **_collect_columns(rows),
         **{name: copy(getattr(run, name)) for name in (*_PLAIN, *_PARTS)},
         counts=dict(run.counts),
         inexact=run.slopes.counts["inexact"],
@@ -151,12 +152,10 @@ def _resume_run(run: SteppedRun, begin: Snapshot) -> list[Step]:
     run.states = [replace(begin.restore(f"states.{i}", first), grips=()) for i in range(begin["count"])]
     run.counts.update(begin["counts"])
     run.slopes.counts["inexact"] = begin["inexact"]
-    columns = {name: begin[name] for name in _COLUMNS if begin[name] is not None}
+    known = {name: begin[name] for name in _COLUMNS if begin[name] is not None}
     nothing: dict[str, Any] = dict.fromkeys(_COLUMNS)
-    return [
-        Step(state=first, **nothing | {name: column[i] for name, column in columns.items()})
-        for i in range(len(columns["time"]))
-    ]
+    rows = [{name: column[i] for name, column in known.items()} for i in range(len(known["time"]))]
+    return [Step(state=first, **nothing | row) for row in rows]
 
 
 @dataclass(frozen=True)
@@ -195,45 +194,30 @@ def solve_until_onset(problem: Problem, steps: StepControl = StepControl()) -> F
     )
 
 
-def _build_result(
-    problem: Problem,
-    run: SteppedRun,
-    rows: list[Step],
-    kept: list[State],
-    deepest: State | None,
-    sensitivities: bool,
-    seconds: float,
-) -> Result:
-    def column(name: str, rest: float = 0.0) -> Array:
-        return np.array([rest, *(getattr(row, name) for row in rows)])
+def _collect_columns(rows: Sequence[Step]) -> dict[str, Any]:
+    """The numbers (n, ...) of steps by their names in `Step`; None where the steps have none."""
+    columns = {name: [getattr(row, name) for row in rows] for name in _COLUMNS}
+    return {name: None if values[0] is None else np.array(values) for name, values in columns.items()}
 
-    slopes = deepening = None
-    if sensitivities:
-        nothing = np.zeros(run.laws.count)
-        slopes = np.array([nothing, *(row.force_sensitivity for row in rows)])
-        if problem.history.forced:
-            deepening = np.array([nothing, *(row.displacement_sensitivity for row in rows)])
-    displacement, force = column("displacement", problem.history.displacement_at(0.0)), column("force")
-    penetration, bodies = column("penetration"), len(problem.rigid_bodies)
-    doubts = _collect_warnings(run, deepest, displacement, force, penetration)
+
+def _build_result(
+    run: SteppedRun, rows: list[Step], kept: list[State], deepest: State | None, seconds: float
+) -> Result:
+    columns = _collect_columns(rows)
+    del columns["newton_iterations"]
     return Result(
         problem=run.problem,
-        times=column("time"),
-        displacement=displacement,
-        force=force,
-        force_sensitivity=slopes,
-        parameter_names=problem.parameter_names,
-        penetration=penetration,
-        contact_area=column("contact_area"),
-        reactions=np.array([np.zeros((bodies, 6)), *(row.reactions for row in rows)]),
-        coordinates=np.array([run.rest, *(row.coordinates for row in rows)]),
-        displacement_sensitivity=deepening,
+        times=columns.pop("time"),
+        parameter_names=run.problem.parameter_names,
         states=tuple(kept),
         completed=not run.reason,
         reason=run.reason,
-        doubts=doubts,
-        statistics=_collect_statistics(run, seconds, int((penetration > run.deepest).sum())),
+        doubts=_collect_warnings(
+            run, deepest, columns["displacement"], columns["force"], columns["penetration"]
+        ),
+        statistics=_collect_statistics(run, seconds, int((columns["penetration"] > run.deepest).sum())),
         system=run.system,
+        **columns,
     )
 
 
@@ -242,21 +226,19 @@ def _collect_warnings(
 ) -> tuple[SimulationWarning, ...]:
     """The warnings about the steps of a run, of which ``deepest`` is the one farthest in."""
     folds: tuple[SimulationWarning, ...] = ()
-    system = run.system
     if deepest is not None:
+        volumes = run.system.weights.sum(axis=1)
         folds = find_inverted_elements(
-            run.problem.mesh,
-            deepest.u,
-            lambda: compute_element_fields(system, run.laws, deepest).energy * system.weights.sum(axis=1),
-            deepest.displacement,
-            displacement,
-        )
+            run.problem.mesh, deepest.u,
+            lambda: compute_element_fields(run.system, run.laws, deepest).energy * volumes,
+            deepest.displacement, displacement,
+        )  # fmt: skip
     return (
         *folds,
         *find_slip(displacement, force),
         *find_penetration(displacement, penetration, run.deepest, run.stiffness),
-        *find_unbalanced_steps(displacement, run.unbalanced, run.control.tolerance),
-        *find_unconverged_friction(displacement, run.unsettled),
+        *find_inexact_steps("unbalanced", displacement, run.unbalanced, run.control.tolerance),
+        *find_inexact_steps("unsettled", displacement, run.unsettled, run.control.tolerance),
         *find_inexact_sensitivities(displacement, run.slopes.counts["inexact"]),
     )
 
