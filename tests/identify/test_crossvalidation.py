@@ -82,9 +82,9 @@ def test_the_standing_of_a_choice_is_its_rank():
     folds = cross_validate(simulate, records([1.2]), near(), list_choices(5, 3))
     ranked = sorted(folds, key=lambda fold: fold.mean_heldout)
     best, worst = rank_fold(ranked[0], folds), rank_fold(ranked[-1], folds)
-    assert best.share_better < 0.11
-    assert worst.share_better > 0.89
-    assert best.median_percent == pytest.approx(np.median([f.mean_heldout for f in folds]))
+    assert best["share_better"] < 0.11
+    assert worst["share_better"] > 0.89
+    assert best["median_percent"] == pytest.approx(np.median([f.mean_heldout for f in folds]))
 
 
 def test_regions_have_their_names_and_limits_are_told():

@@ -173,26 +173,19 @@ def cross_validate(
     return tuple(folds)
 
 
-@dataclass(frozen=True)
-class FoldRanking:
-    """The rank of one fold among others: ``share_better`` of them have a smaller held-out error."""
+def rank_fold(ranked: Fold, folds: Sequence[Fold]) -> dict[str, float]:
+    """Rank the mean held-out error of a fold in the distribution over ``folds`` (5, 50 and 95 %).
 
-    mean_percent: float
-    share_better: float
-    median_percent: float
-    low_percent: float
-    high_percent: float
-
-
-def rank_fold(ranked: Fold, folds: Sequence[Fold]) -> FoldRanking:
-    """Rank the mean held-out error of a fold in the distribution over ``folds`` (5, 50 and 95 %)."""
+    Returns the keys of `OwnFold`: ``share_better`` of the folds have a smaller error.
+    """
     means = np.array([fold.mean_heldout for fold in folds])
-    low, middle, high = np.percentile(means, [5, 50, 95])
+    low, middle, high = np.percentile(means, [5, 50, 95]).tolist()
     # Ties, itself above all, count half.
-    better = np.mean(means < ranked.mean_heldout - 1e-9) + 0.5 * np.mean(
-        np.abs(means - ranked.mean_heldout) <= 1e-9
-    )
-    return FoldRanking(ranked.mean_heldout, float(better), float(middle), float(low), float(high))
+    ties = np.abs(means - ranked.mean_heldout) <= 1e-9
+    better = float(np.mean(means < ranked.mean_heldout - 1e-9) + 0.5 * np.mean(ties))
+    return {
+        "share_better": better, "median_percent": middle, "low_percent": low, "high_percent": high
+    }  # fmt: skip
 
 
 def summarise_errors_by_site(folds: Sequence[Fold], sites: int) -> tuple[ErrorSummary, ...]:

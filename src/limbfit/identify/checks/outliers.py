@@ -21,6 +21,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...phases import find_boundaries, find_phases
+from ...results.identification import LeftOutRecord
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse, check_responses
 from .plausibility import UNITS, RecordWarning
 
@@ -63,26 +64,6 @@ class LogLinearModel:
         moved = np.where(small, force + scaled @ step, force * grown)
         slope = np.where(small[:, None], scaled, scaled * grown[:, None])
         return SiteResponse(moved, slope / parameters)
-
-
-@dataclass(frozen=True)
-class LeaveOneOutError:
-    """A site predicted without itself.
-
-    ``error`` is the root mean square of its prediction error over its peak, ``expected`` that of the others
-    when the site is left out, ``ratio`` the best factor from predicted to measured force, and ``cook`` Cook's
-    distance: how far the site moves the forces of all sites, compared with the misfit.
-    """
-
-    site: str
-    error: float
-    expected: float
-    ratio: float
-    cook: float
-
-    @property
-    def standardised(self) -> float:
-        return self.error / self.expected
 
 
 @dataclass(frozen=True)
@@ -182,8 +163,13 @@ class LeaveOutFits:
         errors = [self.compute_errors(self.fit_without(*left_out, j))[j] for j in rest]
         return max(float(np.sqrt(np.mean(np.square(errors)))), MIN_ERROR_SHARE)
 
-    def leave_one_out(self) -> tuple[LeaveOneOutError, ...]:
-        """Predict every site from all others."""
+    def leave_one_out(self) -> tuple[LeftOutRecord, ...]:
+        """Predict every site from all others.
+
+        The error is the root mean square over the site's peak; it is expected to be that of the others when
+        the site is left out. Cook's distance is how far the site moves the forces of all sites, compared with
+        the misfit.
+        """
         whole = [r.force_N for r in self.simulate(self.fit_without())]
         misfit = max(float(np.mean(self.compute_errors(self.fit_without()) ** 2)), (MIN_ERROR_SHARE / 2) ** 2)
         found = []
@@ -194,13 +180,15 @@ class LeaveOutFits:
                 np.mean((r.force_N - w) ** 2) / peak**2
                 for r, w, peak in zip(self.simulate(parameters), whole, self.peaks)
             ]
+            error, expected = float(self.compute_errors(parameters)[i]), self.compute_expected_error(i)
             found.append(
-                LeaveOneOutError(
+                LeftOutRecord(
                     site=site.name,
-                    error=float(self.compute_errors(parameters)[i]),
-                    expected=self.compute_expected_error(i),
+                    error=error,
+                    expected=expected,
                     ratio=float(force @ site.force_N / (force @ force)),
                     cook=float(np.sum(moved) / (len(self.start) * misfit)),
+                    standardised=error / expected,
                 )
             )
         return tuple(found)
@@ -208,7 +196,7 @@ class LeaveOutFits:
 
 def find_misfitting_sites(
     simulate: Simulate, measured: Sequence[MeasuredCurve], start: Array
-) -> tuple[tuple[LeaveOneOutError, ...], tuple[int, ...]]:
+) -> tuple[tuple[LeftOutRecord, ...], tuple[int, ...]]:
     """Leave every site out; return the errors and the indices of the sites that do not fit: none, one or two.
 
     With fewer than four sites nobody can tell which one is wrong.
@@ -226,9 +214,7 @@ def find_misfitting_sites(
     return singles, (best,) if alone > MAX_STANDARDISED_ERROR else ()
 
 
-def _find_worst_pair(
-    sites: LeaveOutFits, singles: Sequence[LeaveOneOutError]
-) -> tuple[tuple[int, ...], float]:
+def _find_worst_pair(sites: LeaveOutFits, singles: Sequence[LeftOutRecord]) -> tuple[tuple[int, ...], float]:
     """Return the two sites that, both left out, are predicted worst by the rest; 0 if one of them is fine."""
     everyone = sites.compute_errors(sites.fit_without())
     if max(everyone.max(), *(single.error for single in singles)) <= MAX_ERROR_SHARE / 2:
@@ -346,7 +332,7 @@ def _exchange_records(measured: Sequence[MeasuredCurve], i: int, j: int) -> list
 class OutlierReport:
     """The errors of all sites left out, with the records named as given, and the warnings."""
 
-    left_out: tuple[LeaveOneOutError, ...]
+    left_out: tuple[LeftOutRecord, ...]
     warnings: tuple[RecordWarning, ...]
 
 
@@ -458,7 +444,7 @@ def _build_correction(
     return RecordCorrection(kind, indices, cause, gain, *errors, float(before.max()))
 
 
-def warn_of_outlier(error: LeaveOneOutError, unit: str = "N") -> RecordWarning:
+def warn_of_outlier(error: LeftOutRecord, unit: str = "N") -> RecordWarning:
     """Build the warning about a site that does not fit, with the unit that its force ratio is near.
 
     ``unit`` is that of what is compared; for a depth, another unit was found before.

@@ -218,19 +218,12 @@ def _build_result(
     """What ``crossvalidate.json`` holds."""
     names, sites = bench.bounds.names, bench.sites
     regions = {site.name: site.region for site in context.study.sites}
-    place = rank_fold(found.own, found.folds)
     by_site = summarise_errors_by_site(found.folds, len(sites))
     return CrossvalidateResult(
         fitted_sites=size,
         choices=len(found.folds),
         choices_possible=possible,
-        own=OwnFold(
-            **dict(found.own.summarise(sites, names)),
-            share_better=place.share_better,
-            median_percent=place.median_percent,
-            low_percent=place.low_percent,
-            high_percent=place.high_percent,
-        ),
+        own=OwnFold(**{**dict(found.own.summarise(sites, names)), **rank_fold(found.own, found.folds)}),
         sites=[
             HeldoutSite(
                 site=name,

@@ -81,8 +81,7 @@ def check_records(
     against = explain_warnings(found.warnings, plain)
     flags = [RecordFlag(**flag.to_dict(), found="in the record") for flag in plain]
     flags += [RecordFlag(**flag.to_dict(), found="against the model") for flag in against]
-    left_out = [LeftOutRecord.model_validate(entry) for entry in found.left_out]
-    return RecordChecks(flags, left_out, list(dict.fromkeys(failed)))
+    return RecordChecks(flags, list(found.left_out), list(dict.fromkeys(failed)))
 
 
 def _build_exchange(records: Sequence[SiteRecord]) -> Callable[[LogLinearModel], Exchange]:
