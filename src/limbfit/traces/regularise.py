@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Self
 
 import numpy as np
 from scipy.interpolate import BSpline, make_smoothing_spline
@@ -79,15 +80,15 @@ class Regularised:
     def _speed(self, kind: str) -> float:
         return next((abs(phase.rate_mm_s) for phase in self.phases if phase.kind == kind), float("nan"))
 
-    def resample(self, points: int) -> Regularised:
+    def resample(self, points: int) -> Self:
         """The same curves at about ``points`` times (`spread`), every corner among them."""
         time = spread(self.phases, points, self.knots_s)
-        return replace(
-            self,
-            time_s=time,
-            displacement_mm=np.interp(time, self.knots_s, self.knots_mm),
-            force_N=np.maximum(self.curve(time), 0.0),
-        )
+        displacement, force = self._evaluate(time)
+        return replace(self, time_s=time, displacement_mm=displacement, force_N=force)
+
+    def _evaluate(self, time: Array) -> tuple[Array, Array]:
+        """Displacement and force at times (n,); a dry indenter cannot pull."""
+        return np.interp(time, self.knots_s, self.knots_mm), np.maximum(self.curve(time), 0.0)
 
 
 def regularise(
@@ -273,15 +274,8 @@ class Creep(Regularised):
     def depth_mm(self) -> float:
         return float(self.displacement_mm.max())
 
-    def resample(self, points: int) -> Creep:
-        """The same curves at about ``points`` times (`spread`), every corner among them."""
-        time = spread(self.phases, points, self.knots_s)
-        return replace(
-            self,
-            time_s=time,
-            displacement_mm=self.curve(time),
-            force_N=np.interp(time, self.knots_s, self.knots_N),
-        )
+    def _evaluate(self, time: Array) -> tuple[Array, Array]:
+        return self.curve(time), np.interp(time, self.knots_s, self.knots_N)
 
 
 def regularise_creep(

@@ -55,12 +55,9 @@ class Fold:
         return tuple(i for i in range(len(self.errors_percent)) if i not in self.fitted)
 
     @property
-    def heldout_errors(self) -> tuple[float, ...]:
-        return tuple(self.errors_percent[i] for i in self.heldout)
-
-    @property
     def mean_heldout(self) -> float:
-        return float(np.mean(self.heldout_errors)) if self.heldout else float("nan")
+        errors = [self.errors_percent[i] for i in self.heldout]
+        return float(np.mean(errors)) if errors else float("nan")
 
     @property
     def mean_fitted(self) -> float:
