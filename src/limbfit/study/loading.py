@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from ..anatomy.sites.markups import read_markups
-from ..errors import StudyError
+from ..errors import StudyError, add_location
 from ..extensions import load_extensions
 from .study import Study
 from .unused_keys import check_unused_keys
@@ -39,19 +39,19 @@ def load_study(path: str | Path, *, recorded: bool = True) -> Study:
     content = {key: value for key, value in content.items() if key not in ("file", "notes")}
     notes = _place_by_markups(content, file)
     _load_extensions(content, file)
-    try:
-        study = Study(**content, file=file, notes=notes)
-        unused = [name for name in study.indenters if name not in study.used_indenters]
-        what = "no record names it; only limbfit design --protocol does"
-        notes = (*notes, *(f"indenters.{name}: {what}" for name in unused))
-        study = study.model_copy(update={"notes": notes})
-    except ValidationError as error:
-        raise _build_study_error(error, file) from None
-    for place, path in study.inputs.items():
-        if (recorded or not place.startswith(("sites.", "records."))) and not study.path(path).exists():
-            raise StudyError(f"{path} does not exist", file=file, place=place)
-    check_unused_keys(study, content)
-    return study
+    with add_location(file=file):
+        try:
+            study = Study(**content, file=file, notes=notes)
+        except ValidationError as error:
+            raise _build_study_error(error) from None
+        for place, path in study.inputs.items():
+            if (recorded or not place.startswith(("sites.", "records."))) and not study.path(path).exists():
+                raise StudyError(f"{path} does not exist", place=place)
+        check_unused_keys(study, content)
+    unused = [name for name in study.indenters if name not in study.used_indenters]
+    what = "no record names it; only limbfit design --protocol does"
+    notes = (*notes, *(f"indenters.{name}: {what}" for name in unused))
+    return study.model_copy(update={"notes": notes})
 
 
 def _place_by_markups(content: dict[str, Any], file: Path) -> tuple[str, ...]:
@@ -69,20 +69,14 @@ def _place_by_markups(content: dict[str, Any], file: Path) -> tuple[str, ...]:
     for site in (site for site in sites if isinstance(site, dict)):
         name = str(site.get("name"))
         is_placed = "position" in site or "near" in site
-        if is_placed and name in points:
-            raise StudyError(
-                "the site has a place here and a control point in the markups file",
-                file=file,
-                place=f"sites.{name}",
-                remedy="leave one of them out",
-            )
-        if not is_placed and name not in points:
-            raise StudyError(
-                f"no control point of {table['file']} is labelled {name!r}",
-                file=file,
-                place=f"sites.{name}",
-                remedy="it has " + (", ".join(map(repr, points)) or "none"),
-            )
+        with add_location(file=file, place=f"sites.{name}"):
+            if is_placed and name in points:
+                what = "the site has a place here and a control point in the markups file"
+                raise StudyError(what, remedy="leave one of them out")
+            if not is_placed and name not in points:
+                known = ", ".join(map(repr, points)) or "none"
+                what = f"no control point of {table['file']} is labelled {name!r}"
+                raise StudyError(what, remedy=f"it has {known}")
         if not is_placed:
             site[table.get("gives", "position")] = points[name].tolist()
     unused = sorted(set(points) - {str(site.get("name")) for site in sites if isinstance(site, dict)})
@@ -97,11 +91,11 @@ def _load_extensions(content: dict[str, Any], file: Path) -> None:
         load_extensions(file.parent / name for name in named)
 
 
-def _build_study_error(error: ValidationError, file: Path) -> StudyError:
+def _build_study_error(error: ValidationError) -> StudyError:
     first = error.errors()[0]
     place = ".".join(str(part) for part in first["loc"]) or None
     more = len(error.errors()) - 1
     what, remedy = first["msg"].removeprefix("Value error, "), None
     if first["type"] == "extra_forbidden":
         what, remedy = "unknown key", "see docs/study.md for the keys"
-    return StudyError(what + (f" (and {more} more)" if more else ""), file=file, place=place, remedy=remedy)
+    return StudyError(what + (f" (and {more} more)" if more else ""), place=place, remedy=remedy)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from ..errors import StudyError
@@ -263,24 +262,21 @@ def check_unused_keys(study: Study, content: Mapping[str, Any]) -> None:
     for rule in UNUSED_KEYS:
         for key in rule.keys:
             if _is_stated(content, key) and rule.when(study):
-                raise _build_unused_key_error(study.file, key, rule.why, rule.remedy)
+                raise _build_unused_key_error(key, rule.why, rule.remedy)
     for name, indenter in study.indenters.items():
         if "edge_radius_mm" in content["indenters"][name] and not SHAPES[indenter.shape].has_edge:
             place = f"indenters.{name}.edge_radius_mm"
-            raise _build_unused_key_error(
-                study.file, place, "the indenter has no edge to round", "leave it out"
-            )
+            raise _build_unused_key_error(place, "the indenter has no edge to round", "leave it out")
     mesh = content.get("mesh", {})
     if "accuracy" in mesh and ACCURACIES["standard"][0].keys() <= mesh.keys():
-        raise _build_unused_key_error(
-            study.file, "mesh.accuracy", "all edge lengths are stated", "leave it or them out"
-        )
+        why = "all edge lengths are stated"
+        raise _build_unused_key_error("mesh.accuracy", why, "leave it or them out")
     for site, stated in zip(study.sites, content["sites"], strict=True):
         for site_rule in UNUSED_SITE_KEYS:
             for key in site_rule.keys:
                 if key in stated and site_rule.when(study, site):
                     place = f"sites.{site.name}.{key}"
-                    raise _build_unused_key_error(study.file, place, site_rule.why, site_rule.remedy)
+                    raise _build_unused_key_error(place, site_rule.why, site_rule.remedy)
 
 
 def _is_stated(content: Mapping[str, Any], key: str) -> bool:
@@ -294,5 +290,5 @@ def _is_stated(content: Mapping[str, Any], key: str) -> bool:
     return value != {}
 
 
-def _build_unused_key_error(file: Path, key: str, why: str, remedy: str) -> StudyError:
-    return StudyError(f"without effect: {why}", file=file, place=key, remedy=remedy)
+def _build_unused_key_error(key: str, why: str, remedy: str) -> StudyError:
+    return StudyError(f"without effect: {why}", place=key, remedy=remedy)
