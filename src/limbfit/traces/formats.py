@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.io import loadmat, whosmat
@@ -235,43 +235,27 @@ def _read_tdms(file: Path, columns: Names) -> ColumnTable:
     """The group that holds the columns, its times by their channel or by the waveform's increment."""
     nptdms = _import("nptdms", "npTDMS", "tdms", file.suffix)
     try:
-        read = nptdms.TdmsFile.read(file)
-        groups = [[_Channel.from_tdms(one) for one in group.channels()] for group in read.groups()]
+        groups = [group.channels() for group in nptdms.TdmsFile.read(file).groups()]
     except Exception as error:  # a broken file can fail anywhere in the parser
         raise TraceError(f"not a readable TDMS file ({type(error).__name__})") from None
     others = {name for key, name in columns.items() if key != TIME} or {columns[TIME]}
     fitting = [group for group in groups if others <= {one.name for one in group}]
     if len(fitting) > 1:
-        raise TraceError(
-            f"{len(fitting)} of its groups hold these channels", remedy="save one group to a file"
-        )
+        what = f"{len(fitting)} of its groups hold these channels"
+        raise TraceError(what, remedy="save one group to a file")
     channels = fitting[0] if fitting else [one for group in groups for one in group]
-    notes: tuple[str, ...] = ()
-    if fitting and columns[TIME] not in (one.name for one in channels):
-        tracks = [one.time_s for one in channels if one.name in others]
-        if all(track is not None and np.array_equal(track, tracks[0]) for track in tracks):
-            channels = [_Channel(columns[TIME], "s", tracks[0], None), *channels]
-            notes = ("the times are those of the waveform",)
     names = [one.name for one in channels]
+    units = [str(one.properties.get("unit_string", "")) for one in channels]
+    vectors = [one[:] for one in channels]
+    notes: tuple[str, ...] = ()
+    if fitting and columns[TIME] not in names:
+        waves = [one for one in channels if one.name in others]
+        tracks = [one.time_track() for one in waves if "wf_increment" in one.properties]
+        if len(tracks) == len(waves) and all(np.array_equal(track, tracks[0]) for track in tracks):
+            names, units, vectors = [columns[TIME], *names], ["s", *units], [tracks[0], *vectors]
+            notes = ("the times are those of the waveform",)
     _check_names(names, columns)
-    return ColumnTable(
-        names, [one.unit for one in channels], vectors=[one.values for one in channels], notes=notes
-    )
-
-
-class _Channel(NamedTuple):
-    """Of a TDMS file; ``time_s`` are the waveform's times, None where it has none."""
-
-    name: str
-    unit: str
-    values: Any
-    time_s: Any
-
-    @classmethod
-    def from_tdms(cls, channel: Any) -> _Channel:
-        unit = str(channel.properties.get("unit_string", ""))
-        has_waveform = "wf_increment" in channel.properties
-        return cls(channel.name, unit, channel[:], channel.time_track() if has_waveform else None)
+    return ColumnTable(names, units, vectors=vectors, notes=notes)
 
 
 def _read_excel(file: Path, columns: Names) -> ColumnTable:

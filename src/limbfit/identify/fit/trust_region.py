@@ -94,16 +94,15 @@ def minimise(
         step = _solve_bounded_step(
             point, np.maximum(lower - point.z, -radius), np.minimum(upper - point.z, radius)
         )
-        hopeless = _predict_decrease(point, step) < _NOISE_FLOOR_SHARE * point.cost and not np.any(
-            np.abs(step) > 0.99 * radius
-        )
+        promised = _predict_decrease(point, step)
+        hopeless = promised < _NOISE_FLOOR_SHARE * point.cost and not np.any(np.abs(step) > 0.99 * radius)
         trial = evaluate(np.clip(point.z + step, lower, upper))
-        gain = _compute_gain(point, trial, step)
+        gain = -np.inf if trial is None else (point.cost - trial.cost) / max(promised, 1e-300)
         length = float(np.abs(step).max())
         radius = _update_radius(radius, length, gain)
         if trial is None or gain <= 1e-4:
             refused = refused + 1 if trial is not None else 0
-            rough = refused >= _MAX_REFUSED and _predict_decrease(point, step) < _ROUGH_SHARE * point.cost
+            rough = refused >= _MAX_REFUSED and promised < _ROUGH_SHARE * point.cost
             if trial is not None and (hopeless or rough):
                 yield SearchStep(point, radius, AT_NOISE_FLOOR, converged=True)
                 return
@@ -138,13 +137,6 @@ def _predict_decrease(point: SearchPoint, step: Array) -> float:
     """The decrease of the cost that the linearisation promises."""
     after = point.residual + point.jacobian @ step
     return point.cost - 0.5 * float(after @ after)
-
-
-def _compute_gain(point: SearchPoint, trial: SearchPoint | None, step: Array) -> float:
-    """Actual over predicted decrease; minus infinity where the trial failed."""
-    if trial is None:
-        return -np.inf
-    return (point.cost - trial.cost) / max(_predict_decrease(point, step), 1e-300)
 
 
 def _update_radius(radius: float, length: float, gain: float) -> float:
