@@ -13,7 +13,12 @@ from bars import PAPER, SITES, TRUTH, coarsened, plain, records, simulate
 
 from limbfit.errors import CalibrationError
 from limbfit.identify.fit.calibration import CalibrationSettings, calibrate
-from limbfit.identify.fit.multifidelity import CorrectionSettings, MeshCorrection, calibrate_with_correction
+from limbfit.identify.fit.multifidelity import (
+    CorrectedCalibration,
+    CorrectionSettings,
+    MeshCorrection,
+    calibrate_with_correction,
+)
 from limbfit.identify.fit.objective import SiteResponse
 
 TIGHT = CorrectionSettings(rounds=4, tolerance_percent=0.02)
@@ -25,6 +30,11 @@ def counting(function, calls):
         return function(parameters)
 
     return run
+
+
+@pytest.fixture(scope="module")
+def corrected() -> CorrectedCalibration:
+    return calibrate_with_correction(coarsened, plain, records(0.03), PAPER)
 
 
 def test_the_coarse_model_alone_is_wrong_and_the_corrected_one_is_not():
@@ -49,13 +59,10 @@ def test_few_coarse_and_fewer_fine_evaluations():
     assert found.calibration.cost == pytest.approx(reference.cost, rel=0.1)
 
 
-def test_the_forces_at_the_end_are_the_fine_ones():
-    found = calibrate_with_correction(coarsened, plain, records(0.03), PAPER)
-    exact = plain(found.calibration.parameters)
-    for response, site in zip(found.calibration.responses, exact, strict=True):
-        assert response.force_N == pytest.approx(site.force_N, abs=1e-12)
-    at = simulate(found.calibration.parameters)
-    for response, true in zip(found.calibration.responses, at, strict=True):
+def test_the_forces_at_the_end_are_the_fine_ones(corrected):
+    found = corrected.calibration
+    for response, true in zip(found.responses, simulate(found.parameters), strict=True):
+        assert response.force_N == pytest.approx(true.force_N, abs=1e-12)
         scale = np.abs(true.jacobian * TRUTH).max()
         assert response.jacobian * TRUTH == pytest.approx(true.jacobian * TRUTH, abs=0.08 * scale)
 
@@ -75,7 +82,7 @@ def test_every_stage_ends_with_fine_forces_and_history_is_whole():
         assert last.errors_percent == pytest.approx(errors, rel=1e-9)
 
 
-def test_a_run_killed_anywhere_and_begun_again_repeats_itself():
+def test_a_run_killed_anywhere_and_begun_again_repeats_itself(corrected):
     """Simulations are remembered, as the store of a study does; everything else is computed anew."""
     memory: dict[tuple[str, bytes], list[SiteResponse]] = {}
     left = [0]
@@ -101,7 +108,6 @@ def test_a_run_killed_anywhere_and_begun_again_repeats_itself():
             remembered("coarse", coarsened), remembered("fine", plain), data, PAPER
         )
 
-    whole = calibrate_with_correction(coarsened, plain, records(0.03), PAPER)
     kills = 0
     while True:
         left[0] = 1
@@ -111,14 +117,14 @@ def test_a_run_killed_anywhere_and_begun_again_repeats_itself():
             kills += 1
             continue
         break
-    assert kills == whole.calibration.evaluations + len(whole.rounds) - 1
-    assert np.array_equal(again.calibration.parameters, whole.calibration.parameters)
-    assert again.calibration.history == whole.calibration.history
-    assert again.rounds == whole.rounds
+    assert kills == corrected.calibration.evaluations + len(corrected.rounds) - 1
+    assert np.array_equal(again.calibration.parameters, corrected.calibration.parameters)
+    assert again.calibration.history == corrected.calibration.history
+    assert again.rounds == corrected.rounds
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_one_simulation_in_ten_may_fail_on_either_mesh(seed):
+def test_one_simulation_in_ten_may_fail_on_either_mesh(seed, corrected):
     def failing(function, rate, offset):
         rng = np.random.default_rng([seed, offset])
 
@@ -130,12 +136,11 @@ def test_one_simulation_in_ten_may_fail_on_either_mesh(seed):
 
         return run
 
-    reference = calibrate_with_correction(coarsened, plain, records(0.03), PAPER)
     found = calibrate_with_correction(
         failing(coarsened, 0.1, 0), failing(plain, 0.1, 1), records(0.03), PAPER
     )
     assert found.calibration.converged, found.calibration.reason
-    assert found.calibration.parameters == pytest.approx(reference.calibration.parameters, rel=0.03)
+    assert found.calibration.parameters == pytest.approx(corrected.calibration.parameters, rel=0.03)
 
 
 def test_a_fine_simulation_that_always_fails_is_told():
