@@ -186,25 +186,18 @@ class LogTables:
 
     def _compute_element_columns(self, points: Array, fields: ElementFields | None) -> dict[str, Array]:
         parts = self.model.geometry.parts.values()
-        stress, J = (np.zeros((sum(len(part.ids) for part in parts), 6)), [])
-        middle, at, tissue = [], 0, 0
-        for part in parts:
-            count = len(part.ids)
-            middle.append(points[part.cells].mean(axis=1))
-            J.append(np.ones(count))
-            if part.material in self.model.materials:
-                if fields is not None:
-                    stress[at : at + count] = fields.cauchy[tissue : tissue + count]
-                    J[-1] = fields.J[tissue : tissue + count]
-                tissue += count
-            at += count
+        is_soft = np.repeat(
+            [part.material in self.model.materials for part in parts], [len(part.ids) for part in parts]
+        )
+        stress, J = np.zeros((len(is_soft), 6)), np.ones(len(is_soft))
+        if fields is not None:
+            stress[is_soft], J[is_soft] = fields.cauchy, fields.J
+        middle = np.vstack([points[part.cells].mean(axis=1) for part in parts])
         found = dict(zip(_CAUCHY, stress.T))
         xx, yy, zz, xy, yz, zx = stress.T
         tensor = np.stack([xx, xy, zx, xy, yy, yz, zx, yz, zz], axis=1).reshape(-1, 3, 3)
         found |= dict(zip(("s3", "s2", "s1"), np.linalg.eigvalsh(tensor).T))
-        found |= dict(zip(("x", "y", "z"), np.vstack(middle).T))
-        found["J"] = np.concatenate(J)
-        return found
+        return found | dict(zip(("x", "y", "z"), middle.T)) | {"J": J}
 
     def _compute_rigid_columns(self, step: Step | None) -> dict[str, Array]:
         """Return columns of every rigid body.

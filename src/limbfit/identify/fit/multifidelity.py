@@ -47,11 +47,8 @@ class MeshCorrection:
     finite or has no force is not corrected: ``reasons`` says why, and its corrected response has no numbers.
     The fine responses need no derivatives.
 
-    Raises
-    ------
-    CalibrationError
-        If the two, or the responses to be corrected, are not of the same sites and times: an error of the
-        caller.
+    Raises `CalibrationError` if the two, or the responses to be corrected, are not of the same sites and
+    times: an error of the caller.
     """
 
     coarse: Sequence[SiteResponse]
