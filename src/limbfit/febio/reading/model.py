@@ -9,7 +9,7 @@ grows while everything else rests: that step is read as the beginning, and the t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
@@ -357,23 +357,17 @@ def _read_contact(node: XmlNode, geometry: Geometry) -> Contact:
 
 @dataclass(frozen=True)
 class Request:
-    """One table per step: ``names`` of its columns, the ``items`` (ranges of FEBio's numbers; empty: all).
-
-    ``members`` are the items if a set is asked for.
-    """
+    """One table per step: ``names`` of columns, ``items``: sets or ranges of FEBio's numbers (empty: all)."""
 
     kind: str
     names: tuple[str, ...]
     file: str
     delimiter: str
-    items: tuple[tuple[int, int], ...]
-    members: frozenset[int] | None = None
+    items: tuple[Container[int], ...]
 
     def includes(self, number: int) -> bool:
         """True if the item of that number is asked for."""
-        if self.members is not None:
-            return number in self.members
-        return not self.items or any(low <= number <= high for low, high in self.items)
+        return not self.items or any(number in some for some in self.items)
 
 
 def read_requests(section: XmlNode | None, geometry: Geometry) -> tuple[tuple[Request, ...], tuple[str, ...]]:
@@ -400,30 +394,27 @@ def read_requests(section: XmlNode | None, geometry: Geometry) -> tuple[tuple[Re
                 )
             if known:
                 file = PurePosixPath(entry.attributes.get("file", "").replace("\\", "/")).name
-                delimiter, members = entry.attributes.get("delim", " "), _find_members(entry, geometry)
-                items = _read_items(entry) if members is None else ()
-                requests.append(Request(entry.tag, known, file, delimiter, items, members))
+                delimiter, items = entry.attributes.get("delim", " "), _read_items(entry, geometry)
+                requests.append(Request(entry.tag, known, file, delimiter, items))
     return tuple(requests), tuple(notes)
 
 
-def _find_members(entry: XmlNode, geometry: Geometry) -> frozenset[int] | None:
-    """Return the items of the set that an entry names, if it does."""
+def _read_items(entry: XmlNode, geometry: Geometry) -> tuple[Container[int], ...]:
+    """Read the set that an entry names, or ranges of numbers: ``1,4,10:20``.
+
+    FEBio also has ``10:20:2``, which is refused.
+    """
     node, element = entry.attributes.get("node_set"), entry.attributes.get("elem_set")
     if node is not None:
-        return frozenset(geometry.node_ids[find_node_set(geometry, node, entry)].tolist())
-    if element is None:
-        return None
-    if element not in geometry.element_sets:
-        raise entry.error(f"there is no element set {element!r}")
-    return frozenset(geometry.element_sets[element].tolist())
-
-
-def _read_items(entry: XmlNode) -> tuple[tuple[int, int], ...]:
-    """Read ranges of numbers: ``1,4,10:20`` (FEBio also has ``10:20:2``, which is refused)."""
+        return (frozenset(geometry.node_ids[find_node_set(geometry, node, entry)].tolist()),)
+    if element is not None:
+        if element not in geometry.element_sets:
+            raise entry.error(f"there is no element set {element!r}")
+        return (frozenset(geometry.element_sets[element].tolist()),)
     ranges = []
     for text in filter(None, (part.strip() for part in entry.text.split(","))):
         low, _, high = text.partition(":")
         if not (low.isdecimal() and (high or low).isdecimal()):
             raise entry.error(f"{text[:40]!r} is neither a number nor a range of numbers")
-        ranges.append((int(low), int(high or low)))
+        ranges.append(range(int(low), int(high or low) + 1))
     return tuple(ranges)
