@@ -8,7 +8,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from ..web import build_inline_script, compute_integrity, read_asset
@@ -17,6 +16,7 @@ from .page import Cell, Figure, Page, Row, Table
 from .sections.contents import make_page
 from .sections.methods import write_method_markdown
 from .store import load_store
+from .words import TEMPLATES, make_environment
 
 REPORT_NAME, METHODS_NAME = "report.html", "methods.md"
 SCRIPTS = (
@@ -106,14 +106,11 @@ def _render(page: Page) -> str:
 
     Its policy lets one script run, told by its digest, and lets nothing be loaded or sent.
     """
-    loader = PackageLoader("limbfit.report", "templates")
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    environment = make_environment(autoescape=True)
     environment.filters["data"] = _embed_json
 
     def source(name: str) -> str:
-        return loader.get_source(environment, name)[0]
+        return TEMPLATES.get_source(environment, name)[0]
 
     moves = any(block.kind == "interactive" for section in page.sections for block in section.blocks)
     script = f"(() => {{\n{build_inline_script(*SCRIPTS)}\n{source('report.js')}}})();" if moves else ""

@@ -154,11 +154,6 @@ class Results:
         files = {"skin": folder / "skin.stl"} | {p.stem: p for p in inner}
         return {name: path for name, path in files.items() if path.is_file()}
 
-    def region(self, site: str) -> str:
-        rows = [row.region for row in self.sites if row.site == site]
-        rows += [row.region for row in self.predicted if row.site == site]
-        return (rows or [None])[0] or ""
-
     @property
     def placed_sites(self) -> dict[str, PlacedSite]:
         """The sites by name."""

@@ -18,9 +18,8 @@ _BAR = "\ue000"  # for a "|" in a value, until columns are apart
 
 def make_environment(undefined: type[Undefined] = StrictUndefined, **options: Any) -> Environment:
     """Templates that read attributes of stored results and write numbers as the report does."""
-    environment = Environment(
-        loader=TEMPLATES, undefined=undefined, trim_blocks=True, lstrip_blocks=True, **options
-    )
+    options |= {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
+    environment = Environment(loader=TEMPLATES, undefined=undefined, **options)
     environment.filters |= {
         "fixed": formats.format_fixed,
         "number": formats.number,

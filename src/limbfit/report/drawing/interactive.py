@@ -103,7 +103,7 @@ def _describe_site(store: Results, row: PlacedSite) -> Json:
     errors = [error for error in known if error is not None]
     return {
         "name": row.site,
-        "region": store.region(row.site),
+        "region": row.region or "",
         "fitted": row.fitted,
         "at": list(row.position_mm),
         "axis": (axis / np.linalg.norm(axis)).tolist(),
@@ -206,19 +206,16 @@ def draw_convergence_curves(store: Results) -> Interactive | None:
     steps = [step for stage in store.stages for step in stage.iterations]
     if not steps:
         return None
-    make_panels = [_make_error_panel(steps)]
+    panels = [_make_error_panel(steps)]
     for name in store.law.keys:
         series = [
             {"label": tissue, "y": [step.parameters[tissue][name] for step in steps]}
             for tissue in store.tissues
         ]
-        make_panels.append(
-            {"title": format_symbol(name), "unit": get_unit(name), "log": False, "series": series}
-        )
+        panels.append({"title": format_symbol(name), "unit": get_unit(name), "log": False, "series": series})
     caption = write_words("figure iterates")
-    return Interactive(
-        "iterates", "iterates", "Error and parameters over the iterates.", caption, {"panels": make_panels}
-    )
+    label = "Error and parameters over the iterates."
+    return Interactive("iterates", "iterates", label, caption, {"panels": panels})
 
 
 def _make_error_panel(steps: Sequence[SearchIteration]) -> Json:

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 
 from ...results.identification import (
     CorrelationMatrix,
-    RecordResiduals,
-    ResidualsSummary,
     SearchStage,
     SimulationDoubts,
 )
 from ..drawing.figures import draw_convergence_figure, draw_interval_figure
 from ..drawing.interactive import draw_convergence_curves
 from ..formats import format_fixed, label
-from ..page import Block, Bullets, Cell, Prose, Section, Table, make_bullets, make_section
+from ..page import Block, Bullets, Cell, Section, Table, make_bullets, make_section
 from ..store import Results
 from ..tables import make_row, make_table
 from ..words import make_prose, write_words
+
+_KINDS = {
+    "folded": "elements inside out",
+    "slipped": "force falls in loading",
+    "sunk": "indenter too deep in the skin",
+    "unbalanced": "equilibrium beyond the tolerance",
+    "unsettled": "friction not settled",
+    "inexact": "inexact sensitivities",
+}
+EQUAL_PERCENT = 0.01  # of the largest force: what the tolerance of an equilibrium leaves
 
 
 def make_parameter_section(store: Results) -> Section:
@@ -36,7 +43,7 @@ def make_parameter_section(store: Results) -> Section:
         describe_relaxation(store),
         describe_priors(store),
         _describe_combinations(store),
-        _describe_residuals(known.residuals),
+        make_prose("residuals", found=known.residuals),
         otherwise=none,
     )
 
@@ -72,7 +79,6 @@ def describe_priors(store: Results) -> tuple[Block | None, ...]:
     found = store.uncertainty.priors if store.uncertainty else None
     if found is None:
         return ()
-
     return make_prose("priors", found=found), make_table("priors", store.parameters, store=store, found=found)
 
 
@@ -84,37 +90,6 @@ def _describe_combinations(store: Results) -> tuple[Block | None, ...]:
     for name in map(".".join, store.parameters):
         sentences = [sentence.replace(name, label(name)) for sentence in sentences]
     return make_prose("combinations"), Bullets(tuple(sentences))
-
-
-def _describe_residuals(found: ResidualsSummary) -> Prose | None:
-    """What the intervals rest on: noise, misfit of the model, errors of meshes and surfaces, by site."""
-    meshes = _list_shares({name: row.mesh_share for name, row in found.sites.items()})
-    own = _list_shares({name: row.site_share for name, row in found.sites.items()})
-    return make_prose("residuals", found=found, meshes=meshes, own=own, describe_residuals=describe_residuals)
-
-
-def _list_shares(shares: Mapping[str, float | None]) -> str:
-    known = {name: share for name, share in shares.items() if share is not None}
-    return ", ".join(f"{name} {format_fixed(100 * share)} %" for name, share in known.items())
-
-
-def describe_residuals(sites: Mapping[str, RecordResiduals]) -> str:
-    """Standard deviations of each fitted record's noise and of the model's misfit, in words."""
-    return ", ".join(
-        f"{name} {format_fixed(one.noise_sd_N, 3)} and {format_fixed(one.misfit_sd_N, 3)} {one.unit}"
-        for name, one in sites.items()
-    )
-
-
-_KINDS = {
-    "folded": "elements inside out",
-    "slipped": "force falls in loading",
-    "sunk": "indenter too deep in the skin",
-    "unbalanced": "equilibrium beyond the tolerance",
-    "unsettled": "friction not settled",
-    "inexact": "inexact sensitivities",
-}
-EQUAL_PERCENT = 0.01  # of the largest force: what the tolerance of an equilibrium leaves
 
 
 def make_convergence_section(store: Results) -> Section:

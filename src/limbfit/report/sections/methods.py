@@ -25,7 +25,6 @@ from ..formats import (
 from ..page import Prose, Section
 from ..store import Json, Results
 from ..words import make_environment
-from .identification import describe_residuals
 from .provenance import flatten_settings
 
 Part = tuple[str, str]  # a heading and its paragraph
@@ -82,7 +81,6 @@ def write_method_parts(store: Results) -> tuple[Part, ...]:
         span=_format_span,
         pairs=_format_pairs,
         describe_indenter=lambda one: SHAPES[one["shape"]].describe(one),
-        describe_residuals=describe_residuals,
         describe_start=_format_start,
         describe_bounds=_format_bounds,
     )

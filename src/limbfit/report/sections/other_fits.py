@@ -14,6 +14,8 @@ from ..store import Results
 from ..tables import make_row, make_table, to_numeric
 from ..words import make_prose
 
+MAX_FACTOR = 1e3  # of an interval over its value, in the figure
+
 
 def make_crossvalidation_section(store: Results, content: CrossvalidateResult) -> Section:
     """What the experiment ``crossvalidate`` found."""
@@ -57,9 +59,6 @@ def _draw_errors(content: CrossvalidateResult) -> Figure:
     ax.grid(visible=False, axis="x")
     add_legend(drawing, axes[0])
     return make_figure(drawing, "crossvalidate", content=content)
-
-
-MAX_FACTOR = 1e3  # of an interval over its value, in the figure
 
 
 def make_regions_section(store: Results, content: RegionsResult) -> Section:
