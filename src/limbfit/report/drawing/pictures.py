@@ -100,7 +100,7 @@ def build_picture_row(shots: Sequence[Shot], titles: Sequence[str], alt: str) ->
                 "title": title,
                 "view": view,
                 "image": embed_png(buffer.getvalue()),
-                "arrows": [_draw_arrow(view, mark) for mark in marks if mark.axis is not None],
+                "arrows": [_outline_arrow(view, mark) for mark in marks if mark.axis is not None],
                 "dots": [
                     (mark, *view.project(mark.position)[0], at)
                     for mark, at in zip(ordered, heights, strict=True)
@@ -116,7 +116,7 @@ def build_picture_row(shots: Sequence[Shot], titles: Sequence[str], alt: str) ->
     )
 
 
-def _draw_arrow(view: View, mark: Mark) -> tuple[Mark, Array, Array, Array]:
+def _outline_arrow(view: View, mark: Mark) -> tuple[Mark, Array, Array, Array]:
     """The mark, where its arrow begins and where its head does, and the head's corners (3, 2), in pixels."""
     assert mark.axis is not None
     tip = view.project(mark.position)[0]
