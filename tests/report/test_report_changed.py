@@ -12,8 +12,9 @@ from page_outline import Outline, section_of, without_scripts
 from stored_results import add_fat, leave_unarranged, remove_geometry, write_results
 
 from completing import complete
-from limbfit import compress_cube
+from limbfit import compress_cube, load_study
 from limbfit.errors import InputError
+from limbfit.pipeline.commands.run import compute_keys
 from limbfit.report import build_report
 from limbfit.report.store import load_store
 from limbfit.results.models import ModelsResult
@@ -220,3 +221,11 @@ def test_other_models_are_left_out_once_the_study_was_identified_anew(copy, tmp_
     page = build_report(copy, tmp_path / "out").read_text(encoding="utf-8")
     assert '<section id="models"' not in page
     assert "limbfit uncertainty --models” are left out" in page
+
+
+def test_a_report_is_stale_once_other_models_were_weighed(study):
+    before = compute_keys(load_study(study))
+    (study / "results" / "models").mkdir(parents=True)
+    (study / "results" / "models" / "models.json").write_text("{}")
+    after = compute_keys(load_study(study))
+    assert {stage for stage in before if before[stage] != after[stage]} == {"report"}

@@ -15,6 +15,7 @@ from ...execution import run_in_background
 from ...extensions import load_extensions
 from ...fe import are_compiled, compile_kernels
 from ...results.identification import CalibrationResult, PredictResult
+from ...results.models import ModelsResult
 from ...results.runs import (
     ExperimentRecord,
     MachineFacts,
@@ -25,6 +26,7 @@ from ...results.runs import (
 )
 from ...study import Study
 from ..engine.context import Context, Listener, build_executor, ignore_progress
+from ..engine.digests import compute_file_digest
 from ..engine.hand_labels import keep_hand_labels
 from ..engine.journal import write_journal
 from ..engine.keys import Keys, Stage
@@ -127,7 +129,7 @@ def compute_keys(study: Study) -> dict[str, str]:
     """The key of every stage: a digest of its settings, input files, code and of the stages it stands on.
 
     The calibration's is the one that it has in the study of its fitted sites alone: whatever is held out can
-    change, come and go without it. The report's covers the experiments that it shows.
+    change, come and go without it. The report's covers the experiments and other models that it shows.
     """
     return _chain_keys(Keys(study))
 
@@ -138,6 +140,8 @@ def _chain_keys(known: Keys) -> dict[str, str]:
     calibrate = known.of(stages, study=_select_calibration_inputs(study))["calibrate"]
     found = known.of(stages[:-1], {"calibrate": calibrate})
     shown = [row["key"] for row in list_experiment_rows(study, known, found) if row["state"] == "done"]
+    models = study.results / ModelsResult.FILE
+    shown += [compute_file_digest(models)] if models.is_file() else []
     return found | known.of(stages[-1:], found, options={"report": {"experiments": shown} if shown else {}})
 
 
