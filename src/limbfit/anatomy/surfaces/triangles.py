@@ -39,23 +39,28 @@ class Surface:
     faces: Indices
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "points", np.ascontiguousarray(self.points, dtype=np.float64))
-        object.__setattr__(self, "faces", np.ascontiguousarray(self.faces, dtype=np.int64))
+        object.__setattr__(self, "points", np.asarray(self.points, dtype=np.float64))
+        object.__setattr__(self, "faces", np.asarray(self.faces, dtype=np.int64))
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the trees, which cannot be sent to another process."""
         return {"points": self.points, "faces": self.faces}
 
     @cached_property
+    def _contiguous(self) -> tuple[Array, Indices]:
+        """Points and faces as libigl takes them."""
+        return np.ascontiguousarray(self.points), np.ascontiguousarray(self.faces)
+
+    @cached_property
     def _boxes(self) -> igl.AABB:
         tree = igl.AABB()
-        tree.init(self.points, self.faces)
+        tree.init(*self._contiguous)
         return tree
 
     @cached_property
     def _windings(self) -> igl.FastWindingNumberBVH:
         tree = igl.FastWindingNumberBVH()
-        tree.init(self.points, self.faces)
+        tree.init(*self._contiguous)
         return tree
 
     def find_nearest(self, points: ArrayLike) -> tuple[Array, Indices, Array]:
@@ -63,7 +68,7 @@ class Surface:
         query = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
         if not len(query):
             return np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-        squared, face, foot = self._boxes.squared_distance(self.points, self.faces, query)
+        squared, face, foot = self._boxes.squared_distance(*self._contiguous, query)
         return squared, face, foot
 
     def find_signed(self, points: ArrayLike) -> tuple[Array, Indices, Array]:
@@ -90,6 +95,7 @@ class Surface:
         locator.BuildLocator()
         far = 2.0 * float(np.linalg.norm(np.ptp(np.vstack([self.points, starts]), axis=0)))
         hits, cells = vtkPoints(), vtkIdList()
+        hits.SetDataTypeToDouble()
         found = []
         for start, way in zip(starts, ways):
             locator.IntersectWithLine(start, start + far * way, 1e-6, hits, cells)
@@ -100,7 +106,7 @@ class Surface:
     @cached_property
     def self_intersections(self) -> Indices:
         """(p, 2) pairs of faces without a common point of which an edge of one pierces the other."""
-        _, pairs, coplanar = find_self_intersections(self.points, self.faces)
+        _, pairs, coplanar = find_self_intersections(*self._contiguous)
         pairs = np.sort(pairs[~coplanar.astype(bool).ravel()], axis=1)
         first, second = self.faces[pairs[:, 0]], self.faces[pairs[:, 1]]
         apart = ~(first[:, :, None] == second[:, None, :]).any(axis=(1, 2))
