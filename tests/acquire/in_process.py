@@ -9,7 +9,7 @@ import numpy as np
 
 from acquiring import indentation
 from limbfit.acquire.device import LineDevice
-from limbfit.acquire.events import PINS, Confirm, KeyDown, KeyUp, Settings
+from limbfit.acquire.events import PINS, Settings, Signal
 from limbfit.acquire.protocol import Phase
 from limbfit.acquire.session import Session
 from limbfit.acquire.virtual import Fault, VirtualFitSocket, VirtualLimb, fit_surrogate
@@ -89,7 +89,7 @@ class Bench:
         limit[self.settings.pin - 1] = self.settings.force_limit_N
         self._limit_N = limit + SENSOR_MN / 1000
         self.session.begin(0.0)
-        self.session.handle(Confirm(), 0.0)
+        self.session.handle(Signal.CONFIRM, 0.0)
 
     @property
     def now(self) -> float:
@@ -115,9 +115,9 @@ class Bench:
         """What the operator does by himself: holds the key when it is time, and lets it go at the depth."""
         protocol = self.session.protocol
         if protocol.phase is Phase.READY:
-            self.session.handle(KeyDown(), self.now)
+            self.session.handle(Signal.KEY_DOWN, self.now)
         elif protocol.phase is Phase.SEARCH and protocol.depth_um - protocol.touch_um > 1000 * self.depth_mm:
-            self.session.handle(KeyUp(), self.now)
+            self.session.handle(Signal.KEY_UP, self.now)
 
     def until(self, phase: Phase | None = None, most_ms: int = 60_000) -> None:
         """Run to a phase, or to the end."""

@@ -23,7 +23,7 @@ from hypothesis.stateful import (
 )
 from in_process import Bench
 
-from limbfit.acquire.events import PINS, Abort, KeyDown, KeyUp, LinkLost
+from limbfit.acquire.events import PINS, Abort, LinkLost, Signal
 from limbfit.acquire.protocol import Phase
 from limbfit.acquire.virtual import FAULT_KINDS, Fault
 
@@ -92,7 +92,7 @@ class Sequences(RuleBasedStateMachine):
         for _ in range(ms):
             self.bench.millisecond(device=False)
 
-    @rule(event=st.sampled_from([KeyDown(), KeyUp(), Abort("the operator"), LinkLost("cut")]))
+    @rule(event=st.sampled_from([Signal.KEY_DOWN, Signal.KEY_UP, Abort("the operator"), LinkLost("cut")]))
     def operator(self, event) -> None:
         self.bench.session.handle(event, self.bench.now)
         if isinstance(event, LinkLost):

@@ -23,7 +23,7 @@ from in_process import settings
 
 from acquiring import SPEED, fitsocket, start
 from limbfit.acquire import LineDevice, LiveUpdate, Session, connect, read_recording, run_session
-from limbfit.acquire.events import Abort, Confirm, Flags, Sample
+from limbfit.acquire.events import Abort, Flags, Sample, Signal
 from limbfit.acquire.line_protocol import Encoder, SetLimits
 from limbfit.acquire.protocol import Phase
 from limbfit.errors import RunError
@@ -208,7 +208,7 @@ def test_two_sessions_over_one_serial_port(ready) -> None:
 
             def listen(told, events=events) -> None:
                 if told.phase == "position":
-                    events.put(Confirm())
+                    events.put(Signal.CONFIRM)
                 elif isinstance(told, LiveUpdate) and told.phase == "clamp":
                     events.put(Abort("enough"))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from in_process import FAST, Bench, settings
 
-from limbfit.acquire.events import Abort, Confirm, KeyDown, KeyUp
+from limbfit.acquire.events import Abort, Signal
 from limbfit.acquire.protocol import FINAL, TRANSITIONS, Outcome, Phase
 from limbfit.acquire.session import PhaseUpdate
 from limbfit.acquire.virtual import Fault
@@ -86,7 +86,7 @@ def test_letting_go_halts_at_once_and_a_shallow_search_is_none() -> None:
 def test_the_key_moves_nothing_in_other_phases() -> None:
     bench = Bench()
     bench.until(Phase.CLAMP)
-    for event in (KeyDown(), KeyUp(), Confirm()):
+    for event in (Signal.KEY_DOWN, Signal.KEY_UP, Signal.CONFIRM):
         bench.session.handle(event, bench.now)
     assert bench.phase is Phase.CLAMP
     assert bench.device.motors.position_mm[0] == 0

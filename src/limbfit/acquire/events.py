@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntFlag
+from enum import Enum, IntFlag
 from typing import ClassVar
 
 from ..study import AcquireTable
@@ -43,24 +43,14 @@ class Sample:
         return bool(self.moving >> (pin - 1) & 1)
 
 
-@dataclass(frozen=True, slots=True)
-class Begin:
-    """The operator starts the session."""
+class Signal(Enum):
+    """What happens besides samples and ends."""
 
-
-@dataclass(frozen=True, slots=True)
-class Confirm:
-    """The operator says that the limb is in place, the test pin at its site."""
-
-
-@dataclass(frozen=True, slots=True)
-class KeyDown:
-    """The operator holds the key of the depth search."""
-
-
-@dataclass(frozen=True, slots=True)
-class KeyUp:
-    """The operator lets it go."""
+    BEGIN = "the operator starts the session"
+    CONFIRM = "the operator says that the limb is in place, the test pin at its site"
+    KEY_DOWN = "the operator holds the key of the depth search"
+    KEY_UP = "the operator lets it go"
+    TICK = "time passes without a sample"
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +67,7 @@ class LinkLost:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
-class Tick:
-    """Time passes without a sample."""
-
-
-Event = Sample | Begin | Confirm | KeyDown | KeyUp | Abort | LinkLost | Tick
+Event = Sample | Signal | Abort | LinkLost
 
 
 class Message:

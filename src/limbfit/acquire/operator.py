@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from queue import SimpleQueue
 
-from .events import Abort, Confirm, Event, KeyDown, KeyUp
+from .events import Abort, Event, Signal
 from .protocol import Phase
 from .session import PhaseUpdate, Update
 
@@ -28,12 +28,12 @@ class Keyboard:
         found: list[Event] = []
         for one in characters:
             if one in b"\r\n":
-                found.append(Confirm())
+                found.append(Signal.CONFIRM)
             elif one == 0x20:
                 before, self._last = self._last, now
                 if not self.is_held and before is not None and now - before <= FIRST_REPEAT_S:
                     self.is_held = True
-                    found.append(KeyDown())
+                    found.append(Signal.KEY_DOWN)
             else:
                 found.append(Abort("the operator stopped it by a key"))
         return found
@@ -43,7 +43,7 @@ class Keyboard:
         if self._last is None or not self.is_held or now - self._last <= self.gap_s:
             return []
         self.is_held, self._last = False, None
-        return [KeyUp()]
+        return [Signal.KEY_UP]
 
 
 class NoOperator:
@@ -56,6 +56,6 @@ class NoOperator:
         if not isinstance(update, PhaseUpdate):
             return
         if update.phase == Phase.POSITION:
-            self.events.put(Confirm())
+            self.events.put(Signal.CONFIRM)
         elif update.phase == Phase.READY:
-            self.events.put(KeyDown())
+            self.events.put(Signal.KEY_DOWN)

@@ -13,18 +13,15 @@ from .events import (
     RATE_HZ,
     Abort,
     Action,
-    Begin,
-    Confirm,
     Event,
     Fence,
     Flags,
     Hold,
-    KeyDown,
-    KeyUp,
     LinkLost,
     Move,
     Sample,
     Settings,
+    Signal,
     Stop,
     to_thousandths,
 )
@@ -177,7 +174,7 @@ class Protocol:
         if self.is_over:
             return ()
         match event:
-            case Begin() if self.phase is Phase.IDLE:
+            case Signal.BEGIN if self.phase is Phase.IDLE:
                 self._last_sample_s = now
                 return self._transition(Outcome.BEGUN, now)
             case Abort(reason=reason):
@@ -189,11 +186,11 @@ class Protocol:
                 return self._transition(
                     self._report_unreachable("whether the device has retracted is not known"), now
                 )
-            case Confirm() if self.phase is Phase.POSITION:
+            case Signal.CONFIRM if self.phase is Phase.POSITION:
                 self._is_confirmed = True
-            case KeyDown() if self.phase is Phase.READY:
+            case Signal.KEY_DOWN if self.phase is Phase.READY:
                 return self._transition(Outcome.KEY_HELD, now)
-            case KeyUp() if self.phase is Phase.SEARCH:
+            case Signal.KEY_UP if self.phase is Phase.SEARCH:
                 self._is_confirmed = False
                 return (Hold(self.settings.pin),)
         return self._check_time(now)

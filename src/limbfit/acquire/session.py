@@ -23,15 +23,14 @@ from .events import (
     PERIOD_US,
     Abort,
     Action,
-    Begin,
     Event,
     Hold,
     LinkLost,
     Move,
     Sample,
     Settings,
+    Signal,
     Stop,
-    Tick,
     to_thousandths,
 )
 from .line_protocol import (
@@ -142,7 +141,7 @@ class Session:
         with self._guard_link(now):
             self.device.send(limits, now)
             self.device.send(NoteSite(self._site), now)
-        self.handle(Begin(), now)
+        self.handle(Signal.BEGIN, now)
 
     def handle_reports(
         self, reports: list[Sample | Declined | LimitTripped | OutOfReach], now: float
@@ -185,7 +184,7 @@ class Session:
             silent = now - self._last_fresh_s
             if silent * 1000 > self.settings.watchdog_ms:
                 self.handle(Abort(f"no fresh sample for {silent * 1000:.0f} ms"), now)
-        self.handle(Tick(), now)
+        self.handle(Signal.TICK, now)
         with self._guard_link(now):
             if reason := self.device.resend(now):
                 self.handle(Abort(reason), now)
