@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from limbfit.anatomy.surfaces.surfaces import save_anatomy
-from limbfit.phantom.build import _to_triple, draw_true_parameters
+from limbfit.phantom.build import draw_true_parameters
 from limbfit.phantom.forces import (
     DISCRETISATIONS,
     ForceJob,
@@ -37,10 +37,9 @@ def phantom(tmp_path_factory):
 def test_site_is_simulated_to_its_end(phantom, name):
     folder, sites = phantom
     site = sites[name]
-    made, at, axis = DISCRETISATIONS["coarse"], _to_triple(site.position), _to_triple(site.axis)
-    mesh = mesh_true_site(TruthMeshJob(name, folder, at, axis, made.mesh, made.within_mm))
-    steps = made.steps(site.thickness)
-    found = simulate_true_force(ForceJob(name, mesh, at, axis, site.ramp, steps, draw_true_parameters(0)))
+    made = DISCRETISATIONS["coarse"]
+    mesh = mesh_true_site(TruthMeshJob(site, folder, made.mesh, made.within_mm))
+    found = simulate_true_force(ForceJob(site, mesh, made.steps(site.thickness), draw_true_parameters(0)))
     peak = int(np.argmax(found.force))
     assert 2.0 < found.force[peak] < 20.0
     assert found.times[peak] == pytest.approx(site.depth / site.speed, rel=0.02)
@@ -52,11 +51,9 @@ def test_a_site_shows_what_is_asked_for_and_no_more(phantom):
     """One of coarse tissue within 45 mm; the force is the same whatever is seen beside it."""
     folder, sites = phantom
     site, made = sites["05"], DISCRETISATIONS["coarse"]
-    at, axis = _to_triple(site.position), _to_triple(site.axis)
-    settings = replace(made.mesh, edge_near_mm=7.0)
-    mesh = mesh_true_site(TruthMeshJob("05", folder, at, axis, settings, 45.0))
+    mesh = mesh_true_site(TruthMeshJob(site, folder, replace(made.mesh, edge_near_mm=7.0), 45.0))
     steps = replace(made.steps(site.thickness), load_steps=4, unload_steps=3)
-    job = ForceJob("05", mesh, at, axis, site.ramp, steps, draw_true_parameters(0))
+    job = ForceJob(site, mesh, steps, draw_true_parameters(0))
     plain, found = (
         simulate_true_force(job),
         simulate_true_force(replace(job, measurements=SecondaryMeasurements(True, True, True))),

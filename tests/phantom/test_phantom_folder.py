@@ -31,15 +31,14 @@ def cubic_law(function, jobs):
         if function is mesh_true_site:
             yield None
             continue
-        times = np.linspace(0, 2 * job.ramp.peak_s, 101)
-        depth = np.interp(times, *job.ramp.knots)
-        lag = np.where(times > job.ramp.peak_s, 0.8, 1.0)
-        points = (
-            np.array(job.position) + np.array([[14.0, 0.0, 0.0], [0.0, 22.0, 0.0]]) * job.measurements.surface
-        )
-        moves = np.multiply.outer(np.outer([0.5, 0.1], job.axis), depth)[: 2 * job.measurements.surface]
+        ramp = job.site.ramp
+        times = np.linspace(0, 2 * ramp.peak_s, 101)
+        depth = np.interp(times, *ramp.knots)
+        lag = np.where(times > ramp.peak_s, 0.8, 1.0)
+        points = job.site.position + np.array([[14.0, 0.0, 0.0], [0.0, 22.0, 0.0]]) * job.measurements.surface
+        moves = np.multiply.outer(np.outer([0.5, 0.1], job.site.axis), depth)[: 2 * job.measurements.surface]
         force = lag * 0.02 * depth**3
-        yield TrueForce(job.site, times, force, {"element": "none"}, {}, points[: len(moves)], moves)
+        yield TrueForce(times, force, {"element": "none"}, {}, points[: len(moves)], moves)
 
 
 @pytest.fixture(scope="module")

@@ -205,15 +205,11 @@ def _write_traces(
     save_anatomy(truth, anatomy)
     made = choose_discretisation(detail, limb.kind)
     settings = replace(made.mesh, layers=limb.layers)
-    places = [(site.name, _to_triple(site.position), _to_triple(site.axis)) for site in indented]
-    mesh_jobs = [TruthMeshJob(name, truth, at, axis, settings, made.within_mm) for name, at, axis in places]
+    mesh_jobs = [TruthMeshJob(site, truth, settings, made.within_mm) for site in indented]
     jobs = []
     tell("meshes", 0, len(mesh_jobs))
-    for (name, at, axis), site, mesh in zip(
-        places, indented, mapping(mesh_true_site, mesh_jobs), strict=True
-    ):
-        steps = made.steps(site.thickness)
-        jobs.append(ForceJob(name, mesh, at, axis, site.ramp, steps, parameters, measurements))
+    for site, mesh in zip(indented, mapping(mesh_true_site, mesh_jobs), strict=True):
+        jobs.append(ForceJob(site, mesh, made.steps(site.thickness), parameters, measurements))
         tell("meshes", len(jobs), len(mesh_jobs))
     tell("forces", 0, len(jobs))
     facts = []
@@ -258,11 +254,6 @@ def _record_site(traces: Path, site: TrueSite, simulated: TrueForce, seed: int) 
         "force_noise_N": made.force_noise,
         "simulation": simulated.facts,
     }
-
-
-def _to_triple(vector: Any) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in vector)
-    return x, y, z
 
 
 def _site_to_dict(site: TrueSite) -> dict[str, Any]:

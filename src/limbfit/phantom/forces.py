@@ -31,8 +31,8 @@ from ..indentation import (
 )
 from ..mesh import Mesh, find_gauges_along
 from ..study import IndenterTable
-from .record import NOTHING, Ramp, SecondaryMeasurements
-from .sites import INDENTER_EDGE_MM, INDENTER_MM
+from .record import NOTHING, SecondaryMeasurements
+from .sites import INDENTER_EDGE_MM, INDENTER_MM, TrueSite
 
 ELEMENT = "tet10g8p0"
 
@@ -88,25 +88,20 @@ def choose_discretisation(detail: str, kind: str) -> Discretisation:
 
 @dataclass(frozen=True)
 class TruthMeshJob:
-    """A site to be meshed: where the anatomy is stored, and where the site is in it."""
+    """A site to be meshed, and where its anatomy is stored."""
 
-    site: str
+    site: TrueSite
     anatomy: Path
-    position: tuple[float, float, float]
-    axis: tuple[float, float, float]
     settings: MeshSettings
     within_mm: float | None
 
 
 @dataclass(frozen=True)
 class ForceJob:
-    """One indentation to be simulated: its mesh, place, ramp, steps, and the tissues' parameters."""
+    """One indentation to be simulated: its site, mesh, steps, and the tissues' parameters."""
 
-    site: str
+    site: TrueSite
     mesh: Mesh
-    position: tuple[float, float, float]
-    axis: tuple[float, float, float]
-    ramp: Ramp
     steps: StepControl
     parameters: Parameters
     measurements: SecondaryMeasurements = NOTHING
@@ -121,7 +116,6 @@ class TrueForce:
     mm, where cameras were. ``speeds`` (n,) m/s of shear waves in each tissue on the axis.
     """
 
-    site: str
     times: NDArray[np.float64]
     force: NDArray[np.float64]
     facts: dict[str, float | int | str]
@@ -141,9 +135,8 @@ def _build_base(folder: Path, settings: MeshSettings) -> tuple[Anatomy, BaseMesh
 def mesh_true_site(job: TruthMeshJob) -> Mesh:
     """Mesh one site, and keep the tissue that its force depends on."""
     anatomy, base = _build_base(job.anatomy, job.settings)
-    position = np.array(job.position)
-    mesh, _ = mesh_site(anatomy, position, np.array(job.axis), job.settings, base)
-    return mesh if job.within_mm is None else cut_neighbourhood(mesh, position, job.within_mm).mesh
+    mesh, _ = mesh_site(anatomy, job.site.position, job.site.axis, job.settings, base)
+    return mesh if job.within_mm is None else cut_neighbourhood(mesh, job.site.position, job.within_mm).mesh
 
 
 def simulate_true_force(job: ForceJob) -> TrueForce:
@@ -154,13 +147,14 @@ def simulate_true_force(job: ForceJob) -> TrueForce:
     RunError
         When the simulation does not complete.
     """
-    knots_s, knots_mm = job.ramp.knots
+    site = job.site
+    knots_s, knots_mm = site.ramp.knots
     model = SiteModel(
-        name=job.site,
+        name=site.name,
         mesh=Path(),
         mesh_digest="",
-        position=job.position,
-        axis=job.axis,
+        position=tuple(site.position.tolist()),
+        axis=tuple(site.axis.tolist()),
         knots_s=knots_s,
         knots_mm=knots_mm,
         indenter=IndenterTable(width_mm=INDENTER_MM, edge_radius_mm=INDENTER_EDGE_MM),
@@ -168,7 +162,7 @@ def simulate_true_force(job: ForceJob) -> TrueForce:
     problem = replace(build_problem(model, job.mesh, job.parameters), element=ELEMENT)
     result = solve(problem, steps=job.steps, store="all" if any(job.measurements) else "peak")
     if not result.completed:
-        raise RunError(f"the phantom's site {job.site} could not be simulated: {result.reason}")
+        raise RunError(f"the phantom's site {site.name} could not be simulated: {result.reason}")
     times = np.linspace(0.0, knots_s[-1], 401)
     facts: dict[str, float | int | str] = {
         "element": ELEMENT,
@@ -177,14 +171,10 @@ def simulate_true_force(job: ForceJob) -> TrueForce:
         "steps": int(result.statistics["steps"]),
         "penalty_per_mm": float(result.statistics["penalty_per_mm"]),
     }
-    found = TrueForce(job.site, times, result.force_at(times), facts)
+    found = TrueForce(times, result.force_at(times), facts)
     if not any(job.measurements):
         return found
-    gauges = (
-        find_gauges_along(job.mesh, np.array(job.position), np.array(job.axis))
-        if job.measurements.ultrasound
-        else ()
-    )
+    gauges = find_gauges_along(job.mesh, site.position, site.axis) if job.measurements.ultrasound else ()
     indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
     around = choose_points_around(job.mesh, indenter) if job.measurements.surface else np.zeros((0, 3))
     waves = place_waves_under(model, job.mesh) if job.measurements.shear_waves else ()
