@@ -77,10 +77,8 @@ class VirtualFitSocket:
         self.acknowledged_us = 0
         self._begun_us = self._stopped_us = 0
         self._watchdog_us = MAX_WATCHDOG_MS * 1000
-        self._built_in_limits = SafetyLimits(
-            (MAX_FORCE_MN,) * PINS, (round(1000 * STROKE_MM),) * PINS, MAX_SPEED_UM_S, 1 << 30, 1 << 30
-        )
-        self._guard = Guard(self._built_in_limits)
+        most = (MAX_FORCE_MN,) * PINS, (round(1000 * STROKE_MM),) * PINS, MAX_SPEED_UM_S
+        self._guard = Guard(SafetyLimits(*most, range_mN=1 << 30, max_unchanged_samples=1 << 30))
         self._halt_forces_mN = [0] * PINS
         self._lag_times_us = np.zeros(PINS, dtype=int)
         self._forces_mN: tuple[int, ...] = (0,) * PINS

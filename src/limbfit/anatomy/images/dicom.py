@@ -108,7 +108,7 @@ def _collect_facts(series: Series) -> dict[str, Any]:
     facts: dict[str, Any] = {
         "uid": series.uid,
         "number": first.series_number if first.series_number.isdecimal() else "",
-        "modality": first.modality if first.modality.isalpha() and len(first.modality) <= 3 else "",
+        "modality": _redact_modality(first.modality),
         "slices": len(series.slices),
         "rows": first.rows,
         "columns": first.columns,
@@ -227,8 +227,9 @@ def _close(a: Array | None, b: Array | None) -> bool:
 def _check_kind(slices: Sequence[SliceHeader]) -> None:
     for header in slices:
         if header.modality not in _VOLUMES:
+            kind = _redact_modality(header.modality) or "unknown"
             raise ImageError(
-                f"images of modality {_redact_modality(header.modality)} are not slices of a volume",
+                f"images of modality {kind} are not slices of a volume",
                 remedy="give an MR or CT series",
             )
         if header.position is None or header.orientation is None or header.pixel_spacing is None:
@@ -260,8 +261,7 @@ def _check_kind(slices: Sequence[SliceHeader]) -> None:
 
 def _redact_modality(modality: str) -> str:
     """The modality for a message: a code of DICOM, never free text that someone typed into the tag."""
-    is_code = 2 <= len(modality) <= 10 and modality.isascii() and modality.isupper() and modality.isalpha()
-    return modality if is_code and len(modality) <= 3 else "unknown"
+    return modality if re.fullmatch("[A-Z]{2,3}", modality) else ""
 
 
 def _compute_axes(header: SliceHeader) -> tuple[Array, Array]:

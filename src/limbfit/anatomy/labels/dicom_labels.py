@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pydicom
 from numpy.typing import NDArray
-from pydicom.dataset import Dataset, FileDataset
+from pydicom.dataset import FileDataset
 from pydicom.errors import InvalidDicomError
 
 from ...arrays import Array, Indices, Mask
@@ -135,9 +135,13 @@ def _read_frames(data: FileDataset) -> _SegmentFrames:
         raise LabelError("frames of several orientations", remedy="export one for each orientation")
     measures = find_functional_group(groups[0], "PixelMeasuresSequence")
     stated = (measures.get("SpacingBetweenSlices"), measures.get("SliceThickness"))
+    segments = [0] * len(groups)
+    if kind == "BINARY":
+        identities = [find_functional_group(group, "SegmentIdentificationSequence") for group in groups]
+        segments = [int(identity.ReferencedSegmentNumber) for identity in identities]
     return _SegmentFrames(
         data.pixel_array.reshape(len(groups), data.Rows, data.Columns),
-        np.array([_read_segment_number(group) if kind == "BINARY" else 0 for group in groups]),
+        np.array(segments),
         positions,
         orientations[0],
         np.array(measures.PixelSpacing, dtype=float),
@@ -147,10 +151,6 @@ def _read_frames(data: FileDataset) -> _SegmentFrames:
             for segment in data.SegmentSequence
         },
     )
-
-
-def _read_segment_number(groups: tuple[Dataset, Dataset]) -> int:
-    return int(find_functional_group(groups, "SegmentIdentificationSequence").ReferencedSegmentNumber)
 
 
 def _stack_frames(frames: _SegmentFrames) -> tuple[Grid, Indices]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 from scipy.ndimage import label as connected
 
@@ -53,24 +52,22 @@ def _check_names(labels: LabelMap) -> None:
 
 
 def _keep_one_limb(labels: LabelMap) -> tuple[LabelMap, list[str]]:
-    parts, sizes = _number_pieces(labels.limb)
-    if len(sizes) > 1 and np.sort(sizes)[-2] > _MAX_STRAY_SHARE * sizes.max():
+    largest, others, large = _find_largest(labels.limb)
+    if large > 1:
         raise LabelError(
             "two limbs, or a limb in two pieces, in one label map",
             remedy="keep the labels of one limb, in one piece",
         )
-    largest = parts == int(np.argmax(sizes)) + 1
     notes = []
     stray = labels.limb & ~largest
-    if stray.any():
-        notes.append(f"dropped {_describe_pieces(len(sizes) - 1, stray, labels)} apart from the limb")
+    if others:
+        notes.append(f"dropped {_describe_pieces(others, stray, labels)} apart from the limb")
     array = np.where(largest, labels.array, 0)
     holes = binary_fill_holes(largest) & ~largest
     if holes.any():
         array[holes] = labels.soft_value
-        notes.append(
-            f"filled {_describe_pieces(len(_number_pieces(holes)[1]), holes, labels, 'hole')} inside the limb"
-        )
+        count = int(connected(holes)[1])
+        notes.append(f"filled {_describe_pieces(count, holes, labels, 'hole')} inside the limb")
     return labels.with_array(array), notes
 
 
@@ -81,25 +78,25 @@ def _keep_one_piece(labels: LabelMap, name: str) -> tuple[LabelMap, list[str]]:
             f"{name!r} takes up more than {_MAX_BONE_SHARE:.0%} of the limb",
             remedy="if it is the soft tissue, name it 'soft tissue'",
         )
-    parts, sizes = _number_pieces(mask)
-    if len(sizes) < 2:
+    largest, others, large = _find_largest(mask)
+    if not others:
         return labels, []
-    if np.sort(sizes)[-2] > _MAX_STRAY_SHARE * sizes.max():
+    if large > 1:
         raise LabelError(
-            f"{name!r} lies in {int((sizes > _MAX_STRAY_SHARE * sizes.max()).sum())} large pieces",
-            remedy="give each bone its own name, or join the pieces",
+            f"{name!r} lies in {large} large pieces", remedy="give each bone its own name, or join the pieces"
         )
-    stray = mask & (parts != int(np.argmax(sizes)) + 1)
+    stray = mask & ~largest
     array = np.where(stray, labels.soft_value, labels.array)
-    pieces = _describe_pieces(len(sizes) - 1, stray, labels)
-    note = f"{pieces} of {name!r} apart from the bone became soft tissue"
-    return labels.with_array(array), [note]
+    pieces = _describe_pieces(others, stray, labels)
+    return labels.with_array(array), [f"{pieces} of {name!r} apart from the bone became soft tissue"]
 
 
-def _number_pieces(mask: Mask) -> tuple[NDArray[np.int32], Indices]:
-    """The pieces that share faces, numbered from 1, and their sizes in voxels."""
-    parts, _ = connected(mask)
-    return parts, np.bincount(parts.ravel())[1:]
+def _find_largest(mask: Mask) -> tuple[Mask, int, int]:
+    """The largest of the pieces that share faces, how many others there are, and how many are large."""
+    parts, count = connected(mask)
+    sizes = np.bincount(parts.ravel())[1:]
+    large = int((sizes > _MAX_STRAY_SHARE * sizes.max()).sum())
+    return parts == int(np.argmax(sizes)) + 1, int(count) - 1, large
 
 
 def _describe_pieces(count: int, mask: Mask, labels: LabelMap, noun: str = "piece") -> str:
@@ -117,7 +114,9 @@ def place_on_grid(labels: LabelMap, like: Volume) -> LabelMap:
     """
     if labels.has_same_grid(like):
         return labels
-    original, labels = labels, _crop_labels(labels.align_axes(like.direction))
+    original, labels = labels, labels.align_axes(like.direction)
+    if labels.array.any():  # a margin of zeros may lie outside the image
+        labels = labels.crop(find_box(labels.limb))
     offset = _find_offset(labels, like)
     if offset is None:
         raise LabelError(
@@ -134,13 +133,6 @@ def place_on_grid(labels: LabelMap, like: Volume) -> LabelMap:
     full = np.zeros(like.array.shape, dtype=np.uint8)
     full[tuple(slice(a, b) for a, b in zip(offset[::-1], last[::-1]))] = labels.array
     return LabelMap(full, like.spacing, like.origin, like.direction, labels.names)
-
-
-def _crop_labels(labels: LabelMap) -> LabelMap:
-    """Crop the empty layers around the labels; a margin of zeros may lie outside the image."""
-    if not labels.array.any():
-        return labels
-    return labels.crop(find_box(labels.limb))
 
 
 def _find_offset(labels: Grid, like: Grid) -> Indices | None:

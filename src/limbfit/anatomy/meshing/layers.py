@@ -133,7 +133,8 @@ class LimbFields:
         if not len(shallow):
             return BoneLoss(volume_mm3=0.0, depth_mm=0.0)
         # A bone's shallow part spans at most its own edge length beyond its shallow vertices.
-        pad = _measure_longest_edge(bone)
+        corners = bone.triangles
+        pad = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
         low, high = shallow.min(axis=0) - pad, shallow.max(axis=0) + pad
         high[2] = min(high[2], 0.0)
         spacing = (np.prod(high - low) / TRIM_SAMPLES) ** (1 / 3)
@@ -261,11 +262,6 @@ def compute_box_distance(surface: Surface, points: Array) -> Array:
     outside = np.maximum(np.maximum(low - points, points - high), 0.0)
     distance = np.linalg.norm(outside, axis=1)
     return np.where(distance > 0, distance, -np.inf)
-
-
-def _measure_longest_edge(surface: Surface) -> float:
-    corners = surface.points[surface.faces]
-    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
 
 
 def sample_box(low: Array, high: Array, spacing: float) -> Array:

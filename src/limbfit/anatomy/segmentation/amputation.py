@@ -68,7 +68,7 @@ def amputate_limb(
     array = np.where(height >= 0, labels.array, 0).astype(np.uint8)
     near = np.nonzero((height < 0) & (height > -pad_mm))
     depth = section.depth_at(labels.index_to_point(np.column_stack(near[::-1])))
-    end = pad_mm * _evaluate_quarter_ellipse(depth / min(section.largest_depth, _ROUNDING * pad_mm))
+    end = pad_mm * _evaluate_quarter_ellipse(depth / min(float(section.depth.max()), _ROUNDING * pad_mm))
     kept = -height[near] < end
     array[tuple(axis[kept] for axis in near)] = labels.soft_value
     _check_room(array, section, height, pad_mm)
@@ -163,10 +163,6 @@ class _Section:
     axes: Array
     depth: Array
     whole: bool
-
-    @property
-    def largest_depth(self) -> float:
-        return float(self.depth.max())
 
     def depth_at(self, points: Array) -> Array:
         """Depth of points (n, 3) projected onto the plane."""

@@ -55,7 +55,10 @@ def _compute_half_way_level(levels: Field, rind: Mask, spacing: Array) -> Field:
     values, inside = levels[thinned], rind[thinned]
     sampling = spacing[::-1] * every
     half = np.maximum(np.round(_NEAR_MM / sampling).astype(int), 1)
-    centres = [_compute_centres(n, step) for n, step in zip(values.shape, _STEP_MM / sampling)]
+    centres = [
+        np.linspace(0, n - 1, max(2, round(n / max(step, 1.0)) + 1))
+        for n, step in zip(values.shape, _STEP_MM / sampling)
+    ]
     found = np.full([len(c) for c in centres], np.nan)
     for place in np.ndindex(*found.shape):
         middle = [int(c[n]) for c, n in zip(centres, place)]
@@ -85,10 +88,6 @@ def _compute_isodata_level(values: Field) -> float:
         low, high = float(values[~above].mean()), float(values[above].mean())
         level = (low + high) / 2
     return level if high > _MIN_FAT_LEVEL * low else np.nan
-
-
-def _compute_centres(count: int, step: float) -> Array:
-    return np.linspace(0, count - 1, max(2, round(count / max(step, 1.0)) + 1))
 
 
 def _interpolate_places(places: Array, count: int) -> Field:
