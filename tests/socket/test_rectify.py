@@ -38,7 +38,7 @@ def made_plain() -> Socket:
 def ratio(socket: Socket, anatomy: Anatomy, height: float) -> float:
     """Socket's over limb's circumference at a height over the proximal cut."""
     point = anatomy.cut_point + height * anatomy.cut_normal
-    return socket.circumference(point, anatomy.cut_normal) / measure_circumference(
+    return measure_circumference(socket.surface, point, anatomy.cut_normal) / measure_circumference(
         anatomy.skin, point, anatomy.cut_normal
     )
 

@@ -51,10 +51,6 @@ class Socket:
         """The volume up to the brim."""
         return self.closed.volume
 
-    def circumference(self, point: ArrayLike, normal: ArrayLike) -> float:
-        """Length of the face's section by a plane, mm."""
-        return measure_circumference(self.surface, point, normal)
-
     def offset(self, limb: Surface) -> Array:
         """(n,) how deep each point lies inside a closed limb surface, mm; negative outside."""
         return -limb.signed_distance(self.points)

@@ -73,7 +73,7 @@ class VirtualLimb:
             return False
         found = self.sites[site]
         self._set_test_pin(pin - 1)
-        self._values[self._test_pin], self._step[self._test_pin] = found.values, found.step_mm
+        self._values[self._test_pin], self._step[self._test_pin] = found.values, found.depth_mm / PIECES
         self._levels[self._test_pin] = self._memory[self._test_pin] = 0.0
         return True
 
@@ -112,18 +112,6 @@ class Surrogate:
     depth_mm: float
     values: Array
     error_percent: float
-
-    @property
-    def step_mm(self) -> float:
-        return self.depth_mm / PIECES
-
-    def force(self, time_s: Array, displacement_mm: Array) -> Array:
-        """Forces (n,) N of a history (n,) that starts at rest, stepped as finely as it is given."""
-        levels = _split_depth(displacement_mm, self.depth_mm) @ np.diff(self.values, axis=1).T
-        memories = [
-            _integrate_memory(time_s, levels[:, k : k + 1], tau)[:, 0] for k, tau in enumerate(TAUS_S, 1)
-        ]
-        return np.maximum(levels[:, 0] + np.stack(memories, axis=1).sum(axis=1), 0.0)
 
 
 def fit_surrogate(time_s: Array, displacement_mm: Array, force_N: Array) -> Surrogate:
