@@ -14,7 +14,7 @@ VERBS = frozenset(
 acquire adapt add advance amputate announce answer append apply approach approximate assemble
 assess assign average balance batch begin bench bisect build bump calibrate call cap chain change check
 choose clamp classify clean clear clip close coarsen code collect colour combine compare compile
-compress compute connect constrain continue convolve copy correct count couple create crop cross curve
+compress compute connect constrain continue convolve copy correct count couple create cross curve
 cut decode deconvolve deform delay demo derive describe design diagnose die difference differentiate
 dilate divide do draw drop edit embed end ensure equilibrate erode estimate evaluate exchange
 expand explain explore export extend extract extrapolate extrude fail fill find finish fit flag flatten
