@@ -12,7 +12,7 @@ from typing import Any
 from test_study_docs import KEYS
 
 from limbfit.extensions import load_extensions
-from limbfit.pipeline.commands.experiments import EXPERIMENTS, compute_experiment_key
+from limbfit.pipeline.commands.experiments import EXPERIMENTS
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.keys import Keys
 from limbfit.study import Study, load_study
@@ -284,7 +284,7 @@ def decided(study: Study) -> dict[str, str]:
     """The key of every stage, and of the experiments that read more of a study."""
     known, stages = Keys(study), compute_keys(study)
     more = [e for e in EXPERIMENTS if e.name in ("uncertainty", "design")]
-    return stages | {e.name: compute_experiment_key(e, known, stages, e.options) for e in more}
+    return stages | {e.name: known.of(e, stages, e.options).digest for e in more}
 
 
 @cache

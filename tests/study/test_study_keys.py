@@ -22,7 +22,7 @@ from keyed_studies import (
 )
 
 import limbfit
-from limbfit.pipeline.commands.experiments import EXPERIMENTS, compute_experiment_key
+from limbfit.pipeline.commands.experiments import EXPERIMENTS
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.keys import Keys
 
@@ -60,10 +60,8 @@ def test_the_design_of_a_socket_is_no_reason_to_put_it_on_again(folder: Path) ->
     def of(content: Mapping[str, Any]) -> list[str]:
         study = loaded(folder, content)
         stages = compute_keys(study)
-        names = ("socket", "socket_design")
-        return [
-            compute_experiment_key(EXPERIMENTS[n], Keys(study), stages, EXPERIMENTS[n].options) for n in names
-        ]
+        chosen = [EXPERIMENTS[name] for name in ("socket", "socket_design")]
+        return [Keys(study).of(one, stages, one.options).digest for one in chosen]
 
     put_on, designed = of(GIVEN)
     other = of(changed(GIVEN, "socket.design.pressure_kPa", 12.0))

@@ -11,20 +11,16 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
 from ...extensions import Registry
 from ...report.sections.contents import SECTIONS, Maker
-from ...results.runs import StageParts
 from ...study import Study
 from ..design.design import check_design, run_design
 from ..design.protocol import check_protocol, run_protocol
-from ..engine.context import Context
-from ..engine.keys import Keys, Stage
-from ..engine.storage import read_json
-from ..engine.store import Store
+from ..engine.keys import Keys, Stage, StageKey
+from ..engine.store import StageState, Store
 from ..identification.crossvalidation import check_crossvalidate, run_crossvalidate
 from ..identification.problem import check_fitted
 from ..records.planned_records import SEEN
@@ -44,7 +40,7 @@ class Experiment(Stage):
     """A stage of its own, outside the chain: ``run(context, folder, **options)`` writes ``<name>.json``.
 
     ``needs`` names stages of the chain; ``options`` are what it can be run with and their defaults, in plain
-    JSON. ``run`` returns facts for its stamp. ``check`` refuses what study, limb and options decide.
+    JSON. ``check`` refuses what study, limb and options decide.
     """
 
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -206,53 +202,17 @@ def check_experiment(
         experiment.check(study, limb, options)
 
 
-def compute_experiment_key(
-    experiment: Experiment, keys: Keys, stages: Mapping[str, str], options: Mapping[str, Any]
-) -> str:
-    """The key of an experiment with its options; ``stages`` are the keys of the chain."""
-    return keys.of([experiment], stages, options={experiment.name: options})[experiment.name]
+def list_experiment_states(
+    keys: Keys, below: Mapping[str, str]
+) -> list[tuple[StageState, StageKey, dict[str, Any]]]:
+    """State, key and options of every experiment, each judged with the options that it was run with.
 
-
-def list_experiment_rows(study: Study, keys: Keys, stages: Mapping[str, str]) -> list[dict[str, Any]]:
-    """State of every experiment, as of a stage, each judged with the options that it was run with."""
-    store, rows = Store(study.results), []
+    ``below`` are the keys of the chain.
+    """
+    store, found = Store(keys.study.results), []
     for experiment in EXPERIMENTS:
         stamp = store.stamp(experiment.name)
         options = {**experiment.options, **(stamp.options if stamp else {})}
-        key = compute_experiment_key(experiment, keys, stages, options)
-        state = store.state(experiment.name, key)
-        rows.append(
-            {
-                "experiment": experiment.name,
-                "state": state.state,
-                "seconds": state.seconds,
-                "finished": state.finished,
-                "options": options,
-                "key": key,
-            }
-        )
-    return rows
-
-
-def do_experiment(
-    context: Context,
-    experiment: Experiment,
-    key: str,
-    options: Mapping[str, Any],
-    parts: StageParts | None = None,
-) -> Any:
-    """Run an experiment where its result is not there yet; what its ``<name>.json`` holds.
-
-    ``parts``: what the key is made of, for its stamp.
-    """
-    store, name = context.store, experiment.name
-    if store.state(name, key).state == "done":
-        context.tell(name, 1, 1, "is up to date")
-    else:
-
-        def produce(folder: Path) -> dict[str, Any]:
-            return {**experiment.run(context, folder, **options), "options": dict(options), "parts": parts}
-
-        stamp = store.make(name, key, produce)
-        context.tell(name, 1, 1, f"done in {stamp.seconds:.1f} s")
-    return read_json(store[name] / f"{name}.json")
+        key = keys.of(experiment, below, options)
+        found.append((store.state(experiment.name, key.digest), key, options))
+    return found

@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,6 @@ from ...results.runs import (
     ExperimentRecord,
     MachineFacts,
     RunResult,
-    StageParts,
     StageRecord,
     StudyName,
 )
@@ -29,11 +30,10 @@ from ..engine.context import Context, Listener, build_executor, ignore_progress
 from ..engine.digests import compute_file_digest
 from ..engine.hand_labels import keep_hand_labels
 from ..engine.journal import write_journal
-from ..engine.keys import Keys, Stage
+from ..engine.keys import Keys, Stage, StageKey, describe_causes
 from ..engine.provenance import collect_versions, compute_input_digests, describe_machine, record_settings
-from ..engine.stale_reasons import collect_parts, describe_causes
-from ..engine.storage import write_result
-from ..engine.store import Store, lock
+from ..engine.storage import read_json, write_result
+from ..engine.store import StageState, Store, lock
 from ..identification.calibrate import run_calibrate
 from ..identification.predict import run_predict
 from ..identification.problem import check_fitted
@@ -45,17 +45,10 @@ from ..records.record_checks import choose_surface_points, tell_flags
 from ..records.secondary_measurements import read_motion
 from ..records.traces import run_traces
 from ..simulation.limb_geometry import LimbGeometry
-from .experiments import (
-    EXPERIMENTS,
-    check_experiment,
-    compute_experiment_key,
-    do_experiment,
-    list_experiment_rows,
-    merge_options,
-)
+from .experiments import EXPERIMENTS, check_experiment, list_experiment_states, merge_options
 
 
-def run_report(context: Context, folder: Path) -> dict[str, Any]:
+def run_report(context: Context, folder: Path) -> None:
     """``report.html``; a phantom's ``truth.json`` beside the study is shown in it.
 
     It is drawn on the executor: graphics libraries can crash, and a worker that dies is an error in words.
@@ -65,7 +58,6 @@ def run_report(context: Context, folder: Path) -> dict[str, Any]:
     if truth.is_file():
         shutil.copyfile(truth, context.store.folder / "truth.json")
     list(context.executor.map(_draw, [(context.store.folder, folder, context.study.extensions)]))
-    return {}
 
 
 def _draw(job: tuple[Path, Path, tuple[Path, ...]]) -> None:
@@ -131,18 +123,29 @@ def compute_keys(study: Study) -> dict[str, str]:
     The calibration's is the one that it has in the study of its fitted sites alone: whatever is held out can
     change, come and go without it. The report's covers the experiments and other models that it shows.
     """
-    return _chain_keys(Keys(study))
+    return {name: key.digest for name, key in _compute_chain(Keys(study)).items()}
 
 
-def _chain_keys(known: Keys) -> dict[str, str]:
-    study = known.study
-    stages = list_stages(study)
-    calibrate = known.of(stages, study=_select_calibration_inputs(study))["calibrate"]
-    found = known.of(stages[:-1], {"calibrate": calibrate})
-    shown = [row["key"] for row in list_experiment_rows(study, known, found) if row["state"] == "done"]
-    models = study.results / ModelsResult.FILE
-    shown += [compute_file_digest(models)] if models.is_file() else []
-    return found | known.of(stages[-1:], found, options={"report": {"experiments": shown} if shown else {}})
+def _compute_chain(keys: Keys) -> dict[str, StageKey]:
+    """See `compute_keys`."""
+    fitted = _select_calibration_inputs(keys.study)
+    chain: dict[str, StageKey] = {}
+    below, alone = dict[str, str](), dict[str, str]()
+    for stage in list_stages(keys.study):
+        options: dict[str, Any] = {}
+        if stage.name == "report":
+            states = list_experiment_states(keys, below)
+            shown = [key.digest for state, key, _ in states if state.state == "done"]
+            models = keys.study.results / ModelsResult.FILE
+            shown += [compute_file_digest(models)] if models.is_file() else []
+            options = {"experiments": shown} if shown else {}
+        key = keys.of(stage, below, options)
+        if "calibrate" not in below:
+            key_alone = keys.of(stage, alone, study=fitted)
+            alone[stage.name] = key_alone.digest
+            key = key_alone if stage.name == "calibrate" else key
+        chain[stage.name], below[stage.name] = key, key.digest
+    return chain
 
 
 def _select_calibration_inputs(study: Study) -> Study:
@@ -162,40 +165,19 @@ def study_status(study: Study) -> list[dict[str, Any]]:
     ``why`` names what changed since a stale one was made. Below the stages: the experiments that were begun
     or done.
     """
-    store, known = Store(study.results), Keys(study)
-    wanted, rows = _chain_keys(known), []
-    for stage in list_stages(study):
-        state = store.state(stage.name, wanted[stage.name])
-        rows.append(
-            {
-                "stage": stage.name,
-                "state": state.state,
-                "seconds": state.seconds,
-                "finished": state.finished,
-                "why": _describe_why(known, stage, wanted) if state.state == "stale" else [],
-            }
-        )
-    columns = ("state", "seconds", "finished")
-    for row in list_experiment_rows(study, known, wanted):
-        if row["state"] != "missing":
-            why = (
-                _describe_why(known, EXPERIMENTS[row["experiment"]], wanted)
-                if row["state"] == "stale"
-                else []
-            )
-            rows.append({"stage": row["experiment"], **{key: row[key] for key in columns}, "why": why})
-    return rows
+    store, keys = Store(study.results), Keys(study)
+    chain = _compute_chain(keys)
+    below = {name: key.digest for name, key in chain.items()}
+    found = [(store.state(name, key.digest), key) for name, key in chain.items()]
+    experiments = list_experiment_states(keys, below)
+    found += [(state, key) for state, key, _ in experiments if state.state != "missing"]
+    return [asdict(state) | {"why": _describe_why(store, state, key)} for state, key in found]
 
 
-def _collect_parts(known: Keys, stage: Stage, chain: Mapping[str, str]) -> StageParts:
-    """What the key of a stage is made of, for a later status to say what changed."""
-    seen = _select_calibration_inputs(known.study) if stage.name == "calibrate" else known.study
-    return collect_parts(stage, known, seen, chain)
-
-
-def _describe_why(known: Keys, stage: Stage, chain: Mapping[str, str]) -> list[str]:
-    stamp = Store(known.study.results).stamp(stage.name)
-    return describe_causes(stamp.parts if stamp else None, _collect_parts(known, stage, chain))
+def _describe_why(store: Store, state: StageState, key: StageKey) -> list[str]:
+    """What changed since a stale stage was made; nothing of another."""
+    stamp = store.stamp(state.stage) if state.state == "stale" else None
+    return [] if stamp is None else describe_causes(stamp.parts, key.parts)
 
 
 def run_study(
@@ -236,33 +218,31 @@ def _run_stages(
 ) -> dict[str, Any]:
     """See `run_study`; ``check`` is given the limb before anything is meshed."""
     anew = _select_stages_to_redo(study, until, start, force)
-    store = Store(study.results)
-    with (
-        lock(study.results),
-        write_journal(study, "run", listener) as listener,
-        build_executor(study) as executor,
-    ):
-        context = Context(study, store, executor, listener)
+    with _open_run(study, "run", listener) as context:
         kept = keep_hand_labels(study)
         if kept is not None:
             context.tell("segment", 0, 1, f"label map corrected by hand: kept as {kept}")
-        known = Keys(study)
-        chain = _chain_keys(known)
-        wanted = list(chain) if until is None else list(chain)[: list(chain).index(until) + 1]
-        missing = {name for name in wanted if name in anew or store.state(name, chain[name]).state != "done"}
+        chain = _compute_chain(Keys(study))
+        wanted = [stage for stage in STAGES if stage.name in chain]
+        if until is not None:
+            wanted = wanted[: list(chain).index(until) + 1]
+        states = {stage.name: context.store.state(stage.name, chain[stage.name].digest) for stage in wanted}
+        missing = {name for name, state in states.items() if name in anew or state.state != "done"}
         if "calibrate" in missing:
             check_fitted(study)
-        wanted.sort(key=lambda name: name != "traces")  # records need no limb: what is wrong is said at once
+        # Records need no limb: what is wrong with them is said at once.
+        wanted.sort(key=lambda stage: stage.name != "traces")
         with compile_in_background("calibrate" in missing) as compiled:
-            for name in wanted:
+            for stage in wanted:
+                name = stage.name
                 if name == "mesh":
                     _check_limb(context, check, name in missing)
                 if name == "calibrate":
                     compiled()
-                if name in missing:
-                    if name == "calibrate":
+                    if name in missing:
                         tell_flags(context)
-                    _do(context, name, known, chain)
+                if name in missing:
+                    _do(context, stage, chain[name])
                 else:
                     context.tell(name, 1, 1, "is up to date")
         summary = summarise(study)
@@ -332,42 +312,48 @@ def run_experiment(
     check_experiment(experiment, study, None, chosen)
     last = [stage.name for stage in STAGES if stage.name in experiment.needs][-1:]
     if last:
-
-        def check(limb: LimbGeometry) -> None:
-            check_experiment(experiment, study, limb, chosen)
-
+        check = partial(check_experiment, experiment, study, options=chosen)
         _run_stages(study, last[0], None, (), listener, check)
-    store = Store(study.results)
+    with _open_run(study, name, listener) as context:
+        keys = Keys(study)
+        below = {stage: key.digest for stage, key in _compute_chain(keys).items()}
+        key = keys.of(experiment, below, chosen)
+        if context.store.state(name, key.digest).state == "done":
+            context.tell(name, 1, 1, "is up to date")
+        else:
+            _do(context, experiment, key, chosen)
+        folder = context.store[name]
+    return read_json(folder / f"{name}.json") | {"folder": str(folder)}
+
+
+@contextmanager
+def _open_run(study: Study, what: str, listener: Listener) -> Iterator[Context]:
+    """Hold a study for a run, which is logged."""
     with (
         lock(study.results),
-        write_journal(study, name, listener) as listener,
+        write_journal(study, what, listener) as listener,
         build_executor(study) as executor,
     ):
-        known = Keys(study)
-        chain = _chain_keys(known)
-        key = compute_experiment_key(experiment, known, chain, chosen)
-        parts = _collect_parts(known, experiment, chain)
-        context = Context(study, store, executor, listener)
-        found = do_experiment(context, experiment, key, chosen, parts)
-    return found | {"folder": str(store[name])}
+        yield Context(study, Store(study.results), executor, listener)
 
 
-def _do(context: Context, name: str, known: Keys, chain: Mapping[str, str]) -> None:
-    stage = next(stage for stage in STAGES if stage.name == name)
-    if name == "report":
+def _do(context: Context, stage: Stage, key: StageKey, options: Mapping[str, Any] | None = None) -> None:
+    """Do a stage, or an experiment with its ``options``."""
+    facts = {"parts": key.parts} | ({} if options is None else {"options": dict(options)})
+    if stage.name == "report":
         write_result(context.store.folder / "run.json", run_record(context.study))
-    parts = _collect_parts(known, stage, chain)
     stamp = context.store.make(
-        name, chain[name], lambda folder: {**stage.run(context, folder), "parts": parts}
+        stage.name,
+        key.digest,
+        lambda folder: {**(stage.run(context, folder, **(options or {})) or {}), **facts},
     )
-    context.tell(name, 1, 1, f"done in {stamp.seconds:.1f} s")
+    context.tell(stage.name, 1, 1, f"done in {stamp.seconds:.1f} s")
 
 
 def run_record(study: Study) -> RunResult:
     """``run.json``: versions, settings, digests of the inputs, how long each stage took."""
-    store = Store(study.results)
-    stamps = {stage.name: store.stamp(stage.name) for stage in list_stages(study)}
-    inputs, known = compute_input_digests(study), Keys(study)
+    store, inputs, keys = Store(study.results), compute_input_digests(study), Keys(study)
+    below = {name: key.digest for name, key in _compute_chain(keys).items()}
     return RunResult(
         limbfit=__version__,
         study=StudyName(**study.study.model_dump(mode="json")),
@@ -377,15 +363,19 @@ def run_record(study: Study) -> RunResult:
         inputs=inputs,
         stages={
             name: StageRecord(seconds=stamp.seconds, finished=stamp.finished, key=stamp.key)
-            for name, stamp in stamps.items()
-            if stamp
+            for name in below
+            if (stamp := store.stamp(name))
         },
         experiments={
-            row["experiment"]: ExperimentRecord(
-                **{key: row[key] for key in ("state", "seconds", "finished", "options", "key")}
+            state.stage: ExperimentRecord(
+                state=state.state,
+                seconds=state.seconds,
+                finished=state.finished,
+                options=options,
+                key=key.digest,
             )
-            for row in list_experiment_rows(study, known, _chain_keys(known))
-            if row["state"] in ("done", "stale")
+            for state, key, options in list_experiment_states(keys, below)
+            if state.state in ("done", "stale")
         },
     )
 
@@ -395,8 +385,7 @@ def report_study(study: Study, *, listener: Listener = ignore_progress) -> dict[
     store = Store(study.results)
     with lock(study.results), build_executor(study) as executor:
         context = Context(study, store, executor, listener)
-        known = Keys(study)
-        _do(context, "report", known, _chain_keys(known))
+        _do(context, STAGES[-1], _compute_chain(Keys(study))["report"])
         return summarise(study)
 
 

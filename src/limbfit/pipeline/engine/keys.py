@@ -1,97 +1,134 @@
-"""Keys of stages and experiments: digests of all that decides them."""
+"""Keys of stages and experiments, digests of all that decides them, and why one is no longer what it was.
+
+Only digests are kept beside results, so that no setting or file name leaves a trace in them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 from typing import Any
 
+from ..._version import __version__
 from ...extensions import compute_extensions_digest
+from ...results.runs import StageParts
 from ...study import Study
-from .digests import code_digest, compute_digest, compute_file_digest
+from .digests import code_parts, compute_digest, compute_file_digest
 from .provenance import list_input_files
+
+_FEW = 4  # causes of one kind that are named
 
 
 @dataclass(frozen=True)
 class Stage:
     """A stage: what it stands on, which tables it reads, and which keys of ``[[sites]]`` and ``[[records]]``.
 
-    ``apart`` are keys of its tables, such as ``socket.design``, that it does not read. Its code is that of
-    `digests.find_sources`.
+    ``run(context, folder)`` does it, and may return facts for its stamp. ``apart`` are keys of its tables,
+    such as ``socket.design``, that it does not read. Its code is that of `digests.find_sources`.
     """
 
     name: str
-    run: Callable[..., dict[str, Any]]
+    run: Callable[..., dict[str, Any] | None]
     needs: tuple[str, ...] = ()
     tables: tuple[str, ...] = ()
     site_keys: tuple[str, ...] = ()
     record_keys: tuple[str, ...] = ()
     apart: tuple[str, ...] = ()
 
-    def read(self, stated: Mapping[str, Any]) -> dict[str, Any]:
-        """What it reads of the tables of a study, by their names."""
+    def read(self, stated: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+        """What it reads of a study: each value with its name, such as ``records.1-slow.trace``."""
         found = {table: stated[table] for table in self.tables}
         for table, _, key in (name.partition(".") for name in self.apart):
             found[table] = {name: value for name, value in (found[table] or {}).items() if name != key}
-        return found
-
-
-def select_records_read(stage: Stage, stated: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What a stage reads of ``[[records]]``, one after the other; nothing where there are none."""
-    rows = stated["records"] if stage.record_keys else []
-    return [{key: row[key] for key in stage.record_keys} for row in rows]
+        yield from _iterate_leaves(found, "")
+        for site in stated["sites"] if self.site_keys else ():
+            yield from _iterate_leaves({key: site[key] for key in self.site_keys}, f"sites.{site['name']}.")
+        for row in stated["records"] if self.record_keys else ():
+            name = f"records.{row['site']}-{row['name']}."
+            yield from _iterate_leaves({key: row[key] for key in self.record_keys}, name)
 
 
 @dataclass(frozen=True)
+class StageKey:
+    """The key of a stage, and what it is a digest of."""
+
+    digest: str
+    parts: StageParts
+
+
 class Keys:
     """Keys of the stages of one study; input files are digested once, whatever part of it is asked about."""
 
-    study: Study
-
-    @cached_property
-    def digests(self) -> dict[Path, str]:
-        named = {path for paths in list_input_files(self.study).values() for path in paths}
-        places = {path: self.study.path(path) for path in named}
+    def __init__(self, study: Study) -> None:
+        self.study = study
+        named = {path for paths in list_input_files(study).values() for path in paths}
+        places = {path: study.path(path) for path in named}
         # A record that is yet to be made has none.
-        return {path: compute_file_digest(place) if place.exists() else "" for path, place in places.items()}
-
-    @cached_property
-    def extensions(self) -> str:
-        """Of the study's own Python files, which may change what any stage does."""
-        return compute_extensions_digest(self.study.extensions)
+        self._files = {path: compute_file_digest(at) if at.exists() else "" for path, at in places.items()}
+        own = compute_extensions_digest(study.extensions)  # they may change what any stage does
+        self._code = {"limbfit": __version__} | ({"study.extensions": own} if own else {})
 
     def of(
         self,
-        stages: Iterable[Stage],
-        known: Mapping[str, str] | None = None,
+        stage: Stage,
+        below: Mapping[str, str],
+        options: Mapping[str, Any] | None = None,
         study: Study | None = None,
-        options: Mapping[str, Mapping[str, Any]] | None = None,
-    ) -> dict[str, str]:
-        """The key of each stage, in order; those below it are among ``stages`` or ``known``.
+    ) -> StageKey:
+        """The key of a stage.
 
         Parameters
         ----------
-        known : keys of other stages; a stage that is in it has that key.
+        below : keys of the stages below it, by name.
+        options : what it is run with beside the study.
         study : a part of the study, instead of the whole.
-        options : what a stage is run with beside the study, by its name.
         """
-        known, options, study = known or {}, options or {}, study or self.study
-        stated, files = study.model_dump(mode="json"), list_input_files(study)
-        found: dict[str, str] = {}
-        for stage in stages:
-            read = files.get(stage.name)
-            extra = [options[stage.name]] if options.get(stage.name) else []
-            found[stage.name] = known.get(stage.name) or compute_digest(
-                stage.name,
-                stage.read(stated),
-                [{key: site[key] for key in stage.site_keys} for site in stated["sites"]],
-                *select_records_read(stage, stated),
-                None if read is None else {str(path): self.digests[path] for path in read},
-                code_digest(stage.run),
-                *([self.extensions] if self.extensions else []),
-                [found.get(below) or known.get(below) for below in stage.needs],
-                *extra,
-            )
-        return found
+        study = study or self.study
+        names = {path: key for key, path in study.inputs.items()}
+        files = list_input_files(study).get(stage.name, [])
+        read = dict(stage.read(study.model_dump(mode="json")))
+        parts = StageParts(
+            settings={name: compute_digest(value) for name, value in read.items()},
+            inputs={names.get(path, "labels corrected by hand"): self._files[path][:16] for path in files},
+            code=code_parts(stage.run) | self._code,
+            stages={name: below[name] for name in stage.needs if name in below},
+        )
+        order = list(read)  # of sites and records: results are in it too
+        return StageKey(compute_digest(stage.name, parts.to_plain(), order, *filter(None, [options])), parts)
+
+
+def _iterate_leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict) and value:
+        for key, part in value.items():
+            yield from _iterate_leaves(part, f"{name}{key}.")
+    else:
+        yield name.removesuffix("."), value
+
+
+def describe_causes(before: StageParts | None, now: StageParts) -> list[str]:
+    """What differs, in words; what is above a lower stage's change comes last."""
+    if before is None:
+        return ["made by an older version, which did not store what its key depends on"]
+    found = []
+    words = {
+        "settings": "setting {} changed",
+        "inputs": "input file {} changed",
+        "stages": "stage {} changed",
+    }
+    for kind, text in words.items():
+        names = _find_different(getattr(before, kind), getattr(now, kind))
+        found += [text.format(_list_few(names))] if names else []
+    code, then = _find_different(before.code, now.code), before.code.get("limbfit")
+    if then != __version__:
+        found.append(f"limbfit was {then}, is {__version__}")
+    elif code:
+        found.append(f"code of {_list_few(code)} changed")
+    return found or ["its options changed"]
+
+
+def _list_few(names: list[str]) -> str:
+    return ", ".join(names[:_FEW]) + (f" and {len(names) - _FEW} more" if len(names) > _FEW else "")
+
+
+def _find_different(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    return [name for name in {**before, **now} if before.get(name) != now.get(name)]
