@@ -39,6 +39,7 @@ from limbfit.pipeline.engine.context import Context, ignore_progress
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.socket.limb import SocketLimb
 from limbfit.pipeline.socket.shape import build_socket
+from limbfit.pipeline.socket.simulation import SocketRun, put_on, summarise_run
 from limbfit.socket import Socket
 from limbfit.study.socket import SocketAreaTable
 
@@ -158,15 +159,16 @@ def run(bench: Bench, seed: int, case: int) -> dict[str, Any]:
     except InputError as error:
         return row | {"outcome": "refused", "words": error.what}
     row["deepest_mm"] = float(socket.offset(limb.outer.skin).max())
+    donned = SocketRun("", limb, bench.mesh, choose_tissues(study)[0], socket)
     try:
-        found = limb.don(bench.mesh, limb.materials(choose_tissues(study)[0]), socket, told)
+        found = put_on(donned, told)
     except RunError as error:
         return row | {
             "outcome": "stopped",
             "words": str(error),
             "cpu_s": round(time.process_time() - started, 1),
         }
-    facts = limb.facts(found, socket)
+    facts = summarise_run(donned, found)
     (load,) = facts["loads"]
     return row | {
         "outcome": "completed",

@@ -38,6 +38,7 @@ from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.socket.intervals import ParameterSpread, draw_step, predict_change
 from limbfit.pipeline.socket.limb import SocketLimb
 from limbfit.pipeline.socket.shape import build_socket
+from limbfit.pipeline.socket.simulation import SocketRun, put_on, summarise_run
 from limbfit.socket import Socket
 
 SETTLING = "settling (mm)"
@@ -66,10 +67,11 @@ class Bench:
             table = table.model_copy(update={"friction": friction * float(table.friction)})
         study = self.study.model_copy(update={"socket": table})
         limb, started = replace(self.limb, study=study), time.process_time()
-        laws = limb.materials(to_parameters(parameters, study.tissues))
-        found = limb.don(self.mesh, laws, self.socket, lambda *_: None, known)
+        values = to_parameters(parameters, study.tissues)
+        run = SocketRun("", limb, self.mesh, values, self.socket, sensitivities=known)
+        found = put_on(run, lambda *_: None)
         around = ParameterSpread(self.covariance, np.zeros_like(self.centre)) if known else None
-        load = limb.facts(found, self.socket, around)["loads"][-1]
+        load = summarise_run(run, found, around)["loads"][-1]
         row = {"values": {one["region"]: one["mean_kPa"] for one in load["regions"]}}
         row["values"][SETTLING] = load["settling_mm"]
         row["cpu_s"] = round(time.process_time() - started, 1)

@@ -48,13 +48,14 @@ from limbfit.laws import to_vector
 from limbfit.mesh import write_vtu
 from limbfit.phantom.record import Ramp, record
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.engine.storage import read_curves, write_json
+from limbfit.pipeline.engine.storage import write_json
 from limbfit.pipeline.engine.store import COARSE, Store
 from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.records.records import to_response
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.pipeline.simulation.loading import LoadHistory, describe_indentation
+from limbfit.results.curves import read_curves
 from limbfit.study import IndenterTable, SolverTable, Study
 
 Array = NDArray[np.float64]

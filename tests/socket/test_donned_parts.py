@@ -21,7 +21,7 @@ from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.donning import Load, SocketFit, build_socket_problem, pack, simulate_donning, unpack
 from limbfit.errors import ProblemError
 from limbfit.fe import Checkpoints, OgdenQLV, StepControl, solve
-from limbfit.pipeline.engine.partial_results import Begun, ResultFiles
+from limbfit.pipeline.engine.partial_results import ResultFiles
 from limbfit.socket import Recipe, rectify_limb
 from limbfit.socket.trim import Trim
 
@@ -48,11 +48,11 @@ def donned(tmp_path_factory):
     problem = build_socket_problem(mesh, TISSUES, socket, fit)
     middles = mesh.points[mesh.face_sets["skin"][:, :3]].mean(axis=1)
     given = problem, fit, {"front": middles[:, 1] < anatomy.cut_point[1] - 20.0}
-    places: list[Begun] = []
+    kept, places = ResultFiles(folder), []
 
     def keep(part):
-        places.append(Begun(ResultFiles(folder), str(len(places))))
-        places[-1].put(pack(part))
+        kept.put(str(len(places)), pack(part))
+        places.append(kept.find(str(len(places))))
 
     return given, simulate_donning(*given, sensitivities=True, threads=1, keep=keep), places
 
@@ -64,7 +64,7 @@ def test_what_goes_on_from_a_part_is_what_went_through(donned, which):
     given, whole, places = donned
     assert len(places) == 2
     told: list[float] = []
-    begin = unpack(*places[which].latest())
+    begin = unpack(*places[which])
     found = simulate_donning(
         *given,
         sensitivities=True,
@@ -87,15 +87,15 @@ def test_what_goes_on_from_a_part_is_what_went_through(donned, which):
         assert found.result.statistics[count] == whole.result.statistics[count]
 
 
-def test_what_is_at_its_end_is_not_kept_on(tmp_path):
-    begun = Begun(ResultFiles(tmp_path), "a")
-    assert begun.latest() is None
-    begun.put(({"n": 1}, {"x": np.arange(3.0)}))
-    begun.put(({"n": 2}, {"x": np.arange(4.0)}))
-    facts, arrays = begun.latest()
+def test_what_is_put_last_is_kept_until_it_is_dropped(tmp_path):
+    kept = ResultFiles(tmp_path / "runs")
+    assert kept.find("a") is None
+    kept.put("a", ({"n": 1}, {"x": np.arange(3.0)}))
+    kept.put("a", ({"n": 2}, {"x": np.arange(4.0)}))
+    facts, arrays = kept.find("a")
     assert (facts, arrays["x"].tolist()) == ({"n": 2}, [0.0, 1.0, 2.0, 3.0])
-    begun.drop()
-    assert begun.latest() is None
+    kept.drop("a")
+    assert kept.find("a") is None
     assert not list((tmp_path / "runs").iterdir())
 
 

@@ -14,7 +14,7 @@ from limbfit.pipeline.socket.intervals import (
     spread_to_facts,
     widen_intervals,
 )
-from limbfit.pipeline.socket.limb import format_warning
+from limbfit.pipeline.socket.simulation import format_warning
 
 NAMES = ("skin.c_kPa", "skin.tau_s", "liner.c_kPa")
 SLOPES = np.array([3.0, -1.0, 2.0])

@@ -220,7 +220,7 @@ READ: dict[str, str] = {
             *("socket.donning_s", "socket.hold_s", "socket.loads.duration_s", "socket.loads.hold_s"),
             "socket.liner.thickness_mm",
         ),
-        "pipeline/socket/limb.py",
+        "pipeline/socket/simulation.py",
     ),
     "socket.worn_s": "pipeline/socket/socket.py",
     **{key: "pipeline/socket/design.py" for key in KEYS if key.startswith("socket.design.")},

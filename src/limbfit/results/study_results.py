@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
-from typing import Generic, Protocol, Self, TypeVar, overload
+from typing import Protocol, TypeVar
 
 from ..arrays import Array
 from ..errors import InputError
@@ -36,43 +37,20 @@ class HasResults(Protocol):
     def results(self) -> Path: ...
 
 
-class Single(Generic[R]):
+class Single(cached_property[R]):
     """An attribute of `StudyResults` that has one file."""
 
     def __init__(self, model: type[R]) -> None:
+        super().__init__(lambda results: model.read(results.folder))
         self.model = model
 
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
 
-    @overload
-    def __get__(self, results: None, owner: type) -> Self: ...
-
-    @overload
-    def __get__(self, results: StudyResults, owner: type) -> R: ...
-
-    def __get__(self, results: StudyResults | None, owner: type) -> Self | R:
-        if results is None:
-            return self
-        found = self.model.read(results.folder)
-        results.__dict__[self.name] = found  # which Python takes from now on
-        return found
-
-
-class Each(Generic[R]):
+class Each(cached_property[dict[str, R]]):
     """An attribute of `StudyResults` that has a file for each site or stage: a dictionary by their names."""
 
     def __init__(self, model: type[R]) -> None:
+        super().__init__(lambda results: model.find_all(results.folder))
         self.model = model
-
-    @overload
-    def __get__(self, results: None, owner: type) -> Self: ...
-
-    @overload
-    def __get__(self, results: StudyResults, owner: type) -> dict[str, R]: ...
-
-    def __get__(self, results: StudyResults | None, owner: type) -> Self | dict[str, R]:
-        return self if results is None else self.model.find_all(results.folder)
 
 
 class StudyResults:

@@ -9,8 +9,8 @@ from typing import Any
 from fastapi import APIRouter
 
 from ..pipeline import STAGE_NAMES
-from ..pipeline.engine.storage import read_curves
-from ..pipeline.simulation.simulations import find_newest_simulations
+from ..pipeline.simulation.simulations import find_newest_simulation
+from ..results.curves import read_curves
 from ..results.identification import CalibrationResult
 from ..study import Record
 from .folder import StudyFolder
@@ -170,7 +170,7 @@ def _read_events(log: Path) -> list[dict[str, Any]]:
 
 def _read_newest(folder: StudyFolder, site: str) -> list[float] | None:
     for runs in sorted(folder.results.glob(".work-calibrate-*/runs")):
-        simulation = find_newest_simulations(runs, (site,)).get(site)
+        simulation = find_newest_simulation(runs, site)
         if simulation is not None and simulation.completed:
             return list(map(float, simulation.force_N))
     return None

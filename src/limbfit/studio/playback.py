@@ -14,7 +14,7 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from ..errors import InputError
 from ..mesh import read_grid, read_vtu
 from ..phases import find_loading_end, find_phases
-from ..pipeline.engine.storage import read_curves
+from ..results.curves import read_curves
 from ..results.runs import SimulateResult
 from ..web.shapes import to_volume_shape
 from .folder import StudyFolder, compute_fingerprint

@@ -14,7 +14,8 @@ from pydantic import Field
 
 from ..errors import InputError, RunError
 from ..pipeline import export_study
-from ..pipeline.engine.storage import read_curves, read_json, write_json
+from ..pipeline.engine.storage import read_json, write_json
+from ..results.curves import read_curves
 from ..results.identification import CalibrationResult, PredictResult
 from ..study import Record
 from . import playback, processes

@@ -18,10 +18,11 @@ from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, 
 from limbfit.indentation import simulating as indentation
 from limbfit.mesh import write_vtu
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.engine.storage import read_curves, write_json
+from limbfit.pipeline.engine.storage import write_json
 from limbfit.pipeline.engine.store import COARSE, Store
 from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.simulation.simulations import compute_job_digest
+from limbfit.results.curves import read_curves
 from limbfit.results.identification import CalibrationResult
 from limbfit.study import Study, load_study
 

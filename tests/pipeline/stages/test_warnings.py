@@ -14,7 +14,8 @@ from limbfit.cli.commands import show_warnings
 from limbfit.execution import SerialExecutor
 from limbfit.fe import SimulationWarning
 from limbfit.indentation import Simulation
-from limbfit.pipeline.identification.simulation_warnings import SearchWarning, summarise_doubts
+from limbfit.pipeline.identification.calibrate import summarise_doubts
+from limbfit.pipeline.identification.record_simulator import SearchWarning
 from limbfit.pipeline.simulation import simulations
 from limbfit.report import build_report
 from limbfit.results.identification import CalibrationResult
@@ -29,7 +30,7 @@ DOUBT = FOLD.text
 def test_a_kept_simulation_keeps_its_warnings(tmp_path, monkeypatch):
     made = Simulation("tibia", np.arange(3.0), None, True, "", 0.02, {"steps": 2}, (FOLD,))
     monkeypatch.setattr(simulations, "compute_job_digest", lambda job: "one")
-    simulations.SimulationCache(tmp_path)._keep(None, made)
+    simulations.SimulationCache(tmp_path).keep(None, made)
     again = next(simulations.SimulationCache(tmp_path).run([None], SerialExecutor()))
     assert again.doubts == (FOLD,)
     assert again.warnings == (DOUBT,)

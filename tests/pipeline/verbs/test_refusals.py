@@ -21,7 +21,7 @@ from limbfit import (
 )
 from limbfit.anatomy.imaging import LabelMap, Volume, write_labels, write_volume
 from limbfit.errors import InputError
-from limbfit.pipeline.commands.refusals import list_refused_commands
+from limbfit.pipeline.commands.check import list_refused_commands
 
 UNFITTED = ("fitted = true", "")
 BOTH_FITTED = ('trace = "2.csv"', 'trace = "2.csv"\nfitted = true')

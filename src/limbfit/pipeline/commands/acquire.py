@@ -33,9 +33,10 @@ from ...acquire import (
 )
 from ...acquire.virtual import Fault, Serving, Surrogate, VirtualFitSocket, VirtualLimb, fit_surrogate, serve
 from ...errors import InputError, TraceError
+from ...results.curves import read_curves
 from ...results.records import TracesResult
 from ...study import Indentation, Record, Site, Study
-from ..engine.storage import read_curves, write_curves, write_json
+from ..engine.storage import write_curves, write_json
 from ..engine.store import translate_disk_errors
 
 FOLDER = "acquired"  # beside the study file: measured data, no result
@@ -360,7 +361,7 @@ def _read_surrogate(file: Path, column: str) -> Surrogate:
     try:
         curves = read_curves(file)
         return fit_surrogate(curves["time_s"], curves["displacement_mm"], curves[column])
-    except (KeyError, ValueError):
+    except (KeyError, InputError, ValueError):
         raise TraceError("not a simulated curve", file=file, remedy="run the stage again") from None
     except TraceError as error:
         raise TraceError(error.what, file=file) from None

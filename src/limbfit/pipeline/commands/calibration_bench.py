@@ -11,7 +11,6 @@ from ...bench.timing import FEBIO_SECONDS
 from ...study import Study, load_study
 from ..engine.context import Listener, ignore_progress
 from ..engine.store import Store
-from ..simulation.simulations import SimulationCache
 from .demo import make_phantom_study
 from .run import run_study
 
@@ -66,8 +65,8 @@ def _collect_facts(study: Study) -> dict[str, Any]:
     store = Store(study.results)
     predicted = store.results.predict
     seconds = {stage: store.results.stages[stage].seconds for stage in ("calibrate", "predict")}
-    runs = {stage: SimulationCache(store[stage] / "runs") for stage in seconds}
-    names = {file.name for cache in runs.values() for file in cache.folder.glob("*.npz")}
+    names = {file.name for stage in seconds for file in store[stage].glob("runs/*.npz")}
+    calibration = store.results.calibration
     parameters, sites = len(study.parameters), len(study.fitted)
     febio = FEBIO_SECONDS[FEBIO_CASE] * FEBIO_ITERATIONS * sites * (parameters + 1)
     total = seconds["calibrate"] + seconds["predict"]
@@ -77,8 +76,8 @@ def _collect_facts(study: Study) -> dict[str, Any]:
         "seconds_calibrate": seconds["calibrate"],
         "seconds_predict": seconds["predict"],
         "forward_runs": len(names),
-        "forward_runs_calibrate": len(runs["calibrate"]),
-        "forward_runs_calibrate_with_sensitivities": runs["calibrate"].with_sensitivities(),
+        "forward_runs_calibrate": calibration.forward_runs,
+        "forward_runs_calibrate_with_sensitivities": calibration.forward_runs_with_sensitivities,
         "sites_fitted": sites,
         "sites_predicted": len(predicted.sites),
         "nodes_per_site": max(site.nodes for site in store.results.mesh.sites.values()),

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ...anatomy.imaging import Volume
 from ...anatomy.surfaces.surfaces import Anatomy
+from ...errors import InputError
 from ...identify.checks.domain import Extent, RecordedRange, describe_outside
 from ...indentation import read_indenter
 from ...results.identification import OutsideRecords
@@ -17,6 +19,7 @@ from ...study import ClampsTable, Record, Site, Study
 from ...traces import Regularised, SurfaceMotion, Trace
 from ..engine.context import Listener, Progress, ignore_progress
 from ..engine.store import Store
+from ..identification.problem import check_fitted
 from ..limb.inputs import check_labels, read_marked_image, read_study_image, read_study_labels
 from ..limb.sites import place_site
 from ..limb.surfaces import read_given_anatomy
@@ -25,8 +28,12 @@ from ..records.traces import SecondaryMeasurement, read_observed, read_record
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, name_load, time_socket_loads
 from ..socket.shape import build_loadable_socket, build_regions, check_load, check_regions
-from .refusals import list_refused_commands
+from .acquire import build_device_settings
+from .experiments import EXPERIMENTS, check_experiment
+from .export import FORMATS, check_export
 from .run import compute_keys
+
+_COMMANDS = {"protocol": "design --protocol", "socket_design": "socket design"}
 
 
 def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[str, Any]:
@@ -104,6 +111,30 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
         "outside_records": {name: [row.to_plain() for row in rows] for name, rows in outside.items()},
         "outside_text": describe_outside(outside),
     }
+
+
+def list_refused_commands(study: Study, limb: LimbGeometry | None) -> list[dict[str, Any]]:
+    """``commands`` that would be refused, and ``why``; ``limb``: None where it is not known yet."""
+    found: dict[str, list[str]] = {}
+    for command, check in _iterate_checks(study, limb):
+        try:
+            check()
+        except InputError as error:
+            why = str(InputError(error.what, place=error.place, remedy=error.remedy))
+            found.setdefault(why, []).append(command)
+    return [{"commands": commands, "why": why} for why, commands in found.items()]
+
+
+def _iterate_checks(study: Study, limb: LimbGeometry | None) -> Iterator[tuple[str, Callable[[], Any]]]:
+    yield "run", partial(check_fitted, study)
+    for experiment in EXPERIMENTS:
+        name = experiment.name
+        command = _COMMANDS.get(name, name.replace("sensitivity-", "sensitivity --only "))
+        yield command, partial(check_experiment, experiment, study, limb, experiment.options)
+    for to in FORMATS:
+        yield f"export --to {to}", partial(check_export, study, to)
+    for one in study.indentations:
+        yield f"acquire --site {one.name}", partial(build_device_settings, study, one, None, False)
 
 
 def _describe_outside(

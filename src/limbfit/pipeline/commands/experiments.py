@@ -52,7 +52,7 @@ _INDENTERS, _RECORD = ("indenter", "indenters", "clamps"), ("site", "name", "ind
 
 
 def _build_sensitivity(
-    name: str, run: Callable[..., dict[str, Any]], check: Check = check_variants, **options: Any
+    name: str, run: Callable[..., None], check: Check = check_variants, **options: Any
 ) -> Experiment:
     return Experiment(
         f"sensitivity-{name}",

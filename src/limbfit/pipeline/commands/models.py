@@ -23,6 +23,7 @@ from ...errors import InputError
 from ...identify.uncertainty.model_comparison import compute_mixture_interval, weigh_models
 from ...identify.uncertainty.uncertainty import NORMAL_95
 from ...laws import FIBRED, FUNG, LAWS, OGDEN, POWER
+from ...results.curves import read_curves
 from ...results.identification import RecordPrediction
 from ...results.models import (
     CalibratedModel,
@@ -37,7 +38,7 @@ from ...results.socket import LoadedRegion, SocketResult
 from ...study import Study, load_study
 from ..engine.context import Listener, Progress, ignore_progress
 from ..engine.hand_labels import find_hand_labels
-from ..engine.storage import read_curves, write_curves, write_result
+from ..engine.storage import write_curves, write_result
 from ..engine.store import Store, lock
 from .fitting import fit_socket
 from .run import compute_keys, run_study

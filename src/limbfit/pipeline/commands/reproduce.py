@@ -12,11 +12,12 @@ import numpy as np
 
 from ..._version import __version__
 from ...errors import InputError
+from ...results.curves import read_curves
 from ...study import Study, load_study
 from ..engine.context import Listener, ignore_progress
 from ..engine.hand_labels import find_hand_labels
 from ..engine.provenance import collect_versions, compute_input_digests, record_settings
-from ..engine.storage import read_curves, read_json
+from ..engine.storage import read_json
 from ..engine.store import Store
 from .run import run_study
 

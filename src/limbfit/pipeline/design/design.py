@@ -39,12 +39,7 @@ DEEPEST_SHARE = 0.5  # of the tissue's thickness that a candidate may go
 
 
 def check_design(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
-    """Refuse more sites than there are, sites with several records, and depths that fit at too few of them.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse more sites than there are, sites with several records, and depths that fit at too few."""
     sites, depths = count_wanted_sites(study, options["sites"]), options["depths_mm"]
     if not 0 < sites <= len(study.sites):
         raise InputError(f"{sites} sites are wanted of {len(study.sites)}", place="--sites")
@@ -87,7 +82,7 @@ def run_design(
     parameters: Parameters,
     parameters_from: str,
     noise: dict[str, float],
-) -> dict[str, Any]:
+) -> None:
     """Simulate every candidate once, with derivatives, and choose."""
     study = context.study
     vector = study.vector(parameters)
@@ -114,7 +109,6 @@ def run_design(
     )
     write_result(folder / "design.json", content)
     _write_tables(folder, content)
-    return {}
 
 
 def _build_candidate_models(

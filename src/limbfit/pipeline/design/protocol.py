@@ -59,12 +59,7 @@ DESIGNED, PLAIN, UNSEEN = "designed", "one ramp at each site", "by force alone"
 
 
 def check_protocol(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
-    """Refuse unknown parameters, and a session too short for set-up, rest and hold alone.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse unknown parameters, and a session too short for set-up, rest and hold alone."""
     _select_named(build_unknowns(study), options["determine"])
     budget = Budget(60.0 * options["minutes"], options["setup_s"])
     _check_minutes([options["rest_s"] + min(options["holds_s"], default=0.0)], budget)
@@ -102,7 +97,7 @@ def run_protocol(
     seen: Mapping[str, float | None],
     pressures: Mapping[str, Sequence[float]],
     socket_times: Mapping[str, tuple[float, float]],
-) -> dict[str, Any]:
+) -> None:
     """Simulate every possible record at every draw, with derivatives, and choose within the time.
 
     ``seen``: how well what is read (`SEEN`); None: there is none. ``pressures``: derivatives (p,) of their
@@ -156,7 +151,6 @@ def run_protocol(
     write_result(folder / "protocol.json", content)
     _write_tables(folder, content)
     write_records(folder / "records.toml", content.records, seen)
-    return {}
 
 
 def _select_named(known: Unknowns, determine: Sequence[str]) -> tuple[int, ...]:

@@ -81,9 +81,3 @@ def write_curves(file: Path, **columns: NDArray[np.float64]) -> None:
     """A CSV with named columns of numbers."""
     table = np.column_stack(list(columns.values()))
     np.savetxt(file, table, fmt="%.9g", delimiter=",", header=",".join(columns), comments="")
-
-
-def read_curves(file: Path) -> dict[str, NDArray[np.float64]]:
-    """The columns of a CSV that ``write_curves`` made."""
-    names = file.read_text(encoding="utf-8").split("\n", 1)[0].split(",")
-    return dict(zip(names, np.loadtxt(file, delimiter=",", skiprows=1, unpack=True), strict=True))

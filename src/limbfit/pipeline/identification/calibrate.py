@@ -2,34 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ...identify.fit.calibration import Calibration
 from ...identify.fit.multifidelity import CorrectionRound
 from ...identify.fit.multistart import MultistartResult, describe_starts
-from ...identify.fit.objective import MeasuredCurve
+from ...identify.fit.objective import MeasuredCurve, SiteResponse
 from ...identify.uncertainty.relaxation import RelaxationAssessment, assess_relaxation
 from ...identify.uncertainty.uncertainty import Uncertainty
-from ...indentation import Parameters
+from ...indentation import Parameters, Simulation
 from ...laws import FIBRED, FUNG, is_ogden
 from ...priors import SOURCE
 from ...results.base import Interval, Intervals
 from ...results.identification import (
     CalibrationResult,
     CalibrationUncertainty,
+    ContactSummary,
     CorrelationMatrix,
     MeshCorrectionRound,
     ParameterBounds,
     PriorShares,
+    SearchDoubt,
     SearchIteration,
     SearchStage,
     SearchStart,
     SearchStarts,
+    SimulationDoubt,
+    SimulationDoubts,
     StatedPrior,
     StoredLaw,
 )
@@ -42,12 +46,11 @@ from ..simulation.simulations import SimulationCache
 from .fine_meshes import correct_answer, plan_coarser_meshes
 from .intervals import sample_intervals
 from .problem import CalibrationProblem, build_problem
-from .record_simulator import RecordSimulator, WarmStarts
+from .record_simulator import RecordSimulator, SearchWarning, WarmStarts
 from .search import search_from_starts
-from .simulation_warnings import summarise_contact, summarise_doubts
 
 
-def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
+def run_calibrate(context: Context, folder: Path) -> None:
     """One material, then each tissue its own, on the fitted sites; simulations are kept.
 
     A run taken up again repeats the interrupted one from its kept simulations.
@@ -73,17 +76,17 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
     warnings = {site: list(one.warnings) for site, one in answers.items() if one.warnings}
     for site, texts in warnings.items():
         report(f"warning: site {site}, at the answer: {'; '.join(texts)}")
-    log, bounds, example = simulator.log, problem.unknowns, cache.example()
+    log, bounds, kept = simulator.log, problem.unknowns, cache.load_all()
     content = CalibrationResult(
         stages=[_summarise_stage(found, i, problem, simulator.starts) for i in range(len(found.stages))],
         bounds=ParameterBounds(lower=study.by_tissue(bounds.lower), upper=study.by_tissue(bounds.upper)),
         law=StoredLaw(**study.law.record()),
         objective=study.calibration.objective,
         uncertainty=_summarise_uncertainty(known, problem.study, relaxation),
-        forward_runs=len(cache),
-        forward_runs_with_sensitivities=cache.with_sensitivities(),
-        linear_solver=example.facts["linear_solver"] if example else None,
-        element=example.facts["element"] if example else None,
+        forward_runs=len(kept),
+        forward_runs_with_sensitivities=sum(one.jacobian is not None for one in kept),
+        linear_solver=kept[0].facts["linear_solver"] if kept else None,
+        element=kept[0].facts["element"] if kept else None,
         corrections=corrections,
         multistart=_summarise_starts(starts, problem.study) if study.calibration.starts > 1 else None,
         warnings=warnings,
@@ -96,7 +99,6 @@ def run_calibrate(context: Context, folder: Path) -> dict[str, Any]:
         doubts=summarise_doubts(log.warnings, answers, log.evaluations * records.simulations, found),
     )
     write_result(folder / "calibration.json", content)
-    return {}
 
 
 def _summarise_stage(
@@ -224,4 +226,62 @@ def _summarise_priors(known: Uncertainty, study: Study) -> PriorShares | None:
         },
         share=dict(zip(known.names, known.prior_share.tolist(), strict=True)),
         wider_without=dict(zip(known.names, known.wider_without.tolist(), strict=True)),
+    )
+
+
+def summarise_contact(
+    answers: Mapping[str, Simulation],
+    searched: Mapping[str, float | None],
+    rested: Sequence[SiteResponse],
+    fitted: Sequence[SiteResponse],
+) -> dict[str, ContactSummary]:
+    """Per site the penalty that all of its simulations hold, and what contact does at the answer.
+
+    ``search_penalty_per_mm`` is that of the mesh on which parameters are searched; ``from_rest_percent`` how
+    far the answer's force from rest is from the fitted one, in percent of its largest.
+    """
+    content = {}
+    for (site, simulation), answer, fit in zip(answers.items(), rested, fitted, strict=True):
+        off = np.max(np.abs(answer.force_N - fit.force_N)) / np.max(np.abs(fit.force_N))
+        content[site] = ContactSummary(
+            penalty_per_mm=simulation.facts.get("penalty_per_mm"),
+            sunk_steps=simulation.facts.get("sunk_steps"),
+            unbalanced_steps=simulation.facts.get("unbalanced_steps"),
+            search_penalty_per_mm=searched.get(site),
+            penetration_mm=simulation.penetration_mm,
+            from_rest_percent=100 * float(off) if np.isfinite(off) else None,
+        )
+    return content
+
+
+def summarise_doubts(
+    searched: Sequence[SearchWarning], answers: Mapping[str, Simulation], simulations: int, found: Calibration
+) -> SimulationDoubts:
+    """How many of the ``simulations`` of the search are doubtful, which, and what is at the answer.
+
+    ``iterate`` is the number of the accepted iterate that a doubt belongs to, from the beginning of the best
+    start; None for a trial that was not accepted.
+    """
+    accepted: dict[tuple[float, ...], int] = {}
+    for number, iterate in enumerate(found.history):
+        accepted.setdefault(iterate.parameters, number)
+    rows = [
+        SearchDoubt(
+            evaluation=one.evaluation,
+            iterate=accepted.get(one.parameters),
+            site=one.site,
+            parameters=dict(zip(found.names, one.parameters, strict=True)),
+            **asdict(one.doubt),
+        )
+        for one in searched
+    ]
+    return SimulationDoubts(
+        simulations=simulations,
+        doubtful=len({(one.evaluation, one.site) for one in searched}),
+        search=rows,
+        answer={
+            site: [SimulationDoubt.model_validate(doubt) for doubt in one.doubts]
+            for site, one in answers.items()
+            if one.doubts
+        },
     )

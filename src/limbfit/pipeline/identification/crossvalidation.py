@@ -53,13 +53,7 @@ _MARGIN = 0.02  # of the emulator's box, in the logarithm, that fits may go beyo
 
 
 def check_crossvalidate(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
-    """Refuse a study whose recorded sites are all fitted; see `run_crossvalidate`.
-
-    Raises
-    ------
-    StudyError
-        With the remedy.
-    """
+    """Refuse a study whose recorded sites are all fitted; see `run_crossvalidate`."""
     recorded = [site for site in study.sites if study.records_at(site)]
     size = options["fit"] or len(study.fitted)
     if not 0 < size < len(recorded):
@@ -73,7 +67,7 @@ def check_crossvalidate(study: Study, limb: LimbGeometry | None, options: Mappin
 
 def run_crossvalidate(
     context: Context, folder: Path, *, fit: int, choices: int, seed: int, runs: int
-) -> dict[str, Any]:
+) -> None:
     """Held-out errors over choices of ``fit`` sites, with all their records (0: as many as the study fits).
 
     At most ``choices`` of them are drawn with ``seed``; ``runs`` more simulations of all sites make the
@@ -99,7 +93,6 @@ def run_crossvalidate(
     content = _build_result(context, bench, found, size, comb(len(recorded), size), checks)
     write_result(folder / "crossvalidate.json", content)
     _write_tables(folder, content)
-    return {}
 
 
 class _Found:

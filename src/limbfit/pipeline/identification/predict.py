@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -53,7 +52,7 @@ _MISSING = {
 }
 
 
-def run_predict(context: Context, folder: Path) -> dict[str, Any]:
+def run_predict(context: Context, folder: Path) -> None:
     """Force at every recorded site with all materials and with one, intervals, and the fields at the peak."""
     study = context.study
     calibration = context.results.calibration
@@ -111,7 +110,6 @@ def run_predict(context: Context, folder: Path) -> dict[str, Any]:
         **_compute_means(rows),
     )
     write_result(folder / "predict.json", content)
-    return {}
 
 
 @dataclass(frozen=True)

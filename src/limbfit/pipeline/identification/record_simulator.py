@@ -9,12 +9,12 @@ import numpy as np
 
 from ...arrays import Array
 from ...execution import Executor
+from ...fe import SimulationWarning
 from ...identify.fit.objective import SiteResponse
 from ...identify.uncertainty.intervals import EvaluationStore
 from ...indentation import Simulation, SimulationJob
 from ..records.records import RecordSet
 from ..simulation.simulations import SimulationCache
-from .simulation_warnings import SearchWarning
 
 Responses = list[SiteResponse]
 Report = Callable[
@@ -51,6 +51,16 @@ class WarmStarts:
 
     def _reaches(self, parameters: Array, distance: float) -> bool:
         return bool(np.max(np.abs(np.log(parameters / self._chain[-1]))) <= distance)
+
+
+@dataclass(frozen=True)
+class SearchWarning:
+    """A doubt about a simulation of the search: in which evaluation, where, with which parameters."""
+
+    evaluation: int
+    site: str
+    parameters: tuple[float, ...]
+    doubt: SimulationWarning
 
 
 @dataclass

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -143,7 +142,7 @@ def _choose_far_mm(study: Study, stated: float) -> float:
     return stated if study.clamps is None else min(stated, study.clamps.width_mm)
 
 
-def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
+def run_mesh(context: Context, folder: Path) -> None:
     """One graded mesh per site, and a coarse one where the study wants it; side by side.
 
     Meshes of an interrupted run are kept.
@@ -158,7 +157,6 @@ def run_mesh(context: Context, folder: Path) -> dict[str, Any]:
     write_result(folder / "mesh.json", content)
     for facts in (*folder.glob("*.vtu"), *folder.glob(f"{COARSE}/*.vtu")):
         facts.with_suffix(".json").unlink()
-    return {}
 
 
 def _make_meshes(context: Context, folder: Path, settings: MeshSettings, word: str) -> MeshSet:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from .files import MARKED_SKIN, name_file_in_errors
 from .inputs import read_marked_image, read_study_image, read_study_labels, segment_automatically
 
 
-def run_segment(context: Context, folder: Path) -> dict[str, Any]:
+def run_segment(context: Context, folder: Path) -> None:
     """Image to label map; a corrected label map of the study wins over the automatic one."""
     study = context.study
     assert study.image is not None
@@ -57,7 +56,6 @@ def run_segment(context: Context, folder: Path) -> dict[str, Any]:
         motion=store_second_skin(study, volume, labels, folder),
     )
     write_result(folder / "segment.json", found)
-    return {}
 
 
 def label_volumes(labels: LabelMap) -> dict[str, float]:

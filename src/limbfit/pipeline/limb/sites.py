@@ -18,7 +18,7 @@ from ..engine.storage import write_result
 from .files import MARKED_SKIN
 
 
-def run_sites(context: Context, folder: Path) -> dict[str, Any]:
+def run_sites(context: Context, folder: Path) -> None:
     """Where each indentation is: on the skin, with the indenter's axis; markers matched to names."""
     study = context.study
     anatomy = load_anatomy(context.store["surfaces"])
@@ -28,7 +28,6 @@ def run_sites(context: Context, folder: Path) -> dict[str, Any]:
     markers = _match_markers(context, anatomy)
     placed = [place_site(site, study, anatomy, markers.get(site.name)) for site in study.sites]
     write_result(folder / "sites.json", SitesResult(sites=placed))
-    return {}
 
 
 def _match_markers(context: Context, anatomy: Anatomy) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from ..engine.context import Context
 from .files import THICKNESS, find_labelled_file, name_file_in_errors
 
 
-def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
+def run_surfaces(context: Context, folder: Path) -> None:
     """Label map or the study's own surfaces to a checked anatomy: closed skin, closed bones, proximal cut."""
     study = context.study
     context.tell("surfaces", 0, 2, "building surfaces")
@@ -34,7 +33,6 @@ def run_surfaces(context: Context, folder: Path) -> dict[str, Any]:
     for note in notes:
         context.tell("surfaces", 1, 2, note)
     save_anatomy(folder, anatomy, notes)
-    return {}
 
 
 def _read_limb_labels(context: Context) -> LabelMap:

@@ -11,12 +11,12 @@ from ...anatomy.sites.sites import compute_indenter_axis, measure_tissue_under
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...identify.checks.plausibility import RecordFacts, RecordWarning, check_plausibility
 from ...indentation import compute_contact_radius
+from ...results.curves import read_curves
 from ...results.limb import PlacedSite
 from ...results.records import RecordRemark, TraceFacts
 from ...study import Record, Study
 from ...traces import SurfaceMotion
 from ..engine.context import Context
-from ..engine.storage import read_curves
 from ..simulation.limb_geometry import LimbGeometry
 from .secondary_measurements import ChosenPoints, choose_points
 

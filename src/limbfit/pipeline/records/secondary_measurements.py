@@ -30,10 +30,11 @@ from ...indentation import (
     to_vector3,
 )
 from ...mesh import read_vtu
+from ...results.curves import read_curves
 from ...results.records import LayerRecord, TraceFacts, WaveRecord
 from ...study import Record, Study, Vector
 from ...traces import SurfaceMotion, Thinning, WaveMeans
-from ..engine.storage import read_curves, write_curves
+from ..engine.storage import write_curves
 from ..engine.store import Store
 from ..limb.files import LAYERS, SMOOTHING, WAVES
 

@@ -112,7 +112,7 @@ def _phases_to_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list
     return [RecordPhase.model_validate(phase) for phase in phases]
 
 
-def run_traces(context: Context, folder: Path) -> dict[str, Any]:
+def run_traces(context: Context, folder: Path) -> None:
     """Records to regularised curves, counted from touch-down."""
     recorded = context.study.recorded
     facts = {}
@@ -140,7 +140,6 @@ def run_traces(context: Context, folder: Path) -> dict[str, Any]:
             words = f"site {record.name}, {what} hardly gives way, and is not compared"
             context.tell("traces", i, len(recorded), words)
     write_result(folder / "traces.json", TracesResult(sites=facts))
-    return {}
 
 
 def read_observed(

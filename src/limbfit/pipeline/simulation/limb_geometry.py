@@ -57,7 +57,8 @@ class LimbGeometry:
         return found
 
 
-# Refuses what a study, its limb (None: not known yet) and options decide, before anything is simulated.
+# Refuses (`InputError`) what a study, its limb (None: not known yet) and options rule out, before anything is
+# simulated.
 Check = Callable[[Study, LimbGeometry | None, Mapping[str, Any]], None]
 
 

@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ...execution import Executor
 from ...extensions import compute_extensions_digest
 from ...fe import SimulationWarning
-from ...indentation import (
-    Simulation,
-    SimulationJob,
-    SiteModel,
-    simulate,
-)
+from ...indentation import Simulation, SimulationJob, SiteModel, simulate
 from ..engine.context import Context
 from ..engine.digests import code_digest, compute_digest
-from ..engine.storage import write_atomically
-from ..engine.store import EARLIER, RUNS
+from ..engine.partial_results import Arrays, Facts, ResultFiles, read_made
+from ..engine.store import RUNS
 
 CURVE_POINTS = 81  # times, about, at which measured and simulated force are compared
 
@@ -30,20 +23,17 @@ CURVE_POINTS = 81  # times, about, at which measured and simulated force are com
 class SimulationCache:
     """Finished simulations in ``folder``, one file each.
 
-    ``also`` are folders of earlier runs, beside those of interrupted attempts: what is found there is copied,
-    since they may be replaced.
-    ``work`` does a job; what it tells beyond `simulate` is in the simulation's facts.
+    ``also`` are folders of earlier runs (see `ResultFiles`). ``work`` does a job; what it tells beyond
+    `simulate` is in the simulation's facts.
     """
 
     def __init__(
         self,
         folder: Path,
-        also: Sequence[Path] = (),
+        also: Iterable[Path] = (),
         work: Callable[[SimulationJob], Simulation] = simulate,
     ) -> None:
-        self.folder, self.work = folder, work
-        self.places = (folder, folder.parent / EARLIER, *also)
-        folder.mkdir(parents=True, exist_ok=True)
+        self.kept, self.work = ResultFiles(folder, also), work
 
     def run(
         self, jobs: Sequence[SimulationJob], executor: Executor, again: bool = False
@@ -52,58 +42,39 @@ class SimulationCache:
 
         ``again``: those that failed are tried once more.
         """
-        found = {job: kept for job in dict.fromkeys(jobs) if (kept := self._find(job)) is not None}
+        stored = {job: self.kept.find(compute_job_digest(job)) for job in dict.fromkeys(jobs)}
+        found = {job: _to_simulation(*made) for job, made in stored.items() if made is not None}
         if again:
             found = {job: kept for job, kept in found.items() if kept.completed}
-        missing = [job for job in dict.fromkeys(jobs) if job not in found]
+        missing = [job for job in stored if job not in found]
         made = executor.map(self.work, missing, keys=[job.model.name for job in missing], on_lost=_build_lost)
         for job in jobs:
             if job not in found:
                 simulation = found[job] = next(made)
                 if not simulation.facts.get("lost"):  # the machine's fault: another run tries it again
-                    self._keep(job, simulation)
+                    self.keep(job, simulation)
             yield found[job]
 
-    def example(self) -> Simulation | None:
-        """Any kept simulation, for what they all have in common; None where there is none."""
-        file = next(self.folder.glob("*.npz"), None)
-        return None if file is None else _load(file)
+    def keep(self, job: SimulationJob, simulation: Simulation) -> None:
+        """Store a simulation, as it may have been done elsewhere."""
+        arrays = {
+            name: values
+            for name in ("force_N", "jacobian", "observed", "observed_jacobian")
+            if (values := getattr(simulation, name)) is not None
+        }
+        facts = {
+            "site": simulation.site,
+            "completed": simulation.completed,
+            "reason": simulation.reason,
+            "penetration_mm": simulation.penetration_mm,
+            "facts": simulation.facts,
+            "doubts": [asdict(doubt) for doubt in simulation.doubts],
+        }
+        self.kept.put(compute_job_digest(job), (facts, arrays))
 
-    def __len__(self) -> int:
-        return len(list(self.folder.glob("*.npz")))
-
-    def with_sensitivities(self) -> int:
-        """How many of the kept simulations have derivatives."""
-        return sum(_load(file).jacobian is not None for file in self.folder.glob("*.npz"))
-
-    def _find(self, job: SimulationJob) -> Simulation | None:
-        name = f"{compute_job_digest(job)}.npz"
-        for place in self.places:
-            if (place / name).is_file():
-                if place != self.folder:
-                    with write_atomically(self.folder / name) as stream:
-                        stream.write((place / name).read_bytes())
-                return _load(self.folder / name)
-        return None
-
-    def _keep(self, job: SimulationJob, simulation: Simulation) -> None:
-        with write_atomically(self.folder / f"{compute_job_digest(job)}.npz") as stream:
-            arrays = {"force_N": simulation.force_N}
-            if simulation.jacobian is not None:
-                arrays["jacobian"] = simulation.jacobian
-            if simulation.observed.size:
-                arrays["observed"] = simulation.observed
-            if simulation.observed_jacobian is not None:
-                arrays["observed_jacobian"] = simulation.observed_jacobian
-            facts = {
-                "site": simulation.site,
-                "completed": simulation.completed,
-                "reason": simulation.reason,
-                "penetration_mm": simulation.penetration_mm,
-                "facts": simulation.facts,
-                "doubts": [asdict(doubt) for doubt in simulation.doubts],
-            }
-            np.savez(stream, facts=json.dumps(facts), **arrays)  # type: ignore[arg-type]
+    def load_all(self) -> list[Simulation]:
+        """Every simulation that is kept in the folder."""
+        return [_to_simulation(*read_made(file)) for file in self.kept.files]
 
 
 def _build_lost(job: SimulationJob, reason: str) -> Simulation:
@@ -115,19 +86,9 @@ def _build_lost(job: SimulationJob, reason: str) -> Simulation:
     return Simulation(site, np.zeros(n), slopes, False, reason, 0.0, facts, observed=nothing)
 
 
-def _load(file: Path) -> Simulation:
-    with np.load(file, allow_pickle=False) as stored:
-        facts: dict[str, Any] = json.loads(str(stored["facts"]))
-        jacobian = stored.get("jacobian")
-        doubts = tuple(SimulationWarning(**one) for one in facts.pop("doubts"))
-        return Simulation(
-            force_N=stored["force_N"],
-            jacobian=jacobian,
-            doubts=doubts,
-            observed=stored.get("observed", np.zeros((0, 0))),
-            observed_jacobian=stored.get("observed_jacobian"),
-            **facts,
-        )
+def _to_simulation(facts: Facts, arrays: Arrays) -> Simulation:
+    doubts = tuple(SimulationWarning(**one) for one in facts.pop("doubts"))
+    return Simulation(**facts | {"jacobian": None} | dict(arrays), doubts=doubts)
 
 
 def compute_job_digest(job: SimulationJob) -> str:
@@ -161,14 +122,8 @@ def open_experiment_cache(context: Context, folder: Path) -> SimulationCache:
     return SimulationCache(folder / RUNS, also=others)
 
 
-def find_newest_simulations(folder: Path, sites: Sequence[str]) -> dict[str, Simulation]:
-    """The last kept simulation of each of the sites, of those that have one, while a stage goes on."""
-    found: dict[str, Simulation] = {}
+def find_newest_simulation(folder: Path, site: str) -> Simulation | None:
+    """The last kept simulation of a site, while a stage goes on; None where there is none."""
     files = [(file.stat().st_mtime_ns, file) for file in folder.glob("*.npz")]
-    for _, file in sorted(files, reverse=True):
-        if len(found) == len(sites):
-            break
-        simulation = _load(file)
-        if simulation.site in sites:
-            found.setdefault(simulation.site, simulation)
-    return found
+    simulations = (_to_simulation(*read_made(file)) for _, file in sorted(files, reverse=True))
+    return next((one for one in simulations if one.site == site), None)

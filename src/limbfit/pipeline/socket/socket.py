@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +25,15 @@ from ...socket.landmarks import find_bone
 from ...socket.published import select_published_findings
 from ...study import Study
 from ..engine.context import Context
-from ..engine.partial_results import Begun, ResultFiles
+from ..engine.partial_results import ResultFiles
 from ..engine.storage import write_result, write_table
+from ..engine.store import RUNS
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import NEAR_MM, LimbAxis, describe_socket_load, name_load, time_socket_loads
 from .intervals import CHANGE_PERCENT, FRICTION, ParameterSpread, draw_step, store_change, widen_intervals
-from .limb import SocketLimb, SocketRun, run_sockets, simulate_socket
+from .limb import SocketLimb
 from .shape import build_loadable_socket, check_at_rest
+from .simulation import SocketRun, put_on, run_sockets, simulate_socket, summarise_run
 
 NAME = "socket"
 NOT_COMPARED = (
@@ -40,12 +43,7 @@ NOT_COMPARED = (
 
 
 def check_socket(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
-    """Refuse tissues that are not at rest, and a shape or load that the limb cannot have.
-
-    Raises
-    ------
-    StudyError
-    """
+    """Refuse tissues that are not at rest, and a shape or load that the limb cannot have."""
     check_at_rest(study)
     if limb is not None:
         build_loadable_socket(study, limb.anatomy, limb.anatomy.skin)
@@ -62,7 +60,7 @@ def run_socket(
     recorded_range: Mapping[str, Any] | None,
     relaxation: dict[str, Any] | None,
     samples: int,
-) -> dict[str, Any]:
+) -> None:
     """Pressure, shear and settling in the study's socket at the ``parameters`` of the tissues.
 
     Parameters
@@ -79,13 +77,10 @@ def run_socket(
     socket = build_loadable_socket(context.study, limb.anatomy, limb.outer.skin)
     write_surface(folder / "socket.stl", socket.surface)
     mesh, facts = limb.mesh(context, NAME, folder, socket)
-
-    def told(time: float, end: float, words: str) -> None:
-        context.tell(NAME, time, end, words)
-
     covariance = None if covariance_log is None else np.array(covariance_log)
-    begun = Begun(ResultFiles(folder), limb.key(folder, parameters, socket, covariance is not None))
-    found = limb.don(mesh, limb.materials(parameters), socket, told, covariance is not None, begun=begun)
+    kept = ResultFiles(folder / RUNS, also=[context.store[NAME] / RUNS])
+    run = SocketRun(NAME, limb, mesh, parameters, socket, kept, covariance is not None)
+    found = put_on(run, partial(context.tell, NAME))
     known = None
     if covariance is not None:
         at, probable = (context.study.vector(one) for one in (parameters, most_probable or parameters))
@@ -93,34 +88,31 @@ def run_socket(
         if relaxation is not None:
             spread = RelaxationSpread.from_stored(RelaxationBeyond.model_validate(relaxation))
             known = known.relax(spread.own_weight, *spread.interpolate(context.study.socket.worn_s))
-    content = limb.facts(found, socket, known) | {
+    content = summarise_run(run, found, known) | {
         "parameters": parameters,
         "parameters_from": parameters_from,
         "socket": _describe_shape(limb, socket),
         "mesh": facts,
         # All that was found is of transtibial limbs.
-        "published": select_published_findings(limb.faces(mesh, socket))
-        if find_bone(limb.anatomy, "tibia")
-        else [],
+        "published": select_published_findings(run.faces) if find_bone(limb.anatomy, "tibia") else [],
         "samples": None,
         "worn_s": None if relaxation is None else context.study.socket.worn_s,
     }
-    compared = _compare_with_records(limb, mesh, found, recorded_range)
+    compared = _compare_with_records(run, found, recorded_range)
     for held in (content["donning"], *content["loads"]):
         held |= compared[held.get("name", "donning")]
     content["outside_text"] = [] if covariance is None else _describe_outside(content, recorded_range)
     if covariance is not None and samples:
         steps = [draw_step(covariance, number) for number in range(samples)]
-        content["samples"] = _simulate_samples(context, folder, (limb, mesh, socket), content, steps)
+        content["samples"] = _simulate_samples(context, run, content, steps)
     write_result(folder / "socket.json", SocketResult(**content))
     _write_fields(folder, mesh, found)
     _write_tables(folder, content)
-    begun.drop()
-    return {}
+    kept.drop(run.begun)
 
 
 def _compare_with_records(
-    limb: SocketLimb, mesh: Mesh, found: DonningResult, stored: Mapping[str, Any] | None
+    run: SocketRun, found: DonningResult, stored: Mapping[str, Any] | None
 ) -> dict[str, dict[str, Any]]:
     """What donning and each load do to the tissue, and what of it no fitted record did, by name.
 
@@ -129,12 +121,13 @@ def _compare_with_records(
     if stored is None:
         return {name: {"loading": None, "outside_records": None} for name in found.held}
     tested = RecordedRange.from_stored(RecordedExtents.model_validate(stored))
-    axis, before = LimbAxis(limb.anatomy), list[Extent]()
-    near_mm = NEAR_MM + limb.study.socket.liner.thickness_mm
-    compared, histories = {}, time_socket_loads(limb.study.socket)
+    axis, before = LimbAxis(run.limb.anatomy), list[Extent]()
+    mesh, study = run.mesh, run.limb.study
+    near_mm = NEAR_MM + study.socket.liner.thickness_mm
+    compared, histories = {}, time_socket_loads(study.socket)
     for name, held in found.held.items():
         before = describe_socket_load(
-            mesh, mesh.face_sets[OUTER], held, before, histories[name], limb.study.tissues, near_mm, axis,
+            mesh, mesh.face_sets[OUTER], held, before, histories[name], study.tissues, near_mm, axis,
             tested,
         )  # fmt: skip
         compared[name] = {
@@ -153,39 +146,32 @@ def _describe_outside(content: Mapping[str, Any], tested: Mapping[str, Any] | No
 
 
 def _simulate_samples(
-    context: Context,
-    folder: Path,
-    donned: tuple[SocketLimb, Mesh, Socket],
-    content: dict[str, Any],
-    steps: Sequence[Array],
+    context: Context, run: SocketRun, content: dict[str, Any], steps: Sequence[Array]
 ) -> dict[str, Any]:
     """Simulate parameters whose logarithms differ by ``steps (k,)``, and widen the intervals by the misses.
 
     More friction is simulated beside them, where there is some, and what it changes stored. Told are how many
     draws came to their end, and why others did not.
     """
-    (limb, mesh, socket), study = donned, context.study
-    kept = ResultFiles(folder, also=[context.store[NAME]])
-
-    def job(name: str, on: SocketLimb, parameters: Parameters) -> SocketRun:
-        key = on.key(folder, parameters, socket)
-        return SocketRun(name, on, mesh, on.materials(parameters), socket, kept, key)
-
-    simulated, at = content["parameters"], study.vector(content["parameters"])
-    draws = [job(f"draw {n}", limb, study.by_tissue(at * np.exp(step))) for n, step in enumerate(steps, 1)]
-    rougher = _build_rougher(limb)
-    more = [] if rougher is None else [job(FRICTION, rougher, simulated)]
-    jobs = [*draws, *more]
+    study, plain = context.study, replace(run, sensitivities=False)
+    at = study.vector(run.parameters)
+    jobs = [
+        replace(plain, name=f"draw {n}", parameters=study.by_tissue(at * np.exp(step)))
+        for n, step in enumerate(steps, 1)
+    ]
+    rougher = _build_rougher(run.limb)
+    if rougher is not None:
+        jobs.append(replace(plain, name=FRICTION, limb=rougher))
     reasons = run_sockets(
         jobs, context.executor, lambda done, words: context.tell(NAME, done, len(jobs), words)
     )
     ended = [None if reason else simulate_socket(one)[0] for one, reason in zip(jobs, reasons, strict=True)]
-    for other in filter(None, ended[len(draws) :]):
+    for other in filter(None, ended[len(steps) :]):
         store_change(content, other, FRICTION)
     names = [f"{tissue}.{name}" for tissue, name in study.parameters]
     found = [
         (dict(zip(names, step, strict=True)), facts)
-        for step, facts in zip(steps, ended[: len(draws)], strict=True)
+        for step, facts in zip(steps, ended[: len(steps)], strict=True)
         if facts is not None
     ]
     if len(found) < 2:  # one says nothing of a spread

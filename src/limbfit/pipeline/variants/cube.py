@@ -6,7 +6,7 @@ A cube of 10 mm between frictionless plates that hold on to it: compressed over 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,9 @@ from ...relaxation import DEFAULT_SPAN_S
 from ...results.variants import CubeResult, CubeTissue
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import write_result
+from ..engine.storage import write_curves, write_result
 from ..simulation.limb_geometry import LimbGeometry
+from .variants import format_column
 
 
 @dataclass(frozen=True)
@@ -58,14 +59,11 @@ class PublishedTissue:
 
     def material(self, relaxation: PronyTerms) -> Ogden:
         """The tissue for the solver, MPa; ``relaxation`` is taken where none was published."""
-        published = (self.relaxation,) if self.relaxation else ()
-        used = relaxation if self.relaxation is None else published
+        if self.relaxation is not None:
+            relaxation = (self.relaxation,) if self.relaxation else ()
         shear = 0.5 * sum(c for c, _ in self.terms)
-        return Ogden(
-            tuple((c * KPA, m) for c, m in self.terms),
-            used,
-            kappa_ratio=self.bulk_kPa / shear,
-        )
+        terms = tuple((c * KPA, m) for c, m in self.terms)
+        return Ogden(terms, relaxation, kappa_ratio=self.bulk_kPa / shear)
 
 
 _FIRST_ORDER = (
@@ -130,16 +128,6 @@ STEPS = 40  # in each ramp, and in the time held
 COMPRESSION_PERCENT = 20.0
 
 
-@dataclass(frozen=True)
-class Specimen:
-    """A tissue to be compressed; ``row`` is what is told of it beside its stress."""
-
-    name: str
-    kind: str
-    material: Material
-    row: dict[str, Any]
-
-
 def compress_cube(
     output: Path | None = None,
     *,
@@ -177,10 +165,20 @@ def compress_cube(
     times = _build_times()
     rows, stresses = [], {}
     own = build_materials(parameters or {}, kappa_ratio, law, relaxation_span_s=relaxation_span_s)
-    for specimen in _build_specimens(parameters or {}, own, law):
-        stress, least, most = compress(specimen.material, times, compression_percent)
-        stresses[specimen.name] = stress
-        rows.append(CubeTissue(**specimen.row, **_summarise(times, stress), J_min=least, J_max=most))
+    back = int(np.argmin(np.abs(times - 2 * RAMP_S)))  # at its height again
+    for material, facts in _list_tissues(parameters or {}, own, law):
+        stress, least, most = compress(material, times, compression_percent)
+        stresses[facts["tissue"]] = stress.tolist()
+        row = CubeTissue(
+            **facts,
+            **_describe_material(material),
+            peak_kPa=stress.max(),
+            back_kPa=stress[back],
+            end_kPa=stress[-1],
+            J_min=least,
+            J_max=most,
+        )
+        rows.append(row)
     content = CubeResult(
         side_mm=SIDE_MM,
         compression_percent=compression_percent,
@@ -189,7 +187,7 @@ def compress_cube(
         element="hex8",
         tissues=rows,
         time_s=times.tolist(),
-        stress_kPa={name: stress.tolist() for name, stress in stresses.items()},
+        stress_kPa=stresses,
     )
     if output is not None:
         _write(output, content)
@@ -207,19 +205,14 @@ def check_compression(percent: float) -> None:
 
 
 def check_cube(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
-    """Refuse tissues with fibres, and what is no compression.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse tissues with fibres, and what is no compression."""
     check_compression(options["compression_percent"])
     if study.fibres:
         what = "the cube compares isotropic tissues, and this study has fibres"
         raise InputError(what, file=study.file, place="material.law")
 
 
-def run_cube(context: Context, folder: Path, *, compression_percent: float) -> dict[str, Any]:
+def run_cube(context: Context, folder: Path, *, compression_percent: float) -> None:
     """The experiment: this study's identified tissues beside the published ones."""
     context.tell("cube", 0, 1, "compressing")
     compress_cube(
@@ -230,48 +223,54 @@ def run_cube(context: Context, folder: Path, *, compression_percent: float) -> d
         relaxation_span_s=context.study.material.relaxation_span_s,
         compression_percent=compression_percent,
     )
-    return {}
 
 
-def _build_specimens(
+def _list_tissues(
     parameters: dict[str, dict[str, float]], own: dict[str, Material], law: str
-) -> list[Specimen]:
-    found = []
-    for i, (tissue, values) in enumerate(parameters.items()):
-        words = ", ".join(f"{p.key} = {values[p.key]:.4g} {p.unit}".rstrip() for p in LAWS[law].parameters)
-        kind = "muscle" if i == len(parameters) - 1 else "skin"
-        row = {"values": words, "conversion": "none", "source": "this study"}
-        found.append(_build_specimen(f"{tissue} (this study)", kind, own[tissue], LAWS[law].words, row))
+) -> Iterator[tuple[Material, dict[str, Any]]]:
+    """The given tissues and the published ones, and what is said of each."""
+    for tissue, values in parameters.items():
+        yield (
+            own[tissue],
+            {
+                "tissue": f"{tissue} (this study)",
+                "kind": "muscle" if tissue == list(parameters)[-1] else "skin",
+                "law": LAWS[law].words,
+                "values": ", ".join(
+                    f"{p.key} = {values[p.key]:.4g} {p.unit}".rstrip() for p in LAWS[law].parameters
+                ),
+                "conversion": "none",
+                "source": "this study",
+            },
+        )
     # The paper's, where no study gives its own.
     relaxation: dict[str, PronyTerms] = {"skin": ((3.57, 0.32),), "muscle": ((3.47, 0.34),)}
     if parameters:
         first, last = (tuple(map(tuple, list(own.values())[i].table().prony)) for i in (0, -1))
         relaxation = {"skin": first, "muscle": last}
     for known in PUBLISHED:
-        row = {"values": known.values, "conversion": known.conversion, "source": known.source}
-        found.append(
-            _build_specimen(
-                known.name, known.kind, known.material(relaxation[known.kind]), "sum of Ogden terms", row
-            )
+        yield (
+            known.material(relaxation[known.kind]),
+            {
+                "tissue": known.name,
+                "kind": known.kind,
+                "law": "sum of Ogden terms",
+                "values": known.values,
+                "conversion": known.conversion,
+                "source": known.source,
+            },
         )
-    return found
 
 
-def _build_specimen(name: str, kind: str, material: Material, law: str, row: dict[str, Any]) -> Specimen:
+def _describe_material(material: Material) -> dict[str, Any]:
     table = material.table()
-    relaxation = 1.0 + float(table.prony[:, 0].sum())
-    terms = table.terms.tolist() if table.has_terms else []
-    facts = {
-        "tissue": name,
-        "kind": kind,
-        "shear_modulus_kPa": material.instantaneous_modulus / relaxation / KPA,
+    return {
+        "shear_modulus_kPa": material.instantaneous_modulus / (1.0 + table.prony[:, 0].sum()) / KPA,
         "instantaneous_modulus_kPa": material.instantaneous_modulus / KPA,
         "bulk_modulus_kPa": table.kappa / KPA,
-        "prony": table.prony.tolist(),
-        "law": law,
-        "terms": [[c / KPA, m] for c, m in terms],
+        "prony": table.prony,
+        "terms": [[c / KPA, m] for c, m in table.terms] if table.has_terms else [],
     }
-    return Specimen(name, kind, material, facts | row)
 
 
 def _build_times() -> Array:
@@ -280,18 +279,13 @@ def _build_times() -> Array:
     return np.concatenate([RAMP_S * ramp, RAMP_S * (1 + ramp), 2 * RAMP_S + HOLD_S * ramp**1.5])
 
 
-def build_cube_mesh(cells: int = 1) -> Mesh:
-    """The cube of ``cells`` hexahedra along a side, from the origin, mm."""
-    lines = np.linspace(0.0, SIDE_MM, cells + 1)
-    points, corners = build_boxes(lines, lines, lines)
-    return Mesh(points, corners[:, HEX], "hex8", np.zeros(len(corners), dtype=int), ("cube",), {}, {})
-
-
 def compress(material: Material, times: Array, compression_percent: float) -> tuple[Array, float, float]:
     """Stress (k,) in kPa at ``times`` s, and the least and largest ratio of volumes."""
     depth = SIDE_MM * compression_percent / 100.0
     ramp = np.array([0.0, RAMP_S, 2 * RAMP_S, 2 * RAMP_S + HOLD_S])
-    mesh = build_cube_mesh()
+    side = np.array([0.0, SIDE_MM])
+    points, corners = build_boxes(side, side, side)
+    mesh = Mesh(points, corners[:, HEX], "hex8", np.zeros(len(corners), dtype=int), ("cube",), {}, {})
     planes = [Support(np.flatnonzero(mesh.points[:, i] == 0.0), i) for i in range(3)]
     top = Support(np.flatnonzero(mesh.points[:, 2] == SIDE_MM), 2, -1.0)
     problem = Problem(
@@ -315,28 +309,9 @@ def compress(material: Material, times: Array, compression_percent: float) -> tu
     return stress / KPA, float(volume.min()), float(volume.max())
 
 
-def _summarise(times: Array, stress: Array) -> dict[str, Any]:
-    """Peak, and the tension that stays when the cube is back at its height, at once and at the end."""
-    back = int(np.argmin(np.abs(times - 2 * RAMP_S)))
-    return {
-        "peak_kPa": float(stress.max()),
-        "back_kPa": float(stress[back]),
-        "end_kPa": float(stress[-1]),
-    }
-
-
 def _write(folder: Path, content: CubeResult) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     write_result(folder / "cube.json", content)
-    columns = [np.array([0.0, *content.time_s])]
-    columns += [np.array([0.0, *values]) for values in content.stress_kPa.values()]
-    heads = ["time_s", *(_format_column(name) for name in content.stress_kPa)]
-    table = np.column_stack(columns)
-    np.savetxt(folder / "cube.csv", table, fmt="%.9g", delimiter=",", header=",".join(heads), comments="")
+    columns = {format_column(name, "kPa"): np.array([0.0, *v]) for name, v in content.stress_kPa.items()}
+    write_curves(folder / "cube.csv", time_s=np.array([0.0, *content.time_s]), **columns)
     (folder / "cube.svg").write_text(report.draw_cube(content), encoding="utf-8")
-
-
-def _format_column(name: str) -> str:
-    """A tissue's name as the head of a CSV column, with the unit."""
-    plain = "".join(c if c.isalnum() and c.isascii() else " " for c in name)
-    return "_".join(plain.split()) + "_kPa"

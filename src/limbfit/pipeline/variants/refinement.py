@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
-from ...indentation import Simulation
+from ...indentation import Parameters, Simulation
 from ...results.variants import RefinedSite, RefinementResult, RefinementRun
 from ...study import Study
 from ..engine.context import Context
-from ..engine.digests import compute_file_digest
-from ..limb.mesh import make_mesh, mesh_job, mesh_settings, read_mesh_facts, scale_edges
+from ..limb.mesh import mesh_job, mesh_settings, read_mesh_facts, scale_edges
+from ..limb.remesh import mesh_models
 from ..simulation.extrapolation import MESH_ORDERS, extrapolate_richardson
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import open_experiment_cache
-from .sensitivity import read_identified_parameters, store_runs
 from .variants import (
     ChosenSite,
     Variant,
     check_variants,
     choose_sites,
     compare_variants,
-    run_variants,
-    write_variants,
+    simulate_variants,
+    store_variants,
 )
 
 FACTORS = (1.4, 1.0, 0.7)  # of the edge lengths of the study's meshes
@@ -33,12 +32,7 @@ FARTHEST = 0.1  # of the force on the finest mesh: a limit farther away is no li
 
 
 def check_refinement(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
-    """Refuse one mesh alone, and what `check_variants` does.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse one mesh alone, and what `check_variants` does."""
     check_variants(study, limb, options)
     wanted = _choose_factors(options["factors"])
     if len(wanted) < 2 or wanted[-1] <= 0.0:
@@ -50,76 +44,58 @@ def _choose_factors(given: Sequence[float]) -> list[float]:
     return sorted({1.0, *map(float, given)}, reverse=True)
 
 
-def run_refinement(
-    context: Context, folder: Path, *, sites: Sequence[str], factors: Sequence[float]
-) -> dict[str, Any]:
+def run_refinement(context: Context, folder: Path, *, sites: Sequence[str], factors: Sequence[float]) -> None:
     """Force at sites on meshes whose edges are ``factors`` times the study's, and what it tends to."""
-    wanted = _choose_factors(factors)
-    parameters = read_identified_parameters(context)
-    chosen = choose_sites(context, sites)
-    facts = _make_meshes(context, folder, chosen, wanted)
-    variants = [
-        Variant(
-            one,
-            replace(one.model, mesh=file, mesh_digest=compute_file_digest(file)),
-            parameters,
-            f"edge x {factor:g}",
-            facts[one.name, factor],
-            base=factor == 1.0,
-        )
-        for one in chosen
-        for factor in wanted
-        for file in [_find_file(context, folder, one, factor)]
-    ]
-    simulations = run_variants(context, "sensitivity-mesh", open_experiment_cache(context, folder), variants)
-    write_variants(folder, variants, simulations)
+    parameters, chosen = context.results.calibration.parameters, choose_sites(context, sites)
+    variants = _build_variants(context, folder, chosen, _choose_factors(factors), parameters)
+    cache = open_experiment_cache(context, folder)
+    simulations = simulate_variants(context, folder, "sensitivity-mesh", variants, cache)
     content = RefinementResult(
         sites=[RefinedSite(**dict(one.summary), **_find_limit(one, variants, simulations)) for one in chosen],
         runs=compare_variants(variants, simulations, RefinementRun),
         parameters=parameters,
     )
-    store_runs(folder, content, content.runs)
-    return {}
+    store_variants(folder, content, content.runs)
 
 
-def _find_file(context: Context, folder: Path, one: ChosenSite, factor: float) -> Path:
-    return one.model.mesh if factor == 1.0 else folder / f"{one.site.name}-{factor:g}.vtu"
-
-
-def _make_meshes(
-    context: Context, folder: Path, chosen: Sequence[ChosenSite], factors: Sequence[float]
-) -> dict[tuple[str, float], dict[str, Any]]:
-    """Make the meshes that are not there yet; what is told of each, by site and factor."""
-    study, stored = context.study, context.results.mesh.sites
-    settings = mesh_settings(study)
-    pairs = [(one, factor) for one in chosen for factor in factors]
-    jobs = {
-        (one.name, factor): mesh_job(
+def _build_variants(
+    context: Context,
+    folder: Path,
+    chosen: Sequence[ChosenSite],
+    factors: Sequence[float],
+    parameters: Parameters,
+) -> list[Variant]:
+    """Each site on each mesh; those that are not there yet are made."""
+    settings, stored = mesh_settings(context.study), context.results.mesh.sites
+    others = [(one.model, factor) for one in chosen for factor in factors if factor != 1.0]
+    jobs = [
+        mesh_job(
             context,
-            one.site.name,
-            one.model.position,
-            one.model.axis,
+            model.site,
+            model.position,
+            model.axis,
             scale_edges(settings, factor),
-            _find_file(context, folder, one, factor),
+            folder / f"{model.site}-{factor:g}.vtu",
         )
-        for one, factor in pairs
-        if factor != 1.0
-    }
-    missing = [job for job in dict.fromkeys(jobs.values()) if not job.file.with_suffix(".json").is_file()]
-    for i, made in enumerate(context.executor.map(make_mesh, missing)):
-        context.tell("sensitivity-mesh", i + 1, len(missing), f"mesh of {made.nodes} nodes")
-    found = {}
-    for one, factor in pairs:
-        job = jobs.get((one.name, factor))
-        known = stored[one.site.name] if job is None else read_mesh_facts(job.file)
-        found[one.name, factor] = {
-            "factor": factor,
-            "edge_near_mm": factor * settings.edge_near_mm,
-            "element": settings.element,
-            "nodes": known.nodes,
-            "cells": known.cells,
-        }
-    return found
+        for model, factor in others
+    ]
+    report = partial(context.tell, "sensitivity-mesh", 0, 0)
+    meshed = iter(mesh_models(jobs, [model for model, _ in others], context.executor, report))
+    variants = []
+    for one in chosen:
+        for factor in factors:
+            model = one.model if factor == 1.0 else next(meshed)
+            known = stored[model.site] if factor == 1.0 else read_mesh_facts(model.mesh)
+            facts = {
+                "factor": factor,
+                "edge_near_mm": factor * settings.edge_near_mm,
+                "element": settings.element,
+                "nodes": known.nodes,
+                "cells": known.cells,
+            }
+            label = f"edge x {factor:g}"
+            variants.append(Variant(one, model, parameters, label, facts, base=factor == 1.0))
+    return variants
 
 
 def _find_limit(

@@ -30,7 +30,7 @@ from ..simulation.simulations import SimulationCache, open_experiment_cache
 CHOICES = ("all", "fitted")
 
 
-def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]:
+def run_regions(context: Context, folder: Path, *, sites: str) -> None:
     """Each region's own parameters, started from the whole limb's, and the errors of both.
 
     ``sites``: ``all`` fits every recorded site of a region, as table 3 lists them; ``fitted`` those that the
@@ -68,16 +68,10 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> dict[str, Any]
     )
     write_result(folder / "regions.json", content)
     _write_tables(folder, content)
-    return {}
 
 
 def check_regions(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
-    """Refuse a study whose recorded sites have no region, and an unknown choice of sites.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a study whose recorded sites have no region, and an unknown choice of sites."""
     if (sites := options["sites"]) not in CHOICES:
         raise InputError(f"{sites!r} is not a choice of sites", place="sites", remedy="use all or fitted")
     if not any(record.site.region for record in study.recorded):

@@ -27,7 +27,6 @@ from ...indentation import (
     to_parameters,
 )
 from ...mesh import read_vtu
-from ...results.base import StoredResult
 from ...results.variants import (
     ForceDerivative,
     FrictionResult,
@@ -36,14 +35,13 @@ from ...results.variants import (
     IndenterRun,
     StiffnessResult,
     StiffnessRun,
-    VariantRun,
     VolumeResult,
     VolumeRun,
 )
 from ...shapes import BUILTIN_SHAPES, SHAPES
 from ...study import IndenterTable
 from ..engine.context import Context
-from ..engine.storage import write_result, write_rows, write_table
+from ..engine.storage import write_table
 from ..records.records import load_records
 from ..simulation.simulations import SimulationCache, open_experiment_cache
 from .variants import (
@@ -52,17 +50,12 @@ from .variants import (
     choose_sites,
     compare_variants,
     measure_tissue_over_bone,
-    run_variants,
-    write_variants,
+    simulate_variants,
+    store_variants,
 )
 
 NO_VOLUME = dict.fromkeys(("J_min", "J_low", "J_high", "J_max", "beyond_percent"))
 ALLOWED = 0.01  # departure of J from one that the paper's bulk modulus is to keep to
-
-
-def open_volume_cache(folder: Path) -> SimulationCache:
-    """Kept apart from simulations without volumes, which have the same key."""
-    return SimulationCache(folder / "volumes", work=simulate_with_volumes)
 
 
 def simulate_with_volumes(job: SimulationJob) -> Simulation:
@@ -118,34 +111,34 @@ FACTORS = (0.5, 2.0)
 KAPPA_RATIOS = (10.0, 25.0, 50.0, 100.0, 200.0, 400.0)
 
 
-def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str]) -> dict[str, Any]:
+def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str]) -> None:
     """Force against the moduli of each tissue, all with the same ``m`` (the geometric mean of theirs).
 
     Beside it the exact derivatives at all recorded sites, with the identified ``m``.
     """
-    identified, law = read_identified_parameters(context), context.study.law
+    identified, law = context.results.calibration.parameters, context.study.law
     m, equal = None, identified
     if "m" in law.keys:
         m = float(np.exp(np.mean([np.log(values["m"]) for values in identified.values()])))
         equal = {tissue: values | {"m": m} for tissue, values in identified.items()}
     chosen = choose_sites(context, sites)
     variants = [variant for one in chosen for variant in _build_stiffer(one, equal, law.moduli)]
-    simulations = _simulate(context, folder, "sensitivity-c", variants)
+    cache = open_experiment_cache(context, folder)
+    simulations = simulate_variants(context, folder, "sensitivity-c", variants, cache)
     content = StiffnessResult(
         sites=[one.summary for one in chosen],
         runs=compare_variants(variants, simulations, StiffnessRun),
         parameters=identified,
         equal_m=m,
         factors=FACTORS,
-        local=_collect_derivatives(context, folder, identified),
+        local=_collect_derivatives(context, cache, identified),
     )
-    store_runs(folder, content, content.runs)
+    store_variants(folder, content, content.runs)
     heads = ["site", "region", "tissue_mm", *(f"{tissue}_c" for tissue in identified)]
     rows = [
         [row.site, row.region, row.tissue_mm, *row.peak_percent_per_percent.values()] for row in content.local
     ]
     write_table(folder / "derivatives.csv", heads, rows)
-    return {}
 
 
 def _build_stiffer(chosen: ChosenSite, equal: Parameters, moduli: Sequence[str]) -> list[Variant]:
@@ -164,7 +157,9 @@ def _build_stiffer(chosen: ChosenSite, equal: Parameters, moduli: Sequence[str])
     return [base, *changed]
 
 
-def _collect_derivatives(context: Context, folder: Path, identified: Parameters) -> list[ForceDerivative]:
+def _collect_derivatives(
+    context: Context, cache: SimulationCache, identified: Parameters
+) -> list[ForceDerivative]:
     """Of every record of a force: change of the largest one in percent for one percent more of a modulus.
 
     It is each tissue's first.  They are of where parameters are searched, as those of the prediction.
@@ -172,7 +167,6 @@ def _collect_derivatives(context: Context, folder: Path, identified: Parameters)
     study = context.study
     records = load_records(context, [record for record in study.recorded if not record.forced]).searched
     best = study.vector(identified)
-    cache = open_experiment_cache(context, folder)
     rows: list[ForceDerivative] = []
     for record, found in zip(
         records, cache.run([record.job(best) for record in records], context.executor), strict=True
@@ -197,12 +191,12 @@ def _collect_derivatives(context: Context, folder: Path, identified: Parameters)
     return rows
 
 
-def run_kappa(
-    context: Context, folder: Path, *, sites: Sequence[str], ratios: Sequence[float]
-) -> dict[str, Any]:
+def run_kappa(context: Context, folder: Path, *, sites: Sequence[str], ratios: Sequence[float]) -> None:
     """Force and change of volume against the ratio of bulk modulus and ``c``."""
-    identified, own = read_identified_parameters(context), context.study.material.kappa_ratio
-    chosen = choose_sites(context, sites)
+    identified, chosen = context.results.calibration.parameters, choose_sites(context, sites)
+    own = context.study.material.kappa_ratio
+    # Kept apart from simulations without volumes, which have the same key.
+    cache = SimulationCache(folder / "volumes", work=simulate_with_volumes)
     variants = [
         Variant(
             one,
@@ -215,8 +209,7 @@ def run_kappa(
         for one in chosen
         for ratio in sorted({own, *map(float, ratios)})
     ]
-    simulations = run_variants(context, "sensitivity-kappa", open_volume_cache(folder), variants)
-    write_variants(folder, variants, simulations)
+    simulations = simulate_variants(context, folder, "sensitivity-kappa", variants, cache)
     measured = [
         replace(variant, facts=variant.facts | simulation.facts.get("volume", NO_VOLUME))
         for variant, simulation in zip(variants, simulations, strict=True)
@@ -227,13 +220,12 @@ def run_kappa(
         parameters=identified,
         kappa_ratio=own,
     )
-    store_runs(folder, content, content.runs)
-    return {}
+    store_variants(folder, content, content.runs)
 
 
-def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> dict[str, Any]:
+def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> None:
     """Force where the skin slips freely under the indenter, and where it sticks to it."""
-    identified, chosen = read_identified_parameters(context), choose_sites(context, sites)
+    identified, chosen = context.results.calibration.parameters, choose_sites(context, sites)
     variants = [
         Variant(
             one,
@@ -246,20 +238,20 @@ def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> dict
         for one in chosen
         for friction in dict.fromkeys((one.model.indenter.friction, "frictionless", "sticky"))
     ]
-    simulations = _simulate(context, folder, "sensitivity-contact", variants)
+    cache = open_experiment_cache(context, folder)
+    simulations = simulate_variants(context, folder, "sensitivity-contact", variants, cache)
     content = FrictionResult(
         sites=[one.summary for one in chosen],
         runs=compare_variants(variants, simulations, FrictionRun),
         parameters=identified,
         friction=chosen[0].model.indenter.friction,
     )
-    store_runs(folder, content, content.runs)
-    return {}
+    store_variants(folder, content, content.runs)
 
 
-def run_indenter(context: Context, folder: Path, *, sites: Sequence[str]) -> dict[str, Any]:
+def run_indenter(context: Context, folder: Path, *, sites: Sequence[str]) -> None:
     """Force and effort with the indenter as it is, and with others of its width: a sphere before all."""
-    identified, chosen = read_identified_parameters(context), choose_sites(context, sites)
+    identified, chosen = context.results.calibration.parameters, choose_sites(context, sites)
     variants = [
         Variant(
             one,
@@ -272,14 +264,14 @@ def run_indenter(context: Context, folder: Path, *, sites: Sequence[str]) -> dic
         for one in chosen
         for label, table, base in list_other_indenters(one.model.indenter)
     ]
-    simulations = _simulate(context, folder, "sensitivity-indenter", variants)
+    cache = open_experiment_cache(context, folder)
+    simulations = simulate_variants(context, folder, "sensitivity-indenter", variants, cache)
     content = IndenterResult(
         sites=[one.summary for one in chosen],
         runs=compare_variants(variants, simulations, IndenterRun),
         parameters=identified,
     )
-    store_runs(folder, content, content.runs)
-    return {}
+    store_variants(folder, content, content.runs)
 
 
 def list_other_indenters(own: IndenterTable) -> list[tuple[str, IndenterTable, bool]]:
@@ -294,21 +286,3 @@ def list_other_indenters(own: IndenterTable) -> list[tuple[str, IndenterTable, b
             if table != own:
                 found.append((label, table, False))
     return found
-
-
-def read_identified_parameters(context: Context) -> Parameters:
-    """The last stage of the calibration."""
-    return context.results.calibration.parameters
-
-
-def _simulate(context: Context, folder: Path, name: str, variants: Sequence[Variant]) -> list[Simulation]:
-    """Simulate the variants and write their curves."""
-    simulations = run_variants(context, name, open_experiment_cache(context, folder), variants)
-    write_variants(folder, variants, simulations)
-    return simulations
-
-
-def store_runs(folder: Path, content: StoredResult, runs: Sequence[VariantRun]) -> None:
-    """The result as JSON, and its runs as ``runs.csv``."""
-    write_result(folder / Path(content.FILE).name, content)
-    write_rows(folder / "runs.csv", runs, leave_out=("warnings", "label", "base"))

@@ -3,51 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from ...arrays import Array
 from ...errors import InputError
 from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
+from ...results.base import StoredResult
 from ...results.variants import VariantRun, VariedSite
-from ...study import Indentation, Record, Site, Study
+from ...study import Indentation, Record, Study
 from ..engine.context import Context
-from ..engine.storage import write_curves
+from ..engine.storage import write_curves, write_result, write_rows
 from ..records.deviations import measure_bone_distance_mm
 from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
-from ..simulation.simulations import CURVE_POINTS, SimulationCache
+from ..simulation.simulations import (
+    CURVE_POINTS,
+    SimulationCache,
+    build_curve_job,
+)
 
 Run = TypeVar("Run", bound=VariantRun)
 
 
 @dataclass(frozen=True)
 class ChosenSite:
-    """An indentation that is varied; ``tissue_mm`` is between its site and the nearest bone."""
+    """An indentation that is varied, and what is stored of it."""
 
-    site: Site
     model: SiteModel
-    tissue_mm: float
-    role: str
-
-    @property
-    def name(self) -> str:
-        """That of the record, or of the site that plans it."""
-        return self.model.name
-
-    @property
-    def summary(self) -> VariedSite:
-        """What is stored of it."""
-        return VariedSite(
-            site=self.name,
-            region=self.site.region,
-            role=self.role,
-            tissue_mm=self.tissue_mm,
-            indentation_mm=max(self.model.knots_mm),
-        )
+    summary: VariedSite
 
 
 @dataclass(frozen=True)
@@ -63,22 +49,12 @@ class Variant:
 
     def job(self) -> SimulationJob:
         tissues = tuple(self.parameters)
-        values = tuple(map(float, to_vector(self.parameters, tissues, self.model.law)))
-        return SimulationJob(self.model, tissues, values, tuple(map(float, self.times)), False)
-
-    @property
-    def times(self) -> Array:
-        """Times (k,) s of the compared forces."""
-        return self.model.curve_times(CURVE_POINTS)
+        values = to_vector(self.parameters, tissues, self.model.law)
+        return replace(build_curve_job(self.model, tissues, values), sensitivities=False)
 
 
 def check_variants(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
-    """Refuse ``sites`` that cannot be varied, and a limb without a bone to measure the tissue from.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse ``sites`` that cannot be varied, and a limb without a bone to measure the tissue from."""
     _select_driven(study, options["sites"])
     if limb is not None and not limb.anatomy.bones:
         what = "the limb has no bone, and this compares tissue by its thickness over bone"
@@ -106,51 +82,48 @@ def choose_sites(context: Context, names: Sequence[str]) -> list[ChosenSite]:
     InputError
         For a site or record that the study does not have, and a site with several.
     """
-    every = [_choose_site(context, one) for one in _select_driven(context.study, names)]
+    every = []
+    for one in _select_driven(context.study, names):
+        model = build_model(context, one)
+        summary = VariedSite(
+            site=model.name,
+            region=context.study.site(model.site).region,
+            role="",
+            tissue_mm=measure_tissue_over_bone(model),
+            indentation_mm=max(model.knots_mm),
+        )
+        every.append(ChosenSite(model, summary))
     if names:
         return every
-    thin, thick = min(every, key=_get_tissue), max(every, key=_get_tissue)
-    if thin is thick:
-        return [thin]
-    return [_add_role(thin, "thin"), _add_role(thick, "thick")]
-
-
-def _get_tissue(chosen: ChosenSite) -> float:
-    return chosen.tissue_mm
-
-
-def _add_role(chosen: ChosenSite, role: str) -> ChosenSite:
-    return ChosenSite(chosen.site, chosen.model, chosen.tissue_mm, role)
-
-
-def _choose_site(context: Context, one: Indentation) -> ChosenSite:
-    model = build_model(context, one)
-    return ChosenSite(context.study.site(model.site), model, measure_tissue_over_bone(model), "")
+    thin = min(every, key=lambda one: one.summary.tissue_mm)
+    thick = max(every, key=lambda one: one.summary.tissue_mm)
+    roles = {"thin": thin, "thick": thick} if thin is not thick else {"": thin}
+    return [
+        replace(one, summary=one.summary.model_copy(update={"role": role})) for role, one in roles.items()
+    ]
 
 
 def measure_tissue_over_bone(model: SiteModel) -> float:
-    """Distance in mm from a site to the nearest point of a bone in its mesh.
-
-    Raises
-    ------
-    InputError
-        Where the mesh has no bone.
-    """
+    """Distance in mm from a site to the nearest point of a bone in its mesh, which has one."""
     found = measure_bone_distance_mm(model)
-    if found is None:
-        raise InputError("there is no bone in the mesh", file=model.mesh, remedy="name the sites to be used")
+    assert found is not None  # `check_variants` refuses a limb without a bone
     return found
 
 
-def run_variants(
-    context: Context, name: str, cache: SimulationCache, variants: Sequence[Variant]
+def simulate_variants(
+    context: Context,
+    folder: Path,
+    name: str,
+    variants: Sequence[Variant],
+    cache: SimulationCache,
 ) -> list[Simulation]:
-    """Simulate them all, in order, those that are kept for nothing."""
-    done = []
-    for simulation in cache.run([variant.job() for variant in variants], context.executor):
+    """Simulate them all, in order, and write the curves of each site."""
+    done: list[Simulation] = []
+    found = cache.run([variant.job() for variant in variants], context.executor)
+    for variant, simulation in zip(variants, found, strict=True):
         done.append(simulation)
-        words = f"site {simulation.site}, {variants[len(done) - 1].label}"
-        context.tell(name, len(done), len(variants), words)
+        context.tell(name, len(done), len(variants), f"site {simulation.site}, {variant.label}")
+    _write_curves(folder, variants, done)
     return done
 
 
@@ -163,18 +136,18 @@ def compare_variants(
     They are None where a simulation is partial. ``run`` is the model of a row.
     """
     base = {
-        variant.chosen.name: simulation
+        variant.model.name: simulation
         for variant, simulation in zip(variants, simulations, strict=True)
         if variant.base
     }
     return [
         run(
-            site=variant.chosen.name,
+            site=variant.model.name,
             label=variant.label,
             base=variant.base,
             **variant.facts,
             peak_force_N=float(simulation.force_N.max()) if simulation.completed else None,
-            **_change(simulation, base[variant.chosen.name]),
+            **_change(simulation, base[variant.model.name]),
             penetration_mm=simulation.penetration_mm,
             steps=simulation.facts.get("steps"),
             newton_iterations=simulation.facts.get("newton_iterations"),
@@ -197,23 +170,27 @@ def _change(simulation: Simulation, base: Simulation) -> dict[str, float | None]
     }
 
 
-def write_variants(folder: Path, variants: Sequence[Variant], simulations: Sequence[Simulation]) -> None:
+def store_variants(folder: Path, content: StoredResult, runs: Sequence[VariantRun]) -> None:
+    """The result as JSON, and its runs as ``runs.csv``."""
+    write_result(folder / Path(content.FILE).name, content)
+    write_rows(folder / "runs.csv", runs, leave_out=("warnings", "label", "base"))
+
+
+def _write_curves(folder: Path, variants: Sequence[Variant], simulations: Sequence[Simulation]) -> None:
     """``<site>.csv``: time, displacement and the force of every variant that was completed."""
-    for name in dict.fromkeys(variant.chosen.name for variant in variants):
-        mine = [i for i, variant in enumerate(variants) if variant.chosen.name == name]
-        first = variants[mine[0]]
+    pairs = list(zip(variants, simulations, strict=True))
+    for model in {variant.model.name: variant.chosen.model for variant in variants}.values():
+        times = model.curve_times(CURVE_POINTS)
         forces = {
-            format_column(variants[i].label): simulations[i].force_N for i in mine if simulations[i].completed
+            format_column(variant.label): simulation.force_N
+            for variant, simulation in pairs
+            if variant.model.name == model.name and simulation.completed
         }
-        write_curves(
-            folder / f"{name}.csv",
-            time_s=first.times,
-            displacement_mm=first.model.history.at(first.times),
-            **forces,
-        )
+        file = folder / f"{model.name}.csv"
+        write_curves(file, time_s=times, displacement_mm=model.history.at(times), **forces)
 
 
-def format_column(label: str) -> str:
-    """The head of a variant's column of forces."""
+def format_column(label: str, unit: str = "N") -> str:
+    """A label in words as the head of a CSV column, with the unit."""
     plain = "".join(c if (c.isalnum() and c.isascii()) or c == "." else " " for c in label)
-    return "_".join(plain.split()) + "_N"
+    return "_".join([*plain.split(), unit])
