@@ -58,9 +58,9 @@ def runs(folder, name: str, site: str) -> dict[str, dict]:
 
 def test_thin_and_thick_sites_are_chosen_unless_named(context):
     thin, thick = choose_sites(context, [])
-    assert (thin.role, thick.role) == ("thin", "thick")
-    assert 15.0 < thin.tissue_mm < thick.tissue_mm < 30.0
-    assert [one.site.name for one in choose_sites(context, ["2", "1"])] == ["2", "1"]
+    assert (thin.summary.role, thick.summary.role) == ("thin", "thick")
+    assert 15.0 < thin.summary.tissue_mm < thick.summary.tissue_mm < 30.0
+    assert [one.model.site for one in choose_sites(context, ["2", "1"])] == ["2", "1"]
     with pytest.raises(InputError):
         choose_sites(context, ["no such site"])
 

@@ -97,7 +97,9 @@ def acquire_site(
     device = LineDevice(connect(address))
     try:
         with translate_disk_errors(study.folder):
-            folder = _make_folder(study, one)
+            stamp = f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"[:-3]
+            folder = study.folder / FOLDER / one.name / stamp
+            folder.mkdir(parents=True)
             recorder = Recorder(folder / RECORD, _head(one, site, settings, device, operator is None))
     except BaseException:
         device.close()
@@ -217,7 +219,9 @@ def build_device_settings(
     if depth_mm is None and isinstance(one, Record):
         depth_mm = one.depth_mm
     if depth_mm is None and unattended:
-        depth_mm = one.depth_mm or _find_recorded_depth(study, one)
+        traces = TracesResult.find(study.results)
+        recorded = None if traces is None else traces.sites.get(one.name)
+        depth_mm = one.depth_mm or (None if recorded is None else recorded.depth_mm)
         if depth_mm is None:
             remedy = "give --depth, or state its depth_mm"
             raise InputError(
@@ -235,19 +239,6 @@ def build_device_settings(
             place="--depth, or depth_mm",
         )
     return settings.model_copy(update={"search_depth_mm": depth_mm})
-
-
-def _find_recorded_depth(study: Study, one: Indentation) -> float | None:
-    traces = TracesResult.find(study.results)
-    facts = None if traces is None else traces.sites.get(one.name)
-    return None if facts is None else facts.depth_mm
-
-
-def _make_folder(study: Study, one: Indentation) -> Path:
-    stamp = f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"[:-3]
-    folder = study.folder / FOLDER / one.name / stamp
-    folder.mkdir(parents=True)
-    return folder
 
 
 def _head(
@@ -290,31 +281,23 @@ def _keep(study: Study, one: Indentation, folder: Path, completed: bool) -> dict
             _write_ramp(study, folder / f"ramp-{ramp.cycle}.csv", ramp)
         counted = [ramp for ramp in found if ramp.cycle > study.acquire.precondition]
         if counted and one.trace is not None:
-            files["trace"] = str(_place_trace(study, one.trace, counted[0]))
+            file = study.path(one.trace)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            if file.exists():  # it stays beside the new one
+                until = f"until-{datetime.now(UTC):%Y%m%dT%H%M%S}"
+                file.rename(file.with_name(f"{file.stem}.{until}{file.suffix}"))
+            _write_ramp(study, file, counted[0])
+            files["trace"] = str(file)
         # Last: who waits for the verdict finds the trace in its place.
         write_json(folder / VERDICT, verdict | {"trace": str(one.trace) if files["trace"] else None})
     return {"verdict": verdict, "files": files}
 
 
-def _place_trace(study: Study, trace: Path, ramp: RecordedRamp) -> Path:
-    """The record where the study names it; a former one stays beside it, with the time in its name."""
-    file = study.path(trace)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    if file.exists():
-        file.rename(file.with_name(f"{file.stem}.until-{datetime.now(UTC):%Y%m%dT%H%M%S}{file.suffix}"))
-    _write_ramp(study, file, ramp)
-    return file
-
-
 def _write_ramp(study: Study, file: Path, ramp: RecordedRamp) -> None:
-    names, trace = study.traces, ramp.trace
-    columns = zip(
-        (names.time_s, names.displacement_mm, names.force_N),
-        (trace.time_s, trace.displacement_mm, trace.force_N),
-        strict=True,
-    )
+    keys = ("time_s", "displacement_mm", "force_N")
+    columns = {getattr(study.traces, key): getattr(ramp.trace, key) for key in keys}
     work = file.with_name(f".{file.name}.work")
-    write_curves(work, **dict(columns))
+    write_curves(work, **columns)
     work.replace(file)
 
 

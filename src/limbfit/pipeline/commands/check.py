@@ -16,7 +16,7 @@ from ...indentation import read_indenter
 from ...results.identification import OutsideRecords
 from ...results.records import TraceFacts
 from ...study import ClampsTable, Record, Site, Study
-from ...traces import Regularised, SurfaceMotion, Trace
+from ...traces import SurfaceMotion
 from ..engine.context import Listener, Progress, ignore_progress
 from ..engine.store import Store
 from ..identification.problem import check_fitted
@@ -24,7 +24,7 @@ from ..limb.inputs import check_labels, read_marked_image, read_study_image, rea
 from ..limb.sites import place_site
 from ..limb.surfaces import read_given_anatomy
 from ..records.record_checks import choose_surface_points, record_flags
-from ..records.traces import SecondaryMeasurement, read_observed, read_record
+from ..records.traces import read_observed, read_record
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, name_load, time_socket_loads
 from ..socket.shape import build_loadable_socket, build_regions, check_load, check_regions
@@ -67,7 +67,11 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
     listener(Progress("check", 1, 2, "records"))
     read = {record.name: read_record(study, record) for record in study.recorded}
     records = {name: record for name, (_, _, record) in read.items()}
-    seen = {record.name: _read_secondary(study, record, read[record.name]) for record in study.recorded}
+    seen = {
+        one.name: read_observed(study, one, trace, facts_of.touch_down_s, smooth)
+        for one in study.recorded
+        for trace, smooth, facts_of in [read[one.name]]
+    }
     for name, record in records.items():
         facts.append(
             f"site {name}: peak force {record.peak_force_N:.2f} N at {record.depth_mm:.2f} mm, "
@@ -87,7 +91,11 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
     limb = _read_limb(study, given)
     placed, anatomy = (limb.places, limb.anatomy) if limb is not None else ({}, None)
     facts += _describe_surface_motion(study, {name: one.motion for name, one in seen.items()}, limb)
-    facts += [told for name, one in seen.items() for told in _describe_waves(name, one)]
+    for name, one in seen.items():
+        for place, means in one.waves:
+            speeds = f"{means.speed_m_s.min():.2f} to {means.speed_m_s.max():.2f} m/s"
+            readings = int(means.samples.sum())
+            facts.append(f"site {name}: shear waves at {place.name}, {speeds} in {readings} readings")
     if records and not placed:
         facts.append(
             "the sites are not placed yet: stiffness is compared without the thickness of the tissue "
@@ -179,22 +187,6 @@ def _describe_outside(
         for name, history in time_socket_loads(study.socket).items():
             found[name_load(name)] = tested.find_outside([history.time])
     return found
-
-
-def _read_secondary(
-    study: Study, record: Record, read: tuple[Trace, Regularised, TraceFacts]
-) -> SecondaryMeasurement:
-    """What was seen beside a record."""
-    trace, smooth, facts = read
-    return read_observed(study, record, trace, facts.touch_down_s, smooth)
-
-
-def _describe_waves(name: str, seen: SecondaryMeasurement) -> Iterator[str]:
-    """How fast shear waves are."""
-    for place, means in seen.waves:
-        speeds = f"{means.speed_m_s.min():.2f} to {means.speed_m_s.max():.2f} m/s"
-        readings = int(means.samples.sum())
-        yield f"site {name}: shear waves at {place.name}, {speeds} in {readings} readings"
 
 
 def _describe_surface_motion(

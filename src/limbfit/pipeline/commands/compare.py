@@ -73,7 +73,9 @@ def compare_site(
     else:
         assert log is not None
         other = _build_log_result(problem, log, Path(str(febio_log)))
-    runs = {"limbfit": solve_as_simulated(found, problem, 1)}
+    found.context.tell("compare", 1, 3, f"site {name}: limbfit")
+    first = build_first_steps(found.model, found.context.study.tissues)
+    runs = {"limbfit": solve(problem, first, store="none")}  # as `limbfit simulate` does
     runs["limbfit_matched"] = _solve_matched(found, problem, other)
     found.context.tell("compare", 3, 3, f"site {name}")
     files = CurveFiles(csv=str(folder / f"{name}.csv"), png=str(folder / f"{name}.png"))
@@ -84,20 +86,17 @@ def compare_site(
         parameters_from=found.origin,
         element=other.statistics["element"],
         unknowns=runs["limbfit"].statistics["unknowns"],
-        febio=_summarise_febio(found, other),
-        limbfit=_summarise_run(runs["limbfit"], other),
-        limbfit_matched=_summarise_run(runs["limbfit_matched"], other),
+        febio=FebioSimulation(
+            **_summarise_solver(other),
+            version=other.statistics["linear_solver"],
+            penalty=found.context.study.febio.penalty,
+        ),
+        **{key: _summarise_run(run, other) for key, run in runs.items()},
         febio_log=None if febio_log is None else str(febio_log),
         files=files,
     )
     write_result(folder / f"{name}.json", content)
     return content.to_plain()
-
-
-def solve_as_simulated(found: Indentation, problem: Problem, part: int) -> Result:
-    """limbfit's own result, as ``limbfit simulate`` gets it."""
-    found.context.tell("compare", part, 3, f"site {found.name}: limbfit")
-    return solve(problem, build_first_steps(found.model, found.context.study.tissues), store="none")
 
 
 def _solve_matched(found: Indentation, problem: Problem, other: Result) -> Result:
@@ -148,27 +147,20 @@ def difference(other: Result, mine: Result) -> CurveDifference:
     )
 
 
-def _summarise_febio(found: Indentation, other: Result) -> FebioSimulation:
-    return FebioSimulation(
-        completed=other.completed,
-        reason=other.reason,
-        peak_force_N=other.peak_force,
-        steps=other.statistics["steps"],
-        seconds=other.statistics["seconds"]["total"] or None,
-        version=other.statistics["linear_solver"],
-        penalty=found.context.study.febio.penalty,
-    )
+def _summarise_solver(run: Result) -> dict[str, Any]:
+    return {
+        "completed": run.completed,
+        "reason": run.reason,
+        "peak_force_N": run.peak_force,
+        "steps": run.statistics["steps"],
+        "seconds": run.statistics["seconds"]["total"] or None,
+    }
 
 
 def _summarise_run(mine: Result, other: Result) -> LimbfitSimulation:
+    sunk = float(mine.penetration.max(initial=0.0))
     return LimbfitSimulation(
-        completed=mine.completed,
-        reason=mine.reason,
-        peak_force_N=mine.peak_force,
-        steps=mine.statistics["steps"],
-        seconds=mine.statistics["seconds"]["total"],
-        penetration_mm=float(mine.penetration.max(initial=0.0)),
-        difference=difference(other, mine),
+        **_summarise_solver(mine), penetration_mm=sunk, difference=difference(other, mine)
     )
 
 

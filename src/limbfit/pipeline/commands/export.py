@@ -71,7 +71,12 @@ def export_study(
     for one in chosen:
         found = prepare_site(study, one.name, parameters=parameters, listener=listener)
         folder.mkdir(parents=True, exist_ok=True)
-        curve = _build_curve(found) if to == FITTED else _NO_CURVE
+        curve = _NO_CURVE
+        if to == FITTED:
+            assert isinstance(found.stated, Record)
+            record = load_site_record(found.context, found.stated)
+            inside = (record.times_s >= 0.0) & (record.times_s <= found.model.knots_s[-1])
+            curve = record.times_s[inside], record.force_N[inside]
         files, notes = _write(found, build_site_problem(found), to, folder, curve)
         rows.append(
             {
@@ -98,7 +103,7 @@ def check_export(
     if to not in FORMATS:
         raise InputError(f"{to!r} is no format", place="--to", remedy=f"give one of {', '.join(FORMATS)}")
     chosen, store = _select_chosen(study, to, site), Store(study.results)
-    used, origin = (parameters, "given") if parameters else choose_parameters(study, store)
+    used, origin = choose_parameters(study, parameters)
     context = Context(study, store, SerialExecutor(), ignore_progress)
     kinds = {(one.indenter, _is_forced(one)): one for one in chosen}
     with TemporaryDirectory() as folder:
@@ -150,14 +155,6 @@ def _build_block_model(study: Study, one: Planned, file: Path) -> SiteModel:
         course=study.material.course,
         prestretch=tuple(sorted(study.material.prestretch.items())),
     )
-
-
-def _build_curve(found: Indentation) -> tuple[Array, Array]:
-    """Times, s, from touch-down and forces, N, of an indentation's record."""
-    assert isinstance(found.stated, Record)
-    record = load_site_record(found.context, found.stated)
-    inside = (record.times_s >= 0.0) & (record.times_s <= found.model.knots_s[-1])
-    return record.times_s[inside], record.force_N[inside]
 
 
 def _select_chosen(study: Study, to: str, site: str | None) -> Sequence[Planned]:

@@ -50,7 +50,7 @@ def fit_socket(
     RunError
         Where the simulation does not come to its end.
     """
-    used, origin = (parameters, "given") if parameters else choose_tissues(study, literature)
+    used, origin = choose_tissues(study, literature, parameters)
     known: dict[str, Any] = {}
     if origin == IDENTIFIED:
         uncertainty = Store(study.results).results.calibration.uncertainty.to_plain()
@@ -109,7 +109,7 @@ def design_socket(
     doubled = sorted({name for name in optimise if list(optimise).count(name) > 1})
     if doubled:
         raise InputError(f"region {doubled[0]!r} is named twice", remedy="name it once")
-    used, origin = (parameters, "given") if parameters else choose_tissues(study, literature)
+    used, origin = choose_tissues(study, literature, parameters)
     return run_experiment(
         study,
         "socket_design",
@@ -121,11 +121,15 @@ def design_socket(
     )
 
 
-def choose_tissues(study: Study, literature: bool = False) -> tuple[Parameters, str]:
-    """Parameters of a study's tissues, and where they are from: identified, or ``literature``: of people."""
-    store = Store(study.results)
-    if not literature and store.stamp("calibrate") is not None:
-        return choose_parameters(study, store)
+def choose_tissues(
+    study: Study, literature: bool = False, given: Parameters | None = None
+) -> tuple[Parameters, str]:
+    """Parameters of a study's tissues, and where they are from.
+
+    They are ``given``, else identified, else, or with ``literature``, those of people.
+    """
+    if given or (not literature and Store(study.results).stamp("calibrate") is not None):
+        return choose_parameters(study, given)
     values = {tissue: study.material.of(tissue, "start") for tissue in study.tissues}
     try:
         medians = of_tissues(study.tissues, study.calibration.prior_tissues)

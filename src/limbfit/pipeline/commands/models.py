@@ -155,17 +155,10 @@ def select_models(names: Sequence[str]) -> tuple[str, ...]:
         For a name that no model has.
     """
     chosen = tuple(dict.fromkeys(MODELS if "all" in names else names))
-    for name in chosen:
-        if name not in MODELS:
-            raise InputError(
-                f"no model is named {name!r}",
-                place="--models",
-                remedy="use all, or some of " + ", ".join(MODELS),
-            )
-    if not chosen:
-        raise InputError(
-            "no model is named", place="--models", remedy="use all, or some of " + ", ".join(MODELS)
-        )
+    unknown = [name for name in chosen if name not in MODELS]
+    if unknown or not chosen:
+        what = f"no model is named {unknown[0]!r}" if unknown else "no model is named"
+        raise InputError(what, place="--models", remedy="use all, or some of " + ", ".join(MODELS))
     return chosen
 
 
@@ -321,10 +314,10 @@ def _mix_record(
 ) -> MixedPrediction | None:
     """The largest value of a record and its intervals, N or mm; None if a model does not predict it."""
     curves = [read_curves(store["predict"] / f"{row.record}.csv") for store in stores.values()]
-    bands = [band for one in curves if (band := _find_band(one)) is not None]
-    if len(bands) < len(curves):
+    ends = [[one[key] for key in one if "_low_" in key or "_high_" in key] for one in curves]
+    if not all(ends):
         return None
-    low, high = (np.array(ends) for ends in zip(*bands, strict=True))
+    low, high = np.array(ends).swapaxes(0, 1)
     means, sds = (low + high) / 2, (high - low) / (2 * NORMAL_95)
     mixed = compute_mixture_interval(means, sds, weights)
     between = np.sqrt(weights @ (means - weights @ means) ** 2)
@@ -332,9 +325,9 @@ def _mix_record(
     name, unit = head.split("_measured_")
     measured = curves[0][head]
     by_model = {f"{name}_{'own' if key == OWN else key}_{unit}": one for key, one in zip(stores, means)}
-    ends = dict(zip((f"{name}_low_{unit}", f"{name}_high_{unit}"), mixed, strict=True))
+    band = {f"{name}_low_{unit}": mixed[0], f"{name}_high_{unit}": mixed[1]}
     times = {"time_s": curves[0]["time_s"]}
-    write_curves(folder / f"{row.record}.csv", **times, **{head: measured}, **ends, **by_model)
+    write_curves(folder / f"{row.record}.csv", **times, **{head: measured}, **band, **by_model)
     peak = int(np.argmax(np.abs(measured)))
     return MixedPrediction(
         site=row.site,
@@ -347,13 +340,6 @@ def _mix_record(
         sd_between_models=between[peak],
         inside_percent=100 * float(np.mean((measured >= mixed[0]) & (measured <= mixed[1]))),
     )
-
-
-def _find_band(curves: Mapping[str, Array]) -> tuple[Array, Array] | None:
-    """The columns of the 95 % band of a stored prediction."""
-    low = next((values for key, values in curves.items() if "_low_" in key), None)
-    high = next((values for key, values in curves.items() if "_high_" in key), None)
-    return None if low is None or high is None else (low, high)
 
 
 def fit_socket_of_models(study: Study, *, listener: Listener = ignore_progress) -> dict[str, Any]:

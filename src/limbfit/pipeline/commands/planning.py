@@ -52,7 +52,7 @@ def design_study(
     InputError
         For more sites than there are, or identified parameters that are stale.
     """
-    used, origin = (parameters, "given") if parameters else choose_parameters(study, Store(study.results))
+    used, origin = choose_parameters(study, parameters)
     return run_experiment(
         study,
         "design",
@@ -127,7 +127,7 @@ def plan_protocol(
             place="--determine",
             remedy="state socket alone, and A or no criterion",
         )
-    used, origin = (parameters, "given") if parameters else choose_parameters(study, Store(study.results))
+    used, origin = choose_parameters(study, parameters)
     times = time_socket_loads(study.socket) if pressures else {}
     if not holds_s:
         longest = max((one.end_s for one in times.values()), default=0.0)

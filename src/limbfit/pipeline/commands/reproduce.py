@@ -60,7 +60,11 @@ def reproduce_study(
     _copy_inputs(study, folder)
     summary = run_study(load_study(folder), listener=listener)
     then = Store(study.results).results.calibration.parameters
-    parameters = dict(_compute_relative(then, summary["parameters"]))
+    parameters = {
+        f"{tissue}.{name}": abs(summary["parameters"][tissue][name] - value) / max(abs(value), 1e-300)
+        for tissue, values in then.items()
+        for name, value in values.items()
+    }
     forces = dict(_compare_forces(study.results / "predict", folder / "results" / "predict"))
     return {
         "same": bool(max([*parameters.values(), *forces.values()]) <= tolerance),
@@ -133,20 +137,11 @@ def _copy_inputs(study: Study, folder: Path) -> None:
                 shutil.copyfile(one, target.with_name(target.name + one.name[len(source.name) :]))
 
 
-def _compute_relative(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    for tissue, values in then.items():
-        for name, value in values.items():
-            yield f"{tissue}.{name}", abs(now[tissue][name] - value) / max(abs(value), 1e-300)
-
-
-def _select_simulated(curves: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """What is compared of a prediction, simulated: force, or displacement under a stated force."""
-    return curves.get("force_simulated_N", curves.get("displacement_simulated_mm"))
-
-
 def _compare_forces(then: Path, now: Path) -> Iterator[tuple[str, float]]:
+    """Of force, or displacement under a stated force, as simulated: the largest difference of each site."""
     for file in sorted(then.glob("*.csv")):
-        a, b = (_select_simulated(read_curves(folder / file.name)) for folder in (then, now))
+        curves = [read_curves(folder / file.name) for folder in (then, now)]
+        a, b = (one.get("force_simulated_N", one.get("displacement_simulated_mm")) for one in curves)
         if a is not None and b is not None:
             yield file.stem, float(np.abs(a - b).max() / max(np.abs(a).max(), 1e-300))
         elif a is not b:  # one of them could not be predicted: all of the force is missing

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -50,29 +49,24 @@ def show_stage(study: Study, stage: str, *, listener: Listener = ignore_progress
         )
     run_study(study, until=stage, listener=listener)
     store = Store(study.results)
-    facts = _FACTS[stage](study, store)
-    picture = store["segment"] / "quality.png"
-    if stage != "segment":
+    if stage == "segment":
+        picture = store["segment"] / "quality.png"
+        facts = {**store.results.segment.to_plain(), "labels": str(store["segment"] / "labels.seg.nrrd")}
+    else:
         picture = store[stage] / f"{stage}.png"
-        _draw(study, stage, picture, listener)
+        listener(Progress(stage, 0, 1, "drawing"))
+        # On the executor: graphics libraries can crash, and a worker that dies is an error in words.
+        with lock(study.results), build_executor(study) as executor:
+            list(executor.map(_draw, [(study.results, stage, picture)]))
+        listener(Progress(stage, 1, 1, "drawn"))
+        plain = stage != "surfaces"
+        facts = getattr(store.results, stage).to_plain() if plain else _describe_surfaces(study, store)
     shown = str(picture) if picture.is_file() else None
     return {"study": study.study.name, "stage": stage, "picture": shown, **facts}
 
 
-def _draw(study: Study, stage: str, file: Path, listener: Listener) -> None:
-    """On the executor: graphics libraries can crash, and a worker that dies is an error in words."""
-    listener(Progress(stage, 0, 1, "drawing"))
-    with lock(study.results), build_executor(study) as executor:
-        list(executor.map(_draw_one, [(study.results, stage, file)]))
-    listener(Progress(stage, 1, 1, "drawn"))
-
-
-def _draw_one(job: tuple[Path, str, Path]) -> None:
+def _draw(job: tuple[Path, str, Path]) -> None:
     draw_stage(*job)
-
-
-def _segment_facts(study: Study, store: Store) -> dict[str, Any]:
-    return {**store.results.segment.to_plain(), "labels": str(store["segment"] / "labels.seg.nrrd")}
 
 
 def _describe_surfaces(study: Study, store: Store) -> dict[str, Any]:
@@ -83,17 +77,16 @@ def _describe_surfaces(study: Study, store: Store) -> dict[str, Any]:
         "volumes_cm3": {name: round(body.volume / 1000, 2) for name, body in bodies.items()},
         "triangles": {name: len(body.faces) for name, body in bodies.items()},
         "closed_bodies": len(bodies),
-        "thinnest_mm": {name: _describe_thinnest(anatomy, name) for name in anatomy.bones},
+        # Where each bone comes nearest to the skin.
+        "thinnest_mm": {
+            name: {"tissue_mm": round(thickness, 2), "at": np.round(place, 1).tolist()}
+            for name in anatomy.bones
+            for thickness, place in [find_thinnest_tissue(anatomy, name)]
+        },
         "cut_point": anatomy.cut_point.tolist(),
         "cut_normal": anatomy.cut_normal.tolist(),
         "amputation": None if plane is None else _describe_amputation(study, anatomy),
     }
-
-
-def _describe_thinnest(anatomy: Anatomy, name: str) -> dict[str, Any]:
-    """Where a bone comes nearest to the skin: thickness of the tissue and the place on the bone."""
-    thickness, place = find_thinnest_tissue(anatomy, name)
-    return {"tissue_mm": round(thickness, 2), "at": np.round(place, 1).tolist()}
 
 
 def _describe_amputation(study: Study, anatomy: Anatomy) -> dict[str, Any]:
@@ -106,19 +99,3 @@ def _describe_amputation(study: Study, anatomy: Anatomy) -> dict[str, Any]:
         for name, body in {"skin": anatomy.skin, **anatomy.bones}.items()
     }
     return {"pad_mm": study.geometry.amputation_pad_mm, "beyond_plane_mm": ends}
-
-
-def _describe_sites(study: Study, store: Store) -> dict[str, Any]:
-    return store.results.sites.to_plain()
-
-
-def _mesh_facts(study: Study, store: Store) -> dict[str, Any]:
-    return store.results.mesh.to_plain()
-
-
-_FACTS: dict[str, Callable[[Study, Store], dict[str, Any]]] = {
-    "segment": _segment_facts,
-    "surfaces": _describe_surfaces,
-    "sites": _describe_sites,
-    "mesh": _mesh_facts,
-}

@@ -64,7 +64,7 @@ def prepare_site(
     """
     stated = study.indentation(name)
     store = Store(study.results)
-    used, origin = (parameters, "given") if parameters else choose_parameters(study, store)
+    used, origin = choose_parameters(study, parameters)
     run_study(study, until="mesh", listener=listener)
     context = Context(study, store, SerialExecutor(), listener)
     return Indentation(context, stated, build_model(context, stated), used, origin)
@@ -120,16 +120,32 @@ def simulate_site(
         displacement_mm=result.displacement_at(times) if model.forced else model.history.at(times),
         force_N=result.force_at(times + model.waits_s),
     )
-    summary = _summarise(found, result, "limbfit" if program is None else result.statistics["linear_solver"])
-    summary |= _compare_with_records(found, result, None if program else fields)
     files = {
         "curve": curve,
         "fields": fields if fields.is_file() and (by_febio or result.states) else None,
         "animation": played,
     }
     # A path may tell who the patient is: what is stored names the files as they lie beside it.
-    beside = {kind: file and file.relative_to(folder).as_posix() for kind, file in files.items()}
-    stored = SimulateResult(**summary | beside)
+    beside: dict[str, Any] = {
+        kind: file and file.relative_to(folder).as_posix() for kind, file in files.items()
+    }
+    stored = SimulateResult(
+        site=name,
+        solver="limbfit" if program is None else result.statistics["linear_solver"],
+        parameters=found.parameters,
+        parameters_from=found.origin,
+        peak_force_N=result.peak_force,
+        depth_mm=_measure_depth(found, result),
+        # FEBio says nothing of its penetration.
+        penetration_mm=float(result.penetration.max(initial=0.0)) if program is None else None,
+        completed=result.completed,
+        reason=result.reason,
+        warnings=result.warnings,
+        element=result.statistics["element"],
+        unknowns=result.statistics["unknowns"],
+        **_compare_with_records(found, result, None if program else fields),
+        **beside,
+    )
     write_result(folder / f"{name}.json", stored)
     return stored.to_plain() | {kind: file and str(file) for kind, file in files.items()}
 
@@ -148,7 +164,7 @@ def _compare_with_records(found: Indentation, result: Result, fields: Path | Non
     rows = tested.find_outside(
         describe_indentation(
             LoadHistory.from_knots(model.knots_s, model.knots_N or model.knots_mm),
-            float(result.displacement.max()) if model.forced else max(model.knots_mm),
+            _measure_depth(found, result),
             model.indenter,
             limb.place(site),
             LimbAxis(limb.anatomy),
@@ -160,23 +176,9 @@ def _compare_with_records(found: Indentation, result: Result, fields: Path | Non
     return {"outside_records": rows, "outside_text": describe_outside({f"site {found.name}": rows})}
 
 
-def _summarise(found: Indentation, result: Result, solver: str) -> dict[str, Any]:
-    """What is told of a simulation; FEBio says nothing of its penetration."""
-    own = solver == "limbfit"
-    return {
-        "site": found.name,
-        "solver": solver,
-        "parameters": found.parameters,
-        "parameters_from": found.origin,
-        "peak_force_N": result.peak_force,
-        "depth_mm": float(result.displacement.max()) if found.model.forced else max(found.model.knots_mm),
-        "penetration_mm": float(result.penetration.max(initial=0.0)) if own else None,
-        "completed": result.completed,
-        "reason": result.reason,
-        "warnings": list(result.warnings),
-        "element": result.statistics["element"],
-        "unknowns": result.statistics["unknowns"],
-    }
+def _measure_depth(found: Indentation, result: Result) -> float:
+    """The largest displacement, mm: that of a force is the simulated one."""
+    return float(result.displacement.max()) if found.model.forced else max(found.model.knots_mm)
 
 
 def build_site_problem(found: Indentation) -> Problem:
@@ -209,12 +211,15 @@ def read_recorded_range(study: Study) -> RecordedExtents | None:
     return store.results.predict.recorded_range
 
 
-def choose_parameters(study: Study, store: Store) -> tuple[Parameters, str]:
-    """The identified parameters, else the study's start, and which they are.
+def choose_parameters(study: Study, given: Parameters | None = None) -> tuple[Parameters, str]:
+    """The ``given`` parameters, else the identified ones, else the study's start; and which they are.
 
-    Neither will do where the calibration is stale: it is not this study's, and who has identified a model
-    does not expect the start.
+    Neither of the latter will do where the calibration is stale: it is not this study's, and who has
+    identified a model does not expect the start.
     """
+    store = Store(study.results)
+    if given:
+        return given, "given"
     if store.stamp("calibrate") is None:
         start = {tissue: study.material.of(tissue, "start") for tissue in study.tissues}
         return start, "start of the study"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from itertools import product
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
@@ -47,10 +47,7 @@ from ..records.planned_records import PlannedRecord, press, write_records
 from ..records.records import build_model, estimate_surface_error_mm
 from ..simulation.limb_geometry import LimbGeometry, build_site_model, coarsen_model
 from ..simulation.loading import LoadHistory, describe_untested_times
-from ..simulation.simulations import (
-    build_curve_job,
-    open_experiment_cache,
-)
+from ..simulation.simulations import build_curve_job, open_experiment_cache
 from .design import DEEPEST_SHARE
 
 DETERMINED = 1.25  # largest factor of a 95 % interval that counts as determined
@@ -113,21 +110,28 @@ def run_protocol(
     planned, left_out = _plan_records(context, speeds_mm_s, holds_s, depths_mm, noises)
     budget = Budget(60.0 * minutes, setup_s)
     _check_minutes([one.seconds + rest_s for one in planned], budget)
-    found, options, blind, peaks = _build_options(context, folder, planned, tissues, noises, rest_s, left_out)
+    simulated = _simulate_planned(context, folder, planned, tissues, noises)
+    found, unusable = _select_usable(study, simulated, len(tissues))
+    left_out += unusable
     if not found:
         raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
     stiffness = is_modulus(study).astype(np.float64)
     wanted = DesignTarget(
         compute_bounds_information(known), rows, "A" if criterion == "A" else "D", stiffness
     )
-    plans, told_by = _build_and_report_plans(
-        found, options, blind if noises.has_secondary else None, budget, wanted
-    )
+    off_mm = estimate_surface_error_mm(study, context.store)
+    options, blind = ([one.to_option(rest_s, off_mm, which) for one in found] for which in (0, 1))
+    plans = _build_plans([one.planned for one in found], options, budget, wanted)
+    told_by: dict[str, Sequence[RecordOption]] = dict.fromkeys(plans, options)
+    if noises.has_secondary:
+        plans[UNSEEN] = plan_records(blind, budget, wanted)
+        told_by |= dict.fromkeys((UNSEEN, PLAIN), blind)
     told = [
-        _to_row(name, chosen, told_by[name], budget, wanted, (known.names, which), pressures, len(tissues))
+        _judge_plan(name, chosen, told_by[name], budget, wanted, (known.names, which), pressures)
         for name, chosen in plans.items()
     ]
-    chosen = (found[i].model for i in plans[DESIGNED])
+    candidates = [_to_row(one, option) for one, option in zip(found, options, strict=True)]
+    chosen = (found[i].planned.model for i in plans[DESIGNED])
     histories = [LoadHistory.from_knots(model.knots_s, model.knots_mm) for model in chosen]
     left_out += describe_untested_times(histories, socket_times)
     content = ProtocolResult(
@@ -137,11 +141,11 @@ def run_protocol(
         criterion=wanted.criterion,
         determine=[known.names[i] for i in which],
         draws=tissues.tolist(),
-        records=[_record(found[i], options[i], peaks[i]) for i in plans[DESIGNED]],
+        records=[candidates[i] for i in plans[DESIGNED]],
         pressures=list(pressures),
         protocols=told,
         verdict=_describe_verdict(told[0], [known.names[i] for i in which]),
-        candidates=[_record(one, option, peak) for one, option, peak in zip(found, options, peaks)],
+        candidates=candidates,
         left_out=left_out,
         parameters=parameters,
         parameters_from=parameters_from,
@@ -163,24 +167,6 @@ def _select_named(known: Unknowns, determine: Sequence[str]) -> tuple[int, ...]:
             remedy=f"use {', '.join(known.names)}",
         )
     return tuple(i for i, name in enumerate(known.names) if not determine or name in determine)
-
-
-def _build_and_report_plans(
-    found: Sequence[PlannedRecord],
-    options: Sequence[RecordOption],
-    blind: Sequence[RecordOption] | None,
-    budget: Budget,
-    wanted: DesignTarget,
-) -> tuple[dict[str, tuple[int, ...]], dict[str, Sequence[RecordOption]]]:
-    """The plans by name, and what their records tell; ``blind``: by force alone, if more is seen."""
-    plans = _build_plans(found, options, budget, wanted)
-    if DESIGNED not in plans:
-        raise RunError(f"no record that could be simulated fits into {budget.seconds / 60:g} min")
-    told_by: dict[str, Sequence[RecordOption]] = dict.fromkeys(plans, options)
-    if blind is not None:
-        plans[UNSEEN] = _build_plans(found, blind, budget, wanted)[DESIGNED]
-        told_by |= dict.fromkeys((UNSEEN, PLAIN), blind)
-    return plans, told_by
 
 
 def _plan_records(
@@ -226,52 +212,67 @@ def _plan_records(
     return found, list(dict.fromkeys(left_out))
 
 
-def _build_options(
-    context: Context,
-    folder: Path,
-    planned: Sequence[PlannedRecord],
-    tissues: Array,
-    noise: RecordNoise,
-    rest_s: float,
-    left_out: list[str],
-) -> tuple[list[PlannedRecord], list[RecordOption], list[RecordOption], list[float]]:
-    """What each record would tell at each draw, and its force alone: nothing where its simulation does not
-    come to its end.
+@dataclass(frozen=True, eq=False)
+class _Simulated:
+    """A planned record at every draw of the tissues.
 
-    Records that press harder than the device may at the first draw are left out.
+    ``information`` (2, d, p, p) is what it tells, with what is seen beside its force and without: zero where
+    its simulation does not come to its end. ``peak_N`` is its largest force at the first draw.
     """
-    study, cache = context.study, open_experiment_cache(context, folder)
-    limit = study.acquire.force_limit_N
-    jobs = [build_curve_job(one.model, study.tissues, tissue) for one in planned for tissue in tissues]
-    infos = np.zeros((2, len(planned), *tissues.shape, tissues.shape[1]))
-    peaks, failed = np.zeros(len(planned)), [0] * len(planned)
-    for i, (job, simulation) in enumerate(zip(jobs, cache.run(jobs, context.executor))):
-        k, draw = divmod(i, len(tissues))
-        context.tell("protocol", i + 1, len(jobs), planned[k].told)
-        assert simulation.jacobian is not None
-        if draw == 0:
-            peaks[k] = simulation.force_N.max()
-        if simulation.completed:
-            infos[:, k, draw] = _compute_information(job, simulation, noise)
-        else:
-            failed[k] += 1
-    kept = []
+
+    planned: PlannedRecord
+    information: Array
+    peak_N: float
+    failed: int
+
+    def to_option(self, rest_s: float, surface_mm: float, which: int) -> RecordOption:
+        """What may be chosen; its site's surfaces are off by so much."""
+        planned, share = self.planned, compute_expected_share(self.planned.model, surface_mm)
+        place = planned.site, planned.tool
+        return RecordOption(place, planned.seconds + rest_s, self.information[which], share)
+
+
+def _simulate_planned(
+    context: Context, folder: Path, planned: Sequence[PlannedRecord], tissues: Array, noise: RecordNoise
+) -> list[_Simulated]:
+    """Simulate each record at each draw, with derivatives."""
+    cache, (draws, p) = open_experiment_cache(context, folder), tissues.shape
+    jobs = [
+        build_curve_job(one.model, context.study.tissues, tissue) for one in planned for tissue in tissues
+    ]
+    simulations = zip(jobs, cache.run(jobs, context.executor), strict=True)
+    found = []
     for k, one in enumerate(planned):
-        if peaks[k] > limit:
-            left_out.append(f"{one.told}: {peaks[k]:.1f} N, over acquire.force_limit_N ({limit:g} N)")
-        elif failed[k] == len(tissues):
-            left_out.append(f"{one.told}: not simulated to the end")
+        information, peak_N, failed = np.zeros((2, draws, p, p)), 0.0, 0
+        for draw, (job, simulation) in enumerate(islice(simulations, draws)):
+            context.tell("protocol", k * draws + draw + 1, len(jobs), one.told)
+            if draw == 0:
+                peak_N = float(simulation.force_N.max())
+            if simulation.completed:
+                information[:, draw] = _compute_information(job, simulation, noise)
+            else:
+                failed += 1
+        found.append(_Simulated(one, information, peak_N, failed))
+    return found
+
+
+def _select_usable(
+    study: Study, simulated: Sequence[_Simulated], draws: int
+) -> tuple[list[_Simulated], list[str]]:
+    """Those that press no harder than the device may and come to their end, and what was left out."""
+    limit, kept, left_out = study.acquire.force_limit_N, [], []
+    for one in simulated:
+        told = one.planned.told
+        if one.peak_N > limit:
+            left_out.append(f"{told}: {one.peak_N:.1f} N, over acquire.force_limit_N ({limit:g} N)")
+        elif one.failed == draws:
+            left_out.append(f"{told}: not simulated to the end")
         else:
-            kept.append(k)
-            if failed[k]:
-                where = f"at {failed[k]} of {len(tissues)} draws"
-                left_out.append(f"{one.told}: not simulated to the end {where}, and is not counted there")
-    places = [(planned[k].site, planned[k].tool) for k in kept]
-    seconds = [planned[k].seconds + rest_s for k in kept]
-    off_mm = estimate_surface_error_mm(study, context.store)
-    shares = [compute_expected_share(planned[k].model, off_mm) for k in kept]
-    seeing, blind = (list(map(RecordOption, places, seconds, info[kept], shares)) for info in infos)
-    return [planned[k] for k in kept], seeing, blind, [float(peaks[k]) for k in kept]
+            kept.append(one)
+            if one.failed:
+                where = f"at {one.failed} of {draws} draws"
+                left_out.append(f"{told}: not simulated to the end {where}, and is not counted there")
+    return kept, left_out
 
 
 def _compute_information(
@@ -281,14 +282,13 @@ def _compute_information(
     assert simulation.jacobian is not None
     parameters, points = np.array(job.parameters), np.array(job.model.skin_points).reshape(-1, 3)
     force = SiteResponse(simulation.force_N, simulation.jacobian)
+    alone = noises.compute_force_information(force, parameters)
     if not noises.has_secondary:
-        return (alone := noises.compute_force_information(force, parameters)), alone
+        return alone, alone
     assert simulation.observed_jacobian is not None
     beside = simulation.observed, simulation.observed_jacobian
     parts = len(job.model.layers), points, job.model.knots_s[-1] / READING_S
-    return noises.compute_information(force, *beside, parts, parameters), noises.compute_force_information(
-        force, parameters
-    )
+    return noises.compute_information(force, *beside, parts, parameters), alone
 
 
 def _build_plans(
@@ -297,34 +297,37 @@ def _build_plans(
     """The designed protocol, one slow ramp at every site, as deep as usual, and the best without each
     ingredient."""
     slow, tool = min(one.speed_mm_s for one in found), found[0].indenter
-    places = [(one.site, one.indenter) for one in found]
-    most = {
-        place: max(one.depth_mm for one in found if (one.site, one.indenter) == place) for place in places
-    }
-    deep = [one.depth_mm == most[place] for one, place in zip(found, places, strict=True)]
-    plain = [
-        one.speed_mm_s == slow and not one.hold_s and one.indenter == tool and one.usual for one in found
-    ]
-    kinds: Mapping[str, Sequence[bool]] = {
-        DESIGNED: [True] * len(found),
-        "without holds": [not one.hold_s for one in found],
-        "at one speed": [one.speed_mm_s == slow for one in found],
-        "with one indenter": [one.indenter == tool for one in found],
-        "at one depth": deep,
+    most: dict[tuple[str, str], float] = {}
+    for one in found:
+        place = one.site, one.tool
+        most[place] = max(most.get(place, 0.0), one.depth_mm)
+    kinds: dict[str, Callable[[PlannedRecord], bool]] = {
+        DESIGNED: lambda one: True,
+        "without holds": lambda one: not one.hold_s,
+        "at one speed": lambda one: one.speed_mm_s == slow,
+        "with one indenter": lambda one: one.indenter == tool,
+        "at one depth": lambda one: one.depth_mm == most[one.site, one.tool],
     }
     plans: dict[str, tuple[int, ...]] = {}
-    for name, allowed in kinds.items():
-        chosen = [i for i, ok in enumerate(allowed) if ok]
+    for name, is_allowed in kinds.items():
+        chosen = [i for i, one in enumerate(found) if is_allowed(one)]
         fits = any(compute_duration_s(options, [i], budget) <= budget.seconds for i in chosen)
         if fits and (name == DESIGNED or len(chosen) < len(found)):
             best = plan_records([options[i] for i in chosen], budget, wanted)
             plans[name] = tuple(chosen[i] for i in best)
-    if any(plain):
-        plans[PLAIN] = tuple(i for i, ok in enumerate(plain) if ok)
+    if DESIGNED not in plans:
+        raise RunError(f"no record that could be simulated fits into {budget.seconds / 60:g} min")
+    plain = tuple(
+        i
+        for i, one in enumerate(found)
+        if one.speed_mm_s == slow and not one.hold_s and one.indenter == tool and one.usual
+    )
+    if plain:
+        plans[PLAIN] = plain
     return plans
 
 
-def _to_row(
+def _judge_plan(
     name: str,
     chosen: Sequence[int],
     options: Sequence[RecordOption],
@@ -332,14 +335,13 @@ def _to_row(
     wanted: DesignTarget,
     parameters: tuple[Sequence[str], Sequence[int]],
     pressures: Iterable[str],
-    draws: int,
 ) -> ProtocolPlan:
     """A protocol, and what to expect of it: the middle of the draws and the worst.
 
     ``parameters``: all of their names, and which are to be determined.
     """
     names, which = parameters
-    covariances = wanted.compute_covariances(options, chosen, draws)
+    covariances = wanted.compute_covariances(options, chosen, len(options[0].information))
     factors = compute_factors_95(covariances)
     middle, worst = np.median(factors, axis=0), factors.max(axis=0)
     of_pressures = np.median(compute_factors_95(wanted.project(covariances)), axis=0)
@@ -355,15 +357,15 @@ def _to_row(
     )
 
 
-def _record(one: PlannedRecord, option: RecordOption, peak: float) -> ProtocolRecord:
+def _to_row(one: _Simulated, option: RecordOption) -> ProtocolRecord:
     return ProtocolRecord(
-        site=one.site,
-        indenter=one.tool,
-        depth_mm=one.depth_mm,
-        speed_mm_s=one.speed_mm_s,
-        hold_s=one.hold_s,
+        site=one.planned.site,
+        indenter=one.planned.tool,
+        depth_mm=one.planned.depth_mm,
+        speed_mm_s=one.planned.speed_mm_s,
+        hold_s=one.planned.hold_s,
         seconds=option.seconds,
-        peak_force_N=peak,
+        peak_force_N=one.peak_N,
     )
 
 

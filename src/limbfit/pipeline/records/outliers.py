@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -70,24 +70,9 @@ def check_records(
         failed.extend(f"site {a.site}, record of {b.site}: {a.reason}" for a, b in pairs if not a.completed)
         return one, two
 
-    found = find_outliers(
-        simulate,
-        [replace(record.measured, weight=1.0 / record.record.of_site) for record in records],
-        best,
-        _build_exchange(records),
-        exactly,
-        one,
-    )
-    against = explain_warnings(found.warnings, plain)
-    flags = [RecordFlag(**flag.to_dict(), found="in the record") for flag in plain]
-    flags += [RecordFlag(**flag.to_dict(), found="against the model") for flag in against]
-    return RecordChecks(flags, list(found.left_out), list(dict.fromkeys(failed)))
+    def exchange(first: LogLinearModel) -> Exchange:
+        """From the expansion of all sites to about what two answer to each other's record."""
 
-
-def _build_exchange(records: Sequence[SiteRecord]) -> Callable[[LogLinearModel], Exchange]:
-    """From the expansion of all sites to about what two answer to each other's record."""
-
-    def build(first: LogLinearModel) -> Exchange:
         def pair(parameters: Array, i: int, j: int) -> tuple[SiteResponse, SiteResponse]:
             histories = [(records[k].times_s, records[k].displacement_mm) for k in (i, j)]
             one, two = first.responses[i], first.responses[j]
@@ -95,7 +80,18 @@ def _build_exchange(records: Sequence[SiteRecord]) -> Callable[[LogLinearModel],
 
         return pair
 
-    return build
+    found = find_outliers(
+        simulate,
+        [replace(record.measured, weight=1.0 / record.record.of_site) for record in records],
+        best,
+        exchange,
+        exactly,
+        one,
+    )
+    against = explain_warnings(found.warnings, plain)
+    flags = [RecordFlag(**flag.to_dict(), found="in the record") for flag in plain]
+    flags += [RecordFlag(**flag.to_dict(), found="against the model") for flag in against]
+    return RecordChecks(flags, list(found.left_out), list(dict.fromkeys(failed)))
 
 
 def _build_driven_job(site: SiteRecord, other: SiteRecord, parameters: Array) -> SimulationJob:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from ...identify.checks.plausibility import RecordFacts, RecordWarning, check_pl
 from ...indentation import compute_contact_radius
 from ...results.curves import read_curves
 from ...results.limb import PlacedSite
-from ...results.records import RecordRemark, TraceFacts
+from ...results.records import TraceFacts
 from ...study import Record, Study
 from ...traces import SurfaceMotion
 from ..engine.context import Context
@@ -26,9 +26,8 @@ def read_record_warnings(context: Context) -> tuple[RecordWarning, ...]:
     study = context.study
     traces = context.results.traces.sites
     rows = {row.site: row for row in context.results.sites.sites}
-    steps = {
-        name: _step(read_curves(context.store["traces"] / f"{name}-raw.csv")["time_s"]) for name in traces
-    }
+    raw = {name: read_curves(context.store["traces"] / f"{name}-raw.csv") for name in traces}
+    steps = {name: float(np.median(np.diff(curves["time_s"]))) for name, curves in raw.items()}
     return record_flags(study, traces, steps, rows, load_anatomy(context.store["surfaces"]))
 
 
@@ -66,13 +65,9 @@ def record_flags(
         )
         for one in recorded
     ]
-    remarks = tuple(_flag(one.name, r) for one in recorded for r in records[one.name].remarks)
-    return (*remarks, *check_plausibility(facts))
-
-
-def _flag(site: str, remark: RecordRemark) -> RecordWarning:
-    """What reading a record had to say about it."""
-    return RecordWarning((site,), **remark.to_plain())
+    remarks = [(one.name, remark) for one in recorded for remark in records[one.name].remarks]
+    of_reading = (RecordWarning((name,), **remark.to_plain()) for name, remark in remarks)
+    return (*of_reading, *check_plausibility(facts))
 
 
 def _collect_facts(
@@ -105,10 +100,6 @@ def _collect_facts(
         radius_mm=radius,
         **facts,
     )
-
-
-def _step(times_s: Sequence[float] | np.ndarray) -> float:
-    return float(np.median(np.diff(times_s)))
 
 
 def choose_surface_points(

@@ -15,16 +15,19 @@ from ...identify.fit.objective import MeasuredCurve, SiteResponse
 from ...identify.uncertainty.noise import compute_depth_slope
 from ...indentation import Simulation, SimulationJob, SiteModel
 from ...mesh import read_vtu
+from ...results.curves import read_curves
 from ...study import Indentation, Record, Site, Study
 from ..engine.context import Context
 from ..engine.store import Store
+from ..limb.files import SMOOTHING
 from ..simulation.limb_geometry import build_site_model, coarsen_model
 from .secondary_measurements import (
     SecondaryValues,
-    build_secondary_values,
     choose_points,
+    list_compared_tissues,
     place_waves,
-    read_stored_record,
+    read_motion,
+    read_secondary_values,
 )
 
 T = TypeVar("T")
@@ -186,31 +189,32 @@ def load_site_record(context: Context, record: Record) -> SiteRecord:
     TraceError
         Where nothing of its surface can be compared, or the limb has no place of its shear waves.
     """
-    study, surface_error_mm = context.study, estimate_surface_error_mm(context.study, context.store)
-    stored = read_stored_record(context.store, record)
-    facts, points = stored.facts, None
+    study, folder = context.study, context.store["traces"]
+    facts, points = context.results.traces.sites[record.name], None
     force = (facts.knots_N or ()) if record.forced else ()
-    model = build_site_model(context, record, facts.knots_s, facts.knots_mm, force, stored.tissues)
-    if stored.motion is not None:
+    tissues = list_compared_tissues(facts)
+    model = build_site_model(context, record, facts.knots_s, facts.knots_mm, force, tissues)
+    if facts.surface is not None and facts.surface.compared:
         mesh = read_vtu(model.mesh)
         place, skin = (model.position, model.axis), (mesh.points, mesh.face_sets["skin"])
-        points = choose_points(study, record, place, skin, stored.motion)
+        points = choose_points(study, record, place, skin, read_motion(folder, record))
         model = replace(model, skin_points=points.points, skin_axes=points.axes)
     if facts.waves:
         model = replace(model, waves=place_waves(study, record, model, facts.waves))
+    curves = read_curves(folder / f"{record.name}.csv")
     return SiteRecord(
         record=record,
         tissues=study.tissues,
         model=model,
-        times_s=stored.curves["time_s"],
-        displacement_mm=stored.curves["displacement_mm"],
-        force_N=stored.curves["force_N"],
-        smoothing=stored.smoothing,
+        times_s=curves["time_s"],
+        displacement_mm=curves["displacement_mm"],
+        force_N=curves["force_N"],
+        smoothing=np.load(folder / SMOOTHING.format(record.name)),
         nested_mm=study.within_mm if study.mesh.coarse is None else None,
-        secondary=build_secondary_values(record, stored, points),
+        secondary=read_secondary_values(folder, record, facts, points, curves["time_s"]),
         touch_down_sd_mm=facts.touch_down_uncertainty_mm,
         error_share=study.calibration.force_error_percent / 100.0,
-        surface_error_mm=surface_error_mm,
+        surface_error_mm=estimate_surface_error_mm(study, context.store),
     )
 
 

@@ -35,8 +35,7 @@ from ...results.records import LayerRecord, TraceFacts, WaveRecord
 from ...study import Record, Study, Vector
 from ...traces import SurfaceMotion, Thinning, WaveMeans
 from ..engine.storage import write_curves
-from ..engine.store import Store
-from ..limb.files import LAYERS, SMOOTHING, WAVES
+from ..limb.files import LAYERS, WAVES
 
 Ints = NDArray[np.int64]
 
@@ -45,42 +44,6 @@ NEAR_MM = 40.0
 MAX_POINTS = 30
 _COLUMNS = ("x_mm", "y_mm", "z_mm", "ux_mm", "uy_mm", "uz_mm")
 _LEAST_DEPTH = 0.1  # of the largest: nearer to touch-down moves are not in proportion to the depth
-
-
-@dataclass(frozen=True)
-class StoredRecord:
-    """What the stage ``traces`` stored of a record: curves by their columns, ``facts`` of ``traces.json``.
-
-    ``smoothing`` (n, n) is what regularising did. ``layers`` and ``waves`` have no column, and there is no
-    ``motion`` of the surface, where nothing of the kind is compared.
-    """
-
-    facts: TraceFacts
-    curves: dict[str, Array]
-    smoothing: Array
-    layers: dict[str, Array]
-    waves: dict[str, Array]
-    motion: SurfaceMotion | None
-
-    @property
-    def tissues(self) -> list[str]:
-        """The tissues whose compression is compared."""
-        return [name for name, layer in self.facts.layers.items() if layer.compared]
-
-
-def read_stored_record(store: Store, record: Record) -> StoredRecord:
-    """What `run_traces` stored of a record."""
-    folder, facts = store["traces"], store.results.traces.sites[record.name]
-    layers = any(layer.compared for layer in facts.layers.values())
-    motion = read_motion(folder, record) if facts.surface is not None and facts.surface.compared else None
-    return StoredRecord(
-        facts=facts,
-        curves=read_curves(folder / f"{record.name}.csv"),
-        smoothing=np.load(folder / SMOOTHING.format(record.name)),
-        layers=read_curves(folder / LAYERS.format(record.name)) if layers else {},
-        waves=read_curves(folder / WAVES.format(record.name)) if facts.waves else {},
-        motion=motion,
-    )
 
 
 @dataclass(frozen=True)
@@ -226,26 +189,39 @@ def _divide_by_depth(depth_mm: Array, values: Array) -> Array:
     return np.asarray(values / np.maximum(depth_mm, _LEAST_DEPTH * deepest))
 
 
-def build_secondary_values(
-    record: Record, stored: StoredRecord, points: ChosenPoints | None
+def read_secondary_values(
+    folder: Path, record: Record, facts: TraceFacts, points: ChosenPoints | None, times_s: Array
 ) -> tuple[SecondaryValues, ...]:
-    """What is compared beside a record, in the order of a simulation's gauges.
+    """What is compared beside a stored record, in the order of a simulation's gauges.
 
-    ``points`` are those of its surface that are compared; None: none.
+    Parameters
+    ----------
+    folder : of the stage ``traces``, which has stored the record's ``facts``.
+    points : those of its surface that are compared; None: none.
+    times_s : (t,) of the record.
     """
-    times_s, found = stored.curves["time_s"], list[SecondaryValues]()
-    for number, tissue in enumerate(stored.tissues):
-        facts = stored.facts.layers[tissue]
-        found.append(_build_layer_measurement(tissue, facts, stored.layers, number, times_s))
+    tissues, found = list_compared_tissues(facts), list[SecondaryValues]()
+    if tissues:
+        layers = read_curves(folder / LAYERS.format(record.name))
+        for number, tissue in enumerate(tissues):
+            stated = facts.layers[tissue]
+            found.append(_build_layer_measurement(tissue, stated, layers, number, times_s))
     first = len(found)
     if points is not None:
-        assert stored.motion is not None
-        found.append(_build_surface_measurement(record, points, stored.motion, first, times_s))
+        motion = read_motion(folder, record)
+        found.append(_build_surface_measurement(record, points, motion, first, times_s))
         first += 3 * len(points.points)
-    for number, place in enumerate(stored.facts.waves):
-        own = {name: values[stored.waves["place"] == number] for name, values in stored.waves.items()}
-        found.append(_build_wave_measurement(record, place.name, own, first + number, times_s))
+    if facts.waves:
+        waves = read_curves(folder / WAVES.format(record.name))
+        for number, place in enumerate(facts.waves):
+            own = {name: values[waves["place"] == number] for name, values in waves.items()}
+            found.append(_build_wave_measurement(record, place.name, own, first + number, times_s))
     return tuple(found)
+
+
+def list_compared_tissues(facts: TraceFacts) -> list[str]:
+    """The tissues of a record whose compression is compared."""
+    return [name for name, layer in facts.layers.items() if layer.compared]
 
 
 def _build_layer_measurement(

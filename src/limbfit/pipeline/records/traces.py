@@ -42,7 +42,7 @@ from ...traces import (
 )
 from ..engine.context import Context
 from ..engine.storage import write_curves, write_result
-from ..limb.files import LAYERS, SMOOTHING, WAVES
+from ..limb.files import LAYERS, SMOOTHING, WAVES, name_file_in_errors
 from ..simulation.simulations import CURVE_POINTS
 from .secondary_measurements import write_motion
 
@@ -53,9 +53,9 @@ SEEN = 3.0  # standard deviations that the skin must move by to be compared
 class SecondaryMeasurement(NamedTuple):
     """What was seen beside a record's force: layers, the skin, shear waves at places under the indenter."""
 
-    layers: tuple[Thinning, ...] = ()
-    motion: SurfaceMotion | None = None
-    waves: tuple[tuple[WaveSpeeds, WaveMeans], ...] = ()
+    layers: tuple[Thinning, ...]
+    motion: SurfaceMotion | None
+    waves: tuple[tuple[WaveSpeeds, WaveMeans], ...]
 
 
 def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, TraceFacts]:
@@ -63,13 +63,15 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, Trace
     table = study.traces
     file = study.path(record.trace)
     trace = read_trace(file, (table.time_s, table.displacement_mm, table.force_N))
-    try:
+    with name_file_in_errors(file):
         known = interpret_record(trace, record.touch_down_s, forced=record.forced)
         trace, touch = known.trace, known.touch_down
         made = regularise_creep if record.forced else regularise
         smooth = made(trace, touch, table.smoothing, record.peak_s)
-    except TraceError as error:
-        raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
+    remarks = list(known.warnings)
+    if trace.notes:
+        cause, remedy = "the format of the rig's export", "compare the phases with what the rig did"
+        remarks.insert(0, TraceWarning("reading", "; ".join(trace.notes), cause, remedy, {}))
     facts = TraceFacts(
         site=record.site.name,
         control=record.control,
@@ -87,20 +89,9 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, Trace
         knots_s=smooth.knots_s.tolist(),
         knots_mm=smooth.knots_mm.tolist(),
         knots_N=smooth.knots_N.tolist() if isinstance(smooth, Creep) else None,
-        remarks=[
-            RecordRemark.model_validate(remark)
-            for remark in (*_list_reading_warnings(trace), *known.warnings)
-        ],
+        remarks=[RecordRemark.model_validate(remark) for remark in remarks],
     )
     return trace, smooth, facts
-
-
-def _list_reading_warnings(trace: Trace) -> tuple[TraceWarning, ...]:
-    """What was done to read a file that is no plain table in s, mm and N."""
-    if not trace.notes:
-        return ()
-    cause, remedy = "the format of the rig's export", "compare the phases with what the rig did"
-    return (TraceWarning("reading", "; ".join(trace.notes), cause, remedy, {}),)
 
 
 def _phases_to_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[RecordPhase]:
@@ -136,7 +127,10 @@ def run_traces(context: Context, folder: Path) -> None:
         seen = read_observed(context.study, record, trace, told.touch_down_s, smooth)
         facts[record.name] = told = told.model_copy(update=observed_to_facts(record, seen))
         store_observed(folder, record, seen)
-        for what in describe_still_values(told):
+        still = [f"ultrasound: {name}" for name, one in told.layers.items() if not one.compared]
+        if told.surface is not None and not told.surface.compared:
+            still.append("surface: the skin")
+        for what in still:
             words = f"site {record.name}, {what} hardly gives way, and is not compared"
             context.tell("traces", i, len(recorded), words)
     write_result(folder / "traces.json", TracesResult(sites=facts))
@@ -154,58 +148,40 @@ def read_observed(
     """
     pressed = smooth.time_s[smooth.force_N >= END_SHARE * smooth.force_N.max()]
     end_s = touch_down_s + float(pressed[-1])
-    found = SecondaryMeasurement()
+    time = study.traces.time_s
+    layers: tuple[Thinning, ...] = ()
+    waves: tuple[tuple[WaveSpeeds, WaveMeans], ...] = ()
+    motion: SurfaceMotion | None = None
     if record.ultrasound is not None:
-        found = found._replace(layers=_read_thinnings(study, record, touch_down_s, end_s))
+        file = study.path(record.ultrasound)
+        with name_file_in_errors(file):
+            read = read_layers(file, time)
+            layers = compute_thinnings(read, touch_down_s, end_s, record.ultrasound_sd_mm)
+        _check_tissues(study, file, "mm", [one.tissue for one in layers])
     if record.shear_waves is not None:
-        found = found._replace(waves=_read_waves(study, record, touch_down_s, end_s))
+        file = study.path(record.shear_waves)
+        speeds = read_wave_speeds(file, time)
+        _check_tissues(study, file, "m_s", [one.tissue for one in speeds])
+        with name_file_in_errors(file):
+            waves = tuple((one, one.average(touch_down_s, end_s)) for one in speeds)
     if record.surface is not None:
         file = study.path(record.surface)
-        whole = read_surface_motion(file, study.traces.time_s)
+        whole = read_surface_motion(file, time)
         times = float(trace.time_s[0]), float(trace.time_s[-1])
         try:
-            found = found._replace(motion=select_frames_in_contact(whole, times, touch_down_s, end_s))
+            motion = select_frames_in_contact(whole, times, touch_down_s, end_s)
         except TraceError as error:
-            raise TraceError(error.what, file=file, place=study.traces.time_s, remedy=error.remedy) from None
-    return found
-
-
-def _read_waves(
-    study: Study, record: Record, touch_down_s: float, end_s: float
-) -> tuple[tuple[WaveSpeeds, WaveMeans], ...]:
-    assert record.shear_waves is not None
-    file = study.path(record.shear_waves)
-    found = read_wave_speeds(file, study.traces.time_s)
-    _check_tissues(study, file, "m_s", [one.tissue for one in found])
-    try:
-        return tuple((one, one.average(touch_down_s, end_s)) for one in found)
-    except TraceError as error:
-        raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
+            raise TraceError(error.what, file=file, place=time, remedy=error.remedy) from None
+    return SecondaryMeasurement(layers, motion, waves)
 
 
 def _check_tissues(study: Study, file: Path, unit: str, named: Sequence[str]) -> None:
-    """Whether the model has the tissues that the columns of a file name."""
+    """Refuse columns of a file that name tissues which the model has not."""
     for tissue in named:
         if tissue not in study.tissues:
             known = ", ".join(f"{one}_{unit}" for one in study.tissues)
-            raise TraceError(
-                f"the model has no tissue {tissue!r}",
-                file=file,
-                place="header",
-                remedy=f"name columns among {known}",
-            )
-
-
-def _read_thinnings(study: Study, record: Record, touch_down_s: float, end_s: float) -> tuple[Thinning, ...]:
-    assert record.ultrasound is not None
-    file = study.path(record.ultrasound)
-    try:
-        layers = read_layers(file, study.traces.time_s)
-        found = compute_thinnings(layers, touch_down_s, end_s, record.ultrasound_sd_mm)
-    except TraceError as error:
-        raise TraceError(error.what, file=file, place=error.place, remedy=error.remedy) from None
-    _check_tissues(study, file, "mm", [one.tissue for one in found])
-    return found
+            what, remedy = f"the model has no tissue {tissue!r}", f"name columns among {known}"
+            raise TraceError(what, file=file, place="header", remedy=remedy)
 
 
 def observed_to_facts(record: Record, seen: SecondaryMeasurement) -> dict[str, Any]:
@@ -244,13 +220,6 @@ def observed_to_facts(record: Record, seen: SecondaryMeasurement) -> dict[str, A
             for place, means in seen.waves
         ]
     return facts
-
-
-def describe_still_values(facts: TraceFacts) -> tuple[str, ...]:
-    """What of the facts hardly moves, in words."""
-    layers = [f"ultrasound: {name}" for name, one in facts.layers.items() if not one.compared]
-    still = facts.surface is not None and not facts.surface.compared
-    return (*layers, *(["surface: the skin"] if still else []))
 
 
 def store_observed(folder: Path, record: Record, seen: SecondaryMeasurement) -> None:
