@@ -63,7 +63,7 @@ def main() -> None:
     args = parser.parse_args()
     study = load_study(args.study)
     context = Context(study, Store(study.results), SerialExecutor(), lambda progress: None)
-    stage = context.stored("calibrate", "calibration.json")["stages"][-1]
+    stage = context.results.calibration.to_plain()["stages"][-1]
     best = to_vector(stage["parameters"], study.tissues)
     moved = best * np.exp(np.concatenate([(-1) ** i * MOVED for i in range(len(study.tissues))]))
     print(

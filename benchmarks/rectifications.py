@@ -39,7 +39,7 @@ from limbfit.pipeline.engine.context import Context, ignore_progress
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.socket.limb import SocketLimb
 from limbfit.pipeline.socket.shape import build_socket
-from limbfit.pipeline.socket.simulation import SocketRun, put_on, summarise_run
+from limbfit.pipeline.socket.simulation import SocketRun, solve_run, summarise_run
 from limbfit.socket import Socket
 from limbfit.study.socket import SocketAreaTable
 
@@ -161,7 +161,7 @@ def run(bench: Bench, seed: int, case: int) -> dict[str, Any]:
     row["deepest_mm"] = float(socket.offset(limb.outer.skin).max())
     donned = SocketRun("", limb, bench.mesh, choose_tissues(study)[0], socket)
     try:
-        found = put_on(donned, told)
+        found = solve_run(donned, told)
     except RunError as error:
         return row | {
             "outcome": "stopped",

@@ -38,7 +38,7 @@ from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.socket.intervals import ParameterSpread, draw_step, predict_change
 from limbfit.pipeline.socket.limb import SocketLimb
 from limbfit.pipeline.socket.shape import build_socket
-from limbfit.pipeline.socket.simulation import SocketRun, put_on, summarise_run
+from limbfit.pipeline.socket.simulation import SocketRun, solve_run, summarise_run
 from limbfit.socket import Socket
 
 SETTLING = "settling (mm)"
@@ -69,7 +69,7 @@ class Bench:
         limb, started = replace(self.limb, study=study), time.process_time()
         values = to_parameters(parameters, study.tissues)
         run = SocketRun("", limb, self.mesh, values, self.socket, sensitivities=known)
-        found = put_on(run, lambda *_: None)
+        found = solve_run(run, lambda *_: None)
         around = ParameterSpread(self.covariance, np.zeros_like(self.centre)) if known else None
         load = summarise_run(run, found, around)["loads"][-1]
         row = {"values": {one["region"]: one["mean_kPa"] for one in load["regions"]}}

@@ -30,7 +30,7 @@ def run_peaks(context, folder, *, factor: float = 1.0):
     if not seen.is_file():
         seen.write_text("begun")
         context.tell("peaks", 1, 2, "halfway")
-    sites = context.stored("traces", "traces.json")["sites"]
+    sites = context.results.traces.to_plain()["sites"]
     peaks = {name: factor * facts["peak_force_N"] for name, facts in sites.items()}
     write_json(folder / "peaks.json", {"peaks_N": peaks})
     return {}

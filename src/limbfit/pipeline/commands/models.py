@@ -23,17 +23,9 @@ from ...errors import InputError
 from ...identify.uncertainty.model_comparison import compute_mixture_interval, weigh_models
 from ...identify.uncertainty.uncertainty import NORMAL_95
 from ...laws import FIBRED, FUNG, LAWS, OGDEN, POWER
+from ...results import models as stored
 from ...results.curves import read_curves
 from ...results.identification import RecordPrediction
-from ...results.models import (
-    CalibratedModel,
-    MixedLoad,
-    MixedPrediction,
-    MixedPressure,
-    ModelsResult,
-    ModelWeight,
-    SocketOfModels,
-)
 from ...results.socket import LoadedRegion, SocketResult
 from ...study import Study, load_study
 from ..engine.context import Listener, Progress, ignore_progress
@@ -190,13 +182,13 @@ def _share_stages(study: Study, derived: Study) -> None:
     by_hand = Path("by-hand")
     if (study.results / by_hand).is_dir() and not (derived.results / by_hand).exists():
         shutil.copytree(study.results / by_hand, derived.results / by_hand)
-    stored, own = Store(study.results), Store(derived.results)
+    done, own = Store(study.results), Store(derived.results)
     for stage, key in compute_keys(derived).items():
-        if stored.state(stage, key).state != "done" or own.state(stage, key).state == "done":
+        if done.state(stage, key).state != "done" or own.state(stage, key).state == "done":
             continue
         if own[stage].is_dir():
             shutil.rmtree(own[stage])
-        shutil.copytree(stored[stage], own[stage], copy_function=_link_or_copy)
+        shutil.copytree(done[stage], own[stage], copy_function=_link_or_copy)
 
 
 def _link_inputs(study: Study, folder: Path, document: Document) -> None:
@@ -272,7 +264,7 @@ def compare_models(
         run_study(derived[name], until="predict", listener=_name_model(listener, words))
     with lock(study.results):
         content = _mix_predictions(study, derived, left_out)
-        write_result(study.results / ModelsResult.FILE, content)
+        write_result(study.results / stored.ModelsResult.FILE, content)
     return content.to_plain() | {"folder": str(study.results / FOLDER)}
 
 
@@ -283,7 +275,9 @@ def _name_model(listener: Listener, words: str) -> Listener:
     return tell
 
 
-def _mix_predictions(study: Study, derived: Mapping[str, Study], left_out: Mapping[str, str]) -> ModelsResult:
+def _mix_predictions(
+    study: Study, derived: Mapping[str, Study], left_out: Mapping[str, str]
+) -> stored.ModelsResult:
     """Weights of the models, and for each record the interval of the study's own and of all."""
     stores = {OWN: Store(study.results), **{name: Store(one.results) for name, one in derived.items()}}
     calibrations = [store.results.calibration for store in stores.values()]
@@ -291,7 +285,7 @@ def _mix_predictions(study: Study, derived: Mapping[str, Study], left_out: Mappi
     weights = weigh_models(evidence)
     predicted = [store.results.predict for store in stores.values()]
     models = [
-        CalibratedModel(
+        stored.CalibratedModel(
             model=name,
             words=MODELS[name].words if name in MODELS else "as the study states it",
             weight=weight,
@@ -306,12 +300,12 @@ def _mix_predictions(study: Study, derived: Mapping[str, Study], left_out: Mappi
     ]
     records = [_mix_record(stores, weights, row, study.results / FOLDER) for row in predicted[0].sites]
     mixed = [record for record in records if record is not None]
-    return ModelsResult(models=models, records=mixed, left_out=left_out)
+    return stored.ModelsResult(models=models, records=mixed, left_out=left_out)
 
 
 def _mix_record(
     stores: Mapping[str, Store], weights: Array, row: RecordPrediction, folder: Path
-) -> MixedPrediction | None:
+) -> stored.MixedPrediction | None:
     """The largest value of a record and its intervals, N or mm; None if a model does not predict it."""
     curves = [read_curves(store["predict"] / f"{row.record}.csv") for store in stores.values()]
     ends = [[one[key] for key in one if "_low_" in key or "_high_" in key] for one in curves]
@@ -329,7 +323,7 @@ def _mix_record(
     times = {"time_s": curves[0]["time_s"]}
     write_curves(folder / f"{row.record}.csv", **times, **{head: measured}, **band, **by_model)
     peak = int(np.argmax(np.abs(measured)))
-    return MixedPrediction(
+    return stored.MixedPrediction(
         site=row.site,
         record=row.record,
         fitted=row.fitted,
@@ -357,35 +351,36 @@ def fit_socket_of_models(study: Study, *, listener: Listener = ignore_progress) 
     InputError
         If no models were compared, or the study's own socket cannot be simulated.
     """
-    stored = ModelsResult.find(study.results)
-    if stored is None:
+    compared = stored.ModelsResult.find(study.results)
+    if compared is None:
         raise InputError(
             "no other models were compared", file=study.file, remedy="limbfit uncertainty --models all"
         )
-    names = [one.model for one in stored.models if one.model != OWN]
+    names = [one.model for one in compared.models if one.model != OWN]
     compare_models(study, names, listener=listener)  # anew where the study has changed
-    chosen = [one for one in ModelsResult.read(study.results).models if one.weight >= MIN_SOCKET_WEIGHT]
+    compared = stored.ModelsResult.read(study.results)
+    chosen = [one for one in compared.models if one.weight >= MIN_SOCKET_WEIGHT]
     sockets = []
     for one in chosen:
         of_model = study if one.model == OWN else load_study(study.results / FOLDER / one.model)
         fit_socket(of_model, listener=_name_model(listener, f"socket, {one.words}"))
         sockets.append(SocketResult.read(of_model.results))
     weights = np.array([one.weight for one in chosen])
-    content = SocketOfModels(
-        models=[ModelWeight(model=one.model, words=one.words, weight=one.weight) for one in chosen],
+    content = stored.SocketOfModels(
+        models=[stored.ModelWeight(model=one.model, words=one.words, weight=one.weight) for one in chosen],
         loads=_mix_pressures(sockets, weights / weights.sum()),
     )
     with lock(study.results):
-        write_result(study.results / SocketOfModels.FILE, content)
+        write_result(study.results / stored.SocketOfModels.FILE, content)
     return content.to_plain() | {"folder": str(study.results / FOLDER)}
 
 
-def _mix_pressures(sockets: Sequence[SocketResult], weights: Array) -> list[MixedLoad]:
+def _mix_pressures(sockets: Sequence[SocketResult], weights: Array) -> list[stored.MixedLoad]:
     """For donning and each load, the mean pressure of each region by every model, and of all."""
     names = ["donning", *(load.name for load in sockets[0].loads)]
     held = [[one.donning, *one.loads] for one in sockets]
     return [
-        MixedLoad(
+        stored.MixedLoad(
             name=name,
             regions=[
                 _mix_region(same, weights) for same in zip(*(state.regions for state in states), strict=True)
@@ -395,11 +390,11 @@ def _mix_pressures(sockets: Sequence[SocketResult], weights: Array) -> list[Mixe
     ]
 
 
-def _mix_region(same: Sequence[LoadedRegion], weights: Array) -> MixedPressure:
+def _mix_region(same: Sequence[LoadedRegion], weights: Array) -> stored.MixedPressure:
     means = np.array([region.mean_kPa for region in same])
     ends = np.array([region.interval_kPa or 2 * (region.mean_kPa,) for region in same])
     sds = (ends[:, 1] - ends[:, 0]) / (2 * NORMAL_95)
     low, high = compute_mixture_interval(ends.mean(axis=1)[:, None], sds[:, None], weights)
-    return MixedPressure(
+    return stored.MixedPressure(
         region=same[0].region, mean_kPa=means.tolist(), interval_kPa=(max(float(low[0]), 0.0), high[0])
     )

@@ -157,7 +157,9 @@ def _choose_designs(
         "D-optimal": choose_design(every, sites, prior, "D"),
         "A-optimal": choose_design(every, sites, prior, "A"),
     }
-    own = _own_choice(study, every)
+    # The fitted sites at the depth nearest to the recorded one; their deepest candidates otherwise.
+    fitted = {site.name for site in study.fitted}
+    own = tuple(i for i in _select_deepest(every) if every[i].site in fitted)
     if own:
         designs["the study's own"] = evaluate_design(every, own, prior)
     designs["all sites"] = evaluate_design(every, _select_deepest(every), prior)
@@ -193,12 +195,6 @@ def _to_row(one: Candidate, peak: float, prior: Array) -> DesignCandidate:
         peak_force_N=float(peak),
         bits=float(gain / (2 * np.log(2))),
     )
-
-
-def _own_choice(study: Study, every: Sequence[Candidate]) -> tuple[int, ...]:
-    """The study's fitted sites at the depth nearest to the recorded one; its deepest candidate otherwise."""
-    fitted = {site.name for site in study.fitted}
-    return tuple(i for i in _select_deepest(every) if every[i].site in fitted)
 
 
 def _select_deepest(every: Sequence[Candidate]) -> tuple[int, ...]:

@@ -9,7 +9,6 @@ from typing import Any
 from ...execution import Executor, Limits, make_executor
 from ...results.study_results import StudyResults
 from ...study import Study
-from .storage import read_json
 from .store import Store
 
 
@@ -59,10 +58,6 @@ class Context:
         facts: Mapping[str, Any] | None = None,
     ) -> None:
         self.listener(Progress(stage, done, total, text, fit, facts))
-
-    def stored(self, stage: str, name: str) -> Any:
-        """A JSON file of a finished stage or experiment as it is, such as one of an extension."""
-        return read_json(self.store[stage] / name)
 
     @property
     def results(self) -> StudyResults:

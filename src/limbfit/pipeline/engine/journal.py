@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
-from typing import Any, TextIO
+from typing import Any
 
 from ..._version import __version__
 from ...study import Study
@@ -56,25 +56,17 @@ def write_journal(study: Study, what: str, listener: Listener) -> Iterator[Liste
         )
         listener(event)
 
-    with _close_at_end(stream):
-        write("begin", what=what, limbfit=__version__, process=os.getpid())
-        try:
-            yield listen
-        except BaseException as error:
-            with suppress(Exception):  # the error itself matters more, such as that the disk is full
-                kind = "interrupted" if isinstance(error, KeyboardInterrupt | GeneratorExit) else "failed"
-                write(kind, error=type(error).__name__, text=redact_paths(str(error), study))
-            raise
-        write("end")
-
-
-@contextmanager
-def _close_at_end(stream: TextIO) -> Iterator[None]:
-    """The stream is closed at the end, where a full disk would be told of once more."""
     try:
-        yield
+        write("begin", what=what, limbfit=__version__, process=os.getpid())
+        yield listen
+        write("end")
+    except BaseException as error:
+        with suppress(Exception):  # the error itself matters more, such as that the disk is full
+            kind = "interrupted" if isinstance(error, KeyboardInterrupt | GeneratorExit) else "failed"
+            write(kind, error=type(error).__name__, text=redact_paths(str(error), study))
+        raise
     finally:
-        with suppress(OSError):
+        with suppress(OSError):  # a full disk would be told of once more
             stream.close()
 
 

@@ -88,12 +88,15 @@ class Store:
         return StageStamp.read(self.folder, stage)
 
     def _complete(self, stage: str, key: str, work: Path, produce: Callable[[Path], dict[str, Any]]) -> None:
-        clock = _Clock(work / ".seconds")
+        clock, start = work / ".seconds", perf_counter()  # seconds add up over attempts
+        before = float(read_json(clock)) if clock.is_file() else 0.0
         try:
             facts = produce(work)
         finally:
-            seconds = clock.stop()
-        clock.file.unlink(missing_ok=True)
+            seconds = before + perf_counter() - start
+            if work.is_dir():
+                write_json(clock, round(seconds, 3))
+        clock.unlink(missing_ok=True)
         shutil.rmtree(work / EARLIER, ignore_errors=True)
         for draft in work.rglob(f".*{DRAFT}"):  # of attempts that were killed while writing
             draft.unlink()
@@ -135,21 +138,6 @@ class Store:
             place.rename(old)
         work.rename(place)
         shutil.rmtree(old, ignore_errors=True)
-
-
-class _Clock:
-    """Seconds spent on a stage, kept on disk so that they add up over attempts."""
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        self.before = float(read_json(file)) if file.is_file() else 0.0
-        self.start = perf_counter()
-
-    def stop(self) -> float:
-        total = self.before + perf_counter() - self.start
-        if self.file.parent.is_dir():
-            write_json(self.file, round(total, 3))
-        return total
 
 
 @contextmanager

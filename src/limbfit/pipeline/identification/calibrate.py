@@ -12,31 +12,14 @@ import numpy as np
 from ...identify.fit.calibration import Calibration
 from ...identify.fit.multifidelity import CorrectionRound
 from ...identify.fit.multistart import MultistartResult, describe_starts
-from ...identify.fit.objective import MeasuredCurve, SiteResponse
+from ...identify.fit.objective import SiteResponse
 from ...identify.uncertainty.relaxation import RelaxationAssessment, assess_relaxation
 from ...identify.uncertainty.uncertainty import Uncertainty
 from ...indentation import Parameters, Simulation
 from ...laws import FIBRED, FUNG, is_ogden
 from ...priors import SOURCE
+from ...results import identification as stored
 from ...results.base import Interval, Intervals
-from ...results.identification import (
-    CalibrationResult,
-    CalibrationUncertainty,
-    ContactSummary,
-    CorrelationMatrix,
-    MeshCorrectionRound,
-    ParameterBounds,
-    PriorShares,
-    SearchDoubt,
-    SearchIteration,
-    SearchStage,
-    SearchStart,
-    SearchStarts,
-    SimulationDoubt,
-    SimulationDoubts,
-    StatedPrior,
-    StoredLaw,
-)
 from ...study import Study
 from ..engine.context import Context
 from ..engine.storage import write_result
@@ -70,17 +53,22 @@ def run_calibrate(context: Context, folder: Path) -> None:
     correction, spent = correct_answer(problem, simulator, best.parameters, responses, coarser)
     found, known = sample_intervals(problem, simulator, best, correction, spent)
     corrections = [_summarise_round(one, found.sites, problem) for one in rounds]
-    relaxation = _assess_relaxation(problem, found, known, records.measured)
+    relaxation = None
+    if is_ogden(study.law.name) or study.law.name in (FIBRED, FUNG):
+        fit = found.parameters, found.responses, records.measured, known.residual_model
+        relaxation = assess_relaxation(*fit, problem.unknowns, problem.space)
     simulations = simulator.run_answer(found.parameters)
     answers = {one.site: one for one in records.select_forces(simulations)}
     warnings = {site: list(one.warnings) for site, one in answers.items() if one.warnings}
     for site, texts in warnings.items():
         report(f"warning: site {site}, at the answer: {'; '.join(texts)}")
     log, bounds, kept = simulator.log, problem.unknowns, cache.load_all()
-    content = CalibrationResult(
+    content = stored.CalibrationResult(
         stages=[_summarise_stage(found, i, problem, simulator.starts) for i in range(len(found.stages))],
-        bounds=ParameterBounds(lower=study.by_tissue(bounds.lower), upper=study.by_tissue(bounds.upper)),
-        law=StoredLaw(**study.law.record()),
+        bounds=stored.ParameterBounds(
+            lower=study.by_tissue(bounds.lower), upper=study.by_tissue(bounds.upper)
+        ),
+        law=stored.StoredLaw(**study.law.record()),
         objective=study.calibration.objective,
         uncertainty=_summarise_uncertainty(known, problem.study, relaxation),
         forward_runs=len(kept),
@@ -103,7 +91,7 @@ def run_calibrate(context: Context, folder: Path) -> None:
 
 def _summarise_stage(
     found: Calibration, number: int, problem: CalibrationProblem, warm_starts: WarmStarts
-) -> SearchStage:
+) -> stored.SearchStage:
     """One stage: from the start of the problem, or the end of the stage before, to its own end."""
     study, stage = problem.study, found.stages[number]
     before = np.array(found.stages[number - 1].parameters) if number else problem.unknowns.start
@@ -112,7 +100,7 @@ def _summarise_stage(
     def starts(parameters: Sequence[float]) -> list[Parameters]:
         return [study.by_tissue(one) for one in warm_starts.find(np.array(parameters))]
 
-    return SearchStage(
+    return stored.SearchStage(
         name=problem.titles[number],
         start=study.by_tissue(before),
         parameters=study.by_tissue(np.array(stage.parameters)),
@@ -121,7 +109,7 @@ def _summarise_stage(
         converged=stage.converged,
         reason=stage.reason,
         iterations=[
-            SearchIteration(
+            stored.SearchIteration(
                 iteration=i,
                 parameters=study.by_tissue(np.array(iterate.parameters)),
                 starts=starts(iterate.parameters),
@@ -136,9 +124,9 @@ def _summarise_stage(
 
 def _summarise_round(
     one: CorrectionRound, sites: Sequence[str], problem: CalibrationProblem
-) -> MeshCorrectionRound:
+) -> stored.MeshCorrectionRound:
     """One correction of the search by the whole meshes; percentages are of each site's largest force."""
-    return MeshCorrectionRound(
+    return stored.MeshCorrectionRound(
         stage=problem.titles[one.stage] if one.stage >= 0 else "start",
         parameters=problem.study.by_tissue(np.array(one.parameters)),
         scale_by_site=dict(zip(sites, one.scales, strict=True)),
@@ -148,11 +136,11 @@ def _summarise_round(
     )
 
 
-def _summarise_starts(tried: MultistartResult, study: Study) -> SearchStarts:
+def _summarise_starts(tried: MultistartResult, study: Study) -> stored.SearchStarts:
     """What came of every start."""
     names = [f"{tissue}.{name}" for tissue, name in study.parameters]
     starts = [
-        SearchStart(
+        stored.SearchStart(
             start=study.by_tissue(np.array(one.start)),
             parameters=None if one.parameters is None else study.by_tissue(np.array(one.parameters)),
             cost=one.cost,
@@ -164,18 +152,18 @@ def _summarise_starts(tried: MultistartResult, study: Study) -> SearchStarts:
         )
         for one in tried.starts
     ]
-    return SearchStarts(summary=describe_starts(tried, names), reached=tried.reached, starts=starts)
+    return stored.SearchStarts(summary=describe_starts(tried, names), reached=tried.reached, starts=starts)
 
 
 def _summarise_uncertainty(
     known: Uncertainty, study: Study, relaxation: RelaxationAssessment | None
-) -> CalibrationUncertainty:
+) -> stored.CalibrationUncertainty:
     """What is stored of the uncertainty; intervals by tissue and name, like the parameters."""
     verdicts = known.verdicts if relaxation is None else relaxation.qualify_verdicts(known)
-    return CalibrationUncertainty(
+    return stored.CalibrationUncertainty(
         method=known.method,
         intervals_95=group_intervals(known, study),
-        correlation=CorrelationMatrix(names=known.names, matrix=known.correlation.tolist()),
+        correlation=stored.CorrelationMatrix(names=known.names, matrix=known.correlation.tolist()),
         covariance_log=known.covariance.tolist(),
         sampling_covariance_log=known.sampling_covariance.tolist(),
         verdict=dict(zip(known.names, verdicts, strict=True)),
@@ -197,29 +185,14 @@ def group_intervals(known: Uncertainty, study: Study) -> Intervals:
     return intervals
 
 
-def _assess_relaxation(
-    problem: CalibrationProblem,
-    found: Calibration,
-    known: Uncertainty,
-    measured: Sequence[MeasuredCurve],
-) -> RelaxationAssessment | None:
-    """What is known of relaxation beyond the records; none of other laws."""
-    law = problem.study.law.name
-    if not is_ogden(law) and law not in (FIBRED, FUNG):
-        return None
-    return assess_relaxation(
-        found.parameters, found.responses, measured, known.residual_model, problem.unknowns, problem.space
-    )
-
-
-def _summarise_priors(known: Uncertainty, study: Study) -> PriorShares | None:
+def _summarise_priors(known: Uncertainty, study: Study) -> stored.PriorShares | None:
     """The priors that counted, and how much of each interval comes from them; none where none were stated."""
     if not study.priors:
         return None
     stated = study.calibration.prior
-    return PriorShares(
+    return stored.PriorShares(
         stated={
-            name: StatedPrior(
+            name: stored.StatedPrior(
                 median=prior.median, factor=prior.factor, source="the study" if name in stated else SOURCE
             )
             for name, prior in study.priors.items()
@@ -234,7 +207,7 @@ def summarise_contact(
     searched: Mapping[str, float | None],
     rested: Sequence[SiteResponse],
     fitted: Sequence[SiteResponse],
-) -> dict[str, ContactSummary]:
+) -> dict[str, stored.ContactSummary]:
     """Per site the penalty that all of its simulations hold, and what contact does at the answer.
 
     ``search_penalty_per_mm`` is that of the mesh on which parameters are searched; ``from_rest_percent`` how
@@ -243,7 +216,7 @@ def summarise_contact(
     content = {}
     for (site, simulation), answer, fit in zip(answers.items(), rested, fitted, strict=True):
         off = np.max(np.abs(answer.force_N - fit.force_N)) / np.max(np.abs(fit.force_N))
-        content[site] = ContactSummary(
+        content[site] = stored.ContactSummary(
             penalty_per_mm=simulation.facts.get("penalty_per_mm"),
             sunk_steps=simulation.facts.get("sunk_steps"),
             unbalanced_steps=simulation.facts.get("unbalanced_steps"),
@@ -256,7 +229,7 @@ def summarise_contact(
 
 def summarise_doubts(
     searched: Sequence[SearchWarning], answers: Mapping[str, Simulation], simulations: int, found: Calibration
-) -> SimulationDoubts:
+) -> stored.SimulationDoubts:
     """How many of the ``simulations`` of the search are doubtful, which, and what is at the answer.
 
     ``iterate`` is the number of the accepted iterate that a doubt belongs to, from the beginning of the best
@@ -266,7 +239,7 @@ def summarise_doubts(
     for number, iterate in enumerate(found.history):
         accepted.setdefault(iterate.parameters, number)
     rows = [
-        SearchDoubt(
+        stored.SearchDoubt(
             evaluation=one.evaluation,
             iterate=accepted.get(one.parameters),
             site=one.site,
@@ -275,12 +248,12 @@ def summarise_doubts(
         )
         for one in searched
     ]
-    return SimulationDoubts(
+    return stored.SimulationDoubts(
         simulations=simulations,
         doubtful=len({(one.evaluation, one.site) for one in searched}),
         search=rows,
         answer={
-            site: [SimulationDoubt.model_validate(doubt) for doubt in one.doubts]
+            site: [stored.SimulationDoubt.model_validate(doubt) for doubt in one.doubts]
             for site, one in answers.items()
             if one.doubts
         },

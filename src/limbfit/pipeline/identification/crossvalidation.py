@@ -7,12 +7,12 @@ from those too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from math import comb
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from ...identify.checks.crossvalidation import (
     summarise_errors_by_site,
 )
 from ...identify.fit.calibration import CalibrationSettings
-from ...identify.fit.objective import SiteResponse
+from ...identify.fit.objective import MeasuredCurve, SiteResponse
 from ...identify.fit.parameters import Unknowns
 from ...identify.fit.prediction import compute_error_percent
 from ...identify.uncertainty.emulator import Emulator
@@ -73,7 +73,7 @@ def run_crossvalidate(
     At most ``choices`` of them are drawn with ``seed``; ``runs`` more simulations of all sites make the
     emulator.
     """
-    study = context.study
+    study, stored = context.study, context.results.calibration
     recorded = [site for site in study.sites if study.records_at(site)]
     size = fit or len(study.fitted)
     simulator = RecordSimulator(
@@ -82,24 +82,49 @@ def run_crossvalidate(
         context.executor,
         partial(context.tell, "crossvalidate", 0, 0),
     )
-    bench = _Bench(context, simulator, seed, runs)
-    own_choice = tuple(i for i, site in enumerate(recorded) if site.fitted)
+    problem, best = build_problem(study), study.vector(stored.parameters)
+    bounds, measured = problem.unknowns.with_start(best), simulator.records.measured
+    sites: dict[str, tuple[int, ...]] = {}
+    for i, one in enumerate(measured):
+        sites[one.site_name] = (*sites.get(one.site_name, ()), i)
+    correction = correct_to_fine_meshes(problem, simulator, best)
+
+    def simulate(points: Sequence[Array]) -> Runs:
+        found = []
+        for i, point in enumerate(points):
+            context.tell("crossvalidate", i, len(points), f"simulation {i + 1} of {len(points)}")
+            found.append(correction.as_fine(simulator.search(point)))
+        return found
+
+    # Where nothing is known, fits go anywhere; the emulator must not.
+    covariance = np.array(stored.uncertainty.covariance_log)
+    drawn = list(spread_points(best, covariance, bounds, runs, seed))
+    known = [(best, correction.responses), *_select_complete(context, drawn, simulate(drawn))]
+    own = tuple(i for i, site in enumerate(recorded) if site.fitted)
     chosen = list_choices(len(recorded), size, choices, seed)
-    regions = list_choices_without_regions([site.region for site in recorded])
-    first = bench.validate(own_choice, chosen, {})
-    checks = bench.check(first.spread(_CHECKED), 1)
-    found = bench.validate(own_choice, chosen, regions)
-    checks += bench.check(found.spread(_CHECKED), 2)
-    content = _build_result(context, bench, found, size, comb(len(recorded), size), checks)
+    regions, checks = list_choices_without_regions([site.region for site in recorded]), []
+    for number, without in ((1, {}), (2, regions)):
+        emulator = _fit_emulator(bounds.names, known)
+        fits = _fit_choices(context, emulator, bounds, measured, list(sites.values()), (own, chosen, without))
+        checked = fits.spread(_CHECKED)
+        optima = [fold.parameters for fold in checked]
+        solved = simulate(optima)
+        checks += _check_folds(number, checked, solved, emulator, measured, sites)
+        known += _select_complete(context, optima, solved)
+    last = _fit_emulator(bounds.names, known)
+    summary = FoldEmulator(runs=len(known), loo_percent=float(np.median(last.loo_percent)), checks=checks)
+    possible = comb(len(recorded), size)
+    content = _build_result(study, bounds.names, tuple(sites), fits, size, possible, summary)
     write_result(folder / "crossvalidate.json", content)
     _write_tables(folder, content)
 
 
-class _Found:
+class _Fits(NamedTuple):
     """The fits of one emulator: the study's own choice, others, and those without a region."""
 
-    def __init__(self, own: Fold, folds: tuple[Fold, ...], regions: tuple[Fold, ...]) -> None:
-        self.own, self.folds, self.regions = own, folds, regions
+    own: Fold
+    folds: tuple[Fold, ...]
+    regions: tuple[Fold, ...]
 
     def spread(self, count: int) -> list[Fold]:
         """Some fits from the best to the worst, the study's own first."""
@@ -108,96 +133,89 @@ class _Found:
         return [self.own, *(ranked[i] for i in places)]
 
 
-class _Bench:
-    """Simulations of all recorded sites, the emulator made of them, and the fits on it."""
+def _select_complete(
+    context: Context, points: Iterable[Array], runs: Runs
+) -> list[tuple[Array, list[SiteResponse]]]:
+    """The points whose simulations came to their end, with these; the others are told."""
+    found = []
+    for point, run in zip(points, runs, strict=True):
+        if failed := _describe_failed(run):
+            told = f"warning: a simulation failed at site {failed}: the emulator does without it"
+            context.tell("crossvalidate", 0, 0, told)
+        else:
+            found.append((point, run))
+    return found
 
-    def __init__(self, context: Context, simulator: RecordSimulator, seed: int, runs: int) -> None:
-        self.context, self.simulator = context, simulator
-        study = context.study
-        stored = context.results.calibration
-        self.best = study.vector(stored.parameters)
-        problem = build_problem(study)
-        self.bounds = problem.unknowns.with_start(self.best)
-        self.measured = simulator.records.measured
-        of_site: dict[str, list[int]] = {}
-        for i, one in enumerate(self.measured):
-            of_site.setdefault(one.site_name, []).append(i)
-        self.sites, self.groups = tuple(of_site), tuple(map(tuple, of_site.values()))
-        covariance = np.array(stored.uncertainty.covariance_log)
-        # Where nothing is known, fits go anywhere; the emulator must not.
-        drawn = spread_points(self.best, covariance, self.bounds, runs, seed)
-        correction = correct_to_fine_meshes(problem, simulator, self.best)
-        self.as_fine = correction.as_fine
-        self.points, self.runs = [self.best], [correction.responses]
-        self.learn(list(drawn))
 
-    def learn(self, points: Sequence[Array]) -> Runs:
-        """Simulate at some points and make the emulator anew; the runs."""
-        runs = []
-        for i, point in enumerate(points):
-            self.context.tell("crossvalidate", i, len(points), f"simulation {i + 1} of {len(points)}")
-            runs.append(self.as_fine(self.simulator.search(point)))
-        for point, run in zip(points, runs, strict=True):
-            if failed := _describe_failed(run):
-                told = f"warning: a simulation failed at site {failed}: the emulator does without it"
-                self.context.tell("crossvalidate", 0, 0, told)
-            else:
-                self.points, self.runs = [*self.points, point], [*self.runs, run]
-        self.emulator = Emulator.fit(self.bounds.names, np.array(self.points), self.runs)
-        return runs
+def _fit_emulator(names: Sequence[str], known: Sequence[tuple[Array, list[SiteResponse]]]) -> Emulator:
+    points, runs = zip(*known, strict=True)
+    return Emulator.fit(tuple(names), np.array(points), list(runs))
 
-    @property
-    def unknowns(self) -> Unknowns:
-        """The study's, within the emulator's region."""
-        low = np.maximum(self.emulator.lower * np.exp(-_MARGIN), self.bounds.lower)
-        high = np.minimum(self.emulator.upper * np.exp(_MARGIN), self.bounds.upper)
-        return Unknowns(self.bounds.names, self.best, low, high, self.bounds.priors)
 
-    def validate(self, own: Choice, chosen: Sequence[Choice], regions: dict[str, Choice]) -> _Found:
-        table = self.context.study.calibration
-        settings = CalibrationSettings(objective=table.objective, relative_tolerance=1e-3, max_iterations=40)
-        given = (self.emulator, self.measured, self.unknowns)
+def _fit_choices(
+    context: Context,
+    emulator: Emulator,
+    bounds: Unknowns,
+    measured: Sequence[MeasuredCurve],
+    groups: Sequence[Choice],
+    choices: tuple[Choice, Sequence[Choice], Mapping[str, Choice]],
+) -> _Fits:
+    """Fit the study's own choice, others, and those without a region, within the emulator's box.
 
-        def tell(done: int, total: int) -> None:
-            self.context.tell("crossvalidate", done, total, f"{done} of {total} choices fitted")
+    ``groups`` are the numbers of each site's records.
+    """
+    table, (own, chosen, regions) = context.study.calibration, choices
+    settings = CalibrationSettings(objective=table.objective, relative_tolerance=1e-3, max_iterations=40)
+    low = np.maximum(emulator.lower * np.exp(-_MARGIN), bounds.lower)
+    high = np.minimum(emulator.upper * np.exp(_MARGIN), bounds.upper)
+    unknowns = Unknowns(bounds.names, bounds.start, low, high, bounds.priors)
 
-        def fitted(
-            choices: dict[str, Choice], told: Callable[[int, int], None] = lambda done, total: None
-        ) -> tuple[Fold, ...]:
-            records = {label: expand_to_records(choice, self.groups) for label, choice in choices.items()}
-            folds = cross_validate(*given, records, settings, told)
-            pairs = zip(folds, choices.values(), strict=True)
-            return tuple(average_by_site(fold, choice, self.groups) for fold, choice in pairs)
+    def tell(done: int, total: int) -> None:
+        context.tell("crossvalidate", done, total, f"{done} of {total} choices fitted")
 
-        (alone,) = fitted({"": own})
-        numbered = fitted({str(i): choice for i, choice in enumerate(chosen)}, tell)
-        return _Found(alone, tuple(replace(fold, label="") for fold in numbered), fitted(regions))
+    def fit(
+        choices: Mapping[str, Choice], told: Callable[[int, int], None] = lambda done, total: None
+    ) -> tuple[Fold, ...]:
+        records = {label: expand_to_records(choice, groups) for label, choice in choices.items()}
+        folds = cross_validate(emulator, measured, unknowns, records, settings, told)
+        pairs = zip(folds, choices.values(), strict=True)
+        return tuple(average_by_site(fold, choice, groups) for fold, choice in pairs)
 
-    def check(self, folds: Sequence[Fold], number: int) -> list[FoldCheck]:
-        """The solver's errors at the optima of some fits beside the emulator's, which then learns them."""
-        emulated = [self.emulator(fold.parameters) for fold in folds]
-        runs = self.learn([fold.parameters for fold in folds])
-        rows = []
-        for fold, cheap, run in zip(folds, emulated, runs):
-            if _describe_failed(run):
-                continue
-            held = [self.groups[site] for site in fold.heldout]
-            solved = [
-                np.mean([compute_error_percent(run[i].force_N, self.measured[i].force_N) for i in of_site])
-                for of_site in held
-            ]
-            away = [compute_error_percent(cheap[i].force_N, run[i].force_N) for i in range(len(run))]
-            rows.append(
-                FoldCheck(
-                    round=number,
-                    fitted=[self.sites[i] for i in fold.fitted],
-                    heldout_emulated_percent=fold.mean_heldout,
-                    heldout_solved_percent=float(np.mean(solved)),
-                    emulator_error_percent=float(np.mean(away)),
-                    emulator_error_largest_percent=float(np.max(away)),
-                )
+    (alone,) = fit({"": own})
+    numbered = fit({str(i): choice for i, choice in enumerate(chosen)}, tell)
+    return _Fits(alone, tuple(replace(fold, label="") for fold in numbered), fit(regions))
+
+
+def _check_folds(
+    number: int,
+    folds: Sequence[Fold],
+    solved: Runs,
+    emulator: Emulator,
+    measured: Sequence[MeasuredCurve],
+    sites: Mapping[str, Choice],
+) -> list[FoldCheck]:
+    """The solver's errors at the optima of some fits beside the emulator's."""
+    names, rows = list(sites), []
+    for fold, run in zip(folds, solved, strict=True):
+        if _describe_failed(run):
+            continue
+        held = [
+            np.mean([compute_error_percent(run[i].force_N, measured[i].force_N) for i in sites[names[site]]])
+            for site in fold.heldout
+        ]
+        pairs = zip(emulator(fold.parameters), run, strict=True)
+        away = [compute_error_percent(cheap.force_N, one.force_N) for cheap, one in pairs]
+        rows.append(
+            FoldCheck(
+                round=number,
+                fitted=[names[i] for i in fold.fitted],
+                heldout_emulated_percent=fold.mean_heldout,
+                heldout_solved_percent=float(np.mean(held)),
+                emulator_error_percent=float(np.mean(away)),
+                emulator_error_largest_percent=float(np.max(away)),
             )
-        return rows
+        )
+    return rows
 
 
 def _describe_failed(run: Sequence[SiteResponse]) -> str:
@@ -206,11 +224,16 @@ def _describe_failed(run: Sequence[SiteResponse]) -> str:
 
 
 def _build_result(
-    context: Context, bench: _Bench, found: _Found, size: int, possible: int, checks: Sequence[FoldCheck]
+    study: Study,
+    names: Sequence[str],
+    sites: Sequence[str],
+    found: _Fits,
+    size: int,
+    possible: int,
+    emulator: FoldEmulator,
 ) -> CrossvalidateResult:
     """What ``crossvalidate.json`` holds."""
-    names, sites = bench.bounds.names, bench.sites
-    regions = {site.name: site.region for site in context.study.sites}
+    regions = {site.name: site.region for site in study.sites}
     by_site = summarise_errors_by_site(found.folds, len(sites))
     return CrossvalidateResult(
         fitted_sites=size,
@@ -232,9 +255,7 @@ def _build_result(
         regions=[fold.summarise(sites, names) for fold in found.regions],
         folds=[fold.summarise(sites, names) for fold in found.folds],
         at_limit_share=float(np.mean([bool(fold.at_limit) for fold in found.folds])),
-        emulator=FoldEmulator(
-            runs=len(bench.points), loo_percent=float(np.median(bench.emulator.loo_percent)), checks=checks
-        ),
+        emulator=emulator,
     )
 
 

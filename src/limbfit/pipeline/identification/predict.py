@@ -17,18 +17,7 @@ from ...identify.fit.objective import SiteResponse, find_largest_magnitude
 from ...identify.fit.prediction import PredictionModel, compute_error_percent, summarise_errors
 from ...identify.uncertainty.discrepancy import MeshMisfit
 from ...indentation import Simulation, SimulationJob, store_job_fields
-from ...results.identification import (
-    FitSummary,
-    ObservedError,
-    OutsideRecords,
-    PredictResult,
-    QuantityRange,
-    RecordedExtents,
-    RecordFit,
-    RecordPrediction,
-    SearchStage,
-    SimulationDoubt,
-)
+from ...results import identification as stored
 from ...study import Study
 from ..engine.context import Context
 from ..engine.storage import write_curves, write_result
@@ -44,7 +33,7 @@ from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
 from ..simulation.simulations import SimulationCache
 
-Loading = tuple[Sequence[Extent], Sequence[OutsideRecords]]
+Loading = tuple[Sequence[Extent], Sequence[stored.OutsideRecords]]
 _MISSING = {
     "force": "no force is predicted",
     "interval": "no 95 % interval and no check against the other sites",
@@ -99,14 +88,14 @@ def run_predict(context: Context, folder: Path) -> None:
     of_mesh = calibration.uncertainty.residuals.mesh_misfit
     mesh_misfit = None if of_mesh is None else MeshMisfit(of_mesh.share, of_mesh.correlation)
     quality = _assess_fits(study, judged, best, known, mesh_misfit)
-    content = PredictResult(
+    content = stored.PredictResult(
         sites=rows,
-        recorded_range=RecordedExtents.model_validate(tested),
+        recorded_range=stored.RecordedExtents.model_validate(tested),
         outside_text=describe_outside(outside),
         flags=warnings.flags,
         left_out=warnings.left_out,
         failed=warnings.failed,
-        fit_quality=FitSummary(verdict=summarise_fit(quality), records=quality),
+        fit_quality=stored.FitSummary(verdict=summarise_fit(quality), records=quality),
         **_compute_means(rows),
     )
     write_result(folder / "predict.json", content)
@@ -120,7 +109,7 @@ class Answer:
     starts: tuple[Array, ...]
 
     @classmethod
-    def of(cls, stage: SearchStage, study: Study) -> Answer:
+    def of(cls, stage: stored.SearchStage, study: Study) -> Answer:
         """The answer of a stage as ``calibration.json`` holds it."""
         starts = stage.iterations[-1].starts
         return cls(study.vector(stage.parameters), tuple(study.vector(one) for one in starts))
@@ -182,30 +171,26 @@ class SitePrediction:
         return [*doubts, *(f"{_MISSING[what]}: {reason}" for what, reason in self.missing.items())]
 
 
-@dataclass(frozen=True)
-class FieldJob:
-    """Fields at the deepest point of a site, to be stored by the worker that has just simulated it."""
+def store_fields(wanted: tuple[SimulationJob, Path]) -> list[Extent]:
+    """Store the fields of a job at its deepest point, if not done yet; the strains near the indenter.
 
-    job: SimulationJob
-    file: Path
-
-
-def store_fields(wanted: FieldJob) -> tuple[str, list[Extent]]:
-    """Store them where they are not yet; return the record's name and the strains near the indenter."""
-    if not wanted.file.is_file():
-        store_job_fields(wanted.job, wanted.file)
-    return wanted.job.model.name, read_strain_extents(wanted.file) if wanted.file.is_file() else []
+    It is done by the worker that has just simulated the job.
+    """
+    job, file = wanted
+    if not file.is_file():
+        store_job_fields(job, file)
+    return read_strain_extents(file) if file.is_file() else []
 
 
 def _write_fields(
     context: Context, folder: Path, jobs: Sequence[SimulationJob], before: int
 ) -> dict[str, list[Extent]]:
     """Store the fields of the jobs; return the strains near the indenter of each record."""
-    wanted = [FieldJob(job, folder / f"{job.model.name}.vtu") for job in jobs]
-    names, found = [one.job.model.name for one in wanted], {}
-    for i, (name, strains) in enumerate(context.executor.map(store_fields, wanted, keys=names)):
+    names, found = [job.model.name for job in jobs], {}
+    wanted = [(job, folder / f"{name}.vtu") for job, name in zip(jobs, names, strict=True)]
+    for name, strains in zip(names, context.executor.map(store_fields, wanted, keys=names), strict=True):
         found[name] = strains
-        context.tell("predict", before + i + 1, before + len(wanted), f"fields of site {name}")
+        context.tell("predict", before + len(found), before + len(wanted), f"fields of site {name}")
     return found
 
 
@@ -287,7 +272,7 @@ def _assess_fits(
     best: Array,
     known: PredictionModel,
     of_mesh: MeshMisfit | None,
-) -> list[RecordFit]:
+) -> list[stored.RecordFit]:
     """How well the model follows each record, beside its noise and the errors of its mesh and site.
 
     Forces are smoothed as the record is: else the corner at its peak would be taken for an error of the
@@ -335,7 +320,7 @@ def _write_observed(
     near: Simulation | None,
     best: Array,
     known: PredictionModel,
-) -> list[ObservedError]:
+) -> list[stored.ObservedError]:
     """Everything that was seen beside a record's force with its prediction, as files and rows.
 
     ``near`` is the simulation with derivatives where that is another than the site's own.
@@ -356,7 +341,7 @@ def _write_observed(
             columns |= {f"{what}_low_{unit}": low, f"{what}_high_{unit}": high}
         write_curves(folder / f"{one.name}.csv", **columns)
         rows.append(
-            ObservedError(
+            stored.ObservedError(
                 kind=seen.kind,
                 what=seen.what,
                 name=one.name,
@@ -371,8 +356,8 @@ def _write_observed(
 
 
 def _summarise_site(
-    site: SitePrediction, observed: Sequence[ObservedError], loading: Loading
-) -> RecordPrediction:
+    site: SitePrediction, observed: Sequence[stored.ObservedError], loading: Loading
+) -> stored.RecordPrediction:
     record, own = site.record, site.own
 
     def error(found: Simulation | SiteResponse | None) -> float | None:
@@ -380,7 +365,7 @@ def _summarise_site(
             return None
         return compute_error_percent(found.force_N, record.compared)
 
-    return RecordPrediction(
+    return stored.RecordPrediction(
         site=record.site.name,
         record=record.name,
         control=record.record.control,
@@ -394,16 +379,16 @@ def _summarise_site(
         reason=own.reason,
         not_predicted=site.missing,
         warnings=site.warnings,
-        doubts=[SimulationDoubt.model_validate(doubt) for doubt in own.doubts],
+        doubts=[stored.SimulationDoubt.model_validate(doubt) for doubt in own.doubts],
         steps=own.facts["steps"],
         element=own.facts["element"],
         observed=observed,
-        loading=[QuantityRange.model_validate(one) for one in loading[0]],
+        loading=[stored.QuantityRange.model_validate(one) for one in loading[0]],
         outside_records=loading[1],
     )
 
 
-def _compute_means(rows: Sequence[RecordPrediction]) -> dict[str, float | None]:
+def _compute_means(rows: Sequence[stored.RecordPrediction]) -> dict[str, float | None]:
     """Mean and standard deviation of the errors of fitted and held-out sites; None where there are none.
 
     A site's is the mean of its records'.

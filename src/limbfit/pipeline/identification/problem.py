@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -55,10 +54,24 @@ def check_fitted(study: Study) -> None:
 
 def build_problem(study: Study) -> CalibrationProblem:
     """The problem that a study states."""
+    table, tissues = study.calibration, len(study.tissues)
     unknowns, stages = build_unknowns(study), build_groupings(study)
-    titles, settings = list_stage_titles(study.tissues), build_settings(study)
-    space, moves = build_space(unknowns, stages[-1]), is_moved(study)
-    return CalibrationProblem(study, unknowns, stages, titles, settings, space, moves)
+    several = f"{COUNTS[tissues] if tissues < len(COUNTS) else tissues} materials"
+    return CalibrationProblem(
+        study=study,
+        unknowns=unknowns,
+        stages=stages,
+        titles=("one material",) if tissues == 1 else ("one material", several),
+        settings=CalibrationSettings(
+            objective=table.objective,
+            relative_tolerance=table.relative_tolerance,
+            max_iterations=table.max_iterations,
+            stopping=table.stopping,
+            force_error_percent=table.force_error_percent,
+        ),
+        space=build_space(unknowns, stages[-1]),
+        is_moved=is_moved(study),
+    )
 
 
 def is_moved(study: Study) -> bool:
@@ -92,21 +105,3 @@ def build_groupings(study: Study) -> tuple[Grouping, ...]:
         constrain(one, names, study.fixed, study.calibration.tied) for one in build_stage_groupings(names)
     ]
     return tuple(dict.fromkeys(made))
-
-
-def build_settings(study: Study) -> CalibrationSettings:
-    """How the study wants its parameters found."""
-    table = study.calibration
-    return CalibrationSettings(
-        objective=table.objective,
-        relative_tolerance=table.relative_tolerance,
-        max_iterations=table.max_iterations,
-        stopping=table.stopping,
-        force_error_percent=table.force_error_percent,
-    )
-
-
-def list_stage_titles(tissues: Sequence[str]) -> tuple[str, ...]:
-    """Names of the stages of the identification; a single tissue has one."""
-    n = len(tissues)
-    return ("one material", f"{COUNTS[n] if n < len(COUNTS) else n} materials")[: min(n, 2)]

@@ -45,10 +45,12 @@ def run_segment(context: Context, folder: Path) -> None:
     quality = assess_labels(labels)
     write_result(folder / "quality.json", quality)
     draw_sheet(folder / "quality.png", volume, labels, quality)
+    voxel_cm3 = float(np.prod(labels.spacing)) / 1000
+    voxels = {name: float((labels.array == value).sum()) for value, name in labels.names.items()}
     context.tell("segment", 2, 3, "outlining the skin with markers")
     found = SegmentResult(
         method=method,
-        volumes_cm3=label_volumes(labels),
+        volumes_cm3={name: round(number * voxel_cm3, 2) for name, number in voxels.items()},
         repairs=notes,
         warnings=[f"image: {note}" for note in volume.notes],
         labels_sha256=compute_file_digest(folder / LABELS),
@@ -56,15 +58,6 @@ def run_segment(context: Context, folder: Path) -> None:
         motion=store_second_skin(study, volume, labels, folder),
     )
     write_result(folder / "segment.json", found)
-
-
-def label_volumes(labels: LabelMap) -> dict[str, float]:
-    """Volume of each label in cubic centimetres."""
-    voxel_cm3 = float(np.prod(labels.spacing)) / 1000
-    return {
-        name: round(float((labels.array == value).sum()) * voxel_cm3, 2)
-        for value, name in labels.names.items()
-    }
 
 
 def remove_own_markers(study: Study, volume: Volume, folder: Path) -> tuple[Volume, int | None]:

@@ -25,17 +25,13 @@ def run_sites(context: Context, folder: Path) -> None:
     for note in study.notes:
         context.tell("sites", 0, 1, note)
     context.tell("sites", 0, 1, "placing sites")
-    markers = _match_markers(context, anatomy)
+    hints = {site.name: np.array(site.near) for site in study.sites if site.near is not None}
+    markers = {}
+    if hints:
+        marked = read_surface(context.store["segment"] / MARKED_SKIN)
+        markers = match_markers(find_markers(marked, anatomy.skin), hints)
     placed = [place_site(site, study, anatomy, markers.get(site.name)) for site in study.sites]
     write_result(folder / "sites.json", SitesResult(sites=placed))
-
-
-def _match_markers(context: Context, anatomy: Anatomy) -> dict[str, Any]:
-    hints = {site.name: np.array(site.near) for site in context.study.sites if site.near is not None}
-    if not hints:
-        return {}
-    marked = read_surface(context.store["segment"] / MARKED_SKIN)
-    return dict(match_markers(find_markers(marked, anatomy.skin), hints))
 
 
 def place_site(site: Site, study: Study, anatomy: Anatomy, marker: Any) -> PlacedSite:

@@ -10,15 +10,7 @@ import numpy as np
 
 from ...errors import TraceError
 from ...phases import MotionPhase, describe_phases
-from ...results.records import (
-    LayerRecord,
-    RecordPhase,
-    RecordRemark,
-    SurfaceRecord,
-    TraceFacts,
-    TracesResult,
-    WaveRecord,
-)
+from ...results import records as stored
 from ...study import Record, Study
 from ...traces import (
     Creep,
@@ -58,7 +50,7 @@ class SecondaryMeasurement(NamedTuple):
     waves: tuple[tuple[WaveSpeeds, WaveMeans], ...]
 
 
-def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, TraceFacts]:
+def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, stored.TraceFacts]:
     """A record as it is used, its regularised curves and the facts that ``traces.json`` holds."""
     table = study.traces
     file = study.path(record.trace)
@@ -72,7 +64,7 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, Trace
     if trace.notes:
         cause, remedy = "the format of the rig's export", "compare the phases with what the rig did"
         remarks.insert(0, TraceWarning("reading", "; ".join(trace.notes), cause, remedy, {}))
-    facts = TraceFacts(
+    facts = stored.TraceFacts(
         site=record.site.name,
         control=record.control,
         touch_down_s=touch.time_s,
@@ -89,18 +81,18 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, Trace
         knots_s=smooth.knots_s.tolist(),
         knots_mm=smooth.knots_mm.tolist(),
         knots_N=smooth.knots_N.tolist() if isinstance(smooth, Creep) else None,
-        remarks=[RecordRemark.model_validate(remark) for remark in remarks],
+        remarks=[stored.RecordRemark.model_validate(remark) for remark in remarks],
     )
     return trace, smooth, facts
 
 
-def _phases_to_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[RecordPhase]:
+def _phases_to_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[stored.RecordPhase]:
     """What the indenter does, in times of the record and in mm from touch-down."""
     first_s, first_mm = float(trace.time_s[0]), float(trace.displacement_mm[0]) - touch.displacement_mm
     phases = [phase.later(touch.time_s) for phase in smooth.phases]
     if touch.time_s > first_s:
         phases.insert(0, MotionPhase("approach", first_s, touch.time_s, first_mm, 0.0))
-    return [RecordPhase.model_validate(phase) for phase in phases]
+    return [stored.RecordPhase.model_validate(phase) for phase in phases]
 
 
 def run_traces(context: Context, folder: Path) -> None:
@@ -133,7 +125,7 @@ def run_traces(context: Context, folder: Path) -> None:
         for what in still:
             words = f"site {record.name}, {what} hardly gives way, and is not compared"
             context.tell("traces", i, len(recorded), words)
-    write_result(folder / "traces.json", TracesResult(sites=facts))
+    write_result(folder / "traces.json", stored.TracesResult(sites=facts))
 
 
 def read_observed(
@@ -189,7 +181,7 @@ def observed_to_facts(record: Record, seen: SecondaryMeasurement) -> dict[str, A
     facts: dict[str, Any] = {}
     if seen.layers:
         facts["layers"] = {
-            one.tissue: LayerRecord(
+            one.tissue: stored.LayerRecord(
                 thickness_mm=one.thickness_mm,
                 compression_mm=float(one.compression_mm.max()),
                 before=one.before,
@@ -200,7 +192,7 @@ def observed_to_facts(record: Record, seen: SecondaryMeasurement) -> dict[str, A
         }
     if (motion := seen.motion) is not None:
         frames, points, _ = motion.moved_mm.shape
-        facts["surface"] = SurfaceRecord(
+        facts["surface"] = stored.SurfaceRecord(
             points=points,
             frames=frames,
             displacement_mm=motion.max_motion_mm,
@@ -209,7 +201,7 @@ def observed_to_facts(record: Record, seen: SecondaryMeasurement) -> dict[str, A
         )
     if seen.waves:
         facts["waves"] = [
-            WaveRecord(
+            stored.WaveRecord(
                 name=place.name,
                 tissue=place.tissue,
                 depth_mm=place.depth_mm,

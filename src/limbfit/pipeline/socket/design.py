@@ -118,12 +118,15 @@ def run_socket_design(
         mesh, facts = limb.mesh(context, NAME, folder, face)
         kept = ResultFiles(folder / RUNS, also=[context.store[NAME] / RUNS])
         unloaded = SocketRun("", limb, mesh, parameters, face, kept)
-        recipe = _shape_as_pressed(unloaded, plain, target, tell)
+        recipe = _compute_pressed_recipe(unloaded, plain, target, tell)
         designed = _build_face(limb, recipe, {})
         reduced, percent = reduce_to_volume(designed.volume_mm3, limb.outer.skin, limb.frame, plain)
         control = _Design(replace(unloaded, name=CONTROL, face=reduced), {"reduction_percent": percent})
         design = _Design(replace(unloaded, name=DESIGN, face=designed), {"depths_mm": {}})
-        designs, found = _put_on([control, design], context.executor, partial(_tell_after, tell, 1)), None
+        designs, found = (
+            _solve_designs([control, design], context.executor, partial(_tell_after, tell, 1)),
+            None,
+        )
         if optimise:
             best, found = _optimise_depths(context, recipe, designs, optimise, simulations, tell)
             designs.append(best)
@@ -172,7 +175,7 @@ def _tell_after(tell: Tell, before: int, done: float, words: str) -> None:
     tell(before + done, words)
 
 
-def _shape_as_pressed(unloaded: SocketRun, plain: Recipe, target: Target, tell: Tell) -> Recipe:
+def _compute_pressed_recipe(unloaded: SocketRun, plain: Recipe, target: Target, tell: Tell) -> Recipe:
     """How the limb's shape becomes that under the target pressure."""
     limb, mesh, kept = unloaded.limb, unloaded.mesh, unloaded.kept
     assert kept is not None
@@ -209,7 +212,7 @@ def _build_face(limb: SocketLimb, recipe: Recipe, depths: Mapping[str, float]) -
     return face
 
 
-def _put_on(designs: Sequence[_Design], executor: Executor, tell: Tell) -> list[_Design]:
+def _solve_designs(designs: Sequence[_Design], executor: Executor, tell: Tell) -> list[_Design]:
     """With what happens when each is put on and loaded: several side by side on the study's workers."""
     for reason in filter(None, run_sockets([one.run for one in designs], executor, tell)):
         raise RunError(reason)
@@ -281,7 +284,7 @@ def _optimise_depths(
         try:
             face = _build_face(best.run.limb, recipe, depths)
             tried = _Design(replace(best.run, name=name, face=face), {"depths_mm": depths})
-            (made,) = _put_on([tried], context.executor, told)
+            (made,) = _solve_designs([tried], context.executor, told)
         except (SurfaceError, RunError) as error:
             told(1.0, f"{name}: {error}")
             rows.append(_to_row(search.tell(proposed, None), optimise, None, str(error)))

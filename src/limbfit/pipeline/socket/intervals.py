@@ -22,7 +22,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...identify.uncertainty.uncertainty import NORMAL_95
-from ...laws import LAWS, OGDEN, TissueLaw
+from ...laws import LAWS, OGDEN
 from ...study import Study
 
 CHANGE_PERCENT = 10.0  # of a parameter, for which the change of a value is told
@@ -85,7 +85,12 @@ class SimulationSpread:
         own = [(tissue, parameter.name) for tissue in study.tissues for parameter in study.law.parameters]
         simulated = np.array([name in names for name in own])  # fibres that a tissue has not change nothing
         order = [list(names).index(name) for name in own if name in names]
-        keyed = [f"{region}.{_find_key(laws.get(region, LAWS[OGDEN]), name)}" for region, name in names]
+        keys = {
+            tissue: {parameter.name: parameter.key for parameter in law.parameters}
+            for tissue, law in laws.items()
+        }
+        liner = {parameter.name: parameter.key for parameter in LAWS[OGDEN].parameters}
+        keyed = [f"{region}.{keys.get(region, liner)[name]}" for region, name in names]
         return cls(keyed, order, known.select(simulated))
 
     def told(
@@ -116,10 +121,6 @@ class SimulationSpread:
         low, high = low + moved - half - max(fall, 0.0), high + moved + half - min(fall, 0.0)
         interval = [max(min(low, value), 0.0), max(high, value)]
         return interval, found, changes, [moved, float(np.sqrt(further)), fall]
-
-
-def _find_key(law: TissueLaw, name: str) -> str:
-    return next(parameter.key for parameter in law.parameters if parameter.name == name)
 
 
 def spread_to_facts(

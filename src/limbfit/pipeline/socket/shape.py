@@ -106,13 +106,9 @@ def trim_of(study: Study, anatomy: Anatomy) -> Trim:
         return Trim(planes, line)
     knee = find_knee_centre(anatomy)
     below = table.trim_mm if table.trim_mm is not None else (BELOW_CUT_MM if knee is None else BELOW_KNEE_MM)
-    return Trim([(anatomy.cut_point + (_find_top(anatomy) - below) * anatomy.cut_normal, anatomy.cut_normal)])
-
-
-def _find_top(anatomy: Anatomy) -> float:
-    """Height of the tibia's top over the proximal cut, mm; that of the cut where no bone is a tibia."""
     tibia = find_bone(anatomy, "tibia")
-    return 0.0 if tibia is None else float(anatomy.height(tibia.points).max())
+    top = 0.0 if tibia is None else float(anatomy.height(tibia.points).max())  # over the proximal cut, mm
+    return Trim([(anatomy.cut_point + (top - below) * anatomy.cut_normal, anatomy.cut_normal)])
 
 
 def build_regions(study: Study, anatomy: Anatomy) -> dict[str, SkinRegion]:

@@ -98,7 +98,7 @@ class SocketRun:
         table = study.socket.model_dump(mode="json", exclude={"design", "worn_s"})
         return compute_digest(
             *(table, study.material.model_dump(mode="json"), self.parameters, self.sensitivities),
-            *(compute_file_digest(self.kept.folder.parent / MESH), code_digest(put_on)),
+            *(compute_file_digest(self.kept.folder.parent / MESH), code_digest(solve_run)),
             *(face.points.tolist(), face.clear.tolist()),
         )
 
@@ -108,7 +108,7 @@ class SocketRun:
         return f"begun-{self.key}"
 
 
-def put_on(run: SocketRun, tell: Callable[[float, float, str], None]) -> DonningResult:
+def solve_run(run: SocketRun, tell: Callable[[float, float, str], None]) -> DonningResult:
     """Put a socket on and load it; ``tell`` is given the time, the end of all, both s, and words.
 
     Raises
@@ -176,7 +176,7 @@ def simulate_socket(run: SocketRun) -> Made:
     assert run.kept is not None
 
     def make() -> Made:
-        found = put_on(run, lambda time, end, words: report_progress([time / end, words]))
+        found = solve_run(run, lambda time, end, words: report_progress([time / end, words]))
         fields = {
             f"{name}.{part}": getattr(held, part)
             for name, held in found.held.items()

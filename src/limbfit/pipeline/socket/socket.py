@@ -33,7 +33,7 @@ from ..simulation.loading import NEAR_MM, LimbAxis, describe_socket_load, name_l
 from .intervals import CHANGE_PERCENT, FRICTION, ParameterSpread, draw_step, store_change, widen_intervals
 from .limb import SocketLimb
 from .shape import build_loadable_socket, check_at_rest
-from .simulation import SocketRun, put_on, run_sockets, simulate_socket, summarise_run
+from .simulation import SocketRun, run_sockets, simulate_socket, solve_run, summarise_run
 
 NAME = "socket"
 NOT_COMPARED = (
@@ -80,7 +80,7 @@ def run_socket(
     covariance = None if covariance_log is None else np.array(covariance_log)
     kept = ResultFiles(folder / RUNS, also=[context.store[NAME] / RUNS])
     run = SocketRun(NAME, limb, mesh, parameters, socket, kept, covariance is not None)
-    found = put_on(run, partial(context.tell, NAME))
+    found = solve_run(run, partial(context.tell, NAME))
     known = None
     if covariance is not None:
         at, probable = (context.study.vector(one) for one in (parameters, most_probable or parameters))

@@ -29,19 +29,9 @@ from ...identify.uncertainty.uncertainty import (
     choose_verdict,
     format_product,
 )
+from ...results import uncertainty as stored
 from ...results.base import ResultPart
 from ...results.identification import CorrelationMatrix
-from ...results.uncertainty import (
-    EmulatorSummary,
-    EvidenceComparison,
-    IntervalParts,
-    IntervalSummary,
-    LikelihoodProfile,
-    ParameterCombination,
-    ParameterUncertainty,
-    SourceEffect,
-    UncertaintyResult,
-)
 from ..engine.storage import write_atomically, write_curves, write_result, write_rows, write_table
 from ..records.records import SiteRecord
 from .sources import Change
@@ -94,7 +84,7 @@ class Found:
 
     known: Uncertainty
     explored: Exploration
-    evidence: EvidenceComparison | None
+    evidence: stored.EvidenceComparison | None
     gain: FitSensitivity
     changes: tuple[Change, ...]
     unknowns: Unknowns
@@ -126,9 +116,9 @@ def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) ->
     (folder / "predictions").mkdir(exist_ok=True)
     parameters, combinations = _summarise_parameters(found), _summarise_combinations(found)
     rows = [_write_prediction(folder, found, one) for one in predicted]
-    explored, posterior = found.explored, found.explored.posterior
-    predictions = IntervalSummary(sites=rows, **_compute_coverage(rows))
-    content = UncertaintyResult(
+    explored, posterior, emulator = found.explored, found.explored.posterior, found.explored.emulator
+    predictions = stored.IntervalSummary(sites=rows, **_compute_coverage(rows))
+    content = stored.UncertaintyResult(
         parameters=parameters,
         combinations=combinations,
         correlation=CorrelationMatrix(
@@ -137,9 +127,18 @@ def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) ->
         covariance_log=posterior.covariance.tolist(),
         covariance_sources_log=found.source_covariance.tolist(),
         residuals=found.known.residual_model.summarise(),
-        emulator=_summarise_emulator(found),
+        emulator=stored.EmulatorSummary(
+            runs=len(emulator.points),
+            needed_percent=explored.needed_percent,
+            good_enough=explored.good_enough,
+            rounds=explored.rounds,
+            lower=emulator.lower.tolist(),
+            upper=emulator.upper.tolist(),
+            kernel_length=emulator.length,
+            nugget=emulator.nugget,
+        ),
         posterior=posterior.summarise(),
-        profiles={one.name: LikelihoodProfile.model_validate(one) for one in explored.profiles},
+        profiles={one.name: stored.LikelihoodProfile.model_validate(one) for one in explored.profiles},
         checks=explored.checks,
         evidence=found.evidence,
         sources=[_summarise_source(found, change) for change in found.changes],
@@ -163,7 +162,7 @@ def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) ->
     )
 
 
-def _summarise_parameters(found: Found) -> list[ParameterUncertainty]:
+def _summarise_parameters(found: Found) -> list[stored.ParameterUncertainty]:
     """One row for every parameter: calibrated, its interval by every method, the verdict on all sources."""
     known, explored = found.known, found.explored
     posterior = explored.posterior
@@ -184,7 +183,7 @@ def _summarise_parameters(found: Found) -> list[ParameterUncertainty]:
         given = known.verdicts[i] == GIVEN
         factor = np.sqrt(with_sources[1] / with_sources[0])
         rows.append(
-            ParameterUncertainty(
+            stored.ParameterUncertainty(
                 name=name,
                 calibrated=float(known.parameters[i]),
                 median=float(median),
@@ -200,7 +199,7 @@ def _summarise_parameters(found: Found) -> list[ParameterUncertainty]:
     return rows
 
 
-def _summarise_combinations(found: Found) -> list[ParameterCombination]:
+def _summarise_combinations(found: Found) -> list[stored.ParameterCombination]:
     """The principal axes of the posterior, as its draws, the linearisation and the sources see them."""
     known, explored = found.known, found.explored
     logs = np.log(explored.posterior.samples)
@@ -216,7 +215,7 @@ def _summarise_combinations(found: Found) -> list[ParameterCombination]:
         total = float(np.hypot(sd, sources))
         wider = float(factor ** (total / max(sd, 1e-300)))
         rows.append(
-            ParameterCombination(
+            stored.ParameterCombination(
                 text=format_product(weights, known.names),
                 weights=weights.tolist(),
                 linearised_factor_95=float(np.exp(min(NORMAL_95 * linear, 50.0))),
@@ -228,22 +227,7 @@ def _summarise_combinations(found: Found) -> list[ParameterCombination]:
     return rows
 
 
-def _summarise_emulator(found: Found) -> EmulatorSummary:
-    explored = found.explored
-    emulator = explored.emulator
-    return EmulatorSummary(
-        runs=len(emulator.points),
-        needed_percent=explored.needed_percent,
-        good_enough=explored.good_enough,
-        rounds=explored.rounds,
-        lower=emulator.lower.tolist(),
-        upper=emulator.upper.tolist(),
-        kernel_length=emulator.length,
-        nugget=emulator.nugget,
-    )
-
-
-def _summarise_source(found: Found, change: Change) -> SourceEffect:
+def _summarise_source(found: Found, change: Change) -> stored.SourceEffect:
     """One line of the table: change of force in percent of the largest, change of parameters in percent.
 
     A source of each site's own changes parameters by the root of the sum of squares over sites.
@@ -255,7 +239,7 @@ def _summarise_source(found: Found, change: Change) -> SourceEffect:
         shift = found.gain.compute_shift(change.force_N)
     else:
         shift = np.sqrt(np.diag(found.gain.compute_covariance(change.force_N, False, variant.sites)))
-    return SourceEffect(
+    return stored.SourceEffect(
         source=variant.source,
         change=variant.change,
         shared=variant.shared,
@@ -266,7 +250,7 @@ def _summarise_source(found: Found, change: Change) -> SourceEffect:
     )
 
 
-def _write_prediction(folder: Path, found: Found, one: Predicted) -> IntervalParts:
+def _write_prediction(folder: Path, found: Found, one: Predicted) -> stored.IntervalParts:
     """A site's interval as CSV, and its row: how wide, why, and how much of the record lies inside.
 
     Of a site whose prediction failed there is the reason only.
@@ -280,7 +264,7 @@ def _write_prediction(folder: Path, found: Found, one: Predicted) -> IntervalPar
     }
     if one.noise is None:
         missing = ("inside_percent", "half_width_percent", *_SHARES.values())
-        return IntervalParts(**facts | dict.fromkeys(missing))
+        return stored.IntervalParts(**facts | dict.fromkeys(missing))
     parameters = found.known.parameters
     force, measured = one.response.force_N, record.compared
     what, unit = ("displacement" if record.record.forced else "force"), record.record.unit
@@ -311,14 +295,14 @@ def _write_prediction(folder: Path, found: Found, one: Predicted) -> IntervalPar
     )
     inside = (measured >= low) & (measured <= high)
     facts |= {_SHARES[k]: 100 * float(np.sqrt(v.mean())) / peak for k, v in variances.items()}
-    return IntervalParts(
+    return stored.IntervalParts(
         **facts,
         inside_percent=100 * float(inside.mean()),
         half_width_percent=100 * float(half.mean()) / peak,
     )
 
 
-def _compute_coverage(rows: Sequence[IntervalParts]) -> dict[str, float | None]:
+def _compute_coverage(rows: Sequence[stored.IntervalParts]) -> dict[str, float | None]:
     """Mean share of the records inside their intervals, in percent."""
     found: dict[str, float | None] = {}
     for kind, fitted in (("fitted", True), ("heldout", False)):
@@ -331,9 +315,9 @@ def _compute_coverage(rows: Sequence[IntervalParts]) -> dict[str, float | None]:
 
 def _describe_verdict(
     found: Found,
-    parameters: Sequence[ParameterUncertainty],
-    combinations: Sequence[ParameterCombination],
-    predictions: IntervalSummary,
+    parameters: Sequence[stored.ParameterUncertainty],
+    combinations: Sequence[stored.ParameterCombination],
+    predictions: stored.IntervalSummary,
 ) -> list[str]:
     """The answer in sentences."""
     words = []

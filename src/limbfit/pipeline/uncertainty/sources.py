@@ -20,9 +20,9 @@ from ...anatomy.sites.sites import compute_indenter_axis, project_to_skin
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...arrays import Array
 from ...fe import ORDER_IN_TIME
-from ...indentation import SimulationJob, SiteModel
+from ...indentation import SimulationJob, SiteModel, to_vector3
 from ...shapes import SHAPES
-from ...study import SolverTable, Study, Vector
+from ...study import Study
 from ..engine.context import Context
 from ..identification.fine_meshes import estimate_own_mesh_error
 from ..limb.mesh import build_coarse_settings, mesh_settings, plan_meshes, scale_edges
@@ -94,10 +94,18 @@ def build_variants(
         moved = [_move_site(context, model, number, table.position_mm) for model in models]
         found.append(vary("site position", f"{table.position_mm:g} mm {word}", moved, False, True))
     for number, word in enumerate(("along the limb", "around the limb")):
-        tilted = [replace(m, axis=_tilt_axis(m, number, table.axis_degrees)) for m in models]
+        angle = np.radians(table.axis_degrees)
+        axes = [
+            np.cos(angle) * np.array(m.axis) + np.sin(angle) * _build_tangents(np.array(m.axis))[number]
+            for m in models
+        ]
+        tilted = [replace(m, axis=to_vector3(axis)) for m, axis in zip(models, axes, strict=True)]
         found.append(vary("site axis", f"{table.axis_degrees:g} degrees {word}", tilted, False, True))
     found += _build_contact_variants(context.study, models, vary)
-    finer = [replace(m, steps=_refine_steps(m)) for m in models]
+    finer = []
+    for m in models:
+        counts = {key: MORE_STEPS * getattr(m.steps, key) for key in ("load_steps", "unload_steps")}
+        finer.append(replace(m, steps=m.steps.model_copy(update=counts)))
     change = f"{MORE_STEPS} times as many, extrapolated at order {ORDER_IN_TIME:g}"
     in_time = vary("time steps", change, finer, True, True)
     found.append(replace(in_time, scale=estimate_coarse_error(ORDER_IN_TIME, MORE_STEPS)))
@@ -117,7 +125,10 @@ def _build_contact_variants(study: Study, models: Sequence[SiteModel], vary: Var
             for m in models
         ]
         found.append(vary("indenter edge", f"radius {radius:g} mm larger", rounded, True, True))
-    others = [_change_friction(m) for m in models]
+    swapped = {"frictionless": "sticky"}  # all others slip freely
+    others = [
+        _change_indenter(m, friction=swapped.get(str(m.indenter.friction), "frictionless")) for m in models
+    ]
     word = " or ".join(dict.fromkeys(str(m.indenter.friction) for m in others))
     found.append(vary("friction", word, others, True, False))
     softer = [replace(m, kappa_ratio=m.kappa_ratio / 2) for m in models]
@@ -125,19 +136,8 @@ def _build_contact_variants(study: Study, models: Sequence[SiteModel], vary: Var
     return found
 
 
-def _change_friction(model: SiteModel) -> SiteModel:
-    other = "sticky" if model.indenter.friction == "frictionless" else "frictionless"
-    return _change_indenter(model, friction=other)
-
-
 def _change_indenter(model: SiteModel, **changes: object) -> SiteModel:
     return replace(model, indenter=model.indenter.model_copy(update=changes))
-
-
-def _refine_steps(model: SiteModel) -> SolverTable:
-    steps = model.steps
-    update = {"load_steps": MORE_STEPS * steps.load_steps, "unload_steps": MORE_STEPS * steps.unload_steps}
-    return steps.model_copy(update=update)
 
 
 def _build_tangents(axis: Array) -> tuple[Array, Array]:
@@ -160,18 +160,7 @@ def _move_site(context: Context, model: SiteModel, number: int, distance_mm: flo
     )
     axis = axis + turned
     axis /= np.linalg.norm(axis)
-    return replace(model, position=_to_vector(point), axis=_to_vector(axis))
-
-
-def _tilt_axis(model: SiteModel, number: int, degrees: float) -> Vector:
-    axis, angle = np.array(model.axis), np.radians(degrees)
-    turned = np.cos(angle) * axis + np.sin(angle) * _build_tangents(axis)[number]
-    return _to_vector(turned)
-
-
-def _to_vector(values: Array) -> Vector:
-    x, y, z = map(float, values)
-    return x, y, z
+    return replace(model, position=to_vector3(point), axis=to_vector3(axis))
 
 
 def choose_searched_settings(study: Study) -> MeshSettings:

@@ -16,7 +16,6 @@ from ..limb.mesh import mesh_job, mesh_settings, read_mesh_facts, scale_edges
 from ..limb.remesh import mesh_models
 from ..simulation.extrapolation import MESH_ORDERS, extrapolate_richardson
 from ..simulation.limb_geometry import LimbGeometry
-from ..simulation.simulations import open_experiment_cache
 from .variants import (
     ChosenSite,
     Variant,
@@ -48,14 +47,10 @@ def run_refinement(context: Context, folder: Path, *, sites: Sequence[str], fact
     """Force at sites on meshes whose edges are ``factors`` times the study's, and what it tends to."""
     parameters, chosen = context.results.calibration.parameters, choose_sites(context, sites)
     variants = _build_variants(context, folder, chosen, _choose_factors(factors), parameters)
-    cache = open_experiment_cache(context, folder)
-    simulations = simulate_variants(context, folder, "sensitivity-mesh", variants, cache)
-    content = RefinementResult(
-        sites=[RefinedSite(**dict(one.summary), **_find_limit(one, variants, simulations)) for one in chosen],
-        runs=compare_variants(variants, simulations, RefinementRun),
-        parameters=parameters,
-    )
-    store_variants(folder, content, content.runs)
+    simulations = simulate_variants(context, folder, RefinementResult, variants)
+    refined = [RefinedSite(**dict(one.summary), **_find_limit(one, variants, simulations)) for one in chosen]
+    runs = compare_variants(variants, simulations, RefinementRun)
+    store_variants(context, folder, RefinementResult, runs, sites=refined)
 
 
 def _build_variants(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,9 @@ from ..identification.intervals import sample_intervals
 from ..identification.problem import CalibrationProblem, build_problem
 from ..identification.record_simulator import RecordSimulator
 from ..identification.search import search_parameters
-from ..records.records import SiteRecord, load_records, load_site_record, to_response
+from ..records.records import load_records, load_site_record, to_response
 from ..simulation.limb_geometry import LimbGeometry
-from ..simulation.simulations import SimulationCache, open_experiment_cache
+from ..simulation.simulations import open_experiment_cache
 
 CHOICES = ("all", "fitted")
 
@@ -54,9 +54,14 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> None:
         _summarise_region(context, problem, simulators[name], name, members[name], fit, folder)
         for name, fit in found.items()
     ]
+    recorded = [site for site in study.sites if study.records_at(site)]
+    without = [site.name for site in recorded if not site.region]
+    unfitted = dict.fromkeys(site.region for site in recorded if site.region and site.region not in members)
+    left_out = [f"region {name}: none of its sites is fitted" for name in unfitted]
+    left_out += [f"sites without a region: {', '.join(without)}"] if without else []
     content = RegionsResult(
         sites_used=sites,
-        left_out=_describe_left_out(context, members),
+        left_out=left_out,
         whole=WholeLimbFit(
             name=stages[-1].name,
             start=stages[0].start,
@@ -64,7 +69,8 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> None:
             fitted_sites=[site.name for site in study.fitted],
         ),
         regions=rows,
-        **_compute_means(rows),
+        mean_own_error_percent=_average_sites(row.own_error_percent_by_site for row in rows),
+        mean_whole_error_percent=_average_sites(row.whole_error_percent_by_site for row in rows),
     )
     write_result(folder / "regions.json", content)
     _write_tables(folder, content)
@@ -97,15 +103,6 @@ def _group_by_region(context: Context, sites: str) -> dict[str, tuple[list[Site]
     return found
 
 
-def _describe_left_out(context: Context, members: dict[str, Any]) -> list[str]:
-    """What no region's model is judged on, in words."""
-    recorded = [site for site in context.study.sites if context.study.records_at(site)]
-    without = [site.name for site in recorded if not site.region]
-    regions = dict.fromkeys(site.region for site in recorded if site.region and site.region not in members)
-    words = [f"region {name}: none of its sites is fitted" for name in regions]
-    return words + ([f"sites without a region: {', '.join(without)}"] if without else [])
-
-
 def _build_region(
     context: Context, problem: CalibrationProblem, simulator: RecordSimulator, mine: Sequence[Site]
 ) -> RegionRecords:
@@ -115,18 +112,12 @@ def _build_region(
         return search_parameters(problem, simulator, start, problem.stages[-1:])[0]
 
     def simulate(parameters: Array) -> list[SiteResponse]:
-        return _simulate_forces(context, simulator.cache, records, parameters)
+        """On the study's own meshes; with derivatives where the study's prediction has made them so."""
+        apart = context.study.is_searched_apart
+        jobs = [record.own_job(parameters) if apart else record.job(parameters) for record in records]
+        return [to_response(one) for one in simulator.cache.run(jobs, context.executor)]
 
     return RegionRecords(identify, simulate, tuple(record.measured for record in records))
-
-
-def _simulate_forces(
-    context: Context, cache: SimulationCache, records: Sequence[SiteRecord], parameters: Array
-) -> list[SiteResponse]:
-    """Forces on the study's own meshes; with derivatives where the study's prediction has made them so."""
-    apart = context.study.is_searched_apart
-    jobs = [record.own_job(parameters) if apart else record.job(parameters) for record in records]
-    return [to_response(one) for one in cache.run(jobs, context.executor)]
 
 
 def _summarise_region(
@@ -162,14 +153,9 @@ def _summarise_region(
     )
 
 
-def _compute_means(rows: Sequence[RegionFitted]) -> dict[str, float | None]:
-    """Mean error over all sites, each with its own region's model and with the whole limb's."""
-    own = {site: error for row in rows for site, error in row.own_error_percent_by_site.items()}
-    whole = {site: error for row in rows for site, error in row.whole_error_percent_by_site.items()}
-    return {
-        "mean_own_error_percent": average_errors(own),
-        "mean_whole_error_percent": average_errors(whole),
-    }
+def _average_sites(errors: Iterable[Mapping[str, float | None]]) -> float | None:
+    """Mean error over the sites of all regions."""
+    return average_errors({site: error for of_region in errors for site, error in of_region.items()})
 
 
 def _write_tables(folder: Path, content: RegionsResult) -> None:

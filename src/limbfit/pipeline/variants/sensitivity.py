@@ -27,32 +27,14 @@ from ...indentation import (
     to_parameters,
 )
 from ...mesh import read_vtu
-from ...results.variants import (
-    ForceDerivative,
-    FrictionResult,
-    FrictionRun,
-    IndenterResult,
-    IndenterRun,
-    StiffnessResult,
-    StiffnessRun,
-    VolumeResult,
-    VolumeRun,
-)
+from ...results import variants as stored
 from ...shapes import BUILTIN_SHAPES, SHAPES
 from ...study import IndenterTable
 from ..engine.context import Context
 from ..engine.storage import write_table
 from ..records.records import load_records
 from ..simulation.simulations import SimulationCache, open_experiment_cache
-from .variants import (
-    ChosenSite,
-    Variant,
-    choose_sites,
-    compare_variants,
-    measure_tissue_over_bone,
-    simulate_variants,
-    store_variants,
-)
+from .variants import ChosenSite, Variant, choose_sites, measure_tissue_over_bone, run_variants
 
 NO_VOLUME = dict.fromkeys(("J_min", "J_low", "J_high", "J_max", "beyond_percent"))
 ALLOWED = 0.01  # departure of J from one that the paper's bulk modulus is to keep to
@@ -121,23 +103,13 @@ def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str]) -> No
     if "m" in law.keys:
         m = float(np.exp(np.mean([np.log(values["m"]) for values in identified.values()])))
         equal = {tissue: values | {"m": m} for tissue, values in identified.items()}
-    chosen = choose_sites(context, sites)
+    chosen, cache = choose_sites(context, sites), open_experiment_cache(context, folder)
     variants = [variant for one in chosen for variant in _build_stiffer(one, equal, law.moduli)]
-    cache = open_experiment_cache(context, folder)
-    simulations = simulate_variants(context, folder, "sensitivity-c", variants, cache)
-    content = StiffnessResult(
-        sites=[one.summary for one in chosen],
-        runs=compare_variants(variants, simulations, StiffnessRun),
-        parameters=identified,
-        equal_m=m,
-        factors=FACTORS,
-        local=_collect_derivatives(context, cache, identified),
-    )
-    store_variants(folder, content, content.runs)
+    local = _collect_derivatives(context, cache, identified)
+    more = {"equal_m": m, "factors": FACTORS, "local": local}
+    run_variants(context, folder, stored.StiffnessResult, stored.StiffnessRun, variants, cache, **more)
     heads = ["site", "region", "tissue_mm", *(f"{tissue}_c" for tissue in identified)]
-    rows = [
-        [row.site, row.region, row.tissue_mm, *row.peak_percent_per_percent.values()] for row in content.local
-    ]
+    rows = [[row.site, row.region, row.tissue_mm, *row.peak_percent_per_percent.values()] for row in local]
     write_table(folder / "derivatives.csv", heads, rows)
 
 
@@ -159,7 +131,7 @@ def _build_stiffer(chosen: ChosenSite, equal: Parameters, moduli: Sequence[str])
 
 def _collect_derivatives(
     context: Context, cache: SimulationCache, identified: Parameters
-) -> list[ForceDerivative]:
+) -> list[stored.ForceDerivative]:
     """Of every record of a force: change of the largest one in percent for one percent more of a modulus.
 
     It is each tissue's first.  They are of where parameters are searched, as those of the prediction.
@@ -167,7 +139,7 @@ def _collect_derivatives(
     study = context.study
     records = load_records(context, [record for record in study.recorded if not record.forced]).searched
     best = study.vector(identified)
-    rows: list[ForceDerivative] = []
+    rows: list[stored.ForceDerivative] = []
     for record, found in zip(
         records, cache.run([record.job(best) for record in records], context.executor), strict=True
     ):
@@ -176,7 +148,7 @@ def _collect_derivatives(
         peak = int(np.argmax(found.force_N))
         relative = found.jacobian[peak] * best / found.force_N[peak]
         rows.append(
-            ForceDerivative(
+            stored.ForceDerivative(
                 site=record.name,
                 region=record.site.region,
                 tissue_mm=measure_tissue_over_bone(record.model),
@@ -193,34 +165,23 @@ def _collect_derivatives(
 
 def run_kappa(context: Context, folder: Path, *, sites: Sequence[str], ratios: Sequence[float]) -> None:
     """Force and change of volume against the ratio of bulk modulus and ``c``."""
-    identified, chosen = context.results.calibration.parameters, choose_sites(context, sites)
-    own = context.study.material.kappa_ratio
-    # Kept apart from simulations without volumes, which have the same key.
-    cache = SimulationCache(folder / "volumes", work=simulate_with_volumes)
+    identified, own = context.results.calibration.parameters, context.study.material.kappa_ratio
     variants = [
         Variant(
             one,
             replace(one.model, kappa_ratio=ratio),
             identified,
             f"kappa = {ratio:g} c",
-            {"kappa_ratio": ratio},
+            {"kappa_ratio": ratio, **NO_VOLUME},
             base=ratio == own,
         )
-        for one in chosen
+        for one in choose_sites(context, sites)
         for ratio in sorted({own, *map(float, ratios)})
     ]
-    simulations = simulate_variants(context, folder, "sensitivity-kappa", variants, cache)
-    measured = [
-        replace(variant, facts=variant.facts | simulation.facts.get("volume", NO_VOLUME))
-        for variant, simulation in zip(variants, simulations, strict=True)
-    ]
-    content = VolumeResult(
-        sites=[one.summary for one in chosen],
-        runs=compare_variants(measured, simulations, VolumeRun),
-        parameters=identified,
-        kappa_ratio=own,
-    )
-    store_variants(folder, content, content.runs)
+    # Kept apart from simulations without volumes, which have the same key.
+    cache = SimulationCache(folder / "volumes", work=simulate_with_volumes)
+    models = stored.VolumeResult, stored.VolumeRun
+    run_variants(context, folder, *models, variants, cache, kappa_ratio=own)
 
 
 def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> None:
@@ -238,15 +199,8 @@ def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> None
         for one in chosen
         for friction in dict.fromkeys((one.model.indenter.friction, "frictionless", "sticky"))
     ]
-    cache = open_experiment_cache(context, folder)
-    simulations = simulate_variants(context, folder, "sensitivity-contact", variants, cache)
-    content = FrictionResult(
-        sites=[one.summary for one in chosen],
-        runs=compare_variants(variants, simulations, FrictionRun),
-        parameters=identified,
-        friction=chosen[0].model.indenter.friction,
-    )
-    store_variants(folder, content, content.runs)
+    models, friction = (stored.FrictionResult, stored.FrictionRun), chosen[0].model.indenter.friction
+    run_variants(context, folder, *models, variants, friction=friction)
 
 
 def run_indenter(context: Context, folder: Path, *, sites: Sequence[str]) -> None:
@@ -264,14 +218,7 @@ def run_indenter(context: Context, folder: Path, *, sites: Sequence[str]) -> Non
         for one in chosen
         for label, table, base in list_other_indenters(one.model.indenter)
     ]
-    cache = open_experiment_cache(context, folder)
-    simulations = simulate_variants(context, folder, "sensitivity-indenter", variants, cache)
-    content = IndenterResult(
-        sites=[one.summary for one in chosen],
-        runs=compare_variants(variants, simulations, IndenterRun),
-        parameters=identified,
-    )
-    store_variants(folder, content, content.runs)
+    run_variants(context, folder, stored.IndenterResult, stored.IndenterRun, variants)
 
 
 def list_other_indenters(own: IndenterTable) -> list[tuple[str, IndenterTable, bool]]:

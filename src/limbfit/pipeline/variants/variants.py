@@ -23,6 +23,7 @@ from ..simulation.simulations import (
     CURVE_POINTS,
     SimulationCache,
     build_curve_job,
+    open_experiment_cache,
 )
 
 Run = TypeVar("Run", bound=VariantRun)
@@ -110,19 +111,37 @@ def measure_tissue_over_bone(model: SiteModel) -> float:
     return found
 
 
+def run_variants(
+    context: Context,
+    folder: Path,
+    result: type[StoredResult],
+    run: type[VariantRun],
+    variants: Sequence[Variant],
+    cache: SimulationCache | None = None,
+    **more: Any,
+) -> None:
+    """Simulate variants and store a ``result`` with a ``run`` of each, and ``more`` of its keys."""
+    simulations = simulate_variants(context, folder, result, variants, cache)
+    sites = {variant.model.name: variant.chosen.summary for variant in variants}
+    runs = compare_variants(variants, simulations, run)
+    store_variants(context, folder, result, runs, sites=list(sites.values()), **more)
+
+
 def simulate_variants(
     context: Context,
     folder: Path,
-    name: str,
+    result: type[StoredResult],
     variants: Sequence[Variant],
-    cache: SimulationCache,
+    cache: SimulationCache | None = None,
 ) -> list[Simulation]:
     """Simulate them all, in order, and write the curves of each site."""
+    cache = open_experiment_cache(context, folder) if cache is None else cache
     done: list[Simulation] = []
     found = cache.run([variant.job() for variant in variants], context.executor)
     for variant, simulation in zip(variants, found, strict=True):
         done.append(simulation)
-        context.tell(name, len(done), len(variants), f"site {simulation.site}, {variant.label}")
+        words = f"site {simulation.site}, {variant.label}"
+        context.tell(Path(result.FILE).stem, len(done), len(variants), words)
     _write_curves(folder, variants, done)
     return done
 
@@ -145,7 +164,7 @@ def compare_variants(
             site=variant.model.name,
             label=variant.label,
             base=variant.base,
-            **variant.facts,
+            **variant.facts | simulation.facts.get("volume", {}),
             peak_force_N=float(simulation.force_N.max()) if simulation.completed else None,
             **_change(simulation, base[variant.model.name]),
             penetration_mm=simulation.penetration_mm,
@@ -170,9 +189,13 @@ def _change(simulation: Simulation, base: Simulation) -> dict[str, float | None]
     }
 
 
-def store_variants(folder: Path, content: StoredResult, runs: Sequence[VariantRun]) -> None:
+def store_variants(
+    context: Context, folder: Path, result: type[StoredResult], runs: Sequence[VariantRun], **more: Any
+) -> None:
     """The result as JSON, and its runs as ``runs.csv``."""
-    write_result(folder / Path(content.FILE).name, content)
+    parameters = context.results.calibration.parameters
+    content = result.model_validate({"runs": runs, "parameters": parameters, **more})
+    write_result(folder / Path(result.FILE).name, content)
     write_rows(folder / "runs.csv", runs, leave_out=("warnings", "label", "base"))
 
 
