@@ -41,7 +41,7 @@ def edit(file: Path, change) -> None:
 
 
 def test_every_result_is_among_the_kept_files():
-    """But those that tests/pipeline/experiments writes: test_models.py and test_socket_design.py."""
+    """But those that tests/pipeline writes: commands/test_models.py and socket/test_socket_design.py."""
     assert {name for name, _, _ in KEPT} == set(MODELS) - {"socket_design", "models", "models_socket"}
 
 
