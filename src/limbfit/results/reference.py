@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Union, get_args, get_origin
-
-from pydantic.fields import FieldInfo
 
 from ..errors import InputError
 from .base import ResultPart
@@ -85,22 +82,16 @@ def _find_models(annotation: Any) -> Iterator[type[ResultPart]]:
 
 
 def _format_table(model: type[ResultPart]) -> str:
-    rows = [_format_row(name, field) for name, field in model.model_fields.items()]
-    return "\n".join(["| key | value | unit | meaning |", "|---|---|---|---|", *rows, ""])
-
-
-def _format_row(name: str, field: FieldInfo) -> str:
-    meaning = field.description or ""
-    if not field.is_required():
-        meaning += " Absent where it does not apply."
-    return f"| `{name}` | {_format_type(field.annotation)} | {_find_unit(name)} | {meaning} |"
-
-
-def _find_unit(name: str) -> str:
-    """The unit that ends a key, or stands before ``_by_site``."""
-    plain = re.sub(r"_by_site$", "", name)
-    unit = max((unit for unit in _UNITS if plain.endswith(f"_{unit}")), key=len, default="")
-    return _UNIT_WORDS.get(unit, unit.replace("percent", "%"))
+    rows = ["| key | value | unit | meaning |", "|---|---|---|---|"]
+    for name, field in model.model_fields.items():
+        # The unit ends a key, or stands before ``_by_site``.
+        plain = name.removesuffix("_by_site")
+        unit = max((unit for unit in _UNITS if plain.endswith(f"_{unit}")), key=len, default="")
+        unit = _UNIT_WORDS.get(unit, unit.replace("percent", "%"))
+        absent = "" if field.is_required() else " Absent where it does not apply."
+        meaning = f"{field.description or ''}{absent}"
+        rows.append(f"| `{name}` | {_format_type(field.annotation)} | {unit} | {meaning} |")
+    return "\n".join([*rows, ""])
 
 
 def _format_type(annotation: Any) -> str:

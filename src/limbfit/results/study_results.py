@@ -110,12 +110,9 @@ class StudyResults:
         return read_curves(file)
 
 
-def _list_models() -> dict[str, type[StoredResult]]:
-    kinds = vars(StudyResults).items()
-    return {name: kind.model for name, kind in kinds if isinstance(kind, Single | Each)}
-
-
-MODELS = _list_models()  # of each stored result, by its attribute
+MODELS: dict[str, type[StoredResult]] = {  # of each stored result, by its attribute
+    name: kind.model for name, kind in vars(StudyResults).items() if isinstance(kind, Single | Each)
+}
 
 
 def load_results(study: HasResults | str | Path) -> StudyResults:

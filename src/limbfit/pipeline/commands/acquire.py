@@ -13,24 +13,8 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from ... import acquire
 from ..._version import __version__
-from ...acquire import (
-    Event,
-    LineDevice,
-    Listener,
-    NoOperator,
-    RecordedRamp,
-    Recorder,
-    Session,
-    Settings,
-    Update,
-    check_record,
-    connect,
-    find_ramps,
-    prioritise,
-    read_recording,
-    run_session,
-)
 from ...acquire.virtual import Fault, Serving, Surrogate, VirtualFitSocket, VirtualLimb, fit_surrogate, serve
 from ...errors import InputError, TraceError
 from ...results.curves import read_curves
@@ -57,11 +41,11 @@ def acquire_site(
     name: str,
     *,
     address: str,
-    operator: SimpleQueue[Event] | None = None,
-    stops: SimpleQueue[Event] | None = None,
+    operator: SimpleQueue[acquire.Event] | None = None,
+    stops: SimpleQueue[acquire.Event] | None = None,
     depth_mm: float | None = None,
     replace_record: bool = False,
-    listener: Listener | None = None,
+    listener: acquire.Listener | None = None,
 ) -> dict[str, Any]:
     """Record a site, or one of its records, on a device, judge it, and put it where the study names it.
 
@@ -94,21 +78,21 @@ def acquire_site(
     settings = check_recording(
         study, name, depth_mm=depth_mm, unattended=operator is None, replace_record=replace_record
     )
-    device = LineDevice(connect(address))
+    device = acquire.LineDevice(acquire.connect(address))
     try:
         with translate_disk_errors(study.folder):
             stamp = f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"[:-3]
             folder = study.folder / FOLDER / one.name / stamp
             folder.mkdir(parents=True)
-            recorder = Recorder(folder / RECORD, _head(one, site, settings, device, operator is None))
+            recorder = acquire.Recorder(folder / RECORD, _head(one, site, settings, device, operator is None))
     except BaseException:
         device.close()
         raise
     events = operator if operator is not None else stops if stops is not None else SimpleQueue()
-    told = _join_listeners(NoOperator(events), listener) if operator is None else listener
+    told = _join_listeners(acquire.NoOperator(events), listener) if operator is None else listener
     try:
-        session = Session(settings, device, site=site.name, recorder=recorder, listener=told)
-        ending = run_session(session, events)
+        session = acquire.Session(settings, device, site=site.name, recorder=recorder, listener=told)
+        ending = acquire.run_session(session, events)
     finally:
         recorder.close()
     found = {
@@ -133,7 +117,7 @@ def check_recording(
     depth_mm: float | None = None,
     unattended: bool = False,
     replace_record: bool = False,
-) -> Settings:
+) -> acquire.Settings:
     """The device's settings for a site, or one of its records; see `acquire_site`.
 
     Raises
@@ -164,9 +148,9 @@ def judge_recording(file: Path) -> dict[str, Any]:
     TraceError
         Where it is no record.
     """
-    recording = read_recording(file)
+    recording = acquire.read_recording(file)
     try:
-        verdict, count = check_record(recording).to_dict(), len(find_ramps(recording))
+        verdict, count = acquire.check_record(recording).to_dict(), len(acquire.find_ramps(recording))
     except (KeyError, TypeError, ValueError):
         raise TraceError("its head or its events lack what a verdict needs", file=file) from None
     seconds = float(np.ptp(recording.device_us)) / 1e6 if recording.device_us.size else 0.0
@@ -207,12 +191,12 @@ def _check_inside(study: Study, one: Indentation) -> None:
 
 def build_device_settings(
     study: Study, one: Indentation, depth_mm: float | None, unattended: bool
-) -> Settings:
+) -> acquire.Settings:
     """Those of ``[acquire]``, with what the record states of its own."""
     own = {"ramp_speed_mm_s": one.speed_mm_s, "hold_s": one.hold_s} if isinstance(one, Record) else {}
     stated = {key: value for key, value in own.items() if value is not None}
     try:
-        settings = Settings(**(study.acquire.model_dump() | stated))
+        settings = acquire.Settings(**(study.acquire.model_dump() | stated))
     except ValidationError as error:
         what = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
         raise InputError(what, file=study.file, place=_place(one).removesuffix(".trace")) from None
@@ -242,7 +226,7 @@ def build_device_settings(
 
 
 def _head(
-    one: Indentation, site: Site, settings: Settings, device: LineDevice, unattended: bool
+    one: Indentation, site: Site, settings: acquire.Settings, device: acquire.LineDevice, unattended: bool
 ) -> dict[str, Any]:
     identity = asdict(device.identity)
     del identity["nonce"]
@@ -253,14 +237,14 @@ def _head(
         "begun": datetime.now(UTC).isoformat(timespec="milliseconds"),
         "limbfit": __version__,
         "unattended": unattended,
-        "priority": prioritise(),
+        "priority": acquire.prioritise(),
         "device": identity,
         "settings": settings.model_dump(),
     }
 
 
-def _join_listeners(first: Listener, second: Listener | None) -> Listener:
-    def tell(told: Update) -> None:
+def _join_listeners(first: acquire.Listener, second: acquire.Listener | None) -> acquire.Listener:
+    def tell(told: acquire.Update) -> None:
         first(told)
         if second is not None:
             second(told)
@@ -273,9 +257,9 @@ def _keep(study: Study, one: Indentation, folder: Path, completed: bool) -> dict
     files: dict[str, Any] = {"record": str(folder / RECORD), "trace": None}
     if not completed:
         return {"verdict": None, "files": files}
-    recording = read_recording(folder / RECORD)
-    verdict = check_record(recording).to_dict()
-    found = find_ramps(recording)
+    recording = acquire.read_recording(folder / RECORD)
+    verdict = acquire.check_record(recording).to_dict()
+    found = acquire.find_ramps(recording)
     with translate_disk_errors(study.folder):
         for ramp in found:
             _write_ramp(study, folder / f"ramp-{ramp.cycle}.csv", ramp)
@@ -293,7 +277,7 @@ def _keep(study: Study, one: Indentation, folder: Path, completed: bool) -> dict
     return {"verdict": verdict, "files": files}
 
 
-def _write_ramp(study: Study, file: Path, ramp: RecordedRamp) -> None:
+def _write_ramp(study: Study, file: Path, ramp: acquire.RecordedRamp) -> None:
     keys = ("time_s", "displacement_mm", "force_N")
     columns = {getattr(study.traces, key): getattr(ramp.trace, key) for key in keys}
     work = file.with_name(f".{file.name}.work")
@@ -354,5 +338,5 @@ def serve_fitsocket(
     device: VirtualFitSocket, serving: Serving, *, speed: float = 1.0, tell: Callable[[str], None]
 ) -> None:
     """Serve a virtual device until `Serving.stop`; its thread asks for real-time priority."""
-    tell(f"priority: {prioritise()}")
+    tell(f"priority: {acquire.prioritise()}")
     serve(device, serving, speed=speed, tell=tell)

@@ -15,7 +15,7 @@ from ...identify.checks.domain import Extent, RecordedRange, describe_outside
 from ...indentation import read_indenter
 from ...results.identification import OutsideRecords
 from ...results.records import TraceFacts
-from ...study import ClampsTable, Record, Site, Study
+from ...study import Record, Site, Study
 from ...traces import SurfaceMotion
 from ..engine.context import Listener, Progress, ignore_progress
 from ..engine.store import Store
@@ -88,7 +88,12 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
         known = (f"{name} {p.median:g}, factor {p.factor:g}" for name, p in study.priors.items())
         facts.append(f"lognormal priors (median, one standard deviation): {'; '.join(known)}")
     steps = {name: float(np.median(np.diff(trace.time_s))) for name, (trace, _, _) in read.items()}
-    limb = _read_limb(study, given)
+    store, limb = Store(study.results), None
+    if given is not None:
+        places = {site.name: place_site(site, study, given, None) for site in study.sites}
+        limb = LimbGeometry(given, places)
+    elif store.stamp("sites") and store.state("sites", compute_keys(study)["sites"]).state == "done":
+        limb = LimbGeometry.stored(store)
     placed, anatomy = (limb.places, limb.anatomy) if limb is not None else ({}, None)
     facts += _describe_surface_motion(study, {name: one.motion for name, one in seen.items()}, limb)
     for name, one in seen.items():
@@ -104,7 +109,13 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
     if "socket" in study.model_fields_set:
         facts += _describe_socket(study, anatomy, bones)
     if study.clamps is not None:
-        facts.append(_describe_clamps(study, study.clamps, limb))
+        pins = study.clamps
+        said = f"clamps: {len(pins.angles)} pins of {pins.force_N:g} N, {pins.begun_s:g} s before touch-down"
+        if limb is None:
+            facts.append(f"{said}; they are placed after limbfit run --until sites")
+        else:
+            held = [f"{count} at site {name}" for name, count in limb.clamping_pins(study).items()]
+            facts.append(f"{said}; {', '.join(held)} meet the skin")
     refused = list_refused_commands(study, limb)
     facts += [f"cannot run: limbfit {', '.join(row['commands'])}: {row['why']}" for row in refused]
     flags = record_flags(study, records, steps, placed, anatomy)
@@ -209,16 +220,6 @@ def _describe_surface_motion(
         yield said
 
 
-def _read_limb(study: Study, given: Anatomy | None) -> LimbGeometry | None:
-    """The limb of given surfaces or of stages that are done; else None."""
-    if given is not None:
-        return LimbGeometry(given, {site.name: place_site(site, study, given, None) for site in study.sites})
-    store = Store(study.results)
-    if store.stamp("sites") is None or store.state("sites", compute_keys(study)["sites"]).state != "done":
-        return None
-    return LimbGeometry.stored(store)
-
-
 def _describe_image(study: Study) -> tuple[list[str], tuple[str, ...] | None]:
     """Facts, and the names of the bones where a label map is given."""
     volume = read_study_image(study)
@@ -235,17 +236,6 @@ def _describe_image(study: Study) -> tuple[list[str], tuple[str, ...] | None]:
         facts.append("corrected labels: " + ", ".join(labels.names.values()))
         facts += [f"label map: {note}" for note in notes]
     return facts, bones
-
-
-def _describe_clamps(study: Study, clamps: ClampsTable, limb: LimbGeometry | None) -> str:
-    """What ``[clamps]`` says; where the limb is known, how many of the pins hold it at each site."""
-    said = (
-        f"clamps: {len(clamps.angles)} pins of {clamps.force_N:g} N, {clamps.begun_s:g} s before touch-down"
-    )
-    if limb is None:
-        return f"{said}; they are placed after limbfit run --until sites"
-    held = [f"{count} at site {name}" for name, count in limb.clamping_pins(study).items()]
-    return f"{said}; {', '.join(held)} meet the skin"
 
 
 def _describe_socket(study: Study, anatomy: Anatomy | None, bones: Collection[str] | None) -> list[str]:

@@ -10,22 +10,11 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from ... import febio
 from ...arrays import Array
 from ...errors import ProblemError
 from ...fe import Problem, Result, System, solve
 from ...fe.solution.control import schedule_steps
-from ...febio import (
-    TIME_TOLERANCE,
-    FacePenalties,
-    FebioLog,
-    RunVerdict,
-    build_contact,
-    build_result,
-    compute_end_time,
-    compute_mean_penalty,
-    find_febio,
-    read_log,
-)
 from ...indentation import Parameters, build_first_steps
 from ...results.runs import CompareResult, CurveDifference, CurveFiles, FebioSimulation, LimbfitSimulation
 from ...study import Study
@@ -61,8 +50,8 @@ def compare_site(
         Where FEBio is absent and no table is given, where the table is not one of this indentation, and as
         `prepare_site`.
     """
-    program = find_febio(study.febio.program) if febio_log is None else None
-    log = None if febio_log is None else read_log(febio_log)
+    program = febio.find_febio(study.febio.program) if febio_log is None else None
+    log = None if febio_log is None else febio.read_log(febio_log)
     found = prepare_site(study, name, parameters=parameters, listener=listener)
     folder, name = found.context.store["compare"], found.name
     folder.mkdir(parents=True, exist_ok=True)
@@ -72,14 +61,31 @@ def compare_site(
         other, _ = run_febio_site(found, program, folder / f"{name}.febio")
     else:
         assert log is not None
-        other = _build_log_result(problem, log, Path(str(febio_log)))
+        reached, end = float(log.times[-1]), febio.compute_end_time(problem)
+        complete = reached > end * (1.0 - febio.TIME_TOLERANCE)
+        reason = "" if complete else f"the table ends at {reached:.4g} s of {end:.4g} s"
+        verdict = febio.RunVerdict("normal" if complete else "partial", reason, reached, "")
+        try:
+            other = febio.build_result(problem, log, verdict)
+        except ProblemError as error:
+            raise ProblemError(error.what, file=febio_log, remedy=error.remedy) from None
     found.context.tell("compare", 1, 3, f"site {name}: limbfit")
     first = build_first_steps(found.model, found.context.study.tissues)
     runs = {"limbfit": solve(problem, first, store="none")}  # as `limbfit simulate` does
     runs["limbfit_matched"] = _solve_matched(found, problem, other)
     found.context.tell("compare", 3, 3, f"site {name}")
     files = CurveFiles(csv=str(folder / f"{name}.csv"), png=str(folder / f"{name}.png"))
-    _write(files, name, other, runs)
+    times = _select_common_times(other, min(runs.values(), key=lambda run: run.times[-1]))
+    curves = {key: run.force_at(times) for key, run in runs.items()}
+    febio_N = other.force[: len(times)]
+    write_curves(
+        Path(files.csv),
+        time_s=times,
+        displacement_mm=other.displacement[: len(times)],
+        febio_N=febio_N,
+        **{f"{key}_N": force for key, force in curves.items()},
+    )
+    _draw(Path(files.png), name, times, febio_N, curves)
     content = CompareResult(
         site=name,
         parameters=found.parameters,
@@ -91,7 +97,14 @@ def compare_site(
             version=other.statistics["linear_solver"],
             penalty=found.context.study.febio.penalty,
         ),
-        **{key: _summarise_run(run, other) for key, run in runs.items()},
+        **{
+            key: LimbfitSimulation(
+                **_summarise_solver(run),
+                penetration_mm=float(run.penetration.max(initial=0.0)),
+                difference=difference(other, run),
+            )
+            for key, run in runs.items()
+        },
         febio_log=None if febio_log is None else str(febio_log),
         files=files,
     )
@@ -107,25 +120,12 @@ def _solve_matched(found: Indentation, problem: Problem, other: Result) -> Resul
     times = np.minimum(other.times[1:], end)  # a table has nine digits
     if not len(times):  # FEBio got nowhere: all the way then
         times = schedule_steps(problem.history, settings.steps)
-    contact = build_contact(problem, settings)
-    penalty = compute_mean_penalty(contact, problem, float(times[0]))
+    contact = febio.build_contact(problem, settings)
+    penalty = febio.compute_mean_penalty(contact, problem, float(times[0]))
     steps = replace(settings.steps, times=tuple(times), penalty=penalty, penetration=FREE, stress="linear")
     system = System(problem)
-    weights = FacePenalties(system, (contact,) * len(problem.rigid_bodies), times)
+    weights = febio.FacePenalties(system, (contact,) * len(problem.rigid_bodies), times)
     return solve(problem, steps, store="none", on_step=weights.update_after, system=system)
-
-
-def _build_log_result(problem: Problem, log: FebioLog, file: Path) -> Result:
-    """A table from elsewhere, complete where it reaches the end of the history."""
-    reached, end = float(log.times[-1]), compute_end_time(problem)
-    reason = (
-        "" if reached > end * (1.0 - TIME_TOLERANCE) else f"the table ends at {reached:.4g} s of {end:.4g} s"
-    )
-    verdict = RunVerdict("partial" if reason else "normal", reason, reached, "")
-    try:
-        return build_result(problem, log, verdict)
-    except ProblemError as error:
-        raise ProblemError(error.what, file=file, remedy=error.remedy) from None
 
 
 def _select_common_times(other: Result, mine: Result) -> Array:
@@ -155,26 +155,6 @@ def _summarise_solver(run: Result) -> dict[str, Any]:
         "steps": run.statistics["steps"],
         "seconds": run.statistics["seconds"]["total"] or None,
     }
-
-
-def _summarise_run(mine: Result, other: Result) -> LimbfitSimulation:
-    sunk = float(mine.penetration.max(initial=0.0))
-    return LimbfitSimulation(
-        **_summarise_solver(mine), penetration_mm=sunk, difference=difference(other, mine)
-    )
-
-
-def _write(files: CurveFiles, name: str, other: Result, runs: dict[str, Result]) -> None:
-    times = _select_common_times(other, min(runs.values(), key=lambda run: run.times[-1]))
-    curves = {key: run.force_at(times) for key, run in runs.items()}
-    write_curves(
-        Path(files.csv),
-        time_s=times,
-        displacement_mm=other.displacement[: len(times)],
-        febio_N=other.force[: len(times)],
-        **{f"{key}_N": force for key, force in curves.items()},
-    )
-    _draw(Path(files.png), name, times, other.force[: len(times)], curves)
 
 
 def _draw(file: Path, name: str, times: Array, febio: Array, curves: dict[str, Array]) -> None:

@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
@@ -54,8 +54,14 @@ def diagnose(folder: Path = Path(".")) -> dict[str, Any]:
         ``healthy`` (nothing failed) and ``checks``, each with ``check``, ``state`` (``ok``, ``warning``,
         ``failed``), ``found`` and ``remedy``.
     """
-    checks = [finding for look in (*_LOOKS, _check_self_test) for finding in look()]
-    checks += list(_check_writing(folder))
+    checks = [
+        *_check_machine(),
+        *_check_solvers(),
+        *_check_meshers(),
+        *_check_programs(),
+        *_check_self_test(),
+        *_check_writing(folder),
+    ]
     return {
         "healthy": all(one.state != "failed" for one in checks),
         "versions": {"limbfit": __version__, **collect_versions()},
@@ -64,7 +70,7 @@ def diagnose(folder: Path = Path(".")) -> dict[str, Any]:
     }
 
 
-def _check_python() -> Iterator[Finding]:
+def _check_machine() -> Iterator[Finding]:
     yield Finding("limbfit", "ok", f"{__version__}, Python {describe_machine()['python']}")
     missing = []
     for line in metadata.requires("limbfit") or []:
@@ -79,22 +85,16 @@ def _check_python() -> Iterator[Finding]:
         yield Finding("libraries", "failed", f"missing: {', '.join(missing)}", "pip install limbfit")
     else:
         yield Finding("libraries", "ok", "all there")
-
-
-def _check_cores() -> Iterator[Finding]:
     usable, there = count_usable_cores(), os.cpu_count() or 1
     set_here = [f"{name}={os.environ[name]}" for name in THREAD_VARIABLES if name in os.environ]
     yield Finding("cores", "ok", f"{usable} of {there} may be used: {usable} workers of one thread each")
     yield Finding("threads", "ok", ", ".join(set_here) or "not set here; workers get one each")
-
-
-def _check_memory() -> Iterator[Finding]:
-    free, workers = psutil.virtual_memory().available / 1e9, count_usable_cores()
+    free = psutil.virtual_memory().available / 1e9
     enough = free >= NEEDED_GB
     yield Finding(
         "memory",
         "ok" if enough else "warning",
-        f"{free:.1f} GB free, {free / workers:.1f} GB for each of {workers} workers",
+        f"{free:.1f} GB free, {free / usable:.1f} GB for each of {usable} workers",
         ""
         if enough
         else f"a site at the paper's size wants {NEEDED_GB:g} GB; use fewer workers (--workers 1)",
@@ -202,13 +202,3 @@ def compress_test_cube(strain: float) -> tuple[float, float]:
     material = OgdenQLV(c=c * KPA, m=4.0, gamma=0.0, tau=1.0, kappa_ratio=ratio)
     stress, _, _ = compress(material, np.array([RAMP_S]), 100.0 * strain)
     return float(stress[0]), 9 * ratio * c / (3 * ratio + 1) * strain
-
-
-_LOOKS: tuple[Callable[[], Iterator[Finding]], ...] = (
-    _check_python,
-    _check_cores,
-    _check_memory,
-    _check_solvers,
-    _check_meshers,
-    _check_programs,
-)

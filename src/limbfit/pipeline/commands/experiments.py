@@ -2,15 +2,16 @@
 
 An experiment is stored like a stage, in ``results/<name>`` under a key of all that decides it, and is stale
 when any of it has changed. It writes ``<name>.json``, which its command prints and its section of the report
-reads, and CSV tables beside it. `simulations.experiment_cache` keeps its simulations, and finds those of the
-stages and of other experiments, so that a killed one goes on and nothing is simulated twice.
+reads; some write CSV tables beside it. `simulations.open_experiment_cache` keeps its simulations, and finds
+those of the stages and of other experiments, so that a killed one goes on and nothing is simulated twice.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from inspect import Parameter, signature
 from typing import Any
 
 from ...errors import InputError
@@ -23,15 +24,20 @@ from ..engine.keys import Keys, Stage, StageKey
 from ..engine.store import StageState, Store
 from ..identification.crossvalidation import check_crossvalidate, run_crossvalidate
 from ..identification.problem import check_fitted
-from ..records.planned_records import SEEN
 from ..simulation.limb_geometry import Check, LimbGeometry
 from ..socket.design import check_socket_design, run_socket_design
 from ..socket.socket import check_socket, run_socket
 from ..uncertainty.uncertainty import run_uncertainty
-from ..variants.cube import COMPRESSION_PERCENT, check_cube, run_cube
-from ..variants.refinement import FACTORS, check_refinement, run_refinement
+from ..variants.cube import check_cube, run_cube
 from ..variants.regions import check_regions, run_regions
-from ..variants.sensitivity import KAPPA_RATIOS, run_contact, run_indenter, run_kappa, run_stiffness
+from ..variants.sensitivity import (
+    check_refinement,
+    run_contact,
+    run_indenter,
+    run_kappa,
+    run_refinement,
+    run_stiffness,
+)
 from ..variants.variants import check_variants
 
 
@@ -40,120 +46,73 @@ class Experiment(Stage):
     """A stage of its own, outside the chain: ``run(context, folder, **options)`` writes ``<name>.json``.
 
     ``needs`` names stages of the chain; ``options`` are what it can be run with and their defaults, in plain
-    JSON. ``check`` refuses what study, limb and options decide.
+    JSON: those of ``run`` where none are given. ``check`` refuses what study, limb and options decide.
     """
 
     options: Mapping[str, Any] = field(default_factory=dict)
     check: Check | None = None
 
+    def __post_init__(self) -> None:
+        if not self.options:
+            stated = signature(self.run).parameters.values()
+            defaults = {one.name: one.default for one in stated if one.default is not Parameter.empty}
+            object.__setattr__(self, "options", defaults)
 
-_SIMULATED = ("sites", "traces", "mesh", "calibrate")
-_INDENTERS, _RECORD = ("indenter", "indenters", "clamps"), ("site", "name", "indenter")
 
-
-def _build_sensitivity(
-    name: str, run: Callable[..., None], check: Check = check_variants, **options: Any
-) -> Experiment:
-    return Experiment(
-        f"sensitivity-{name}",
-        run,
-        needs=_SIMULATED,
-        tables=("material", "solver", *_INDENTERS),
-        site_keys=("name", "region", "edge", "depth_mm", "speed_mm_s", "indenter"),
-        record_keys=_RECORD,
-        options={"sites": [], **options},
-        check=check,
-    )
-
+_MESHED, _SIMULATED = ("sites", "traces", "mesh"), ("sites", "traces", "mesh", "calibrate")
+_TABLES = ("material", "solver", "indenter", "indenters", "clamps")
+_SOCKET = ("socket", "geometry", "mesh", "material")
+# Keys of sites and of records.
+_FITTED = ("name", "region", "fitted", "weight", "edge", "indenter")
+_PLANNED = ("name", "fitted", "edge", "depth_mm", "speed_mm_s", "indenter")
+_VARIED = ("name", "region", "edge", "depth_mm", "speed_mm_s", "indenter")
+_RECORD = ("site", "name", "indenter")
 
 _OWN: tuple[Experiment, ...] = (
+    Experiment("cube", run_cube, ("calibrate",), ("material",), check=check_cube),
     Experiment(
-        "cube",
-        run_cube,
-        needs=("calibrate",),
-        tables=("material",),
-        options={"compression_percent": COMPRESSION_PERCENT},
-        check=check_cube,
+        "regions", run_regions, _SIMULATED, ("calibration", *_TABLES), _FITTED, _RECORD, check=check_regions
     ),
-    Experiment(
-        "regions",
-        run_regions,
-        needs=_SIMULATED,
-        tables=("material", "calibration", "solver", *_INDENTERS),
-        site_keys=("name", "region", "fitted", "weight", "edge", "indenter"),
-        record_keys=_RECORD,
-        options={"sites": "all"},
-        check=check_regions,
+    *(
+        Experiment(f"sensitivity-{name}", run, _SIMULATED, _TABLES, _VARIED, _RECORD, check=check)
+        for name, run, check in (
+            ("c", run_stiffness, check_variants),
+            ("kappa", run_kappa, check_variants),
+            ("contact", run_contact, check_variants),
+            ("indenter", run_indenter, check_variants),
+            ("mesh", run_refinement, check_refinement),
+        )
     ),
-    _build_sensitivity("c", run_stiffness),
-    _build_sensitivity("kappa", run_kappa, ratios=list(KAPPA_RATIOS)),
-    _build_sensitivity("contact", run_contact),
-    _build_sensitivity("indenter", run_indenter),
-    _build_sensitivity("mesh", run_refinement, check_refinement, factors=list(FACTORS)),
     Experiment(
         "uncertainty",
         run_uncertainty,
-        needs=(*_SIMULATED, "predict"),
-        tables=("material", "calibration", "solver", *_INDENTERS, "uncertainty"),
-        site_keys=("name", "fitted", "weight", "edge", "indenter"),
-        record_keys=_RECORD,
+        (*_SIMULATED, "predict"),
+        ("calibration", "uncertainty", *_TABLES),
+        ("name", "fitted", "weight", "edge", "indenter"),
+        _RECORD,
     ),
     Experiment(
         "crossvalidate",
         run_crossvalidate,
-        needs=_SIMULATED,
-        tables=("material", "calibration", "solver", *_INDENTERS),
-        site_keys=("name", "region", "fitted", "weight", "edge", "indenter"),
-        record_keys=_RECORD,
-        options={"fit": 0, "choices": 200, "seed": 0, "runs": 12},
+        _SIMULATED,
+        ("calibration", *_TABLES),
+        _FITTED,
+        _RECORD,
         check=check_crossvalidate,
     ),
-    Experiment(
-        "design",
-        run_design,
-        needs=("sites", "traces", "mesh"),
-        tables=("material", "solver", *_INDENTERS),
-        site_keys=("name", "fitted", "edge", "depth_mm", "speed_mm_s", "indenter"),
-        record_keys=_RECORD,
-        options={"sites": 0, "depths_mm": [], "parameters": {}, "parameters_from": "", "noise": {}},
-        check=check_design,
-    ),
+    Experiment("design", run_design, _MESHED, _TABLES, _PLANNED, _RECORD, check=check_design),
     Experiment(
         "protocol",
         run_protocol,
-        needs=("sites", "traces", "mesh"),
-        tables=("material", "solver", "calibration", "acquire", *_INDENTERS),
-        site_keys=("name", "fitted", "edge", "depth_mm", "speed_mm_s", "indenter"),
-        record_keys=_RECORD,
-        options={
-            **{"minutes": 25.0, "setup_s": 60.0, "rest_s": 30.0, "speeds_mm_s": [], "holds_s": []},
-            **{"depths_mm": [], "determine": [], "criterion": "D", "draws": 3, "seed": 0},
-            **{"seen": dict.fromkeys(SEEN), "pressures": {}, "socket_times": {}},
-            **{"parameters": {}, "parameters_from": "", "noise": {}},
-        },
+        _MESHED,
+        ("calibration", "acquire", *_TABLES),
+        _PLANNED,
+        _RECORD,
         check=check_protocol,
     ),
-    Experiment(
-        "socket",
-        run_socket,
-        needs=("surfaces",),
-        tables=("socket", "geometry", "mesh", "material"),
-        apart=("socket.design",),
-        options={"parameters": {}, "parameters_from": "", "covariance_log": None}
-        | {"most_probable": None, "recorded_range": None, "relaxation": None, "samples": 0},
-        check=check_socket,
-    ),
-    Experiment(
-        "socket_design",
-        run_socket_design,
-        needs=("surfaces",),
-        tables=("socket", "geometry", "mesh", "material"),
-        options={"parameters": {}, "parameters_from": "", "optimise": [], "simulations": 0},
-        check=check_socket_design,
-    ),
+    Experiment("socket", run_socket, ("surfaces",), _SOCKET, apart=("socket.design",), check=check_socket),
+    Experiment("socket_design", run_socket_design, ("surfaces",), _SOCKET, check=check_socket_design),
 )
-
-
 EXPERIMENTS = Registry("experiment", {experiment.name: experiment for experiment in _OWN})
 
 
@@ -191,10 +150,7 @@ def check_experiment(
 ) -> None:
     """Refuse an experiment that its inputs rule out; ``limb``: None where it is not known yet.
 
-    Raises
-    ------
-    InputError
-        With the remedy.
+    Raises `InputError` with the remedy.
     """
     if "calibrate" in experiment.needs:
         check_fitted(study)

@@ -10,23 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from ... import febio
 from ...arrays import Array
 from ...bench.blocks import build_block_model, build_layered_block
 from ...errors import InputError
 from ...execution import SerialExecutor
 from ...fe import ELEMENTS, Problem
-from ...febio import (
-    ParameterRange,
-    check_optimisable,
-    describe_differences,
-    turn_to_indenter_frame,
-    write_feb,
-    write_inp,
-    write_optimisation,
-)
 from ...indentation import Parameters, SiteModel, build_problem
 from ...laws import POWER
-from ...mesh import Mesh, write_vtu
+from ...mesh import write_vtu
 from ...study import Indentation as Planned
 from ...study import Record, Study
 from ..engine.context import Context, Listener, ignore_progress
@@ -95,10 +87,7 @@ def check_export(
 ) -> Sequence[Planned]:
     """The indentations to be written, each of which has been written on a small block in the limb's place.
 
-    Raises
-    ------
-    InputError
-        As `export_study`, before anything is meshed.
+    Raises `InputError` as `export_study`, before anything is meshed.
     """
     if to not in FORMATS:
         raise InputError(f"{to!r} is no format", place="--to", remedy=f"give one of {', '.join(FORMATS)}")
@@ -108,7 +97,16 @@ def check_export(
     kinds = {(one.indenter, _is_forced(one)): one for one in chosen}
     with TemporaryDirectory() as folder:
         file = Path(folder) / "block.vtu"
-        block = _build_block(study)
+        # In layers of the study's tissues, under a skin, held below.
+        mesh = build_layered_block(ELEMENTS[study.mesh.element].cell_type, _DIVISIONS)
+        middles = mesh.points[mesh.corners].mean(axis=1)[:, 2]
+        ranks = np.argsort(np.argsort(-middles, kind="stable"), kind="stable")
+        block = replace(
+            mesh,
+            regions=ranks * len(study.tissues) // len(ranks),
+            region_names=study.tissues,
+            node_sets={"fixed_bottom": mesh.node_sets["bottom"]},
+        )
         write_vtu(block, file)
         for one in kinds.values():
             model = _build_block_model(study, one, file)
@@ -123,16 +121,6 @@ def check_export(
 
 def _is_forced(one: Planned) -> bool:
     return isinstance(one, Record) and one.forced
-
-
-def _build_block(study: Study) -> Mesh:
-    """A block in layers of the study's tissues, under a skin, held below."""
-    mesh = build_layered_block(ELEMENTS[study.mesh.element].cell_type, _DIVISIONS)
-    middles = mesh.points[mesh.corners].mean(axis=1)[:, 2]
-    ranks = np.argsort(np.argsort(-middles, kind="stable"), kind="stable")
-    count = len(study.tissues)
-    held = {"fixed_bottom": mesh.node_sets["bottom"]}
-    return replace(mesh, regions=ranks * count // len(ranks), region_names=study.tissues, node_sets=held)
 
 
 def _build_block_model(study: Study, one: Planned, file: Path) -> SiteModel:
@@ -177,30 +165,30 @@ def _write(
     name = found.name
     settings = build_feb_settings(found, f"{name}-forces.txt")
     if to == "feb":
-        write_feb(problem, folder / f"{name}.feb", settings)
-        return (folder / f"{name}.feb",), describe_differences(problem, settings)
+        febio.write_feb(problem, folder / f"{name}.feb", settings)
+        return (folder / f"{name}.feb",), febio.describe_differences(problem, settings)
     if to == FITTED:
         if problem.fibres is not None:
             raise InputError("FEBio's fit is written for tissues without fibres", place="--to")
         if found.context.study.material.law == POWER:
             what = f'FEBio\'s fit cannot tie the relaxation terms that make the power of time of "{POWER}"'
             raise InputError(what, place="--to", remedy="identify with limbfit")
-        check_optimisable(problem)
+        febio.check_optimisable(problem)
         control, model = folder / f"{name}-optimize.feb", folder / f"{name}-model.feb"
         # FEBio's fit takes its automatic penalty of a step of no time: another one than in a plain run.
         settings = replace(settings, penalty=None)
-        turned = turn_to_indenter_frame(problem)
-        write_feb(turned, model, settings)
+        turned = febio.turn_to_indenter_frame(problem)
+        febio.write_feb(turned, model, settings)
         ranges = _build_ranges(found, problem.mesh.region_names)
         iterations = found.context.study.calibration.max_iterations
-        write_optimisation(control, ranges, *curve, iterations=iterations)
-        return (control, model), describe_differences(turned, settings)
+        febio.write_optimisation(control, ranges, *curve, iterations=iterations)
+        return (control, model), febio.describe_differences(turned, settings)
     program = "abaqus" if to == "inp" else to
-    write_inp(problem, folder / f"{name}.inp", program, settings)
+    febio.write_inp(problem, folder / f"{name}.inp", program, settings)
     return (folder / f"{name}.inp",), ()
 
 
-def _build_ranges(found: Indentation, tissues: Sequence[str]) -> dict[str, ParameterRange]:
+def _build_ranges(found: Indentation, tissues: Sequence[str]) -> dict[str, febio.ParameterRange]:
     """Start and bounds of the tissues, in the solver's units."""
     study = found.context.study
     ranges = {}
@@ -215,5 +203,5 @@ def _build_ranges(found: Indentation, tissues: Sequence[str]) -> dict[str, Param
                 what = f"{tissue}.{key} = {value:g} lies outside its bounds, {lower[key]:g} to {upper[key]:g}"
                 raise InputError(what, file=study.file, place="material")
         start, lower, upper = map(study.law.in_solver_units, (start, lower, upper))
-        ranges[tissue] = ParameterRange(start, lower, upper, study.material.kappa_ratio)
+        ranges[tissue] = febio.ParameterRange(start, lower, upper, study.material.kappa_ratio)
     return ranges

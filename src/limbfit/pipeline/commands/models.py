@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -75,27 +75,18 @@ def _set_law(name: str, fibred: bool = False) -> Callable[[Study, Document], Non
         calibration = document.get("calibration", {})
         if name in (POWER, FUNG):  # no people are described by these
             calibration.pop("priors", None)
-        for key in ("prior", "fixed", "tied"):
+        for key in ("prior", "fixed", "tied"):  # such as ``skin.tau_s``, or ties of several
             stated = calibration.get(key)
-            if stated:
-                _drop_unknown(stated, keys)
+            lacking = [one for one in stated or () if not _is_known(one, keys)]
+            for one in lacking:
+                stated.remove(one) if isinstance(stated, list) else stated.pop(one)
 
     return change
 
 
-def _drop_unknown(stated: Any, keys: Iterable[str]) -> None:
-    """Remove parameters, such as ``skin.tau_s``, and ties of some, if a law with these keys lacks them."""
-    known = set(keys)
-
-    def is_known(stated: str | Sequence[str]) -> bool:
-        names = [stated] if isinstance(stated, str) else stated
-        return all(name.rpartition(".")[2] in known for name in names)
-
-    for one in [one for one in stated if not is_known(one)]:
-        if isinstance(stated, list):
-            stated.remove(one)
-        else:
-            del stated[one]
+def _is_known(stated: str | Sequence[str], keys: Collection[str]) -> bool:
+    names = [stated] if isinstance(stated, str) else stated
+    return all(name.rpartition(".")[2] in keys for name in names)
 
 
 def _change_layer(change_mm: float) -> Callable[[Study, Document], None]:
@@ -141,10 +132,7 @@ MODELS: dict[str, ModelChange] = {
 def select_models(names: Sequence[str]) -> tuple[str, ...]:
     """The models of these names, each once; "all" stands for every one.
 
-    Raises
-    ------
-    InputError
-        For a name that no model has.
+    Raises `InputError` for a name that no model has.
     """
     chosen = tuple(dict.fromkeys(MODELS if "all" in names else names))
     unknown = [name for name in chosen if name not in MODELS]
@@ -157,10 +145,7 @@ def select_models(names: Sequence[str]) -> tuple[str, ...]:
 def derive_study(study: Study, name: str) -> Study:
     """Write the study of a model, with the same inputs, into its folder.
 
-    Raises
-    ------
-    InputError
-        If the study cannot be changed so.
+    Raises `InputError` if the study cannot be changed so.
     """
     if study.file is None:
         raise InputError("the study has no file")

@@ -173,10 +173,7 @@ def _choose_speeds(study: Study, loads: Iterable[LoadHistory], depths_mm: Sequen
 def _read_socket_pressures(study: Study) -> dict[str, list[float]]:
     """Derivatives (p,) of the logarithm of every mean pressure by those of the parameters.
 
-    Raises
-    ------
-    InputError
-        Where the study has no current socket, or one without derivatives.
+    Raises `InputError` where the study has no current socket, or one without derivatives.
     """
     store, remedy = Store(study.results), "run limbfit socket on it, with identified parameters, first"
     place = "--determine socket"

@@ -66,12 +66,16 @@ def reproduce_study(
         for name, value in values.items()
     }
     forces = dict(_compare_forces(study.results / "predict", folder / "results" / "predict"))
+    old: dict[str, str | None] = {"limbfit": known.get("limbfit"), **known["versions"]}
+    new: dict[str, str | None] = {"limbfit": __version__, **collect_versions()}
     return {
         "same": bool(max([*parameters.values(), *forces.values()]) <= tolerance),
         "tolerance": tolerance,
         "parameters": parameters,
         "forces": forces,
-        "versions": _list_version_changes(known),
+        "versions": {
+            name: [old.get(name), new.get(name)] for name in {**old, **new} if old.get(name) != new.get(name)
+        },
         "folder": str(folder),
     }
 
@@ -146,11 +150,3 @@ def _compare_forces(then: Path, now: Path) -> Iterator[tuple[str, float]]:
             yield file.stem, float(np.abs(a - b).max() / max(np.abs(a).max(), 1e-300))
         elif a is not b:  # one of them could not be predicted: all of the force is missing
             yield file.stem, 1.0
-
-
-def _list_version_changes(known: Mapping[str, Any]) -> dict[str, list[str | None]]:
-    then = {"limbfit": known.get("limbfit"), **known["versions"]}
-    now: dict[str, str] = {"limbfit": __version__, **collect_versions()}
-    return {
-        name: [then.get(name), now.get(name)] for name in {**then, **now} if then.get(name) != now.get(name)
-    }

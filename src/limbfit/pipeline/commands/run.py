@@ -25,7 +25,7 @@ from ...results.runs import (
     StageRecord,
     StudyName,
 )
-from ...study import Study
+from ...study import Site, Study
 from ..engine.context import Context, Listener, build_executor, ignore_progress
 from ..engine.digests import compute_file_digest
 from ..engine.hand_labels import keep_hand_labels
@@ -70,17 +70,6 @@ _PLACE = ("name", "position", "near", "axis", "region", "fitted", "indenter")
 _WAVES = ("shear_waves", "shear_waves_sd_m_s", "shear_waves_bias_m_s")
 _SEEN = ("ultrasound", "ultrasound_sd_mm", "surface", "surface_sd_mm", "surface_frame", *_WAVES)
 _RECORD = ("trace", "touch_down_s", "peak_s", "control", *_SEEN)
-_UNSEEN: dict[str, Any] = {
-    **dict.fromkeys(("trace", "touch_down_s", "peak_s", "axis", "edge", "indenter", "ultrasound", "surface")),
-    "shear_waves": None,
-    "region": "",
-    "control": "displacement",
-    "ultrasound_sd_mm": 0.1,
-    "surface_sd_mm": 0.05,
-    "surface_frame": "limb",
-    "shear_waves_sd_m_s": 0.1,
-    "shear_waves_bias_m_s": 0.1,
-}
 _NAMED = ("site", "name")
 # How pins press; the mesh depends on how wide they are alone.
 _PRESSING = tuple(
@@ -153,7 +142,7 @@ def _select_calibration_inputs(study: Study) -> Study:
     sites = [site.model_copy(update={"region": ""}) for site in study.fitted]
     if any(site.near is not None for site in sites):
         others = [site for site in study.sites if not site.fitted and site.near is not None]
-        sites += [site.model_copy(update=_UNSEEN) for site in others]
+        sites += [Site(name=site.name, near=site.near) for site in others]
     fitted = {site.name for site in study.fitted}
     records = tuple(record for record in study.records if record.site in fitted)
     return study.model_copy(update={"sites": tuple(sites), "records": records})

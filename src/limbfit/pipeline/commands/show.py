@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...anatomy.sites.sites import find_thinnest_tissue
-from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
+from ...anatomy.surfaces.surfaces import load_anatomy
 from ...errors import InputError
 from ...report.drawing.stage_pictures import draw_stage
 from ...study import Study
@@ -72,7 +72,15 @@ def _draw(job: tuple[Path, str, Path]) -> None:
 def _describe_surfaces(study: Study, store: Store) -> dict[str, Any]:
     anatomy = load_anatomy(store["surfaces"])
     plane = study.geometry.amputation
-    bodies = {"skin": anatomy.skin, **anatomy.bones, **anatomy.regions}
+    bodies, amputation = {"skin": anatomy.skin, **anatomy.bones, **anatomy.regions}, None
+    if plane is not None:
+        normal = np.asarray(plane.normal) / np.linalg.norm(plane.normal)
+        # How far skin and bones reach beyond the plane.
+        ends = {
+            name: round(float(-((body.points - np.asarray(plane.point)) @ normal).min()), 2)
+            for name, body in {"skin": anatomy.skin, **anatomy.bones}.items()
+        }
+        amputation = {"pad_mm": study.geometry.amputation_pad_mm, "beyond_plane_mm": ends}
     return {
         "volumes_cm3": {name: round(body.volume / 1000, 2) for name, body in bodies.items()},
         "triangles": {name: len(body.faces) for name, body in bodies.items()},
@@ -85,17 +93,5 @@ def _describe_surfaces(study: Study, store: Store) -> dict[str, Any]:
         },
         "cut_point": anatomy.cut_point.tolist(),
         "cut_normal": anatomy.cut_normal.tolist(),
-        "amputation": None if plane is None else _describe_amputation(study, anatomy),
+        "amputation": amputation,
     }
-
-
-def _describe_amputation(study: Study, anatomy: Anatomy) -> dict[str, Any]:
-    """How far skin and bones reach beyond the plane of the virtual amputation."""
-    plane = study.geometry.amputation
-    assert plane is not None
-    normal = np.asarray(plane.normal) / np.linalg.norm(plane.normal)
-    ends = {
-        name: round(float(-((body.points - np.asarray(plane.point)) @ normal).min()), 2)
-        for name, body in {"skin": anatomy.skin, **anatomy.bones}.items()
-    }
-    return {"pad_mm": study.geometry.amputation_pad_mm, "beyond_plane_mm": ends}

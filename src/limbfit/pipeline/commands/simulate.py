@@ -51,16 +51,13 @@ def prepare_site(
 ) -> Indentation:
     """A site as recorded, or as the study plans it; meshes are made where missing.
 
+    Raises `InputError` for a site that the study does not have, identified parameters that are stale, or any
+    input of the stages before.
+
     Parameters
     ----------
     name : of a site with one record at most, or of a record.
     parameters : per tissue; by default the identified ones, or the study's start where none were identified.
-
-    Raises
-    ------
-    InputError
-        For a site that the study does not have, identified parameters that are stale, or any input of the
-        stages before.
     """
     stated = study.indentation(name)
     store = Store(study.results)

@@ -24,11 +24,12 @@ from ...identify.checks.design import (
     evaluate_design,
 )
 from ...identify.fit.objective import SiteResponse
-from ...indentation import Parameters, SiteModel
+from ...indentation import SiteModel
+from ...laws import Parameters
 from ...results.planning import DesignCandidate, DesignResult, DesignSite, ExpectedNoise, SiteDesign
-from ...study import Site, Study
-from ..engine.context import Context
-from ..engine.storage import write_result, write_rows, write_table
+from ...study import Study
+from ..engine.context import NO_PARAMETERS, Context
+from ..engine.storage import write_result
 from ..identification.problem import build_unknowns
 from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
@@ -54,7 +55,11 @@ def check_design(study: Study, limb: LimbGeometry | None, options: Mapping[str, 
             )
     if limb is None or not depths:
         return
-    fitting = [site for site in study.sites if min(depths) <= _find_deepest_mm(study, limb, site)]
+    fitting = []
+    for site in study.sites:
+        width = study.indenter_of((study.records_at(site) or (site,))[0]).width_mm
+        if min(depths) <= DEEPEST_SHARE * measure_tissue_under(limb.anatomy, *limb.place(site), width):
+            fitting.append(site)
     if len(fitting) < sites:
         what = f"{min(depths):g} mm is no deeper than half of the tissue at {len(fitting)} of {sites} sites"
         raise StudyError(
@@ -67,21 +72,15 @@ def count_wanted_sites(study: Study, sites: int) -> int:
     return sites or len(study.fitted) or min(DEFAULT_SITES, len(study.sites))
 
 
-def _find_deepest_mm(study: Study, limb: LimbGeometry, site: Site) -> float:
-    """How deep a candidate at a site may go."""
-    width = study.indenter_of((study.records_at(site) or (site,))[0]).width_mm
-    return DEEPEST_SHARE * measure_tissue_under(limb.anatomy, *limb.place(site), width)
-
-
 def run_design(
     context: Context,
     folder: Path,
     *,
-    sites: int,
-    depths_mm: Sequence[float],
-    parameters: Parameters,
-    parameters_from: str,
-    noise: dict[str, float],
+    sites: int = 0,
+    depths_mm: Sequence[float] = (),
+    parameters: Parameters = NO_PARAMETERS,
+    parameters_from: str = "",
+    noise: Mapping[str, float] = {},
 ) -> None:
     """Simulate every candidate once, with derivatives, and choose."""
     study = context.study
@@ -108,7 +107,6 @@ def run_design(
         noise=ExpectedNoise(**noise),
     )
     write_result(folder / "design.json", content)
-    _write_tables(folder, content)
 
 
 def _build_candidate_models(
@@ -127,17 +125,15 @@ def _build_candidate_models(
             if depth > DEEPEST_SHARE * thickness:
                 left_out.append(f"site {own.site} at {depth:g} mm: the tissue is {thickness:.1f} mm thick")
             else:
-                models.append(_scale_to_depth(own, depth))
+                # The same phases to another depth: at the same rates, held for as long.
+                phases, share = own.history.phases, depth / max(own.knots_mm)
+                seconds = [phase.duration_s * (1.0 if phase.kind == "hold" else share) for phase in phases]
+                knots_mm = share * np.array([phases[0].start_mm, *(phase.end_mm for phase in phases)])
+                knots_s = np.r_[0.0, np.cumsum(seconds)]
+                models.append(
+                    replace(own, knots_s=tuple(knots_s.tolist()), knots_mm=tuple(knots_mm.tolist()))
+                )
     return models, left_out
-
-
-def _scale_to_depth(own: SiteModel, depth: float) -> SiteModel:
-    """The phases of the record, or of the plan, to another depth: at the same rates, held for as long."""
-    phases, share = own.history.phases, depth / max(own.knots_mm)
-    seconds = [phase.duration_s * (1.0 if phase.kind == "hold" else share) for phase in phases]
-    knots_mm = share * np.array([phases[0].start_mm, *(phase.end_mm for phase in phases)])
-    knots_s = np.r_[0.0, np.cumsum(seconds)]
-    return replace(own, knots_s=tuple(knots_s.tolist()), knots_mm=tuple(knots_mm.tolist()))
 
 
 def _choose_designs(
@@ -224,20 +220,3 @@ def _describe_verdict(designs: dict[str, Design], names: Sequence[str]) -> str:
     if open_too:
         words.append(f"nor do all sites together: {', '.join(open_too)}")
     return "; ".join(words) or "the best choice determines every parameter within a factor of two"
-
-
-def _write_tables(folder: Path, content: DesignResult) -> None:
-    names = list(content.designs[0].factor_95)
-    rows = [
-        [
-            row.design,
-            " ".join(f"{one.site}@{one.depth_mm:.2f}mm" for one in row.sites),
-            row.d_efficiency,
-            row.a_efficiency,
-            *(row.factor_95[name] for name in names),
-        ]
-        for row in content.designs
-    ]
-    heads = ["design", "sites", "d_efficiency", "a_efficiency", *(f"factor_95_{name}" for name in names)]
-    write_table(folder / "designs.csv", heads, rows)
-    write_rows(folder / "candidates.csv", content.candidates)

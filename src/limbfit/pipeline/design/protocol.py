@@ -29,21 +29,21 @@ from ...identify.checks.design import (
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
 from ...indentation import (
-    Parameters,
     Simulation,
     SimulationJob,
     find_layers_under,
     find_nearby_skin_points,
     place_waves_under,
 )
+from ...laws import Parameters
 from ...mesh import read_vtu
 from ...results.planning import ExpectedNoise, ProtocolPlan, ProtocolRecord, ProtocolResult
 from ...study import Study
-from ..engine.context import Context
-from ..engine.storage import write_result, write_rows, write_table
+from ..engine.context import NO_PARAMETERS, Context
+from ..engine.storage import write_result
 from ..identification.problem import build_unknowns
 from ..records.deviations import compute_expected_share, is_modulus
-from ..records.planned_records import PlannedRecord, press, write_records
+from ..records.planned_records import SEEN, PlannedRecord, press, write_records
 from ..records.records import build_model, estimate_surface_error_mm
 from ..simulation.limb_geometry import LimbGeometry, build_site_model, coarsen_model
 from ..simulation.loading import LoadHistory, describe_untested_times
@@ -78,22 +78,22 @@ def run_protocol(
     context: Context,
     folder: Path,
     *,
-    minutes: float,
-    setup_s: float,
-    rest_s: float,
-    speeds_mm_s: Sequence[float],
-    holds_s: Sequence[float],
-    depths_mm: Sequence[float],
-    determine: Sequence[str],
-    criterion: str,
-    draws: int,
-    seed: int,
-    parameters: Parameters,
-    parameters_from: str,
-    noise: dict[str, float],
-    seen: Mapping[str, float | None],
-    pressures: Mapping[str, Sequence[float]],
-    socket_times: Mapping[str, tuple[float, float]],
+    minutes: float = 25.0,
+    setup_s: float = 60.0,
+    rest_s: float = 30.0,
+    speeds_mm_s: Sequence[float] = (),
+    holds_s: Sequence[float] = (),
+    depths_mm: Sequence[float] = (),
+    determine: Sequence[str] = (),
+    criterion: str = "D",
+    draws: int = 3,
+    seed: int = 0,
+    parameters: Parameters = NO_PARAMETERS,
+    parameters_from: str = "",
+    noise: Mapping[str, float] = {},
+    seen: Mapping[str, float | None] = dict.fromkeys(SEEN),
+    pressures: Mapping[str, Sequence[float]] = {},
+    socket_times: Mapping[str, tuple[float, float]] = {},
 ) -> None:
     """Simulate every possible record at every draw, with derivatives, and choose within the time.
 
@@ -110,8 +110,7 @@ def run_protocol(
     planned, left_out = _plan_records(context, speeds_mm_s, holds_s, depths_mm, noises)
     budget = Budget(60.0 * minutes, setup_s)
     _check_minutes([one.seconds + rest_s for one in planned], budget)
-    simulated = _simulate_planned(context, folder, planned, tissues, noises)
-    found, unusable = _select_usable(study, simulated, len(tissues))
+    found, unusable = _simulate_planned(context, folder, planned, tissues, noises)
     left_out += unusable
     if not found:
         raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
@@ -153,7 +152,6 @@ def run_protocol(
         **seen,
     )
     write_result(folder / "protocol.json", content)
-    _write_tables(folder, content)
     write_records(folder / "records.toml", content.records, seen)
 
 
@@ -223,7 +221,6 @@ class _Simulated:
     planned: PlannedRecord
     information: Array
     peak_N: float
-    failed: int
 
     def to_option(self, rest_s: float, surface_mm: float, which: int) -> RecordOption:
         """What may be chosen; its site's surfaces are off by so much."""
@@ -234,14 +231,15 @@ class _Simulated:
 
 def _simulate_planned(
     context: Context, folder: Path, planned: Sequence[PlannedRecord], tissues: Array, noise: RecordNoise
-) -> list[_Simulated]:
-    """Simulate each record at each draw, with derivatives."""
-    cache, (draws, p) = open_experiment_cache(context, folder), tissues.shape
-    jobs = [
-        build_curve_job(one.model, context.study.tissues, tissue) for one in planned for tissue in tissues
-    ]
+) -> tuple[list[_Simulated], list[str]]:
+    """Simulate each record at each draw, with derivatives; and what was left out.
+
+    That is what does not come to its end, or presses harder at the first draw than the device may.
+    """
+    cache, (draws, p), found, left_out = open_experiment_cache(context, folder), tissues.shape, [], []
+    names, limit = context.study.tissues, context.study.acquire.force_limit_N
+    jobs = [build_curve_job(one.model, names, tissue) for one in planned for tissue in tissues]
     simulations = zip(jobs, cache.run(jobs, context.executor), strict=True)
-    found = []
     for k, one in enumerate(planned):
         information, peak_N, failed = np.zeros((2, draws, p, p)), 0.0, 0
         for draw, (job, simulation) in enumerate(islice(simulations, draws)):
@@ -252,27 +250,16 @@ def _simulate_planned(
                 information[:, draw] = _compute_information(job, simulation, noise)
             else:
                 failed += 1
-        found.append(_Simulated(one, information, peak_N, failed))
-    return found
-
-
-def _select_usable(
-    study: Study, simulated: Sequence[_Simulated], draws: int
-) -> tuple[list[_Simulated], list[str]]:
-    """Those that press no harder than the device may and come to their end, and what was left out."""
-    limit, kept, left_out = study.acquire.force_limit_N, [], []
-    for one in simulated:
-        told = one.planned.told
-        if one.peak_N > limit:
-            left_out.append(f"{told}: {one.peak_N:.1f} N, over acquire.force_limit_N ({limit:g} N)")
-        elif one.failed == draws:
-            left_out.append(f"{told}: not simulated to the end")
+        if peak_N > limit:
+            left_out.append(f"{one.told}: {peak_N:.1f} N, over acquire.force_limit_N ({limit:g} N)")
+        elif failed == draws:
+            left_out.append(f"{one.told}: not simulated to the end")
         else:
-            kept.append(one)
-            if one.failed:
-                where = f"at {one.failed} of {draws} draws"
-                left_out.append(f"{told}: not simulated to the end {where}, and is not counted there")
-    return kept, left_out
+            found.append(_Simulated(one, information, peak_N))
+            if failed:
+                where = f"at {failed} of {draws} draws"
+                left_out.append(f"{one.told}: not simulated to the end {where}, and is not counted there")
+    return found, left_out
 
 
 def _compute_information(
@@ -384,15 +371,3 @@ def _describe_verdict(best: ProtocolPlan, wanted: Sequence[str]) -> str:
         f"{len(wanted)} parameters within 25 %"
     )
     return f"{head}; not {', '.join(open_ones)}" if open_ones else head
-
-
-def _write_tables(folder: Path, content: ProtocolResult) -> None:
-    write_rows(folder / "records.csv", content.records)
-    write_rows(folder / "candidates.csv", content.candidates)
-    names = list(content.protocols[0].factor_95)
-    heads = ["protocol", "records", "minutes", "determined", *(f"factor_95_{name}" for name in names)]
-    rows = [
-        [row.design, row.records, row.minutes, row.determined, *row.factor_95.values()]
-        for row in content.protocols
-    ]
-    write_table(folder / "protocols.csv", heads, rows)

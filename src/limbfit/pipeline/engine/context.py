@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from ...execution import Executor, Limits, make_executor
+from ...laws import Parameters
 from ...results.study_results import StudyResults
 from ...study import Study
 from .store import Store
+
+NO_PARAMETERS: Parameters = {}  # an experiment's, where its command states none
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,9 @@ import inspect
 import json
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..._version import __version__
 
@@ -79,23 +78,20 @@ def _find_closure(file: Path) -> tuple[Path, ...]:
         here = waiting.pop()
         if here not in found:
             found.add(here)
-            waiting += _read(here).reached if here.suffix == ".py" else []
+            if here.suffix == ".py":
+                imports, beside, _ = _read(here)
+                waiting += [home for place, name in imports for home in _find_homes(place, name)]
+                waiting += beside
     return tuple(sorted(found))
 
 
-@dataclass(frozen=True)
-class _Module:
+class _Module(NamedTuple):
     """What the text of a module says: its imports (place without suffix, name), files that it names, lazy
     names."""
 
-    imports: tuple[tuple[Path, str], ...]
+    imports: list[tuple[Path, str]]
     beside: tuple[Path, ...]
     lazy: dict[str, Path]
-
-    @property
-    def reached(self) -> list[Path]:
-        """The files that this one needs."""
-        return [home for place, name in self.imports for home in _find_homes(place, name)] + [*self.beside]
 
 
 @cache
@@ -108,12 +104,14 @@ def _read(file: Path) -> _Module:
             paths = [alias.name.split(".") for alias in node.names]
             imports += [(_place(path[:-1]), path[-1]) for path in paths if path[0] == PACKAGE.name]
         elif isinstance(node, ast.ImportFrom):
-            place = _find_base(file, node)
-            imports += [] if place is None else [(place, alias.name) for alias in node.names]
+            path = node.module.split(".") if node.module else []
+            place = file.parents[node.level - 1].joinpath(*path) if node.level else _place(path)
+            if node.level or path[0] == PACKAGE.name:
+                imports += [(place, alias.name) for alias in node.names]
         elif isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == _LAZY:
             homes = ast.literal_eval(node.value) if isinstance(node.value, ast.Dict) else _read_stub(file)
             lazy = {name: file.parent.joinpath(*home.split(".")) for name, home in homes.items()}
-    return _Module(tuple(imports), _find_beside(file, text), lazy)
+    return _Module(imports, _find_beside(file, text), lazy)
 
 
 def _parse_head(text: str) -> ast.Module:
@@ -151,14 +149,6 @@ def _read_stub(file: Path) -> dict[str, str]:
     stub = ast.parse(file.with_suffix(".pyi").read_text(encoding="utf-8"))
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom) and node.module]
     return {alias.name: str(node.module) for node in imports for alias in node.names}
-
-
-def _find_base(file: Path, node: ast.ImportFrom) -> Path | None:
-    """The module, without its suffix, that names are imported from; None for other packages."""
-    path = node.module.split(".") if node.module else []
-    if node.level:
-        return file.parents[node.level - 1].joinpath(*path)
-    return _place(path) if path[0] == PACKAGE.name else None
 
 
 def _place(path: list[str]) -> Path:

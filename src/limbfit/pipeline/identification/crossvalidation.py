@@ -38,7 +38,7 @@ from ...identify.uncertainty.emulator import Emulator
 from ...results.uncertainty import CrossvalidateResult, FoldCheck, FoldEmulator, HeldoutSite, OwnFold
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import write_result, write_rows, write_table
+from ..engine.storage import write_result
 from ..records.records import load_records
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import open_experiment_cache
@@ -66,7 +66,7 @@ def check_crossvalidate(study: Study, limb: LimbGeometry | None, options: Mappin
 
 
 def run_crossvalidate(
-    context: Context, folder: Path, *, fit: int, choices: int, seed: int, runs: int
+    context: Context, folder: Path, *, fit: int = 0, choices: int = 200, seed: int = 0, runs: int = 12
 ) -> None:
     """Held-out errors over choices of ``fit`` sites, with all their records (0: as many as the study fits).
 
@@ -116,7 +116,6 @@ def run_crossvalidate(
     possible = comb(len(recorded), size)
     content = _build_result(study, bounds.names, tuple(sites), fits, size, possible, summary)
     write_result(folder / "crossvalidate.json", content)
-    _write_tables(folder, content)
 
 
 class _Fits(NamedTuple):
@@ -261,23 +260,3 @@ def _build_result(
 
 def _to_plain(value: float) -> float | None:
     return None if np.isnan(value) else value
-
-
-def _write_tables(folder: Path, content: CrossvalidateResult) -> None:
-    """Every fit and its errors, and errors by site, as CSV."""
-    sites = [row.site for row in content.sites]
-    names = list(content.own.parameters)
-    heads = ["fitted", "mean_error_fitted_percent", "mean_error_heldout_percent", *names]
-    heads += [f"error_{site}_percent" for site in sites]
-    rows = [
-        [
-            " ".join(fold.fitted),
-            fold.mean_error_fitted_percent,
-            fold.mean_error_heldout_percent,
-            *(fold.parameters[name] for name in names),
-            *(fold.errors_percent[site] for site in sites),
-        ]
-        for fold in (content.own, *content.folds, *content.regions)
-    ]
-    write_table(folder / "fits.csv", heads, rows)
-    write_rows(folder / "sites.csv", content.sites)

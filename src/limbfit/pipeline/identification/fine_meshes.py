@@ -10,7 +10,6 @@ from ...arrays import Array
 from ...errors import RunError
 from ...identify.fit.multifidelity import MeshCorrection
 from ...study.meshing import MeshTable
-from ...study.tables import SolverTable
 from ..engine.context import Context
 from ..limb.mesh import MeshJob, mesh_settings, plan_meshes, scale_edges
 from ..limb.remesh import mesh_where_possible
@@ -38,10 +37,7 @@ def correct_to_fine_meshes(
 ) -> FineMeshCorrection:
     """The responses at an answer, and what brings those of the search to the study's own meshes.
 
-    Raises
-    ------
-    RunError
-        Where a site cannot be simulated there.
+    Raises `RunError` where a site cannot be simulated there.
     """
     searched = simulator.search(parameters)
     correction = FineMeshCorrection(searched, list)
@@ -109,7 +105,11 @@ def _estimate_mesh_errors(
     study, records = problem.study, simulator.records.own
     errors, share = [0.0 * record.compared for record in records], estimate_own_mesh_error(study.mesh)
     meshed = [(i, other) for i, other in enumerate(others) if other is not None]
-    steps = _scale_steps(study.solver)
+    fewer = {
+        name: max(2, round(getattr(study.solver, name) / COARSENING_FACTOR))
+        for name in ("load_steps", "unload_steps")
+    }
+    steps = study.solver.model_copy(update=fewer)
     near = [
         replace(one, model=replace(one.model, within_mm=study.within_mm, steps=steps)) for _, one in meshed
     ]
@@ -130,10 +130,3 @@ def estimate_own_mesh_error(table: MeshTable) -> float:
     """One standard deviation of what the study's own mesh lacks, over its difference from the coarser one."""
     ratio = COARSENING_FACTOR if table.coarse is None else table.coarse.edge_near_mm / table.edge_near_mm
     return estimate_fine_error(MESH_ORDERS[table.element], ratio)
-
-
-def _scale_steps(table: SolverTable) -> SolverTable:
-    """The steps in time `COARSENING_FACTOR` times as long."""
-    names = ("load_steps", "unload_steps")
-    fewer = {name: max(2, round(getattr(table, name) / COARSENING_FACTOR)) for name in names}
-    return table.model_copy(update=fewer)

@@ -42,10 +42,7 @@ class CalibrationProblem:
 def check_fitted(study: Study) -> None:
     """Refuse a study that has nothing to identify parameters from.
 
-    Raises
-    ------
-    StudyError
-        With the remedy.
+    Raises `StudyError` with the remedy.
     """
     if not study.fitted:
         remedy = "set fitted = true where there is a record, or stop before it: limbfit run --until mesh"

@@ -25,11 +25,12 @@ def find_labelled_file(study: Study) -> Path:
 
 
 @contextmanager
-def name_file_in_errors(file: Path) -> Iterator[None]:
-    """Say which file an error is about, where it does not say so itself."""
+def name_file_in_errors(file: Path | None, place: str | None = None, about: str = "") -> Iterator[None]:
+    """Say which file, and place in it, an error is about, where it names none itself; and what ``about``."""
     try:
         yield
     except InputError as error:
         if error.file is not None:
             raise
-        raise type(error)(error.what, file=file, place=error.place, remedy=error.remedy) from None
+        what, place = about + error.what, place or error.place
+        raise type(error)(what, file=file, place=place, remedy=error.remedy) from None

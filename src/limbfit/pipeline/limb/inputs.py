@@ -89,9 +89,7 @@ def segment_automatically(study: Study, volume: Volume) -> LabelMap:
 def check_labels(study: Study, labels: LabelMap) -> None:
     """Refuse a given map without a label that ``[geometry]`` needs.
 
-    Raises
-    ------
-    LabelError
+    Raises `LabelError`.
     """
     with name_file_in_errors(find_labelled_file(study)):
         labels.with_regions(list_labelled_regions(study))

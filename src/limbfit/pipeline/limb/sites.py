@@ -10,12 +10,11 @@ import numpy as np
 from ...anatomy.sites.markers import find_markers, match_markers
 from ...anatomy.sites.sites import compute_indenter_axis, project_to_skin
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy, read_surface
-from ...errors import SiteError
 from ...results.limb import MarkerEvidence, PlacedSite, SitesResult
 from ...study import Site, Study
 from ..engine.context import Context
 from ..engine.storage import write_result
-from .files import MARKED_SKIN
+from .files import MARKED_SKIN, name_file_in_errors
 
 
 def run_sites(context: Context, folder: Path) -> None:
@@ -37,19 +36,12 @@ def run_sites(context: Context, folder: Path) -> None:
 def place_site(site: Site, study: Study, anatomy: Anatomy, marker: Any) -> PlacedSite:
     """A site on the skin with its axis; ``marker`` is what was matched to it, or None.
 
-    Raises
-    ------
-    SiteError
-        When the site is too far off the skin.
+    Raises `SiteError` when the site is too far off the skin.
     """
     wanted = np.array(site.position) if marker is None else marker.position
-    try:
+    with name_file_in_errors(study.file, f"sites.{site.name}"):
         point, off = project_to_skin(anatomy, wanted)
         axis = site.axis or compute_indenter_axis(anatomy.skin, point, study.width_at(site))
-    except SiteError as error:
-        raise SiteError(
-            error.what, file=study.file, place=f"sites.{site.name}", remedy=error.remedy
-        ) from None
     evidence = None
     if marker is not None:
         assert site.near is not None

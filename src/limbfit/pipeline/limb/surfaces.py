@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...anatomy.imaging import LabelMap, read_labels
+from ...anatomy.imaging import read_labels
 from ...anatomy.labels.labelfiles import normalise_name
 from ...anatomy.segmentation.amputation import amputate_anatomy, amputate_limb
 from ...anatomy.surfaces.mending import build_closed_anatomy, orient_outward
@@ -25,31 +25,21 @@ def run_surfaces(context: Context, folder: Path) -> None:
     if study.surfaces is not None:
         anatomy, notes = read_given_anatomy(study)
     else:
-        labels = _read_limb_labels(context)
-        anatomy, notes = _build_imaged_anatomy(study, labels)
-        if has_mapped_fat(study):
-            depth = measure_fat_depth(labels, anatomy, study.geometry.surface_edge_mm)
-            write_thickness(folder / THICKNESS, anatomy.skin, depth)
+        anatomy, notes = _build_imaged_anatomy(context, folder)
     for note in notes:
         context.tell("surfaces", 1, 2, note)
     save_anatomy(folder, anatomy, notes)
 
 
-def _read_limb_labels(context: Context) -> LabelMap:
-    """The label map of the segment stage, after the virtual amputation where there is one."""
-    geometry = context.study.geometry
-    named = list_labelled_regions(context.study)
-    with name_file_in_errors(find_labelled_file(context.study)):
-        labels = read_labels(context.store["segment"] / "labels.seg.nrrd").with_regions(named)
-    if geometry.amputation is None:
-        return labels
-    plane = geometry.amputation
-    return amputate_limb(labels, plane.point, plane.normal, pad_mm=geometry.amputation_pad_mm)
-
-
-def _build_imaged_anatomy(study: Study, labels: LabelMap) -> tuple[Anatomy, tuple[str, ...]]:
-    geometry = study.geometry
-    cut = geometry.proximal_cut
+def _build_imaged_anatomy(context: Context, folder: Path) -> tuple[Anatomy, tuple[str, ...]]:
+    """The anatomy of the segment stage's label map, after the virtual amputation where there is one."""
+    study, geometry = context.study, context.study.geometry
+    cut, plane = geometry.proximal_cut, geometry.amputation
+    with name_file_in_errors(find_labelled_file(study)):
+        labels = read_labels(context.store["segment"] / "labels.seg.nrrd")
+        labels = labels.with_regions(list_labelled_regions(study))
+    if plane is not None:
+        labels = amputate_limb(labels, plane.point, plane.normal, pad_mm=geometry.amputation_pad_mm)
     with name_file_in_errors(find_labelled_file(study)):
         anatomy = build_anatomy(
             labels,
@@ -59,6 +49,9 @@ def _build_imaged_anatomy(study: Study, labels: LabelMap) -> tuple[Anatomy, tupl
     anatomy, files, notes = _add_given_regions(study, anatomy)
     with name_file_in_errors(find_labelled_file(study)):
         check_anatomy(anatomy, files)
+    if has_mapped_fat(study):
+        depth = measure_fat_depth(labels, anatomy, geometry.surface_edge_mm)
+        write_thickness(folder / THICKNESS, anatomy.skin, depth)
     return anatomy, notes
 
 

@@ -107,10 +107,7 @@ def choose_surface_points(
 ) -> dict[str, ChosenPoints]:
     """By record the points of its surface that can be compared; ``motions``: of records, by name.
 
-    Raises
-    ------
-    TraceError
-        Where a record has none.
+    Raises `TraceError` where a record has none.
     """
     skin, found = (limb.anatomy.skin.points, limb.anatomy.skin.faces), {}
     for record in study.recorded:

@@ -81,17 +81,17 @@ class SiteRecord:
     def measured(self) -> MeasuredCurve:
         """What the calibration compares with."""
         weight = self.record.weight * (1.0 if self.seen is None else self.seen.weight(self.error_share))
-        doubt = self.touch_down_sd_mm * self._by_depth if self.seen is None else None
+        doubt = None
+        if self.seen is None:
+            # By how it changes with the place of its touch-down, N/mm, or mm/mm.
+            slope = np.ones_like(self.times_s)
+            if not self.record.forced:
+                driven = self.times_s, self.displacement_mm, self.force_N
+                slope = self.smoothing @ compute_depth_slope(*driven)
+            doubt = self.touch_down_sd_mm * slope
         return MeasuredCurve(
             self.name, self.compared, weight, self.site.name, self.unit, doubt, self.error_share
         )
-
-    @property
-    def _by_depth(self) -> Array:
-        """How the record (n,) changes with the place of its touch-down, N/mm, or mm/mm."""
-        if self.record.forced:
-            return np.ones_like(self.times_s)
-        return self.smoothing @ compute_depth_slope(self.times_s, self.displacement_mm, self.force_N)
 
     @property
     def compared(self) -> Array:
@@ -184,10 +184,8 @@ def load_records(context: Context, records: Sequence[Record], secondary: bool = 
 def load_site_record(context: Context, record: Record) -> SiteRecord:
     """A stored record and its site's model, on the whole of its own mesh.
 
-    Raises
-    ------
-    TraceError
-        Where nothing of its surface can be compared, or the limb has no place of its shear waves.
+    Raises `TraceError` where nothing of its surface can be compared, or the limb has no place of its shear
+    waves.
     """
     study, folder = context.study, context.store["traces"]
     facts, points = context.results.traces.sites[record.name], None

@@ -338,16 +338,13 @@ def choose_points(
 ) -> ChosenPoints:
     """The points of a record's surface that can be compared, at most `MAX_POINTS`, evenly spread.
 
+    Raises `TraceError` where there is none, with the study's file.
+
     Parameters
     ----------
     place : position and axis of the indenter.
     skin : points (n, 3) mm and faces (f, 3 or more).
     motion : in the frame that the study states.
-
-    Raises
-    ------
-    TraceError
-        Where there is none, with the study's file.
     """
     assert record.surface is not None
     indenter = read_indenter(study.indenter_of(record), *place, record.site.edge)
@@ -414,10 +411,7 @@ def place_waves(
 ) -> tuple[WavePlace, ...]:
     """Where the shear waves of a record are, in the site's own mesh; ``waves`` as ``traces.json`` has them.
 
-    Raises
-    ------
-    TraceError
-        Where the limb has no such place, with the record's file.
+    Raises `TraceError` where the limb has no such place, with the record's file.
     """
     assert record.shear_waves is not None
     try:

@@ -17,7 +17,6 @@ from ...traces import (
     Regularised,
     SurfaceMotion,
     Thinning,
-    TouchDown,
     Trace,
     TraceWarning,
     WaveMeans,
@@ -60,6 +59,10 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, store
         trace, touch = known.trace, known.touch_down
         made = regularise_creep if record.forced else regularise
         smooth = made(trace, touch, table.smoothing, record.peak_s)
+    phases = [phase.later(touch.time_s) for phase in smooth.phases]
+    first_s, first_mm = float(trace.time_s[0]), float(trace.displacement_mm[0]) - touch.displacement_mm
+    if touch.time_s > first_s:
+        phases.insert(0, MotionPhase("approach", first_s, touch.time_s, first_mm, 0.0))
     remarks = list(known.warnings)
     if trace.notes:
         cause, remedy = "the format of the rig's export", "compare the phases with what the rig did"
@@ -76,7 +79,7 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, store
         noise_N=smooth.noise_N,
         speed_load_mm_s=smooth.speed_load_mm_s,
         speed_unload_mm_s=None if np.isnan(smooth.speed_unload_mm_s) else smooth.speed_unload_mm_s,
-        phases=_phases_to_rows(trace, smooth, touch),
+        phases=[stored.RecordPhase.model_validate(phase) for phase in phases],
         phases_in_words=describe_phases(smooth.phases),
         knots_s=smooth.knots_s.tolist(),
         knots_mm=smooth.knots_mm.tolist(),
@@ -84,15 +87,6 @@ def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, store
         remarks=[stored.RecordRemark.model_validate(remark) for remark in remarks],
     )
     return trace, smooth, facts
-
-
-def _phases_to_rows(trace: Trace, smooth: Regularised, touch: TouchDown) -> list[stored.RecordPhase]:
-    """What the indenter does, in times of the record and in mm from touch-down."""
-    first_s, first_mm = float(trace.time_s[0]), float(trace.displacement_mm[0]) - touch.displacement_mm
-    phases = [phase.later(touch.time_s) for phase in smooth.phases]
-    if touch.time_s > first_s:
-        phases.insert(0, MotionPhase("approach", first_s, touch.time_s, first_mm, 0.0))
-    return [stored.RecordPhase.model_validate(phase) for phase in phases]
 
 
 def run_traces(context: Context, folder: Path) -> None:
@@ -133,10 +127,7 @@ def read_observed(
 ) -> SecondaryMeasurement:
     """What was seen while the record's force is 5 % of its largest or more.
 
-    Raises
-    ------
-    TraceError
-        For a file that cannot be that, with the file, the place and the remedy.
+    Raises `TraceError` for a file that cannot be that, with the file, the place and the remedy.
     """
     pressed = smooth.time_s[smooth.force_N >= END_SHARE * smooth.force_N.max()]
     end_s = touch_down_s + float(pressed[-1])
@@ -160,10 +151,8 @@ def read_observed(
         file = study.path(record.surface)
         whole = read_surface_motion(file, time)
         times = float(trace.time_s[0]), float(trace.time_s[-1])
-        try:
+        with name_file_in_errors(file, time):
             motion = select_frames_in_contact(whole, times, touch_down_s, end_s)
-        except TraceError as error:
-            raise TraceError(error.what, file=file, place=time, remedy=error.remedy) from None
     return SecondaryMeasurement(layers, motion, waves)
 
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...arrays import Array
-from ...errors import ProblemError
 from ...indentation import Direction, SiteModel, build_clamping_pins, read_indenter
 from ...mesh import read_vtu
 from ...results.limb import PlacedSite
@@ -19,6 +18,7 @@ from ...study import Indentation, IndenterTable, Record, Site, Study, Vector
 from ..engine.context import Context
 from ..engine.digests import compute_file_digest
 from ..engine.store import COARSE, Store
+from ..limb.files import name_file_in_errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +41,7 @@ class LimbGeometry:
     def clamping_pins(self, study: Study) -> dict[str, int]:
         """How many pins of ``[clamps]`` hold the limb at each site.
 
-        Raises
-        ------
-        ProblemError
-            Where they cannot be placed, with the study's file.
+        Raises `ProblemError` where they cannot be placed, with the study's file.
         """
         skin, (x, y, z) = self.anatomy.skin, map(float, self.anatomy.cut_normal)
         found = {}
@@ -74,10 +71,7 @@ def build_site_model(
 
     ``layers``: tissues whose compression is wanted, too.
 
-    Raises
-    ------
-    ProblemError
-        Where the study's clamps do not meet the limb there.
+    Raises `ProblemError` where the study's clamps do not meet the limb there.
     """
     study: Study = context.study
     site = one.site if isinstance(one, Record) else one
@@ -120,10 +114,7 @@ def coarsen_model(context: Context, model: SiteModel) -> SiteModel:
 
     No more of the mesh counts than ``calibration.search_radius_mm``.
 
-    Raises
-    ------
-    ProblemError
-        Where the study's clamps do not meet the limb there.
+    Raises `ProblemError` where the study's clamps do not meet the limb there.
     """
     study = context.study
     if study.mesh.coarse is not None:
@@ -151,39 +142,31 @@ def count_pins_met(
 ) -> int:
     """How many pins hold the limb in an indentation; 0 where the study has none.
 
+    Raises `ProblemError` where the pins cannot be placed, with the study's file.
+
     Parameters
     ----------
     name : of the indentation.
     place : position and axis of the indenter.
     skin : points (n, 3) mm and faces (f, 3 or more).
     along : the limb's axis, proximally.
-
-    Raises
-    ------
-    ProblemError
-        Where the pins cannot be placed, with the study's file.
     """
     if study.clamps is None:
         return 0
-    try:
-        pins = build_clamping_pins(
-            *skin, read_indenter(indenter, *place, None), np.array(along), study.clamps
-        )
-        return len(pins)
-    except ProblemError as error:
-        what = f"site {name}: {error.what}"
-        raise ProblemError(what, file=study.file, place="clamps", remedy=error.remedy) from None
+    with name_file_in_errors(study.file, "clamps", f"site {name}: "):
+        tool = read_indenter(indenter, *place, None)
+        return len(build_clamping_pins(*skin, tool, np.array(along), study.clamps))
 
 
 def find_fibre_directions(context: Context) -> tuple[tuple[str, Direction], ...]:
     """The direction of the fibres in each tissue that has some, of length one, or that of a flow."""
-    found: list[tuple[str, Direction]] = []
-    for tissue, stated in context.study.fibres.items():
-        if stated == "flow":
-            found.append((tissue, "flow"))
-        else:
-            found.append((tissue, read_limb_axis(context) if stated == "axis" else _normalise(stated)))
-    return tuple(found)
+
+    def find(stated: str | Vector) -> Direction:
+        if isinstance(stated, str):
+            return "flow" if stated == "flow" else read_limb_axis(context)
+        return _normalise(stated)
+
+    return tuple((tissue, find(stated)) for tissue, stated in context.study.fibres.items())
 
 
 def read_limb_axis(context: Context) -> Vector:

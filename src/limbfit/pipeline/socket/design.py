@@ -23,7 +23,8 @@ from ...donning.model import OUTER
 from ...donning.relief import Relief, SocketTrial
 from ...errors import RunError, SurfaceError
 from ...execution import Executor
-from ...indentation import Parameters, build_fibre_field
+from ...indentation import build_fibre_field
+from ...laws import Parameters
 from ...mesh import write_vtu
 from ...results.socket import SocketDesignResult
 from ...socket import Recipe, Socket, rectify_limb
@@ -32,7 +33,7 @@ from ...socket.rectify import reduce_to_volume
 from ...socket.targets import Target, build_zone
 from ...socket.wall import measure_thickness
 from ...study import Study
-from ..engine.context import Context
+from ..engine.context import NO_PARAMETERS, Context
 from ..engine.digests import code_digest, compute_digest
 from ..engine.partial_results import Made, ResultFiles
 from ..engine.storage import write_result, write_table
@@ -69,10 +70,8 @@ def build_undeformed_socket(
 ) -> tuple[Recipe, Socket]:
     """The recipe of all designs, and the face on the limb as it is, with whose shape a wall can be made.
 
-    Raises
-    ------
-    StudyError
-        Where loads, regions or the target pressure are not those of this limb, or the wall cannot be made.
+    Raises `StudyError` where loads, regions or the target pressure are not those of this limb, or the wall
+    cannot be made.
     """
     with place_errors(study, PLACE):
         recipe, frame = build_recipe(study, anatomy), build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
@@ -95,10 +94,10 @@ def run_socket_design(
     context: Context,
     folder: Path,
     *,
-    parameters: Parameters,
-    parameters_from: str,
-    optimise: Sequence[str],
-    simulations: int,
+    parameters: Parameters = NO_PARAMETERS,
+    parameters_from: str = "",
+    optimise: Sequence[str] = (),
+    simulations: int = 0,
 ) -> None:
     """Design a socket for the target pressure of the study, and put it and its control on the limb.
 
@@ -123,22 +122,27 @@ def run_socket_design(
         reduced, percent = reduce_to_volume(designed.volume_mm3, limb.outer.skin, limb.frame, plain)
         control = _Design(replace(unloaded, name=CONTROL, face=reduced), {"reduction_percent": percent})
         design = _Design(replace(unloaded, name=DESIGN, face=designed), {"depths_mm": {}})
-        designs, found = (
-            _solve_designs([control, design], context.executor, partial(_tell_after, tell, 1)),
-            None,
-        )
+        found, told = None, partial(_tell_after, tell, 1)
+        designs = _solve_designs([control, design], context.executor, told)
         if optimise:
             best, found = _optimise_depths(context, recipe, designs, optimise, simulations, tell)
             designs.append(best)
     last = designs[-1].run
     walled = build_socket_wall(study, limb.anatomy, last.face)
     write_surface(folder / "socket.stl", walled)
+    thickness = measure_thickness(walled, last.face)
     content = {
         "target": {"pressure": target.kind, "pressure_kPa": target.pressure_kPa}
         | {"regions": dict(target.regions)},
         "designs": [_summarise_design(one) for one in designs],
         "optimisation": found,
-        "wall": _build_wall_facts(walled, last),
+        "wall": {
+            "of": last.name,
+            "stated_mm": study.socket.design.wall_mm,
+            "least_mm": thickness.min(),
+            "median_mm": np.median(thickness),
+            "volume_cm3": walled.volume / 1000.0,
+        },
         "parameters": parameters,
         "parameters_from": parameters_from,
         "liner": limb.liner,
@@ -318,17 +322,6 @@ def _to_row(
         "peaks_kPa": None if peaks is None else {name: peaks[name] for name in optimise},
         "merit": trial.merit if np.isfinite(trial.merit) else None,
         "reason": reason,
-    }
-
-
-def _build_wall_facts(body: Surface, run: SocketRun) -> dict[str, Any]:
-    measured = measure_thickness(body, run.face)
-    return {
-        "of": run.name,
-        "stated_mm": run.limb.study.socket.design.wall_mm,
-        "least_mm": measured.min(),
-        "median_mm": np.median(measured),
-        "volume_cm3": body.volume / 1000.0,
     }
 
 

@@ -32,7 +32,7 @@ from ...socket.targets import Target
 from ...socket.trim import Trim
 from ...socket.wall import build_wall
 from ...study import Study
-from ...study.socket import SocketAreaTable, SocketLoadTable
+from ...study.socket import SocketLoadTable
 
 BELOW_KNEE_MM = 10.0  # of the top of the tibia: the brim, where nothing is stated
 BELOW_CUT_MM = 30.0  # of the proximal cut, where no bone is a tibia
@@ -43,16 +43,13 @@ EDGE_MM, FACE_MM2 = 10.0, 8e4
 def build_socket(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
     """The study's socket around a limb: read from its file, or rectified from the limb.
 
+    Raises `StudyError` with the key and the remedy.
+
     Parameters
     ----------
     anatomy : of the limb.
     outer : the closed surface that the socket touches, skin or liner on skin; flat at the same proximal cut.
         Around the bare skin, a rectified face may come nearer to the bones by the liner's thickness.
-
-    Raises
-    ------
-    StudyError
-        With the key and the remedy.
     """
     table, frame = study.socket, build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     with place_errors(study):
@@ -61,7 +58,13 @@ def build_socket(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
                 study.path(table.file), table.unit, table.space, outer=outer, frame=frame, bones=anatomy.bones
             )
         regions = build_regions(study, anatomy)
-        areas = [_build_area(study, area, regions) for area in table.areas]
+        areas = []
+        for area in table.areas:
+            if area.position is None:
+                name = area.region or ""
+                check_regions(study, [name], f"socket.areas.{area.name}.region", regions)
+            position = regions[name].position if area.position is None else np.array(area.position)
+            areas.append(Area(area.name, position, area.radius_mm, area.depth_mm))
         socket = rectify_limb(outer, frame, replace(build_recipe(study, anatomy), areas=areas))
         refuse_bones(
             socket.surface,
@@ -121,21 +124,10 @@ def build_regions(study: Study, anatomy: Anatomy) -> dict[str, SkinRegion]:
     return regions
 
 
-def _build_area(study: Study, area: SocketAreaTable, regions: Mapping[str, SkinRegion]) -> Area:
-    if area.position is not None:
-        return Area(area.name, np.array(area.position), area.radius_mm, area.depth_mm)
-    name = area.region or ""
-    check_regions(study, [name], f"socket.areas.{area.name}.region", regions)
-    return Area(area.name, regions[name].position, area.radius_mm, area.depth_mm)
-
-
 def check_regions(study: Study, names: Sequence[str], place: str, known: Collection[str]) -> None:
     """That regions which are named are among the ``known`` ones.
 
-    Raises
-    ------
-    StudyError
-        With those that there are.
+    Raises `StudyError` with those that there are.
     """
     wrong = next((name for name in names if name not in known), None)
     if wrong is not None:
@@ -152,10 +144,7 @@ def load_of(
 ) -> tuple[Array, Array, Array]:
     """Force (3,) N and moment (3,) N mm on the socket about a point (3,) mm, all LPS.
 
-    Raises
-    ------
-    StudyError
-        Where the knee centre or the side of the limb must be known and is not.
+    Raises `StudyError` where the knee centre or the side of the limb must be known and is not.
     """
     check_load(study, load, anatomy.bones)
     brim = socket.points[socket.brim]
@@ -171,10 +160,7 @@ def load_of(
 def check_load(study: Study, load: SocketLoadTable, bones: Collection[str]) -> None:
     """That what a preset needs is known of a limb whose bones have these names.
 
-    Raises
-    ------
-    StudyError
-        Where the knee centre or the side of the limb must be known and is not.
+    Raises `StudyError` where the knee centre or the side of the limb must be known and is not.
     """
     if load.preset is None:
         return
@@ -199,9 +185,7 @@ def check_load(study: Study, load: SocketLoadTable, bones: Collection[str]) -> N
 def check_at_rest(study: Study) -> None:
     """Refuse tissues that contract or are stretched at rest.
 
-    Raises
-    ------
-    StudyError
+    Raises `StudyError`.
     """
     for place, states, remedy in (
         ("material.law", study.material.course, f'give a study of its own with the law "{FIBRED}"'),
@@ -215,10 +199,7 @@ def check_at_rest(study: Study) -> None:
 def build_loadable_socket(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
     """`build_socket` a limb on which the study's loads are known, too.
 
-    Raises
-    ------
-    StudyError
-        With the key and the remedy.
+    Raises `StudyError` with the key and the remedy.
     """
     socket = build_socket(study, anatomy, outer)
     for load in study.socket.loads:

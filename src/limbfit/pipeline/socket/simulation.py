@@ -111,10 +111,7 @@ class SocketRun:
 def solve_run(run: SocketRun, tell: Callable[[float, float, str], None]) -> DonningResult:
     """Put a socket on and load it; ``tell`` is given the time, the end of all, both s, and words.
 
-    Raises
-    ------
-    RunError
-        Where the simulation does not come to its end.
+    Raises `RunError` where the simulation does not come to its end.
     """
     fit, kept = run.fit, run.kept
     end = fit.ends[-1][2]

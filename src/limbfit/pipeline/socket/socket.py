@@ -24,7 +24,7 @@ from ...socket import Socket
 from ...socket.landmarks import find_bone
 from ...socket.published import select_published_findings
 from ...study import Study
-from ..engine.context import Context
+from ..engine.context import NO_PARAMETERS, Context
 from ..engine.partial_results import ResultFiles
 from ..engine.storage import write_result, write_table
 from ..engine.store import RUNS
@@ -53,13 +53,13 @@ def run_socket(
     context: Context,
     folder: Path,
     *,
-    parameters: Parameters,
-    parameters_from: str,
-    covariance_log: Sequence[Sequence[float]] | None,
-    most_probable: Parameters | None,
-    recorded_range: Mapping[str, Any] | None,
-    relaxation: dict[str, Any] | None,
-    samples: int,
+    parameters: Parameters = NO_PARAMETERS,
+    parameters_from: str = "",
+    covariance_log: Sequence[Sequence[float]] | None = None,
+    most_probable: Parameters | None = None,
+    recorded_range: Mapping[str, Any] | None = None,
+    relaxation: Mapping[str, Any] | None = None,
+    samples: int = 0,
 ) -> None:
     """Pressure, shear and settling in the study's socket at the ``parameters`` of the tissues.
 
@@ -101,7 +101,10 @@ def run_socket(
     compared = _compare_with_records(run, found, recorded_range)
     for held in (content["donning"], *content["loads"]):
         held |= compared[held.get("name", "donning")]
-    content["outside_text"] = [] if covariance is None else _describe_outside(content, recorded_range)
+    content["outside_text"] = []
+    if covariance is not None:
+        outside = {name_load(name): one["outside_records"] for name, one in compared.items()}
+        content["outside_text"] = describe_outside(outside) if recorded_range else [NOT_COMPARED]
     if covariance is not None and samples:
         steps = [draw_step(covariance, number) for number in range(samples)]
         content["samples"] = _simulate_samples(context, run, content, steps)
@@ -137,14 +140,6 @@ def _compare_with_records(
     return compared
 
 
-def _describe_outside(content: Mapping[str, Any], tested: Mapping[str, Any] | None) -> list[str]:
-    """In words what donning and loads do that no fitted record did."""
-    if tested is None:
-        return [NOT_COMPARED]
-    loads = {name_load(load["name"]): load["outside_records"] for load in content["loads"]}
-    return describe_outside({"donning": content["donning"]["outside_records"], **loads})
-
-
 def _simulate_samples(
     context: Context, run: SocketRun, content: dict[str, Any], steps: Sequence[Array]
 ) -> dict[str, Any]:
@@ -159,9 +154,11 @@ def _simulate_samples(
         replace(plain, name=f"draw {n}", parameters=study.by_tissue(at * np.exp(step)))
         for n, step in enumerate(steps, 1)
     ]
-    rougher = _build_rougher(run.limb)
-    if rougher is not None:
-        jobs.append(replace(plain, name=FRICTION, limb=rougher))
+    table = study.socket
+    if not isinstance(table.friction, str) and table.friction > 0.0:
+        more = {"friction": table.friction * (1.0 + CHANGE_PERCENT / 100.0)}
+        rougher = study.model_copy(update={"socket": table.model_copy(update=more)})
+        jobs.append(replace(plain, name=FRICTION, limb=replace(run.limb, study=rougher)))
     reasons = run_sockets(
         jobs, context.executor, lambda done, words: context.tell(NAME, done, len(jobs), words)
     )
@@ -179,15 +176,6 @@ def _simulate_samples(
     else:
         widen_intervals(content, found)
     return {"simulated": len(found), "failed": [reason for reason in reasons if reason]}
-
-
-def _build_rougher(limb: SocketLimb) -> SocketLimb | None:
-    """The same with a larger coefficient of friction; None where contact has none."""
-    table = limb.study.socket
-    if isinstance(table.friction, str) or table.friction == 0.0:
-        return None
-    more = table.model_copy(update={"friction": table.friction * (1.0 + CHANGE_PERCENT / 100.0)})
-    return replace(limb, study=limb.study.model_copy(update={"socket": more}))
 
 
 def _describe_shape(limb: SocketLimb, socket: Socket) -> dict[str, Any]:
@@ -215,7 +203,13 @@ def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:
     """Regions and steps as CSV."""
     columns = ("mean_kPa", "peak_kPa", "shear_kPa", "shear_peak_kPa")
     rows = [
-        [name, region["region"], *(region[key] for key in columns), *_describe_interval(region)]
+        [
+            name,
+            region["region"],
+            *(region[key] for key in columns),
+            *(region["interval_kPa"] or ("", "")),
+            next(iter(region["interval_from"] or {}), ""),
+        ]
         for name, held in (("donning", content["donning"]), *((one["name"], one) for one in content["loads"]))
         for region in held["regions"]
     ]
@@ -225,10 +219,3 @@ def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:
     heads = [*keys, *(f"force_{axis}_N" for axis in "xyz"), "settling_mm"]
     lines = [[*(row[key] for key in keys), *row["force_N"], row["move_mm"][2]] for row in content["steps"]]
     write_table(folder / "steps.csv", heads, lines)
-
-
-def _describe_interval(region: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Interval of a region's mean, and the parameter that most of it comes from; empty where not known."""
-    if region["interval_kPa"] is None:
-        return "", "", ""
-    return *region["interval_kPa"], next(iter(region["interval_from"]))

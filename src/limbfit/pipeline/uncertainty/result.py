@@ -57,10 +57,7 @@ def write_runs(
 def read_emulator(file: Path) -> Emulator:
     """The emulator of stored runs.
 
-    Raises
-    ------
-    InputError
-        Where there are none.
+    Raises `InputError` where there are none.
     """
     if not file.is_file():
         raise InputError("no emulator is stored", file=file, remedy="run limbfit uncertainty first")
@@ -117,12 +114,19 @@ def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) ->
     parameters, combinations = _summarise_parameters(found), _summarise_combinations(found)
     rows = [_write_prediction(folder, found, one) for one in predicted]
     explored, posterior, emulator = found.explored, found.explored.posterior, found.explored.emulator
-    predictions = stored.IntervalSummary(sites=rows, **_compute_coverage(rows))
+    inside = [(row.fitted, row.inside_percent) for row in rows if row.inside_percent is not None]
+    coverage = [[percent for of_fitted, percent in inside if of_fitted == kind] for kind in (True, False)]
+    fitted, heldout = (float(np.mean(shares)) if shares else None for shares in coverage)
+    predictions = stored.IntervalSummary(
+        sites=rows, coverage_fitted_percent=fitted, coverage_heldout_percent=heldout
+    )
+    sd = np.sqrt(np.diag(posterior.covariance))
+    sd = np.where(sd > 0, sd, 1.0)
     content = stored.UncertaintyResult(
         parameters=parameters,
         combinations=combinations,
         correlation=CorrelationMatrix(
-            names=found.known.names, matrix=_compute_correlation(posterior.covariance).tolist()
+            names=found.known.names, matrix=(posterior.covariance / np.outer(sd, sd)).tolist()
         ),
         covariance_log=posterior.covariance.tolist(),
         covariance_sources_log=found.source_covariance.tolist(),
@@ -302,17 +306,6 @@ def _write_prediction(folder: Path, found: Found, one: Predicted) -> stored.Inte
     )
 
 
-def _compute_coverage(rows: Sequence[stored.IntervalParts]) -> dict[str, float | None]:
-    """Mean share of the records inside their intervals, in percent."""
-    found: dict[str, float | None] = {}
-    for kind, fitted in (("fitted", True), ("heldout", False)):
-        shares = [
-            row.inside_percent for row in rows if row.fitted == fitted and row.inside_percent is not None
-        ]
-        found[f"coverage_{kind}_percent"] = float(np.mean(shares)) if shares else None
-    return found
-
-
 def _describe_verdict(
     found: Found,
     parameters: Sequence[stored.ParameterUncertainty],
@@ -385,12 +378,6 @@ def _describe_profiles(explored: Exploration) -> list[str]:
                 "the emulator alone."
             )
     return words
-
-
-def _compute_correlation(covariance: Array) -> Array:
-    sd = np.sqrt(np.diag(covariance))
-    sd = np.where(sd > 0, sd, 1.0)
-    return covariance / np.outer(sd, sd)
 
 
 def _flatten_row(row: ResultPart) -> dict[str, Any]:

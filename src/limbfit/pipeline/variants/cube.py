@@ -168,10 +168,15 @@ def compress_cube(
     back = int(np.argmin(np.abs(times - 2 * RAMP_S)))  # at its height again
     for material, facts in _list_tissues(parameters or {}, own, law):
         stress, least, most = compress(material, times, compression_percent)
+        table = material.table()
         stresses[facts["tissue"]] = stress.tolist()
         row = CubeTissue(
             **facts,
-            **_describe_material(material),
+            shear_modulus_kPa=material.instantaneous_modulus / (1.0 + table.prony[:, 0].sum()) / KPA,
+            instantaneous_modulus_kPa=material.instantaneous_modulus / KPA,
+            bulk_modulus_kPa=table.kappa / KPA,
+            prony=table.prony.tolist(),
+            terms=[(c / KPA, m) for c, m in table.terms] if table.has_terms else [],
             peak_kPa=stress.max(),
             back_kPa=stress[back],
             end_kPa=stress[-1],
@@ -212,7 +217,7 @@ def check_cube(study: Study, limb: LimbGeometry | None, options: Mapping[str, An
         raise InputError(what, file=study.file, place="material.law")
 
 
-def run_cube(context: Context, folder: Path, *, compression_percent: float) -> None:
+def run_cube(context: Context, folder: Path, *, compression_percent: float = COMPRESSION_PERCENT) -> None:
     """The experiment: this study's identified tissues beside the published ones."""
     context.tell("cube", 0, 1, "compressing")
     compress_cube(
@@ -260,17 +265,6 @@ def _list_tissues(
                 "source": known.source,
             },
         )
-
-
-def _describe_material(material: Material) -> dict[str, Any]:
-    table = material.table()
-    return {
-        "shear_modulus_kPa": material.instantaneous_modulus / (1.0 + table.prony[:, 0].sum()) / KPA,
-        "instantaneous_modulus_kPa": material.instantaneous_modulus / KPA,
-        "bulk_modulus_kPa": table.kappa / KPA,
-        "prony": table.prony,
-        "terms": [[c / KPA, m] for c, m in table.terms] if table.has_terms else [],
-    }
 
 
 def _build_times() -> Array:

@@ -30,14 +30,21 @@ from ..simulation.simulations import open_experiment_cache
 CHOICES = ("all", "fitted")
 
 
-def run_regions(context: Context, folder: Path, *, sites: str) -> None:
+def run_regions(context: Context, folder: Path, *, sites: str = "all") -> None:
     """Each region's own parameters, started from the whole limb's, and the errors of both.
 
     ``sites``: ``all`` fits every recorded site of a region, as table 3 lists them; ``fitted`` those that the
     study fits, and the others of the region are predicted.
     """
     study = context.study
-    members = _group_by_region(context, sites)
+    recorded = [site for site in study.sites if study.records_at(site)]
+    # By region: the sites that it is fitted on, and all that have a record.
+    members: dict[str, tuple[list[Site], list[Site]]] = {}
+    for name in dict.fromkeys(site.region for site in recorded if site.region):
+        mine = [site for site in recorded if site.region == name]
+        used = mine if sites == "all" else [site for site in mine if site.fitted]
+        if used:
+            members[name] = (used, mine)
     stages = context.results.calibration.stages
     whole = study.vector(stages[-1].parameters)
     cache = open_experiment_cache(context, folder)
@@ -54,7 +61,6 @@ def run_regions(context: Context, folder: Path, *, sites: str) -> None:
         _summarise_region(context, problem, simulators[name], name, members[name], fit, folder)
         for name, fit in found.items()
     ]
-    recorded = [site for site in study.sites if study.records_at(site)]
     without = [site.name for site in recorded if not site.region]
     unfitted = dict.fromkeys(site.region for site in recorded if site.region and site.region not in members)
     left_out = [f"region {name}: none of its sites is fitted" for name in unfitted]
@@ -87,20 +93,6 @@ def check_regions(study: Study, limb: LimbGeometry | None, options: Mapping[str,
             place="sites",
             remedy='give each a region, such as region = "tibia"',
         )
-
-
-def _group_by_region(context: Context, sites: str) -> dict[str, tuple[list[Site], list[Site]]]:
-    """By region: the sites that it is fitted on, and all that have a record."""
-    study = context.study
-    recorded = [site for site in study.sites if study.records_at(site)]
-    names = list(dict.fromkeys(site.region for site in recorded if site.region))
-    found = {}
-    for name in names:
-        mine = [site for site in recorded if site.region == name]
-        used = mine if sites == "all" else [site for site in mine if site.fitted]
-        if used:
-            found[name] = (used, mine)
-    return found
 
 
 def _build_region(

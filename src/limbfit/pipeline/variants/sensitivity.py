@@ -6,22 +6,23 @@ one with the thinnest and the one with the thickest tissue over bone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...arrays import Array
-from ...fe import Result, solve
+from ...errors import InputError
+from ...fe import solve
 from ...fe.kernel.laws import Laws
 from ...fe.observables import compute_element_fields
 from ...indentation import (
     Parameters,
     Simulation,
     SimulationJob,
-    SiteModel,
     build_problem,
     build_steps,
     to_parameters,
@@ -29,14 +30,27 @@ from ...indentation import (
 from ...mesh import read_vtu
 from ...results import variants as stored
 from ...shapes import BUILTIN_SHAPES, SHAPES
-from ...study import IndenterTable
+from ...study import IndenterTable, Study
 from ..engine.context import Context
-from ..engine.storage import write_table
+from ..limb.mesh import mesh_job, mesh_settings, read_mesh_facts, scale_edges
+from ..limb.remesh import mesh_models
 from ..records.records import load_records
+from ..simulation.extrapolation import MESH_ORDERS, extrapolate_richardson
+from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import SimulationCache, open_experiment_cache
-from .variants import ChosenSite, Variant, choose_sites, measure_tissue_over_bone, run_variants
+from .variants import (
+    ChosenSite,
+    Variant,
+    check_variants,
+    choose_sites,
+    compare_variants,
+    measure_tissue_over_bone,
+    run_variants,
+    simulate_variants,
+    store_variants,
+)
 
-NO_VOLUME = dict.fromkeys(("J_min", "J_low", "J_high", "J_max", "beyond_percent"))
+NO_VOLUME: Mapping[str, float | None] = dict.fromkeys(("J_min", "J_low", "J_high", "J_max", "beyond_percent"))
 ALLOWED = 0.01  # departure of J from one that the paper's bulk modulus is to keep to
 
 
@@ -50,7 +64,13 @@ def simulate_with_volumes(job: SimulationJob) -> Simulation:
     model = job.model
     parameters = to_parameters(job.parameters, job.tissues, job.model.law)
     problem = build_problem(model, read_vtu(model.mesh), parameters)
-    result = solve(problem, steps=build_steps(model), store="peak")
+    result, volumes = solve(problem, steps=build_steps(model), store="peak"), NO_VOLUME
+    if result.states:
+        laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+        J = compute_element_fields(result.system, laws, result.states[-1]).J
+        centres = problem.mesh.points[problem.mesh.corners].mean(axis=1)
+        near = np.linalg.norm(centres - np.array(model.position), axis=1) < model.indenter.width_mm
+        volumes = summarise_volumes(J[near], result.system.weights.sum(axis=1)[near])
     return Simulation(
         site=model.name,
         force_N=result.force_at(np.array(job.times_s) + model.waits_s),
@@ -58,20 +78,9 @@ def simulate_with_volumes(job: SimulationJob) -> Simulation:
         completed=result.completed,
         reason=result.reason,
         penetration_mm=float(result.penetration.max(initial=0.0)),
-        facts=dict(result.statistics) | {"volume": _compute_volume_ratio(result, model)},
+        facts=dict(result.statistics) | {"volume": dict(volumes)},
         doubts=result.doubts,
     )
-
-
-def _compute_volume_ratio(result: Result, model: SiteModel) -> dict[str, Any]:
-    if not result.states:
-        return dict(NO_VOLUME)
-    problem = result.problem
-    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    J = compute_element_fields(result.system, laws, result.states[-1]).J
-    centres = problem.mesh.points[problem.mesh.corners].mean(axis=1)
-    near = np.linalg.norm(centres - np.array(model.position), axis=1) < model.indenter.width_mm
-    return summarise_volumes(J[near], result.system.weights.sum(axis=1)[near])
 
 
 def summarise_volumes(J: Array, volumes: Array) -> dict[str, float]:
@@ -93,7 +102,7 @@ FACTORS = (0.5, 2.0)
 KAPPA_RATIOS = (10.0, 25.0, 50.0, 100.0, 200.0, 400.0)
 
 
-def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str]) -> None:
+def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str] = ()) -> None:
     """Force against the moduli of each tissue, all with the same ``m`` (the geometric mean of theirs).
 
     Beside it the exact derivatives at all recorded sites, with the identified ``m``.
@@ -108,9 +117,6 @@ def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str]) -> No
     local = _collect_derivatives(context, cache, identified)
     more = {"equal_m": m, "factors": FACTORS, "local": local}
     run_variants(context, folder, stored.StiffnessResult, stored.StiffnessRun, variants, cache, **more)
-    heads = ["site", "region", "tissue_mm", *(f"{tissue}_c" for tissue in identified)]
-    rows = [[row.site, row.region, row.tissue_mm, *row.peak_percent_per_percent.values()] for row in local]
-    write_table(folder / "derivatives.csv", heads, rows)
 
 
 def _build_stiffer(chosen: ChosenSite, equal: Parameters, moduli: Sequence[str]) -> list[Variant]:
@@ -163,7 +169,9 @@ def _collect_derivatives(
     return rows
 
 
-def run_kappa(context: Context, folder: Path, *, sites: Sequence[str], ratios: Sequence[float]) -> None:
+def run_kappa(
+    context: Context, folder: Path, *, sites: Sequence[str] = (), ratios: Sequence[float] = KAPPA_RATIOS
+) -> None:
     """Force and change of volume against the ratio of bulk modulus and ``c``."""
     identified, own = context.results.calibration.parameters, context.study.material.kappa_ratio
     variants = [
@@ -184,7 +192,7 @@ def run_kappa(context: Context, folder: Path, *, sites: Sequence[str], ratios: S
     run_variants(context, folder, *models, variants, cache, kappa_ratio=own)
 
 
-def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> None:
+def run_contact(context: Context, folder: Path, *, sites: Sequence[str] = ()) -> None:
     """Force where the skin slips freely under the indenter, and where it sticks to it."""
     identified, chosen = context.results.calibration.parameters, choose_sites(context, sites)
     variants = [
@@ -203,7 +211,7 @@ def run_contact(context: Context, folder: Path, *, sites: Sequence[str]) -> None
     run_variants(context, folder, *models, variants, friction=friction)
 
 
-def run_indenter(context: Context, folder: Path, *, sites: Sequence[str]) -> None:
+def run_indenter(context: Context, folder: Path, *, sites: Sequence[str] = ()) -> None:
     """Force and effort with the indenter as it is, and with others of its width: a sphere before all."""
     identified, chosen = context.results.calibration.parameters, choose_sites(context, sites)
     variants = [
@@ -233,3 +241,104 @@ def list_other_indenters(own: IndenterTable) -> list[tuple[str, IndenterTable, b
             if table != own:
                 found.append((label, table, False))
     return found
+
+
+EDGE_FACTORS = (1.4, 1.0, 0.7)  # of the edge lengths of the study's meshes
+FARTHEST = 0.1  # of the force on the finest mesh: a limit farther away is no limit
+
+
+def check_refinement(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
+    """Refuse one mesh alone, and what `check_variants` does."""
+    check_variants(study, limb, options)
+    wanted = _choose_factors(options["factors"])
+    if len(wanted) < 2 or wanted[-1] <= 0.0:
+        raise InputError("one mesh cannot be compared", place="factors", remedy="give another edge length")
+
+
+def _choose_factors(given: Sequence[float]) -> list[float]:
+    """Of the edges, the coarsest first; the study's own among them."""
+    return sorted({1.0, *map(float, given)}, reverse=True)
+
+
+def run_refinement(
+    context: Context, folder: Path, *, sites: Sequence[str] = (), factors: Sequence[float] = EDGE_FACTORS
+) -> None:
+    """Force at sites on meshes whose edges are ``factors`` times the study's, and what it tends to."""
+    parameters, chosen = context.results.calibration.parameters, choose_sites(context, sites)
+    variants = _build_variants(context, folder, chosen, _choose_factors(factors), parameters)
+    simulations = simulate_variants(context, folder, stored.RefinementResult, variants)
+    refined = [
+        stored.RefinedSite(**dict(one.summary), **_find_limit(one, variants, simulations)) for one in chosen
+    ]
+    runs = compare_variants(variants, simulations, stored.RefinementRun)
+    store_variants(context, folder, stored.RefinementResult, runs, sites=refined)
+
+
+def _build_variants(
+    context: Context,
+    folder: Path,
+    chosen: Sequence[ChosenSite],
+    factors: Sequence[float],
+    parameters: Parameters,
+) -> list[Variant]:
+    """Each site on each mesh; those that are not there yet are made."""
+    settings, stored = mesh_settings(context.study), context.results.mesh.sites
+    others = [(one.model, factor) for one in chosen for factor in factors if factor != 1.0]
+    jobs = [
+        mesh_job(
+            context,
+            model.site,
+            model.position,
+            model.axis,
+            scale_edges(settings, factor),
+            folder / f"{model.site}-{factor:g}.vtu",
+        )
+        for model, factor in others
+    ]
+    report = partial(context.tell, "sensitivity-mesh", 0, 0)
+    meshed = iter(mesh_models(jobs, [model for model, _ in others], context.executor, report))
+    variants = []
+    for one in chosen:
+        for factor in factors:
+            model = one.model if factor == 1.0 else next(meshed)
+            known = stored[model.site] if factor == 1.0 else read_mesh_facts(model.mesh)
+            facts = {
+                "factor": factor,
+                "edge_near_mm": factor * settings.edge_near_mm,
+                "element": settings.element,
+                "nodes": known.nodes,
+                "cells": known.cells,
+            }
+            label = f"edge x {factor:g}"
+            variants.append(Variant(one, model, parameters, label, facts, base=factor == 1.0))
+    return variants
+
+
+def _find_limit(
+    one: ChosenSite, variants: Sequence[Variant], simulations: Sequence[Simulation]
+) -> dict[str, Any]:
+    """The largest force that the meshes of a site tend to, and how far the study's mesh is from it.
+
+    Nothing where they do not tend to anything yet. With an element whose forces do not change in one
+    direction, the limit is the finest mesh's force, at no order.
+    """
+    done = {
+        float(variant.facts["edge_near_mm"]): float(simulation.force_N.max())
+        for variant, simulation in zip(variants, simulations, strict=True)
+        if variant.chosen is one and simulation.completed
+    }
+    own = next(v for v in variants if v.chosen is one and v.base)
+    edge = float(own.facts["edge_near_mm"])
+    nothing = dict.fromkeys(("limit_N", "order", "order_measured", "error_percent"))
+    if len(done) < 2 or edge not in done:
+        return nothing
+    found = extrapolate_richardson(list(done), list(done.values()), MESH_ORDERS[own.facts["element"]])
+    finest = done[min(done)]
+    if abs(found.limit - finest) > FARTHEST * finest:
+        return nothing
+    return {
+        "limit_N": found.limit,
+        "order": found.order,
+        "order_measured": found.measured,
+        "error_percent": found.error_percent(done[edge]),
+    }

@@ -78,10 +78,7 @@ def _select_driven(study: Study, names: Sequence[str]) -> list[Indentation]:
 def choose_sites(context: Context, names: Sequence[str]) -> list[ChosenSite]:
     """The named indentations; none named: one where the tissue over the bone is thinnest, one where thickest.
 
-    Raises
-    ------
-    InputError
-        For a site or record that the study does not have, and a site with several.
+    Raises `InputError` for a site or record that the study does not have, and a site with several.
     """
     every = []
     for one in _select_driven(context.study, names):
