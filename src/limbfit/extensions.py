@@ -28,12 +28,8 @@ class Registry(Generic[T]):
         self._added: dict[str, tuple[T, Path | None]] = {}
 
     def add(self, name: str, what: T) -> None:
-        """Register ``what``; a file may register its own names again, and a session anything.
-
-        Raises
-        ------
-        InputError
-            Where the name is taken.
+        """Register ``what``; a file may register its own names again, and a session anything. Raises
+        `InputError` where the name is taken.
         """
         source = _running[-1] if _running else None
         known = self._added[name][1] if name in self._added else None
@@ -42,13 +38,7 @@ class Registry(Generic[T]):
         self._added[name] = what, source
 
     def __getitem__(self, name: str) -> T:
-        """What is registered by a name.
-
-        Raises
-        ------
-        InputError
-            Where nothing is.
-        """
+        """What is registered by a name. Raises `InputError` where nothing is."""
         if name in self._own:
             return self._own[name]
         if name in self._added:
@@ -69,12 +59,8 @@ class Registry(Generic[T]):
 
 
 def load_extensions(files: Iterable[Path]) -> None:
-    """Run files that register something, unless that was done.
-
-    Raises
-    ------
-    InputError
-        For a file that cannot be run, with what it raised.
+    """Run files that register something, unless that was done. Raises `InputError` for a file that cannot be
+    run, with what it raised.
     """
     for file in files:
         digest = _compute_digest(file)

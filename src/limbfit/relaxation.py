@@ -23,12 +23,8 @@ MAX_SPAN = 1e7  # last time over first; with more, waves in a power of -0.2 exce
 def choose_relaxation_times(first_s: float, last_s: float) -> Array:
     """Return five or six relaxation times (n,), s, from ``first_s`` to ``last_s``, even in the logarithm.
 
-    Five are a decade apart, or less, where the span is four decades or less; six cover a wider one.
-
-    Raises
-    ------
-    InputError
-        If the times do not grow from above zero, or the last is more than 1e7 times the first.
+    Five are a decade apart, or less, where the span is four decades or less; six cover a wider one. Raises
+    `InputError` if the times do not grow from above zero, or the last is more than 1e7 times the first.
     """
     if not 0.0 < first_s < last_s < math.inf or last_s > MAX_SPAN * first_s:
         raise InputError(

@@ -9,12 +9,8 @@ from typing import Any
 
 
 def find_renamed(module: str, name: str, renamed: Mapping[str, str]) -> Any:
-    """Return what a module's old ``name`` stands for; for the module's ``__getattr__``.
-
-    Raises
-    ------
-    AttributeError
-        Where the module never had the name.
+    """Return what a module's old ``name`` stands for; for the module's ``__getattr__``. Raises
+    `AttributeError` where the module never had the name.
     """
     if name not in renamed:
         raise AttributeError(f"module {module!r} has no attribute {name!r}")

@@ -161,14 +161,8 @@ def _explain_port_error(error: Exception, baud: int) -> str:
 
 
 def connect(address: str, timeout_s: float = 5.0) -> Link:
-    """Open the wire of an address: ``tcp://HOST[:PORT]`` or ``serial:PATH[@BAUD]``.
-
-    Raises
-    ------
-    InputError
-        For an address of neither form.
-    RunError
-        Where nobody listens, or the port cannot be opened.
+    """Open the wire of an address: ``tcp://HOST[:PORT]`` or ``serial:PATH[@BAUD]``. Raises `InputError` for
+    an address of neither form, and `RunError` where nobody listens, or the port cannot be opened.
     """
     if match := _TCP.match(address):
         host, port = match[1].strip("[]"), int(match[2] or DEFAULT_PORT)

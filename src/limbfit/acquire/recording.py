@@ -146,12 +146,8 @@ class Recording:
 
 
 def read_recording(file: str | Path) -> Recording:
-    """Read a record, finished or not, up to the last block that is whole.
-
-    Raises
-    ------
-    TraceError
-        Where it is no record, or its first block is damaged.
+    """Read a record, finished or not, up to the last block that is whole. Raises `TraceError` where it is no
+    record, or its first block is damaged.
     """
     path = Path(file)
     if not path.is_file():

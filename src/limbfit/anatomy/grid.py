@@ -247,12 +247,8 @@ class LabelMap(Grid):
         )
 
     def with_regions(self, regions: Mapping[str, str]) -> LabelMap:
-        """Return the map with some labels as regions, given by the label of each region's name.
-
-        Raises
-        ------
-        LabelError
-            For a label that has no voxel, or that is soft tissue as a whole.
+        """Return the map with some labels as regions, given by the label of each region's name. Raises
+        `LabelError` for a label that has no voxel, or that is soft tissue as a whole.
         """
         present = {self.names.get(value) for value in np.unique(self.array).tolist()} - {None}
         for name, label in regions.items():

@@ -81,12 +81,8 @@ def _divide_depth(divisions: int) -> tuple[int, int]:
 
 
 def choose_divisions(element: str, unknowns: int) -> int:
-    """Fewest cells along the side that give a block that many unknowns.
-
-    Raises
-    ------
-    ProblemError
-        For an element that is not in the table.
+    """Fewest cells along the side that give a block that many unknowns. Raises `ProblemError` for an element
+    that is not in the table.
     """
     if element not in ELEMENTS:
         raise ProblemError(f"no element {element!r}", remedy=f"use one of {', '.join(ELEMENTS)}")

@@ -221,12 +221,8 @@ def compare_force(case: ReferenceCase, folder: Path) -> Row:
 
 
 def compare_socket(case: SocketCase, folder: Path) -> Iterator[dict[str, Any]]:
-    """A row for each part of a case, of FEBio's input run by limbfit and the tables of both.
-
-    Raises
-    ------
-    InputError
-        Where a file of the case is missing.
+    """A row for each part of a case, of FEBio's input run by limbfit and the tables of both. Raises
+    `InputError` where a file of the case is missing.
     """
     file = folder / "socket" / f"{case.name}.feb"
     if not file.is_file():
@@ -276,12 +272,8 @@ def _build_unfinished_row(reason: str) -> Row:
 
 
 def find_reference(start: Path) -> Path:
-    """The folder ``shared/reference`` in, or beside, ``start`` or any folder above it.
-
-    Raises
-    ------
-    InputError
-        Where there is none.
+    """The folder ``shared/reference`` in, or beside, ``start`` or any folder above it. Raises `InputError`
+    where there is none.
     """
     start = start.resolve()
     for folder in (start, *start.parents):
@@ -295,12 +287,8 @@ def find_reference(start: Path) -> Path:
 
 
 def load_case(case: ReferenceCase, folder: Path) -> tuple[Problem, StepControl, FebioLog]:
-    """The problem on FEBio's mesh, FEBio's own time steps, and FEBio's results.
-
-    Raises
-    ------
-    InputError
-        Where a file of the case is missing or damaged.
+    """The problem on FEBio's mesh, FEBio's own time steps, and FEBio's results. Raises `InputError` where a
+    file of the case is missing or damaged.
     """
     model = read_feb(folder / f"{case.name}.feb")
     log = read_log(folder / f"{case.name}.txt")

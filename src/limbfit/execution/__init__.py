@@ -68,12 +68,8 @@ def share_executor(executor: Executor) -> AbstractContextManager[None]:
 def make_executor(workers: int = 0, limits: Limits = NO_LIMITS) -> Executor:
     """Make an executor with that many workers, one thread each; 0 means one worker per usable core.
 
-    One worker means this process itself. `place_jobs` and `share_executor` take precedence.
-
-    Raises
-    ------
-    InputError
-        For a scheduler or a batch system that cannot be used.
+    One worker means this process itself. `place_jobs` and `share_executor` take precedence. Raises
+    `InputError` for a scheduler or a batch system that cannot be used.
     """
     shared, placement = _shared.get(), _placement.get() or Placement()
     if shared is not None:

@@ -82,12 +82,8 @@ class DaskExecutor(Executor):
 
     @classmethod
     def connect(cls, address: str, limits: Limits = NO_LIMITS) -> Self:
-        """Use the workers of the scheduler at ``address`` (``tcp://host:8786``).
-
-        Raises
-        ------
-        InputError
-            If Dask is not installed, or no scheduler answers.
+        """Use the workers of the scheduler at ``address`` (``tcp://host:8786``). Raises `InputError` if Dask
+        is not installed, or no scheduler answers.
         """
         try:
             client = _import_dask("distributed").Client(address, timeout=_CONNECT_S, set_as_default=False)
@@ -103,12 +99,8 @@ class DaskExecutor(Executor):
     def from_queue(cls, queue: str, workers: int, limits: Limits = NO_LIMITS) -> Self:
         """Use ``workers`` jobs of a batch system (`QUEUES`), or local processes (``local``).
 
-        What else the batch system wants (queue, account, walltime) stands in Dask's ``jobqueue.yaml``.
-
-        Raises
-        ------
-        InputError
-            For an unknown batch system, or one that cannot be used as configured.
+        What else the batch system wants (queue, account, walltime) stands in Dask's ``jobqueue.yaml``. Raises
+        `InputError` for an unknown batch system, or one that cannot be used as configured.
         """
         if queue == LOCAL_QUEUE:
             cluster = _import_dask("distributed").LocalCluster(

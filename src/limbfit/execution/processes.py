@@ -301,12 +301,7 @@ def run_in_background(function: Callable[[Any], Any], job: Any) -> Iterator[Call
     """Run ``function(job)`` beside the block, which gets a function that waits for the answer.
 
     An exception of the job is raised where it is waited for. A job that is not done when the block ends is
-    ended.
-
-    Raises
-    ------
-    RunError
-        If the process died.
+    ended. Raises `RunError` if the process died.
     """
     worker = Worker(threads=1)
     worker.send(function, job)

@@ -235,12 +235,8 @@ class RigidBody:
 
 
 def read_course(what: str, of: str, times: ArrayLike, values: ArrayLike) -> tuple[Array, Array]:
-    """Times (n,) s and values (n,) that are piecewise linear between them.
-
-    Raises
-    ------
-    ProblemError
-        Where there are not as many of both, two or more, some are not finite, or times do not grow from 0.
+    """Times (n,) s and values (n,) that are piecewise linear between them. Raises `ProblemError` where there
+    are not as many of both, two or more, some are not finite, or times do not grow from 0.
     """
     t, v = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
     if t.ndim != 1 or t.shape != v.shape or len(t) < 2:

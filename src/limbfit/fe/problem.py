@@ -273,12 +273,8 @@ def isochoric_stretch(directions: ArrayLike, stretches: ArrayLike) -> Array:
     """Pre-stretches (m, 3, 3) along ``directions`` at constant volume.
 
     ``directions (m, 3)``, or one (3,), of any length; ``stretches``, one or (m,), along them: what is across
-    has their inverse root.  A layer that is stretched by s in its plane has 1/s^2 along its normal.
-
-    Raises
-    ------
-    ProblemError
-        Where a direction has no length, or a stretch is not positive.
+    has their inverse root.  A layer that is stretched by s in its plane has 1/s^2 along its normal. Raises
+    `ProblemError` where a direction has no length, or a stretch is not positive.
     """
     n, along = np.atleast_2d(np.asarray(directions, dtype=float)), np.asarray(stretches, dtype=float)
     length = np.linalg.norm(n, axis=1, keepdims=True)

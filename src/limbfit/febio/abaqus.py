@@ -35,14 +35,9 @@ _NO_COMPRESSIBILITY = 1e12  # mm^2/N
 
 
 def write_inp(problem: Problem, path: str | Path, program: str, settings: FebSettings) -> RigidMesh:
-    """Write an indentation as ``.inp``; return the indenter's rigid mesh.
-
-    Raises
-    ------
-    ProblemError
-        If the program has no such material, and for what `write_feb` refuses, too.
-    RunError
-        If the file cannot be written.
+    """Write an indentation as ``.inp``; return the indenter's rigid mesh. Raises `ProblemError` if the
+    program has no such material, and for what `write_feb` refuses, too, and `RunError` if the file cannot be
+    written.
     """
     check_simple_indentation(problem, program.capitalize())
     for name in problem.mesh.region_names:

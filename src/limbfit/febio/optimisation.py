@@ -76,14 +76,8 @@ def write_optimisation(
     *,
     iterations: int = 25,
 ) -> None:
-    """Write the control file that fits the tissues to the force (n,) N at ``times (n,)`` s.
-
-    Raises
-    ------
-    ProblemError
-        For more tissues than FEBio can fit at once.
-    RunError
-        If the file cannot be written.
+    """Write the control file that fits the tissues to the force (n,) N at ``times (n,)`` s. Raises
+    `ProblemError` for more tissues than FEBio can fit at once, and `RunError` if the file cannot be written.
     """
     count = sum(tissue.count for tissue in tissues.values())
     if count > MAX_PARAMETERS:

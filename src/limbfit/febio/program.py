@@ -48,12 +48,8 @@ class FebioRun:
 
 
 def find_febio(program: str | Path | None = None) -> Path:
-    """Find the FEBio program: the one given, that of ``FEBIO_CMD``, or febio4 or febio on the path.
-
-    Raises
-    ------
-    InputError
-        If there is none, with how to get it.
+    """Find the FEBio program: the one given, that of ``FEBIO_CMD``, or febio4 or febio on the path. Raises
+    `InputError` if there is none, with how to get it.
     """
     for name, given in (("febio.program", program), (PROGRAM_VARIABLE, os.environ.get(PROGRAM_VARIABLE))):
         if given:
@@ -144,12 +140,8 @@ def build_result(problem: Problem, log: FebioLog | None, verdict: RunVerdict, se
     """Build a `Result` of FEBio's force over time, complete or not.
 
     FEBio's table does not contain penetration and area. Forces across the axis, moments and coordinates are
-    not read. All of these are NaN, and there are no states.
-
-    Raises
-    ------
-    ProblemError
-        If the table holds no force along the indenter's axis, or goes beyond the history.
+    not read. All of these are NaN, and there are no states. Raises `ProblemError` if the table holds no force
+    along the indenter's axis, or goes beyond the history.
     """
     times, force = np.zeros(1), np.zeros(1)
     if log is not None:
@@ -193,12 +185,8 @@ def build_result(problem: Problem, log: FebioLog | None, verdict: RunVerdict, se
 
 
 def compute_axial_force(problem: Problem, log: FebioLog) -> Array:
-    """Return the force (n,) of the indenter on the tissue along its axis, N.
-
-    Raises
-    ------
-    ProblemError
-        If the table lacks a component of it.
+    """Return the force (n,) of the indenter on the tissue along its axis, N. Raises `ProblemError` if the
+    table lacks a component of it.
     """
     assert problem.indenter is not None
     force = np.zeros(len(log.times))
@@ -305,12 +293,8 @@ class FebioLog:
 def read_log(path: str | Path) -> FebioLog:
     """Read a log file of FEBio: ``*Step``, ``*Time``, ``*Data`` and one line per item, per step.
 
-    A last step that was not written to its end is left out.
-
-    Raises
-    ------
-    ProblemError
-        If the file is missing, holds no complete step, or a line that is no number.
+    A last step that was not written to its end is left out. Raises `ProblemError` if the file is missing,
+    holds no complete step, or a line that is no number.
     """
     try:
         text = Path(path).read_text(encoding="utf-8", errors="replace")

@@ -80,14 +80,9 @@ class FebSettings:
 
 def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None = None) -> RigidMesh | None:
     """Write a problem as FEBio input; return the rigid mesh of its indenter, or of its first body, if any.
-
-    Raises
-    ------
-    ProblemError
-        For a problem that FEBio cannot be given as it is: sticky contact, limbfit's own elements, a force
-        along an axis between those of space that is not all that drives a body; and as `prepare_problem`.
-    RunError
-        If the file cannot be written.
+    Raises `ProblemError` for a problem that FEBio cannot be given as it is: sticky contact, limbfit's own
+    elements, a force along an axis between those of space that is not all that drives a body; and as
+    `prepare_problem`, and `RunError` if the file cannot be written.
     """
     settings = settings or FebSettings()
     bodies, prepared = _check_bodies(problem), problem

@@ -33,11 +33,7 @@ _SOLVED = 1e-8  # residual of the potential
 
 def build_fibre_field(fibres: Iterable[tuple[str, Direction]], mesh: Mesh) -> Array | None:
     """The fibres' direction in each cell (m, 3); any where a tissue has none, None where all have none.
-
-    Raises
-    ------
-    ProblemError
-        Where a flow has no way: see `compute_flow_directions`.
+    Raises `ProblemError` where a flow has no way: see `compute_flow_directions`.
     """
     found = None
     for tissue, direction in fibres:
@@ -51,12 +47,9 @@ def build_fibre_field(fibres: Iterable[tuple[str, Direction]], mesh: Mesh) -> Ar
 def compute_flow_directions(mesh: Mesh, tissue: str) -> Array:
     """Unit directions (k, 3) in the cells of a tissue, in their order, towards the far end of the bone.
 
-    The potential is 0 on the proximal cut and 1 on the bone within `DISTAL_MM` of its far end.
-
-    Raises
-    ------
-    ProblemError
-        For a mesh of other than tetrahedra, and where the tissue meets no cut or no end of the bone.
+    The potential is 0 on the proximal cut and 1 on the bone within `DISTAL_MM` of its far end. Raises
+    `ProblemError` for a mesh of other than tetrahedra, and where the tissue meets no cut or no end of the
+    bone.
     """
     if not mesh.kind.is_tetrahedron:
         raise ProblemError("fibres along a flow need a mesh of tetrahedra", remedy="state a direction")

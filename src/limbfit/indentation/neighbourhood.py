@@ -41,12 +41,7 @@ class Neighbourhood:
 def cut_neighbourhood(mesh: Mesh, centre: Array, radius_mm: float) -> Neighbourhood:
     """The cells within a distance of a point that hang together with the one nearest to it.
 
-    Node and face sets keep what is left of them.
-
-    Raises
-    ------
-    ProblemError
-        Where no cell is that near.
+    Node and face sets keep what is left of them. Raises `ProblemError` where no cell is that near.
     """
     distance = np.linalg.norm(mesh.points[mesh.corners].mean(axis=1) - centre, axis=1)
     near = np.flatnonzero(distance < radius_mm)

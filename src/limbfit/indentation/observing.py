@@ -98,12 +98,7 @@ def place_waves_under(
     Tissue moves along the indenter's axis, and the waves run along its edge.
 
     ``wanted``: tissues, each so deep below the skin, mm, or in its own middle; by default the middle of every
-    tissue.
-
-    Raises
-    ------
-    ProblemError
-        For a tissue that is not there, or not so deep.
+    tissue. Raises `ProblemError` for a tissue that is not there, or not so deep.
     """
     way, _, axis = read_indenter(model.indenter, model.position, model.axis, model.edge).frame
     position, top, spans = np.array(model.position), 0.0, {}
@@ -209,11 +204,7 @@ class SkinPoints:
 
 def find_skin_points(mesh: Mesh, points: Array) -> SkinPoints:
     """The points of a mesh's face set ``skin`` nearest to ``points`` (k, 3), mm; see `find_nearest_points`.
-
-    Raises
-    ------
-    ProblemError
-        For a mesh without skin.
+    Raises `ProblemError` for a mesh without skin.
     """
     faces = mesh.face_sets.get("skin", np.empty((0, 3), dtype=np.int64))
     if not len(faces):

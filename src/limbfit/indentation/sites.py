@@ -221,11 +221,7 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
 
 def read_indenter(table: IndenterTable, position: Vector, axis: Vector, edge: Vector | None) -> Indenter:
     """The indenter at a site; reads the surface of shape ``stl``, whose path must be one of this machine.
-
-    Raises
-    ------
-    InputError
-        For a surface that cannot be read, or that is no indenter.
+    Raises `InputError` for a surface that cannot be read, or that is no indenter.
     """
     file, surface = table.file, None
     if file is not None:

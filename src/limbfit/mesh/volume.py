@@ -213,11 +213,7 @@ def check(mesh: Mesh, measure: Callable[[Mesh], Array] | None = None) -> None:
 
 def boundary_faces(mesh: Mesh, chosen: Mask | None = None) -> Indices:
     """Outward faces (k, 3, 6 or 4) that belong to one cell only, of all cells or of the ``chosen`` (m,).
-
-    Raises
-    ------
-    ProblemError
-        When a face belongs to more than two cells.
+    Raises `ProblemError` when a face belongs to more than two cells.
     """
     faces = (mesh.cells if chosen is None else mesh.cells[chosen])[:, mesh.kind.faces]
     faces = faces.reshape(-1, faces.shape[2])

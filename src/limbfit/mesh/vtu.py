@@ -118,12 +118,8 @@ def grid_to_mesh(grid: vtkUnstructuredGrid, path: str | Path) -> Mesh:
 
 
 def read_grid(path: Path) -> vtkUnstructuredGrid:
-    """A VTU file as VTK's own grid, with all its fields.
-
-    Raises
-    ------
-    ProblemError
-        When there is no such file, or it holds no cells.
+    """A VTU file as VTK's own grid, with all its fields. Raises `ProblemError` when there is no such file, or
+    it holds no cells.
     """
     if not path.is_file():
         raise ProblemError("no such mesh", file=path)

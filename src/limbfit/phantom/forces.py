@@ -140,13 +140,7 @@ def mesh_true_site(job: TruthMeshJob) -> Mesh:
 
 
 def simulate_true_force(job: ForceJob) -> TrueForce:
-    """Solve one site.
-
-    Raises
-    ------
-    RunError
-        When the simulation does not complete.
-    """
+    """Solve one site. Raises `RunError` when the simulation does not complete."""
     site = job.site
     knots_s, knots_mm = site.ramp.knots
     model = SiteModel(

@@ -119,12 +119,8 @@ def make_limb(
     tendon: bool = False,
     kind: str = "transtibial",
 ) -> Limb:
-    """The limb of a seed: its shape, lying 8 to 14 degrees off the patient axes, under some layers.
-
-    Raises
-    ------
-    InputError
-        For a limb that is none of ``LIMBS``, or a patellar tendon of one that has none.
+    """The limb of a seed: its shape, lying 8 to 14 degrees off the patient axes, under some layers. Raises
+    `InputError` for a limb that is none of ``LIMBS``, or a patellar tendon of one that has none.
     """
     if kind not in LIMBS:
         raise InputError(f"unknown limb {kind!r}", remedy=f"use one of {', '.join(LIMBS)}")

@@ -98,12 +98,8 @@ def build_true_sites(limb: Limb, seed: int) -> tuple[TrueSite, ...]:
 
 
 def select_sites(sites: Sequence[TrueSite], names: Sequence[str]) -> tuple[TrueSite, ...]:
-    """Select the named sites, in the order of the limb's list.
-
-    Raises
-    ------
-    SiteError
-        When a name is not among them.
+    """Select the named sites, in the order of the limb's list. Raises `SiteError` when a name is not among
+    them.
     """
     available = {site.name for site in sites}
     unknown = [name for name in names if name not in available]

@@ -33,12 +33,8 @@ def build_report(results: Path, out: Path) -> Path:
     Beside it: ``methods.md``, its tables in ``tables`` and its drawings in ``figures``.
 
     Only stored artefacts are read, nothing is solved. Parts that are not stored yet are left out with a
-    sentence that says so.
-
-    Raises
-    ------
-    InputError
-        When there is no such results folder, or a stored file is not readable.
+    sentence that says so. Raises `InputError` when there is no such results folder, or a stored file is not
+    readable.
     """
     store, out = load_store(Path(results)), Path(out)
     page = make_page(store)

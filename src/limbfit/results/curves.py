@@ -11,13 +11,7 @@ from ..errors import InputError
 
 
 def read_curves(file: Path) -> dict[str, Array]:
-    """Read the columns (n,) of a CSV of numbers, by their heads.
-
-    Raises
-    ------
-    InputError
-        For a file that is none.
-    """
+    """Read the columns (n,) of a CSV of numbers, by their heads. Raises `InputError` for any other file."""
     lines = file.read_text(encoding="utf-8").splitlines()
     names = [name.strip() for name in lines[0].split(",")] if lines else []
     try:

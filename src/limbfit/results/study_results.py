@@ -97,11 +97,7 @@ class StudyResults:
 
     def curves(self, stage: str, name: str) -> dict[str, Array]:
         """Return the columns (n,) of ``results/<stage>/<name>.csv`` by their heads, such as ``force_N``.
-
-        Raises
-        ------
-        InputError
-            Where there is no such file; it names those that there are.
+        Raises `InputError` where there is no such file; it names those that there are.
         """
         file = self.folder / stage / f"{name}.csv"
         if not file.is_file():

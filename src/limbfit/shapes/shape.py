@@ -104,25 +104,15 @@ class Shape(ABC):
 
     @classmethod
     def of(cls, size: Size) -> Self:
-        """The shape of a size.
-
-        Raises
-        ------
-        ProblemError
-            Where it cannot be of that size.
-        """
+        """The shape of a size. Raises `ProblemError` where it cannot be of that size."""
         if size.surface is not None:
             raise ProblemError(f"an indenter of shape {cls.name!r} has no surface")
         return cls(size.width, size.radius, **cls.complete_measures(size.measures or {}))
 
     @classmethod
     def complete_measures(cls, given: Mapping[str, float]) -> dict[str, float]:
-        """Return its measures by key, with the usual value of each that is not given.
-
-        Raises
-        ------
-        ProblemError
-            For one that it does not have, or beyond its bounds.
+        """Return its measures by key, with the usual value of each that is not given. Raises `ProblemError`
+        for one that it does not have, or beyond its bounds.
         """
         unknown = sorted(given.keys() - {measure.key for measure in cls.measures})
         if unknown:

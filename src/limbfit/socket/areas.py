@@ -71,11 +71,7 @@ class Area:
 
     def project_to(self, face: Surface) -> Self:
         """Put its points on the drawn face (LPS), which a liner keeps off the skin; leave out those off it.
-
-        Raises
-        ------
-        SurfaceError
-            Where all of it lies off the face.
+        Raises `SurfaceError` where all of it lies off the face.
         """
         _, near, feet = face.find_nearest(self.points)
         apart, normals = self.points - feet, face.face_normals[near]

@@ -26,12 +26,7 @@ def apply_clearance(points: Array, faces: Ints, limb: LimbProfile, outer: Surfac
     """Move the points of a face (limb frame) until it is clear of the limb by ``CLEAR_MM`` or more.
 
     Each stays on its ray and moves outwards only. What is measured are the face's points, middles of edges
-    and faces, and the limb's points.
-
-    Raises
-    ------
-    SurfaceError
-        Where that takes more than ``MAX_ROUNDS`` rounds.
+    and faces, and the limb's points. Raises `SurfaceError` where that takes more than ``MAX_ROUNDS`` rounds.
     """
     local = Surface(frame.to_limb(outer.points), outer.faces)
     angle, station, radius = limb.rays.coordinates(points)

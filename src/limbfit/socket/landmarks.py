@@ -40,13 +40,7 @@ class Directions:
 
     @property
     def medial(self) -> Array:
-        """Towards the other leg.
-
-        Raises
-        ------
-        SurfaceError
-            Where the side of the limb is not known.
-        """
+        """Towards the other leg. Raises `SurfaceError` where the side of the limb is not known."""
         if self.lateral is None:
             raise SurfaceError(
                 "medial and lateral are not known: no bones are named tibia and fibula",
@@ -154,12 +148,8 @@ def build_default_regions(
 
 
 def build_stated_region(anatomy: Anatomy, name: str, position: Array, radius_mm: float) -> SkinRegion:
-    """Build a round region: faces of the skin within a radius that look the way of the middle.
-
-    Raises
-    ------
-    SurfaceError
-        Where the position is off the skin.
+    """Build a round region: faces of the skin within a radius that look the way of the middle. Raises
+    `SurfaceError` where the position is off the skin.
     """
     skin = anatomy.skin
     squared, face, foot = skin.find_nearest(np.atleast_2d(position))

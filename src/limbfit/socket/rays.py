@@ -122,12 +122,8 @@ class LimbProfile:
 
 
 def compute_profile(outer: Surface, frame: Frame) -> LimbProfile:
-    """Compute the radii of a limb's closed outer surface (LPS mm) in its frame.
-
-    Raises
-    ------
-    SurfaceError
-        Where the surface does not surround its own middle line.
+    """Compute the radii of a limb's closed outer surface (LPS mm) in its frame. Raises `SurfaceError` where
+    the surface does not surround its own middle line.
     """
     local = Surface(frame.to_limb(outer.points), outer.faces)
     rays = _build_rays(local)
@@ -217,12 +213,8 @@ class Offsets:
 def compute_offsets(limb: LimbProfile, before: Surface, after: Surface, frame: Frame) -> Offsets:
     """Compute by how much a limb's outer surface (LPS mm) moves along each ray of the limb.
 
-    Both surfaces have the same triangles, open at the proximal cut, so that their facets cancel.
-
-    Raises
-    ------
-    SurfaceError
-        Where a surface does not surround the limb's middle line.
+    Both surfaces have the same triangles, open at the proximal cut, so that their facets cancel. Raises
+    `SurfaceError` where a surface does not surround the limb's middle line.
     """
     first, second = (
         compute_radii(Surface(frame.to_limb(one.points), one.faces), limb.rays, limb.stations, limb.angles)[0]

@@ -101,12 +101,7 @@ def rectify_limb(outer: Surface, frame: Frame, recipe: Recipe) -> Socket:
 def reduce_to_volume(volume_mm3: float, outer: Surface, frame: Frame, recipe: Recipe) -> tuple[Socket, float]:
     """Find the face without areas whose uniform reduction leaves a volume, and that reduction in percent.
 
-    The volume is met within ``VOLUME_SHARE``.
-
-    Raises
-    ------
-    SurfaceError
-        As `rectify_limb`.
+    The volume is met within ``VOLUME_SHARE``. Raises `SurfaceError` as `rectify_limb`.
     """
     plain = replace(recipe, areas=(), offsets=None)
     reductions = [plain.reduction_percent]

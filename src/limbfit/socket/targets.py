@@ -89,12 +89,8 @@ class Target:
 
 
 def build_zone(name: str, anatomy: Anatomy, regions: Mapping[str, SkinRegion], depth_mm: float) -> Zone:
-    """Build the zone of a region of the limb that is pressed into a face by a depth, or relieved.
-
-    Raises
-    ------
-    SurfaceError
-        Where the limb has no such region.
+    """Build the zone of a region of the limb that is pressed into a face by a depth, or relieved. Raises
+    `SurfaceError` where the limb has no such region.
     """
     if name not in regions:
         raise SurfaceError(f"no region is named {name!r}", remedy="the limb has " + ", ".join(regions))

@@ -71,13 +71,8 @@ class TrimmedLimb:
 
 
 def trim_limb(limb: LimbProfile, frame: Frame, trim: Trim) -> TrimmedLimb:
-    """Cut the meridians of a limb at its trimline.
-
-    Raises
-    ------
-    SurfaceError
-        Where the brim would lie beyond the limb's proximal cut, at its distal end, or a line does not go once
-        around the limb.
+    """Cut the meridians of a limb at its trimline. Raises `SurfaceError` where the brim would lie beyond the
+    limb's proximal cut, at its distal end, or a line does not go once around the limb.
     """
     stations, angles = limb.stations, limb.angles
     points = limb.rays.points(angles[:, None], stations[None, :], limb.radius.T)

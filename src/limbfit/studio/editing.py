@@ -132,13 +132,7 @@ def set_area(file: Path, name: str, values: Mapping[str, Any]) -> Study:
 
 
 def remove_area(file: Path, name: str) -> Study:
-    """Take an area out of the study file.
-
-    Raises
-    ------
-    StudyError
-        Where there is none of that name.
-    """
+    """Take an area out of the study file. Raises `StudyError` where there is none of that name."""
 
     def change(document: tomlkit.TOMLDocument) -> None:
         rows = _ensure_areas(document)

@@ -37,14 +37,9 @@ class StudyFolder:
         return load_study(self.file, recorded=False)
 
     def artefact(self, *parts: str) -> Path:
-        """The path of a file under ``results/``, given as plain names, one for each part.
-
-        Raises
-        ------
-        InputError
-            Where a part is no plain name, or the file lies outside of ``results/`` (by a link).
-        FileNotFoundError
-            Where there is none.
+        """The path of a file under ``results/``, given as plain names, one for each part. Raises `InputError`
+        where a part is no plain name, or the file lies outside of ``results/`` (by a link), and
+        `FileNotFoundError` where there is none.
         """
         return resolve_inside(self.results, *parts)
 

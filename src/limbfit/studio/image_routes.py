@@ -170,12 +170,8 @@ def _save_labels(folder: StudyFolder, study: Study, shown: ShownLabels, labels: 
 
 
 def paint_runs(labels: LabelMap, runs: list[tuple[int, int, int]]) -> LabelMap:
-    """The labels with runs of voxels of the page's order set.
-
-    Raises
-    ------
-    InputError
-        For voxels outside of the map and for labels that it does not have.
+    """The labels with runs of voxels of the page's order set. Raises `InputError` for voxels outside of the
+    map and for labels that it does not have.
     """
     turned = labels.align_axes(PAGE_AXES)
     flat = turned.array.ravel().copy()

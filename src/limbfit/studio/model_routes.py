@@ -76,12 +76,8 @@ def get_scene(folder: Folder) -> dict[str, Any]:
 
 @router.get("/surface/{name}")
 def get_surface(folder: Folder, name: str) -> Response:
-    """A surface as a block of arrays: ``points``, ``faces``.
-
-    Raises
-    ------
-    InputError
-        For a name that the model does not have.
+    """A surface as a block of arrays: ``points``, ``faces``. Raises `InputError` for a name that the model
+    does not have.
     """
     anatomy = read_anatomy(folder, folder.load())
     surface = {SKIN: anatomy.skin, **anatomy.bones}.get(name) if anatomy else None
@@ -160,12 +156,8 @@ def _read_marked_anatomy(folder: StudyFolder, mark: str) -> Anatomy | None:
 
 
 def project_to_skin_of_study(folder: StudyFolder, position: Sequence[float]) -> list[float]:
-    """The point of the skin nearest to a place (LPS, mm).
-
-    Raises
-    ------
-    InputError
-        Where there is no skin, or the place is far off it.
+    """The point of the skin nearest to a place (LPS, mm). Raises `InputError` where there is no skin, or the
+    place is far off it.
     """
     anatomy = read_anatomy(folder, folder.load())
     if anatomy is None:
@@ -221,12 +213,8 @@ def _respond_shell(shell: Shell) -> Response:
 
 
 def _check_movable(study: Study, name: str) -> None:
-    """Refuse to move a site that the markups file places, and an unknown one.
-
-    Raises
-    ------
-    InputError
-        For such a site.
+    """Refuse to move a site that the markups file places, and an unknown one. Raises `InputError` for such a
+    site.
     """
     site = study.site(name)
     if study.markups is None:

@@ -138,14 +138,9 @@ def read_mesh(folder: StudyFolder, source: str, site: str) -> Block:
 
 
 def read_moment(folder: StudyFolder, source: str, site: str, moment: int, name: str) -> Block:
-    """``moved`` (n, 3) of the drawn nodes in mm, and ``values`` of a field on cells or drawn nodes.
-
-    Raises
-    ------
-    InputError
-        For an unknown field, or one that is not stored.
-    FileNotFoundError
-        For a moment that is not there.
+    """``moved`` (n, 3) of the drawn nodes in mm, and ``values`` of a field on cells or drawn nodes. Raises
+    `InputError` for an unknown field, or one that is not stored, and `FileNotFoundError` for a moment that is
+    not there.
     """
     field = FIELDS.get(name)
     file = _find_file(folder, source, site, moment)

@@ -58,14 +58,9 @@ def _build_run_words(folder: StudyFolder, *verb: str) -> list[str]:
 def start_run(
     folder: StudyFolder, until: str | None, start: str | None, force: Sequence[str]
 ) -> dict[str, Any]:
-    """Start ``limbfit run`` on the study; what it reports goes to the study's log, as always.
-
-    Raises
-    ------
-    InputError
-        Where the study cannot be read, a record is yet to be made, or a stage does not exist.
-    RunError
-        Where a run holds the study.
+    """Start ``limbfit run`` on the study; what it reports goes to the study's log, as always. Raises
+    `InputError` where the study cannot be read, a record is yet to be made, or a stage does not exist, and
+    `RunError` where a run holds the study.
     """
     _refuse_busy(folder)
     for name in (until, start, *force):
@@ -92,12 +87,8 @@ def _refuse_busy(folder: StudyFolder) -> None:
 
 
 def stop_run(folder: StudyFolder) -> dict[str, Any]:
-    """Interrupt the run that holds the study, as Ctrl-C would; finished work is kept.
-
-    Raises
-    ------
-    RunError
-        Where no run holds the study, or it is no ``limbfit`` command.
+    """Interrupt the run that holds the study, as Ctrl-C would; finished work is kept. Raises `RunError` where
+    no run holds the study, or it is no ``limbfit`` command.
     """
     holder = find_running(folder)
     if holder is None and (early := find_starting(folder)) is not None:
@@ -129,14 +120,8 @@ def _build_simulation_words(folder: StudyFolder) -> list[str]:
 
 
 def start_simulation(folder: StudyFolder, site: str) -> dict[str, Any]:
-    """Simulate a site with the fields of every step.
-
-    Raises
-    ------
-    InputError
-        For a site that the study does not have.
-    RunError
-        Where the study is being run or a simulation goes on.
+    """Simulate a site with the fields of every step. Raises `InputError` for a site that the study does not
+    have, and `RunError` where the study is being run or a simulation goes on.
     """
     name = folder.load().indentation(site).name
     holder = find_running(folder) or find_simulating(folder)
@@ -154,12 +139,8 @@ def _find_output_file(folder: StudyFolder, site: str) -> Path:
 
 
 def stop_simulation(folder: StudyFolder) -> dict[str, Any]:
-    """Interrupt the simulation, as Ctrl-C would; the steps it has stored stay.
-
-    Raises
-    ------
-    RunError
-        Where none goes on.
+    """Interrupt the simulation, as Ctrl-C would; the steps it has stored stay. Raises `RunError` where none
+    goes on.
     """
     simulation = find_simulating(folder)
     if simulation is None:
@@ -219,12 +200,8 @@ def _has_command_line(process: int) -> bool:
 def interrupt_process(process: int) -> None:
     """Do what Ctrl-C in its terminal would do.
 
-    A process that only starts is terminated too: Python may lose an interrupt then.
-
-    Raises
-    ------
-    psutil.Error
-        Where there is no such process, or it belongs to somebody else.
+    A process that only starts is terminated too: Python may lose an interrupt then. Raises `psutil.Error`
+    where there is no such process, or it belongs to somebody else.
     """
     running = psutil.Process(process)
     starts = time.time() - running.create_time() < STARTING_S

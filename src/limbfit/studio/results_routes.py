@@ -77,12 +77,8 @@ def get_site(folder: Folder, site: str) -> dict[str, Any]:
 
 @router.get("/curves/{site}")
 def get_curves(folder: Folder, site: str, kept: str | None = None) -> dict[str, list[float]]:
-    """Columns of the predicted forces of a site (s, mm, N), of this run or of a kept one.
-
-    Raises
-    ------
-    FileNotFoundError
-        Where none are stored.
+    """Columns of the predicted forces of a site (s, mm, N), of this run or of a kept one. Raises
+    `FileNotFoundError` where none are stored.
     """
     if kept is not None:
         _find_kept_run(folder, kept)
@@ -117,12 +113,8 @@ def post_stop(folder: Folder) -> dict[str, Any]:
 
 @router.post("/feb/{site}")
 def post_feb(folder: Folder, site: str) -> dict[str, str]:
-    """Write a site as an input of FEBio; the path of the file below ``/api/files``.
-
-    Raises
-    ------
-    RunError
-        Where meshes are missing or stale: only a run makes them.
+    """Write a site as an input of FEBio; the path of the file below ``/api/files``. Raises `RunError` where
+    meshes are missing or stale: only a run makes them.
     """
     study = folder.load()
     name = study.indentation(site).name
@@ -134,14 +126,9 @@ def post_feb(folder: Folder, site: str) -> dict[str, str]:
 
 @router.post("/keep")
 def post_kept(folder: Folder, run: KeptRunName) -> dict[str, Any]:
-    """Copy what the page shows of this run to ``results/kept/<name>``, to compare later runs with it.
-
-    Raises
-    ------
-    InputError
-        For a name that is no plain one, or is taken.
-    RunError
-        Where the study has no finished prediction.
+    """Copy what the page shows of this run to ``results/kept/<name>``, to compare later runs with it. Raises
+    `InputError` for a name that is no plain one, or is taken, and `RunError` where the study has no finished
+    prediction.
     """
     name = run.name
     if not _NAME.fullmatch(name):
@@ -182,13 +169,7 @@ def _list_kept_runs(folder: StudyFolder) -> list[dict[str, Any]]:
 
 
 def _find_kept_run(folder: StudyFolder, name: str) -> Path:
-    """The folder of a kept run.
-
-    Raises
-    ------
-    FileNotFoundError
-        Where none has this name.
-    """
+    """The folder of a kept run. Raises `FileNotFoundError` where none has this name."""
     if not _NAME.fullmatch(name) or not (folder.results / KEPT / name / ABOUT).is_file():
         raise FileNotFoundError("the kept run")
     return folder.artefact(KEPT, name, ABOUT).parent

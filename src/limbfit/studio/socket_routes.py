@@ -202,12 +202,8 @@ def _compute_profile(folder: StudyFolder, mark: str) -> LimbProfile:
 def get_face(folder: Folder) -> Response:
     """The face as a block of arrays: ``points`` (n, 3), ``faces`` (m, 3), ``values`` (n,): offset, mm.
 
-    Offsets are from the bare skin, negative where the face is pressed in.
-
-    Raises
-    ------
-    InputError
-        Where there is none.
+    Offsets are from the bare skin, negative where the face is pressed in. Raises `InputError` where there is
+    none.
     """
     study = folder.load()
     face, anatomy = _build_face(folder, _mark(folder, study)), read_anatomy(folder, study)
@@ -259,12 +255,8 @@ def post_removal(folder: Folder, name: str) -> dict[str, Any]:
 
 @router.post("/trimline")
 def post_trimline(folder: Folder, line: TrimlineRequest) -> dict[str, Any]:
-    """Replace the brim in the study file by a trimline; returns the changed shape.
-
-    Raises
-    ------
-    InputError
-        Where it does not go once around the limb, or leaves no socket; the file is left as it was.
+    """Replace the brim in the study file by a trimline; returns the changed shape. Raises `InputError` where
+    it does not go once around the limb, or leaves no socket; the file is left as it was.
     """
     study = folder.load()
     anatomy = read_anatomy(folder, study)

@@ -115,12 +115,8 @@ def compute_thinnings(
 ) -> tuple[Thinning, ...]:
     """Compute how each tissue gives way between touch-down and ``end_s``, times of the record.
 
-    The thickness at rest is the mean of all readings before touch-down.
-
-    Raises
-    ------
-    TraceError
-        Where there is none, or hardly any reading in contact.
+    The thickness at rest is the mean of all readings before touch-down. Raises `TraceError` where there is
+    none, or hardly any reading in contact.
     """
     before = layers.time_s < touch_down_s
     inside = np.flatnonzero((layers.time_s >= touch_down_s) & (layers.time_s <= end_s))
@@ -363,12 +359,8 @@ def select_frames_in_contact(
 ) -> SurfaceMotion:
     """The frames between touch-down and ``end_s``, counted from touch-down.
 
-    ``record_s`` are the record's first and last time; all times are of its clock.
-
-    Raises
-    ------
-    TraceError
-        For times outside the record, or none in contact.
+    ``record_s`` are the record's first and last time; all times are of its clock. Raises `TraceError` for
+    times outside the record, or none in contact.
     """
     first, last = float(motion.time_s[0]), float(motion.time_s[-1])
     if first < record_s[0] or last > record_s[1]:

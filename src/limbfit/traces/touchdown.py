@@ -62,12 +62,8 @@ def find_touch_down(trace: Trace, line: BrokenLine | None = None) -> TouchDown:
     A flat punch meets a curved limb at a corner first, so the force starts like a power of the depth and any
     threshold is late. Every onset of a power law with memory is compared with the low-force part of loading,
     under noise as correlated as the record shows it to be, and the touch-down is the mean over their
-    likelihood (see `onset`).  ``line`` is the displacement's broken line, where it is known already.
-
-    Raises
-    ------
-    TraceError
-        Where the force does not rise on the way in.
+    likelihood (see `onset`).  ``line`` is the displacement's broken line, where it is known already. Raises
+    `TraceError` where the force does not rise on the way in.
     """
     line = line or fit_broken_line(trace.time_s, trace.displacement_mm)
     time, travel, force = _select_way_in(trace, line)
@@ -142,12 +138,8 @@ def _select_low_force_part(
 
 
 def touch_down_at(trace: Trace, time_s: float) -> TouchDown:
-    """The touch-down at a time that someone states; baseline and uncertainty are those of the onset.
-
-    Raises
-    ------
-    TraceError
-        Where the time does not lie on the way in, or the force does not rise on it.
+    """The touch-down at a time that someone states; baseline and uncertainty are those of the onset. Raises
+    `TraceError` where the time does not lie on the way in, or the force does not rise on it.
     """
     line = fit_broken_line(trace.time_s, trace.displacement_mm)
     first, last = float(trace.time_s[0]), line.peak_s

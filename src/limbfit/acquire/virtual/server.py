@@ -69,12 +69,8 @@ class Serving:
 
     @classmethod
     def on_port(cls, host: str, port: int) -> Serving:
-        """Listen on a TCP port; 0 takes a free one.
-
-        Raises
-        ------
-        InputError
-            Where the address is none of this machine's, or the port is taken.
+        """Listen on a TCP port; 0 takes a free one. Raises `InputError` where the address is none of this
+        machine's, or the port is taken.
         """
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         listener = socket.socket(family, socket.SOCK_STREAM)

@@ -51,12 +51,8 @@ class Series:
 
 
 def list_series(folder: str | Path) -> list[Series]:
-    """The image series in a folder and those below it, ordered by UID; other files are passed over.
-
-    Raises
-    ------
-    ImageError
-        For a folder without images, or a damaged file in it.
+    """The image series in a folder and those below it, ordered by UID; other files are passed over. Raises
+    `ImageError` for a folder without images, or a damaged file in it.
     """
     groups: dict[str, list[SliceHeader]] = defaultdict(list)
     files = [path for path in sorted(Path(folder).rglob("*")) if path.is_file()]
@@ -182,12 +178,8 @@ def _is_one_stack(series: list[Series]) -> bool:
 
 
 def stack_slices(slices: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Array, Array]:
-    """Slices in order along their normal, spacing (3,) mm and direction (3, 3) of their grid.
-
-    Raises
-    ------
-    ImageError
-        For images that are no slices, of different geometry, missing, doubled or tilted ones.
+    """Slices in order along their normal, spacing (3,) mm and direction (3, 3) of their grid. Raises
+    `ImageError` for images that are no slices, of different geometry, missing, doubled or tilted ones.
     """
     first = slices[0]
     _check_kind(slices)
@@ -324,12 +316,8 @@ def _check_tilt(places: Array, normal: Array, usual: float) -> None:
 
 
 def read_pixels(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
-    """``[k, j, i]`` rescaled grey values of slices in their order.
-
-    Raises
-    ------
-    ImageError
-        For pixels that are cut short, cannot be decoded or do not match the headers.
+    """``[k, j, i]`` rescaled grey values of slices in their order. Raises `ImageError` for pixels that are
+    cut short, cannot be decoded or do not match the headers.
     """
     with silence_readers():
         try:

@@ -94,11 +94,7 @@ def silence_readers() -> Iterator[None]:
 
 def read_headers(path: Path) -> list[SliceHeader] | None:
     """The slices of one file; an empty list for DICOM without an image, None for what is not DICOM at all.
-
-    Raises
-    ------
-    ImageError
-        For a damaged file; its text does not name it.
+    Raises `ImageError` for a damaged file; its text does not name it.
     """
     damaged = ImageError("the DICOM file is cut short or damaged", remedy="export the series again")
     try:

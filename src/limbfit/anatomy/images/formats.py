@@ -128,12 +128,8 @@ def register_image_format(name: str, suffixes: tuple[str, ...], read: Read) -> N
 
 
 def format_of(path: Path, written: bool = False) -> ImageFormat:
-    """The format of an image file by its name; ``written``: of those that can be written.
-
-    Raises
-    ------
-    ImageError
-        For a suffix that no format has.
+    """The format of an image file by its name; ``written``: of those that can be written. Raises `ImageError`
+    for a suffix that no format has.
     """
     formats = [known for known in IMAGE_FORMATS if known.is_written or not written]
     for known in formats:
@@ -144,13 +140,7 @@ def format_of(path: Path, written: bool = False) -> ImageFormat:
 
 
 def read_image(path: Path) -> sitk.Image:
-    """The image of a file.
-
-    Raises
-    ------
-    ImageError
-        Where there is none, or it cannot be read.
-    """
+    """The image of a file. Raises `ImageError` where there is none, or it cannot be read."""
     if not path.is_file():
         raise ImageError("no such image", file=path, remedy="give a DICOM folder or an image file")
     form = format_of(path)

@@ -30,12 +30,8 @@ _FORMAT = "give the columns " + ",".join(COLUMNS)
 
 
 def rasterise_polygons(polygons: Sequence[Array], like: Grid) -> Mask:
-    """``[k, j, i]`` voxels whose centre lies inside, by even-odd; ``polygons`` (n, 3) each, LPS mm.
-
-    Raises
-    ------
-    LabelError
-        For polygons that do not lie on the grid's slices, lie outside it, or leave slices out.
+    """``[k, j, i]`` voxels whose centre lies inside, by even-odd; ``polygons`` (n, 3) each, LPS mm. Raises
+    `LabelError` for polygons that do not lie on the grid's slices, lie outside it, or leave slices out.
     """
     slices: dict[int, list[Array]] = defaultdict(list)
     for polygon in polygons:

@@ -31,11 +31,7 @@ STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
 
 def find_dicom_labels(path: Path) -> Path | None:
     """The DICOM-SEG or RTSTRUCT that ``path`` is, or that is the only one in it; None for another file.
-
-    Raises
-    ------
-    LabelError
-        For a folder without or with several of them, and for DICOM of another kind.
+    Raises `LabelError` for a folder without or with several of them, and for DICOM of another kind.
     """
     if path.is_dir():
         found = [
@@ -95,12 +91,8 @@ class _SegmentFrames:
 
 
 def read_dicom_seg(path: Path) -> LabelMap:
-    """The segments of a DICOM-SEG file by their labels, on the grid of its own frames.
-
-    Raises
-    ------
-    LabelError
-        For a fractional segmentation, frames without a place or out of a stack, or a damaged file.
+    """The segments of a DICOM-SEG file by their labels, on the grid of its own frames. Raises `LabelError`
+    for a fractional segmentation, frames without a place or out of a stack, or a damaged file.
     """
     try:
         with silence_readers():

@@ -21,11 +21,7 @@ _ON_GRID = 0.01  # voxels
 
 def clean_labels(labels: LabelMap, path: Path) -> tuple[LabelMap, list[str]]:
     """Return the map with one connected limb and each bone in one piece, and sentences on what was changed.
-
-    Raises
-    ------
-    LabelError
-        For values without a name, no soft tissue, two limbs, or a bone in two large pieces.
+    Raises `LabelError` for values without a name, no soft tissue, two limbs, or a bone in two large pieces.
     """
     with add_location(file=path):
         _check_names(labels)
@@ -105,12 +101,8 @@ def _describe_pieces(count: int, mask: Mask, labels: LabelMap, noun: str = "piec
 
 
 def place_on_grid(labels: LabelMap, like: Volume) -> LabelMap:
-    """A map of any extent, order and sense of axes on the whole grid of ``like``, voxel by voxel.
-
-    Raises
-    ------
-    LabelError
-        Where the voxels of the two do not coincide, or labelled ones lie outside the image.
+    """A map of any extent, order and sense of axes on the whole grid of ``like``, voxel by voxel. Raises
+    `LabelError` where the voxels of the two do not coincide, or labelled ones lie outside the image.
     """
     if labels.has_same_grid(like):
         return labels

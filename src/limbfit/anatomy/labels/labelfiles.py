@@ -133,12 +133,8 @@ def normalise_name(name: str) -> str:
 
 
 def flatten(masks: Sequence[Mask], names: Sequence[str]) -> tuple[NDArray[np.uint8], dict[int, str]]:
-    """Overlapping segments as one map: where two overlap the smaller wins, as a bone in a limb does.
-
-    Raises
-    ------
-    LabelError
-        For no segment, or two of one name.
+    """Overlapping segments as one map: where two overlap the smaller wins, as a bone in a limb does. Raises
+    `LabelError` for no segment, or two of one name.
     """
     if not names:
         raise LabelError("the file names no segment", remedy="export it again with its segments")

@@ -61,24 +61,16 @@ class VolumeTask(VolumeMesh):
 
 
 def run_mmg(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
-    """Adapt with MMG (Dapogny, Dobrzynski, Frey 2014, J Comput Phys 262, 358-378).
-
-    Raises
-    ------
-    MesherError
-        When MMG crashes, gives nothing or exceeds the time limit.
+    """Adapt with MMG (Dapogny, Dobrzynski, Frey 2014, J Comput Phys 262, 358-378). Raises `MesherError` when
+    MMG crashes, gives nothing or exceeds the time limit.
     """
     return _run_engine("MMG", task, time_limit_s)
 
 
 def run_netgen(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
     """Remesh the surface with MMG and fill it with Netgen (Schoeberl 1997, Comput Visual Sci 1, 41-52).
-
-    Raises
-    ------
-    MeshingError
-        When Netgen is not installed, or there are regions inside the core, which it would not see; when it
-        crashes, gives nothing or exceeds the time limit (`MesherError`).
+    Raises `MeshingError` when Netgen is not installed, or there are regions inside the core, which it would
+    not see; when it crashes, gives nothing or exceeds the time limit (`MesherError`).
     """
     if task.regions.any():
         raise MeshingError('Netgen knows no regions inside the core; choose mesh.engine = "mmg"')

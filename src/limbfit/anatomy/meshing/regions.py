@@ -89,12 +89,8 @@ def _sample_region(fields: LimbFields, number: int, pad_mm: float = 0.0) -> tupl
 
 
 def check_regions(fields: LimbFields, edge_near_mm: float) -> None:
-    """Refuse regions that are too thin for a mesh.
-
-    Raises
-    ------
-    SurfaceError
-        For one that is thinner than half an edge near the site.
+    """Refuse regions that are too thin for a mesh. Raises `SurfaceError` for one that is thinner than half an
+    edge near the site.
     """
     for number, name in enumerate(fields.regions):
         thick = measure_thickness(fields, number)
@@ -122,12 +118,8 @@ def _is_near(surface: Surface, distance_mm: float, points: Array) -> Mask:
 
 
 def cut_at_regions(grid: TetGrid, fields: LimbFields) -> TetGrid:
-    """The grid of the core with its regions numbered from 1.
-
-    Raises
-    ------
-    SurfaceError
-        For a region of which nothing is left under the layers.
+    """The grid of the core with its regions numbered from 1. Raises `SurfaceError` for a region of which
+    nothing is left under the layers.
     """
     # A level differs from the distance by as much as its points are pushed.
     slack = fields.floor_range_mm + 2.0 * fields.bone_clearance_mm

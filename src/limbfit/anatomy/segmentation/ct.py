@@ -34,12 +34,8 @@ _SMOOTH_MM = 1.0
 def is_ct(volume: Volume, expected: Contrast = "auto") -> bool:
     """True if an image has Hounsfield units, by its DICOM modality or else the peak of air in its histogram.
 
-    Without a modality an expected ``CT`` needs no such peak, only grey values below those of fat.
-
-    Raises
-    ------
-    ImageError
-        For a constant image, a CT without Hounsfield units, or one that contradicts ``expected``.
+    Without a modality an expected ``CT`` needs no such peak, only grey values below those of fat. Raises
+    `ImageError` for a constant image, a CT without Hounsfield units, or one that contradicts ``expected``.
     """
     low, high = float(volume.array.min()), float(volume.array.max())
     if high <= low:

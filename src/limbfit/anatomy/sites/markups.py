@@ -24,13 +24,9 @@ _SIGNS = {
 
 
 def read_markups(path: str | Path) -> dict[str, Array]:
-    """The placed control points of a markups file by their labels, (3,) LPS mm.
-
-    Raises
-    ------
-    SiteError
-        For a file that is no markups file, does not state its coordinates as LPS or RAS, is not in
-        millimetres, or gives a label to two points.
+    """The placed control points of a markups file by their labels, (3,) LPS mm. Raises `SiteError` for a file
+    that is no markups file, does not state its coordinates as LPS or RAS, is not in millimetres, or gives a
+    label to two points.
     """
     path = Path(path)
     try:

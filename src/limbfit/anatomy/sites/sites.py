@@ -20,12 +20,8 @@ _TICKS = np.linspace(-0.5, 0.5, 5)
 
 
 def project_to_skin(anatomy: Anatomy, position: ArrayLike, name: str | None = None) -> tuple[Array, float]:
-    """The skin point (3,) nearest to a position (3,), LPS mm, and its distance in mm.
-
-    Raises
-    ------
-    SiteError
-        When the position lies more than 5 mm off the skin; ``name`` says which site.
+    """The skin point (3,) nearest to a position (3,), LPS mm, and its distance in mm. Raises `SiteError` when
+    the position lies more than 5 mm off the skin; ``name`` says which site.
     """
     query = np.asarray(position, dtype=float)
     if query.shape != (3,) or not np.isfinite(query).all():

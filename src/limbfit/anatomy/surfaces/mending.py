@@ -76,12 +76,8 @@ def repair_surface(surface: Surface, name: str) -> RepairReport:
 
     Few crossing faces are smoothed.
 
-    Whatever else keeps it from bounding a body is left for `triangles.check_closed`.
-
-    Raises
-    ------
-    SurfaceError
-        For more than one open loop of notable size, or one whose outline crosses itself.
+    Whatever else keeps it from bounding a body is left for `triangles.check_closed`. Raises `SurfaceError`
+    for more than one open loop of notable size, or one whose outline crosses itself.
     """
     surface, loose = _remove_loose_pieces(surface, name)
     surface, turned = orient_outward(surface, name)

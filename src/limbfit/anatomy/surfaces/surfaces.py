@@ -208,13 +208,9 @@ def _find_rim(surface: Surface, point: Array, normal: Array) -> Indices:
 
 
 def check_anatomy(anatomy: Anatomy, files: Mapping[str, Path] | None = None) -> None:
-    """Refuse an anatomy that cannot be meshed.
-
-    Raises
-    ------
-    SurfaceError
-        For a surface that :func:`check_closed` refuses, a bone or region outside the skin (beyond the cut is
-        allowed), or a region that reaches into a bone.
+    """Refuse an anatomy that cannot be meshed. Raises `SurfaceError` for a surface that :func:`check_closed`
+    refuses, a bone or region outside the skin (beyond the cut is allowed), or a region that reaches into a
+    bone.
     """
     files = files or {}
     check_closed(anatomy.skin, "skin", files.get("skin"))

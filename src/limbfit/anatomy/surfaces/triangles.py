@@ -285,12 +285,8 @@ def _check_size(surface: Surface, name: str, smallest: float) -> None:
 
 
 def check_sides(surface: Surface, name: str) -> None:
-    """Refuse a surface, open or closed, whose triangles do not agree on a side.
-
-    Raises
-    ------
-    SurfaceError
-        For edges of more than two faces, and for neighbours that are oriented against each other.
+    """Refuse a surface, open or closed, whose triangles do not agree on a side. Raises `SurfaceError` for
+    edges of more than two faces, and for neighbours that are oriented against each other.
     """
     edges = find_half_edges(surface.faces)
     counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1]

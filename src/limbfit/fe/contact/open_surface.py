@@ -74,12 +74,8 @@ class Wall(RigidShape):
 
 
 def check_open_surface(points: Array, faces: NDArray, name: str) -> tuple[Array, NDArray[np.int64]]:
-    """The arrays of a surface with one side.
-
-    Raises
-    ------
-    ProblemError
-        Where it is no triangle surface, or its triangles do not agree on a side.
+    """The arrays of a surface with one side. Raises `ProblemError` where it is no triangle surface, or its
+    triangles do not agree on a side.
     """
     points, faces = np.asarray(points, dtype=float), np.asarray(faces)
     check_triangles(points, faces, name)

@@ -52,12 +52,8 @@ class LawTable:
 
     @property
     def terms(self) -> Array:
-        """Ogden moduli c_k (MPa) and exponents m_k (k, 2).
-
-        Raises
-        ------
-        ProblemError
-            Where the law is none of Ogden terms.
+        """Ogden moduli c_k (MPa) and exponents m_k (k, 2). Raises `ProblemError` where the law is none of
+        Ogden terms.
         """
         if not self.has_terms:
             raise ProblemError(

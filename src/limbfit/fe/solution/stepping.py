@@ -173,12 +173,8 @@ class FirstStep:
 
 
 def solve_until_onset(problem: Problem, steps: StepControl = StepControl()) -> FirstStep:
-    """Solve a problem until its indenter, which may wait for tissue that moves before, begins.
-
-    Raises
-    ------
-    ProblemError
-        Where the problem is impossible as stated, and where that is not reached.
+    """Solve a problem until its indenter, which may wait for tissue that moves before, begins. Raises
+    `ProblemError` where the problem is impossible as stated, and where that is not reached.
     """
     run = SteppedRun(problem, steps, False)
     start, first = run.rest, None

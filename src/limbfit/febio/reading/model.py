@@ -163,12 +163,8 @@ class FebModel:
 
 
 def read_feb(path: str | Path) -> FebModel:
-    """Read a FEBio 3 or 4 input.
-
-    Raises
-    ------
-    ProblemError
-        If the file is missing, is not XML, or holds what limbfit does not support; with its line.
+    """Read a FEBio 3 or 4 input. Raises `ProblemError` if the file is missing, is not XML, or holds what
+    limbfit does not support; with its line.
     """
     with add_location(file=path):
         return _read_model(read_tree(path))
