@@ -34,7 +34,7 @@ from limbfit.autoregressive import compute_block_covariance
 from limbfit.identify.checks.fit_quality import assess_fit, refit_residuals
 from limbfit.identify.fit.calibration import CalibrationSettings, calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
-from limbfit.identify.fit.parameters import Unknowns, build_space, build_stage_groupings, group_separately
+from limbfit.identify.fit.parameters import Unknowns, build_stage_groupings
 from limbfit.identify.fit.prediction import MAX_FREEDOM, PredictionModel, compute_error_percent
 from limbfit.identify.uncertainty.intervals import EvaluationStore, sample_uncertainty
 from limbfit.identify.uncertainty.noise import compute_depth_slope, estimate_record_noise
@@ -261,10 +261,8 @@ def run_draw(world: World, seed: int, hold_s: float, after_s: float) -> dict[str
     linearised = estimate_uncertainty(
         best, found.responses, measured, UNKNOWNS, noise, settings=settings, site_N=off
     )
-    space = build_space(UNKNOWNS, group_separately(NAMES))
-    known = sample_uncertainty(linearised, measured, UNKNOWNS, space, store, simulate)
-    residual_model = linearised.residual_model
-    relaxation = assess_relaxation(best, found.responses, measured, residual_model, UNKNOWNS, space)
+    known = sample_uncertainty(linearised, store, simulate)
+    relaxation = assess_relaxation(known, found.responses)
     assert relaxation is not None
     residuals = known.residual_model.summarise()
     model = PredictionModel(
@@ -272,13 +270,13 @@ def run_draw(world: World, seed: int, hold_s: float, after_s: float) -> dict[str
         residuals.known_scale, residuals.site_factor or 1.0, residuals.site_freedom or MAX_FREEDOM,
     )  # fmt: skip
     inside = (known.intervals_95[:, 0] <= truth) & (truth <= known.intervals_95[:, 1])
-    verdicts = relaxation.qualify_verdicts(known)
+    verdicts = relaxation.qualify_verdicts()
     quality = _judge_fit(fitted, found.responses, best, [one.covariance for one in noise], off)
     row: dict[str, Any] = {
         "named": any(one.verdict for one in quality),
         "times_noise": max(phase.times_noise for one in quality for phase in one.phases),
         "prefers": relaxation.preferred,
-        "gives_way": GIVES_WAY in relaxation.describe(known),
+        "gives_way": GIVES_WAY in relaxation.describe(),
         "weights": relaxation.weights.tolist(),
         "determined": [word == DETERMINED for word in known.verdicts],
         "still_determined": [word == DETERMINED for word in verdicts],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from bars import storing
@@ -12,9 +13,9 @@ from scipy.special import bdtr
 
 from limbfit.identify.fit.calibration import CalibrationSettings, calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
-from limbfit.identify.fit.parameters import Unknowns, build_space, group_separately
+from limbfit.identify.fit.parameters import Unknowns, group_separately
 from limbfit.identify.uncertainty.intervals import EvaluationStore, restate_from_samples, sample_uncertainty
-from limbfit.identify.uncertainty.likelihood import ForceSurrogate, Likelihood
+from limbfit.identify.uncertainty.likelihood import Likelihood
 from limbfit.identify.uncertainty.noise import SiteNoise
 from limbfit.identify.uncertainty.posterior import Posterior, sample_posterior
 from limbfit.identify.uncertainty.uncertainty import DETERMINED, Uncertainty, estimate_uncertainty
@@ -91,7 +92,7 @@ def no_deviation(responses: Sequence[SiteResponse], parameters: Array) -> tuple[
 
 
 def coverage_study(
-    simulate: ForceSurrogate,
+    simulate: Any,
     truth: Array,
     unknowns: Unknowns,
     record: Recording,
@@ -111,7 +112,6 @@ def coverage_study(
     clean = [response.force_N for response in simulate(truth)]
     settings = CalibrationSettings(relative_tolerance=1e-4, max_iterations=60)
     stages = (group_separately(unknowns.names),)
-    space = build_space(unknowns, stages[0])
     linear, stated, sampled, misfit, further = [], [], [], [], []
     for repeat in range(repeats):
         measured, noise = record(repeat, clean)
@@ -126,13 +126,13 @@ def coverage_study(
         linear.append(_judged(u, truth))
         asked = EvaluationStore()
         asking = storing(asked, simulate)
-        ours = sample_uncertainty(u, measured, unknowns, space, kept, asking, move_answer=moves)
+        ours = sample_uncertainty(u, kept, asking, move_answer=moves)
         stated.append(_judged(ours, truth))
         further.append(len(asked.points) * len(measured))
         misfit.append(100 * u.residual_model.misfit_elsewhere)
         if steps:
-            samples = _posterior(simulate, measured, u, unknowns, steps)
-            sampled.append(_judged(restate_from_samples(u, samples, unknowns, space), truth))
+            samples = _posterior(simulate, u, steps)
+            sampled.append(_judged(restate_from_samples(u, samples), truth))
     return CoverageStudy(
         _coverage(stated, misfit),
         _coverage(linear, misfit),
@@ -156,14 +156,11 @@ def _judged(known: Uncertainty, truth: Array) -> Judged:
 
 
 def _posterior(
-    simulate: ForceSurrogate,
-    measured: Sequence[MeasuredCurve],
+    simulate: Any,
     known: Uncertainty,
-    unknowns: Unknowns,
     steps: int,
 ) -> Posterior:
     """Sampled from the most probable parameters on, as ``explore`` does."""
-    space = build_space(unknowns, group_separately(unknowns.names))
-    likelihood = Likelihood(simulate, measured, known.residual_model, unknowns, space)
+    likelihood = Likelihood(simulate, known.measured, known.residual_model, known.unknowns, known.space)
     best = likelihood.find_best((known.parameters, known.centre))
     return sample_posterior(likelihood, best.z, likelihood.compute_covariance(best.z), steps=steps)

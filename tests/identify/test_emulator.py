@@ -19,7 +19,7 @@ def cloud(count, width, seed=0, centre=TRUTH):
 
 def bars_emulator(count=20, width=0.3):
     points = cloud(count, width)
-    return Emulator.fit(NAMES, points, [simulate(p) for p in points])
+    return Emulator(points, [simulate(p) for p in points])
 
 
 def quadratic(p):
@@ -34,7 +34,7 @@ def quadratic(p):
 
 def test_a_quadratic_is_met_exactly_even_far_outside():
     points = cloud(4, 0.5, centre=np.ones(2))
-    emulator = Emulator.fit(("x", "y"), points, [quadratic(p) for p in points], softening=1e4)
+    emulator = Emulator(points, [quadratic(p) for p in points], softening=1e4)
     for p in cloud(5, 2.0, seed=1, centre=np.ones(2)):
         assert emulator.compute_errors_percent(p, quadratic(p)).max() < 1e-3
         for ours, true in zip(emulator(p), quadratic(p)):
@@ -81,7 +81,7 @@ def test_a_calibration_on_the_emulator_is_one_on_the_solver():
     data = records(0.002, seed=3)
     slow = calibrate(simulate, data, PAPER)
     points = np.vstack([[i.parameters for i in slow.history], cloud(10, 0.2, centre=slow.parameters)])
-    emulator = Emulator.fit(NAMES, points, [simulate(p) for p in points])
+    emulator = Emulator(points, [simulate(p) for p in points])
     fast = calibrate(emulator, data, type(PAPER)(NAMES, slow.parameters, PAPER.lower, PAPER.upper))
     errors = [np.mean(found.history[-1].errors_percent) for found in (slow, fast)]
     assert errors[1] == pytest.approx(errors[0], rel=0.05)
@@ -91,9 +91,9 @@ def test_failed_runs_are_left_out_and_one_run_is_no_emulator():
     points = cloud(5, 0.3)
     responses = [list(simulate(p)) for p in points]
     responses[2][1] = SiteResponse(responses[2][1].force_N, responses[2][1].jacobian, False, "stopped")
-    assert len(Emulator.fit(NAMES, points, responses).points) == 4
+    assert len(Emulator(points, responses).points) == 4
     with pytest.raises(CalibrationError, match="two complete"):
-        Emulator.fit(NAMES, points[:1], responses[:1])
+        Emulator(points[:1], responses[:1])
 
 
 def test_far_outside_its_runs_forces_stay_finite() -> None:

@@ -10,11 +10,14 @@ from coverage_study import coverage_study
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import SiteResponse
 from limbfit.identify.fit.parameters import build_space, group_by_kind, group_separately
-from limbfit.identify.uncertainty.estimator import FitSensitivity
 from limbfit.identify.uncertainty.exploration import ExplorationSettings, explore_posterior
 from limbfit.identify.uncertainty.noise import estimate_curve_noise
-from limbfit.identify.uncertainty.posterior import Posterior, compute_principal_axes
-from limbfit.identify.uncertainty.uncertainty import estimate_uncertainty
+from limbfit.identify.uncertainty.posterior import Posterior
+from limbfit.identify.uncertainty.uncertainty import (
+    FitSensitivity,
+    compute_principal_axes,
+    estimate_uncertainty,
+)
 from limbfit.results.uncertainty import LikelihoodProfile
 
 SPACE = build_space(PAPER, group_separately(NAMES))
@@ -29,7 +32,7 @@ def calibrated(noise=0.03, seed=4, **extra):
 
 @pytest.mark.slow
 def test_an_exploration_spends_its_runs_and_holds_the_truth():
-    data, found, known = calibrated()
+    _, found, known = calibrated()
     asked = []
 
     def many(points):
@@ -38,7 +41,7 @@ def test_an_exploration_spends_its_runs_and_holds_the_truth():
 
     earlier = [np.array(i.parameters) for i in found.history]
     settings = ExplorationSettings(runs=24, batch=4, steps=600, checked=1)
-    done = explore_posterior(many, data, PAPER, SPACE, known, earlier, settings)
+    done = explore_posterior(many, known, earlier, settings)
     # A check asks for the optimum and two ends of a profile, the narrowest and the widest.
     assert len(asked) <= len(earlier) + 24 + 5
     assert done.good_enough
@@ -50,7 +53,7 @@ def test_an_exploration_spends_its_runs_and_holds_the_truth():
 
 
 def test_failed_runs_do_not_stop_an_exploration():
-    data, found, known = calibrated()
+    _, found, known = calibrated()
 
     def flaky(points):
         runs = [list(simulate(p)) for p in points]
@@ -60,14 +63,14 @@ def test_failed_runs_do_not_stop_an_exploration():
 
     settings = ExplorationSettings(runs=8, batch=8, steps=200, checked=0)
     earlier = [np.array(i.parameters) for i in found.history]
-    done = explore_posterior(flaky, data, PAPER, SPACE, known, earlier, settings)
+    done = explore_posterior(flaky, known, earlier, settings)
     assert len(done.runs) == len(earlier) + 8 - 2
-    assert done.emulator.compute_errors_percent(TRUTH, simulate(TRUTH)).max() < 0.5
+    assert done.likelihood.emulator.compute_errors_percent(TRUTH, simulate(TRUTH)).max() < 0.5
 
 
 def test_a_source_shifts_the_answer_as_a_new_calibration_would():
     data, found, known = calibrated(0.001)
-    gain = FitSensitivity.linearise(found.parameters, found.responses, known.residual_model, PAPER, SPACE)
+    gain = FitSensitivity.linearise(known, found.responses)
     bump = [0.002 * d.force_N for d in data]
 
     def changed(p):
@@ -108,14 +111,14 @@ def test_combinations_of_bent_draws_are_as_wide_as_the_bend():
     logs[:, 0] += along
     logs[:, 1] += 0.5 * along**2
     posterior = Posterior(NAMES, np.exp(logs), np.ones(4000), 0.3, 1.0, 4000.0, True)
-    axes = compute_principal_axes(posterior, SPACE)
+    axes = compute_principal_axes(posterior.covariance, SPACE)
     assert axes @ axes.T == pytest.approx(np.eye(TRUTH.size), abs=1e-12)
     widths = (np.log(posterior.samples) @ axes.T).std(axis=0)
     assert (np.diff(widths) > 0).all()
     assert widths[-2] == pytest.approx(np.sqrt(0.5) * 0.6**2, rel=0.1)  # of half the square
     assert abs(axes[-2, 1]) > 0.95
     tied = build_space(PAPER, group_by_kind(NAMES))
-    rows = compute_principal_axes(posterior, tied)
+    rows = compute_principal_axes(posterior.covariance, tied)
     assert rows.shape == (4, TRUTH.size)
     assert rows[:, :4] == pytest.approx(rows[:, 4:])
 
@@ -123,18 +126,18 @@ def test_combinations_of_bent_draws_are_as_wide_as_the_bend():
 @pytest.fixture(scope="module")
 def vague():
     """Records that leave some parameters open, and what is found with few runs."""
-    data, found, known = calibrated(noise=0.5)
+    _, found, known = calibrated(noise=0.5)
 
     def many(points):
         return [simulate(p) for p in points]
 
     earlier = [np.array(i.parameters) for i in found.history]
     settings = ExplorationSettings(runs=8, batch=8, steps=200, checked=1)
-    return explore_posterior(many, data, PAPER, SPACE, known, earlier, settings)
+    return explore_posterior(many, known, earlier, settings)
 
 
 def test_profiles_say_where_they_are_extrapolated(vague):
-    low, high = vague.emulator.lower, vague.emulator.upper
+    low, high = vague.likelihood.emulator.lower, vague.likelihood.emulator.upper
     for one in vague.profiles:
         k = NAMES.index(one.name)
         beyond = (one.values < low[k]) | (one.values > high[k])
@@ -160,7 +163,7 @@ def test_the_solver_is_asked_at_the_ends_of_the_widest_profile_too(vague):
 
 
 def test_an_end_that_cannot_be_simulated_is_told():
-    data, found, known = calibrated(noise=0.5)
+    _, found, known = calibrated(noise=0.5)
 
     def failing(points):
         runs = [list(simulate(p)) for p in points]
@@ -171,7 +174,7 @@ def test_an_end_that_cannot_be_simulated_is_told():
 
     earlier = [np.array(i.parameters) for i in found.history]
     settings = ExplorationSettings(runs=8, batch=8, steps=200, checked=1)
-    done = explore_posterior(failing, data, PAPER, SPACE, known, earlier, settings)
+    done = explore_posterior(failing, known, earlier, settings)
     widest = next(check for check in done.checks if check.why == "widest")
     assert widest.solved[1] is None
     assert widest.solved[0] is not None

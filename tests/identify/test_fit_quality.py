@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from limbfit.identify.checks.fit_quality import assess_fit, refit_residuals, summarise_fit
-from limbfit.identify.uncertainty.discrepancy import compute_matern, estimate_mesh_misfit
+from limbfit.identify.uncertainty.discrepancy import (
+    ResidualModel,
+    compute_matern,
+    compute_mesh_covariance,
+    estimate_mesh_misfit,
+)
 from limbfit.identify.uncertainty.noise import SiteNoise
 from limbfit.results.identification import RecordFit
 
@@ -94,7 +101,8 @@ def test_a_record_on_another_mesh_is_no_fault_of_the_model() -> None:
     How much of that there is follows from the difference of two meshes, which has other ripples.
     """
     quiet = (SD / 4) ** 2 * np.eye(81) + 1e-4 * np.outer(FORCE, FORCE)
-    four = [SHAPE] * 4, [SiteNoise("05", TIMES, quiet, SD / 4, 0.0)] * 4, np.full(4, PEAK), np.eye(3)
+    noise = (SiteNoise("05", TIMES, quiet, SD / 4, 0.0),) * 4
+    model = ResidualModel(noise, np.full(4, PEAK), np.zeros(4), 1.0, 0.0)
 
     def make_error(seed: int) -> np.ndarray:
         random = np.random.default_rng(seed)
@@ -109,15 +117,16 @@ def test_a_record_on_another_mesh_is_no_fault_of_the_model() -> None:
         return [assess_fit("05", True, TIMES, DEPTH, r, PEAK, C, None, after) for r, C, after in triples]
 
     meshes = [make_error(seed) for seed in range(4)]
-    found = estimate_mesh_misfit(meshes, *four)
+    found = estimate_mesh_misfit(replace(model, mesh_N=meshes), [SHAPE] * 4, np.eye(3))
     assert found is not None
     assert 0.003 < found.share < 0.006
     assert found.correlation <= 0.12
     without = [quiet + np.outer(mesh, mesh) for mesh in meshes]
-    counted = [one + found.compute_covariance(TIMES, PEAK) for one in without]
+    counted = [one + compute_mesh_covariance(found, TIMES, PEAK) for one in without]
     assert any(one.verdict for one in judge(without))
     assert not any(one.verdict for one in judge(counted))
     assert max(one.times_noise for one in judge(counted)) < 1.3
     late = 0.05 * PEAK * np.clip(np.sin(np.pi * (TIMES - 8.0) / 2.0), 0.0, None) * (TIMES > 8.0)
     assert any("the unloading" in one.verdict for one in judge(counted, late))
-    assert estimate_mesh_misfit([0.0 * FORCE] * 4, *four) is None
+    quiet_mesh = replace(model, mesh_N=[0.0 * FORCE] * 4)
+    assert estimate_mesh_misfit(quiet_mesh, [SHAPE] * 4, np.eye(3)) is None

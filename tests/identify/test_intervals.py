@@ -9,7 +9,7 @@ from coverage_study import coverage_study
 
 from limbfit.identify.fit.calibration import Calibration, calibrate, move_answer
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
-from limbfit.identify.fit.parameters import Unknowns, build_space, group_separately
+from limbfit.identify.fit.parameters import Unknowns, group_separately
 from limbfit.identify.uncertainty.intervals import (
     EvaluationStore,
     count_further_evaluations,
@@ -67,15 +67,13 @@ def near_the_truth(noise=0.03, grouping=None):
         estimate_curve_noise(found.responses, data),
         grouping=grouping,
     )
-    return data, kept, known, build_space(bounds, grouping)
+    return data, kept, known
 
 
 def test_further_simulations_are_few_and_asked_for_again_alike():
-    data, kept, known, space = near_the_truth()
+    _, kept, known = near_the_truth()
     asked = EvaluationStore(), EvaluationStore()
-    one, other = (
-        sample_uncertainty(known, data, PAPER, space, kept, storing(again, simulate)) for again in asked
-    )
+    one, other = (sample_uncertainty(known, kept, storing(again, simulate)) for again in asked)
     assert one.method == SAMPLED
     assert 0 < len(asked[0].points) <= 2
     assert np.array_equal(asked[0].points, asked[1].points)
@@ -89,7 +87,7 @@ def test_many_records_have_an_evaluation_at_the_most_probable_parameters():
 
 
 def test_failed_simulations_enter_no_interval():
-    data, kept, known, space = near_the_truth()
+    _, kept, known = near_the_truth()
 
     def failing(parameters):
         good, *rest = simulate(parameters)
@@ -99,18 +97,18 @@ def test_failed_simulations_enter_no_interval():
     failing_kept = EvaluationStore([*kept.points], [*kept.responses])
     assert not failing_kept.add(1.1 * TRUTH, failing(1.1 * TRUTH))
     assert len(failing_kept.points) == before
-    found = sample_uncertainty(known, data, PAPER, space, kept, failing)
+    found = sample_uncertainty(known, kept, failing)
     assert found.method == SAMPLED
     assert np.mean((found.intervals_95[:, 0] < TRUTH) & (found.intervals_95[:, 1] > TRUTH)) >= 0.75
     alone = EvaluationStore(kept.points[:1], kept.responses[:1])
-    assert sample_uncertainty(known, data, PAPER, space, alone, failing) is known
+    assert sample_uncertainty(known, alone, failing) is known
     assert known.method == LINEARISED
 
 
 def test_fixed_and_tied_parameters_stay_so():
     grouping = (0, 1, 2, 3, 4, 1, -1, 3)
-    data, kept, known, space = near_the_truth(grouping=grouping)
-    found = sample_uncertainty(known, data, PAPER, space, kept, simulate)
+    _, kept, known = near_the_truth(grouping=grouping)
+    found = sample_uncertainty(known, kept, simulate)
     assert len(found.combinations) == 5
     assert found.intervals_95[1] == pytest.approx(found.intervals_95[5])
     assert found.intervals_95[6] == pytest.approx([TRUTH[6], TRUTH[6]])
@@ -120,8 +118,8 @@ def test_fixed_and_tied_parameters_stay_so():
 
 def test_the_answer_moves_to_what_is_most_probable():
     """Its intervals are about that, and the calibration ends there, with an error that is no smaller."""
-    data, kept, known, space = near_the_truth()
-    found = sample_uncertainty(known, data, PAPER, space, kept, simulate, move_answer=True)
+    data, kept, known = near_the_truth()
+    found = sample_uncertainty(known, kept, simulate, move_answer=True)
     assert found.parameters == pytest.approx(found.centre)
     assert not np.array_equal(found.parameters, known.parameters)
     assert np.array_equal(found.covariance, known.about_centre)
@@ -141,7 +139,7 @@ def test_the_answer_moves_to_what_is_most_probable():
 
 
 def test_fixed_and_tied_parameters_stay_so_where_the_answer_moves():
-    data, kept, known, space = near_the_truth(grouping=(0, 1, 2, 3, 4, 1, -1, 3))
-    found = sample_uncertainty(known, data, PAPER, space, kept, simulate, move_answer=True)
+    _, kept, known = near_the_truth(grouping=(0, 1, 2, 3, 4, 1, -1, 3))
+    found = sample_uncertainty(known, kept, simulate, move_answer=True)
     assert found.parameters[1] == found.parameters[5]
     assert found.parameters[6] == pytest.approx(TRUTH[6], rel=1e-5)

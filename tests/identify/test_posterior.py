@@ -10,11 +10,10 @@ from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import Unknowns, build_space, group_by_kind, group_separately
 from limbfit.identify.uncertainty.discrepancy import ResidualModel
 from limbfit.identify.uncertainty.emulator import Emulator
-from limbfit.identify.uncertainty.likelihood import Likelihood
+from limbfit.identify.uncertainty.likelihood import Likelihood, check_profile_ends, compute_profile
 from limbfit.identify.uncertainty.model_comparison import compare_models, fit_alternative
 from limbfit.identify.uncertainty.noise import SiteNoise, estimate_curve_noise
 from limbfit.identify.uncertainty.posterior import sample_posterior
-from limbfit.identify.uncertainty.profile import check_profile_ends, compute_profile
 from limbfit.identify.uncertainty.uncertainty import estimate_uncertainty
 from limbfit.results.uncertainty import ModelEvidence
 
@@ -35,7 +34,7 @@ def linear_case(seed=0, sd=SD):
     noise = SiteNoise("s", np.arange(30.0), sd**2 * np.eye(30), sd, 0.0)
     model = ResidualModel((noise,), np.array([ABOUT]), np.zeros(1), 0.2, 0.0)
     points = np.exp(np.random.default_rng(1).uniform(-1, 1, (5, 3)))
-    emulator = Emulator.fit(WIDE.names, points, [line(p) for p in points], softening=1e4)
+    emulator = Emulator(points, [line(p) for p in points], softening=1e4)
     space = build_space(WIDE, group_separately(WIDE.names))
     exact = np.linalg.lstsq(X, data[0].force_N - ABOUT, rcond=None)[0]
     return Likelihood(emulator, data, model, WIDE, space), exact, sd**2 * np.linalg.inv(X.T @ X)
@@ -46,7 +45,7 @@ def bars_case(noise=0.01, seed=4):
     u = estimate_uncertainty(TRUTH, simulate(TRUTH), data, PAPER, estimate_curve_noise(simulate(TRUTH), data))
     rng = np.random.default_rng(0)
     points = TRUTH * np.exp(0.25 * rng.uniform(-1, 1, (24, 8)))
-    emulator = Emulator.fit(NAMES, points, [simulate(p) for p in points])
+    emulator = Emulator(points, [simulate(p) for p in points])
     return emulator, data, u
 
 
@@ -125,7 +124,7 @@ def two_models(truth, noise=0.003):
             middle * np.exp(0.3 * rng.uniform(-1, 1, (20, 8))),
         ]
     )
-    emulator = Emulator.fit(NAMES, points, [simulate(p) for p in points])
+    emulator = Emulator(points, [simulate(p) for p in points])
     found = []
     for name, grouping in (
         ("one material", group_by_kind(NAMES)),
@@ -163,7 +162,7 @@ def test_a_parameter_that_the_records_do_not_tell_costs_nothing():
         return [SiteResponse(r.force_N, np.pad(r.jacobian, ((0, 0), (0, 6)))) for r in line(p[:3])]
 
     points = np.exp(np.random.default_rng(1).uniform(-1, 1, (12, 9)))
-    emulator = Emulator.fit(names, points, [silent(p) for p in points], softening=1e4)
+    emulator = Emulator(points, [silent(p) for p in points], softening=1e4)
     space = build_space(more, group_separately(names))
     wide = Likelihood(emulator, likelihood.measured, likelihood.model, more, space)
     found, _ = fit_alternative("nine", wide, np.r_[exact, np.zeros(6)])

@@ -10,10 +10,9 @@ from bars import NAMES, PAPER, SITES, TRUTH, records, storing
 
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.parameters import Prior, build_space, group_separately
-from limbfit.identify.uncertainty.estimator import PriorPrecision
 from limbfit.identify.uncertainty.intervals import EvaluationStore, sample_uncertainty
 from limbfit.identify.uncertainty.noise import estimate_curve_noise
-from limbfit.identify.uncertainty.uncertainty import estimate_uncertainty
+from limbfit.identify.uncertainty.uncertainty import PriorPrecision, estimate_uncertainty
 from limbfit.priors import of_tissues
 
 PEOPLE = tuple(Prior(name, *known) for name, known in of_tissues(("skin", "muscle")).items())
@@ -57,8 +56,7 @@ def told(unknowns, seed=0):
     known = estimate_uncertainty(
         found.parameters, found.responses, data, unknowns, estimate_curve_noise(found.responses, data)
     )
-    space = build_space(unknowns, group_separately(NAMES))
-    return found, sample_uncertainty(known, data, unknowns, space, kept, simulate)
+    return found, sample_uncertainty(known, kept, simulate)
 
 
 def precision(found, known, unknowns):

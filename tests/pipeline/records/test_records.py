@@ -16,8 +16,8 @@ from limbfit.identify.checks.outliers import LeaveOutFits, list_pairs
 from limbfit.identify.checks.plausibility import RecordFacts, check_plausibility
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.prediction import PredictionModel
-from limbfit.identify.uncertainty.estimator import FitSensitivity
 from limbfit.identify.uncertainty.noise import estimate_record_noise
+from limbfit.identify.uncertainty.uncertainty import FitSensitivity
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store

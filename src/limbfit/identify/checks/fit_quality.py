@@ -4,7 +4,7 @@ The residuals r of a record that the model obeys have a known covariance C: nois
 stiffness of the site as a whole. ``sqrt(r' C^-1 r / n)`` is then about one in every phase. A model that
 cannot follow leaves smooth residuals, many times as large by this measure even where they are small beside
 the force. The mesh counts with the shape of its own error and with a smooth error of any shape
-(`MeshMisfit`): a record of the same limb on another mesh is no fault of the model.
+(`estimate_mesh_misfit`): a record of the same limb on another mesh is no fault of the model.
 
 Autocorrelation is tested on residuals whitened by C (Ljung and Box 1978). What other parameters would explain
 is taken out first: it is the model that is judged, not where the search stopped.

@@ -19,13 +19,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag, cho_factor, cho_solve, cholesky, eigh, solve_triangular
+from scipy.linalg import block_diag, cho_factor, cho_solve, eigh
 from scipy.optimize import brentq, minimize
 from scipy.special import ndtr, stdtrit
 
-from ...arrays import Array
+from ...arrays import Array, Indices
 from ...results.identification import MeshMisfitSummary, RecordResiduals, ResidualsSummary
 from ..fit.prediction import MAX_FREEDOM
 from .noise import SiteNoise
@@ -52,17 +53,9 @@ def compute_matern(times_s: Array, correlation: float) -> Array:
     return (1 + distance) * np.exp(-distance)
 
 
-@dataclass(frozen=True)
-class MeshMisfit:
-    """A misfit that the mesh alone would cause: standard deviation over the largest force of a record
-    (``share``) and correlation length over its duration (``correlation``)."""
-
-    share: float
-    correlation: float
-
-    def compute_covariance(self, times_s: Array, peak_N: float) -> Array:
-        """Return its covariance (n, n) in N^2 for a record with so large a force."""
-        return (self.share * peak_N) ** 2 * compute_matern(times_s, self.correlation)
+def compute_mesh_covariance(misfit: MeshMisfitSummary, times_s: Array, peak_N: float) -> Array:
+    """Return the covariance (n, n) in N^2 of the mesh's misfit for a record with so large a force."""
+    return (misfit.share * peak_N) ** 2 * compute_matern(times_s, misfit.correlation)
 
 
 @dataclass(frozen=True)
@@ -82,14 +75,14 @@ class ResidualModel:
     noise: tuple[SiteNoise, ...]
     peaks_N: Array
     misfit: Array
-    correlation: float
-    known_scale: float
+    correlation: float = 1.0
+    known_scale: float = 0.0
     criterion: float = field(default=0.0, repr=False)
     mesh_N: tuple[Array, ...] = ()
     site_N: tuple[Array, ...] = ()
     site_factor: float = 1.0
     site_factors: Array = field(default_factory=lambda: np.ones(1))
-    mesh_misfit: MeshMisfit | None = None
+    mesh_misfit: MeshMisfitSummary | None = None
 
     @cached_property
     def site_freedom(self) -> float:
@@ -102,10 +95,7 @@ class ResidualModel:
             return float(np.mean(ndtr(half / self.site_factors))) - 0.975
 
         half = brentq(compute_excess, 0.0, 10 * float(self.site_factors.max())) / self.site_factor
-        if half <= stdtrit(MAX_FREEDOM, 0.975):
-            return MAX_FREEDOM
-        if half >= stdtrit(1.0, 0.975):
-            return 1.0
+        half = np.clip(half, *stdtrit([MAX_FREEDOM, 1.0], 0.975))
         return float(brentq(lambda freedom: stdtrit(freedom, 0.975) - half, 1.0, MAX_FREEDOM))
 
     @property
@@ -138,9 +128,7 @@ class ResidualModel:
             site_factor=self.site_factor if self.site_N else None,
             site_freedom=self.site_freedom if self.site_N else None,
             misfit_elsewhere=self.misfit_elsewhere,
-            mesh_misfit=None
-            if self.mesh_misfit is None
-            else MeshMisfitSummary.model_validate(self.mesh_misfit),
+            mesh_misfit=self.mesh_misfit,
             correlation=self.correlation,
             known_scale=self.known_scale,
             effective_samples=self.effective_samples(),
@@ -155,26 +143,32 @@ class ResidualModel:
         """The sites, each once."""
         return tuple(dict.fromkeys(noise.site_name for noise in self.noise))
 
+    def _place_by_site(self, rows: Sequence[Array]) -> list[Array]:
+        """Put the row (n,) of each record into its site's column: (n, sites), or (n, 0) if there are none."""
+        if not rows:
+            return [np.zeros((len(noise.times_s), 0)) for noise in self.noise]
+        columns = dict(zip(self.sites, np.eye(len(self.sites))))
+        return [np.outer(row, columns[noise.site_name]) for row, noise in zip(rows, self.noise, strict=True)]
+
     @property
-    def shared_deviations(self) -> tuple[Array, ...]:
+    def site_deviations(self) -> list[Array]:
+        """Per record (n, sites): one standard deviation of what each site's stiffness changes."""
+        return self._place_by_site([self.site_factor * row for row in self.site_N])
+
+    @property
+    def shared_deviations(self) -> list[Array]:
         """Per record (n, q): one standard deviation of each of the q deviations that records have in common.
 
         First come those of the meshes, then those of the sites, each as many as there are `sites`, or none.
         """
-        kinds = [(self.mesh_N, 1.0), (self.site_N, self.site_factor)]
-        kinds = [(rows, factor) for rows, factor in kinds if rows]
-        found = [np.zeros((len(noise.times_s), len(kinds), len(self.sites))) for noise in self.noise]
-        for k, (rows, factor) in enumerate(kinds):
-            for row, noise, columns in zip(rows, self.noise, found, strict=True):
-                columns[:, k, self.sites.index(noise.site_name)] = factor * row
-        return tuple(columns.reshape(len(columns), -1) for columns in found)
+        pairs = zip(self._place_by_site(self.mesh_N), self.site_deviations, strict=True)
+        return [np.hstack(pair) for pair in pairs]
 
-    @property
-    def site_deviations(self) -> tuple[Array, ...]:
-        """Those of the `shared_deviations` that come from the sites' stiffness: (n, sites) per record."""
-        return tuple(
-            row[:, row.shape[1] - len(self.sites) * bool(self.site_N) :] for row in self.shared_deviations
-        )
+    def select(self, chosen: Sequence[int]) -> ResidualModel:
+        """Return the model of the records of these numbers."""
+        rows = {name: getattr(self, name) for name in ("noise", "mesh_N", "site_N")}
+        picked: dict[str, Any] = {name: tuple(own[i] for i in chosen) for name, own in rows.items() if own}
+        return replace(self, peaks_N=self.peaks_N[chosen], misfit=self.misfit[chosen], **picked)
 
     def own_covariance(self, i: int) -> Array:
         """Covariance (n, n) of what record i shares with no other: its noise and its misfit."""
@@ -185,8 +179,6 @@ class ResidualModel:
         factors = [cho_factor(self.own_covariance(i)) for i in range(len(self.noise))]
         found = [cho_solve(factor, one) for factor, one in zip(factors, rows, strict=True)]
         shared = self.shared_deviations
-        if not shared[0].shape[1]:
-            return found
         known = [cho_solve(factor, one) for factor, one in zip(factors, shared)]
         inner = np.eye(shared[0].shape[1]) + sum(E.T @ K for E, K in zip(shared, known))
         amount = np.linalg.solve(inner, sum(E.T @ one for E, one in zip(shared, found)))
@@ -199,115 +191,96 @@ class ResidualModel:
         shape = shape if noise.similarity is None else shape * noise.similarity
         return (self.misfit[i] * self.peaks_N[i]) ** 2 * shape
 
-    def covariance(self, i: int) -> Array:
-        """Covariance (n, n) of the residuals of record i."""
-        return self.own_covariance(i) + self.shared_deviations[i] @ self.shared_deviations[i].T
-
     def effective_samples(self) -> float:
         """The number of independent residuals: n^2 / ||R||^2 of the correlations R, summed over records."""
         total = 0.0
-        for i in range(len(self.noise)):
-            C = self.covariance(i)
+        for i, E in enumerate(self.shared_deviations):
+            C = self.own_covariance(i) + E @ E.T
             sd = np.sqrt(np.diag(C))
             total += len(C) ** 2 / float(np.sum((C / np.outer(sd, sd)) ** 2))
         return total
 
-    def compute_spectra(self) -> tuple[Spectrum, ...]:
-        """Return the spectrum of each record, without what it shares with others."""
-        return tuple(
-            Spectrum.from_covariances(noise.covariance, self.misfit_covariance(i))
-            for i, noise in enumerate(self.noise)
-        )
+    def whiten(self) -> Spectrum:
+        """Return the coordinates in which noise and misfit are diagonal, without what records share."""
+        transforms, values, log_determinant = [], [], 0.0
+        for i, noise in enumerate(self.noise):
+            variances, vectors = eigh(self.misfit_covariance(i), noise.covariance)
+            transforms.append(vectors.T)
+            values.append(np.maximum(variances, 0.0))
+            log_determinant += float(np.linalg.slogdet(noise.covariance)[1])
+        record = np.repeat(np.arange(len(values)), [len(own) for own in values])
+        return Spectrum(tuple(transforms), np.concatenate(values), record, log_determinant)
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """A record's residuals in coordinates in which noise has variance 1 and misfit ``values`` (n,)."""
+    """The N residuals of all records in coordinates in which noise has variance 1 and misfit is diagonal.
 
-    transform: Array
+    ``transforms`` (n, n) of each record lead there; ``values`` (N,) are the variances of the misfit and
+    ``record`` (N,) the numbers of the records; ``log_determinant`` is that of the noise's covariance.
+    """
+
+    transforms: tuple[Array, ...]
     values: Array
-    log_determinant: float  # of the noise
+    record: Indices
+    log_determinant: float
 
-    @classmethod
-    def from_covariances(cls, noise: Array, misfit: Array) -> Spectrum:
-        L = cholesky(noise, lower=True)
-        inner = solve_triangular(L, solve_triangular(L, misfit, lower=True).T, lower=True)
-        values, vectors = eigh((inner + inner.T) / 2)
-        transform = solve_triangular(L, vectors, lower=True, trans="T").T
-        return cls(transform, np.maximum(values, 0.0), 2 * float(np.log(np.diag(L)).sum()))
+    def transform(self, rows: Array) -> Array:
+        """Transform residuals (N, ...) of all records, one after the other."""
+        parts = np.split(rows, np.cumsum([len(own) for own in self.transforms])[:-1])
+        return np.concatenate([own @ part for own, part in zip(self.transforms, parts)])
 
 
 def estimate_discrepancy(
-    residuals: Sequence[Array],
-    jacobians: Sequence[Array],
-    noise: Sequence[SiteNoise],
-    peaks_N: Array,
-    precision: Array,
-    mesh_N: Sequence[Array] = (),
-    site_N: Sequence[Array] = (),
+    model: ResidualModel, residuals: Sequence[Array], jacobians: Sequence[Array], precision: Array
 ) -> ResidualModel:
     """Estimate size and correlation of the misfit from residuals (n,) and derivatives (n, p) per record.
 
-    The derivatives are with respect to the logarithms of the parameters. ``precision`` (p, p) is what is
-    known of these beforehand, ``mesh_N`` (n,) per record the error of the mesh, which records of one site
-    have in common, and ``site_N`` (n,) what is expected of the site's own stiffness. Misfits are similar
-    within a factor of about two, and sites as far off as expected within a factor of four, unless the
-    residuals say otherwise.
+    Of ``model`` noise, mesh and expected difference of the sites count; what is estimated is replaced. The
+    derivatives are with respect to the logarithms of the parameters, and ``precision`` (p, p) is what is
+    known of these beforehand. Misfits are similar within a factor of about two, and sites as far off as
+    expected within a factor of four, unless the residuals say otherwise.
     """
-    best: tuple[float, Array, float, _RestrictedLikelihood] | None = None
-    unit = np.ones(len(noise))
-    model = ResidualModel(
-        tuple(noise), np.asarray(peaks_N), unit, 0.0, 0.0,
-        mesh_N=tuple(mesh_N), site_N=tuple(site_N),
-    )  # fmt: skip
-    start = np.array([_guess_misfit(r, s, p) for r, s, p in zip(residuals, noise, peaks_N)])
+    model = replace(model, misfit=np.ones(len(model.noise)), site_factor=1.0, site_factors=np.ones(1))
+    start = np.array([_guess_misfit(*own) for own in zip(residuals, model.noise, model.peaks_N, strict=True)])
     bounds = [(np.log(_MIN_MISFIT), np.log(_MAX_MISFIT))] * len(start)
-    if site_N:
+    if model.site_N:
         start, bounds = np.append(start, 0.0), [*bounds, tuple(np.log(_SITE_FACTOR_BOUNDS))]
+    fits = []
     for correlation in CORRELATION_LENGTHS:
         rows = _RestrictedLikelihood(residuals, jacobians, replace(model, correlation=correlation), precision)
         optimum = minimize(rows.criterion, start, jac=True, method="L-BFGS-B", bounds=bounds)
-        if best is None or optimum.fun < best[0]:
-            best = float(optimum.fun), optimum.x, correlation, rows
+        fits.append((float(optimum.fun), optimum.x, correlation, rows))
         start = optimum.x
-    assert best is not None
-    value, logs, correlation, rows = best
-    return replace(
+    value, logs, correlation, rows = min(fits, key=lambda fit: fit[0])
+    found = replace(
         model,
-        misfit=np.exp(logs[: len(noise)]),
-        site_factor=float(np.exp(logs[-1])) if site_N else 1.0,
-        site_factors=rows.sample_site_factors(logs) if site_N else np.ones(1),
+        misfit=np.exp(logs[: len(model.noise)]),
         correlation=correlation,
         known_scale=rows.known_scale(logs),
         criterion=value,
     )
+    if not model.site_N:
+        return found
+    return replace(found, site_factor=float(np.exp(logs[-1])), site_factors=rows.sample_site_factors(logs))
 
 
 def estimate_mesh_misfit(
-    mesh_N: Sequence[Array],
-    jacobians: Sequence[Array],
-    noise: Sequence[SiteNoise],
-    peaks_N: Array,
-    precision: Array,
-    site_N: Sequence[Array] = (),
-) -> MeshMisfit | None:
+    model: ResidualModel, jacobians: Sequence[Array], precision: Array
+) -> MeshMisfitSummary | None:
     """Estimate the misfit that a study sees in records of a limb that its model describes, on another mesh.
 
-    The errors ``mesh_N`` (n,) of the mesh, from the difference of two, take the place of the residuals of
-    `estimate_discrepancy`, which has the other arguments. None if no record's error is known.
+    The errors of the mesh, from the difference of two, take the place of the residuals of
+    `estimate_discrepancy`. None if no record's error is known.
     """
-    chosen = [i for i, error in enumerate(mesh_N) if np.any(error)]
+    chosen = [i for i, error in enumerate(model.mesh_N) if np.any(error)]
     if not chosen:
         return None
+    own = model.select(chosen)
     found = estimate_discrepancy(
-        [mesh_N[i] for i in chosen],
-        [jacobians[i] for i in chosen],
-        [noise[i] for i in chosen],
-        np.asarray(peaks_N)[chosen],
-        precision,
-        site_N=[site_N[i] for i in chosen] if site_N else (),
+        replace(own, mesh_N=()), own.mesh_N, [jacobians[i] for i in chosen], precision
     )
-    return MeshMisfit(found.misfit_elsewhere, found.correlation)
+    return MeshMisfitSummary(share=found.misfit_elsewhere, correlation=found.correlation)
 
 
 def _guess_misfit(residual: Array, noise: SiteNoise, peak: float) -> float:
@@ -326,18 +299,15 @@ class _RestrictedLikelihood:
     def __init__(
         self, residuals: Sequence[Array], jacobians: Sequence[Array], unit: ResidualModel, precision: Array
     ) -> None:
-        spectra = unit.compute_spectra()
-        self.records = len(spectra)
-        self.site = np.concatenate([np.full(len(s.values), i) for i, s in enumerate(spectra)])
-        self.values = np.concatenate([s.values for s in spectra])
-        self.residual = np.concatenate([s.transform @ r for s, r in zip(spectra, residuals)])
-        both = [np.hstack([J, E]) for J, E in zip(jacobians, unit.shared_deviations, strict=True)]
-        self.jacobian = np.concatenate([s.transform @ J for s, J in zip(spectra, both)])
-        self.known = block_diag(precision, np.eye(unit.shared_deviations[0].shape[1]))
+        spectrum, shared = unit.whiten(), np.concatenate(unit.shared_deviations)
+        self.records, self.record, self.values = len(unit.noise), spectrum.record, spectrum.values
+        self.residual = spectrum.transform(np.concatenate(residuals))
+        self.jacobian = spectrum.transform(np.hstack([np.concatenate(jacobians), shared]))
+        self.known = block_diag(precision, np.eye(shared.shape[1]))
         self.places = len(unit.sites) if unit.site_N else 0  # the last unknowns
 
     def variances(self, logs: Array) -> Array:
-        return 1.0 + np.exp(2 * logs[: self.records])[self.site] * self.values
+        return 1.0 + np.exp(2 * logs[: self.records])[self.record] * self.values
 
     def precision(self, logs: Array) -> Array:
         """What is known of the unknowns beforehand."""
@@ -365,7 +335,7 @@ class _RestrictedLikelihood:
             + float(np.linalg.slogdet(A)[1])
             + float(from_mean @ from_mean) / _MISFIT_SD_LOG**2
         )
-        slope = 2 * np.bincount(self.site, share * (1 - fit - leverage), minlength=self.records)
+        slope = 2 * np.bincount(self.record, share * (1 - fit - leverage), minlength=self.records)
         slope = slope + 2 * from_mean / _MISFIT_SD_LOG**2
         if not self.places:
             return value, slope
@@ -389,10 +359,7 @@ class _RestrictedLikelihood:
     def known_scale(self, logs: Array) -> float:
         """Twice the information on the log of the misfit's variance (Satterthwaite's degrees of freedom)."""
         variances = self.variances(logs)
-        share = (variances - 1) / variances
-        half = self.jacobian / np.sqrt(variances)[:, None]
+        share, half = (variances - 1) / variances, self.jacobian / np.sqrt(variances)[:, None]
         A = half.T @ half + self.precision(logs)
-        inner = half.T @ (share[:, None] * half)
-        solved = np.linalg.solve(A, inner)
-        double = np.linalg.solve(A, half.T @ (share[:, None] ** 2 * half))
-        return float(np.sum(share**2) - 2 * np.trace(double) + np.trace(solved @ solved))
+        left = np.eye(len(half)) - half @ np.linalg.solve(A, half.T)
+        return float(share @ left**2 @ share)

@@ -9,18 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from ...arrays import Array
 from ...results.uncertainty import EmulatorRound, ProfileCheck
-from ..fit.objective import MeasuredCurve, SiteResponse
-from ..fit.parameters import SearchSpace, Unknowns
+from ..fit.objective import SiteResponse
+from ..fit.parameters import SearchSpace
 from .emulator import Emulator
-from .likelihood import Likelihood, Optimum
+from .likelihood import Likelihood, Optimum, Profile, check_profile_ends, compute_profile
 from .posterior import Posterior, sample_posterior
-from .profile import Profile, check_profile_ends, compute_profile, select_profiles_to_check
-from .uncertainty import Uncertainty
+from .uncertainty import Uncertainty, reduce_covariance
 
 SimulateMany = Callable[[Sequence[Array]], Sequence[Sequence[SiteResponse]]]
 
@@ -29,6 +30,7 @@ _MAX_DISTANCE = 1.4  # distance of a candidate from their middle, over the root 
 _SHORT_CHAIN_STEPS = 800
 _CHECKED_SAMPLES = 150  # samples at which the emulator's error is asked
 _ERROR_QUANTILE = 0.9  # of those errors
+_MAX_OUTSIDE = 0.05  # share of those samples outside the emulator's runs
 
 
 @dataclass(frozen=True)
@@ -49,10 +51,9 @@ class ExplorationSettings:
 class Exploration:
     """The result; ``good_enough`` says whether the emulator's error came below ``needed_percent``.
 
-    ``runs`` are the simulations that the emulator knows, in the order of its points.
+    ``runs`` are the simulations that the emulator of the ``likelihood`` knows, in the order of its points.
     """
 
-    emulator: Emulator = field(repr=False)
     likelihood: Likelihood = field(repr=False)
     best: Optimum
     posterior: Posterior
@@ -66,9 +67,6 @@ class Exploration:
 
 def explore_posterior(
     simulate: SimulateMany,
-    measured: Sequence[MeasuredCurve],
-    unknowns: Unknowns,
-    space: SearchSpace,
     linearised: Uncertainty,
     points: Sequence[Array],
     settings: ExplorationSettings | None = None,
@@ -79,176 +77,141 @@ def explore_posterior(
     Parameters
     ----------
     simulate : takes several full parameters (p,) and returns the responses of each; failed ones are left out.
-    space : of the calibration's last stage.
     linearised : the linearised uncertainty there, whose covariance of the residuals is used.
     points : parameters that were simulated before, which ``simulate`` returns at no cost.
     report : called with sentences on the progress.
     """
-    run = _Explorer(
-        simulate, measured, unknowns, space, linearised, settings or ExplorationSettings(), report
+    settings, space, model = settings or ExplorationSettings(), linearised.space, linearised.residual_model
+    # Recorded noise, or where the model is wrong by more than that, a third of by how much.
+    needed = tuple(
+        float(100 * max(noise.sd_N / peak, misfit / 3))
+        for noise, peak, misfit in zip(model.noise, model.peaks_N, model.misfit)
     )
-    run.learn(list(points))
-    run.learn(run.build_first_design())
-    while not run.run_round():
-        run.learn(run.build_next_design())
-    return run.build_result()
+    known, runs = _simulate_complete(simulate, points, report)
+    candidates = _draw_linearised(linearised, settings.seed)
+    emulator: Emulator | None = None
+    rounds: list[EmulatorRound] = []
+    spent = 0
+    while True:
+        count = min(settings.batch, settings.runs - spent)
+        design = _select_distant(candidates, known, space, count)
+        design, found = _simulate_complete(simulate, design, report)
+        spent += count
+        pairs = zip(design, found, strict=True)
+        errors = [emulator.compute_errors_percent(*pair) for pair in pairs] if emulator else []
+        known, runs = known + design, runs + found
+        emulator = Emulator(np.array(known), runs)
+        likelihood = Likelihood(emulator, linearised.measured, model, linearised.unknowns, space)
+        _, simulated = min(zip(runs, known), key=lambda one: likelihood.minus_2_log_of(*one))
+        best = likelihood.find_best((linearised.parameters, linearised.centre, simulated))
+        covariance = likelihood.compute_covariance(best.z)
+        sample = partial(sample_posterior, likelihood, best.z, covariance, seed=settings.seed)
+        samples = sample(steps=_SHORT_CHAIN_STEPS).samples
+        rounds.append(_assess_emulator(emulator, samples, errors))
+        error = np.array(rounds[-1].error_percent)
+        report(f"{len(known)} runs: emulator within {error.max():.2f} % of the largest force")
+        good_enough = bool(np.all(error <= needed) and rounds[-1].outside < _MAX_OUTSIDE)
+        if good_enough or spent >= settings.runs:
+            break
+        candidates = np.array([space.reduce(one) for one in np.log(_thin(samples, _CANDIDATES))])
+    report("sampling the posterior")
+    posterior = sample(steps=settings.steps)
+    profiles = []
+    for k, (tie, sd) in enumerate(zip(space.tie.T, np.sqrt(np.diag(covariance)))):
+        report(f"profile {k + 1} of {len(covariance)}")
+        freedom = linearised.degrees_of_freedom[np.flatnonzero(tie)[0]]
+        profiles.append(compute_profile(likelihood, best, k, float(sd), float(freedom)))
+    return Exploration(
+        likelihood=likelihood,
+        best=best,
+        posterior=posterior,
+        profiles=tuple(profiles),
+        checks=_check_profiles(simulate, likelihood, best, profiles, settings.checked, report),
+        rounds=tuple(rounds),
+        needed_percent=needed,
+        good_enough=good_enough,
+        runs=tuple(runs),
+    )
 
 
-class _Explorer:
-    """An exploration in progress."""
-
-    def __init__(
-        self,
-        simulate: SimulateMany,
-        measured: Sequence[MeasuredCurve],
-        unknowns: Unknowns,
-        space: SearchSpace,
-        linearised: Uncertainty,
-        settings: ExplorationSettings,
-        report: Callable[[str], None],
-    ) -> None:
-        self.simulate, self.measured, self.unknowns, self.space = simulate, measured, unknowns, space
-        self.linearised, self.settings, self.report = linearised, settings, report
-        self.random = np.random.default_rng(settings.seed)
-        self.points: list[Array] = []
-        self.responses: list[Sequence[SiteResponse]] = []
-        self.spent = 0
-        self.rounds: list[EmulatorRound] = []
-        self.new_percent: tuple[float, ...] = ()
-        model = linearised.residual_model
-        # Recorded noise, or where the model is wrong by more than that, a third of by how much.
-        self.needed = tuple(
-            float(100 * max(noise.sd_N / peak, misfit / 3))
-            for noise, peak, misfit in zip(model.noise, model.peaks_N, model.misfit)
-        )
-
-    def learn(self, points: list[Array]) -> None:
-        """Simulate; the emulator's errors at these points are stored before it learns them."""
-        found = list(self.simulate(points))
-        whole = [i for i, run in enumerate(found) if all(r.completed for r in run)]
-        if len(whole) < len(found):
-            self.report(f"{len(found) - len(whole)} of {len(found)} simulations failed: they are left out")
-        if self.rounds:
-            errors = [self.emulator.compute_errors_percent(points[i], found[i]) for i in whole]
-            self.new_percent = tuple(np.mean(errors, axis=0).tolist()) if errors else ()
-        self.points += [points[i] for i in whole]
-        self.responses += [found[i] for i in whole]
-
-    def build_first_design(self) -> list[Array]:
-        """Spread points over the linearised posterior, a little wider, inside the bounds."""
-        z = self.space.reduce(np.log(self.linearised.centre))
-        half = self.space.tie / self.space.tie.sum(axis=0)
-        covariance = half.T @ self.linearised.covariance @ half
-        drawn = self.random.multivariate_normal(
-            z, _DESIGN_WIDENING**2 * covariance, _CANDIDATES, method="eigh"
-        )
-        drawn = np.clip(drawn, self.space.lower, self.space.upper)
-        return self._spread(drawn, min(self.settings.batch, self.settings.runs))
-
-    def build_next_design(self) -> list[Array]:
-        """Choose points where the posterior is and where the runs so far are farthest away."""
-        drawn = np.log(self.posterior.samples[:: max(len(self.posterior.samples) // _CANDIDATES, 1)])
-        z = np.array([self.space.reduce(one) for one in drawn])
-        return self._spread(z, min(self.settings.batch, self.settings.runs - self.spent))
-
-    def _spread(self, candidates: Array, count: int) -> list[Array]:
-        """Choose ``count`` of the candidates (m, k), each the farthest from all points before it."""
-        self.spent += count
-        taken = np.array([self.space.reduce(np.log(p)) for p in self.points])
-        values, vectors = np.linalg.eigh(np.cov(candidates.T) + 1e-8 * np.eye(candidates.shape[1]))
-        whiten = vectors / np.sqrt(values)
-        at, known = candidates @ whiten, taken @ whiten
-        # Out in the tail simulations are hard, and report of the tail alone.
-        far = np.linalg.norm(at - at.mean(axis=0), axis=1) > _MAX_DISTANCE * np.sqrt(at.shape[1])
-        distance = np.min(np.linalg.norm(at[:, None] - known[None], axis=2), axis=1)
-        distance[far] = -1.0
-        chosen = []
-        for _ in range(count):
-            i = int(np.argmax(distance))
-            chosen.append(self.space.expand(candidates[i]))
-            distance = np.minimum(distance, np.linalg.norm(at - at[i], axis=1))
-        return chosen
-
-    def run_round(self) -> bool:
-        """Fit and sample; return True if the emulator is good enough, or if no runs are left."""
-        self.emulator = Emulator.fit(self.unknowns.names, np.array(self.points), self.responses)
-        model = self.linearised.residual_model
-        self.likelihood = Likelihood(self.emulator, self.measured, model, self.unknowns, self.space)
-        self.best = self._find_best()
-        self.covariance = self.likelihood.compute_covariance(self.best.z)
-        self.posterior = self._sample(_SHORT_CHAIN_STEPS)
-        samples = self.posterior.samples[:: max(len(self.posterior.samples) // _CHECKED_SAMPLES, 1)]
-        stated = np.array([self.emulator.expected_error_percent(p) for p in samples])
-        error = np.quantile(stated, _ERROR_QUANTILE, axis=0)
-        outside = 1 - float(np.mean([self.emulator.is_inside(p) for p in samples]))
-        loo = np.median(self.emulator.loo_percent, axis=0)
-        self.rounds.append(
-            EmulatorRound(
-                runs=len(self.points),
-                error_percent=_to_tuple(error),
-                loo_percent=_to_tuple(loo),
-                new_percent=self.new_percent,
-                outside=outside,
-            )
-        )
-        self.good_enough = bool(np.all(error <= self.needed) and outside < 0.05)
-        self.report(f"{len(self.points)} runs: emulator within {error.max():.2f} % of the largest force")
-        return self.good_enough or self.spent >= self.settings.runs
-
-    def _find_best(self) -> Optimum:
-        """Find the best optimum from the calibrated, the most probable and the best simulated parameters."""
-        simulated = min(
-            range(len(self.points)),
-            key=lambda i: self.likelihood.minus_2_log_of(self.responses[i], self.points[i]),
-        )
-        return self.likelihood.find_best(
-            (self.linearised.parameters, self.linearised.centre, self.points[simulated])
-        )
-
-    def _sample(self, steps: int) -> Posterior:
-        seed = self.settings.seed
-        return sample_posterior(self.likelihood, self.best.z, self.covariance, steps=steps, seed=seed)
-
-    def build_result(self) -> Exploration:
-        self.report("sampling the posterior")
-        posterior = self._sample(self.settings.steps)
-        sd = np.sqrt(np.diag(self.covariance))
-        freedom = [self.linearised.degrees_of_freedom[np.flatnonzero(tie)[0]] for tie in self.space.tie.T]
-        profiles = []
-        for k in range(len(sd)):
-            self.report(f"profile {k + 1} of {len(sd)}")
-            of = self.likelihood, self.best, k, float(sd[k]), float(freedom[k])
-            profiles.append(compute_profile(*of, is_inside=lambda p: self.emulator.is_inside(p, margin=0.0)))
-        return Exploration(
-            emulator=self.emulator,
-            likelihood=self.likelihood,
-            best=self.best,
-            posterior=posterior,
-            profiles=tuple(profiles),
-            checks=self._check_profiles(profiles),
-            rounds=tuple(self.rounds),
-            needed_percent=self.needed,
-            good_enough=self.good_enough,
-            runs=tuple(self.responses),
-        )
-
-    def _check_profiles(self, profiles: Sequence[Profile]) -> tuple[ProfileCheck, ...]:
-        """Simulate the ends of some profiles with the solver."""
-        chosen = select_profiles_to_check(profiles, self.settings.checked)
-        if not chosen:
-            return ()
-        self.report("checking the ends of profiles with the solver")
-        wanted = [self.best.parameters, *(end for _, one in chosen for end in one.ends)]
-        at_best, *found = self.simulate(wanted)
-        if not all(r.completed for r in at_best):
-            self.report("warning: the answer's own simulation failed: no end of a profile is checked")
-            return ()
-        pairs = zip(found[::2], found[1::2], strict=True)
-        return tuple(
-            check_profile_ends(self.likelihood, self.best, at_best, one, pair, why)
-            for (why, one), pair in zip(chosen, pairs, strict=True)
-        )
+def _simulate_complete(
+    simulate: SimulateMany, points: Sequence[Array], report: Callable[[str], None]
+) -> tuple[list[Array], list[Sequence[SiteResponse]]]:
+    """Simulate, and return the points and responses of the simulations that completed."""
+    found = simulate(points)
+    pairs = [pair for pair in zip(points, found, strict=True) if all(one.completed for one in pair[1])]
+    if len(pairs) < len(found):
+        report(f"{len(found) - len(pairs)} of {len(found)} simulations failed: they are left out")
+    return [point for point, _ in pairs], [run for _, run in pairs]
 
 
-def _to_tuple(values: Array) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)
+def _draw_linearised(linearised: Uncertainty, seed: int) -> Array:
+    """Draw candidates (m, k) from the linearised posterior, a little wider, inside the bounds."""
+    space = linearised.space
+    z = space.reduce(np.log(linearised.centre))
+    covariance = _DESIGN_WIDENING**2 * reduce_covariance(linearised.covariance, space)
+    drawn = np.random.default_rng(seed).multivariate_normal(z, covariance, _CANDIDATES, method="eigh")
+    return np.clip(drawn, space.lower, space.upper)
+
+
+def _select_distant(
+    candidates: Array, points: Sequence[Array], space: SearchSpace, count: int
+) -> list[Array]:
+    """Select ``count`` of the candidates (m, k), each the farthest from ``points`` (p,) and all before it."""
+    taken = np.array([space.reduce(np.log(p)) for p in points])
+    values, vectors = np.linalg.eigh(np.cov(candidates.T) + 1e-8 * np.eye(candidates.shape[1]))
+    whiten = vectors / np.sqrt(values)
+    at, known = candidates @ whiten, taken @ whiten
+    # Out in the tail simulations are hard, and report of the tail alone.
+    far = np.linalg.norm(at - at.mean(axis=0), axis=1) > _MAX_DISTANCE * np.sqrt(at.shape[1])
+    chosen: list[Array] = []
+    for _ in range(count):
+        i = int(np.argmax(np.where(far, -1.0, cdist(at, known).min(axis=1))))
+        known = np.vstack([known, at[i]])
+        chosen.append(space.expand(candidates[i]))
+    return chosen
+
+
+def _thin(samples: Array, count: int) -> Array:
+    """Return about ``count`` of the samples (m, p), evenly spread."""
+    return samples[:: max(len(samples) // count, 1)]
+
+
+def _assess_emulator(emulator: Emulator, samples: Array, new_errors: Sequence[Array]) -> EmulatorRound:
+    """Assess the emulator over samples (m, p); ``new_errors`` (sites,) are those at runs it did not know."""
+    asked = _thin(samples, _CHECKED_SAMPLES)
+    stated = np.array([emulator.expected_error_percent(p) for p in asked])
+    return EmulatorRound(
+        runs=len(emulator.points),
+        error_percent=np.quantile(stated, _ERROR_QUANTILE, axis=0).tolist(),
+        loo_percent=np.median(emulator.loo_percent, axis=0).tolist(),
+        new_percent=np.mean(new_errors, axis=0).tolist() if new_errors else (),
+        outside=1 - float(np.mean([emulator.is_inside(p) for p in asked])),
+    )
+
+
+def _check_profiles(
+    simulate: SimulateMany,
+    likelihood: Likelihood,
+    best: Optimum,
+    profiles: Sequence[Profile],
+    narrowest: int,
+    report: Callable[[str], None],
+) -> tuple[ProfileCheck, ...]:
+    """Simulate the ends of some profiles with the solver."""
+    if not narrowest:
+        return ()
+    # Verdicts rest on the narrowest profiles; the widest extrapolates most.
+    order = sorted(profiles, key=lambda one: np.log(one.interval_95[1] / one.interval_95[0]))
+    chosen = [("narrowest", one) for one in order[:narrowest]]
+    chosen += [("widest", one) for one in order[narrowest:][-1:]]
+    report("checking the ends of profiles with the solver")
+    at_best, *found = simulate([best.parameters, *(end for _, one in chosen for end in one.ends)])
+    if not all(one.completed for one in at_best):
+        report("warning: the answer's own simulation failed: no end of a profile is checked")
+        return ()
+    pairs = zip(found[::2], found[1::2], strict=True)
+    return tuple(
+        check_profile_ends(likelihood, best, at_best, one, pair, why)
+        for (why, one), pair in zip(chosen, pairs, strict=True)
+    )

@@ -16,12 +16,19 @@ import numpy as np
 
 from ...arrays import Array
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
-from ..fit.parameters import SearchSpace, Unknowns
 from ..fit.prediction import compute_error_percent
 from .emulator import Emulator
 from .likelihood import Likelihood
-from .posterior import Posterior, compute_principal_axes, sample_by_importance, sample_posterior
-from .uncertainty import GIVEN, SAMPLED, Combination, Uncertainty, choose_verdict, format_product
+from .posterior import Posterior, sample_by_importance, sample_posterior
+from .uncertainty import (
+    GIVEN,
+    SAMPLED,
+    Uncertainty,
+    build_combinations,
+    choose_verdict,
+    compute_correlation,
+    compute_principal_axes,
+)
 
 _MAX_FURTHER_SIMULATIONS = 10  # of single records
 _MAX_FURTHER_EVALUATIONS = 2  # of all records: further ones hardly changed an interval
@@ -70,13 +77,9 @@ def count_further_evaluations(records: int, spent: int) -> int:
 
 def sample_uncertainty(
     linearised: Uncertainty,
-    measured: Sequence[MeasuredCurve],
-    unknowns: Unknowns,
-    space: SearchSpace,
     evaluations: EvaluationStore,
     simulate: Simulate,
     further: int = _MAX_FURTHER_EVALUATIONS,
-    seed: int = 0,
     move_answer: bool = False,
 ) -> Uncertainty:
     """Replace intervals, combinations, verdicts and correlations of a linearised uncertainty by sampled ones.
@@ -85,7 +88,6 @@ def sample_uncertainty(
     ----------
     linearised : of ``estimate_uncertainty``. Its covariance of the residuals is used, and that of the answer,
         or of the most probable parameters.
-    space : of the calibration's last stage.
     evaluations : of the calibration.
     simulate : called for at most ``further`` more evaluations; one that fails is tried again half-way.
     move_answer : True if the answer moves from the least squares to the most probable parameters.
@@ -94,38 +96,37 @@ def sample_uncertainty(
     -----
     If not even two evaluations completed, ``linearised`` itself is returned; its ``method`` says so.
     """
-    runs = evaluations.select_near(measured)
+    runs = evaluations.select_near(linearised.measured)
     if len(runs.points) < 2:
         _add_evaluation(runs, simulate, linearised.centre)
     if len(runs.points) < 2:
         return linearised
-
-    def likelihood() -> Likelihood:
-        emulator = Emulator.fit(unknowns.names, np.array(runs.points), runs.responses)
-        model, forces_and_sd = linearised.residual_model, emulator.predict_forces_and_sd
-        return Likelihood(emulator, measured, model, unknowns, space, forces_and_sd)
-
     for _ in range(further):
-        now = likelihood()
-        _add_evaluation(runs, simulate, _find_most_probable(now, _sample(now, runs, seed)))
-    posterior = _sample(likelihood(), runs, seed, last=True)
-    if move_answer:
-        linearised = move_uncertainty(
-            linearised, unknowns, space.expand(space.reduce(np.log(posterior.median)))
-        )
-    sampled = pool_linearised_samples(linearised, posterior, unknowns, space)
-    return replace(sampled, centre=linearised.parameters) if move_answer else sampled
+        likelihood = _build_likelihood(linearised, runs)
+        _add_evaluation(runs, simulate, _find_most_probable(likelihood, _sample(likelihood, runs)))
+    posterior = _sample(_build_likelihood(linearised, runs), runs, last=True)
+    if not move_answer:
+        return pool_linearised_samples(linearised, posterior)
+    space = linearised.space
+    answer = _round_to_six_digits(space.expand(space.reduce(np.log(posterior.median))))
+    moved = replace(linearised, parameters=answer, covariance=linearised.about_centre)
+    return replace(pool_linearised_samples(moved, posterior), centre=answer)
 
 
-def _sample(likelihood: Likelihood, runs: EvaluationStore, seed: int, last: bool = False) -> Posterior:
+def _build_likelihood(known: Uncertainty, runs: EvaluationStore) -> Likelihood:
+    emulator = Emulator(np.array(runs.points), runs.responses)
+    return Likelihood(emulator, known.measured, known.residual_model, known.unknowns, known.space, True)
+
+
+def _sample(likelihood: Likelihood, runs: EvaluationStore, last: bool = False) -> Posterior:
     """Sample from the most probable evaluation on, the ``last`` time by a longer walk if it needs one."""
     z = np.array([likelihood.space.reduce(np.log(point)) for point in runs.points])
     best = z[int(np.argmin(likelihood.compute_minus_2_log(z)))]
     covariance = likelihood.compute_covariance(best)
-    found = sample_by_importance(likelihood, best, covariance, seed=seed)
+    found = sample_by_importance(likelihood, best, covariance)
     if found.long_enough or not last:
         return found
-    return sample_posterior(likelihood, best, covariance, steps=_WALK_STEPS, seed=seed)
+    return sample_posterior(likelihood, best, covariance, steps=_WALK_STEPS)
 
 
 def _find_most_probable(likelihood: Likelihood, posterior: Posterior) -> Array:
@@ -148,21 +149,12 @@ def _add_evaluation(runs: EvaluationStore, simulate: Simulate, point: Array) -> 
         runs.add(half, simulate(half))
 
 
-def move_uncertainty(linearised: Uncertainty, unknowns: Unknowns, parameters: Array) -> Uncertainty:
-    """Return the linearised uncertainty about the most probable ``parameters`` (p,), in six digits."""
-    answer = _round_to_six_digits(parameters)
-    at_bound = tuple(map(bool, unknowns.is_at_bound(answer)))
-    return replace(linearised, parameters=answer, covariance=linearised.about_centre, at_bound=at_bound)
-
-
 def _round_to_six_digits(point: Array) -> Array:
     """Round a point, so that a continued run comes to the same one."""
     return np.array([float(f"{value:.6g}") for value in point])
 
 
-def pool_linearised_samples(
-    linearised: Uncertainty, posterior: Posterior, unknowns: Unknowns, space: SearchSpace, seed: int = 0
-) -> Uncertainty:
+def pool_linearised_samples(linearised: Uncertainty, posterior: Posterior) -> Uncertainty:
     """Pool the posterior with samples of the linearised answer: two readings of the same records, equally
     likely.
 
@@ -170,51 +162,42 @@ def pool_linearised_samples(
     all points alike. Details of the records also contain errors of the mesh, which only the posterior
     believes. An interval must not say more than both readings agree on. How far sites differ is drawn, too.
     """
-    random, model, draws = np.random.default_rng(seed), linearised.residual_model, len(posterior.samples)
+    random, model, draws = np.random.default_rng(0), linearised.residual_model, len(posterior.samples)
     zero = np.zeros(len(linearised.parameters))
     others = linearised.covariance - linearised.site_covariance
     drawn = random.multivariate_normal(np.log(linearised.parameters), others, draws, method="eigh")
     of_sites = random.multivariate_normal(zero, linearised.site_covariance, draws, method="eigh")
     drawn += random.choice(model.site_factors, (draws, 1)) / model.site_factor * of_sites
-    drawn = np.clip(drawn, *np.log([unknowns.lower, unknowns.upper]))
+    drawn = np.clip(drawn, *np.log([linearised.unknowns.lower, linearised.unknowns.upper]))
     pooled = np.vstack([posterior.samples, np.exp(drawn)])
-    return restate_from_samples(linearised, replace(posterior, samples=pooled), unknowns, space)
+    return restate_from_samples(linearised, replace(posterior, samples=pooled))
 
 
-def restate_from_samples(
-    uncertainty: Uncertainty, posterior: Posterior, unknowns: Unknowns, space: SearchSpace
-) -> Uncertainty:
+def restate_from_samples(known: Uncertainty, posterior: Posterior) -> Uncertainty:
     """Return the uncertainty with what samples of the parameters say in place of its linearisation."""
-    logs = np.log(posterior.samples)
-    prior_sd = np.log(unknowns.upper / unknowns.lower) / np.sqrt(12.0)
+    prior_sd = np.log(known.unknowns.upper / known.unknowns.lower) / np.sqrt(12.0)
     covariance, intervals = posterior.covariance, posterior.intervals_95
-    sd = np.sqrt(np.diag(covariance))
     factors = np.sqrt(intervals[:, 1] / intervals[:, 0])
-    verdicts = [
-        GIVEN if before == GIVEN else choose_verdict(float(factor), float(share))
-        for before, factor, share in zip(uncertainty.verdicts, factors, sd / prior_sd)
-    ]
-    moved = np.where(sd > 0, sd, 1.0)
+    shares = np.sqrt(np.diag(covariance)) / prior_sd
+    axes = compute_principal_axes(covariance, known.space)
+    along = np.log(posterior.samples) @ axes.T
+    low, high = np.quantile(along, [0.025, 0.975], axis=0)
     return replace(
-        uncertainty,
+        known,
         method=SAMPLED,
         centre=posterior.median,
-        correlation=covariance / np.outer(moved, moved),
+        correlation=compute_correlation(covariance),
         intervals_95=intervals,
-        verdicts=tuple(verdicts),
-        combinations=tuple(
-            _summarise_combination(weights, logs @ weights, prior_sd, uncertainty.names)
-            for weights in compute_principal_axes(posterior, space)
+        verdicts=tuple(
+            GIVEN if before == GIVEN else choose_verdict(float(factor), float(share))
+            for before, factor, share in zip(known.verdicts, factors, shares)
+        ),
+        combinations=build_combinations(
+            known.names,
+            axes,
+            (low + high) / 2,
+            (high - low) / 2,
+            along.std(axis=0),
+            np.linalg.norm(axes * prior_sd, axis=1),
         ),
     )
-
-
-def _summarise_combination(
-    weights: Array, drawn: Array, prior_sd: Array, names: tuple[str, ...]
-) -> Combination:
-    """Summarise a product of powers from samples (m,) of its logarithm."""
-    low, high = np.quantile(drawn, [0.025, 0.975])
-    sd, factor = float(drawn.std()), float(np.exp((high - low) / 2))
-    verdict = choose_verdict(factor, sd / float(np.linalg.norm(weights * prior_sd)))
-    text = format_product(weights, names)
-    return Combination(weights, float(low + high) / 2, sd, factor, text, verdict)

@@ -2,41 +2,38 @@
 
 The residuals have the covariance of ``discrepancy``. The size of the misfit is not known exactly, so a factor
 on all misfits remains an unknown of its own; it is 1 where the misfit was estimated.
+
+The profile says how well the records can be fitted with one parameter fixed and all others free. It needs no
+prior and no linearisation (Raue et al. 2009). A parameter whose profile stays below the threshold up to its
+bound is not determined on that side, whatever a covariance says.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from functools import cache, partial
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import stdtrit
 
 from ...arrays import Array
+from ...results.uncertainty import ProfileCheck
 from ..fit.objective import MeasuredCurve, SiteResponse
 from ..fit.parameters import SearchSpace, Unknowns
+from ..fit.prediction import MAX_FREEDOM
 from ..fit.trust_region import SearchPoint, minimise
 from .discrepancy import ResidualModel
+from .emulator import Emulator
+from .uncertainty import PriorPrecision
 
 _MAX_ITERATIONS = 60
 _TOLERANCE = 1e-5
 MISFIT_FACTOR_BOUNDS = (0.2, 5.0)  # of the misfit
-
-
-class ForceSurrogate(Protocol):
-    """A model fast enough to be asked thousands of times: an `Emulator`, or one that is made of it."""
-
-    def __call__(self, parameters: Array) -> Sequence[SiteResponse]:
-        """Return force (n,) and derivatives (n, p) of every site at parameters (p,)."""
-        ...
-
-    def predict_forces(self, parameters: Array) -> Array:
-        """Return the forces (m, N) of all sites, one after the other, at parameters (m, p)."""
-        ...
-
-
-ForcesAndSd = Callable[[Array], tuple[Array, Array]]
 _MIN_MISFIT = 1e-7  # over the largest force: much less than any noise
+_FIRST_STEP, _STEP_GROWTH, _MAX_STEPS = 0.5, 1.5, 25  # in standard deviations
 
 
 @dataclass(frozen=True)
@@ -52,47 +49,32 @@ class Likelihood:
     """The likelihood of the records over a search space, with the emulator in place of the solver.
 
     The coordinates ``z`` (k,) are those of ``space``. Stated priors of ``unknowns`` count as data; bounds
-    hold. ``forces_and_sd`` returns forces (m, N) and their expected error (m, sites), one sd in N, at
-    parameters (m, p). That error counts as misfit that grows away from the simulated points (Kennedy and
-    O'Hagan 2001).
+    hold. Where ``counts_emulator``, the emulator's expected error counts as misfit that grows away from the
+    simulated points (Kennedy and O'Hagan 2001).
     """
 
     def __init__(
         self,
-        emulator: ForceSurrogate,
+        emulator: Emulator,
         measured: Sequence[MeasuredCurve],
         model: ResidualModel,
         unknowns: Unknowns,
         space: SearchSpace,
-        forces_and_sd: ForcesAndSd | None = None,
+        counts_emulator: bool = False,
     ) -> None:
-        self.forces_and_sd = forces_and_sd
-        if forces_and_sd is not None:  # an expected error has the shape of misfit, which none would not have
+        if counts_emulator:  # an expected error has the shape of misfit, which none would not have
             model = replace(model, misfit=np.maximum(model.misfit, _MIN_MISFIT))
         self.emulator, self.measured, self.model = emulator, tuple(measured), model
-        self.unknowns, self.space = unknowns, space
-        spectra = model.compute_spectra()
-        sizes = np.cumsum([0, *(len(s.values) for s in spectra)])
-        self._sites = tuple(
-            (spectrum.transform, slice(a, b)) for spectrum, a, b in zip(spectra, sizes[:-1], sizes[1:])
-        )
-        self._misfit = np.concatenate([s.values for s in spectra])
-        self._site = np.repeat(np.arange(len(spectra)), np.diff(sizes))
-        unit = model.misfit * model.peaks_N if forces_and_sd is not None else np.ones(len(spectra))
-        self._per_N2 = self._misfit / unit[self._site] ** 2
-        self._constant = sum(s.log_determinant for s in spectra) + sizes[-1] * np.log(2 * np.pi)
-        self._shared = self._whiten(np.concatenate(model.shared_deviations))
-        self._target = self._whiten(np.concatenate([site.force_N for site in measured]))
-        self._rows, self._known = unknowns.build_prior_rows()
+        self.unknowns, self.space, self.counts_emulator = unknowns, space, counts_emulator
+        self._prior = PriorPrecision.from_unknowns(unknowns, space)
+        self._spectrum = model.whiten()
+        self._shared = self._spectrum.transform(np.concatenate(model.shared_deviations))
+        self._target = self._spectrum.transform(np.concatenate([site.force_N for site in measured]))
 
     @property
     def has_misfit(self) -> bool:
         """True if the size of the misfit makes a difference."""
-        return bool(self._misfit.max(initial=0.0) > 1e-6)
-
-    def _whiten(self, forces: Array) -> Array:
-        """Transform forces of all sites (N, ...) so that noise has variance 1 and misfit is diagonal."""
-        return np.concatenate([transform @ forces[where] for transform, where in self._sites])
+        return bool(self._spectrum.values.max(initial=0.0) > 1e-6)
 
     def to_parameters(self, z: Array) -> Array:
         """Return the full parameters (m, p) at z (m, k)."""
@@ -104,73 +86,63 @@ class Likelihood:
 
         It is infinite outside the bounds.
         """
-        z = np.atleast_2d(z)
-        p = self.to_parameters(z)
-        if self.forces_and_sd is None:
-            forces, sd_N = self.emulator.predict_forces(p), np.zeros((1, len(self.measured)))
+        z, parameters = np.atleast_2d(z), self.to_parameters(z)
+        squares = np.atleast_1d(factor)[:, None] ** 2
+        if self.counts_emulator:
+            forces, sd_N = self.emulator.predict_forces_and_sd(parameters)
+            shares = sd_N / (self.model.misfit * self.model.peaks_N)
         else:
-            forces, sd_N = self.forces_and_sd(p)
-        residual = self._whiten(forces.T).T - self._target
-        variances = 1.0 + np.atleast_1d(factor)[:, None] ** 2 * self._misfit
-        prior_deviations = np.log(p) @ self._rows.T - self._known
+            forces, shares = self.emulator.predict_forces(parameters), np.zeros((1, len(self.measured)))
         with np.errstate(over="ignore", invalid="ignore"):  # far from all runs: not finite, so infinite
-            variances = variances + sd_N[:, self._site] ** 2 * self._per_N2
-            found = self._whitened_minus_2_log(residual, variances) + np.sum(prior_deviations**2, axis=1)
-        found = np.where(np.isfinite(found), found, np.inf) + self._constant
+            found = self._compute_minus_2_log(z, forces, squares + shares[:, self._spectrum.record] ** 2)
         outside = np.any((z < self.space.lower - 1e-9) | (z > self.space.upper + 1e-9), axis=1)
-        return np.where(outside, np.inf, found)
+        return np.where(outside | ~np.isfinite(found), np.inf, found)
 
     def minus_2_log_of(self, responses: Sequence[SiteResponse], parameters: Array) -> float:
         """Return the same for forces of the solver, to check the emulator."""
         forces = np.concatenate([response.force_N for response in responses])
-        residual = self._whiten(forces) - self._target
-        variances = 1.0 + self._misfit
-        prior_deviations = self._rows @ np.log(parameters) - self._known
-        return float(
-            self._whitened_minus_2_log(residual[None], variances[None])[0]
-            + prior_deviations @ prior_deviations
-            + self._constant
-        )
+        z = self.space.reduce(np.log(parameters))
+        return float(self._compute_minus_2_log(z[None], forces[None], np.ones((1, 1)))[0])
 
-    def _whitened_minus_2_log(self, residual: Array, variances: Array) -> Array:
-        """Return minus twice the log-likelihood (m,) of whitened residuals (m, N), up to a constant.
+    def _compute_minus_2_log(self, z: Array, forces: Array, squares: Array) -> Array:
+        """Return minus twice the log-likelihood (m,) of forces (m, N) at z (m, k).
 
-        What records share is integrated out (Woodbury).
+        The variance of the misfit is ``squares`` (m, N) times the model's. What records share is integrated
+        out (Woodbury).
         """
-        found = np.sum(residual**2 / variances + np.log(variances), axis=1)
+        residual = self._spectrum.transform(forces.T).T - self._target
+        variances = 1.0 + squares * self._spectrum.values
+        deviations = z @ self._prior.rows.T - self._prior.target
         E = self._shared
-        if not E.shape[1]:
-            return np.asarray(found)
         amount = (residual / variances) @ E
         inner = np.eye(E.shape[1]) + np.einsum("ni,mn,nj->mij", E, 1.0 / variances, E, optimize=True)
         explained = np.einsum("mi,mi->m", amount, np.linalg.solve(inner, amount[..., None])[..., 0])
-        return np.asarray(found - explained + np.linalg.slogdet(inner)[1])
+        log_determinant = np.log(variances).sum(axis=1) + np.linalg.slogdet(inner)[1]
+        constant = self._spectrum.log_determinant + residual.shape[1] * np.log(2 * np.pi)
+        distance = np.sum(residual**2 / variances, axis=1) + np.sum(deviations**2, axis=1)
+        return np.asarray(distance - explained + log_determinant + constant)
 
     def linearise(self, z: Array, factor: float = 1.0) -> SearchPoint | None:
         """Return residuals of unit variance and their derivatives at z (k,), for least squares."""
         parameters = self.to_parameters(z)[0]
         responses = self.emulator(parameters)
-        sd = np.sqrt(1.0 + factor**2 * self._misfit)
-        axes, sizes, _ = np.linalg.svd(self._shared / sd[:, None], full_matrices=False)
-        shrunk = 1.0 - 1.0 / np.sqrt(1.0 + sizes**2)  # of what records share: (I + F F')^(-1/2)
-
-        def scaled(rows: Array) -> Array:
-            """Rows (N, ...) where all residuals together have variance 1."""
-            rows = (rows.T / sd).T
-            return np.asarray(rows - (axes * shrunk) @ (axes.T @ rows))
-
         forces = np.concatenate([response.force_N for response in responses])
         slopes = np.concatenate([self.space.pull_back(r.jacobian, parameters) for r in responses])
         if not (np.isfinite(forces).all() and np.isfinite(slopes).all()):
             return None
-        residual = scaled(self._whiten(forces) - self._target)
-        prior_deviations = self._rows @ np.log(parameters) - self._known
-        jacobian = np.concatenate([scaled(self._whiten(slopes)), self._rows @ self.space.tie])
-        return SearchPoint(z, np.concatenate([residual, prior_deviations]), jacobian)
+        sd = np.sqrt(1.0 + factor**2 * self._spectrum.values)[:, None]
+        axes, sizes, _ = np.linalg.svd(self._shared / sd, full_matrices=False)
+        shrunk = 1.0 - 1.0 / np.sqrt(1.0 + sizes**2)  # of what records share: (I + F F')^(-1/2)
+        residual = self._spectrum.transform(forces) - self._target
+        rows = np.column_stack([residual, self._spectrum.transform(slopes)]) / sd
+        rows -= (axes * shrunk) @ (axes.T @ rows)
+        priors = np.column_stack([self._prior.compute_deviations(z), self._prior.rows])
+        both = np.concatenate([rows, priors])
+        return SearchPoint(z, both[:, 0], both[:, 1:])
 
-    def find_optimum(self, start: Array, fixed_entry: int | None = None, factor: float = 1.0) -> Optimum:
-        """Find the most probable z from ``start`` (k,); the entry ``fixed_entry`` stays as it is."""
-        free = np.arange(len(start)) != (-1 if fixed_entry is None else fixed_entry)
+    def find_optimum(self, start: Array, fixed_entry: int = -1, factor: float = 1.0) -> Optimum:
+        """Find the most probable z from ``start`` (k,); an entry ``fixed_entry`` stays as it is."""
+        free = np.arange(len(start)) != fixed_entry
 
         def evaluate(part: Array) -> SearchPoint | None:
             z = start.copy()
@@ -201,5 +173,121 @@ class Likelihood:
         """
         point = self.linearise(z, factor)
         assert point is not None
-        bounds = np.diag(12.0 / (self.space.upper - self.space.lower) ** 2)
-        return np.asarray(np.linalg.inv(point.jacobian.T @ point.jacobian + bounds), dtype=np.float64)
+        precision = point.jacobian.T @ point.jacobian + self._prior.bound_precision
+        return np.asarray(np.linalg.inv(precision), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The profile of one coordinate: ``values`` (n,) of the parameter in rising order, and ``rise`` (n,).
+
+    ``rise`` is that of minus twice the log-likelihood over its least value. ``interval_95`` ends where it
+    crosses ``threshold``, or at a bound if ``closed`` (low, high) is False. ``ends`` are the full parameters
+    (2, p) there. ``extrapolated`` (n,) and ``ends_extrapolated`` say where the emulator is asked outside its
+    runs.
+    """
+
+    name: str
+    values: Array
+    rise: Array
+    threshold: float
+    interval_95: tuple[float, float]
+    closed: tuple[bool, bool]
+    ends: Array
+    extrapolated: NDArray[np.bool_]
+    ends_extrapolated: tuple[bool, bool]
+
+    @property
+    def verdict(self) -> str:
+        return ("not determined", "determined on one side", "determined on both sides")[sum(self.closed)]
+
+
+def compute_profile(
+    likelihood: Likelihood, best: Optimum, k: int, sd: float, freedom: float = MAX_FREEDOM
+) -> Profile:
+    """Compute the profile of coordinate k from the optimum outwards.
+
+    Parameters
+    ----------
+    sd : a guess of the coordinate's standard deviation, for the steps.
+    freedom : degrees of freedom of the misfit's size. The threshold is the square of Student's 97.5 %
+        quantile, 3.84 for many.
+    """
+    threshold = float(stdtrit(freedom, 0.975) ** 2)
+    sides = [_walk_side(likelihood, best, k, sign * sd, threshold) for sign in (-1.0, 1.0)]
+    (left, low, low_closed), (right, high, high_closed) = sides
+    track = [*reversed(left), best, *right]
+    least = min(point.minus_2_log for point in track)
+    extrapolated = [not likelihood.emulator.is_inside(one.parameters, 0.0) for one in [*track, low, high]]
+    return Profile(
+        name=likelihood.unknowns.names[int(np.flatnonzero(likelihood.space.tie[:, k])[0])],
+        values=np.exp([point.z[k] for point in track]),
+        rise=np.array([point.minus_2_log - least for point in track]),
+        threshold=threshold,
+        interval_95=(float(np.exp(low.z[k])), float(np.exp(high.z[k]))),
+        closed=(low_closed, high_closed),
+        ends=np.stack([low.parameters, high.parameters]),
+        extrapolated=np.array(extrapolated[:-2]),
+        ends_extrapolated=(extrapolated[-2], extrapolated[-1]),
+    )
+
+
+def _walk_side(
+    likelihood: Likelihood, best: Optimum, k: int, step: float, threshold: float
+) -> tuple[list[Optimum], Optimum, bool]:
+    """Return the points on one side, the end of the interval, and True if it crossed the threshold."""
+    lower, upper = likelihood.space.lower[k], likelihood.space.upper[k]
+    track, at, length = [], best, _FIRST_STEP * step
+
+    def optimise(near: Optimum, value: float) -> Optimum:
+        start = near.z.copy()
+        start[k] = value
+        return likelihood.find_optimum(start, fixed_entry=k)
+
+    for _ in range(_MAX_STEPS):
+        value = float(np.clip(at.z[k] + length, lower, upper))
+        track.append(optimise(at, value))
+        if track[-1].minus_2_log - best.minus_2_log > threshold:
+            level = best.minus_2_log + threshold
+            return track, _find_crossing(partial(optimise, at), at, track[-1], k, level), True
+        at, length = track[-1], length * _STEP_GROWTH
+        if value in (lower, upper):
+            break
+    return track, at, False
+
+
+def _find_crossing(
+    optimise: Callable[[float], Optimum], inner: Optimum, outer: Optimum, k: int, level: float
+) -> Optimum:
+    """Find the point between two at which minus twice the log-likelihood is ``level``."""
+    if inner.minus_2_log >= level:
+        return inner
+    found = cache(optimise)
+    a, b = float(inner.z[k]), float(outer.z[k])
+    if found(b).minus_2_log <= level:  # reached from elsewhere it was higher: the better of the two counts
+        return found(b)
+    return found(float(brentq(lambda value: found(value).minus_2_log - level, a, b, xtol=1e-3 * abs(b - a))))
+
+
+def check_profile_ends(
+    likelihood: Likelihood,
+    best: Optimum,
+    best_responses: Sequence[SiteResponse],
+    profile: Profile,
+    responses: Sequence[Sequence[SiteResponse]],
+    why: str = "",
+) -> ProfileCheck:
+    """Compare a profile's two ends with ``responses`` of the solver there and at the optimum."""
+    reference = likelihood.minus_2_log_of(best_responses, best.parameters)
+    low, high = (
+        likelihood.minus_2_log_of(run, end) - reference if all(one.completed for one in run) else None
+        for run, end in zip(responses, profile.ends, strict=True)
+    )
+    z = np.array([likelihood.space.reduce(np.log(end)) for end in profile.ends])
+    return ProfileCheck(
+        name=profile.name,
+        why=why,
+        emulated=(likelihood.compute_minus_2_log(z) - best.minus_2_log).tolist(),
+        solved=(low, high),
+        extrapolated=profile.ends_extrapolated,
+    )

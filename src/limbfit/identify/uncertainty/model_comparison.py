@@ -88,58 +88,38 @@ def compare_models(
     standard error, and the probability of so large a difference by chance (paired t-test).
     """
     heldout = _compare_held_out(np.asarray(errors_first, float), np.asarray(errors_second, float))
-    by_fit = first.minus_2_log_evidence - second.minus_2_log_evidence
-    better_fitted = 0 if abs(by_fit) < _CLEAR_DIFFERENCE else (1 if by_fit > 0 else -1)
-    better_unseen = 0
-    if heldout.get("p_value", 1.0) < 0.05:
-        better_unseen = 1 if heldout["difference_percent"] > 0 else -1
-    better, verdict = _describe_comparison(first, second, better_fitted, better_unseen, by_fit, heldout)
+    rise = first.minus_2_log_evidence - second.minus_2_log_evidence
+    # 1: the second model, -1: the first, 0: neither
+    names = {1: second.name, -1: first.name, 0: ""}
+    fitted = 0 if abs(rise) < _CLEAR_DIFFERENCE else int(np.sign(rise))
+    unseen = int(np.sign(heldout["difference_percent"])) if heldout.get("p_value", 1.0) < 0.05 else 0
+    better = names[int(np.sign(fitted + unseen))]
+    by_fit = f"the fitted records do not distinguish {first.name} from {second.name}"
+    if fitted:
+        strength = "strongly" if abs(rise) > _STRONG_DIFFERENCE else "moderately"
+        by_fit = f"the fitted records support {names[fitted]} {strength}"
+    by_test = "no site was held out"
+    if heldout:
+        predicts = f"{names[unseen]} predict better" if unseen else "both predict alike"
+        by_test = f"at {heldout['sites']:.0f} held-out sites {predicts}"
+    numbers = f"twice the log of the evidence {rise:+.1f} against {first.name}"
+    end = f"better supported: {better}" if better else "neither is better supported"
+    verdict = f"{by_fit} ({numbers}); {by_test}; {end}"
     return EvidenceComparison(first=first, second=second, heldout=heldout, better=better, verdict=verdict)
 
 
 def _compare_held_out(errors_first: Array, errors_second: Array) -> dict[str, float]:
     if not errors_first.size:
         return {}
+    sites, difference = errors_first.size, errors_first - errors_second
     found = {
-        "sites": float(errors_first.size),
+        "sites": float(sites),
         "first_percent": float(errors_first.mean()),
         "second_percent": float(errors_second.mean()),
+        "difference_percent": float(difference.mean()),
     }
-    difference = errors_first - errors_second
-    found["difference_percent"] = float(difference.mean())
-    if errors_first.size > 1 and difference.std() > 0:
-        error = float(difference.std(ddof=1) / np.sqrt(errors_first.size))
+    if sites > 1 and difference.std() > 0:
+        error = float(difference.std(ddof=1) / np.sqrt(sites))
         found["standard_error_percent"] = error
-        found["p_value"] = float(2 * stdtr(errors_first.size - 1, -abs(difference.mean()) / error))
+        found["p_value"] = float(2 * stdtr(sites - 1, -abs(difference.mean()) / error))
     return found
-
-
-def _describe_comparison(
-    first: ModelEvidence,
-    second: ModelEvidence,
-    better_fitted: int,
-    better_unseen: int,
-    by_evidence: float,
-    heldout: dict[str, float],
-) -> tuple[str, str]:
-    names = {1: second.name, -1: first.name}
-    if better_fitted:
-        strength = "strongly" if abs(by_evidence) > _STRONG_DIFFERENCE else "moderately"
-        by_fit = f"the fitted records support {names[better_fitted]} {strength}"
-    else:
-        by_fit = f"the fitted records do not distinguish {first.name} from {second.name}"
-    if not heldout:
-        by_test = "no site was held out"
-    elif better_unseen:
-        by_test = f"at {heldout['sites']:.0f} held-out sites {names[better_unseen]} predict better"
-    else:
-        by_test = f"at {heldout['sites']:.0f} held-out sites both predict alike"
-    if better_fitted and better_unseen in (better_fitted, 0):
-        better = names[better_fitted]
-    elif better_unseen and not better_fitted:
-        better = names[better_unseen]
-    else:
-        better = ""
-    end = f"better supported: {better}" if better else "neither is better supported"
-    numbers = f"twice the log of the evidence {by_evidence:+.1f} against {first.name}"
-    return better, f"{by_fit} ({numbers}); {by_test}; {end}"

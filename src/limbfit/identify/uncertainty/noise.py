@@ -80,12 +80,12 @@ def estimate_record_noise(
     """
     residual = residual_N - residual_N.mean()
     sd, lag = sd_and_lag or (float(residual.std()), estimate_lag_one(residual))
-    samples = _count_samples(times_s, residual.size)
-    slope = touch_down_sd_mm * (
-        np.ones(len(times_s))
-        if displacement_mm is None
-        else compute_depth_slope(times_s, displacement_mm, force_N)
-    )
+    # A point has its share of the samples, by time, and at least one.
+    widths = np.gradient(times_s)
+    samples = np.maximum(np.round(residual.size * widths / widths.sum()).astype(np.int64), 1)
+    slope = np.full(len(times_s), touch_down_sd_mm)
+    if displacement_mm is not None:
+        slope *= compute_depth_slope(times_s, displacement_mm, force_N)
     slope = slope if smoothing is None else smoothing @ slope
     floor = (_MIN_NOISE_SHARE * force_N.max()) ** 2
     covariance = compute_block_covariance(sd, lag, samples) + np.outer(slope, slope)
@@ -109,13 +109,6 @@ def estimate_curve_noise(
         n = curve.force_N.size
         found.append(SiteNoise(curve.name, np.arange(float(n)), sd**2 * np.eye(n), sd, 0.0, site=curve.site))
     return tuple(found)
-
-
-def _count_samples(times_s: Array, samples: int) -> Indices:
-    """Return how many of the samples belong to each point (n,): its share of the time, and at least one."""
-    steps = np.diff(times_s)
-    widths = np.r_[steps[:1], (steps[1:] + steps[:-1]) / 2, steps[-1:]]
-    return np.maximum(np.round(samples * widths / widths.sum()).astype(np.int64), 1)
 
 
 def compute_depth_slope(times_s: Array, displacement_mm: Array, force_N: Array) -> Array:

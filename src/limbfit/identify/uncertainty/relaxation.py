@@ -16,20 +16,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from scipy.optimize import nnls
-from scipy.special import logsumexp
+from scipy.special import expit, logsumexp, softmax
 
 from ...arrays import Array
 from ...results.identification import LongTermModulus, RelaxationBeyond, RelaxationPrior, RelaxationSummary
-from ..fit.objective import MeasuredCurve, SiteResponse
-from ..fit.parameters import SearchSpace, Unknowns
+from ..fit.objective import SiteResponse
 from ..fit.prediction import RelaxationSpread
 from .discrepancy import ResidualModel, estimate_discrepancy
-from .estimator import PriorPrecision
 from .superposition import RelaxationModel, Superposition, TissueParameters, find_tissue_parameters
-from .uncertainty import DETERMINED, NORMAL_95, UNDETERMINED, WEAK, Uncertainty, choose_verdict
+from .uncertainty import (
+    DETERMINED,
+    NORMAL_95,
+    UNDETERMINED,
+    WEAK,
+    PriorPrecision,
+    Uncertainty,
+    choose_verdict,
+)
 
 # Slopes of log G over log t. Muscle: 0.25 in vivo (Klatt et al. 2010); six pieces ex vivo (Iaquinta 2023,
 # perineal_indentation): 0.13 to 0.16 before 1 s, 0.18 to 0.22 from 3 to 10 s.
@@ -72,7 +79,7 @@ class _Fit:
 
 @dataclass(frozen=True)
 class RelaxationAssessment:
-    """Which relaxations fit the records at ``parameters`` (p,), and what they leave open.
+    """Which relaxations fit the records at the ``known`` answer, and what they leave open.
 
     ``weights`` (w,) of the fitted worlds, the model's own terms first. ``evidence`` is twice the logarithm of
     how much more probable the records are with a power law than with the model's own terms.
@@ -80,8 +87,8 @@ class RelaxationAssessment:
     of each tissue's modulus at any time.
     """
 
+    known: Uncertainty
     tissues: tuple[TissueParameters, ...]
-    parameters: Array
     weights: Array
     evidence: float
     tail_weight: float
@@ -94,20 +101,20 @@ class RelaxationAssessment:
             return UNDECIDED
         return POWER_LAW if self.evidence > 0 else OWN
 
-    def state_modulus(self, known: Uncertainty, number: int, duration_s: float) -> tuple[float, Array]:
+    def state_modulus(self, number: int, duration_s: float) -> tuple[float, Array]:
         """Return the model's modulus so long after a step, and the 95 % interval (2,) that holds it; kPa."""
-        tissue, p = self.tissues[number], self.parameters
+        tissue, p = self.tissues[number], self.known.parameters
         at = tissue.modulus_log(p, duration_s)
         steps = np.exp(_DIFFERENCE * np.eye(len(p)))
         slopes = np.array([tissue.modulus_log(p * step, duration_s) - at for step in steps]) / _DIFFERENCE
         shift, covariance, fall = self.spread.interpolate(duration_s)
         i, weight = tissue.moduli[0], self.spread.own_weight
-        half = NORMAL_95 * np.sqrt(weight * slopes @ known.covariance @ slopes + covariance[i, i])
-        off = weight * float(slopes @ np.log(known.centre / p))
+        half = NORMAL_95 * np.sqrt(weight * slopes @ self.known.covariance @ slopes + covariance[i, i])
+        off = weight * float(slopes @ np.log(self.known.centre / p))
         ends = at + shift[i] + np.array([min(off, 0.0) - half - fall[i], max(off, 0.0) + half])
         return float(np.exp(at)), np.exp([min(ends[0], at), max(ends[1], at)])
 
-    def describe(self, known: Uncertainty) -> list[str]:
+    def describe(self) -> list[str]:
         """Return what the records tell of relaxation, in sentences."""
         longest = f"the records, whose longest load lasts {self.spread.longest_s:.0f} s,"
         preferred = {
@@ -119,181 +126,119 @@ class RelaxationAssessment:
         if self.preferred == POWER_LAW and self.tail_weight > _MIN_TAIL_WEIGHT:
             found.append(GIVES_WAY)
         for number, tissue in enumerate(self.tissues):
-            modulus, (low, high) = self.state_modulus(known, number, LONG_TERM_S)
+            modulus, (low, high) = self.state_modulus(number, LONG_TERM_S)
             found.append(
                 f"{tissue.name}: an hour after a step the modulus is {low:.3g} to {high:.3g} kPa (95 %); "
                 f"the model has {modulus:.3g} kPa"
             )
         return found
 
-    def qualify_verdicts(self, known: Uncertainty) -> tuple[str, ...]:
+    def qualify_verdicts(self) -> tuple[str, ...]:
         """Return the verdicts (p,) on parameters for what relaxation beyond the records leaves of them.
 
         A modulus is determined if it is so `LONG_TERM_S` after a step, amplitudes and times if the records
         prefer the model's terms to other relaxations.
         """
-        verdicts = list(known.verdicts)
+
+        def is_determined(number: int, duration_s: float) -> bool:
+            low, high = self.state_modulus(number, duration_s)[1]
+            return choose_verdict(float(np.sqrt(high / low)), 0.0) == DETERMINED
+
+        verdicts = list(self.known.verdicts)
         for number, tissue in enumerate(self.tissues):
             for i in (*tissue.amplitudes, *tissue.times):
                 if verdicts[i] in (DETERMINED, WEAK) and self.preferred != OWN:
                     verdicts[i] = NOT_ALONE
             modulus = tissue.moduli[0]
-            if verdicts[modulus] in (DETERMINED, WEAK):
-                verdicts[modulus] = self._judge_modulus(known, number, verdicts[modulus])
+            if verdicts[modulus] in (DETERMINED, WEAK) and not is_determined(number, LONG_TERM_S):
+                times = [f"{time:g} s" for time in STATED_S if is_determined(number, time)]
+                verdicts[modulus] = NOT_LONG_TERM.format(" and ".join(times)) if times else UNDETERMINED
         return tuple(verdicts)
 
-    def summarise(self, known: Uncertainty) -> RelaxationSummary:
+    def summarise(self) -> RelaxationSummary:
         """Return what is stored, with moduli at `STATED_S` and `LONG_TERM_S`."""
         moduli = []
-        for number, tissue in enumerate(self.tissues):
-            for time in (*STATED_S, LONG_TERM_S):
-                value, interval = self.state_modulus(known, number, time)
-                moduli.append(
-                    LongTermModulus(
-                        tissue=tissue.name, time_s=time, modulus_kPa=value, interval_95=interval.tolist()
-                    )
-                )
+        for (number, tissue), time in product(enumerate(self.tissues), (*STATED_S, LONG_TERM_S)):
+            value, (low, high) = self.state_modulus(number, time)
+            moduli.append(
+                LongTermModulus(tissue=tissue.name, time_s=time, modulus_kPa=value, interval_95=(low, high))
+            )
         return RelaxationSummary(
             prefers=self.preferred,
             evidence=self.evidence,
             tail_weight=self.tail_weight,
-            words=self.describe(known),
+            words=self.describe(),
             moduli=moduli,
             prior=RelaxationPrior(slope=(0.0, MAX_SLOPE), source=SOURCE),
             beyond=RelaxationBeyond.model_validate(self.spread),
         )
 
-    def _judge_modulus(self, known: Uncertainty, number: int, verdict: str) -> str:
-        """The verdict on a long-term modulus whose ``verdict`` would hold if the model's terms were true."""
 
-        def judge(duration_s: float) -> str:
-            low, high = self.state_modulus(known, number, duration_s)[1]
-            return choose_verdict(float(np.sqrt(high / low)), 0.0)
-
-        if judge(LONG_TERM_S) == DETERMINED:
-            return verdict
-        times = [f"{time:g} s" for time in STATED_S if judge(time) == DETERMINED]
-        return NOT_LONG_TERM.format(" and ".join(times)) if times else UNDETERMINED
-
-
-def assess_relaxation(
-    parameters: Array,
-    responses: Sequence[SiteResponse],
-    measured: Sequence[MeasuredCurve],
-    model: ResidualModel,
-    unknowns: Unknowns,
-    space: SearchSpace,
-) -> RelaxationAssessment | None:
+def assess_relaxation(known: Uncertainty, responses: Sequence[SiteResponse]) -> RelaxationAssessment | None:
     """Fit other relaxations to the records of force, and weigh them; nothing is simulated.
 
-    Parameters
-    ----------
-    parameters : (p,) of the answer, with its ``responses``.
-    model : the covariance of the residuals there.
-    space : of the calibration's last stage.
-
-    Returns
-    -------
-    None where no record is of force under a stated displacement, or no tissue relaxes.
+    ``responses`` are those at the ``known`` answer. None where no record is of force under a stated
+    displacement, or no tissue relaxes.
     """
-    tissues = find_tissue_parameters(unknowns.names, space)
-    chosen = [i for i, noise in enumerate(model.noise) if noise.unit == "N"]
+    tissues = find_tissue_parameters(known.names, known.space)
+    chosen = [i for i, noise in enumerate(known.residual_model.noise) if noise.unit == "N"]
     if not chosen or not all(tissue.amplitudes for tissue in tissues):
         return None
-    records = _Records.select(chosen, parameters, responses, measured, model, unknowns, space, tissues)
+    records = _ForceRecords(known, [responses[i] for i in chosen], chosen, tissues)
     longest = records.longest_s
     times = np.geomspace(_SHORTEST * records.shortest_ramp_s, _LONGEST * longest, _SPECTRUM_TIMES)
     worlds = [RelaxationModel(), *(RelaxationModel(slope, longest) for slope in _TAIL_SLOPES)]
     worlds += [RelaxationModel(slope, longest, times) for slope in _SPECTRUM_SLOPES]
     fits = [records.fit(world) for world in worlds]
     weights, evidence = _weigh(fits)
+    # The model's own terms keep the answer, whose covariance is counted with it.
+    fits[0] = replace(fits[0], z=records.answer, covariance=0 * fits[0].covariance)
     shifts, covariances = zip(*(records.spread(fits, weights, t) for t in _DURATIONS_S), strict=True)
-    falls = np.array([records.compute_largest_fall(t) for t in _DURATIONS_S])
+    moduli = [i for tissue in tissues for i in tissue.moduli]
+    is_modulus = np.isin(np.arange(len(known.names)), moduli)
+    falls = MAX_SLOPE * np.outer(np.log(np.maximum(_DURATIONS_S / longest, 1.0)), is_modulus)
     spread = RelaxationSpread(
         longest, float(weights[0]), _DURATIONS_S, np.array(shifts), np.array(covariances), falls
     )
     tails = float(weights[[fit.world.has_tail for fit in fits]].sum())
-    return RelaxationAssessment(tissues, parameters, weights, evidence, tails, spread)
+    return RelaxationAssessment(known, tissues, weights, evidence, tails, spread)
 
 
 def _weigh(fits: Sequence[_Fit]) -> tuple[Array, float]:
-    """Return the weight (w,) of each world and the evidence for a power law."""
+    """Return the weight (w,) of each world, the model's own terms first, and the evidence for a power law."""
     half = -0.5 * np.array([fit.criterion for fit in fits])
-    likely = np.exp(half - half.max())
-    is_own = np.array([fit.world.is_own for fit in fits])
-    evidence = 2 * (logsumexp(half[~is_own]) - np.log((~is_own).sum()) - half[is_own][0])
-    weights = np.where(is_own, 1.0, 1.0 / (~is_own).sum()) * likely
-    own = max(float(weights[is_own][0] / weights.sum()), MIN_OWN_WEIGHT)
-    others = np.where(is_own, 0.0, weights)
-    return np.where(is_own, own, (1 - own) * others / max(others.sum(), np.finfo(float).tiny)), float(
-        evidence
-    )
+    evidence = float(2 * (logsumexp(half[1:]) - np.log(len(half) - 1) - half[0]))
+    own = max(float(expit(-evidence / 2)), MIN_OWN_WEIGHT)
+    return np.r_[own, (1 - own) * softmax(half[1:])], evidence
 
 
-@dataclass(frozen=True)
-class _Records:
+class _ForceRecords:
     """The records of force, and how well their residuals are known."""
 
-    superpositions: tuple[Superposition, ...]
-    measured: tuple[MeasuredCurve, ...]
-    model: ResidualModel
-    prior: PriorPrecision
-    space: SearchSpace
-    tissues: tuple[TissueParameters, ...]
-    parameters: Array
-    shortest_ramp_s: float
-    longest_s: float
-
-    @classmethod
-    def select(
-        cls,
-        chosen: Sequence[int],
-        parameters: Array,
+    def __init__(
+        self,
+        known: Uncertainty,
         responses: Sequence[SiteResponse],
-        measured: Sequence[MeasuredCurve],
-        model: ResidualModel,
-        unknowns: Unknowns,
-        space: SearchSpace,
+        chosen: Sequence[int],
         tissues: tuple[TissueParameters, ...],
-    ) -> _Records:
-        """Take those of ``chosen`` numbers."""
-        noise = tuple(model.noise[i] for i in chosen)
-        forces = [responses[i] for i in chosen]
-        own = replace(
-            model,
-            noise=noise,
-            peaks_N=model.peaks_N[chosen],
-            misfit=model.misfit[chosen],
-            mesh_N=tuple(model.mesh_N[i] for i in chosen) if model.mesh_N else (),
-            site_N=tuple(model.site_N[i] for i in chosen) if model.site_N else (),
-        )
-        pairs = list(zip(noise, forces, strict=True))
-        return cls(
-            tuple(Superposition(one.times_s, r, parameters, tissues) for one, r in pairs),
-            tuple(measured[i] for i in chosen),
-            own,
-            PriorPrecision.from_unknowns(unknowns, space),
-            space,
-            tissues,
-            parameters,
-            min(float(one.times_s[int(np.argmax(r.force_N))] - one.times_s[0]) for one, r in pairs),
-            max(_find_longest_load(one.times_s, r.force_N) for one, r in pairs),
-        )
+    ) -> None:
+        """Take the records of the numbers ``chosen``, whose ``responses`` are those at the answer."""
+        self.parameters, self.space, self.tissues = known.parameters, known.space, tissues
+        self.answer = known.space.reduce(np.log(known.parameters))
+        self.prior = PriorPrecision.from_unknowns(known.unknowns, known.space)
+        self.model = known.residual_model.select(chosen)
+        self.measured = [known.measured[i] for i in chosen]
+        pairs = [(one.times_s, r) for one, r in zip(self.model.noise, responses, strict=True)]
+        self.superpositions = [Superposition(times, r, known.parameters, tissues) for times, r in pairs]
+        self.shortest_ramp_s = min(float(times[int(np.argmax(r.force_N))] - times[0]) for times, r in pairs)
+        self.longest_s = max(_find_longest_load(times, r.force_N) for times, r in pairs)
 
     def fit(self, world: RelaxationModel) -> _Fit:
         """Fit a world, first with alike weights, then by what its own residuals say of its misfit."""
-        prior, model = self.prior, self.model
-        start = self.space.reduce(np.log(self.parameters)) if world.spectrum_s is None else self._guess(world)
+        start = self.answer if world.spectrum_s is None else self._guess(world)
         z, _ = self._solve(world, start, self._alike(), _MAX_FIT_STEPS)
-        found = estimate_discrepancy(
-            *self._linearise(world, z),
-            model.noise,
-            model.peaks_N,
-            prior.precision,
-            model.mesh_N,
-            model.site_N,
-        )
-        stated = prior.rows @ z - prior.target
+        found = estimate_discrepancy(self.model, *self._linearise(world, z), self.prior.precision)
+        stated = self.prior.compute_deviations(z)
         z, covariance = self._solve(world, z, found, _FURTHER_FIT_STEPS)
         return _Fit(world, z, covariance, found.criterion + float(stated @ stated))
 
@@ -310,19 +255,17 @@ class _Records:
         self, world: RelaxationModel, z: Array, model: ResidualModel, steps: int
     ) -> tuple[Array, Array]:
         """Generalised least squares from z (k,) on; the answer and its covariance (k, k)."""
-        prior, answer = self.prior, self.space.reduce(np.log(self.parameters))
-        A = prior.precision
+        prior = self.prior
         for _ in range(steps):
             residuals, scaled = self._linearise(world, z)
-            weighted = model.solve(scaled)
-            A = prior.precision + sum(J.T @ W for J, W in zip(scaled, weighted))
-            g = prior.bound_precision @ (z - answer) + prior.rows.T @ (prior.rows @ z - prior.target)
-            g = g + sum(W.T @ r for r, W in zip(residuals, weighted))
-            step = np.clip(-np.linalg.solve(A, g), -_MAX_STEP_LOG, _MAX_STEP_LOG)
+            precision, weighted = prior.weigh(scaled, model)
+            slope = prior.bound_precision @ (z - self.answer) + prior.rows.T @ prior.compute_deviations(z)
+            slope = slope + sum(W.T @ r for r, W in zip(residuals, weighted))
+            step = np.clip(-np.linalg.solve(precision, slope), -_MAX_STEP_LOG, _MAX_STEP_LOG)
             z = np.clip(z + step, self.space.lower, self.space.upper)
             if np.abs(step).max() < _FIT_TOLERANCE:
                 break
-        return z, np.asarray(np.linalg.inv(A))
+        return z, np.asarray(np.linalg.inv(precision))
 
     def _guess(self, world: RelaxationModel) -> Array:
         """Start of a spectrum's fit: forces are linear in a modulus, and in that times an amplitude."""
@@ -331,7 +274,11 @@ class _Records:
         p[[i for tissue in relaxing for i in (tissue.amplitudes[0], tissue.times[0])]] = 1.0
         rows = []
         for one, curve in zip(self.superpositions, self.measured, strict=True):
-            rows.append(np.column_stack([*one.split(world, p), curve.force_N]) / curve.peak_N)
+            slopes, parts = one.respond(world, p).jacobian * p, []
+            for tissue in self.tissues:
+                relaxing = slopes[:, tissue.amplitudes].sum(axis=1)
+                parts += [slopes[:, tissue.moduli].sum(axis=1) - relaxing, relaxing]
+            rows.append(np.column_stack([*parts, curve.force_N]) / curve.peak_N)
         table = np.vstack(rows)
         shares = np.maximum(nnls(table[:, :-1], table[:, -1])[0].reshape(-1, 2), _DIFFERENCE)
         for tissue, (modulus, amplitude) in zip(self.tissues, shares, strict=True):
@@ -350,30 +297,23 @@ class _Records:
     def spread(self, fits: Sequence[_Fit], weights: Array, duration_s: float) -> tuple[Array, Array]:
         """Mean (p,) and covariance (p, p) of elastic parameters at a time, over those of the answer.
 
-        The model's own terms keep the answer, whose covariance is not counted here. Later than the longest
-        load, a modulus is that at its end: `compute_largest_fall` says what may follow.
+        Later than the longest load, a modulus is that at its end.
         """
-        within, answer = min(duration_s, self.longest_s), self.space.reduce(np.log(self.parameters))
-        own = RelaxationModel()
+        within, own = min(duration_s, self.longest_s), RelaxationModel()
         shares, changes, inner = [], [], []
         for fit, weight in zip(fits, weights, strict=True):
-            z, covariance = (answer, 0 * fit.covariance) if fit.world.is_own else (fit.z, fit.covariance)
             worlds = (fit.world, own) if fit.world.has_tail else (fit.world,)
             for world in worlds:
-                at = self._elastic_log(world, z, within)
-                steps = _DIFFERENCE * np.eye(len(z))
-                D = np.array([self._elastic_log(world, z + s, within) - at for s in steps]) / _DIFFERENCE
+                at = self._elastic_log(world, fit.z, within)
+                steps = _DIFFERENCE * np.eye(len(fit.z))
+                D = np.array([self._elastic_log(world, fit.z + s, within) - at for s in steps]) / _DIFFERENCE
                 shares.append(weight / len(worlds))
                 changes.append(at)
-                inner.append(D.T @ covariance @ D)
-        change = np.array(changes) - self._elastic_log(own, answer, duration_s)
+                inner.append(D.T @ fit.covariance @ D)
+        change = np.array(changes) - self._elastic_log(own, self.answer, duration_s)
         mean = np.array(shares) @ change
         apart = change - mean
         return mean, np.einsum("w,wi,wj->ij", shares, apart, apart) + np.tensordot(shares, inner, 1)
-
-    def compute_largest_fall(self, duration_s: float) -> Array:
-        """The most by which the logarithms (p,) of moduli fall after the longest load until a time."""
-        return self._is_modulus * MAX_SLOPE * np.log(max(duration_s / self.longest_s, 1.0))
 
     def _elastic_log(self, world: RelaxationModel, z: Array, duration_s: float) -> Array:
         """Logarithms (p,) of moduli so long after a step and of other elastic parameters; 0 of the rest."""
@@ -384,11 +324,6 @@ class _Records:
             found[elastic] = np.log(p[elastic])
             found[list(tissue.moduli)] += np.log(world.terms(tissue, p).at(duration_s))
         return found
-
-    @property
-    def _is_modulus(self) -> Array:
-        moduli = [i for tissue in self.tissues for i in tissue.moduli]
-        return np.isin(np.arange(len(self.parameters)), moduli).astype(float)
 
 
 def _find_longest_load(times_s: Array, force_N: Array) -> float:

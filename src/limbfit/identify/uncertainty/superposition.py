@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.special import gammainc
 
 from ...arrays import Array
@@ -86,10 +87,6 @@ class RelaxationModel:
     spectrum_s: Array | None = None
 
     @property
-    def is_own(self) -> bool:
-        return self.spectrum_s is None and self.slope == 0.0
-
-    @property
     def has_tail(self) -> bool:
         return self.spectrum_s is None and self.slope != 0.0
 
@@ -99,11 +96,11 @@ class RelaxationModel:
     def terms(self, tissue: TissueParameters, p: Array) -> RelaxationTerms:
         """The relaxation of a tissue; the model's terms come first."""
         own = tissue.own_terms(p)
-        if self.spectrum_s is not None and self.has_spectrum(tissue):
+        if self.spectrum_s is not None and not tissue.is_given:
             power = compute_power_law_terms(own.amplitudes[0], self.slope, self.spectrum_s)
             ends = np.exp(-self.spectrum_s / (self.longest_s * own.times_s[0]))
             return RelaxationTerms(1.0, power * ends, self.spectrum_s)
-        if self.spectrum_s is not None or self.slope == 0.0:
+        if not self.has_tail:
             return own
         # (1 + t/T)^-s is a mixture of exponentials whose rates times T have a gamma distribution.
         share, middle = gammainc(self.slope, _TAIL_BINS), np.sqrt(_TAIL_BINS[1:] * _TAIL_BINS[:-1])
@@ -122,18 +119,12 @@ def _convolve(elastic: Array, times_s: Array, taus: Array) -> Array:
     return found
 
 
-def _deconvolve(relaxed: Array, times_s: Array, terms: RelaxationTerms) -> Array:
+def _compute_elastic(relaxed: Array, times_s: Array, terms: RelaxationTerms) -> Array:
     """Return the elastic columns (n, q) whose relaxation gives ``relaxed`` (n, q)."""
-    x = np.diff(times_s)[:, None] / terms.times_s
-    decay, ramp = np.exp(-x), -np.expm1(-x) / x
-    found = np.empty_like(relaxed)
-    found[0] = relaxed[0] / terms.at(0.0)
-    history = np.repeat(found[None, 0], len(terms.times_s), axis=0)
-    for i, value in enumerate(relaxed[1:]):
-        before = terms.amplitudes @ (decay[i][:, None] * history - ramp[i][:, None] * found[i])
-        found[i + 1] = (value - before) / (terms.constant + float(terms.amplitudes @ ramp[i]))
-        history = decay[i][:, None] * history + ramp[i][:, None] * (found[i + 1] - found[i])
-    return found
+    steps = np.eye(len(times_s))
+    histories = _convolve(steps, times_s, terms.times_s)
+    relaxation = terms.constant * steps + np.tensordot(terms.amplitudes, histories, 1)
+    return np.asarray(solve_triangular(relaxation, relaxed, lower=True))
 
 
 class Superposition:
@@ -146,18 +137,17 @@ class Superposition:
         self.in_contact = (response.force_N > 0)[:, None]
         scaled = response.jacobian * parameters
         self.elastic = [
-            _deconvolve(scaled[:, [*one.moduli, *one.others]], times_s, one.own_terms(parameters))
+            _compute_elastic(scaled[:, [*one.moduli, *one.others]], times_s, one.own_terms(parameters))
             for one in tissues
         ]
-        self._spectra: dict[int, Array] = {}
 
     def respond(self, world: RelaxationModel, p: Array) -> SiteResponse:
         """Force (n,) and derivatives (n, p) in a world at parameters p."""
         change = np.log(p / self.parameters)
         total, slopes = np.zeros(len(self.times_s)), np.zeros((len(self.times_s), len(p)))
-        for number, tissue in enumerate(self.tissues):
-            elastic, terms, n = self.elastic[number], world.terms(tissue, p), len(tissue.moduli)
-            histories = self._histories(world, number, terms)
+        for elastic, tissue in zip(self.elastic, self.tissues, strict=True):
+            terms, n = world.terms(tissue, p), len(tissue.moduli)
+            histories = _convolve(elastic, self.times_s, terms.times_s)
             relaxed = terms.constant * elastic + np.tensordot(terms.amplitudes, histories, 1)
             factors = np.r_[np.exp(change[list(tissue.moduli)]), change[list(tissue.others)]]
             factors[n:] *= factors[0]
@@ -176,21 +166,3 @@ class Superposition:
                 low, high = _convolve(elastic, self.times_s, around) @ factors
                 slopes[:, time] = terms.amplitudes[k] * (high - low) / (2 * _DIFFERENCE)
         return SiteResponse(total * self.in_contact[:, 0], slopes * self.in_contact / p)
-
-    def split(self, world: RelaxationModel, p: Array) -> list[Array]:
-        """Force (n,) of each tissue's lasting part and of what relaxes, with the moduli as simulated."""
-        found = []
-        for number, tissue in enumerate(self.tissues):
-            terms, own = world.terms(tissue, p), slice(len(tissue.moduli))
-            relaxing = np.tensordot(terms.amplitudes, self._histories(world, number, terms), 1)
-            parts = terms.constant * self.elastic[number], relaxing
-            found += [(part[:, own] * self.in_contact).sum(axis=1) for part in parts]
-        return found
-
-    def _histories(self, world: RelaxationModel, number: int, terms: RelaxationTerms) -> Array:
-        """Convolutions of a tissue; those of the spectrum's fixed times are made once."""
-        if not world.has_spectrum(self.tissues[number]):
-            return _convolve(self.elastic[number], self.times_s, terms.times_s)
-        if number not in self._spectra:
-            self._spectra[number] = _convolve(self.elastic[number], self.times_s, terms.times_s)
-        return self._spectra[number]

@@ -2,8 +2,14 @@
 
 It is linearised at the answer, in logarithms of the parameters. The residuals have one covariance C: noise of
 the records, error of the mesh and misfit of the model (``noise``, ``discrepancy``). The covariance of the
-parameters is that of the calibration as it was done, with its own objective and weights, under C
-(``estimator``). A stated prior is one more reading, whose median is off by its stated deviation.
+parameters is that of the calibration as it was done, with its own objective and weights, under C. A stated
+prior is one more reading, whose median is off by its stated deviation.
+
+At the answer the gradient of what was minimised is zero. The implicit function theorem therefore gives the
+change of the answer from that of the records and of the priors' medians (Huber 1967, the sandwich): ``H^-1 J'
+W dy`` and ``H^-1 s^2 R' db``. J are the derivatives of a site's force, W is the curvature of its cost
+(`MeasuredCurve.compute_cost_curvature`), s^2 the weight of the priors, R their rows, and ``H = J' W J + s^2
+R' R``. The second derivatives of the force are left out: they multiply residuals whose mean is zero.
 
 The most probable parameters under C lie one generalised least-squares step away. If that step is longer than
 C explains, the rest of it is one more deviation. The bounds count as a uniform distribution between them:
@@ -23,9 +29,8 @@ from ...arrays import Array
 from ..fit.calibration import CalibrationSettings
 from ..fit.objective import MeasuredCurve, SiteResponse
 from ..fit.parameters import Grouping, SearchSpace, Unknowns, build_space, group_separately
-from ..fit.prediction import MAX_FREEDOM, combine_freedom
+from ..fit.prediction import combine_freedom
 from .discrepancy import ResidualModel, estimate_discrepancy, estimate_mesh_misfit
-from .estimator import Estimator, PriorPrecision
 from .noise import SiteNoise
 
 DETERMINED, WEAK, UNDETERMINED = "determined", "weakly determined", "not determined by these data"
@@ -36,6 +41,167 @@ NORMAL_95 = 1.959964  # half of a 95 % interval, in standard deviations of a nor
 _MAX_DETERMINED_FACTOR, _MAX_WEAK_FACTOR = 1.25, 2.0
 # Whatever the width: an interval that is hardly narrower than the bounds comes from the bounds.
 _MAX_BOUND_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class PriorPrecision:
+    """What is known before the data, in the search space: the bounds and the stated priors.
+
+    ``sd`` (k,) are the deviations of a uniform distribution between the bounds; ``rows @ z - target`` are the
+    deviations from the stated priors in their standard deviations.
+    """
+
+    sd: Array
+    rows: Array
+    target: Array
+
+    @classmethod
+    def from_unknowns(cls, unknowns: Unknowns, space: SearchSpace) -> PriorPrecision:
+        sd = (space.upper - space.lower) / np.sqrt(12.0)
+        rows, target = unknowns.build_prior_rows()
+        own = rows @ space.tie
+        return cls(sd, own, target - rows @ space.fixed_log)
+
+    @property
+    def bound_precision(self) -> Array:
+        """Precision (k, k) of the bounds."""
+        return np.diag(self.sd**-2)
+
+    @property
+    def precision(self) -> Array:
+        """Precision (k, k) of bounds and priors together."""
+        return self.bound_precision + self.rows.T @ self.rows
+
+    def compute_deviations(self, z: Array) -> Array:
+        """Return how far z (k,) is off each stated prior's median, in its standard deviations."""
+        return self.rows @ z - self.target
+
+    def weigh(self, jacobians: Sequence[Array], model: ResidualModel) -> tuple[Array, list[Array]]:
+        """Return the precision (k, k) of records and priors together, ``J' C^-1 J + P``, and ``C^-1 J``.
+
+        ``jacobians`` (n, k) are the derivatives of each record's force in the search space.
+        """
+        weighted = model.solve(jacobians)
+        return self.precision + sum(J.T @ W for J, W in zip(jacobians, weighted)), weighted
+
+    def compute_shares(self, covariance: Array, tie: Array) -> tuple[Array, Array]:
+        """Return how much of what is known of each parameter comes from the stated priors.
+
+        Parameters
+        ----------
+        covariance : (k, k) of the most probable answer to records, bounds and priors together.
+        tie : (p, k) of the space.
+
+        Returns
+        -------
+        share : (p,) the part of the variance that comes from the deviations of the priors' medians; the rest
+            comes from records and bounds.
+        wider : (p,) how many times as wide the interval of the logarithm would be without priors.
+
+        Both follow from linear theory; they are 0 and 1 for a parameter that does not move.
+        """
+        given = self.rows.T @ self.rows
+        alone = np.linalg.inv(np.linalg.inv(covariance) - given)
+        variance, caused, without = (
+            np.einsum("pi,ij,pj->p", tie, part, tie)
+            for part in (covariance, covariance @ given @ covariance, alone)
+        )
+        moved = variance > 0
+        variance = np.where(moved, variance, 1.0)
+        return np.where(moved, caused / variance, 0.0), np.sqrt(np.where(moved, without / variance, 1.0))
+
+
+@dataclass(frozen=True)
+class _LinearisedEstimate:
+    """Covariance about the calibrated z (k,), and the parts of it that records, misfit and sites that differ
+    cause.
+
+    ``centre`` (k,) is where generalised least squares by noise and misfit would go, with covariance ``best``
+    (k, k); the calibration has other weights. If the two are farther apart than noise and misfit explain, the
+    rest counts as one more deviation of the answer: its intervals must not say more than two readings of the
+    same residuals agree on. ``about_centre`` (k, k) is without that. It is the covariance of the
+    calibration's own estimator, which no details of the records make small, and it is larger than that of the
+    most probable parameters (Gauss and Markov).
+    """
+
+    centre: Array
+    best: Array
+    covariance: Array
+    about_centre: Array
+    by_records: Array
+    by_misfit: Array
+    by_sites: Array
+    model: ResidualModel
+
+    @classmethod
+    def linearise(
+        cls,
+        z: Array,
+        residuals: Sequence[Array],
+        jacobians: Sequence[Array],
+        curvatures: Sequence[Array],
+        prior_share: float,
+        prior: PriorPrecision,
+        model: ResidualModel,
+        space: SearchSpace,
+    ) -> _LinearisedEstimate:
+        """Build the estimate at z (k,) from residuals (n,), derivatives (n, k) N and the curvature (n, n) of
+        the cost per record; ``prior_share`` is the weight of the priors' squares in the cost.
+        """
+        precision, weighted = prior.weigh(jacobians, model)
+        best = np.asarray(np.linalg.inv(precision), dtype=np.float64)
+        slope = prior.rows.T @ prior.compute_deviations(z) + sum(W.T @ r for r, W in zip(residuals, weighted))
+        centre = np.clip(z - best @ slope, space.lower, space.upper)
+        gradients = [J.T @ W for J, W in zip(jacobians, curvatures, strict=True)]
+
+        def propagate(covariances: Sequence[Array]) -> Array:
+            """Covariance (k, k) of the cost's gradient if that of each record is (n, n) N^2."""
+            return np.asarray(sum(G @ C @ G.T for G, C in zip(gradients, covariances, strict=True)))
+
+        G, records = np.hstack(gradients), range(len(residuals))
+        shared = G @ np.concatenate(model.shared_deviations)
+        M = propagate([model.own_covariance(i) for i in records]) + shared @ shared.T
+        H = G @ np.concatenate(jacobians)
+        of_priors = prior.rows.T @ prior.rows
+        # What the bounds say has no place in the estimator: it counts as beside records of the mean noise.
+        spread = max(float(np.trace(M) / np.trace(H)), 1e-16 * float(np.trace(H)))
+        inverse = np.linalg.inv((H + prior_share * of_priors) / spread + prior.bound_precision) / spread
+        by_records = inverse @ M @ inverse
+        known_before = prior_share**2 * of_priors + spread**2 * prior.bound_precision
+        covariance = by_records + inverse @ known_before @ inverse
+        unexplained = _compute_unexplained(centre - z, covariance - best)
+        of_misfit = propagate([model.misfit_covariance(i) for i in records])
+        of_sites = inverse @ G @ np.concatenate(model.site_deviations)
+        return cls(
+            centre=centre,
+            best=best,
+            covariance=covariance + unexplained,
+            about_centre=covariance,
+            by_records=by_records,
+            by_misfit=inverse @ of_misfit @ inverse + unexplained,
+            by_sites=of_sites @ of_sites.T,
+            model=model,
+        )
+
+    def judge(self, rows: Array) -> tuple[Array, Array, Array]:
+        """Return half the 95 % intervals of ``rows @ z``, rows (m, k), their standard deviations, and the
+        degrees of freedom of the variances (Satterthwaite 1946), each (m,)."""
+        variance, misfit, sites = (
+            np.einsum("mi,ij,mj->m", rows, part, rows)
+            for part in (self.covariance, self.by_misfit, self.by_sites)
+        )
+        sd, variance = np.sqrt(variance), np.maximum(variance, np.finfo(float).tiny)
+        parts = (misfit / variance, self.model.known_scale), (sites / variance, self.model.site_freedom)
+        freedom = combine_freedom(*parts)
+        return np.minimum(stdtrit(freedom, 0.975) * sd, 50.0), sd, freedom
+
+
+def _compute_unexplained(step: Array, expected: Array) -> Array:
+    """Return the part (k, k) of the square of a step (k,) that exceeds its expected covariance."""
+    values, vectors = np.linalg.eigh(expected)
+    values = np.maximum(values, 1e-3 * max(float(values[-1]), 1e-30))
+    ratio = float(np.mean((vectors.T @ step) ** 2 / values))
+    return np.outer(step, step) * max(1.0 - 1.0 / max(ratio, 1e-30), 0.0)
 
 
 @dataclass(frozen=True)
@@ -58,6 +224,7 @@ class Combination:
 class Uncertainty:
     """What is known of the answer; ``method`` says whether its intervals are linearised or sampled.
 
+    The answer is that to the ``measured`` curves in the ``space`` of the calibration's last stage.
     ``centre`` (p,) are the most probable parameters. ``covariance`` (p, p) is that of the answer's logarithms
     about the truth, always linearised, and ``about_centre`` (p, p) that of the most probable ones.
     ``sampling_covariance`` (p, p) is the part that the records cause: the scatter of answers to other records
@@ -70,7 +237,10 @@ class Uncertainty:
     residuals.
     """
 
-    names: tuple[str, ...]
+    measured: tuple[MeasuredCurve, ...]
+    unknowns: Unknowns
+    space: SearchSpace
+    residual_model: ResidualModel
     parameters: Array
     centre: Array
     covariance: Array
@@ -80,14 +250,21 @@ class Uncertainty:
     correlation: Array
     intervals_95: Array
     verdicts: tuple[str, ...]
-    at_bound: tuple[bool, ...]
     combinations: tuple[Combination, ...]
-    residual_model: ResidualModel
     degrees_of_freedom: Array
     prior_share: Array
     wider_without: Array
-    minus_2_log_evidence: float = float("nan")
+    minus_2_log_evidence: float
     method: str = LINEARISED
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.unknowns.names
+
+    @property
+    def at_bound(self) -> tuple[bool, ...]:
+        """True for each parameter that lies at one of its bounds."""
+        return tuple(map(bool, self.unknowns.is_at_bound(self.parameters)))
 
     @property
     def sd_log(self) -> Array:
@@ -117,175 +294,87 @@ def estimate_uncertainty(
     mesh_N : (n,) per site, one standard deviation of the mesh's error in the force; empty: it is left out.
     site_N : (n,) per site, the expected deviation of the site's force as a whole; residuals correct its size.
     """
-    residuals = [response.force_N - site.force_N for response, site in zip(responses, measured, strict=True)]
+    parameters, settings = np.asarray(parameters), settings or CalibrationSettings()
     space = build_space(unknowns, grouping or group_separately(unknowns.names))
-    scaled = [space.pull_back(response.jacobian, parameters) for response in responses]
-    z = space.reduce(np.log(parameters))
     prior = PriorPrecision.from_unknowns(unknowns, space)
+    z = space.reduce(np.log(parameters))
+    residuals = [response.force_N - site.force_N for response, site in zip(responses, measured, strict=True)]
+    scaled = [space.pull_back(response.jacobian, parameters) for response in responses]
     peaks = np.array([site.peak_N for site in measured])
-    model = estimate_discrepancy(residuals, scaled, noise, peaks, prior.precision, mesh_N, site_N)
-    of_mesh = estimate_mesh_misfit(mesh_N, scaled, noise, peaks, prior.precision, site_N)
-    model = replace(model, mesh_misfit=of_mesh)
-    chosen = settings or CalibrationSettings()
-    weights = [
-        one.compute_cost_curvature(chosen.objective, r) for r, one in zip(residuals, measured, strict=True)
+    misfit = np.zeros(len(peaks))
+    model = ResidualModel(tuple(noise), peaks, misfit, mesh_N=tuple(mesh_N), site_N=tuple(site_N))
+    mesh_misfit = estimate_mesh_misfit(model, scaled, prior.precision)
+    model = replace(estimate_discrepancy(model, residuals, scaled, prior.precision), mesh_misfit=mesh_misfit)
+    curvatures = [
+        one.compute_cost_curvature(settings.objective, r) for r, one in zip(residuals, measured, strict=True)
     ]
-    estimator = Estimator.linearise(scaled, weights, prior.rows, (chosen.force_error_percent / 100) ** 2)
-    estimate = _LinearisedEstimate.linearise(residuals, scaled, estimator, model, prior, space, z)
-    found = _build_uncertainty(np.asarray(parameters), estimate, model, unknowns, space, prior)
-    stated = prior.rows @ z - prior.target
-    evidence = model.criterion + float(stated @ stated) - float(np.linalg.slogdet(prior.precision)[1])
-    return replace(found, minus_2_log_evidence=evidence)
+    share = (settings.force_error_percent / 100) ** 2
+    estimate = _LinearisedEstimate.linearise(z, residuals, scaled, curvatures, share, prior, model, space)
 
-
-@dataclass(frozen=True)
-class _LinearisedEstimate:
-    """Covariance about the calibrated ``z`` (k,), and the parts of it that records, misfit and sites that
-    differ cause.
-
-    ``centre`` (k,) is where generalised least squares by noise and misfit would go, with covariance ``best``
-    (k, k); the calibration has other weights. If the two are farther apart than noise and misfit explain, the
-    rest counts as one more deviation of the answer: its intervals must not say more than two readings of the
-    same residuals agree on. ``about_centre`` (k, k) is without that. It is the covariance of the
-    calibration's own estimator, which no details of the records make small, and it is larger than that of the
-    most probable parameters (Gauss and Markov).
-    """
-
-    z: Array
-    centre: Array
-    best: Array
-    covariance: Array
-    about_centre: Array
-    by_records: Array
-    by_misfit: Array
-    by_sites: Array
-    known_scale: float
-    site_freedom: float
-
-    @classmethod
-    def linearise(
-        cls,
-        residuals: Sequence[Array],
-        scaled: Sequence[Array],
-        estimator: Estimator,
-        model: ResidualModel,
-        prior: PriorPrecision,
-        space: SearchSpace,
-        z: Array,
-    ) -> _LinearisedEstimate:
-        """Build the estimate from residuals (n,) and derivatives (n, k) per site and the estimator there."""
-        best, centre = _solve_most_probable(residuals, scaled, model, prior, z)
-        centre = np.clip(centre, space.lower, space.upper)
-        own_covariances = [model.own_covariance(i) for i in range(len(residuals))]
-        M = estimator.propagate_covariance(own_covariances) + estimator.propagate_shared(
-            model.shared_deviations
-        )
-        H = estimator.force_hessian
-        # What the bounds say has no place in the estimator: it counts as beside records of the mean noise.
-        spread = max(float(np.trace(M) / np.trace(H)), 1e-16 * float(np.trace(H)))
-        inverse = np.linalg.inv(estimator.hessian / spread + prior.bound_precision) / spread
-        by_records = inverse @ M @ inverse
-        prior_covariance = estimator.prior_covariance + spread**2 * prior.bound_precision
-        covariance = by_records + inverse @ prior_covariance @ inverse
-        misfits = [model.misfit_covariance(i) for i in range(len(residuals))]
-        by_misfit = inverse @ estimator.propagate_covariance(misfits) @ inverse
-        by_sites = inverse @ estimator.propagate_shared(model.site_deviations) @ inverse
-        unexplained = _compute_unexplained(centre - z, covariance - best)
-        return cls(
-            z=z,
-            centre=centre,
-            best=best,
-            covariance=_symmetrise(covariance + unexplained),
-            about_centre=_symmetrise(covariance),
-            by_records=_symmetrise(by_records),
-            by_misfit=by_misfit + unexplained,
-            by_sites=_symmetrise(by_sites),
-            known_scale=model.known_scale,
-            site_freedom=model.site_freedom,
-        )
-
-    def freedom(self, weights: Array) -> float:
-        """Degrees of freedom of the variance of ``weights @ z`` (Satterthwaite 1946)."""
-        variance = max(float(weights @ self.covariance @ weights), np.finfo(float).tiny)
-        misfit, sites = (
-            float(weights @ part @ weights) / variance for part in (self.by_misfit, self.by_sites)
-        )
-        return float(combine_freedom((misfit, self.known_scale), (sites, self.site_freedom)))
-
-    def sd(self, weights: Array) -> float:
-        return float(np.sqrt(weights @ self.covariance @ weights))
-
-    def half_width(self, weights: Array) -> float:
-        """Half the 95 % interval of ``weights @ z``."""
-        return float(min(stdtrit(self.freedom(weights), 0.975) * self.sd(weights), 50.0))
-
-
-def _solve_most_probable(
-    residuals: Sequence[Array], scaled: Sequence[Array], model: ResidualModel, prior: PriorPrecision, z: Array
-) -> tuple[Array, Array]:
-    """Solve the generalised least squares; return the smallest covariance (k, k) and the answer (k,)."""
-    A, g = prior.precision.copy(), prior.rows.T @ (prior.rows @ z - prior.target)
-    for r, J, weighted in zip(residuals, scaled, model.solve(scaled)):
-        A += J.T @ weighted
-        g += weighted.T @ r
-    best = np.asarray(np.linalg.inv(A), dtype=np.float64)
-    return best, z - best @ g
-
-
-def _symmetrise(matrix: Array) -> Array:
-    return (matrix + matrix.T) / 2
-
-
-def _compute_unexplained(step: Array, expected: Array) -> Array:
-    """Return the part (k, k) of the square of a step (k,) that exceeds its expected covariance."""
-    values, vectors = np.linalg.eigh(_symmetrise(expected))
-    values = np.maximum(values, 1e-3 * max(float(values[-1]), 1e-30))
-    ratio = float(np.mean((vectors.T @ step) ** 2 / values))
-    return np.outer(step, step) * max(1.0 - 1.0 / max(ratio, 1e-30), 0.0)
-
-
-def _build_uncertainty(
-    parameters: Array,
-    estimate: _LinearisedEstimate,
-    model: ResidualModel,
-    unknowns: Unknowns,
-    space: SearchSpace,
-    prior: PriorPrecision,
-) -> Uncertainty:
-    """Express the answer in the search space as an answer about every parameter."""
-    moves = np.asarray(space.tie.any(axis=1))
-    middle = space.to_logarithms(estimate.z)
-    half = np.array([estimate.half_width(row) for row in space.tie])
+    tie, moves = space.tie, np.asarray(space.tie.any(axis=1))
+    middle, (half, sd, freedom) = space.to_logarithms(z), estimate.judge(tie)
     low = np.maximum(np.exp(middle - half), np.where(moves, unknowns.lower, 0.0))
     high = np.minimum(np.exp(middle + half), np.where(moves, unknowns.upper, np.inf))
-    shares = [estimate.sd(row) / max(float(row @ prior.sd), 1e-300) for row in space.tie]
-    verdicts = [
-        choose_verdict(float(np.exp(h)), share) if free else GIVEN
-        for h, share, free in zip(half, shares, moves)
-    ]
-    covariance = space.tie @ estimate.covariance @ space.tie.T
-    share, wider = prior.compute_shares(estimate.best, space.tie)
-    sd = np.sqrt(np.where(moves, np.diag(covariance), 1.0))
+    prior_sd = np.where(moves, tie @ prior.sd, 1.0)
+    covariance = tie @ estimate.covariance @ tie.T
+    axes = compute_principal_axes(covariance, space)
+    own = axes @ tie
+    half_of_axes, sd_of_axes, _ = estimate.judge(own)
+    prior_sd_of_axes = np.linalg.norm(own * prior.sd, axis=1)
+    share_of_prior, wider = prior.compute_shares(estimate.best, tie)
+    stated = prior.compute_deviations(z)
     return Uncertainty(
-        names=unknowns.names,
+        measured=tuple(measured),
+        unknowns=unknowns,
+        space=space,
+        residual_model=model,
         parameters=parameters,
         centre=np.exp(space.to_logarithms(estimate.centre)),
         covariance=covariance,
-        about_centre=space.tie @ estimate.about_centre @ space.tie.T,
-        sampling_covariance=space.tie @ estimate.by_records @ space.tie.T,
-        site_covariance=space.tie @ estimate.by_sites @ space.tie.T,
-        correlation=covariance / np.outer(sd, sd),
+        about_centre=tie @ estimate.about_centre @ tie.T,
+        sampling_covariance=tie @ estimate.by_records @ tie.T,
+        site_covariance=tie @ estimate.by_sites @ tie.T,
+        correlation=compute_correlation(covariance),
         intervals_95=np.stack([low, high], axis=1),
-        verdicts=tuple(verdicts),
-        at_bound=tuple(map(bool, unknowns.is_at_bound(parameters))),
-        combinations=_build_combinations(estimate, space, unknowns.names, prior),
-        residual_model=model,
-        degrees_of_freedom=np.array(
-            [estimate.freedom(row) if row.any() else MAX_FREEDOM for row in space.tie]
+        verdicts=tuple(
+            choose_verdict(float(factor), float(share)) if free else GIVEN
+            for factor, share, free in zip(np.exp(half), sd / prior_sd, moves)
         ),
-        prior_share=share,
+        combinations=build_combinations(
+            unknowns.names, axes, axes @ middle, half_of_axes, sd_of_axes, prior_sd_of_axes
+        ),
+        degrees_of_freedom=freedom,
+        prior_share=share_of_prior,
         wider_without=wider,
+        minus_2_log_evidence=model.criterion
+        + float(stated @ stated)
+        - float(np.linalg.slogdet(prior.precision)[1]),
     )
+
+
+def compute_correlation(covariance: Array) -> Array:
+    """Return the correlation (p, p) of a covariance (p, p); it is 0 for what does not vary."""
+    sd = np.sqrt(np.diag(covariance))
+    sd = np.where(sd > 0, sd, 1.0)
+    return covariance / np.outer(sd, sd)
+
+
+def reduce_covariance(covariance: Array, space: SearchSpace) -> Array:
+    """Return the covariance (k, k) in a search space of that (p, p) of the logarithms."""
+    mean = space.tie / space.tie.sum(axis=0)
+    return mean.T @ covariance @ mean
+
+
+def compute_principal_axes(covariance: Array, space: SearchSpace) -> Array:
+    """Return the independent combinations of the parameters (k, p), best known first, of a search space.
+
+    A row holds the weights of logarithms: a combination is ``exp(weights @ log(parameters))``; the weight of
+    tied parameters is divided among them. The ``covariance`` (p, p) of samples gives the axes of these:
+    where samples lie along a bend, the narrowest direction at its middle is not the narrowest of all of them.
+    """
+    _, vectors = np.linalg.eigh(reduce_covariance(covariance, space))
+    signs = np.sign(vectors[np.argmax(np.abs(vectors), axis=0), np.arange(len(vectors))])
+    return np.asarray((space.tie @ ((vectors * signs) / space.tie.sum(axis=0)[:, None])).T)
 
 
 def choose_verdict(factor: float, share_of_prior: float) -> str:
@@ -297,25 +386,59 @@ def choose_verdict(factor: float, share_of_prior: float) -> str:
     return UNDETERMINED
 
 
-def _build_combinations(
-    estimate: _LinearisedEstimate, space: SearchSpace, names: tuple[str, ...], prior: PriorPrecision
+def build_combinations(
+    names: Sequence[str], axes: Array, middle_log: Array, half_log: Array, sd_log: Array, prior_sd: Array
 ) -> tuple[Combination, ...]:
-    """Return the principal axes, best known first; the weight of tied parameters is divided among them."""
-    values, vectors = np.linalg.eigh(estimate.covariance)
-    members = space.tie.sum(axis=0)
-    found = []
-    for value, axis in zip(values, vectors.T):
-        axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-        sd = float(np.sqrt(max(value, 0.0)))
-        factor = float(np.exp(estimate.half_width(axis)))
-        verdict = choose_verdict(factor, sd / float(np.linalg.norm(axis * prior.sd)))
-        weights = space.tie @ (axis / members)
-        middle = float(weights @ space.to_logarithms(estimate.z))
-        found.append(Combination(weights, middle, sd, factor, format_product(weights, names), verdict))
-    return tuple(found)
+    """Build combinations with weights ``axes`` (k, p) from what is known of their logarithms, each (k,).
+
+    These are the middle of the 95 % interval, half its width, and the standard deviation with the records and
+    by the bounds alone.
+    """
+    factors, shares = np.exp(half_log), sd_log / prior_sd
+    return tuple(
+        Combination(row, middle, sd, factor, format_product(row, names), choose_verdict(factor, share))
+        for row, middle, sd, factor, share in zip(
+            axes, middle_log.tolist(), sd_log.tolist(), factors.tolist(), shares.tolist(), strict=True
+        )
+    )
 
 
-def format_product(weights: Array, names: tuple[str, ...]) -> str:
+def format_product(weights: Array, names: Sequence[str]) -> str:
     """Write a combination as text; entries below a tenth are left out."""
     order = [k for k in np.argsort(-np.abs(weights)) if abs(weights[k]) >= 0.1]
     return " · ".join(f"{names[k]}^{weights[k]:.2f}" for k in order)
+
+
+@dataclass(frozen=True)
+class FitSensitivity:
+    """The change of the linearised fit's answer with the simulated force of each site.
+
+    ``matrices`` are (p, n) per site, per N, for the logarithms of the full parameters: ``-(J' C^-1 J + P)^-1
+    J' C^-1``.
+    """
+
+    matrices: tuple[Array, ...]
+
+    @classmethod
+    def linearise(cls, known: Uncertainty, responses: Sequence[SiteResponse]) -> FitSensitivity:
+        """Build the sensitivity of the fit from the responses at its answer."""
+        space = known.space
+        scaled = [space.pull_back(response.jacobian, known.parameters) for response in responses]
+        prior = PriorPrecision.from_unknowns(known.unknowns, space)
+        precision, weighted = prior.weigh(scaled, known.residual_model)
+        return cls(tuple(-space.tie @ np.linalg.solve(precision, W.T) for W in weighted))
+
+    def compute_shift(self, changes: Sequence[Array]) -> Array:
+        """Return the change (p,) of the logarithms if forces rise by ``changes`` (n,) at all sites."""
+        return np.sum([G @ change for G, change in zip(self.matrices, changes, strict=True)], axis=0)
+
+    def compute_covariance(self, changes: Sequence[Array], shared: bool, sites: Sequence[str] = ()) -> Array:
+        """Return the covariance (p, p) if ``changes`` are one standard deviation, ``shared`` by all sites or
+        not.
+
+        ``sites`` names the site of each change if several belong to one; by default each has its own.
+        """
+        moved = np.array([G @ change for G, change in zip(self.matrices, changes, strict=True)])
+        names = np.array(list(sites) or range(len(moved)))
+        together = shared | (names[:, None] == names)
+        return np.asarray(moved.T @ together @ moved)

@@ -55,8 +55,7 @@ def run_calibrate(context: Context, folder: Path) -> None:
     corrections = [_summarise_round(one, found.sites, problem) for one in rounds]
     relaxation = None
     if is_ogden(study.law.name) or study.law.name in (FIBRED, FUNG):
-        fit = found.parameters, found.responses, records.measured, known.residual_model
-        relaxation = assess_relaxation(*fit, problem.unknowns, problem.space)
+        relaxation = assess_relaxation(known, found.responses)
     simulations = simulator.run_answer(found.parameters)
     answers = {one.site: one for one in records.select_forces(simulations)}
     warnings = {site: list(one.warnings) for site, one in answers.items() if one.warnings}
@@ -159,7 +158,7 @@ def _summarise_uncertainty(
     known: Uncertainty, study: Study, relaxation: RelaxationAssessment | None
 ) -> stored.CalibrationUncertainty:
     """What is stored of the uncertainty; intervals by tissue and name, like the parameters."""
-    verdicts = known.verdicts if relaxation is None else relaxation.qualify_verdicts(known)
+    verdicts = known.verdicts if relaxation is None else relaxation.qualify_verdicts()
     return stored.CalibrationUncertainty(
         method=known.method,
         intervals_95=group_intervals(known, study),
@@ -173,7 +172,7 @@ def _summarise_uncertainty(
         priors=_summarise_priors(known, study),
         residuals=known.residual_model.summarise(),
         minus_2_log_evidence=known.minus_2_log_evidence,
-        relaxation=None if relaxation is None else relaxation.summarise(known),
+        relaxation=None if relaxation is None else relaxation.summarise(),
     )
 
 

@@ -104,14 +104,14 @@ def run_crossvalidate(
     chosen = list_choices(len(recorded), size, choices, seed)
     regions, checks = list_choices_without_regions([site.region for site in recorded]), []
     for number, without in ((1, {}), (2, regions)):
-        emulator = _fit_emulator(bounds.names, known)
+        emulator = _fit_emulator(known)
         fits = _fit_choices(context, emulator, bounds, measured, list(sites.values()), (own, chosen, without))
         checked = fits.spread(_CHECKED)
         optima = [fold.parameters for fold in checked]
         solved = simulate(optima)
         checks += _check_folds(number, checked, solved, emulator, measured, sites)
         known += _select_complete(context, optima, solved)
-    last = _fit_emulator(bounds.names, known)
+    last = _fit_emulator(known)
     summary = FoldEmulator(runs=len(known), loo_percent=float(np.median(last.loo_percent)), checks=checks)
     possible = comb(len(recorded), size)
     content = _build_result(study, bounds.names, tuple(sites), fits, size, possible, summary)
@@ -146,9 +146,9 @@ def _select_complete(
     return found
 
 
-def _fit_emulator(names: Sequence[str], known: Sequence[tuple[Array, list[SiteResponse]]]) -> Emulator:
+def _fit_emulator(known: Sequence[tuple[Array, list[SiteResponse]]]) -> Emulator:
     points, runs = zip(*known, strict=True)
-    return Emulator.fit(tuple(names), np.array(points), list(runs))
+    return Emulator(np.array(points), list(runs))
 
 
 def _fit_choices(

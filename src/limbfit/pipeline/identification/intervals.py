@@ -67,7 +67,7 @@ def sample_intervals(
         return correction.as_fine(simulator.search(parameters))
 
     further = count_further_evaluations(records.simulations, spent)
-    about = known, records.measured, problem.unknowns, problem.space, evaluations, simulate, further
+    about = known, evaluations, simulate, further
     moves = moves and problem.is_moved
     sampled = sample_uncertainty(*about, move_answer=moves)
     if sampled.method == LINEARISED:

@@ -15,7 +15,7 @@ from ...identify.checks.fit_quality import assess_fit, refit_residuals, summaris
 from ...identify.fit.multifidelity import MeshCorrection
 from ...identify.fit.objective import SiteResponse, find_largest_magnitude
 from ...identify.fit.prediction import PredictionModel, compute_error_percent, summarise_errors
-from ...identify.uncertainty.discrepancy import MeshMisfit
+from ...identify.uncertainty.discrepancy import compute_mesh_covariance
 from ...indentation import Simulation, SimulationJob, store_job_fields
 from ...results import identification as stored
 from ...study import Study
@@ -86,8 +86,7 @@ def run_predict(context: Context, folder: Path) -> None:
     warnings = check_records(context, cache, records.own, ours, best, one, records.searched, correction)
     judged = [(site, band) for site, band in zip(sites, bands, strict=True) if band is not None]
     of_mesh = calibration.uncertainty.residuals.mesh_misfit
-    mesh_misfit = None if of_mesh is None else MeshMisfit(of_mesh.share, of_mesh.correlation)
-    quality = _assess_fits(study, judged, best, known, mesh_misfit)
+    quality = _assess_fits(study, judged, best, known, of_mesh)
     content = stored.PredictResult(
         sites=rows,
         recorded_range=stored.RecordedExtents.model_validate(tested),
@@ -271,7 +270,7 @@ def _assess_fits(
     judged: Sequence[tuple[SitePrediction, _Band]],
     best: Array,
     known: PredictionModel,
-    of_mesh: MeshMisfit | None,
+    of_mesh: stored.MeshMisfitSummary | None,
 ) -> list[stored.RecordFit]:
     """How well the model follows each record, beside its noise and the errors of its mesh and site.
 
@@ -286,7 +285,7 @@ def _assess_fits(
         errors = [band.deviation, known.find_mesh_error(site.record.name, force)]
         covariance = noise + sum(np.outer(error, error) for error in errors)
         if of_mesh is not None:
-            covariance += of_mesh.compute_covariance(site.record.times_s, find_largest_magnitude(force))
+            covariance += compute_mesh_covariance(of_mesh, site.record.times_s, find_largest_magnitude(force))
         allowed.append(covariance)
     fitted = [i for i, site in enumerate(sites) if site.record.site.fitted]
     refitted = refit_residuals(

@@ -16,17 +16,18 @@ from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
 from ...identify.fit.prediction import MIN_FREEDOM, combine_freedom
 from ...identify.uncertainty.emulator import Emulator
-from ...identify.uncertainty.estimator import FitSensitivity
 from ...identify.uncertainty.exploration import Exploration
 from ...identify.uncertainty.noise import SiteNoise
-from ...identify.uncertainty.posterior import compute_principal_axes
 from ...identify.uncertainty.uncertainty import (
     DETERMINED,
     GIVEN,
     NORMAL_95,
     UNDETERMINED,
+    FitSensitivity,
     Uncertainty,
     choose_verdict,
+    compute_correlation,
+    compute_principal_axes,
     format_product,
 )
 from ...results import uncertainty as stored
@@ -67,7 +68,7 @@ def read_emulator(file: Path) -> Emulator:
             [SiteResponse(f, j) for f, j in zip(np.split(force, ends), np.split(jacobian, ends))]
             for force, jacobian in zip(stored["forces"], stored["jacobians"])
         ]
-        return Emulator.fit(tuple(map(str, stored["names"])), stored["points"], runs)
+        return Emulator(stored["points"], runs)
 
 
 _DRAWS = 1500  # written
@@ -113,7 +114,11 @@ def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) ->
     (folder / "predictions").mkdir(exist_ok=True)
     parameters, combinations = _summarise_parameters(found), _summarise_combinations(found)
     rows = [_write_prediction(folder, found, one) for one in predicted]
-    explored, posterior, emulator = found.explored, found.explored.posterior, found.explored.emulator
+    explored, posterior, emulator = (
+        found.explored,
+        found.explored.posterior,
+        found.explored.likelihood.emulator,
+    )
     inside = [(row.fitted, row.inside_percent) for row in rows if row.inside_percent is not None]
     coverage = [[percent for of_fitted, percent in inside if of_fitted == kind] for kind in (True, False)]
     fitted, heldout = (float(np.mean(shares)) if shares else None for shares in coverage)
@@ -126,7 +131,7 @@ def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) ->
         parameters=parameters,
         combinations=combinations,
         correlation=CorrelationMatrix(
-            names=found.known.names, matrix=(posterior.covariance / np.outer(sd, sd)).tolist()
+            names=found.known.names, matrix=compute_correlation(posterior.covariance).tolist()
         ),
         covariance_log=posterior.covariance.tolist(),
         covariance_sources_log=found.source_covariance.tolist(),
@@ -153,7 +158,7 @@ def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) ->
     _write_table(folder / "parameters.csv", [_flatten_row(row) for row in parameters])
     _write_table(folder / "sources.csv", [_flatten_row(row) for row in content.sources])
     write_rows(folder / "predictions.csv", rows)
-    write_runs(folder / EMULATOR, found.known.names, explored.emulator.points, explored.runs)
+    write_runs(folder / EMULATOR, found.known.names, explored.likelihood.emulator.points, explored.runs)
     draws = posterior.samples[:: max(len(posterior.samples) // _DRAWS, 1)]
     write_curves(folder / "draws.csv", **dict(zip(found.known.names, draws.T)))
     _write_table(
@@ -209,7 +214,7 @@ def _summarise_combinations(found: Found) -> list[stored.ParameterCombination]:
     logs = np.log(explored.posterior.samples)
     prior_sd = np.log(found.unknowns.upper / found.unknowns.lower) / np.sqrt(12.0)
     rows = []
-    for weights in compute_principal_axes(explored.posterior, explored.likelihood.space):
+    for weights in compute_principal_axes(explored.posterior.covariance, explored.likelihood.space):
         drawn = logs @ weights
         low, high = np.quantile(drawn, [0.025, 0.975])
         sd = float(drawn.std(ddof=1))

@@ -14,11 +14,10 @@ from ...arrays import Array
 from ...identify.fit.multifidelity import MeshCorrection
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import build_space, group_by_kind
-from ...identify.uncertainty.discrepancy import ResidualModel
-from ...identify.uncertainty.estimator import FitSensitivity
 from ...identify.uncertainty.exploration import Exploration, ExplorationSettings, explore_posterior
 from ...identify.uncertainty.likelihood import Likelihood
 from ...identify.uncertainty.model_comparison import compare_models, fit_alternative
+from ...identify.uncertainty.uncertainty import FitSensitivity
 from ...results.identification import CalibrationResult, RecordPrediction
 from ...results.uncertainty import EvidenceComparison
 from ...study import Study
@@ -52,9 +51,6 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     known = estimate_linearised(problem, records.own, best, correction)
     explored = explore_posterior(
         partial(_simulate_points, context, simulator, correction, best, earlier),
-        records.measured,
-        problem.unknowns,
-        problem.space,
         known,
         [np.array(point) for point in sorted(earlier)],
         ExplorationSettings(table.runs, max(4, table.runs // 4), checked=table.checked, seed=table.seed),
@@ -63,10 +59,8 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     evidence = None
     if len(study.tissues) > 1:
         predicted = context.results.predict.sites
-        evidence = _compare_groupings(study, problem, explored, known.residual_model, calibration, predicted)
-    gain = FitSensitivity.linearise(
-        best, correction.responses, known.residual_model, problem.unknowns, problem.space
-    )
+        evidence = _compare_groupings(study, problem, explored, calibration, predicted)
+    gain = FitSensitivity.linearise(known, correction.responses)
     changes: list[Change] = []
     if table.sources:
         changes = simulate_changes(
@@ -120,7 +114,6 @@ def _compare_groupings(
     study: Study,
     problem: CalibrationProblem,
     explored: Exploration,
-    model: ResidualModel,
     calibration: CalibrationResult,
     predicted: Sequence[RecordPrediction],
 ) -> EvidenceComparison:
@@ -130,7 +123,7 @@ def _compare_groupings(
     """
     unknowns, titles, likelihood = problem.unknowns, problem.titles, explored.likelihood
     space = build_space(unknowns, group_by_kind(unknowns.names))
-    single = Likelihood(explored.emulator, likelihood.measured, model, unknowns, space)
+    single = Likelihood(likelihood.emulator, likelihood.measured, likelihood.model, unknowns, space)
     start = study.vector(calibration.stages[0].parameters)
     one, _ = fit_alternative(titles[0], single, space.reduce(np.log(start)))
     several, _ = fit_alternative(titles[1], likelihood, explored.best.z)
