@@ -114,19 +114,14 @@ def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) ->
     (folder / "predictions").mkdir(exist_ok=True)
     parameters, combinations = _summarise_parameters(found), _summarise_combinations(found)
     rows = [_write_prediction(folder, found, one) for one in predicted]
-    explored, posterior, emulator = (
-        found.explored,
-        found.explored.posterior,
-        found.explored.likelihood.emulator,
-    )
+    explored, posterior = found.explored, found.explored.posterior
+    emulator = explored.likelihood.emulator
     inside = [(row.fitted, row.inside_percent) for row in rows if row.inside_percent is not None]
     coverage = [[percent for of_fitted, percent in inside if of_fitted == kind] for kind in (True, False)]
     fitted, heldout = (float(np.mean(shares)) if shares else None for shares in coverage)
     predictions = stored.IntervalSummary(
         sites=rows, coverage_fitted_percent=fitted, coverage_heldout_percent=heldout
     )
-    sd = np.sqrt(np.diag(posterior.covariance))
-    sd = np.where(sd > 0, sd, 1.0)
     content = stored.UncertaintyResult(
         parameters=parameters,
         combinations=combinations,
