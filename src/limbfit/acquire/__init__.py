@@ -15,29 +15,3 @@ from .operator import Keyboard, NoOperator
 from .quality import RecordedRamp, Verdict, check_record, find_ramps
 from .recording import Recorder, Recording, follow_recording, read_recording
 from .session import Listener, LiveUpdate, PhaseUpdate, Session, Update, prioritise, run_session
-
-__all__ = [
-    "DEFAULT_ADDRESS",
-    "DEFAULT_PORT",
-    "Event",
-    "Keyboard",
-    "LineDevice",
-    "Listener",
-    "LiveUpdate",
-    "NoOperator",
-    "PhaseUpdate",
-    "RecordedRamp",
-    "Recorder",
-    "Recording",
-    "Session",
-    "Settings",
-    "Update",
-    "Verdict",
-    "check_record",
-    "connect",
-    "find_ramps",
-    "follow_recording",
-    "prioritise",
-    "read_recording",
-    "run_session",
-]

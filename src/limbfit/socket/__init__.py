@@ -4,5 +4,3 @@ from .areas import Area, Zone
 from .reading import read_socket
 from .rectify import Recipe, rectify_limb
 from .shape import Socket, measure_circumference
-
-__all__ = ["Area", "Recipe", "Socket", "Zone", "measure_circumference", "read_socket", "rectify_limb"]

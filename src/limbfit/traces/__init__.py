@@ -31,31 +31,3 @@ from .secondary_measurements import (
     select_frames_in_contact,
 )
 from .touchdown import TouchDown, find_touch_down, touch_down_at
-
-__all__ = [
-    "COLUMNS",
-    "Creep",
-    "InterpretedRecord",
-    "Layers",
-    "Regularised",
-    "SurfaceMeans",
-    "SurfaceMotion",
-    "Thinning",
-    "TouchDown",
-    "Trace",
-    "TraceWarning",
-    "WaveMeans",
-    "WaveSpeeds",
-    "check_trace",
-    "compute_thinnings",
-    "find_touch_down",
-    "interpret_record",
-    "read_layers",
-    "read_surface_motion",
-    "read_trace",
-    "read_wave_speeds",
-    "regularise",
-    "regularise_creep",
-    "select_frames_in_contact",
-    "touch_down_at",
-]

@@ -8,15 +8,3 @@ from .faults import FAULT_KINDS, Fault, read_faults
 from .fitsocket import VirtualFitSocket
 from .limb import Surrogate, VirtualLimb, fit_surrogate
 from .server import Serving, serve
-
-__all__ = [
-    "FAULT_KINDS",
-    "Fault",
-    "Serving",
-    "Surrogate",
-    "VirtualFitSocket",
-    "VirtualLimb",
-    "fit_surrogate",
-    "read_faults",
-    "serve",
-]
