@@ -70,6 +70,12 @@ class LinkLost:
 Event = Sample | Signal | Abort | LinkLost
 
 
+# Types of the words of messages, which say what values have a meaning.
+Pin = int  # 1 to 14
+Whole = int  # 0 or more
+Positive = int
+
+
 class Message:
     """What a line of the wire says: a verb and its words, which are the fields in their order."""
 
@@ -85,29 +91,16 @@ class Message:
     def body(self) -> str:
         return " ".join((self.verb, *(str(getattr(self, name)) for name in self.words())))
 
-    @property
-    def is_sound(self) -> bool:
-        """False where a value has no meaning, such as a pin that no device has."""
-        return True
-
-
-def is_pin(number: int) -> bool:
-    return 1 <= number <= PINS
-
 
 @dataclass(frozen=True, slots=True)
 class Move(Message):
     """Drive a pin (1 to 14) to a position; it halts by itself at a force (0: at none)."""
 
     verb: ClassVar[str] = "MOVE"
-    pin: int
-    target_um: int
-    speed_um_s: int
-    halt_mN: int = 0
-
-    @property
-    def is_sound(self) -> bool:
-        return is_pin(self.pin) and self.target_um >= 0 and self.speed_um_s > 0 and self.halt_mN >= 0
+    pin: Pin
+    target_um: Whole
+    speed_um_s: Positive
+    halt_mN: Whole = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,11 +108,7 @@ class Hold(Message):
     """Halt a pin where it is."""
 
     verb: ClassVar[str] = "HOLD"
-    pin: int
-
-    @property
-    def is_sound(self) -> bool:
-        return is_pin(self.pin)
+    pin: Pin
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,12 +131,8 @@ class Fence(Message):
     """From now on a pin may not go beyond a position."""
 
     verb: ClassVar[str] = "FENCE"
-    pin: int
-    position_um: int
-
-    @property
-    def is_sound(self) -> bool:
-        return is_pin(self.pin) and self.position_um > 0
+    pin: Pin
+    position_um: Positive
 
 
 Action = Move | Hold | Stop | Fence

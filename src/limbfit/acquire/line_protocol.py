@@ -18,20 +18,38 @@ from binascii import crc32
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, get_args
 
-from .events import PINS, Fence, Hold, Message, Move, Sample, Stop, is_pin
+from .events import PINS, Fence, Hold, Message, Move, Pin, Positive, Sample, Stop
 
 VERSION = 1
 HOST_LINE = 128  # bytes, newline included: the longest that a device must take
 DEVICE_LINE = 768  # the longest that limbfit takes
 MAX_NUMBER = 2**31 - 1
 _LINE = re.compile(rb"([0-9]{1,10}) ([\x20-\x29\x2b-\x7e]+)\*([0-9A-F]{8})\Z")
-_WORD = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,39}\Z", re.ASCII)
-_INTEGER = re.compile(r"-?[0-9]{1,9}\Z", re.ASCII)
-_NONCE = re.compile(r"[0-9a-f]{16}\Z")
+_INTEGER = re.compile(r"[0-9]{1,9}\Z", re.ASCII)
 _SAMPLE = re.compile(
     rf"S ([0-9]{{1,15}}),([0-9]{{1,4}}),([0-9]{{1,5}})((?:,-?[0-9]{{1,8}}){{{3 * PINS}}})\Z", re.ASCII
 )
 MAX_VALUE = 1_000_000  # no length, speed or force of this device is larger (um, um/s, mN)
+# Further types of words, and the values that each type has.
+Number = int  # of a line: may be larger than any length, speed or force
+PinOrNone = int  # 0: none
+PinBits = int  # a bit for each
+Word = str
+Nonce = str
+Clock = str
+_INTEGERS = {
+    "Pin": range(1, PINS + 1),
+    "PinOrNone": range(PINS + 1),
+    "PinBits": range(1 << PINS),
+    "Whole": range(MAX_VALUE + 1),
+    "Positive": range(1, MAX_VALUE + 1),
+    "Number": range(MAX_NUMBER + 1),
+}
+_TEXTS = {
+    "Word": re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,39}\Z", re.ASCII),
+    "Nonce": re.compile(r"[0-9a-f]{16}\Z"),
+    "Clock": re.compile(r"(real|paced)\Z"),
+}
 
 
 def derive_salt(host_nonce: str, device_nonce: str) -> int:
@@ -152,12 +170,8 @@ class Hello(Message):
     """Opens a session; the only line without salt."""
 
     verb: ClassVar[str] = "HELLO"
-    version: int
-    nonce: str
-
-    @property
-    def is_sound(self) -> bool:
-        return _NONCE.match(self.nonce) is not None
+    version: Positive
+    nonce: Nonce
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,16 +179,12 @@ class SetLimits(Message):
     """The device's own limits for this session: it takes the lower of these and those built in."""
 
     verb: ClassVar[str] = "LIMITS"
-    pin: int
-    force_mN: int
-    clamp_mN: int
-    position_um: int
-    speed_um_s: int
-    watchdog_ms: int
-
-    @property
-    def is_sound(self) -> bool:
-        return is_pin(self.pin) and min(getattr(self, name) for name in self.words()) > 0
+    pin: Pin
+    force_mN: Positive
+    clamp_mN: Positive
+    position_um: Positive
+    speed_um_s: Positive
+    watchdog_ms: Positive
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +192,7 @@ class NoteSite(Message):
     """The site at which the session is."""
 
     verb: ClassVar[str] = "SITE"
-    name: str
+    name: Word
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +200,7 @@ class NotePhase(Message):
     """The phase in which the session is, for the device's display and log."""
 
     verb: ClassVar[str] = "PHASE"
-    name: str
+    name: Word
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +208,7 @@ class Heartbeat(Message):
     """limbfit lives, and has dealt with the sample of this number."""
 
     verb: ClassVar[str] = "BEAT"
-    number: int
+    number: Number
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,22 +230,17 @@ class Identity(Message):
     """
 
     verb: ClassVar[str] = "ID"
-    version: int
-    nonce: str
-    pins: int
-    rate_hz: int
-    stroke_um: int
-    range_mN: int
-    touch_fF: int
-    clock: str
-    model: str
-    serial: str
-    calibrated: str
-
-    @property
-    def is_sound(self) -> bool:
-        numbers = [getattr(self, name) for name, kind in self.words().items() if kind == "int"]
-        return _NONCE.match(self.nonce) is not None and self.clock in ("real", "paced") and min(numbers) > 0
+    version: Positive
+    nonce: Nonce
+    pins: Positive
+    rate_hz: Positive
+    stroke_um: Positive
+    range_mN: Positive
+    touch_fF: Positive
+    clock: Clock
+    model: Word
+    serial: Word
+    calibrated: Word
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +248,7 @@ class Accepted(Message):
     """The command of this number is being done."""
 
     verb: ClassVar[str] = "OK"
-    number: int
+    number: Number
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,8 +256,8 @@ class Declined(Message):
     """The command of this number is not done, and why, in a word."""
 
     verb: ClassVar[str] = "NO"
-    number: int
-    code: str
+    number: Number
+    code: Word
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,12 +265,8 @@ class LimitTripped(Message):
     """The device stopped by itself: why, in a word, and at which pin (0: none)."""
 
     verb: ClassVar[str] = "FAULT"
-    code: str
-    pin: int
-
-    @property
-    def is_sound(self) -> bool:
-        return self.pin == 0 or is_pin(self.pin)
+    code: Word
+    pin: PinOrNone
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,11 +274,7 @@ class OutOfReach(Message):
     """After a stop these pins (a bit each) do not come home."""
 
     verb: ClassVar[str] = "STUCK"
-    pins: int
-
-    @property
-    def is_sound(self) -> bool:
-        return 0 <= self.pins < 1 << PINS
+    pins: PinBits
 
 
 Command = Hello | SetLimits | NoteSite | NotePhase | Heartbeat | Bye | Move | Hold | Stop | Fence
@@ -302,19 +299,16 @@ def _parse(body: str, kinds: dict[str, Any]) -> Any:
     kind = kinds.get(verb)
     if kind is None or len(words) != len(kind.words()):
         return None
-    values = [_parse_word(word, *field) for word, field in zip(words, kind.words().items(), strict=True)]
-    if None in values:
-        return None
-    message = kind(*values)
-    return message if message.is_sound else None
+    values = [_parse_word(word, of) for word, of in zip(words, kind.words().values(), strict=True)]
+    return None if None in values else kind(*values)
 
 
-def _parse_word(word: str, name: str, kind: str) -> str | int | None:
-    """The value of a field; the number of a line may be larger than any length, speed or force."""
-    if kind == "str":
-        return word if _WORD.match(word) else None
-    number = int(word) if _INTEGER.match(word) else None
-    return number if number is None or name == "number" or abs(number) <= MAX_VALUE else None
+def _parse_word(word: str, kind: str) -> str | int | None:
+    """The value of a word, or None where its type has no such value."""
+    if kind in _TEXTS:
+        return word if _TEXTS[kind].match(word) else None
+    number = int(word) if _INTEGER.match(word) else -1
+    return number if number in _INTEGERS[kind] else None
 
 
 def format_sample(sample: Sample) -> str:

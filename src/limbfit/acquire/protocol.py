@@ -59,32 +59,6 @@ class Phase(StrEnum):
     UNREACHABLE = "unreachable"
 
 
-class Outcome(StrEnum):
-    """How a phase ends."""
-
-    BEGUN = "begun"
-    IN_PLACE = "in place"
-    FORCES_REACHED = "forces reached"
-    SLACKENED = "slackened"
-    HELD = "held"
-    TOUCHED = "touched"
-    AT_START = "at start"
-    KEY_HELD = "key held"
-    DEPTH_FOUND = "depth found"
-    TOO_SHALLOW = "too shallow"
-    RESTED = "rested"
-    AT_DEPTH = "at depth"
-    TO_HOLD = "to hold"
-    HELD_OUT = "held out"
-    NEXT_CYCLE = "next cycle"
-    REST = "rest"
-    CYCLES_DONE = "cycles done"
-    HOME = "home"
-    STOP = "stop"
-    RETRACTED = "retracted"
-    OUT_OF_REACH = "out of reach"
-
-
 FINAL = frozenset({Phase.DONE, Phase.STOPPED, Phase.UNREACHABLE})
 WAITS_FOR_OPERATOR = frozenset({Phase.POSITION, Phase.READY})
 CLAMPED = frozenset(
@@ -101,33 +75,26 @@ CLAMPED = frozenset(
     }
 )
 
-_PROTOCOL_STEPS: dict[tuple[Phase, Outcome], Phase] = {
-    (Phase.IDLE, Outcome.BEGUN): Phase.POSITION,
-    (Phase.POSITION, Outcome.IN_PLACE): Phase.CLAMP,
-    (Phase.CLAMP, Outcome.FORCES_REACHED): Phase.SETTLE,
-    (Phase.SETTLE, Outcome.SLACKENED): Phase.CLAMP,
-    (Phase.SETTLE, Outcome.HELD): Phase.APPROACH,
-    (Phase.APPROACH, Outcome.TOUCHED): Phase.BACK,
-    (Phase.BACK, Outcome.AT_START): Phase.READY,
-    (Phase.READY, Outcome.KEY_HELD): Phase.SEARCH,
-    (Phase.SEARCH, Outcome.DEPTH_FOUND): Phase.RETURN,
-    (Phase.SEARCH, Outcome.TOO_SHALLOW): Phase.BACK,
-    (Phase.RETURN, Outcome.AT_START): Phase.PAUSE,
-    (Phase.PAUSE, Outcome.RESTED): Phase.LOAD,
-    (Phase.LOAD, Outcome.AT_DEPTH): Phase.UNLOAD,
-    (Phase.LOAD, Outcome.TO_HOLD): Phase.DWELL,
-    (Phase.DWELL, Outcome.HELD_OUT): Phase.UNLOAD,
-    (Phase.UNLOAD, Outcome.NEXT_CYCLE): Phase.LOAD,
-    (Phase.UNLOAD, Outcome.REST): Phase.PAUSE,
-    (Phase.UNLOAD, Outcome.CYCLES_DONE): Phase.RETRACT,
-    (Phase.RETRACT, Outcome.HOME): Phase.RELEASE,
-    (Phase.RELEASE, Outcome.HOME): Phase.DONE,
-    (Phase.STOPPING, Outcome.RETRACTED): Phase.STOPPED,
-    (Phase.STOPPING, Outcome.OUT_OF_REACH): Phase.UNREACHABLE,
+_PROTOCOL_STEPS: dict[Phase, tuple[Phase, ...]] = {
+    Phase.IDLE: (Phase.POSITION,),
+    Phase.POSITION: (Phase.CLAMP,),
+    Phase.CLAMP: (Phase.SETTLE,),
+    Phase.SETTLE: (Phase.APPROACH, Phase.CLAMP),  # once more where the limb has slackened
+    Phase.APPROACH: (Phase.BACK,),
+    Phase.BACK: (Phase.READY,),
+    Phase.READY: (Phase.SEARCH,),
+    Phase.SEARCH: (Phase.RETURN, Phase.BACK),  # back where the depth found is too small
+    Phase.RETURN: (Phase.PAUSE,),
+    Phase.PAUSE: (Phase.LOAD,),
+    Phase.LOAD: (Phase.UNLOAD, Phase.DWELL),
+    Phase.DWELL: (Phase.UNLOAD,),
+    Phase.UNLOAD: (Phase.LOAD, Phase.PAUSE, Phase.RETRACT),
+    Phase.RETRACT: (Phase.RELEASE,),
+    Phase.RELEASE: (Phase.DONE,),
 }
 # A stop is possible everywhere but where it has happened or nothing is left to stop.
-TRANSITIONS = _PROTOCOL_STEPS | {
-    (phase, Outcome.STOP): Phase.STOPPING for phase in Phase if phase not in FINAL | {Phase.STOPPING}
+TRANSITIONS = {phase: (*after, Phase.STOPPING) for phase, after in _PROTOCOL_STEPS.items()} | {
+    Phase.STOPPING: (Phase.STOPPED, Phase.UNREACHABLE)
 }
 
 
@@ -176,20 +143,20 @@ class Protocol:
         match event:
             case Signal.BEGIN if self.phase is Phase.IDLE:
                 self._last_sample_s = now
-                return self._transition(Outcome.BEGUN, now)
+                return self._transition(Phase.POSITION, now)
             case Abort(reason=reason):
                 return self._stop(reason, now)
             case LinkLost(reason=reason):
                 self.reason = f"{self.reason}; {reason}" if self.reason else reason
                 if self.phase is not Phase.STOPPING:
-                    self._transition(Outcome.STOP, now)
+                    self._transition(Phase.STOPPING, now)
                 return self._transition(
                     self._report_unreachable("whether the device has retracted is not known"), now
                 )
             case Signal.CONFIRM if self.phase is Phase.POSITION:
                 self._is_confirmed = True
             case Signal.KEY_DOWN if self.phase is Phase.READY:
-                return self._transition(Outcome.KEY_HELD, now)
+                return self._transition(Phase.SEARCH, now)
             case Signal.KEY_UP if self.phase is Phase.SEARCH:
                 self._is_confirmed = False
                 return (Hold(self.settings.pin),)
@@ -208,8 +175,8 @@ class Protocol:
             )
             if wrong:
                 return self._stop(wrong.text, now)
-        outcome = self._find_outcome(sample, now)
-        return self._transition(outcome, now) if outcome else self._check_time(now)
+        following = self._find_next_phase(sample, now)
+        return self._transition(following, now) if following else self._check_time(now)
 
     def _check_phase_limits(self, sample: Sample) -> Violation | None:
         """Check the limits that hold in some phases only."""
@@ -244,13 +211,15 @@ class Protocol:
         return ()
 
     def _stop(self, reason: str, now: float) -> tuple[Action, ...]:
-        if (self.phase, Outcome.STOP) not in TRANSITIONS:
+        if Phase.STOPPING not in TRANSITIONS.get(self.phase, ()):
             return ()
         self.reason = reason
-        return self._transition(Outcome.STOP, now)
+        return self._transition(Phase.STOPPING, now)
 
-    def _transition(self, outcome: Outcome, now: float) -> tuple[Action, ...]:
-        self.phase = TRANSITIONS[self.phase, outcome]
+    def _transition(self, phase: Phase, now: float) -> tuple[Action, ...]:
+        if phase not in TRANSITIONS[self.phase]:
+            raise ValueError(f"no session goes from {self.phase} to {phase}")
+        self.phase = phase
         self._phase_start_s = now
         return self._enter()
 
@@ -319,84 +288,82 @@ class Protocol:
         near = abs(sample.position_um[pin - 1] - target_um) < ARRIVAL_TOLERANCE_UM
         return near and self._is_at_rest(sample, now, (pin,))
 
-    def _find_outcome(self, sample: Sample, now: float) -> Outcome | None:
-        """The outcome of the phase if this sample ends it, else None."""
+    def _find_next_phase(self, sample: Sample, now: float) -> Phase | None:
+        """The phase that follows if this sample ends the present one, else None."""
         settings, passed_s = self.settings, now - self._phase_start_s
         is_home = bool(sample.flags & Flags.HOME)
         match self.phase:
             case Phase.POSITION if self._is_confirmed and is_home:
-                return Outcome.IN_PLACE
+                return Phase.CLAMP
             case Phase.CLAMP if self._is_at_rest(sample, now, settings.clamps):
-                return Outcome.FORCES_REACHED
+                return Phase.SETTLE
             case Phase.SETTLE:
-                return self._find_settle_outcome(sample, now)
+                return self._find_phase_after_settling(sample, now)
             case Phase.APPROACH:
-                return self._find_approach_outcome(sample, now)
+                return self._find_phase_after_approach(sample, now)
             case Phase.BACK | Phase.RETURN if self._has_arrived(sample, now, self.start_um):
-                return Outcome.AT_START
+                return Phase.READY if self.phase is Phase.BACK else Phase.PAUSE
             case Phase.SEARCH:
                 self.depth_um = max(self.depth_um, sample.position_um[settings.pin - 1])
                 if self._is_at_rest(sample, now, (settings.pin,)):
                     enough = self.depth_um - self.touch_um >= to_thousandths(settings.min_depth_mm)
-                    return Outcome.DEPTH_FOUND if enough else Outcome.TOO_SHALLOW
+                    return Phase.RETURN if enough else Phase.BACK
             case Phase.PAUSE if passed_s >= settings.pause_s:
-                return Outcome.RESTED
+                return Phase.LOAD
             case Phase.LOAD if self._has_arrived(sample, now, self.depth_um):
                 is_held = settings.hold_s > 0.0 and self.cycle > settings.precondition
-                return Outcome.TO_HOLD if is_held else Outcome.AT_DEPTH
+                return Phase.DWELL if is_held else Phase.UNLOAD
             case Phase.DWELL if passed_s >= settings.hold_s:
-                return Outcome.HELD_OUT
+                return Phase.UNLOAD
             case Phase.UNLOAD if self._has_arrived(sample, now, self.start_um):
                 if self.cycle == settings.cycles:
-                    return Outcome.CYCLES_DONE
-                return Outcome.NEXT_CYCLE if self.cycle < settings.precondition else Outcome.REST
+                    return Phase.RETRACT
+                return Phase.LOAD if self.cycle < settings.precondition else Phase.PAUSE
             case Phase.RETRACT if self._has_arrived(sample, now, 0):
-                return Outcome.HOME
+                return Phase.RELEASE
             case Phase.RELEASE if is_home and passed_s > COMMAND_DELAY_S:
-                return Outcome.HOME
+                return Phase.DONE
             case Phase.STOPPING if sample.flags & Flags.GIVEN_UP:
                 return self._report_unreachable("the device cannot bring every pin home")
             case Phase.STOPPING if sample.flags & Flags.STOPPED and is_home:
-                return Outcome.RETRACTED
+                return Phase.STOPPED
         return None
 
-    def _find_settle_outcome(self, sample: Sample, now: float) -> Outcome | None:
+    def _find_phase_after_settling(self, sample: Sample, now: float) -> Phase | None:
         self._tare_samples.append(sample.force_mN[self.settings.pin - 1])
         if now - self._phase_start_s < self.settings.settle_s:
             return None
         least = to_thousandths(self.settings.clamp_N - self.settings.clamp_tolerance_N)
         force, pin = min((sample.force_mN[pin - 1], pin) for pin in self.settings.clamps)
         if force >= least:
-            return Outcome.HELD
+            return Phase.APPROACH
         if self._rounds < MAX_CLAMP_ROUNDS:
-            return Outcome.SLACKENED
+            return Phase.CLAMP
         return self._fail(f"pin {pin} clamps with {force / 1000:.1f} N only, after {MAX_CLAMP_ROUNDS} rounds")
 
-    def _find_approach_outcome(self, sample: Sample, now: float) -> Outcome | None:
+    def _find_phase_after_approach(self, sample: Sample, now: float) -> Phase | None:
         pin = self.settings.pin
         touches = sample.capacitance_fF[pin - 1] >= self.device.touch_fF
         if touches and self._contact_um is None:
             self._contact_um = sample.position_um[pin - 1]
         if not self._is_at_rest(sample, now, (pin,)):
             return None
-        if (
-            self._compute_net_force(sample) >= to_thousandths(self.settings.touch_N) // 2
-            and self._contact_um is not None
-        ):
+        is_felt = self._compute_net_force(sample) >= to_thousandths(self.settings.touch_N) // 2
+        if is_felt and self._contact_um is not None:
             self.touch_um = self._contact_um
             self.start_um = max(self.touch_um - to_thousandths(self.settings.start_gap_mm), 0)
             self.guard.set_depth(pin, self._compute_deepest_um())
-            return Outcome.TOUCHED
+            return Phase.BACK
         if touches:
             return None  # the limb gave way: the limits of deafness and time decide
-        if self._compute_net_force(sample) >= to_thousandths(self.settings.touch_N) // 2:
+        if is_felt:
             return self._fail(f"pin {pin} feels a force where its capacitance sees no skin")
         return self._fail(f"pin {pin} met nothing up to the end of its stroke")
 
-    def _report_unreachable(self, why: str) -> Outcome:
+    def _report_unreachable(self, why: str) -> Phase:
         self.reason = f"{self.reason}; {why}; use the device's own release"
-        return Outcome.OUT_OF_REACH
+        return Phase.UNREACHABLE
 
-    def _fail(self, reason: str) -> Outcome:
+    def _fail(self, reason: str) -> Phase:
         self.reason = reason
-        return Outcome.STOP
+        return Phase.STOPPING
