@@ -13,7 +13,7 @@ answer, or an emulator.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Literal
 
@@ -66,29 +66,6 @@ class LogLinearModel:
         return SiteResponse(moved, slope / parameters)
 
 
-@dataclass(frozen=True)
-class RecordCorrection:
-    """One change to the records that makes all sites agree better: names exchanged, or a unit converted.
-
-    ``gain`` is the squared misfit of all sites before over after, each refitted. The errors (root mean square
-    over the peak) are the largest of ``sites``; ``worst_before`` is that of any site, because a fit may
-    follow the bad record and miss the others.
-    """
-
-    kind: Literal["swap", "unit"]
-    sites: tuple[int, ...]
-    cause: str
-    gain: float
-    error_before: float
-    error_after: float
-    worst_before: float
-
-    @property
-    def is_convincing(self) -> bool:
-        worst = self.worst_before
-        return self.gain > MIN_GAIN and worst > MAX_ERROR_SHARE / 2 and self.error_after < 0.6 * worst
-
-
 class LeaveOutFits:
     """All records with their simulation: regularised fits to some of them, and errors at the others.
 
@@ -116,6 +93,25 @@ class LeaveOutFits:
         """Return all records of the sites of some records."""
         sites = {self.measured[i].site_name for i in indices}
         return tuple(i for i, one in enumerate(self.measured) if one.site_name in sites)
+
+    def convert_force(self, i: int, factor: float) -> LeaveOutFits:
+        """Return the same with the force of a record divided by the factor of a unit."""
+        measured = list(self.measured)
+        measured[i] = replace(measured[i], force_N=measured[i].force_N / factor)
+        return LeaveOutFits(self.simulate, measured, self.start)
+
+    def exchange_records(self, i: int, j: int, exchange: Exchange) -> LeaveOutFits:
+        """Return the same with two records in each other's place, their sites driven by each other's."""
+        measured, moved = list(self.measured), LogLinearModel(self.start, exchange(self.start, i, j))
+        measured[i] = replace(self.measured[j], site=self.measured[i].site_name)
+        measured[j] = replace(self.measured[i], site=self.measured[j].site_name)
+
+        def respond(parameters: Array) -> list[SiteResponse]:
+            responses = list(self.simulate(parameters))
+            responses[i], responses[j] = moved(parameters)
+            return responses
+
+        return LeaveOutFits(respond, measured, self.start)
 
     def _fit(self, chosen: Sequence[int]) -> Array:
         z = np.zeros(len(self.start))
@@ -194,22 +190,41 @@ class LeaveOutFits:
         return tuple(found)
 
 
-def find_misfitting_sites(
-    simulate: Simulate, measured: Sequence[MeasuredCurve], start: Array
-) -> tuple[tuple[LeftOutRecord, ...], tuple[int, ...]]:
-    """Leave every site out; return the errors and the indices of the sites that do not fit: none, one or two.
+@dataclass(frozen=True)
+class RecordCorrection:
+    """One change to the records that makes all sites agree better: names exchanged, or a unit converted.
 
-    With fewer than four sites nobody can tell which one is wrong.
+    ``gain`` is the squared misfit of all sites before over after, each refitted. The errors (root mean square
+    over the peak) are the largest of ``sites``; ``worst_before`` is that of any site, because a fit may
+    follow the bad record and miss the others. ``fits`` are those to the records with the change.
     """
-    number = count_sites(measured)
-    if number < MIN_SITES:
-        return (), ()
-    sites = LeaveOutFits(simulate, measured, start)
+
+    kind: Literal["swap", "unit"]
+    sites: tuple[int, ...]
+    cause: str
+    gain: float
+    error_before: float
+    error_after: float
+    worst_before: float
+    fits: LeaveOutFits = field(repr=False)
+
+    @property
+    def is_convincing(self) -> bool:
+        worst = self.worst_before
+        return self.gain > MIN_GAIN and worst > MAX_ERROR_SHARE / 2 and self.error_after < 0.6 * worst
+
+
+def find_misfitting_sites(sites: LeaveOutFits) -> tuple[tuple[LeftOutRecord, ...], tuple[int, ...]]:
+    """Leave every site out; return the errors, and which sites do not fit: none, one or two."""
     singles = sites.leave_one_out()
     best = int(np.argmax([single.standardised for single in singles]))
     alone = singles[best].standardised if singles[best].error > MAX_ERROR_SHARE else 0.0
     pair, together = _find_worst_pair(sites, singles)
-    if together > MAX_STANDARDISED_ERROR and together > 1.5 * alone and number > MIN_SITES:
+    if (
+        together > MAX_STANDARDISED_ERROR
+        and together > 1.5 * alone
+        and count_sites(sites.measured) > MIN_SITES
+    ):
         return singles, pair
     return singles, (best,) if alone > MAX_STANDARDISED_ERROR else ()
 
@@ -282,11 +297,7 @@ def _match_times(history: History, other_history: History) -> Array:
 
 
 def find_best_correction(
-    simulate: Simulate,
-    measured: Sequence[MeasuredCurve],
-    start: Array,
-    exchange: Exchange,
-    exactly: Exchange | None = None,
+    fits: LeaveOutFits, exchange: Exchange, exactly: Exchange | None = None
 ) -> RecordCorrection | None:
     """Find the one change of names or of a unit that lowers the misfit of all sites most, if it is
     convincing.
@@ -298,34 +309,41 @@ def find_best_correction(
     exactly : the same by simulation, asked for the few exchanges that may matter, and then decisive; an
         exchange whose simulation fails is not considered.
     """
-    fits = LeaveOutFits(simulate, measured, start)
     before = fits.compute_errors(fits.fit_without())
     if before.max() <= MAX_ERROR_SHARE / 2:
         return None  # nothing to explain
+
+    def swap(pair: tuple[int, ...], exchange: Exchange) -> RecordCorrection:
+        i, j = pair
+        swapped = fits.exchange_records(i, j, exchange)
+        return _build_correction("swap", pair, "swapped site names", before, swapped)
+
     worst = sorted(find_worst_sites(fits, before))
-    forces = [i for i in worst if measured[i].unit == "N"]
     units = [
-        fit_with_conversion(simulate, measured, start, i, unit, before)
-        for i in forces
-        for unit in FORCE_UNITS
+        _build_correction("unit", (i,), unit, before, fits.convert_force(i, factor))
+        for i in worst
+        for unit, factor in FORCE_UNITS.items()
+        if fits.measured[i].unit == "N"
     ]
-    pairs = list_pairs(measured, worst)
-    swaps = [fit_with_exchange(simulate, measured, start, pair, exchange, before) for pair in pairs]
+    swaps = [swap(pair, exchange) for pair in list_pairs(fits.measured, worst)]
     if exactly is not None:
         likely = sorted((s for s in swaps if s.gain > MIN_GAIN / 2), key=lambda s: -s.gain)
-        pairs = [(s.sites[0], s.sites[1]) for s in likely[:_MAX_SIMULATED_EXCHANGES]]
-        pairs = [pair for pair in pairs if all(r.completed for r in exactly(start, *pair))]
-        swaps = [fit_with_exchange(simulate, measured, start, pair, exactly, before) for pair in pairs]
+        pairs = [s.sites for s in likely[:_MAX_SIMULATED_EXCHANGES]]
+        pairs = [pair for pair in pairs if all(r.completed for r in exactly(fits.start, *pair))]
+        swaps = [swap(pair, exactly) for pair in pairs]
     convincing = [correction for correction in (*units, *swaps) if correction.is_convincing]
     return max(convincing, key=lambda correction: correction.gain, default=None)
 
 
-def _exchange_records(measured: Sequence[MeasuredCurve], i: int, j: int) -> list[MeasuredCurve]:
-    """Return the records with two of them in each other's place."""
-    found = list(measured)
-    found[i] = replace(measured[j], site=measured[i].site_name)
-    found[j] = replace(measured[i], site=measured[j].site_name)
-    return found
+def _build_correction(
+    kind: Literal["swap", "unit"], indices: tuple[int, ...], cause: str, before: Array, fits: LeaveOutFits
+) -> RecordCorrection:
+    """Fit all sites with the change; ``before`` are the errors (n,) without it."""
+    after = fits.compute_errors(fits.fit_without())
+    gain = float(np.sum(before**2) / max(np.sum(after**2), len(after) * (MIN_ERROR_SHARE / 2) ** 2))
+    own = list(indices)
+    errors = float(before[own].max()), float(after[own].max())
+    return RecordCorrection(kind, indices, cause, gain, *errors, float(before.max()), fits)
 
 
 @dataclass(frozen=True)
@@ -368,80 +386,24 @@ def find_outliers(
         responses = simulate(neutral)
         if not check_responses(responses, measured, len(neutral)):
             model = LogLinearModel(neutral, responses)
-    return OutlierReport(errors, _find_warnings(model, measured, exchange(model), exactly))
+            fits = LeaveOutFits(model, measured, neutral)
+    return OutlierReport(errors, _find_warnings(fits, exchange(model), exactly))
 
 
 def _find_warnings(
-    model: LogLinearModel, measured: Sequence[MeasuredCurve], exchange: Exchange, exactly: Exchange | None
+    fits: LeaveOutFits, exchange: Exchange, exactly: Exchange | None
 ) -> tuple[RecordWarning, ...]:
-    start = model.parameters
-    simulate: Simulate = model
-    warnings, corrected = [], list(measured)
+    warnings, measured = [], fits.measured
     for _ in range(_MAX_CORRECTIONS):
-        correction = find_best_correction(simulate, corrected, start, exchange, exactly)
+        correction = find_best_correction(fits, exchange, exactly)
         if correction is None:
             break
-        if correction.kind == "unit":
-            i = correction.sites[0]
-            factor = FORCE_UNITS[correction.cause]
-            corrected[i] = replace(corrected[i], force_N=corrected[i].force_N / factor)
-        else:
-            i, j = correction.sites
-            simulate = _simulate_exchanged(simulate, start, (i, j), exactly or exchange)
-            corrected = _exchange_records(corrected, i, j)
+        fits = correction.fits
         warnings.append(warn_of_correction(correction, [site.name for site in measured]))
-    singles, misfitting = find_misfitting_sites(simulate, corrected, start)
+    singles, misfitting = find_misfitting_sites(fits)
     corrected_sites = {site for warning in warnings for site in warning.sites}
     others = (i for i in misfitting if measured[i].name not in corrected_sites)
     return (*warnings, *(warn_of_outlier(singles[i], measured[i].unit) for i in others))
-
-
-def _simulate_exchanged(
-    simulate: Simulate, start: Array, pair: tuple[int, int], exchange: Exchange
-) -> Simulate:
-    """Return the simulation with two sites driven by each other's record."""
-    i, j = pair
-    moved = LogLinearModel(start, exchange(start, i, j))
-
-    def respond(parameters: Array) -> list[SiteResponse]:
-        responses = list(simulate(parameters))
-        responses[i], responses[j] = moved(parameters)
-        return responses
-
-    return respond
-
-
-def fit_with_conversion(
-    simulate: Simulate, measured: Sequence[MeasuredCurve], start: Array, i: int, unit: str, before: Array
-) -> RecordCorrection:
-    """Fit all sites with the force of one converted; ``before`` are the errors without the conversion."""
-    renamed = list(measured)
-    renamed[i] = replace(measured[i], force_N=measured[i].force_N / FORCE_UNITS[unit])
-    return _build_correction("unit", (i,), unit, before, LeaveOutFits(simulate, renamed, start))
-
-
-def fit_with_exchange(
-    simulate: Simulate,
-    measured: Sequence[MeasuredCurve],
-    start: Array,
-    pair: tuple[int, int],
-    exchange: Exchange,
-    before: Array,
-) -> RecordCorrection:
-    """Fit all sites with the records of two exchanged; ``before`` are the errors without the exchange."""
-    renamed = _exchange_records(measured, *pair)
-    sites = LeaveOutFits(_simulate_exchanged(simulate, start, pair, exchange), renamed, start)
-    return _build_correction("swap", pair, "swapped site names", before, sites)
-
-
-def _build_correction(
-    kind: Literal["swap", "unit"], indices: tuple[int, ...], cause: str, before: Array, sites: LeaveOutFits
-) -> RecordCorrection:
-    after = sites.compute_errors(sites.fit_without())
-    gain = float(np.sum(before**2) / max(np.sum(after**2), len(after) * (MIN_ERROR_SHARE / 2) ** 2))
-    own = list(indices)
-    errors = float(before[own].max()), float(after[own].max())
-    return RecordCorrection(kind, indices, cause, gain, *errors, float(before.max()))
 
 
 def warn_of_outlier(error: LeftOutRecord, unit: str = "N") -> RecordWarning:
