@@ -14,7 +14,7 @@ import socket
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 from ..errors import InputError, RunError
 from .events import PINS, RATE_HZ, Hold, Move, Sample, Stop
@@ -56,11 +56,17 @@ PACED_ANSWER_S = 0.5  # where the device's clock, which runs ahead of its ears, 
 MAX_ATTEMPTS = 6
 
 
-class Link(Protocol):
+class Link:
     """A wire: never waits; a wire that is gone raises `RunError`."""
+
+    gone: ClassVar[str]  # what is said then
+
+    def __init__(self, port: Any) -> None:
+        self._port = port
 
     def fileno(self) -> int:
         """For ``select``."""
+        return int(self._port.fileno())
 
     def wait(self, timeout_s: float) -> None:
         """Wait for something to read, at most so long."""
@@ -68,51 +74,58 @@ class Link(Protocol):
 
     def read(self) -> bytes:
         """What has come, or nothing."""
+        try:
+            return self._receive()
+        except BlockingIOError:
+            return b""
+        except OSError:
+            raise RunError(self.gone) from None
 
     def write(self, data: bytes) -> None:
         """All of it, or the wire counts as gone."""
+        try:
+            sent = self._send(data)
+        except OSError:
+            sent = -1
+        if sent != len(data):
+            raise RunError(f"{self.gone}, or the other end does not read")
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        with suppress(OSError):
+            self._port.close()
+
+    def _receive(self) -> bytes:
+        return self._port.read(_READ_BYTES) or b""
+
+    def _send(self, data: bytes) -> int | None:
+        return self._port.write(data)
 
 
 class TcpLink(Link):
     """A connected socket."""
 
+    gone = "the connection is broken"
+
     def __init__(self, connection: socket.socket) -> None:
         connection.setblocking(False)
         if connection.family in (socket.AF_INET, socket.AF_INET6):
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket = connection
+        super().__init__(connection)
 
-    def fileno(self) -> int:
-        return self._socket.fileno()
-
-    def read(self) -> bytes:
-        try:
-            data = self._socket.recv(_READ_BYTES)
-        except BlockingIOError:
-            return b""
-        except OSError:
-            raise RunError("the connection is broken") from None
+    def _receive(self) -> bytes:
+        data = self._port.recv(_READ_BYTES)
         if not data:
             raise RunError("the other end has closed the connection")
         return data
 
-    def write(self, data: bytes) -> None:
-        try:
-            sent = self._socket.send(data)
-        except OSError:
-            sent = -1
-        if sent != len(data):
-            raise RunError("the connection is broken, or the other end does not read")
-
-    def close(self) -> None:
-        with suppress(OSError):
-            self._socket.close()
+    def _send(self, data: bytes) -> int:
+        return self._port.send(data)
 
 
 class SerialLink(Link):
     """A serial port, 8N1, without flow control."""
+
+    gone = "the serial port is gone"
 
     def __init__(self, port: str, baud: int) -> None:
         try:
@@ -121,31 +134,10 @@ class SerialLink(Link):
             remedy = "pip install 'limbfit[serial]'"
             raise InputError("serial ports need pyserial", place="--device", remedy=remedy) from None
         try:
-            self._port: Any = serial.Serial(port, baud, timeout=0, write_timeout=0, exclusive=True)
+            super().__init__(serial.Serial(port, baud, timeout=0, write_timeout=0, exclusive=True))
         except _PORT_ERRORS as error:
             raise RunError(f"{port} cannot be opened: {_explain_port_error(error, baud)}") from None
         self._port.reset_input_buffer()
-
-    def fileno(self) -> int:
-        return int(self._port.fileno())
-
-    def read(self) -> bytes:
-        try:
-            return bytes(self._port.read(_READ_BYTES))
-        except OSError:
-            raise RunError("the serial port is gone") from None
-
-    def write(self, data: bytes) -> None:
-        try:
-            sent = self._port.write(data)
-        except OSError:
-            sent = -1
-        if sent != len(data):
-            raise RunError("the serial port is gone, or the other end does not read")
-
-    def close(self) -> None:
-        with suppress(OSError):
-            self._port.close()
 
 
 def _explain_port_error(error: Exception, baud: int) -> str:

@@ -26,7 +26,7 @@ from .events import (
     to_thousandths,
 )
 from .line_protocol import Identity
-from .safety import ClampWatch, Guard, Violation, check_device_flags, check_sensitivity, make_session_limits
+from .safety import ClampWatch, Guard, check_device_flags, check_sensitivity, make_session_limits
 
 COMMAND_DELAY_S = 0.05  # a pin may stand still for so long before a command reaches it
 ARRIVAL_TOLERANCE_UM = 60  # a pin that is so near to its target has arrived
@@ -168,17 +168,14 @@ class Protocol:
         if self.phase in FINAL or self.phase is Phase.IDLE:
             return ()
         if self.phase is not Phase.STOPPING:
-            wrong = (
-                check_device_flags(sample.flags)
-                or self.guard.check(sample)
-                or self._check_phase_limits(sample)
-            )
-            if wrong:
-                return self._stop(wrong.text, now)
+            violation = self.guard.check(sample)
+            wrong = check_device_flags(sample.flags) or (violation.text if violation else "")
+            if wrong := wrong or self._check_phase_limits(sample):
+                return self._stop(wrong, now)
         following = self._find_next_phase(sample, now)
         return self._transition(following, now) if following else self._check_time(now)
 
-    def _check_phase_limits(self, sample: Sample) -> Violation | None:
+    def _check_phase_limits(self, sample: Sample) -> str:
         """Check the limits that hold in some phases only."""
         if self.phase in CLAMPED and (wrong := self._clamp_watch.check(sample)):
             return wrong
@@ -188,7 +185,7 @@ class Protocol:
         elif self.phase is Phase.SEARCH:  # the first push: on a ramp the tissue may not be back yet
             force_mN, travel = self._compute_net_force(sample), sample.position_um[pin - 1] - self.touch_um
         else:
-            return None
+            return ""
         return check_sensitivity(travel, force_mN, to_thousandths(self.settings.touch_N) // 2, pin)
 
     def _check_time(self, now: float) -> tuple[Action, ...]:

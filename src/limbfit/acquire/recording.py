@@ -263,19 +263,8 @@ def _parse_content(content: bytes, lost_bytes: int, path: Path, every: int = 1) 
     table = _read_table(rows[every - 1 :: every], path)
     host_us, device_us, number, flags, moving = table[:, : len(_NAMES)].T
     position, force, capacitance = np.split(table[:, len(_NAMES) :], 3, axis=1)
-    return Recording(
-        head,
-        tuple(events),
-        host_us,
-        device_us,
-        number,
-        flags,
-        moving,
-        position,
-        force,
-        capacitance,
-        lost_bytes,
-    )
+    series = host_us, device_us, number, flags, moving, position, force, capacitance
+    return Recording(head, tuple(events), *series, lost_bytes)
 
 
 def _read_table(rows: list[str], path: Path) -> Indices:

@@ -137,7 +137,8 @@ class ClampWatch:
         self.pins = pins
         self._recent_samples: deque[Sample] = deque()
 
-    def check(self, sample: Sample) -> Violation | None:
+    def check(self, sample: Sample) -> str:
+        """Return how the limb has moved, if it has."""
         past = self._recent_samples
         past.append(sample)
         while sample.time_us - past[0].time_us > CLAMP_JUMP_US:
@@ -145,27 +146,23 @@ class ClampWatch:
         for pin in self.pins:
             now, then = sample.force_mN[pin - 1], past[0].force_mN[pin - 1]
             if now < MIN_CLAMP_MN:
-                return Violation("limb", pin, f"the limb has moved: pin {pin} has lost contact")
+                return f"the limb has moved: pin {pin} has lost contact"
             if abs(now - then) > MAX_CLAMP_JUMP_MN:
-                text = f"the limb has moved: the force of pin {pin} jumped by {(now - then) / 1000:+.1f} N"
-                return Violation("limb", pin, text)
-        return None
+                return f"the limb has moved: the force of pin {pin} jumped by {(now - then) / 1000:+.1f} N"
+        return ""
 
 
-def check_device_flags(flags: int) -> Violation | None:
-    """Check what the device says of itself."""
+def check_device_flags(flags: int) -> str:
+    """Return why the device says of itself that it has to stop, if it does."""
     if flags & Flags.BUTTON:
-        return Violation("button", 0, "the device's emergency stop was pressed")
+        return "the device's emergency stop was pressed"
     if flags & Flags.NO_POWER:
-        return Violation("power", 0, "the actuators have no power")
-    if flags & Flags.STOPPED:
-        return Violation("device", 0, "the device stopped by itself")
-    return None
+        return "the actuators have no power"
+    return "the device stopped by itself" if flags & Flags.STOPPED else ""
 
 
-def check_sensitivity(travel_um: int, force_mN: int, expected_mN: int, pin: int) -> Violation | None:
+def check_sensitivity(travel_um: int, force_mN: int, expected_mN: int, pin: int) -> str:
     """Refuse a force sensor that feels nothing of a push that the capacitance saw begin."""
     if travel_um > MAX_UNFELT_TRAVEL_UM and force_mN < expected_mN:
-        text = f"pin {pin} touches ({travel_um / 1000:.1f} mm ago) but feels no force: see its force sensor"
-        return Violation("deaf", pin, text)
-    return None
+        return f"pin {pin} touches ({travel_um / 1000:.1f} mm ago) but feels no force: see its force sensor"
+    return ""

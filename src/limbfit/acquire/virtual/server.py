@@ -8,7 +8,6 @@ import select
 import socket
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,34 +26,25 @@ IDLE_S = 0.02
 class PtyLink(Link):
     """The master of a pseudo terminal; its slave looks like a serial port."""
 
+    gone = "the terminal is gone"
+
     def __init__(self) -> None:
         try:
             import tty
         except ImportError:
             raise InputError("this system has no pseudo terminals", place="--terminal") from None
-        self._master, self._slave = os.openpty()
+        master, self._slave = os.openpty()
         tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
+        os.set_blocking(master, False)
+        super().__init__(os.fdopen(master, "r+b", buffering=0))
         self.name = os.ttyname(self._slave)
-
-    def fileno(self) -> int:
-        return self._master
-
-    def read(self) -> bytes:
-        try:
-            return os.read(self._master, 1 << 16)
-        except BlockingIOError:
-            return b""
-        except OSError:
-            raise RunError("the terminal is gone") from None
 
     def write(self, data: bytes) -> None:
         """What does not fit is lost, as on a serial line that nobody reads."""
-        with suppress(BlockingIOError):
-            os.write(self._master, data)
+        self._port.write(data)
 
     def close(self) -> None:
-        os.close(self._master)
+        super().close()
         os.close(self._slave)
 
 
