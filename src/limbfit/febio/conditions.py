@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Mask
 from ..errors import ProblemError
 from ..fe import Motion
 from .reading.rigid import FREEDOMS, find_straight_line, has_same_rotation
@@ -118,7 +117,7 @@ def format_conditions(name: str, motion: Motion, ends: list[float], curves: Curv
     return words
 
 
-def _cut_motion(motion: Motion, begin: float, end: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _cut_motion(motion: Motion, begin: float, end: float) -> tuple[Array, Array, Mask]:
     """Return times (k,), values (k, 6) and drives of a motion between two ends of steps."""
     times = np.asarray(motion.times)
     inner = times[(times > begin) & (times < end)]
@@ -130,7 +129,7 @@ def _cut_motion(motion: Motion, begin: float, end: float) -> tuple[Array, Array,
 
 
 def _format_step_conditions(
-    name: str, label: str, times: Array, values: Array, forced: NDArray[np.bool_], curves: CurveList
+    name: str, label: str, times: Array, values: Array, forced: Mask, curves: CurveList
 ) -> Iterator[str]:
     moving = np.asarray(values.any(axis=0))
     free = forced | moving

@@ -18,14 +18,13 @@ import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..arrays import Array
+from ..arrays import Array, Indices, Mask
 from ..errors import ProblemError
 from ..fe import ELEMENTS, isochoric_stretch
 from ..fe.kernel.elements import compute_reference_gradients
 from ..mesh import Mesh
 from ..study import Vector
 
-Bools = NDArray[np.bool_]
 Direction = Vector | Literal["flow"]
 DISTAL_MM = 10.0  # of the bone's far end, along the limb, that fibres run to
 _SOLVED = 1e-8  # residual of the potential
@@ -73,7 +72,7 @@ def compute_flow_directions(mesh: Mesh, tissue: str) -> Array:
     return np.asarray(flow / size)
 
 
-def _find_ends(mesh: Mesh, nodes: NDArray[np.int64]) -> tuple[Bools, Bools]:
+def _find_ends(mesh: Mesh, nodes: Indices) -> tuple[Mask, Mask]:
     """Which of the ``nodes`` are on the proximal cut, and which at the far end of the bone."""
     none = np.zeros(0, dtype=np.int64)
     cut, bone = (mesh.node_sets.get(name, none) for name in ("fixed_proximal", "fixed_bone"))
@@ -87,7 +86,7 @@ def _find_ends(mesh: Mesh, nodes: NDArray[np.int64]) -> tuple[Bools, Bools]:
 
 
 def _solve_potential(
-    count: int, cells: NDArray[np.int64], gradients: Array, weights: Array, start: Bools, end: Bools
+    count: int, cells: Indices, gradients: Array, weights: Array, start: Mask, end: Mask
 ) -> Array:
     """The solution (n,) of Laplace's equation by linear tetrahedra: 0 at ``start``, 1 at ``end``."""
     blocks = np.einsum("mia,mib,m->mab", gradients, gradients, weights)

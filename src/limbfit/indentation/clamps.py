@@ -10,9 +10,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Indices
 from ..errors import ProblemError
 from ..fe import Indenter, Motion, Problem, RigidBody
 from ..fe.contact.contact import ContactSurface, find_touching_offset
@@ -20,7 +19,7 @@ from ..study import ClampsTable
 
 
 def build_clamping_pins(
-    points: Array, faces: NDArray[np.int64], indenter: Indenter, along: Array, clamps: ClampsTable
+    points: Array, faces: Indices, indenter: Indenter, along: Array, clamps: ClampsTable
 ) -> dict[str, Indenter]:
     """The clamping pins by name, each off the skin at its angle; of the usual ones those that meet it.
 

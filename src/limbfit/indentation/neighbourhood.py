@@ -11,15 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from ..arrays import Array
+from ..arrays import Array, Indices, Mask
 from ..errors import ProblemError
 from ..fe import Result, System, build_linear_solver, compute_tangent_at_rest
 from ..mesh import Mesh
-
-Ints = NDArray[np.int64]
 
 # Of the cut, what lies this straight below the indenter is held, for deep tissue hangs on bone; the sides may
 # move. Held or free altogether, the factor to the whole force would be 0.69 or 2.3 (docs/convergence.md).
@@ -33,9 +30,9 @@ class Neighbourhood:
     nodes of the part where it was cut off."""
 
     mesh: Mesh
-    nodes: Ints
-    cut: Ints
-    cells: NDArray[np.bool_]
+    nodes: Indices
+    cut: Indices
+    cells: Mask
 
 
 def cut_neighbourhood(mesh: Mesh, centre: Array, radius_mm: float) -> Neighbourhood:
@@ -71,7 +68,7 @@ def cut_neighbourhood(mesh: Mesh, centre: Array, radius_mm: float) -> Neighbourh
     return Neighbourhood(part, np.flatnonzero(inside), number[inside & outside], kept)
 
 
-def find_fixed_cut_nodes(part: Neighbourhood, centre: Array, axis: Array) -> Ints:
+def find_fixed_cut_nodes(part: Neighbourhood, centre: Array, axis: Array) -> Indices:
     """Nodes of the cut to be held: those below the indenter, which advances along ``axis``."""
     offset = part.mesh.points[part.cut] - centre
     return part.cut[offset @ axis > _BELOW * np.linalg.norm(offset, axis=1)]

@@ -11,9 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Indices, Mask
 from ..errors import ProblemError
 from ..fe import Indenter, Result
 from ..fe.result import interpolate
@@ -77,7 +76,7 @@ def choose_points_around(mesh: Mesh, indenter: Indenter) -> Array:
     return found.points[there]
 
 
-def is_under(indenter: Indenter, points: Array) -> NDArray[np.bool_]:
+def is_under(indenter: Indenter, points: Array) -> Mask:
     """Which points (k, 3) the indenter hides from cameras, as far as it goes along its axis."""
     local = (points - np.asarray(indenter.centre)) @ indenter.frame.T
     local[:, 2] = -0.5 * min(indenter.width, indenter.length)
@@ -180,9 +179,6 @@ def _prepend_rest(rows: Sequence[Sequence[Array]]) -> Array:
     return np.concatenate([np.zeros_like(found[:, :1]), found], axis=1)
 
 
-Ints = NDArray[np.int64]
-
-
 @dataclass(frozen=True)
 class SkinPoints:
     """Points (k, 3) mm of the skin at rest, and what interpolates nodal values there.
@@ -193,7 +189,7 @@ class SkinPoints:
 
     points: Array
     off_mm: Array
-    nodes: Ints
+    nodes: Indices
     weights: Array
 
     def gauges(self, axes: Array) -> tuple[Gauge, ...]:
@@ -212,7 +208,7 @@ def find_skin_points(mesh: Mesh, points: Array) -> SkinPoints:
     return find_nearest_points(mesh.points, faces, points)
 
 
-def find_nearest_points(nodes: Array, faces: Ints, points: Array) -> SkinPoints:
+def find_nearest_points(nodes: Array, faces: Indices, points: Array) -> SkinPoints:
     """The points of a skin with ``nodes`` (n, 3) mm and ``faces`` (f, j) nearest to ``points`` (k, 3), mm.
 
     Faces count as the flat triangles of their corners, quadrilaterals as two; nodal values are interpolated

@@ -10,12 +10,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkCommand
 from vtkmodules.vtkIOGeometry import vtkSTLReader
 
-from ..arrays import Array
+from ..arrays import Array, Indices
 from ..errors import ProblemError, SurfaceError
 from ..extensions import load_extensions
 from ..fe import (
@@ -248,7 +247,7 @@ def compute_contact_radius(indenter: IndenterTable) -> float:
     return float(np.sqrt(tool.body.section / np.pi))
 
 
-def _read_stl(file: Path) -> tuple[Array, NDArray[np.int64]]:
+def _read_stl(file: Path) -> tuple[Array, Indices]:
     """Points (n, 3) and faces (m, 3) of an STL file, coincident points merged.
 
     The reader of `anatomy` would load images and graphics into every worker that only solves.

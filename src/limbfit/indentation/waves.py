@@ -21,9 +21,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Indices, Mask
 from ..errors import ProblemError
 from ..fe import Material, Result
 from ..fe.kernel.evaluation_points import EvaluationPoints, evaluate_elastic_at
@@ -68,8 +67,8 @@ class _Regions:
     """The points of several places: of number ``place`` (m,) each; ``A`` and ``N`` see `WavePlace`."""
 
     points: EvaluationPoints
-    nodes: NDArray[np.int64]
-    place: NDArray[np.int64]
+    nodes: Indices
+    place: Indices
     motion: Array
     way: Array
 
@@ -91,7 +90,7 @@ class _Regions:
         motion, way = (np.array([getattr(one, name) for one in places])[number] for name in ("motion", "way"))
         return cls(points, nodes.astype(np.int64), number, motion, way)
 
-    def speeds(self, laws: Laws, steps: Sequence[Array], seconds: Array, turned: NDArray[np.bool_]) -> Array:
+    def speeds(self, laws: Laws, steps: Sequence[Array], seconds: Array, turned: Mask) -> Array:
         """Speeds (k, s) m/s after the ``steps``: displacements (n, 3) of the nodes, mm, since rest.
 
         ``seconds`` (s,) each step took; after those that are ``turned`` the next has no smooth past.
@@ -140,7 +139,7 @@ def sample_disc() -> Array:
     return np.concatenate([np.zeros((1, 3)), *found])
 
 
-def _locate_points(mesh: Mesh, place: WavePlace) -> tuple[NDArray[np.int64], Array]:
+def _locate_points(mesh: Mesh, place: WavePlace) -> tuple[Indices, Array]:
     """Cells and local coordinates of the points of a place's region that are in its tissue."""
     region = mesh.region_names.index(place.tissue)
     motion, way = np.array(place.motion), np.array(place.way)
@@ -197,7 +196,7 @@ def compute_wave_speeds(result: Result, places: Sequence[WavePlace]) -> tuple[Ar
     return speeds, np.stack(slopes, axis=-1)
 
 
-def _find_turns(result: Result, times: Array) -> NDArray[np.bool_]:
+def _find_turns(result: Result, times: Array) -> Mask:
     """At which times (s,) of its states the solver let the stress go on otherwise than before (`Memory`)."""
     kinks = np.concatenate([result.problem.history.kinks, result.problem.turns])
     at_kinks = np.isclose(times[:, None], kinks, rtol=1e-9, atol=0.0).any(axis=1)

@@ -5,24 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from ..anatomy.frame import Frame
 from ..anatomy.surfaces.triangles import Surface, find_half_edges
-from ..arrays import Array
+from ..arrays import Array, Indices
 from ..errors import SurfaceError
 from .rays import LimbProfile
 from .shape import close_by_fans
-
-Ints = NDArray[np.int64]
 
 CLEAR_MM = 0.5  # what is promised
 TARGET_MM = 0.8  # what is aimed at where it is measured
 MAX_ROUNDS = 12
 
 
-def apply_clearance(points: Array, faces: Ints, limb: LimbProfile, outer: Surface, frame: Frame) -> Array:
+def apply_clearance(points: Array, faces: Indices, limb: LimbProfile, outer: Surface, frame: Frame) -> Array:
     """Move the points of a face (limb frame) until it is clear of the limb by ``CLEAR_MM`` or more.
 
     Each stays on its ray and moves outwards only. What is measured are the face's points, middles of edges
@@ -48,7 +45,7 @@ def apply_clearance(points: Array, faces: Ints, limb: LimbProfile, outer: Surfac
     )
 
 
-def _compute_moves(points: Array, faces: Ints, limb: Surface) -> Array:
+def _compute_moves(points: Array, faces: Indices, limb: Surface) -> Array:
     """Compute by how much each point (n,) should move out so that all measured near it is clear, mm."""
     need = np.maximum(TARGET_MM - limb.signed_distance(points), 0.0)
     for corners in ((0, 1), (1, 2), (2, 0), (0, 1, 2)):
@@ -68,7 +65,7 @@ BONE_ROUGHNESS_MM = 0.5  # by which a bone may reach through the face: roughness
 
 def refuse_bones(
     face: Surface,
-    brim: Ints,
+    brim: Indices,
     frame: Frame,
     bones: Mapping[str, Surface],
     *,

@@ -10,17 +10,15 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..anatomy.frame import build_limb_frame
 from ..anatomy.surfaces.surfaces import Anatomy
 from ..anatomy.surfaces.triangles import Surface
-from ..arrays import Array
+from ..arrays import Array, Mask
 from ..errors import SurfaceError
 from .shape import cut_section, measure_section
 
 PLATEAU_MM = 8.0  # of the tibia's top: its mean is the knee centre
-Mask = NDArray[np.bool_]
 LEVELS = ("proximal", "middle", "distal")
 CREST_MM = 12.0  # half the width of the strip over the tibial crest
 CREST_SHARE = (0.15, 0.85)  # of the tibia's length, from its top

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..anatomy.frame import Frame
 from ..anatomy.surfaces.mending import count_turned, open_loops, orient_faces
@@ -19,14 +18,11 @@ from ..anatomy.surfaces.triangles import (
     find_half_edges,
     remove_unused_points,
 )
-from ..arrays import Array
+from ..arrays import Array, Indices
 from ..errors import SurfaceError
 from .clearance import apply_clearance, refuse_bones
 from .rays import Rays, compute_profile
 from .shape import Socket
-
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 MIN_SIZE_RATIO, MAX_SIZE_RATIO = 0.25, 3.0  # of the limb's length, end to end: otherwise another unit
 LOOSE_SHARE = 0.01  # of the faces: pieces that hold less are left out
@@ -164,7 +160,7 @@ def _count_windings(loop: Array, rays: Rays) -> int:
     return round(float(steps.sum()) / (2 * np.pi))
 
 
-def _find_brim(face: Surface, rays: Rays) -> tuple[Ints, bool]:
+def _find_brim(face: Surface, rays: Rays) -> tuple[Indices, bool]:
     """Find the proximal edge, and whether the distal end is open too."""
     loops = open_loops(face)
     around = [loop for loop in loops if _count_windings(face.points[loop], rays)]

@@ -10,20 +10,17 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from ..anatomy.frame import Frame, format_place
 from ..anatomy.surfaces.triangles import Surface
-from ..arrays import Array
+from ..arrays import Array, Indices
 from ..errors import SurfaceError
 from .areas import Area
 from .clearance import apply_clearance
 from .rays import FOLD_MM, LimbProfile, Offsets, compute_profile
 from .shape import Socket
 from .trim import Trim, TrimmedLimb, trim_limb
-
-Ints = NDArray[np.int64]
 
 FLARE_DEGREES = 60.0  # how far the brim turns outwards
 FLARE_ROWS = 3
@@ -65,10 +62,10 @@ class SocketSurface:
     """Triangles on the limb, and how far each point lies below the brim along the limb, mm."""
 
     points: Array
-    faces: Ints
+    faces: Indices
     below_brim: Array
     upwards: Array
-    brim: Ints
+    brim: Indices
 
 
 def rectify_limb(outer: Surface, frame: Frame, recipe: Recipe) -> Socket:
@@ -239,7 +236,7 @@ def _resample_ring(ring: Array, count: int, turn: float) -> tuple[Array, Array]:
     return CubicSpline(length / length[-1], closed, bc_type="periodic")(shares), shares
 
 
-def _join_rings(lower: Array, upper: Array, first: int, second: int) -> Ints:
+def _join_rings(lower: Array, upper: Array, first: int, second: int) -> Indices:
     """Triangles between two rings whose points lie at shares ``lower`` (a,) and ``upper`` (b,) of them.
 
     The points of the rings are numbered from ``first`` and ``second`` on. Seen from inside, where shares grow
@@ -260,7 +257,7 @@ def _join_rings(lower: Array, upper: Array, first: int, second: int) -> Ints:
     return np.array(faces, dtype=np.int64)
 
 
-def _join_all_rings(shares: Sequence[Array]) -> Ints:
+def _join_all_rings(shares: Sequence[Array]) -> Indices:
     """Triangles between rings, the first of which is a point, numbered one ring after the other."""
     starts = np.cumsum([0, *(len(ring) for ring in shares)])
     around = np.arange(len(shares[1]))

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..anatomy.surfaces.mending import open_loops
 from ..anatomy.surfaces.triangles import Surface
-from ..arrays import Array
-
-Ints = NDArray[np.int64]
+from ..arrays import Array, Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +28,9 @@ class Socket:
     """
 
     points: Array
-    faces: Ints
+    faces: Indices
     clear: Array
-    brim: Ints
+    brim: Indices
     open_distal: bool = False
     notes: tuple[str, ...] = ()
 
@@ -78,7 +76,7 @@ def cut_section(surface: Surface, point: ArrayLike, normal: ArrayLike) -> Array:
     rows = np.arange(len(faces))
     a, b, c = (faces[rows, (alone + turn) % 3] for turn in range(3))
 
-    def crossing(start: Ints, end: Ints) -> Array:
+    def crossing(start: Indices, end: Indices) -> Array:
         share = height[start] / (height[start] - height[end])
         return surface.points[start] + share[:, None] * (surface.points[end] - surface.points[start])
 

@@ -6,15 +6,12 @@ from itertools import pairwise
 
 import manifold3d
 import numpy as np
-from numpy.typing import NDArray
 
 from ..anatomy.frame import build_limb_frame
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError
 from .shape import Socket
-
-Ints = NDArray[np.int64]
 
 BRIM_STEPS = 6  # of the half circle between the two sides
 MIN_THICKNESS_SHARE = 0.9  # of the thickness that was asked for

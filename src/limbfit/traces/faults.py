@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from .displacement import BrokenLine
-from .numerics import Array, Bools, average_in_bins, estimate_noise_level, find_resolution, find_runs
+from .numerics import Array, Mask, average_in_bins, estimate_noise_level, find_resolution, find_runs
 from .record import Trace, TraceWarning
 from .touchdown import TouchDown, find_depth_at
 
@@ -63,7 +63,7 @@ def mend_times(trace: Trace) -> tuple[Trace, list[TraceWarning]]:
     ]
 
 
-def _spread_times(time: Array, same: Bools, size: float) -> Array:
+def _spread_times(time: Array, same: Mask, size: float) -> Array:
     """Even times (n,) where an even clock fits the stated ones; else those of each time over its step."""
     index = np.arange(len(time), dtype=float)
     start, step = np.polynomial.polynomial.polyfit(index, time, 1)

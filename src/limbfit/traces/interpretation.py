@@ -29,7 +29,7 @@ from .faults import (
 )
 from .numerics import (
     Array,
-    Bools,
+    Mask,
     average_in_bins,
     estimate_noise,
     estimate_noise_level,
@@ -178,7 +178,7 @@ def _remove_spikes(trace: Trace) -> tuple[Trace, list[TraceWarning]]:
     return trace, warnings
 
 
-def _find_spikes(values: Array) -> Bools:
+def _find_spikes(values: Array) -> Mask:
     """Find the samples (n,) that stick out from the median of their neighbours, one or two in a row."""
     off = values - median_filter(values, 2 * _SPIKE_WIDTH + 1, mode="nearest")
     noise = max(1.4826 * float(np.median(np.abs(off))), estimate_noise_level(values))
@@ -204,7 +204,7 @@ def _remove_steps(trace: Trace, steps: list[tuple[float, float]]) -> Trace:
     return replace(trace, force_N=force)
 
 
-def _find_ends(trace: Trace, line: BrokenLine) -> tuple[Bools, Bools]:
+def _find_ends(trace: Trace, line: BrokenLine) -> tuple[Mask, Mask]:
     """Find samples (n,) before the way in and after the last way out, with the indenter where it began."""
     back = line(trace.time_s) < line.values[0] + _CLEAR_MM
     return back & (trace.time_s < line.peak_s), back & (trace.time_s > _find_release_s(line))

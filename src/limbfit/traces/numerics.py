@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.optimize import minimize_scalar
 
-from ..arrays import Array
+from ..arrays import Array, Indices, Mask
 from ..autoregressive import clip_lag
-
-Bools = NDArray[np.bool_]
 
 _GAP_STEPS = 10.0  # usual steps in time
 _REPEATED_SHARE = 0.75  # of the samples: so many have a value that another one has too
@@ -51,7 +48,7 @@ def split_at_gaps(time: Array, values: Array) -> list[Array]:
     )
 
 
-def find_runs(mask: Bools) -> NDArray[np.int64]:
+def find_runs(mask: Mask) -> Indices:
     """First and one beyond the last (k, 2) of every run of what is true (n,)."""
     return np.flatnonzero(np.diff(np.r_[False, mask, False])).reshape(-1, 2)
 

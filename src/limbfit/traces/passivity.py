@@ -9,7 +9,6 @@ swing, but a person who breathes does.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -120,15 +119,6 @@ def _compute_kink_misfit(x: Array, y: Array, n: Array, delay: float) -> float:
     return max(float(weighted @ weighted - np.sum((q.T @ weighted) ** 2)), 0.0)
 
 
-@dataclass(frozen=True)
-class _ContactPhase:
-    """A phase in contact: bins, and the passive forces that the fit made use of (n, k)."""
-
-    time_s: Array
-    residual_N: Array
-    used: Array
-
-
 def find_swings(
     trace: Trace,
     line: BrokenLine,
@@ -141,15 +131,14 @@ def find_swings(
     parts = _remove_passive_forces(trace, line, touch, rise_N, steps_s)
     if not parts:
         return []
-    time = np.concatenate([part.time_s for part in parts])
-    left = np.concatenate([part.residual_N for part in parts])
+    time, left = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
     per_bin = len(trace.time_s) / _MAX_SWING_BINS if len(trace.time_s) > _MAX_SWING_BINS else 1.0
     noise = sample_noise.compute_mean_sd(max(int(per_bin), 1))
     noise = max(noise, estimate_noise_level(left), 2e-4 * rise_N)
     misfit = float(left @ left) / noise**2
     if misfit < len(left) + _MIN_GAIN:
         return []
-    used, _ = np.linalg.qr(block_diag(*[part.used for part in parts]))
+    used, _ = np.linalg.qr(block_diag(*[forces for _, _, forces in parts]))
     left = left - used @ (used.T @ left)
     misfit = float(left @ left) / noise**2
     best = (0.0, 0.0, 0.0)
@@ -178,8 +167,11 @@ def find_swings(
 
 def _remove_passive_forces(
     trace: Trace, line: BrokenLine, touch: TouchDown, rise_N: float, steps_s: Sequence[float]
-) -> list[_ContactPhase]:
-    """Fit passive forces to each phase in contact, and keep what they leave."""
+) -> list[tuple[Array, Array, Array]]:
+    """Fit passive forces to each phase in contact.
+
+    Returns of each the times of its bins (n,) s, what the forces leave (n,) N, and those in use (n, k).
+    """
     time, force, _ = average_in_bins(trace.time_s, trace.force_N - touch.baseline_N, _MAX_SWING_BINS)
     contact = (force > _CONTACT_SHARE * rise_N) & (time > touch.time_s)
     found = []
@@ -194,7 +186,7 @@ def _remove_passive_forces(
         columns = np.hstack([free, -free, basis])
         weights, _ = nnls(columns, force[inside])
         used = np.hstack([free, basis[:, weights[2 * free.shape[1] :] > 0.0]])
-        found.append(_ContactPhase(time[inside], force[inside] - columns @ weights, used))
+        found.append((time[inside], force[inside] - columns @ weights, used))
     return found
 
 

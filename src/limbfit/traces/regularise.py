@@ -117,8 +117,7 @@ def regularise(
     force = trace.force_N - touch_down.baseline_N
     if ((trace.time_s >= start) & (trace.time_s <= line.peak_s)).sum() < 8:
         raise TraceError("fewer than 8 samples between touch-down and peak", remedy="check the record")
-    corners = select_sampled_corners(find_boundaries(phases), trace.time_s - start)
-    curve = SmoothCurve(trace.time_s - start, force, corners, smoothing, find_holds(corners, phases))
+    curve = SmoothCurve(trace.time_s - start, force, phases, smoothing)
     inside = (trace.time_s >= start) & (trace.time_s <= end)
     time = spread(phases, 1000, knots - start)
     return Regularised(
@@ -148,12 +147,6 @@ def select_sampled_corners(corners: Array, time: Array) -> Array:
     return np.array(kept)
 
 
-def find_holds(corners: Array, phases: Sequence[MotionPhase]) -> tuple[bool, ...]:
-    """True for each part between the corners that is a hold."""
-    middles = (corners[1:] + corners[:-1]) / 2
-    return tuple(any(p.kind == "hold" and p.start_s < middle < p.end_s for p in phases) for middle in middles)
-
-
 @dataclass(frozen=True)
 class _PhaseClock:
     """Time since a part's start as the part counts it: in a hold slower and slower, as relaxation goes."""
@@ -178,16 +171,19 @@ class SmoothCurve:
     """
 
     def __init__(
-        self, time: Array, force: Array, corners: Array, smoothing: float | None, holds: Sequence[bool]
+        self, time: Array, force: Array, phases: Sequence[MotionPhase], smoothing: float | None
     ) -> None:
-        powers = [DENSER if hold else 1.0 for hold in holds]
-        self._clocks = [_PhaseClock(a, b, p) for (a, b), p in zip(pairwise(corners), powers, strict=True)]
+        self._corners = select_sampled_corners(find_boundaries(phases), time)
+        holds = [(phase.start_s, phase.end_s) for phase in phases if phase.kind == "hold"]
+        self._clocks = []
+        for start, end in pairwise(self._corners):
+            is_hold = any(begin < (start + end) / 2 < stop for begin, stop in holds)
+            self._clocks.append(_PhaseClock(start, end, DENSER if is_hold else 1.0))
         parts = [(time >= clock.start_s) & (time <= clock.end_s) for clock in self._clocks]
         self._bins = [
             average_in_bins(clock(time[part]), force[part], _MAX_BINS, clock.power)
             for clock, part in zip(self._clocks, parts)
         ]
-        self._corners = corners
         given = [(smoothing, smoothing)] * len(self._bins)
         self._splines, self._penalties = self._fit_splines([averages for _, averages, _ in self._bins], given)
 
@@ -304,8 +300,7 @@ def regularise_creep(
     knots_N[0] = 0.0
     of_force = find_phases(knots, knots_N)
     moved = trace.displacement_mm - touch_down.displacement_mm
-    parts = select_sampled_corners(find_boundaries(of_force), since)
-    curve = SmoothCurve(since, moved, parts, smoothing, find_holds(parts, of_force))
+    curve = SmoothCurve(since, moved, of_force, smoothing)
     inside = (since >= 0.0) & (since <= end)
     ends = [curve(np.array([phase.start_s, phase.end_s])).tolist() for phase in of_force]
     phases = tuple(replace(phase, start_mm=start, end_mm=end) for phase, (start, end) in zip(of_force, ends))

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Indices, Mask
 from ..errors import TraceError, add_location
 from .formats import TIME
-from .numerics import Array
 from .reading import read_columns
 from .record import check_finite
 
@@ -250,11 +249,11 @@ class SurfaceMotion:
         """The largest component of all."""
         return float(np.nanmax(np.abs(self.moved_mm)))
 
-    def frames(self, which: NDArray[np.bool_]) -> SurfaceMotion:
+    def frames(self, which: Mask) -> SurfaceMotion:
         """Some of the frames (f,)."""
         return SurfaceMotion(self.points, self.time_s[which], self.moved_mm[which])
 
-    def average(self, points: NDArray[np.int64]) -> SurfaceMeans:
+    def average(self, points: Indices) -> SurfaceMeans:
         """Means over at most `MAX_SURFACE_TIMES` spans of time, each of the frames that show the point."""
         spans = np.array_split(np.arange(len(self.time_s)), min(len(self.time_s), MAX_SURFACE_TIMES))
         is_known = np.isfinite(self.moved_mm[:, points])
@@ -278,8 +277,8 @@ class SurfaceMeans:
     ``time_s`` (n,) is its time.
     """
 
-    point: NDArray[np.int64]
-    component: NDArray[np.int64]
+    point: Indices
+    component: Indices
     frames: Array
     time_s: Array
     moved_mm: Array
@@ -336,7 +335,7 @@ def _check_sizes(place: Array, moved: Array, given: str) -> None:
         raise TraceError(what, place=given, remedy="give millimetres")
 
 
-def _find_points(place: Array) -> tuple[Array, NDArray[np.int64]]:
+def _find_points(place: Array) -> tuple[Array, Indices]:
     """The places (k, 3) of rows (r, 3), each once, and which (r,) each row has."""
     whole = np.round(place / _POSITION_TOLERANCE_MM).astype(np.int64)
     _, first, point = np.unique(whole, axis=0, return_index=True, return_inverse=True)

@@ -176,16 +176,12 @@ class OnsetPart:
 
 @dataclass(frozen=True)
 class Onset:
-    """Where the skin is met: means over all onsets that the part allows, and ``sd`` (mm) of the place.
-
-    ``misfit`` is what the best onset leaves, in variances of the noise.
-    """
+    """Where the skin is met: means over all onsets that the part allows, and ``sd`` (mm) of the place."""
 
     place_mm: float
     sd: float
     exponent: float
     baseline_N: float
-    misfit: float
 
 
 def find_onset(
@@ -237,7 +233,7 @@ def _weigh_onsets(part: OnsetPart, whiten: Array, places: Array, zeroed: bool) -
     mean, step = float(along @ places), places[1] - places[0]
     sd = float(np.sqrt(along @ (places - mean) ** 2 + step**2 / 12))
     exponent = float(share.sum(axis=(0, 1)) @ INITIAL_EXPONENTS)
-    return Onset(mean, sd, exponent, float((share * baseline).sum()), least / free)
+    return Onset(mean, sd, exponent, float((share * baseline).sum()))
 
 
 def _build_shapes(part: OnsetPart, places: Array) -> Array:

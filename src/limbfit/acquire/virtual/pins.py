@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Mask
 from ..events import PINS
 
 STROKE_MM = 60.0
@@ -47,7 +46,7 @@ class Motors:
         self.driving[:] = self.position_mm > ARRIVAL_TOLERANCE_MM
         self._target[:], self._speed[:], self._acceleration[:] = 0.0, speed_mm_s, BRAKING
 
-    def find_withdrawn(self) -> NDArray[np.bool_]:
+    def find_withdrawn(self) -> Mask:
         """Withdrawn, and not about to leave."""
         return (self.position_mm < HOME_MM) & ~(self.driving & (self._target > self.position_mm))
 
@@ -78,7 +77,7 @@ class Motors:
         lowest, highest = self.position_mm - PLAY_MM / 2, self.position_mm + PLAY_MM / 2
         self.head_mm = np.minimum(np.maximum(self.head_mm, lowest), highest)
 
-    def find_lagging(self) -> NDArray[np.bool_]:
+    def find_lagging(self) -> Mask:
         """Driven, far from the target, and standing."""
         far = np.abs(self._target - self.position_mm) > 0.05
         return self.driving & far & (np.abs(self.speed_mm_s) < 0.1 * self._speed)

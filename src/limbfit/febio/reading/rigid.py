@@ -13,9 +13,8 @@ from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array, Indices
+from ...arrays import Array, Indices, Mask
 from ...errors import ProblemError
 from ...fe import ELEMENTS, Motion
 from ...fe.kernel.elements import compute_reference_gradients
@@ -291,7 +290,7 @@ def restrict_to_rail(motion: Motion, rail: RigidRail) -> Motion:
     return Motion(motion.times, values, under[:, None] & (np.arange(6) == 2))
 
 
-def has_same_rotation(values: Array, forced: NDArray[np.bool_]) -> bool:
+def has_same_rotation(values: Array, forced: Mask) -> bool:
     """True if FEBio, which adds turns up step by step, and limbfit's one rotation vector agree on a motion.
 
     ``values (n, 6)``, ``forced (n - 1, 6)``: they agree if it turns about one line, or if no given angle

@@ -263,10 +263,6 @@ class RecordNoise:
         """True if anything is measured beside the force."""
         return any(one is not None for one in (self.layers, self.skin, self.waves))
 
-    def compute_force_information(self, force: SiteResponse, parameters: Array) -> Array:
-        """Return the information (p, p) of a record's force."""
-        return compute_information(force, parameters, self.force)
-
     def compute_information(
         self,
         force: SiteResponse,
@@ -282,7 +278,7 @@ class RecordNoise:
         mm on the skin, then speeds, of which there are so many readings.
         """
         layers, points_mm, readings = parts
-        information, waves = self.compute_force_information(force, parameters), layers + 3 * len(points_mm)
+        information, waves = compute_information(force, parameters, self.force), layers + 3 * len(points_mm)
         if self.layers is not None:
             information = information + _sum_information(
                 values[:layers], slopes[:layers], parameters, self.layers

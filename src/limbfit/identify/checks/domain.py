@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -139,18 +139,18 @@ def describe_outside(outside: Mapping[str, Sequence[OutsideRecords] | None]) -> 
 
     The first is about times, the second about all else.
     """
-    times = {name: [row for row in rows or () if row.quantity == TIME] for name, rows in outside.items()}
-    others = {name: [row for row in rows or () if row.quantity != TIME] for name, rows in outside.items()}
-    return [*_describe_worst(times, _describe_times), *_describe_worst(others, _describe_others)]
-
-
-def _describe_worst(outside: Mapping[str, Sequence[OutsideRecords]], describe: Any) -> list[str]:
-    known = {name: rows for name, rows in outside.items() if rows}
-    if not known:
-        return []
-    worst = max(known, key=lambda name: max(map(_compute_excess, known[name])))
-    more = f" ({len(known) - 1} more of {len(outside)} too)" if len(known) > 1 else ""
-    return [f"{worst} {describe(known[worst])}{more}"]
+    found = []
+    for is_time, describe in ((True, _describe_times), (False, _describe_others)):
+        alike = {
+            name: [row for row in rows or () if (row.quantity == TIME) is is_time]
+            for name, rows in outside.items()
+        }
+        known = {name: rows for name, rows in alike.items() if rows}
+        if known:
+            worst = max(known, key=lambda name: max(map(_compute_excess, known[name])))
+            more = f" ({len(known) - 1} more of {len(outside)} too)" if len(known) > 1 else ""
+            found.append(f"{worst} {describe(known[worst])}{more}")
+    return found
 
 
 def _compute_excess(row: OutsideRecords) -> float:

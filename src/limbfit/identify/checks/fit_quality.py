@@ -15,11 +15,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 from scipy.special import chdtrc
 
-from ...arrays import Array
+from ...arrays import Array, Mask
 from ...phases import find_phases
 from ...results.identification import PhaseFit, RecordFit
 
@@ -54,7 +53,7 @@ def assess_fit(
     residual_N: Array,
     peak_N: float,
     covariance: Array,
-    inside: NDArray[np.bool_] | None = None,
+    inside: Mask | None = None,
     refitted_N: Array | None = None,
 ) -> RecordFit:
     """Assess ``residual_N`` (n,), simulated minus measured, with ``covariance`` (n, n) of what may be off.

@@ -244,19 +244,6 @@ def calibrate_with_correction(
     return run.build_result()
 
 
-@dataclass(frozen=True)
-class _CorrectedIterate:
-    """A corrected iterate of a stage, with the cost of the fine forces, and the correction at that point."""
-
-    state: SearchState
-    iterate: Iterate
-    correction: MeshCorrection
-
-    @property
-    def cost(self) -> float:
-        return self.iterate.cost
-
-
 @dataclass
 class _CorrectionLoop:
     """The loop over stages and corrections; ``state`` is that of the inner calibration at its end."""
@@ -287,27 +274,28 @@ class _CorrectionLoop:
         before = 0 if self.state is None else self.state.evaluations
         last = len(self.history)
         settled, is_last = False, stage == len(self.stages) - 1
-        best: _CorrectedIterate | None = None
+        best: tuple[SearchState, MeshCorrection] | None = None
+        least = np.inf  # the cost of the fine forces there
         allowed = self.fidelity.tolerance_percent * (1.0 if is_last else _LOOSENING)
         for _ in range(self.fidelity.rounds):
             loose = not is_last or self.model.correction is None
             inner = self._search(stage, _LOOSENING if loose else 1.0)
             reached = self._correct(stage)
             settled = reached.is_settled(allowed)
-            if best is not None and not reached.reason and not settled and self._cost() > best.cost:
-                self._step_half_way_back(stage, best)
+            if best is not None and not reached.reason and not settled and self._cost() > least:
+                self._step_half_way_back(stage, best[0])
                 reached = self._correct(stage)
             if reached.reason:
                 reason = f"the correction fails: {reached.reason}"
                 break
-            if best is None or self._cost() < best.cost:
+            if self._cost() < least:
                 assert self.state is not None
                 assert self.model.correction is not None
-                best = _CorrectedIterate(self.state, self.history[-1], self.model.correction)
+                best, least = (self.state, self.model.correction), self._cost()
             if settled and not (is_last and loose):
                 break
-        if best is not None and best.cost < self._cost():
-            self._restore(best)
+        if best is not None and least < self._cost():
+            self._restore(*best)
         assert self.state is not None
         end, converged = self.history[-1], inner.converged and settled
         result = replace(
@@ -346,16 +334,16 @@ class _CorrectionLoop:
     def _cost(self) -> float:
         return self.history[-1].cost
 
-    def _restore(self, best: _CorrectedIterate) -> None:
+    def _restore(self, best: SearchState, correction: MeshCorrection) -> None:
         assert self.state is not None
-        self.model.correction = best.correction
-        here = replace(best.iterate, evaluations=self.state.evaluations)
+        self.model.correction = correction
+        here = replace(best.history[-1], evaluations=self.state.evaluations)
         self.history = (*self.history, here)
-        self.state = replace(best.state, history=(here,))
+        self.state = replace(best, history=(here,))
 
-    def _step_half_way_back(self, stage: int, best: _CorrectedIterate) -> None:
+    def _step_half_way_back(self, stage: int, best: SearchState) -> None:
         assert self.state is not None
-        z = 0.5 * (np.array(self.state.z) + np.array(best.state.z))
+        z = 0.5 * (np.array(self.state.z) + np.array(best.z))
         parameters = build_space(self.unknowns, self.stages[stage]).expand(z)
         here = replace(self.history[-1], parameters=tuple(parameters.tolist()))
         self.history = (*self.history[:-1], here)

@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Mask
 from ...errors import ProblemError
 
 Grouping = tuple[int, ...]
@@ -112,7 +111,7 @@ class Unknowns:
         """Return the same unknowns with another start, which is clipped to the bounds."""
         return replace(self, start=np.clip(start, self.lower, self.upper))
 
-    def is_at_bound(self, parameters: Array) -> NDArray[np.bool_]:
+    def is_at_bound(self, parameters: Array) -> Mask:
         """Return (p,) True for each parameter that lies at one of its bounds."""
         low, high = np.log(parameters / self.lower), np.log(self.upper / parameters)
         return np.asarray(np.minimum(low, high) < _BOUND_TOLERANCE_LOG)

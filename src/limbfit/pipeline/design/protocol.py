@@ -23,6 +23,7 @@ from ...identify.checks.design import (
     compute_bounds_information,
     compute_duration_s,
     compute_factors_95,
+    compute_information,
     plan_records,
     sample_tissues,
 )
@@ -269,7 +270,7 @@ def _compute_information(
     assert simulation.jacobian is not None
     parameters, points = np.array(job.parameters), np.array(job.model.skin_points).reshape(-1, 3)
     force = SiteResponse(simulation.force_N, simulation.jacobian)
-    alone = noises.compute_force_information(force, parameters)
+    alone = compute_information(force, parameters, noises.force)
     if not noises.has_secondary:
         return alone, alone
     assert simulation.observed_jacobian is not None
