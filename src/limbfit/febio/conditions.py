@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -107,14 +108,16 @@ def find_step_ends(motions: Iterable[Motion], end: float, settled: float = 0.0) 
     return sorted(found)
 
 
-def format_conditions(name: str, motion: Motion, ends: list[float], curves: CurveList) -> list[list[str]]:
-    """Write the conditions of a rigid body in every step, from its motion in space."""
-    words: list[list[str]] = []
+def list_conditions(
+    name: str, motion: Motion, ends: list[float], curves: CurveList
+) -> list[list[dict[str, Any]]]:
+    """List the conditions of a rigid body in every step, from its motion in space, for the template."""
+    steps: list[list[dict[str, Any]]] = []
     for begin, end in pairwise([0.0, *ends]):
-        times, values, forced = _cut_motion(motion, begin, end)
-        label = name if len(ends) == 1 else f"{name}_{len(words) + 1}"
-        words.append(list(_format_step_conditions(name, label, times, values, forced, curves)))
-    return words
+        label = name if len(ends) == 1 else f"{name}_{len(steps) + 1}"
+        conditions = _list_step_conditions(label, *_cut_motion(motion, begin, end), curves)
+        steps.append([{"body": name, "label": label, **one} for one in conditions])
+    return steps
 
 
 def _cut_motion(motion: Motion, begin: float, end: float) -> tuple[Array, Array, Mask]:
@@ -128,35 +131,23 @@ def _cut_motion(motion: Motion, begin: float, end: float) -> tuple[Array, Array,
     return np.array([begin, *inner, end]), values, motion.at(end)[1]
 
 
-def _format_step_conditions(
-    name: str, label: str, times: Array, values: Array, forced: Mask, curves: CurveList
-) -> Iterator[str]:
+def _list_step_conditions(
+    label: str, times: Array, values: Array, forced: Mask, curves: CurveList
+) -> Iterator[dict[str, Any]]:
     moving = np.asarray(values.any(axis=0))
     free = forced | moving
     if not free.all():
-        held = "".join(f"<R{x}_dof>{int(not free[i])}</R{x}_dof>" for i, x in enumerate(FREEDOMS))
-        yield f'<rigid_bc name="{label}_guide" type="rigid_fixed"><rb>{name}</rb>{held}</rigid_bc>'
+        yield {"kind": "rigid_fixed", "held": dict(zip(FREEDOMS, ~free))}
     on_line = None if forced.any() else find_straight_line(Motion(times - times[0], values))
     if on_line is not None:  # one curve, and its share along each axis
         direction, advance = on_line
         number = curves.add(f"{label}_advance", np.column_stack([times, advance]))
         for i in np.flatnonzero(direction):
-            yield _format_drive(label, name, "rigid_displacement", FREEDOMS[i], number, direction[i])
+            share = float(direction[i])
+            yield {"kind": "rigid_displacement", "freedom": FREEDOMS[i], "curve": number, "factor": share}
         return
     for i in np.flatnonzero(moving):
         turn, letter = i > 2, FREEDOMS[i]
         kind = ("rigid_displacement", "rigid_rotation", "rigid_force", "rigid_moment")[2 * forced[i] + turn]
         number = curves.add(f"{label}_{kind[6:]}_{letter}", np.column_stack([times, values[:, i]]))
-        yield _format_drive(label, name, kind, letter, number, 1.0)
-
-
-def _format_drive(label: str, name: str, kind: str, letter: str, curve: int, factor: float) -> str:
-    force = kind in ("rigid_force", "rigid_moment")
-    tag, dof = (
-        ("rigid_load", f"R{letter}") if force else ("rigid_bc", letter if letter in "xyz" else f"R{letter}")
-    )
-    more = "<load_type>LOAD</load_type>" if force else ""
-    return (
-        f'<{tag} name="{label}_{letter}" type="{kind}"><rb>{name}</rb><dof>{dof}</dof>'
-        f'<value lc="{curve}">{float(factor)!r}</value>{more}<relative>0</relative></{tag}>'
-    )
+        yield {"kind": kind, "freedom": letter, "curve": number, "factor": 1.0}

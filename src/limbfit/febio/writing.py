@@ -12,19 +12,20 @@ Source: FEBio User Manual 4.0, chapter 4, and the section on ``MeshData``; ``FEA
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import escape, quoteattr
+from xml.sax.saxutils import escape
 
 import numpy as np
 from markupsafe import Markup
 
 from ..arrays import Array
 from ..errors import ProblemError
-from ..fe import Indenter, Material, Motion, Problem, StepControl
+from ..fe import Indenter, Motion, Problem, StepControl
 from ..fe.solution.control import schedule_steps
 from ..mesh import Mesh
 from .conditions import (
@@ -32,7 +33,7 @@ from .conditions import (
     FRAME_BODY,
     CurveList,
     find_step_ends,
-    format_conditions,
+    list_conditions,
 )
 from .meshes import (
     FRONT,
@@ -52,7 +53,7 @@ from .penalty import compute_explicit_penalty, compute_mean_stiffness
 from .preparation import PRESTRAIN_S, Preparation, prepare_problem
 from .reading.materials import ACTIVE, FIBRE, GRADIENT, MIXTURE, PRESTRAINED, RELAXED
 from .reading.model import Contact
-from .rendering import find_across, format_row, write_template
+from .rendering import write_template
 
 REST = Motion(np.array([0.0, 1.0]), np.zeros((2, 6)))
 PRESSURE_MODELS = {0: "default", 1: "NIKE3D", 2: "Abaqus"}
@@ -215,18 +216,17 @@ def _describe_file(
     """
     curves, settled = CurveList(), Preparation.from_problem(problem).settling_s
     ends = find_step_ends([body.motion for body in bodies], float(prepared.history.times[-1]), settled)
-    rigid = [format_conditions(body.name, body.motion, ends, curves) for body in bodies]
+    rigid = [list_conditions(body.name, body.motion, ends, curves) for body in bodies]
     steps = [_find_step_size(problem, settled, *span) for span in pairwise([0.0, *ends])]
     for k, step in enumerate(steps):
-        step["conditions"] = [Markup(line) for body in rigid for line in body[k]]
+        step["conditions"] = [one for body in rigid for one in body[k]]
     meshes = {body.name: body.tool for body in bodies}
     centres = {body.name: body.centre for body in bodies}
     everywhere = steps[0]["conditions"] if len(steps) == 1 else []
     if any(body.rail is not None for body in bodies):
         meshes[FRAME_BODY] = build_frame_mesh(bodies)
         centres[FRAME_BODY] = meshes[FRAME_BODY].points[0]
-        held = format_conditions(FRAME_BODY, REST, ends[-1:], curves)[0]
-        everywhere = [*everywhere, *map(Markup, held)]
+        everywhere = [*everywhere, *list_conditions(FRAME_BODY, REST, ends[-1:], curves)[0]]
     remarks = (f"limbfit: {settings.title}; mm, N, s, MPa", *describe_differences(problem, settings))
     history, axes, prestrains = prepared.history, _find_fibre_directions(problem), _find_prestrains(problem)
     return {
@@ -246,7 +246,7 @@ def _describe_file(
         "quadrature": QUADRATURE[problem.formulation.name],
         "fibre_maps": {name: own for name, own in axes.items() if len(own) > 1},
         "prestrain_maps": {name: own for name, own in prestrains.items() if len(own) > 1},
-        "prestrain_names": {name: _name_prestrain_map(name) for name in prestrains},
+        "prestrain_names": {name: re.sub(r"\W", "_", f"prestrain of {name}") for name in prestrains},
         "fixed_set": FIXED_SET,
         "frame_body": FRAME_BODY,
         "force_file": settings.force_file,
@@ -258,7 +258,10 @@ def _describe_file(
             curves.add(f"pressure_{i}", np.column_stack([one.times, one.values]))
             for i, one in enumerate(prepared.pressures, 1)
         ],
-        "materials": [Markup(line) for line in _format_materials(prepared, curves, settled)],
+        "materials": list(_describe_materials(prepared, curves, settled)),
+        "kinds": {"fibre": FIBRE, "relaxed": RELAXED, "active": ACTIVE, "prestrained": PRESTRAINED},
+        "mixture": MIXTURE,
+        "gradient": GRADIENT,
         "curves": curves.all,
     }
 
@@ -284,24 +287,35 @@ def _find_must_points(problem: Problem, settings: FebSettings) -> Array:
     return np.column_stack([times, largest])
 
 
-def _format_materials(problem: Problem, curves: CurveList, settled: float) -> Iterator[str]:
-    """Write the tissues, with the curves of their contraction and of their pre-strain."""
+def _describe_materials(problem: Problem, curves: CurveList, settled: float) -> Iterator[dict[str, Any]]:
+    """Describe the tissues, with the numbers of the curves of their contraction and of their pre-strain.
+
+    Raises `ProblemError` for more terms than FEBio takes.
+    """
     axes, strained, course = _find_fibre_directions(problem), _find_prestrains(problem), 0
     if problem.activation is not None:
-        course = curves.add(
-            "activation", np.column_stack([problem.activation.times, problem.activation.shares])
-        )
+        shares = np.column_stack([problem.activation.times, problem.activation.shares])
+        course = curves.add("activation", shares)
     ramp = curves.add("prestrain", np.array([[0.0, 0.0], [PRESTRAIN_S, 1.0]])) if settled else 0
-    for i, name in enumerate(problem.mesh.region_names, 1):
-        axis = prestrain = ""
-        if name in axes and len(axes[name]) == 1:
-            axis = f'<mat_axis type="vector">{_format_axes(axes[name][0])}</mat_axis>'
-        if name in strained:
-            F0 = f"<F0>{format_row(strained[name][0].ravel())}</F0>"
-            if len(strained[name]) > 1:
-                F0 = f'<F0 type="map">{_name_prestrain_map(name)}</F0>'
-            prestrain = f'<prestrain type="{GRADIENT}"><ramp lc="{ramp}">1</ramp>{F0}</prestrain>'
-        yield from _format_material(i, name, problem.materials[name], axis, course, prestrain)
+    for name in problem.mesh.region_names:
+        table = problem.materials[name].table()
+        prony = [(g, tau) for g, tau in table.prony if g != 0.0]
+        if max(len(prony), len(table.terms)) > MAX_TERMS:
+            raise ProblemError(f"tissue {name!r} has more than {MAX_TERMS} terms, which FEBio does not take")
+        elastic = ["Ogden", FIBRE] if table.fibre[0] > 0.0 else ["Ogden"]
+        solids = [*([RELAXED] if prony else elastic), *([ACTIVE] if table.active > 0.0 else [])]
+        yield {
+            "name": name,
+            "table": table,
+            "prony": prony,
+            "elastic": elastic,
+            "solids": solids,
+            "course": course,
+            "ramp": ramp,
+            "axes": axes.get(name, ()),
+            "prestrains": strained.get(name, ()),
+            "pressure_model": PRESSURE_MODELS[table.volumetric],
+        }
 
 
 def _compute_largest_step(problem: Problem) -> float:
@@ -318,53 +332,6 @@ def _compute_largest_step(problem: Problem) -> float:
 def _divide_evenly(span: float, size: float) -> float:
     """Return a whole fraction of a span of time, not above ``size``, s."""
     return span / float(np.ceil(span / size))
-
-
-def _format_material(
-    number: int, name: str, material: Material, axis: str = "", course: int = 0, prestrain: str = ""
-) -> Iterator[str]:
-    """Write a tissue with its axis of fibres.
-
-    Raises `ProblemError` for more terms than FEBio takes.
-
-    Parameters
-    ----------
-    course : number of the load curve of its contraction.
-    prestrain : its pre-strain, as it is written.
-    """
-    table = material.table()
-    prony = [(float(g), float(tau)) for g, tau in table.prony if g != 0.0]
-    if max(len(prony), len(table.terms)) > MAX_TERMS:
-        raise ProblemError(f"tissue {name!r} has more than {MAX_TERMS} terms, which FEBio does not take")
-    terms = "".join(
-        f"<c{i}>{float(c)!r}</c{i}><m{i}>{float(m)!r}</m{i}>" for i, (c, m) in enumerate(table.terms, 1)
-    )
-    solids = [("Ogden", terms)]
-    if table.fibre[0] > 0.0:
-        k1, k2 = map(float, table.fibre)
-        solids.append((FIBRE, f"<ksi>{k1!r}</ksi><alpha>{k2!r}</alpha><beta>2</beta>"))
-    if prony:
-        kind, content = _combine_solids(solids)
-        terms = "".join(f"<g{i}>{g!r}</g{i}><t{i}>{tau!r}</t{i}>" for i, (g, tau) in enumerate(prony, 1))
-        solids = [(RELAXED, f'<g0>1</g0>{terms}<elastic type="{kind}"><k>0</k>{content}</elastic>')]
-    if table.active > 0.0:
-        active = f'<smax>{float(table.active)!r}</smax><activation lc="{course}">1</activation>'
-        solids.append((ACTIVE, active))
-    kind, content = _combine_solids(solids)
-    if prestrain:
-        kind, content = PRESTRAINED, f'<elastic type="{kind}">{content}</elastic>{prestrain}'
-    shared = (
-        f"<k>{float(table.kappa)!r}</k><pressure_model>{PRESSURE_MODELS[table.volumetric]}</pressure_model>"
-    )
-    head = f'<material id="{number}" name={quoteattr(name)} type="{kind}">'
-    yield f"{head}{axis}{shared}{content}</material>"
-
-
-def _combine_solids(solids: list[tuple[str, str]]) -> tuple[str, str]:
-    """Return kind and content of one solid, or of a mixture of several."""
-    if len(solids) == 1:
-        return solids[0]
-    return MIXTURE, "".join(f'<solid type="{kind}">{content}</solid>' for kind, content in solids)
 
 
 def _find_prestrains(problem: Problem) -> dict[str, Array]:
@@ -389,17 +356,7 @@ def _divide_by_region(mesh: Mesh, values: Any, shape: tuple[int, ...]) -> dict[s
     return {name: own[:1] if (own == own[:1]).all() else own for name, own in found.items()}
 
 
-def _name_prestrain_map(name: str) -> str:
-    """Return the name of a tissue's map of pre-strains."""
-    return f"prestrain_of_{''.join(c if c.isalnum() else '_' for c in name)}"
-
-
 def _find_fibre_directions(problem: Problem) -> dict[str, Array]:
     """Return the fibre directions of each region that has some: (1, 3), or one for each of its cells."""
     found = {} if problem.fibres is None else _divide_by_region(problem.mesh, problem.fibres, (3,))
     return {name: own for name, own in found.items() if problem.materials[name].table().has_fibres}
-
-
-def _format_axes(direction: Array) -> str:
-    """Write the first axis, and a vector that spans a plane with it."""
-    return f"<a>{format_row(direction)}</a><d>{format_row(find_across(direction))}</d>"
