@@ -17,26 +17,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from ..errors import InputError, RunError
-from .events import PINS, RATE_HZ, Hold, Move, Sample, Stop
-from .line_protocol import (
-    DEVICE_LINE,
-    VERSION,
-    Accepted,
-    Bye,
-    Command,
-    Declined,
-    Decoder,
-    Encoder,
-    Heartbeat,
-    Hello,
-    Identity,
-    LimitTripped,
-    OutOfReach,
-    Refusals,
-    Report,
-    derive_salt,
-    parse_report,
-)
+from . import line_protocol as wire
+from .events import PINS, RATE_HZ, Hold, Move, Stop
 
 DEFAULT_PORT = 7714
 DEFAULT_ADDRESS = f"tcp://127.0.0.1:{DEFAULT_PORT}"
@@ -178,7 +160,7 @@ def connect(address: str, timeout_s: float = 5.0) -> Link:
 
 @dataclass
 class _PendingCommand:
-    command: Command
+    command: wire.Command
     due: float
     attempts: int = 1
 
@@ -198,21 +180,21 @@ class LineDevice:
 
     def __init__(self, link: Link) -> None:
         self._link, self._nonce = link, secrets.token_hex(8)
-        self._encoder = Encoder(first=0)
-        self._decoder = Decoder(DEVICE_LINE, numbered=False)
+        self._encoder = wire.Encoder(first=0)
+        self._decoder = wire.Decoder(wire.DEVICE_LINE, numbered=False)
         self._pending: dict[int, _PendingCommand] = {}
         self.identity = self._greet()
         self._answer_time_s = PACED_ANSWER_S if self.identity.clock == "paced" else ANSWER_S
 
     @property
-    def refused(self) -> Refusals:
+    def refused(self) -> wire.Refusals:
         return self._decoder.refused
 
-    def _greet(self) -> Identity:
+    def _greet(self) -> wire.Identity:
         end = time.monotonic() + GREETING_S
         try:
             while time.monotonic() < end:
-                self._link.write(self._encoder.encode(Hello(VERSION, self._nonce).body)[1])
+                self._link.write(self._encoder.encode(wire.Hello(wire.VERSION, self._nonce).body)[1])
                 self._link.wait(GREETING_INTERVAL_S)
                 if identity := self._find_identity(self._link.read()):
                     return identity
@@ -226,20 +208,20 @@ class LineDevice:
             f"no greeting from the device within {GREETING_S:g} s; does it speak docs/device-protocol.md?"
         )
 
-    def _find_identity(self, data: bytes) -> Identity | None:
+    def _find_identity(self, data: bytes) -> wire.Identity | None:
         """Who the device is, once it has said so; from then on lines are numbered and salted."""
         for line in self._decoder.feed(data):
-            report = parse_report(line.body, line.number)
-            if isinstance(report, Identity):
+            report = wire.parse_report(line.body, line.number)
+            if isinstance(report, wire.Identity):
                 _check_identity(report)
-                salt = derive_salt(self._nonce, report.nonce)
-                self._encoder = Encoder(salt)
+                salt = wire.derive_salt(self._nonce, report.nonce)
+                self._encoder = wire.Encoder(salt)
                 self._decoder.restart(salt)
                 return report
             self.refused.unknown += 1
         return None
 
-    def send(self, command: Command, now: float) -> None:
+    def send(self, command: wire.Command, now: float) -> None:
         """Give a command; one that needs an answer is remembered until it comes."""
         match command:  # what a newer command makes void: the older ones for its pin; a stop, all
             case Stop():
@@ -250,24 +232,24 @@ class LineDevice:
                         del self._pending[older]
         self._write(command, now, attempts=1)
 
-    def _write(self, command: Command, now: float, attempts: int) -> None:
+    def _write(self, command: wire.Command, now: float, attempts: int) -> None:
         number, line = self._encoder.encode(command.body)
-        if not isinstance(command, (Heartbeat, Bye)):
+        if not isinstance(command, (wire.Heartbeat, wire.Bye)):
             self._pending[number] = _PendingCommand(command, now + self._answer_time_s, attempts)
         self._link.write(line)
 
-    def receive(self, timeout_s: float = 0.0) -> list[Sample | Declined | LimitTripped | OutOfReach]:
+    def receive(self, timeout_s: float = 0.0) -> list[wire.Notice]:
         """Wait for the device for at most so long; what it says that concerns the session, in order."""
         self._link.wait(timeout_s)
-        found: list[Sample | Declined | LimitTripped | OutOfReach] = []
+        found: list[wire.Notice] = []
         for line in self._decoder.feed(self._link.read()):
-            report: Report | None = parse_report(line.body, line.number)
+            report: wire.Report | None = wire.parse_report(line.body, line.number)
             match report:
-                case None | Identity():
+                case None | wire.Identity():
                     self.refused.unknown += 1
-                case Accepted(number=number):
+                case wire.Accepted(number=number):
                     self._pending.pop(number, None)
-                case Declined(number=number):
+                case wire.Declined(number=number):
                     if self._pending.pop(number, None) is not None:
                         found.append(report)
                 case _:
@@ -291,10 +273,10 @@ class LineDevice:
         self._link.close()
 
 
-def _check_identity(identity: Identity) -> None:
-    if identity.version != VERSION:
+def _check_identity(identity: wire.Identity) -> None:
+    if identity.version != wire.VERSION:
         raise RunError(
-            f"the device speaks version {identity.version} of the protocol, limbfit {VERSION}; "
+            f"the device speaks version {identity.version} of the protocol, limbfit {wire.VERSION}; "
             "see docs/device-protocol.md"
         )
     if (identity.pins, identity.rate_hz) != (PINS, RATE_HZ):

@@ -278,7 +278,8 @@ class OutOfReach(Message):
 
 
 Command = Hello | SetLimits | NoteSite | NotePhase | Heartbeat | Bye | Move | Hold | Stop | Fence
-Report = Identity | Accepted | Declined | LimitTripped | OutOfReach | Sample
+Notice = Sample | Declined | LimitTripped | OutOfReach  # what concerns a session
+Report = Identity | Accepted | Notice
 _COMMANDS: dict[str, Any] = {kind.verb: kind for kind in get_args(Command)}
 _REPORTS: dict[str, Any] = {kind.verb: kind for kind in get_args(Report) if kind is not Sample}
 

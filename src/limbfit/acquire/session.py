@@ -18,6 +18,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from ..errors import RunError
+from . import line_protocol as wire
 from .device import LineDevice
 from .events import (
     PERIOD_US,
@@ -32,16 +33,6 @@ from .events import (
     Signal,
     Stop,
     to_thousandths,
-)
-from .line_protocol import (
-    Bye,
-    Declined,
-    Heartbeat,
-    LimitTripped,
-    NotePhase,
-    NoteSite,
-    OutOfReach,
-    SetLimits,
 )
 from .protocol import Phase, Protocol
 from .recording import Recorder
@@ -136,16 +127,14 @@ class Session:
         settings, identity = self.settings, self.device.identity
         force, clamp = to_thousandths(settings.force_limit_N), to_thousandths(settings.clamp_limit_N)
         speed, watchdog = to_thousandths(settings.speed_limit_mm_s), max(round(settings.watchdog_ms), 1)
-        limits = SetLimits(settings.pin, force, clamp, identity.stroke_um, speed, watchdog)
+        limits = wire.SetLimits(settings.pin, force, clamp, identity.stroke_um, speed, watchdog)
         self._last_fresh_s = now + FIRST_SAMPLE_S
         with self._guard_link(now):
             self.device.send(limits, now)
-            self.device.send(NoteSite(self._site), now)
+            self.device.send(wire.NoteSite(self._site), now)
         self.handle(Signal.BEGIN, now)
 
-    def handle_reports(
-        self, reports: list[Sample | Declined | LimitTripped | OutOfReach], now: float
-    ) -> None:
+    def handle_reports(self, reports: list[wire.Notice], now: float) -> None:
         """Pass what the device said on to the protocol, the record and the counts."""
         newest = None
         for report in reports:
@@ -153,22 +142,22 @@ class Session:
                 case Sample():
                     newest = report
                     self._handle_sample(report, now)
-                case Declined(code=code):
+                case wire.Declined(code=code):
                     self._record("declined", now, code=code)
                     if not self.protocol.is_over and self.protocol.phase is not Phase.STOPPING:
                         self.handle(Abort(f"the device declined a command: {code}{_explain_code(code)}"), now)
-                case LimitTripped(code=code, pin=pin):
+                case wire.LimitTripped(code=code, pin=pin):
                     self._record("fault", now, code=code, pin=pin)
                     where = f", pin {pin}" if pin else ""
                     self.handle(
                         Abort(f"the device stopped by itself: {code}{where}{_explain_code(code)}"), now
                     )
-                case OutOfReach(pins=pins):
+                case wire.OutOfReach(pins=pins):
                     self.unreachable = tuple(k + 1 for k in range(pins.bit_length()) if pins >> k & 1)
                     self._record("unreachable", now, pins=list(self.unreachable))
         if newest is not None:
             with self._guard_link(now):
-                self.device.send(Heartbeat(newest.number), now)
+                self.device.send(wire.Heartbeat(newest.number), now)
 
     def handle(self, event: Event, now: float) -> None:
         """Give an event to the protocol, and its actions to the device."""
@@ -188,10 +177,6 @@ class Session:
         with self._guard_link(now):
             if reason := self.device.resend(now):
                 self.handle(Abort(reason), now)
-
-    def lose_link(self, reason: str, now: float) -> None:
-        """End the session because the wire is gone."""
-        self.handle(LinkLost(reason), now)
 
     # -- out
 
@@ -233,7 +218,7 @@ class Session:
         self._record("phase", now, **facts)
         if not protocol.is_over:
             with self._guard_link(now):
-                self.device.send(NotePhase(phase), now)
+                self.device.send(wire.NotePhase(phase), now)
         if self.listener is not None:
             self.listener(PhaseUpdate(phase, now, protocol.reason, protocol.cycle))
 
@@ -259,7 +244,7 @@ class Session:
         try:
             yield
         except RunError as error:
-            self.lose_link(str(error), now)
+            self.handle(LinkLost(str(error)), now)
 
 
 def prioritise() -> str:
@@ -296,7 +281,7 @@ def run_session(session: Session, operator: SimpleQueue[Event]) -> Protocol:
         gc.enable()
         sys.setswitchinterval(interval)
         with suppress(RunError):
-            session.device.send(Bye(), 0.0)
+            session.device.send(wire.Bye(), 0.0)
         session.device.close()
     return session.protocol
 
@@ -311,7 +296,7 @@ def _run_loop(session: Session, operator: SimpleQueue[Event]) -> None:
         try:
             reports = device.receive(LOOP_TIMEOUT_S)
         except RunError as error:
-            session.lose_link(str(error), now)
+            session.handle(LinkLost(str(error)), now)
             return
         wall = time.monotonic()
         if not paced:
@@ -324,7 +309,7 @@ def _run_loop(session: Session, operator: SimpleQueue[Event]) -> None:
                 now = max(now, max(times) - origin)
             session.handle_reports(reports, now)
         elif paced and wall - heard > PACED_SILENCE_S:
-            session.lose_link(f"the device has been silent for {PACED_SILENCE_S:g} s", now)
+            session.handle(LinkLost(f"the device has been silent for {PACED_SILENCE_S:g} s"), now)
             return
         with suppress(Empty):
             while True:

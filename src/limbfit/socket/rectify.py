@@ -27,9 +27,8 @@ FLARE_ROWS = 3
 MIN_RING_POINTS = 6
 DISTAL_SHARE = 1.0  # of the end's radius: over what height the clearance at the distal end fades out
 MATCHING_ROUNDS, VOLUME_SHARE = 5, 1e-3  # of finding the reduction that leaves a volume
-MAX_CLEARANCE_SHARE = (
-    0.75  # of that height: the largest clearance, so that no part of the face moves past another
-)
+# Of that height: the largest clearance, so that no part of the face moves past another.
+MAX_CLEARANCE_SHARE = 0.75
 
 
 @dataclass(frozen=True)

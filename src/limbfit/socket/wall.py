@@ -17,9 +17,8 @@ BRIM_STEPS = 6  # of the half circle between the two sides
 MIN_THICKNESS_SHARE = 0.9  # of the thickness that was asked for
 ADAPTER_EDGES = 96  # edges of the adapter's cylinder
 SLIVER_MM = 0.005  # what is shorter where adapter and wall meet would collapse in an STL file
-START_BEHIND_MM = (
-    10 * SLIVER_MM
-)  # the face, which may have moved by that much: where measuring its wall begins
+# Behind the face, which may have moved by that much: where measuring its wall begins.
+START_BEHIND_MM = 10 * SLIVER_MM
 
 
 def build_wall(

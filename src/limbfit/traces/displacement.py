@@ -19,9 +19,8 @@ from .numerics import (
 )
 
 _MAX_CORNERS = 41
-_STEP_SHARE = (
-    0.7  # of a step in which the displacement comes: half of one is rounded, and corners are off too
-)
+# Of a step in which the displacement comes: half of one is rounded, and corners are off too.
+_STEP_SHARE = 0.7
 
 
 @dataclass(frozen=True)

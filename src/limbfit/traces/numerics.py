@@ -14,9 +14,8 @@ from ..autoregressive import clip_lag
 _GAP_STEPS = 10.0  # usual steps in time
 _REPEATED_SHARE = 0.75  # of the samples: so many have a value that another one has too
 _REST_SHARE = 0.2  # of the changes: so many come after two samples alike
-_MAX_PIECES = (
-    10  # of a cubic spline along the way in: follows any onset, and no noise faster than a tenth of it
-)
+# Of a cubic spline along the way in: follows any onset, and no noise faster than a tenth of it.
+_MAX_PIECES = 10
 _KNOT_POWER = 2.0  # power by which they crowd at its start, where an onset bends most
 _MIN_SAMPLES = 8  # samples
 
@@ -41,11 +40,9 @@ def find_resolution(values: Array) -> float:
 def split_at_gaps(time: Array, values: Array) -> list[Array]:
     """Values (n,) at times (n,) in parts without gaps of more than ten usual steps between them."""
     steps = np.diff(time)
-    return (
-        np.split(values, np.flatnonzero(steps > _GAP_STEPS * np.median(steps)) + 1)
-        if len(steps)
-        else [values]
-    )
+    if not len(steps):
+        return [values]
+    return np.split(values, np.flatnonzero(steps > _GAP_STEPS * np.median(steps)) + 1)
 
 
 def find_runs(mask: Mask) -> Indices:

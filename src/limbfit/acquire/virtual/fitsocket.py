@@ -12,28 +12,8 @@ from collections import deque
 
 import numpy as np
 
+from .. import line_protocol as wire
 from ..events import PINS, RATE_HZ, Fence, Flags, Hold, Move, Sample, Stop
-from ..line_protocol import (
-    HOST_LINE,
-    VERSION,
-    Accepted,
-    Bye,
-    Command,
-    Declined,
-    Decoder,
-    Encoder,
-    Heartbeat,
-    Hello,
-    Identity,
-    LimitTripped,
-    NotePhase,
-    NoteSite,
-    OutOfReach,
-    SetLimits,
-    derive_salt,
-    format_sample,
-    parse_command,
-)
 from ..safety import FROZEN_S, FROZEN_SAMPLES, Guard, SafetyLimits
 from .faults import Fault, FaultClock
 from .limb import VirtualLimb
@@ -92,8 +72,8 @@ class VirtualFitSocket:
 
     def connect(self) -> None:
         """Begin with a new host."""
-        self._decoder = Decoder(HOST_LINE, numbered=False)
-        self._encoder: Encoder | None = None
+        self._decoder = wire.Decoder(wire.HOST_LINE, numbered=False)
+        self._encoder: wire.Encoder | None = None
         self.host_has_left = False
 
     @property
@@ -121,43 +101,39 @@ class VirtualFitSocket:
             return b""
         out = b""
         for line in self._decoder.feed(data):
-            command = parse_command(line.body)
+            command = wire.parse_command(line.body)
             if command is None:
                 self._decoder.refused.unknown += 1
                 continue
             out += self._handle_command(command, line.number)
         return self._apply_faults(out)
 
-    def _handle_command(self, command: Command, number: int) -> bytes:
-        if isinstance(command, Hello):
-            return (
-                self._greet(command)
-                if self._encoder is None
-                else self._encode(Declined(number, "greeted").body)
-            )
+    def _handle_command(self, command: wire.Command, number: int) -> bytes:
         if self._encoder is None:
+            if isinstance(command, wire.Hello):
+                return self._greet(command)
             self._decoder.refused.unknown += 1
             return b""
         match command:
-            case Heartbeat():
+            case wire.Heartbeat():
                 self._acknowledge(command.number)
                 return b""
-            case Bye():
+            case wire.Bye():
                 self._end_session()
                 self.host_has_left = True
                 return b""
-        code = self._execute(command)
-        return self._encode(Declined(number, code).body if code else Accepted(number).body)
+        code = "greeted" if isinstance(command, wire.Hello) else self._execute(command)
+        return self._encode(wire.Declined(number, code).body if code else wire.Accepted(number).body)
 
-    def _greet(self, hello: Hello) -> bytes:
-        if hello.version != VERSION:
+    def _greet(self, hello: wire.Hello) -> bytes:
+        if hello.version != wire.VERSION:
             self._decoder.refused.unknown += 1
             return b""
         if self.is_home and not self.faults.on("button"):
             self.stopped, self._given_up = "", False
         sensors = self.sensors
-        identity = Identity(
-            VERSION,
+        identity = wire.Identity(
+            wire.VERSION,
             secrets.token_hex(8),
             PINS,
             RATE_HZ,
@@ -169,20 +145,20 @@ class VirtualFitSocket:
             self._serial,
             "2000-01-01",
         )
-        line = Encoder(first=0).encode(identity.body)[1]
-        salt = derive_salt(hello.nonce, identity.nonce)
-        self._encoder = Encoder(salt)
+        line = wire.Encoder(first=0).encode(identity.body)[1]
+        salt = wire.derive_salt(hello.nonce, identity.nonce)
+        self._encoder = wire.Encoder(salt)
         self._decoder.restart(salt)
         return line
 
-    def _execute(self, command: Command) -> str:
+    def _execute(self, command: wire.Command) -> str:
         """Carry out a command; return why not, in a word, or an empty text."""
         match command:
-            case SetLimits():
+            case wire.SetLimits():
                 return self._arm(command)
-            case NoteSite(name=site):
+            case wire.NoteSite(name=site):
                 return "" if self.limb.place_site(site, self._test_pin) else "unknown-site"
-            case NotePhase(name=phase):
+            case wire.NotePhase(name=phase):
                 self.faults.enter(phase)
             case Stop():
                 self._stop("asked")
@@ -198,7 +174,7 @@ class VirtualFitSocket:
 
     _test_pin = 1
 
-    def _arm(self, limits: SetLimits) -> str:
+    def _arm(self, limits: wire.SetLimits) -> str:
         if self.is_armed:
             return "armed"
         if self.stopped:
@@ -271,7 +247,7 @@ class VirtualFitSocket:
         out = self._check_limits(sample, powered)
         out += self._check_home()
         if self.is_armed and self.time_us // STEP_US % STEPS_PER_SAMPLE == 0 and self._encoder is not None:
-            number, line = self._encoder.encode(format_sample(sample))
+            number, line = self._encoder.encode(wire.format_sample(sample))
             self._sent.append((number, self.time_us))
             out += line
         return self._apply_faults(out)
@@ -319,7 +295,7 @@ class VirtualFitSocket:
         if not code:
             return b""
         self._stop(code)
-        return self._encode(LimitTripped(code, pin).body)
+        return self._encode(wire.LimitTripped(code, pin).body)
 
     def _stop(self, code: str) -> None:
         if not self.stopped:
@@ -339,7 +315,7 @@ class VirtualFitSocket:
             return b""
         self._given_up = True
         pins = sum(1 << int(k) for k in np.flatnonzero(~self.motors.find_withdrawn()))
-        return self._encode(OutOfReach(pins).body)
+        return self._encode(wire.OutOfReach(pins).body)
 
     # -- what goes wrong
 

@@ -176,54 +176,47 @@ def choose_design(
         raise CalibrationError(f"{size} sites are wanted of {len(groups)}")
     number = comb(len(groups), size) * max(prod([max(map(len, groups))] * size), 1)
     infos = np.stack([c.information for c in candidates])
+
+    def cost(chosen: Sequence[int]) -> float:
+        information = prior + infos[list(chosen)].sum(axis=0)
+        if criterion == "A":
+            return float(np.trace(np.linalg.inv(information)))
+        return -float(np.linalg.slogdet(information)[1])
+
     if number <= MAX_EXHAUSTIVE_CHOICES:
         choices = (chosen for picked in combinations(groups, size) for chosen in product(*picked))
-        best = min(choices, key=lambda chosen: _compute_cost(infos, chosen, prior, criterion))
-        return evaluate_design(candidates, best, prior)
+        return evaluate_design(candidates, min(choices, key=cost), prior)
     rng = np.random.default_rng(seed)
-    starts = [_choose_greedily(infos, groups, size, prior, criterion)]
+    starts = [_choose_greedily(groups, size, cost)]
     for _ in range(_RESTARTS):
         picked = rng.choice(len(groups), size, replace=False)
         starts.append([int(rng.choice(groups[g])) for g in picked])
-    ends = [_improve_by_exchange(infos, groups, start, prior, criterion) for start in starts]
-    end = min(ends, key=lambda chosen: _compute_cost(infos, chosen, prior, criterion))
-    found = evaluate_design(candidates, sorted(end), prior)
-    return Design(found.chosen, found.covariance, found.log_det, exhaustive=False)
+    end = min((_improve_by_exchange(groups, start, cost) for start in starts), key=cost)
+    return replace(evaluate_design(candidates, sorted(end), prior), exhaustive=False)
 
 
-def _compute_cost(infos: Array, chosen: Sequence[int], prior: Array, criterion: Criterion) -> float:
-    information = prior + infos[list(chosen)].sum(axis=0)
-    if criterion == "A":
-        return float(np.trace(np.linalg.inv(information)))
-    return -float(np.linalg.slogdet(information)[1])
-
-
-def _choose_greedily(
-    infos: Array, groups: Sequence[Sequence[int]], size: int, prior: Array, criterion: Criterion
-) -> list[int]:
+def _choose_greedily(groups: Sequence[Sequence[int]], size: int, cost: Cost) -> list[int]:
     chosen: list[int] = []
     for _ in range(size):
         free = [i for group in groups if not set(group) & set(chosen) for i in group]
-        chosen.append(min(free, key=lambda i: _compute_cost(infos, [*chosen, i], prior, criterion)))
+        chosen.append(min(free, key=lambda i: cost([*chosen, i])))
     return chosen
 
 
-def _improve_by_exchange(
-    infos: Array, groups: Sequence[Sequence[int]], start: Sequence[int], prior: Array, criterion: Criterion
-) -> list[int]:
+def _improve_by_exchange(groups: Sequence[Sequence[int]], start: Sequence[int], cost: Cost) -> list[int]:
     """Return the choice after the best exchange of one candidate, repeated until no exchange helps."""
-    chosen, cost = list(start), _compute_cost(infos, start, prior, criterion)
+    chosen, least = list(start), cost(start)
     while True:
         trials = []
         for at in range(len(chosen)):
             rest = chosen[:at] + chosen[at + 1 :]
             free = [i for group in groups if not set(group) & set(rest) for i in group if i not in chosen]
             trials += [[*rest, i] for i in free]
-        best = min(trials, key=lambda trial: _compute_cost(infos, trial, prior, criterion), default=chosen)
-        least = _compute_cost(infos, best, prior, criterion)
-        if not least < cost - 1e-12 * abs(cost):
+        best = min(trials, key=cost, default=chosen)
+        now = cost(best)
+        if not now < least - 1e-12 * abs(least):
             return chosen
-        chosen, cost = best, least
+        chosen, least = best, now
 
 
 @dataclass(frozen=True)

@@ -370,9 +370,8 @@ class _Search:
         last_space, space = self.build_space(state.stage), self.build_space(stage)
         start = np.log(self.unknowns.start)
         tissue_offsets = start - last_space.to_logarithms(last_space.reduce(start))
-        tissue_offsets[np.abs(tissue_offsets) < 1e-12] = (
-            0.0  # rounding of the mean must not cost a simulation
-        )
+        # Rounding of the mean must not cost a simulation.
+        tissue_offsets[np.abs(tissue_offsets) < 1e-12] = 0.0
         for share in _RATIO_SHARES if tissue_offsets.any() else (0.0,):
             z = space.reduce(logarithms + share * tissue_offsets)
             point = self.evaluate(space, z, ("folded",) if share else START_WARNINGS)
@@ -450,11 +449,8 @@ def move_answer(
     left, _ = compute_residuals(calibration.settings.objective, responses, measured)
     rows, target = unknowns.build_prior_rows()
     prior_deviations = calibration.settings.force_error_percent / 100 * (rows @ np.log(parameters) - target)
-    cost, before, last = (
-        0.5 * float(left @ left + prior_deviations @ prior_deviations),
-        calibration.history[-1],
-        calibration.stages[-1],
-    )
+    cost = 0.5 * float(left @ left + prior_deviations @ prior_deviations)
+    before, last = calibration.history[-1], calibration.stages[-1]
     errors = tuple(
         compute_error_percent(one.force_N, site.force_N)
         for one, site in zip(responses, measured, strict=True)
