@@ -129,12 +129,9 @@ class LogTables:
         self._write(self.model.settling_time_s + step.time, step)
 
     def _write(self, time: float, step: Step | None) -> None:
-        needed = any(request.kind == "element_data" for request in self.model.requests)
-        fields = (
-            compute_element_fields(self.system, self.laws, step.state)
-            if step is not None and needed
-            else None
-        )
+        fields = None
+        if step is not None and any(request.kind == "element_data" for request in self.model.requests):
+            fields = compute_element_fields(self.system, self.laws, step.state)
         u = self._compute_displacement(step)
         for request, path in zip(self.model.requests, self.paths):
             stream = self.streams[path]

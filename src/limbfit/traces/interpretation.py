@@ -15,18 +15,8 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from ..errors import TraceError
+from . import faults
 from .displacement import BrokenLine, fit_broken_line
-from .faults import (
-    find_coarse_steps,
-    find_frozen,
-    find_gaps,
-    find_saturation,
-    find_steps,
-    mend_times,
-    report_frozen_force,
-    report_gaps,
-    report_steps,
-)
 from .numerics import (
     Array,
     Mask,
@@ -91,14 +81,14 @@ def interpret_record(
         Where it begins in contact, where more than 1 % of its samples stick out, where its force drifts by
         more than 30 % of the peak, or as `find_touch_down` and `touch_down_at` do.
     """
-    trace, doubled = mend_times(trace)
+    trace, doubled = faults.mend_times(trace)
     trace, spikes = _remove_spikes(trace)
     line = fit_broken_line(trace.time_s, trace.displacement_mm)
     _check_start(trace, line)
-    rise, gaps = _compute_rise(trace), find_gaps(trace, line)
-    frozen = [] if forced else find_frozen(trace, line, rise)
+    rise, gaps = _compute_rise(trace), faults.find_gaps(trace, line)
+    frozen = [] if forced else faults.find_frozen(trace, line, rise)
     lost = gaps + [(float(trace.time_s[run.start]), float(trace.time_s[run.stop - 1])) for run in frozen]
-    steps = [] if forced else find_steps(trace, line, rise, lost)
+    steps = [] if forced else faults.find_steps(trace, line, rise, lost)
     level = _remove_steps(trace, steps) if steps else _level_ends(trace, line)
     touch = _find_touch_down(level, line, touch_down_s, forced)
     straight, drift = (trace, []) if steps else _remove_drift(trace, level, line, touch)
@@ -107,10 +97,10 @@ def interpret_record(
     warnings = [
         *doubled,
         *spikes,
-        *find_coarse_steps(trace, line, touch, rise),
-        *report_gaps(gaps, line, touch.time_s),
-        *report_frozen_force(trace, frozen, line, touch.time_s),
-        *report_steps(steps),
+        *faults.find_coarse_steps(trace, line, touch, rise),
+        *faults.report_gaps(gaps, line, touch.time_s),
+        *faults.report_frozen_force(trace, frozen, line, touch.time_s),
+        *faults.report_steps(steps),
         *drift,
         *([] if forced else _find_impassive_force(straight, line, touch, rise, lost, steps)),
         *([] if touch_down_s is not None else _report_start(straight, line, touch, forced)),
@@ -129,7 +119,7 @@ def _find_impassive_force(
     steps: list[tuple[float, float]],
 ) -> list[TraceWarning]:
     """Warn of forces that no passive tissue gives, each sought where no other warning explains it."""
-    at_top = find_saturation(trace, line, rise_N, lost)
+    at_top = faults.find_saturation(trace, line, rise_N, lost)
     if at_top:
         return at_top
     way_in = (trace.time_s <= line.peak_s) & (trace.time_s >= touch.time_s)

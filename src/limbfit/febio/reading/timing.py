@@ -100,10 +100,8 @@ class LoadCurve:
 
     def _parabola(self, t: Array, start: Indices) -> Array:
         """Return the parabola through three points from ``start`` on, at ``t``."""
-        (a, b, c), (f, g, h) = (
-            (self.points[start + i, 0] for i in range(3)),
-            (self.points[start + i, 1] for i in range(3)),
-        )
+        a, b, c = (self.points[start + i, 0] for i in range(3))
+        f, g, h = (self.points[start + i, 1] for i in range(3))
         return np.asarray(
             f * (c - t) * (b - t) / ((c - a) * (b - a))
             + g * (c - t) * (t - a) / ((c - b) * (b - a))

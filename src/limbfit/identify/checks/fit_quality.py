@@ -165,14 +165,11 @@ def _describe_fitted(found: RecordFit) -> str:
 
 
 def _describe_held_out(found: RecordFit) -> str:
-    if (
-        found.inside_95 is None
-        or found.inside_95 >= _FEW_INSIDE
-        or not any(_is_clear(p) for p in found.phases)
-    ):
+    inside = found.inside_95
+    if inside is None or inside >= _FEW_INSIDE or not any(map(_is_clear, found.phases)):
         return ""
     worst = max(found.phases, key=lambda phase: phase.error_percent)
     return (
-        f"{found.record} is not predicted: {100 * found.inside_95:.0f} % of its points lie in the 95 % band, "
+        f"{found.record} is not predicted: {100 * inside:.0f} % of its points lie in the 95 % band, "
         f"and the {worst.phase} is off by {worst.error_percent:.2g} % of the largest force"
     )

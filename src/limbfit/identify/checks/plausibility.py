@@ -129,9 +129,9 @@ class RecordFacts:
     def modulus_kPa(self) -> float:
         """The apparent shear modulus; that of a half-space if the thickness is not known."""
         stiffness = self.peak_N / self.depth_mm / (8 * self.radius_mm) * 1e3
-        return stiffness / (
-            compute_layer_factor(self.radius_mm / self.thickness_mm) if self.thickness_mm else 1.0
-        )
+        if not self.thickness_mm:
+            return stiffness
+        return stiffness / compute_layer_factor(self.radius_mm / self.thickness_mm)
 
 
 def compute_layer_factor(radius_over_thickness: float) -> float:
@@ -269,10 +269,8 @@ def _explain_odd_record(f: RecordFacts, shift: Array, sd: Array) -> Iterator[Rec
     if name and best < _MAX_CHI2_EXPLAINED and null - best > _MIN_CHI2_DROP:
         yield RecordWarning((f.site,), "unit", what, numbers, name, "convert the column to s, mm and N")
     elif abs(shift[0] / sd[0]) >= _MAX_STANDARDISED:  # a protocol of its own is no fault
-        cause, remedy = (
-            "a swapped name, another place or another limb",
-            "check which site this record belongs to",
-        )
+        cause = "a swapped name, another place or another limb"
+        remedy = "check which site this record belongs to"
         yield RecordWarning((f.site,), "stiffness", what, numbers, cause, remedy)
 
 

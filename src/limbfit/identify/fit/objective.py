@@ -161,9 +161,8 @@ def compute_residuals(
 
 def _compute_pointwise_residuals(response: SiteResponse, site: MeasuredCurve) -> tuple[Array, Array]:
     difference = response.force_N - site.force_N
-    return site.discount_touch_down(difference) * site.scale, site.discount_touch_down(
-        response.jacobian
-    ) * site.scale
+    residual, jacobian = (site.discount_touch_down(rows) for rows in (difference, response.jacobian))
+    return residual * site.scale, jacobian * site.scale
 
 
 def _compute_mean_square_residuals(response: SiteResponse, site: MeasuredCurve) -> tuple[Array, Array]:
