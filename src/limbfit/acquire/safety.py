@@ -108,10 +108,8 @@ class Guard:
         most = SPEED_MARGIN * self.limits.speed_um_s * span / 1e6
         for pin, (now, then) in enumerate(zip(sample.position_um, past[0].position_um, strict=True), 1):
             if now - then > most:
-                speed = (now - then) / span * 1000
-                text = (
-                    f"pin {pin}: {speed:.1f} mm/s is over the limit of {self.limits.speed_um_s / 1000:g} mm/s"
-                )
+                speed, limit = (now - then) / span * 1000, self.limits.speed_um_s / 1000
+                text = f"pin {pin}: {speed:.1f} mm/s is over the limit of {limit:g} mm/s"
                 return Violation("speed", pin, text)
         return None
 

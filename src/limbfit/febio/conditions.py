@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -27,16 +27,13 @@ class WrittenCurve:
     points: Array
 
 
-@dataclass
-class CurveList:
+class CurveList(list[WrittenCurve]):
     """The load curves of a file; `add` gives a curve its number."""
-
-    all: list[WrittenCurve] = field(default_factory=list)
 
     def add(self, name: str, points: Array, interpolate: str = "LINEAR") -> int:
         """Add points (n, 2), time in s and value; return the number of the curve."""
-        self.all.append(WrittenCurve(name, interpolate, points))
-        return len(self.all)
+        self.append(WrittenCurve(name, interpolate, points))
+        return len(self)
 
 
 def to_space(name: str, motion: Motion, frame: Array) -> Motion:

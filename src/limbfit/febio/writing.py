@@ -262,7 +262,7 @@ def _describe_file(
         "kinds": {"fibre": FIBRE, "relaxed": RELAXED, "active": ACTIVE, "prestrained": PRESTRAINED},
         "mixture": MIXTURE,
         "gradient": GRADIENT,
-        "curves": curves.all,
+        "curves": curves,
     }
 
 

@@ -262,10 +262,9 @@ class VirtualFitSocket:
             [fault.pin - 1 for fault in faults.on("dead")],
             [fault.pin - 1 for fault in faults.on("saturated")],
         )
-        flags = (
-            Flags.HOME * self.is_home | Flags.STOPPED * bool(self.stopped) | Flags.NO_POWER * (not powered)
-        )
-        flags |= Flags.BUTTON * bool(faults.on("button")) | Flags.GIVEN_UP * self._given_up
+        flags = Flags.HOME * self.is_home | Flags.STOPPED * bool(self.stopped)
+        flags |= Flags.NO_POWER * (not powered) | Flags.GIVEN_UP * self._given_up
+        flags |= Flags.BUTTON * bool(faults.on("button"))
         moving = int(np.packbits(self.motors.driving, bitorder="little").view("<u2")[0])
         return Sample(0, self.time_us, int(flags), moving, position, self._forces_mN, seen)
 
