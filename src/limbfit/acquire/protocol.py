@@ -150,9 +150,8 @@ class Protocol:
                 self.reason = f"{self.reason}; {reason}" if self.reason else reason
                 if self.phase is not Phase.STOPPING:
                     self._transition(Phase.STOPPING, now)
-                return self._transition(
-                    self._report_unreachable("whether the device has retracted is not known"), now
-                )
+                why = "whether the device has retracted is not known"
+                return self._transition(self._report_unreachable(why), now)
             case Signal.CONFIRM if self.phase is Phase.POSITION:
                 self._is_confirmed = True
             case Signal.KEY_DOWN if self.phase is Phase.READY:
@@ -197,9 +196,8 @@ class Protocol:
                 why = f"silence for {MAX_SILENCE_S:g} s: whether the device has retracted is not known"
                 return self._transition(self._report_unreachable(why), now)
             if now - self._phase_start_s > MAX_STOP_S:
-                return self._transition(
-                    self._report_unreachable(f"not every pin is home {MAX_STOP_S:g} s later"), now
-                )
+                why = f"not every pin is home {MAX_STOP_S:g} s later"
+                return self._transition(self._report_unreachable(why), now)
             return ()
         waits = self.phase in WAITS_FOR_OPERATOR
         limit = self.settings.operator_limit_s if waits else self.settings.time_limit_s

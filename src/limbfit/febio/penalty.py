@@ -105,9 +105,8 @@ class _BodyFaces:
         stiffness = np.full(len(self.all), contact.penalty)
         if contact.automatic:
             stiffness *= compute_automatic_penalties(problem, self.all, first_step_s)
-        self.share = (
-            stiffness[:, None] / mean_stiffness * (1.0 if self.current or not elastic else CURRENT_AREA)
-        )
+        area = 1.0 if self.current or not elastic else CURRENT_AREA
+        self.share = stiffness[:, None] / mean_stiffness * area
         self.areas = _compute_areas(problem, self.all, problem.mesh.points)
         self.coordinates = body.stated.motion.at(0.0)[0]
         self._weigh(self.areas)

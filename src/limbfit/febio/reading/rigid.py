@@ -307,11 +307,9 @@ def has_same_rotation(values: Array, forced: Mask) -> bool:
 
 def find_straight_line(motion: Motion) -> tuple[Array, Array] | None:
     """Return direction (3,) and advance (n,) mm of a motion along a line; None for any other motion."""
-    still = (
-        np.asarray(motion.forced).any() or motion.values[:, 3:].any() or (np.diff(motion.times) == 0).any()
-    )
     lengths = np.linalg.norm(motion.values[:, :3], axis=1)
-    if still or not lengths.any():
+    turns_or_free = np.asarray(motion.forced).any() or motion.values[:, 3:].any()
+    if turns_or_free or (np.diff(motion.times) == 0).any() or not lengths.any():
         return None
     direction = motion.values[lengths.argmax(), :3] / lengths.max()
     advance = motion.values[:, :3] @ direction

@@ -129,9 +129,8 @@ class LeaveOutFits:
         return self.start * np.exp(z)
 
     def _rows(self, i: int, response: SiteResponse, parameters: Array) -> tuple[Array, Array]:
-        weight = np.sqrt(self.measured[i].weight / response.force_N.size) / (
-            _ASSUMED_ERROR_SHARE * self.peaks[i]
-        )
+        error_N = _ASSUMED_ERROR_SHARE * self.peaks[i]
+        weight = np.sqrt(self.measured[i].weight / response.force_N.size) / error_N
         difference = response.force_N - self.measured[i].force_N
         # A record that is many times too strong must not drown the others (Huber's weight).
         size = float(np.sqrt(np.mean(difference**2))) / self.peaks[i]

@@ -382,9 +382,8 @@ class _Search:
             raise CalibrationError(f"stage {stage + 1} cannot start: {self.failure}")
         self.fold_refusals = 0
         history = (*state.history, self.build_iterate(stage, point))
-        return SearchState(
-            stage, tuple(z.tolist()), FIRST_RADIUS, self.evaluations, history, state.stages
-        ), point
+        state = SearchState(stage, tuple(z.tolist()), FIRST_RADIUS, self.evaluations, history, state.stages)
+        return state, point
 
     def _make_valley_rule(self, state: SearchState) -> Callable[[SearchPoint, SearchPoint], str]:
         """Build the rule that ends slow progress along a valley that the data leave open."""
