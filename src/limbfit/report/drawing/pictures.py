@@ -4,8 +4,7 @@ and 6) and the deformed cut at the peak.
 
 from __future__ import annotations
 
-import base64
-import io
+from base64 import b64encode
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,14 +12,12 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-import matplotlib.image
 import numpy as np
 import pyvista as pv
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize, to_hex
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure as Drawing
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -31,10 +28,10 @@ from vtkmodules.vtkCommonCore import vtkLogger
 from ...arrays import Array
 from ...results.limb import PlacedSite
 from ...web.shapes import build_patient_frame
-from ..formats import number
 from ..page import Figure
 from ..store import Results
-from ..words import make_environment, make_picture, write_words
+from ..words import make_picture, write_words
+from .plots import PANEL_WIDTH_IN, make_figure, styled
 
 PAPER, INK = "#f6f5f1", "#222222"
 FIELD_MAP = "viridis"
@@ -79,76 +76,8 @@ class Mark:
 Shot = tuple[Array, View, list[Mark]]
 
 
-def embed_png(data: bytes) -> str:
-    """A picture as the address of an image."""
-    return "data:image/png;base64," + base64.b64encode(data).decode("ascii")
-
-
-_GAP, _TITLE = 14, 46
-
-
-def build_picture_row(shots: Sequence[Shot], titles: Sequence[str], alt: str) -> str:
-    """Pictures side by side in one SVG, with titles, labelled marks and a scale bar in each."""
-    panels, x = [], 0
-    for (pixels, view, marks), title in zip(shots, titles, strict=True):
-        buffer = io.BytesIO()
-        matplotlib.image.imsave(buffer, pixels, format="png")
-        ordered, heights = _place_labels(view, [mark for mark in marks if mark.axis is None])
-        panels.append(
-            {
-                "x": x,
-                "title": title,
-                "view": view,
-                "image": embed_png(buffer.getvalue()),
-                "arrows": [_outline_arrow(view, mark) for mark in marks if mark.axis is not None],
-                "dots": [
-                    (mark, *view.project(mark.position)[0], at)
-                    for mark, at in zip(ordered, heights, strict=True)
-                ],
-                "scale_mm": _choose_scale_mm(view),
-            }
-        )
-        x += view.size[0] + _GAP
-    height = max(view.size[1] for _, view, _ in shots)
-    template = make_environment(autoescape=True).get_template("pictures.html.j2")
-    return template.render(
-        panels=panels, alt=alt, width=x - _GAP, height=height, title_height=_TITLE, paper=PAPER
-    )
-
-
-def _outline_arrow(view: View, mark: Mark) -> tuple[Mark, Array, Array, Array]:
-    """The mark, where its arrow begins and where its head does, and the head's corners (3, 2), in pixels."""
-    assert mark.axis is not None
-    tip = view.project(mark.position)[0]
-    step = view.project(mark.position + mark.axis)[0] - tip
-    step = step / np.linalg.norm(step)
-    side = np.array([-step[1], step[0]])
-    wing = tip - 22 * step
-    return mark, tip - 70 * step, wing, np.array([tip, wing + 10 * side, wing - 10 * side])
-
-
-def _choose_scale_mm(view: View) -> int:
-    return next(mm for mm in (50, 20, 10, 5) if mm * view.pixels_per_mm < 0.4 * view.size[0])
-
-
-def build_legend(entries: Iterable[tuple[str, str]]) -> str:
-    items = "".join(
-        f'<span><i class="swatch" style="background:{color}"></i>{escape(text)}</span>'
-        for text, color in entries
-    )
-    return f'<div class="legend">{items}</div>'
-
-
-def make_colour_bar(limits: tuple[float, float], title: str, colours: str = FIELD_MAP) -> str:
-    stops = ", ".join(to_hex(colormaps[colours](t)) for t in np.linspace(0, 1, 9))
-    bar = f'<i class="colour-bar" style="background:linear-gradient(90deg, {stops})"></i>'
-    low, high = (number(value) for value in limits)
-    return f'<div class="legend"><span>{low}</span>{bar}<span>{high}</span><span>{escape(title)}</span></div>'
-
-
-# ---- pictures as PNG ------------------------------------------------------------------------------------
-
 _DPI, _PANEL_IN = 110, 4.6  # height of a row of panels
+_PAGE_DPI = 200  # of the pictures within a page's drawings
 _AXIS_MM = 14.0
 _HALO = [withStroke(linewidth=2.5, foreground=PAPER)]
 _SIDES = (("L", "R"), ("P", "A"), ("S", "I"))  # towards which an axis of patient space points, and from which
@@ -161,6 +90,7 @@ class PictureRow:
     shots: Sequence[Shot]
     titles: Sequence[str]
     bar: tuple[tuple[float, float], str] | None = None
+    colours: str = FIELD_MAP
 
 
 def make_key(text: str, color: str, dot: bool = False, filled: bool = True) -> Patch | Line2D:
@@ -171,30 +101,54 @@ def make_key(text: str, color: str, dot: bool = False, filled: bool = True) -> P
 
 
 def build_figure_sheet(
-    title: str, rows: Sequence[PictureRow], keys: Sequence[Patch | Line2D], spare_in: float = 0.0
+    title: str,
+    rows: Sequence[PictureRow],
+    keys: Sequence[Patch | Line2D],
+    spare_in: float = 0.0,
+    max_width_in: float = np.inf,
 ) -> Drawing:
     """Rows of pictures on one sheet with a title and a legend; every picture has a scale and its sides.
 
     ``spare_in`` inches above the legend are left free: the last of the drawing's ``subfigs``.
     """
     shares = [[view.size[0] / view.size[1] for _, view, _ in row.shots] for row in rows]
-    width = _PANEL_IN * max(map(sum, shares)) + (0.9 if any(row.bar for row in rows) else 0.1)
-    heights = [_PANEL_IN] * len(rows) + [spare_in] * (spare_in > 0)
-    drawing = Drawing(figsize=(width, sum(heights) + 0.9), dpi=_DPI, facecolor="white", layout="constrained")
+    margin = 0.9 if any(row.bar for row in rows) else 0.1
+    panel = min(_PANEL_IN, (max_width_in - margin) / max(map(sum, shares)))
+    heights = [panel] * len(rows) + [spare_in] * (spare_in > 0)
+    size = (panel * max(map(sum, shares)) + margin, sum(heights) + 0.9)
+    drawing = Drawing(figsize=size, dpi=_DPI, facecolor="white", layout="constrained")
     FigureCanvasAgg(drawing)
-    drawing.suptitle(title, x=0.01, ha="left", fontsize=13)
+    if title:
+        drawing.suptitle(title, x=0.01, ha="left", fontsize=13)
     parts = drawing.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
     for part, row, ratios in zip(parts, rows, shares, strict=False):
         axes = part.subplots(1, len(ratios), squeeze=False, width_ratios=ratios)[0]
         for ax, (pixels, view, marks), name in zip(axes, row.shots, row.titles, strict=True):
             _draw_panel(ax, pixels, view, marks, name)
         if row.bar is not None:
-            shades = ScalarMappable(Normalize(*row.bar[0]), FIELD_MAP)
-            part.colorbar(shades, ax=axes, label=row.bar[1], fraction=0.02, shrink=0.8, pad=0.01)
+            shades = ScalarMappable(Normalize(*row.bar[0]), row.colours)
+            bar = part.colorbar(shades, ax=axes, label=row.bar[1], fraction=0.02, shrink=0.8, pad=0.01)
+            bar.solids.set(rasterized=False, edgecolor="face")  # or seams show in a drawing of vectors
     if keys:
         handles = list(keys)
         drawing.legend(handles=handles, loc="outside lower left", ncols=len(keys), frameon=False, fontsize=10)
     return drawing
+
+
+@styled
+def make_picture_figure(
+    name: str,
+    rows: Sequence[PictureRow],
+    keys: Sequence[Patch | Line2D] = (),
+    *,
+    words: str = "",
+    **facts: Any,
+) -> Figure:
+    """Rows of pictures with a legend as a figure of the page; words and facts are as for `make_figure`."""
+    drawing = build_figure_sheet("", rows, keys, max_width_in=PANEL_WIDTH_IN)
+    drawing.patch.set_alpha(0)
+    drawing.set_dpi(_PAGE_DPI)
+    return make_figure(drawing, name, words=words, **facts)
 
 
 def write_png(drawing: Drawing, file: Path) -> None:
@@ -226,7 +180,7 @@ def _draw_panel(ax: Axes, pixels: Array, view: View, marks: list[Mark], title: s
         for sign in (1, -1):
             x, y = (0.5 + sign * dx * 0.475) * w, (0.5 + sign * dy * 0.478) * h
             ax.text(x, y, _name_side(sign * direction), fontsize=9, ha="center", va="center", color="#5a5a5a")
-    length = _choose_scale_mm(view)
+    length = next(mm for mm in (50, 20, 10, 5) if mm * view.pixels_per_mm < 0.4 * w)
     end, base = 0.97 * w, 0.965 * h
     ax.plot([end - length * view.pixels_per_mm, end], [base, base], color=INK, lw=2)
     ax.text(end, base - 0.012 * h, f"{length} mm", fontsize=9, ha="right", va="bottom", color=INK)
@@ -351,8 +305,7 @@ def draw_surface_figure(store: Results) -> Figure | None:
     skin = pv.read(store.surface_files["skin"])
     views = make_four_views(store, skin)
     shots = render_views(make_limb_plotter(store, skin), views, lambda view: _mark_facing_sites(store, view))
-    alt = "The limb model from four sides with its indentation sites: " + ", ".join(store.site_names)
-    return make_picture("model", build_picture_row(shots, SIDES, alt))
+    return make_picture_figure("model", [PictureRow(shots, SIDES)], names=store.site_names)
 
 
 @silence_display_warning()
@@ -366,9 +319,7 @@ def draw_marker_figure(store: Results) -> Figure | None:
     limits = (0.0, float(np.ceil(MARKER_COLOUR_MM)))
     plotter = make_field_plotter(marked, "implicit_distance", limits, **MATT)
     shots = render_views(plotter, make_four_views(store, plain), lambda view: _mark_facing_sites(store, view))
-    alt = "Skin of the image with markers from four sides, coloured by the distance to the skin without"
-    bar = make_colour_bar(limits, "distance (mm)")
-    return make_picture("markers", build_picture_row(shots, SIDES, alt) + bar)
+    return make_picture_figure("markers", [PictureRow(shots, SIDES, (limits, "distance (mm)"))])
 
 
 def draw_slices_figure(store: Results) -> Figure | None:
@@ -376,8 +327,9 @@ def draw_slices_figure(store: Results) -> Figure | None:
     file = store.folder / "segment" / "quality.png"
     if not file.is_file():
         return None
-    picture, words = embed_png(file.read_bytes()), escape(write_words("figure slices"))
-    return make_picture("slices", f'<img src="{picture}" alt="{words}" style="width:100%">')
+    picture, words = b64encode(file.read_bytes()).decode("ascii"), escape(write_words("figure slices"))
+    markup = f'<img src="data:image/png;base64,{picture}" alt="{words}" style="width:100%">'
+    return make_picture("slices", markup)
 
 
 def make_four_views(store: Results, skin: Any) -> list[View]:
@@ -410,22 +362,17 @@ def draw_mesh_figure(store: Results, sites: Sequence[str]) -> Figure | None:
     if not found:
         return None
     whole = [(pixels, view, [_mark_site(row, axis=True)]) for row, _, (pixels, view, _), _ in found]
-    near = [close for *_, close in found]
     names = [row.site for row, *_ in found]
     colours = {name: colour for _, grid, *_ in found for name, colour in choose_region_colours(grid).items()}
-    alt = "Meshes cut through the sites " + ", ".join(names) + f": {', '.join(colours)} and bone voids"
     paper = {"skin": "skin–adipose layer", "muscle": "muscle–soft tissue"}
     words = paper if tuple(colours) == tuple(paper) else {name: name for name in colours}
-    key = build_legend(
-        (*((words[name], colour) for name, colour in colours.items()), ("wall of a bone", BONE))
-    )
-    titles = [f"site {name}" for name in names]
-    markup = (
-        build_picture_row(whole, titles, alt)
-        + build_picture_row(near, [f"{t}, near" for t in titles], alt)
-        + key
-    )
-    return make_picture("mesh-cut", markup)
+    keys = [make_key(words[name], colour) for name, colour in colours.items()]
+    rows = [
+        PictureRow(whole, [f"site {name}" for name in names]),
+        PictureRow([close for *_, close in found], [f"site {name}, near" for name in names]),
+    ]
+    keys.append(make_key("wall of a bone", BONE))
+    return make_picture_figure("mesh-cut", rows, keys, names=names, regions=list(colours))
 
 
 def render_cut_meshes(store: Results, sites: Sequence[str]) -> list[tuple[PlacedSite, Grid, Shot, Shot]]:
@@ -453,11 +400,8 @@ def draw_field_figure(store: Results, sites: Sequence[str], stage: str, name: st
     limits = _find_colour_limits(cuts, views, field[0])
     shots = [render_field(cut, view, field[0], limits) for view, cut in zip(views, cuts, strict=True)]
     names = [row.site for row, _, _ in grids]
-    alt = f"Deformed cut at the peak, coloured by {field[1]}, sites " + ", ".join(names)
-    markup = build_picture_row(shots, [f"site {name}" for name in names], alt) + make_colour_bar(
-        limits, field[1]
-    )
-    return make_picture(name, markup, words="field", title=field[1])
+    pictures = PictureRow(shots, [f"site {name}" for name in names], (limits, field[1]))
+    return make_picture_figure(name, [pictures], words="field", title=field[1], names=names)
 
 
 def render_field(cut: Grid, view: View, field: str, limits: tuple[float, float]) -> Shot:

@@ -12,20 +12,19 @@ from ...arrays import Array
 from ...results.socket import SocketResult, TissueStrainInside
 from ..page import Figure
 from ..store import Results
-from ..words import make_picture
 from .colours import MUTED, SIMULATED, THIRD
 from .pictures import (
     FIELD_MAP,
     SIDES,
     Grid,
     Mark,
+    PictureRow,
     Shot,
     View,
-    build_picture_row,
     cut_behind,
-    make_colour_bar,
     make_field_plotter,
     make_four_views,
+    make_picture_figure,
     normalise,
     read_limb_frame,
     read_linear,
@@ -50,10 +49,9 @@ def draw_pressure_figures(store: Results, files: Mapping[str, Path], name: str) 
     figures = []
     for field, words in FIELDS:
         top = max(float(np.max(surface.point_data[field])) for surface in surfaces.values())
-        alt = f"The limb coloured by {words}"
-        markup = _render_surfaces(store, surfaces, field, (0.0, max(top, 1e-6)), FIELD_MAP, alt, words)
+        rows = _render_surfaces(store, surfaces, field, ((0.0, max(top, 1e-6)), words))
         title = f"{name}-{field.removesuffix('_kPa')}"
-        figures.append(make_picture(title, markup, words="socket surface", field=words))
+        figures.append(make_picture_figure(title, rows, words="socket surface", field=words))
     return tuple(figures)
 
 
@@ -74,19 +72,16 @@ def _render_surfaces(
     store: Results,
     surfaces: Mapping[str, Grid],
     field: str,
-    limits: tuple[float, float],
-    colours: str,
-    alt: str,
-    words: str,
-) -> str:
-    """A row of four sides for every surface, by its title, and the bar of their colours."""
+    bar: tuple[tuple[float, float], str],
+    colours: str = FIELD_MAP,
+) -> list[PictureRow]:
+    """A row of four sides for every surface, by its title; ``bar``: limits and title of the colours."""
     views = make_four_views(store, next(iter(surfaces.values())))
-    markup = ""
+    rows = []
     for title, surface in surfaces.items():
-        shots = render_views(make_field_plotter(surface, field, limits, colours), views)
-        titles = [f"{title}, {side}" for side in SIDES]
-        markup += build_picture_row(shots, titles, f"{alt}, {title}, from four sides")
-    return markup + make_colour_bar(limits, words, colours)
+        shots = render_views(make_field_plotter(surface, field, bar[0], colours), views)
+        rows.append(PictureRow(shots, [f"{title}, {side}" for side in SIDES], bar, colours))
+    return rows
 
 
 @silence_display_warning()
@@ -97,10 +92,10 @@ def draw_offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | No
         return None
     limit = max(float(np.percentile(np.abs(face.point_data[OFFSET]), 99)) for face in faces.values())
     limits = (-max(limit, 0.1), max(limit, 0.1))
-    words = "offset from the unloaded limb (mm)"
-    alt = f"Face of the socket coloured by {words}"
-    markup = _render_surfaces(store, faces, OFFSET, limits, OFFSET_MAP, alt, words)
-    return make_picture("socket-design-offset", markup)
+    bar = (limits, "offset from the unloaded limb (mm)")
+    return make_picture_figure(
+        "socket-design-offset", _render_surfaces(store, faces, OFFSET, bar, OFFSET_MAP)
+    )
 
 
 @silence_display_warning()
@@ -112,7 +107,7 @@ def draw_inside_figure(
         return None
     grid, worst = read_linear(file), max(inside, key=lambda tissue: tissue.shear)
     place = np.asarray(worst.place_mm, dtype=float)
-    shear, words = np.asarray(grid.cell_data[SHEAR]), "shear strain"
+    shear = np.asarray(grid.cell_data[SHEAR])
     limits = (0.0, max(float(np.percentile(shear, 99.5)), 1e-6))
     nearest = np.argmin(np.linalg.norm(np.asarray(grid.points) - place, axis=1))
     mark = Mark("largest", place + np.asarray(grid.point_data["displacement_mm"])[nearest], MARKED)
@@ -120,11 +115,8 @@ def draw_inside_figure(
     for view in _make_cut_views(store, grid, place):
         pixels = render_field(cut_behind(grid, view, smooth=True), view, SHEAR, limits)[0]
         shots.append((pixels, view, [mark]))
-    markup = build_picture_row(
-        shots, ("along the limb", "across the limb"), f"Cuts coloured by {words}, {title}"
-    )
-    bar = make_colour_bar(limits, words)
-    return make_picture("socket-inside", markup + bar, title=title, worst=worst)
+    row = PictureRow(shots, ("along the limb", "across the limb"), (limits, "shear strain"))
+    return make_picture_figure("socket-inside", [row], title=title, worst=worst)
 
 
 def _make_cut_views(store: Results, grid: Grid, place: Array) -> tuple[View, View]:
