@@ -20,7 +20,7 @@ from material_point import compute_curve_error, solve_layer, solve_reference_lay
 from limbfit.fe import History, StepControl, solve
 from limbfit.indentation import SiteModel, build_problem
 from limbfit.mesh import read_vtu
-from limbfit.phantom.forces import DISCRETISATIONS, STIFFEST_PER_MM
+from limbfit.phantom.forces import LOAD_STEPS, STIFFEST_PER_MM, UNLOAD_STEPS
 from limbfit.phantom.sites import INDENTER_EDGE_MM, INDENTER_MM
 from limbfit.study import IndenterTable
 
@@ -32,10 +32,7 @@ HISTORIES = {
 }
 CONTROLS = {
     "default": StepControl(),
-    **{
-        f"truth, {detail}": StepControl(load_steps=made.load_steps, unload_steps=made.unload_steps)
-        for detail, made in DISCRETISATIONS.items()
-    },
+    "truth": StepControl(load_steps=LOAD_STEPS, unload_steps=UNLOAD_STEPS),
     "default, linear": StepControl(stress="linear"),
 }
 TAUS = (0.1, 0.2, 0.32, 0.5, 1.0, 3.0)  # s

@@ -9,7 +9,7 @@ import pytest
 from completing import complete
 from limbfit.cli.socket import show_socket
 from limbfit.report.page import Table
-from limbfit.report.sections.socket import make_interval_table, make_published_blocks, make_published_table
+from limbfit.report.sections.socket import make_interval_table, make_published_table
 from limbfit.results.socket import SocketLoad, SocketResult, SocketState
 from limbfit.socket.published import FINDINGS, WHOLE, select_published_findings
 
@@ -104,4 +104,3 @@ def test_what_others_found_stands_beside_the_regions_own_pressures():
     assert own == {("tibial crest", "30.0", "60.0"), (WHOLE, "12.0", "60.0")}
     assert len(table.rows) == sum("tibial crest" in one.regions or WHOLE in one.regions for one in FINDINGS)
     assert "stance" in table.caption
-    assert make_published_blocks([], STANCE, "stance") == ()

@@ -249,37 +249,23 @@ class Strains:
             "energy_density_kPa": self.energy_kPa,
         }
 
-    def within(self, cells: Mask) -> TissueStrain:
-        """The strain of the chosen cells (m,)."""
+    def within(self, cells: Mask) -> tuple[Facts, int]:
+        """The strain of a tissue with the chosen cells (m,), as it is stored, and the cell most sheared.
+
+        The largest values are those of one cell, and grow as cells get smaller; ``_rare`` is what 1 % of the
+        volume exceeds, ``sheared_mm3`` the volume sheared by more than each of ``SHEAR_LEVELS``.
+        """
         volume, shear, compression = self.volume_mm3[cells], self.shear[cells], self.compression[cells]
-        return TissueStrain(
-            volume_mm3=float(volume.sum()),
-            shear=float(shear.max()),
-            shear_rare=_compute_exceeded(shear, volume),
-            compression=float(compression.max()),
-            compression_rare=_compute_exceeded(compression, volume),
-            energy_kPa=float(self.energy_kPa[cells].max()),
-            sheared_mm3={f"{level:g}": float(volume[shear > level].sum()) for level in SHEAR_LEVELS},
-            cell=int(np.flatnonzero(cells)[np.argmax(shear)]),
-        )
-
-
-@dataclass(frozen=True)
-class TissueStrain:
-    """Strain of a tissue: the largest of one cell, and ``_rare`` what 1 % of the volume exceeds.
-
-    ``sheared_mm3``: volume at rest that is sheared by more than each of ``SHEAR_LEVELS``; ``cell``: that of
-    the largest shear. The largest values grow as cells get smaller.
-    """
-
-    volume_mm3: float
-    shear: float
-    shear_rare: float
-    compression: float
-    compression_rare: float
-    energy_kPa: float
-    sheared_mm3: Mapping[str, float]
-    cell: int
+        facts = {
+            "volume_mm3": float(volume.sum()),
+            "shear": float(shear.max()),
+            "shear_rare": _compute_exceeded(shear, volume),
+            "compression": float(compression.max()),
+            "compression_rare": _compute_exceeded(compression, volume),
+            "energy_kPa": float(self.energy_kPa[cells].max()),
+            "sheared_mm3": {f"{level:g}": float(volume[shear > level].sum()) for level in SHEAR_LEVELS},
+        }
+        return facts, int(np.flatnonzero(cells)[np.argmax(shear)])
 
 
 def _compute_exceeded(values: Array, volume: Array) -> float:

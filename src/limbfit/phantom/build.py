@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from scipy.interpolate import interp1d
 
 from ..anatomy.surfaces.surfaces import Anatomy, save_anatomy
@@ -37,11 +38,19 @@ from .forces import (
     simulate_true_force,
 )
 from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, make_limb
-from .mri import DETAIL_GRIDS, make_grid, write_series, write_true_labels
+from .mri import DETAIL_GRIDS, LABELS_FILE, TENDON_LABEL, make_grid, write_series, write_true_labels
 from .record import SecondaryMeasurements, record, write_surface, write_ultrasound, write_waves
-from .sites import DETAIL_SITES, INDENTER_MM, TrueSite, build_markers, build_true_sites, select_sites
-from .socket import write_socket
-from .studyfile import format_study
+from .sites import (
+    DETAIL_SITES,
+    INDENTER_EDGE_MM,
+    INDENTER_MM,
+    TrueSite,
+    build_markers,
+    build_true_sites,
+    select_sites,
+)
+from .socket import FILE as SOCKET_FILE
+from .socket import LINER_MM, write_socket
 from .surfaces import build_true_anatomy
 
 Mapping = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
@@ -142,7 +151,7 @@ def make_phantom(
         truth["sites"] = _write_traces(
             work, patient, anatomy, indented, detail, seed, parameters, mapping, tell, measurements
         )
-        text = format_study(indented, detail, seed, patient, measurements, socket)
+        text = _format_study(indented, detail, seed, patient, measurements, socket)
         (work / "study.toml").write_text(text, encoding="utf-8")
         (work / "truth.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
     return truth
@@ -289,3 +298,33 @@ def _truth_to_dict(
             "within_mm": made.within_mm,
         },
     }
+
+
+def _format_study(
+    sites: Sequence[TrueSite],
+    detail: str,
+    seed: int,
+    limb: Limb,
+    measurements: SecondaryMeasurements,
+    socket: bool,
+) -> str:
+    """The content of ``study.toml`` for some sites of a limb, as a user would write it."""
+    loader = PackageLoader("limbfit.phantom", "templates")
+    environment = Environment(
+        loader=loader, undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True
+    )
+    return environment.get_template("study.toml.j2").render(
+        sites=sites,
+        detail=detail,
+        seed=seed,
+        limb=limb,
+        measurements=measurements,
+        socket=socket,
+        labels_file=LABELS_FILE.as_posix(),
+        tendon=TENDON,
+        tendon_label=TENDON_LABEL,
+        indenter_mm=INDENTER_MM,
+        indenter_edge_mm=INDENTER_EDGE_MM,
+        socket_file=SOCKET_FILE.as_posix(),
+        liner_mm=f"{LINER_MM:g}",
+    )

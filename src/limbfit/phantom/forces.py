@@ -49,32 +49,27 @@ class Discretisation:
 
     mesh: MeshSettings
     within_mm: float | None
-    load_steps: int
-    unload_steps: int
     softest_per_mm: float
 
     def steps(self, tissue_mm: float) -> StepControl:
         """Steps and contact over so much tissue."""
         penalty = float(np.clip(PENALTY_TIMES_TISSUE / tissue_mm, self.softest_per_mm, STIFFEST_PER_MM))
         return StepControl(
-            load_steps=self.load_steps, unload_steps=self.unload_steps, penalty=penalty, hold_penalty=True
+            load_steps=LOAD_STEPS, unload_steps=UNLOAD_STEPS, penalty=penalty, hold_penalty=True
         )
 
 
+LOAD_STEPS, UNLOAD_STEPS = 12, 16
 STIFFEST_PER_MM, PENALTY_TIMES_TISSUE = 400.0, 3200.0
 DISCRETISATIONS = {
     "coarse": Discretisation(
         MeshSettings(edge_near_mm=3.0, edge_far_mm=28.0, near_radius_mm=14.0, growth=1.0, flatness=1.9),
         within_mm=100.0,
-        load_steps=12,
-        unload_steps=16,
         softest_per_mm=100.0,
     ),
     "paper": Discretisation(
         MeshSettings(edge_near_mm=2.8, edge_far_mm=14.0, near_radius_mm=16.0),
         within_mm=None,
-        load_steps=12,
-        unload_steps=16,
         softest_per_mm=STIFFEST_PER_MM,
     ),
 }

@@ -10,7 +10,7 @@ import pyvista as pv
 from numpy.typing import NDArray
 
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
-from ..anatomy.surfaces.triangles import find_bodies, find_half_edges, from_pyvista
+from ..anatomy.surfaces.triangles import find_bodies, find_open_edges, from_pyvista
 from .geometry import TENDON, Limb, compute_gradient
 from .limb_shapes import PROXIMAL_CUT_MM, compute_skin_field
 
@@ -103,10 +103,7 @@ def _project_to_surface(field: Field, surface: Surface, top: float) -> Surface:
 
 def _cap_rim(surface: Surface, top: float) -> Surface:
     """Close a surface with a fan around the middle of its open rim, in the plane z = ``top``."""
-    edges = find_half_edges(surface.faces)
-    n = len(surface.points)
-    keys, back = edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0]
-    rim = edges[~np.isin(keys, back)]
+    n, rim = len(surface.points), find_open_edges(surface.faces)
     if not len(rim):
         return surface
     middle = np.append(surface.points[np.unique(rim), :2].mean(axis=0), top)

@@ -268,8 +268,8 @@ def _summarise_strain(run: SocketRun, one: LoadedState) -> list[dict[str, Any]]:
     for number, tissue in enumerate(mesh.region_names):
         if tissue == LINER:
             continue
-        found = asdict(one.strains.within(mesh.regions == number))
-        place = mesh.points[mesh.cells[found.pop("cell"), :4]].mean(axis=0)
+        found, most_sheared = one.strains.within(mesh.regions == number)
+        place = mesh.points[mesh.cells[most_sheared, :4]].mean(axis=0)
         far = np.linalg.norm(middles - place, axis=1)
         near = min(faces, key=lambda name: float(far[faces[name]].min()), default=None)
         rows.append({"tissue": tissue, **found, "place_mm": place, "near": near})

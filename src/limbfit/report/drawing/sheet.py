@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ...anatomy.grid import FAT, SOFT_TISSUE, LabelMap, Volume
 from ...anatomy.labels.contours import find_outlines
 from ...anatomy.labels.quality import LIMB
+from ...anatomy.morphology import Box, find_box
 from ...results.limb import QualityResult
 
 Mask = NDArray[np.bool_]
@@ -30,7 +31,7 @@ def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: Qual
     """Write the picture (PNG): slices from end to end, below them the suspects of the measures."""
     axis = "ijk".index(quality.axis)
     image, turned = volume.turn_along(axis), labels.turn_along(axis)
-    window = _find_window(turned.limb)
+    window = find_box(turned.limb, _MARGIN)[1:]
     masks = {LIMB: turned.limb} | {
         name: turned.mask(name) for name in turned.names.values() if name != SOFT_TISSUE
     }
@@ -38,7 +39,8 @@ def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: Qual
     shown = _choose_slices(turned.limb)
     odd = _choose_suspects(quality)
     large_rows = -(-len(odd) // _SUSPECT_COLUMNS)
-    ratio = _compute_ratio(window, turned)
+    height, width = (part.stop - part.start for part in window)
+    ratio = float(width * turned.spacing[0] / (height * turned.spacing[1]))
     small, large = 12 / _COLUMNS / ratio + 0.25, 12 / _SUSPECT_COLUMNS / ratio + 0.3
     rows = -(-len(shown) // _COLUMNS)
     figure = Figure(figsize=(12, 0.9 + rows * small + large_rows * large), facecolor="white")
@@ -62,21 +64,6 @@ def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: Qual
     handles = [Line2D([], [], color=colours[name], label=name) for name in masks]
     figure.legend(handles=handles, loc="upper center", ncol=len(handles), frameon=False, fontsize=10)
     figure.savefig(path, dpi=100, metadata={"Software": "limbfit"})
-
-
-def _find_window(limb: Mask) -> tuple[slice, slice]:
-    """Rows and columns of the limb with a margin."""
-    window = []
-    for axes in ((0, 2), (0, 1)):
-        filled = np.flatnonzero(limb.any(axis=axes))
-        window.append(slice(max(int(filled[0]) - _MARGIN, 0), int(filled[-1]) + 1 + _MARGIN))
-    return window[0], window[1]
-
-
-def _compute_ratio(window: tuple[slice, slice], labels: LabelMap) -> float:
-    """Width over height of the window, as it is drawn."""
-    rows, columns = (part.stop - part.start for part in window)
-    return float(columns * labels.spacing[0] / (rows * labels.spacing[1]))
 
 
 def _choose_slices(limb: Mask) -> list[int]:
@@ -108,7 +95,7 @@ def _draw(
     masks: dict[str, Mask],
     colours: dict[str, str],
     k: int,
-    window: tuple[slice, slice],
+    window: Box,
     title: str,
     bold: bool = False,
 ) -> None:

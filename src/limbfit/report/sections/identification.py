@@ -7,7 +7,6 @@ from collections import Counter
 from ...results.identification import (
     CorrelationMatrix,
     SearchStage,
-    SimulationDoubts,
 )
 from ..drawing.figures import draw_convergence_figure, draw_interval_figure
 from ..drawing.interactive import draw_convergence_curves
@@ -30,28 +29,22 @@ EQUAL_PERCENT = 0.01  # of the largest force: what the tolerance of an equilibri
 
 def make_parameter_section(store: Results) -> Section:
     """Table 1, intervals and correlations."""
-    title, none = "Parameters", "No parameters have been identified yet."
     known = store.uncertainty
     if known is None:
-        return make_section("parameters", title, otherwise=none)
+        none = "No parameters have been identified yet."
+        return make_section("parameters", "Parameters", otherwise=none)
+    truth = store.truth.get("parameters", {})
     return make_section(
         "parameters",
-        title,
-        make_parameter_table(store),
+        "Parameters",
+        make_table("parameters", store.parameters, store=store, known=known, truth=truth),
         draw_interval_figure(store),
         make_correlation_table(known.correlation),
         describe_relaxation(store),
         describe_priors(store),
         _describe_combinations(store),
         make_prose("residuals", found=known.residuals),
-        otherwise=none,
     )
-
-
-def make_parameter_table(store: Results) -> Table:
-    """Table 1: start, value after each stage, interval, verdict, and the truth where it is known."""
-    truth = store.truth.get("parameters", {})
-    return make_table("parameters", store.parameters, store=store, known=store.uncertainty, truth=truth)
 
 
 def make_correlation_table(correlation: CorrelationMatrix) -> Table:
@@ -128,7 +121,11 @@ def describe_search(store: Results) -> tuple[Bullets | None, Table | None]:
         return None, None
     found = store.calibration.doubts
     rows, answer = found.search, found.answer
-    texts = [_summarise_search(found)] if rows else []
+    texts = []
+    if rows:
+        kinds = Counter(_KINDS[row.kind] for row in rows)
+        used = sum(row.iterate is not None for row in rows)
+        texts.append(write_words("doubts of the search", found=found, kinds=kinds, used=used))
     texts += [
         f"At the answer, site {site}: {doubt.text}." for site, doubts in answer.items() for doubt in doubts
     ]
@@ -137,9 +134,3 @@ def describe_search(store: Results) -> tuple[Bullets | None, Table | None]:
             texts.append(write_words("doubt of the answer", site=site, off=off))
     table = make_table("doubtful-simulations", rows, folded=True, kinds=_KINDS)
     return make_bullets(texts), table if rows else None
-
-
-def _summarise_search(found: SimulationDoubts) -> str:
-    kinds = Counter(_KINDS[row.kind] for row in found.search)
-    used = sum(row.iterate is not None for row in found.search)
-    return write_words("doubts of the search", found=found, kinds=kinds, used=used)

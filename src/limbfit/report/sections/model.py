@@ -48,11 +48,9 @@ def make_mesh_section(store: Results) -> Section:
         "meshes",
         "Meshes",
         pictures.draw_mesh_figure(store, store.fitted[:4]),
-        _make_mesh_table(store) if store.mesh else None,
+        make_table("meshes", store.mesh.items(), marked=lambda row: row[0] in store.fitted)
+        if store.mesh
+        else None,
         make_bullets(warnings),
         otherwise="No meshes are stored yet.",
     )
-
-
-def _make_mesh_table(store: Results) -> Table:
-    return make_table("meshes", store.mesh.items(), marked=lambda row: row[0] in store.fitted)

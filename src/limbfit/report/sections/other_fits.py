@@ -64,20 +64,16 @@ def _draw_errors(content: CrossvalidateResult) -> Figure:
 def make_regions_section(store: Results, content: RegionsResult) -> Section:
     """What the experiment ``regions`` found."""
     verdicts = [word for row in content.regions for word in row.verdict.values()]
+    parameters = [(tissue, key) for tissue in content.whole.parameters for key in store.law.keys]
     return make_section(
         "regions",
         "Regions",
         make_prose("regions", content=content, verdicts=verdicts),
         make_bullets(f"Left out: {text}." for text in content.left_out),
-        _make_parameter_table(store, content),
+        make_table("regions", parameters, store=store, content=content),
         _make_error_table(content),
         _draw_regions(store, content),
     )
-
-
-def _make_parameter_table(store: Results, content: RegionsResult) -> Table:
-    rows = [(tissue, key) for tissue in content.whole.parameters for key in store.law.keys]
-    return make_table("regions", rows, store=store, content=content)
 
 
 def _make_error_table(content: RegionsResult) -> Table:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from ...results.identification import RecordFit, RecordPrediction
+from ...results.identification import RecordPrediction
 from ..drawing import figures
 from ..drawing.pictures import draw_field_figure
 from ..formats import NOTHING, format_fixed
@@ -32,12 +32,15 @@ def make_fit_section(store: Results) -> Section:
 def make_prediction_section(store: Results) -> Section:
     """Everything about the sites that were not used, and table 2."""
     rows = [row for row in store.predicted if not row.fitted]
+    quality = store.predict.fit_quality if store.predict else None
     unseen = "Every site was fitted, so nothing tests the model on unseen data."
     return make_section(
         "prediction",
         "All sites, held-out sites",
         make_site_table(store) if store.predicted else None,
-        make_quality_table(store),
+        make_table("fit-quality", quality.records, marked="fitted", found=quality)
+        if quality and quality.records
+        else None,
         figures.draw_error_figure(store),
         figures.draw_force_figure(store, rows, "time_s", "forces-held-out", 3),
         figures.draw_force_figure(store, rows, "displacement_mm", "loops-held-out", 3),
@@ -77,22 +80,9 @@ def make_site_table(store: Results) -> Table:
     return make_table("sites", store.predicted, marked="fitted", foot=foot, several=several, store=store)
 
 
-def make_quality_table(store: Results) -> Table | None:
-    """How well the model follows each record, by phase; None where it is not stored."""
-    found = store.predict.fit_quality if store.predict else None
-    if found is None or not found.records:
-        return None
-
-    return make_table("fit-quality", found.records, marked="fitted", found=found)
-
-
-def _name_use(row: RecordPrediction | RecordFit) -> str:
-    return "fitted" if row.fitted else "held out"
-
-
 def _make_mean_rows(store: Results) -> Iterable[Row]:
-    for use, key in (("fitted", "fitted"), ("held out", "heldout")):
-        chosen = [row for row in store.predicted if _name_use(row) == use]
+    for fitted, use, key in ((True, "fitted", "fitted"), (False, "held out", "heldout")):
+        chosen = [row for row in store.predicted if row.fitted == fitted]
         one = _average_by_site((row.site, row.error_one_material_percent) for row in chosen)
         if chosen:
             mean = to_numeric(format_fixed(sum(one) / len(one)) if one else NOTHING)

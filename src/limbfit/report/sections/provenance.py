@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from ...results.runs import StageRecord
 from ..formats import NOTHING, format_duration, format_fixed
 from ..page import Prose, Section, Table, make_section
 from ..store import Results
@@ -17,21 +16,16 @@ def make_timing_section(store: Results) -> Section:
     """How long it took, and on what."""
     if store.run is None:
         return make_section("timing", "Computing time", otherwise="No times are stored.")
-    machine = store.run.machine
+    machine, stages = store.run.machine, store.run.stages
+    seconds = [stage.seconds for stage in stages.values()]
+    total = make_row("Total", to_numeric(format_duration(sum(seconds))), "")
     memory = "" if machine.memory_GB is None else f"{format_fixed(machine.memory_GB)} GB of memory, "
     return make_section(
         "timing",
         "Computing time",
-        make_timing_table(store.run.stages),
+        make_table("timing", stages.items(), foot=(total,), longest=max([*seconds, 1e-9])),
         Prose(f"Machine: {machine.cores} cores, {memory}Python {machine.python}."),
     )
-
-
-def make_timing_table(stages: Mapping[str, StageRecord]) -> Table:
-    """How long each stage took, with bars."""
-    seconds = [stage.seconds for stage in stages.values()]
-    total = make_row("Total", to_numeric(format_duration(sum(seconds))), "")
-    return make_table("timing", stages.items(), foot=(total,), longest=max([*seconds, 1e-9]))
 
 
 def make_settings_section(store: Results) -> Section:

@@ -14,7 +14,6 @@ from ...results.variants import (
     IndenterResult,
     RefinementResult,
     StiffnessResult,
-    VariantRun,
     VariedSite,
     VolumeResult,
 )
@@ -54,8 +53,8 @@ def make_sensitivity_section(store: Results, content: Compared, name: str) -> Se
     )
 
 
-def _format_role(row: VariedSite, form: str) -> str:
-    return form.format(row.role) if row.role else ""
+def _name_site(row: VariedSite) -> str:
+    return f"site {row.site}, {row.role}" if row.role else f"site {row.site}"
 
 
 def _find_leading_tissues(content: StiffnessResult) -> dict[str, dict[str, float]]:
@@ -88,8 +87,8 @@ def _draw_curves(ax: Axes, store: Results, name: str, site: VariedSite, content:
     heads = [head for head in curves if head.endswith("_N")]
     for i, (row, head) in enumerate(zip(rows, heads, strict=False)):
         color, line = (INK, "-") if row.base else _STYLES[i % len(_STYLES)]
-        ax.plot(curves["time_s"], curves[head], color=color, ls=line, label=_name_model(row))
-    ax.set_title(f"site {site.site}{_format_role(site, ', {}')}: {format_fixed(site.tissue_mm)} mm of tissue")
+        ax.plot(curves["time_s"], curves[head], color=color, ls=line, label=row.label.replace(" x ", " × "))
+    ax.set_title(f"{_name_site(site)}: {format_fixed(site.tissue_mm)} mm of tissue")
     ax.set_xlabel("Time (s)")
     ax.margins(x=0.01)
 
@@ -116,8 +115,7 @@ def _draw_kappa_figure(store: Results, content: VolumeResult) -> Figure:
         ratio = [row.kappa_ratio for row in rows]
         known = {key: [getattr(row, key) for row in rows] for key in ("peak_force_N", *_RANGE)}
         style: dict[str, Any] = {"color": color, "ls": line, "marker": "o", "ms": 4}
-        label = f"site {site.site}{_format_role(site, ', {}')}"
-        axes[0].plot(ratio, known["peak_force_N"], label=label, **style)
+        axes[0].plot(ratio, known["peak_force_N"], label=_name_site(site), **style)
         axes[1].fill_between(ratio, known["J_min"], known["J_max"], color=color, alpha=0.15, lw=0)
         axes[1].plot(ratio, known["J_low"], ratio, known["J_high"], **style)
     axes[1].axhspan(0.99, 1.01, color=GRID, zorder=0)
@@ -163,10 +161,6 @@ def _draw_site_curves(store: Results, content: FrictionResult | IndenterResult) 
         ax.set_ylabel("Force (N)")
     add_legend(drawing, axes[0])
     return make_figure(drawing, name, words="compared models", title=_SECTIONS[name][0])
-
-
-def _name_model(row: VariantRun) -> str:
-    return row.label.replace(" x ", " × ")
 
 
 def _list_warnings(content: Compared) -> Bullets | None:

@@ -20,7 +20,7 @@ from ..drawing.socket_pictures import (
     draw_settling_figure,
 )
 from ..formats import format_symbol
-from ..page import Block, Note, Row, Section, Table, make_section
+from ..page import Note, Row, Section, Table, make_section
 from ..store import Results
 from ..tables import make_row, make_table, to_numeric
 from ..words import make_prose
@@ -55,20 +55,20 @@ def make_socket_section(store: Results, content: SocketResult) -> Section:
         make_prose("socket loads", content=content),
         draw_pressure_figures(store, files, "socket"),
         draw_settling_figure(content),
-        _make_region_table(states, content.samples.simulated if content.samples else 0),
+        _make_load_table(
+            "socket-regions",
+            {name: state.regions for name, state in states.items()},
+            draws=content.samples.simulated if content.samples else 0,
+        ),
         make_interval_table(last, name),
         make_prose("socket worn", worn_s=content.worn_s),
-        make_published_blocks(content.published, last, name),
+        make_published_table(content.published, last, name) if content.published else None,
+        make_prose("socket papers") if content.published else None,
         draw_inside_figure(store, name, last.inside, files[name]),
-        _make_strain_table(states),
+        _make_load_table("socket-inside", {name: state.inside for name, state in states.items()}),
         make_prose("socket balance", content=content),
         map(Note, [*content.warnings, *content.outside_text]),
     )
-
-
-def _make_region_table(states: Mapping[str, SocketState], draws: int) -> Table:
-    rows = {name: state.regions for name, state in states.items()}
-    return _make_load_table("socket-regions", rows, draws=draws)
 
 
 def _make_load_table(name: str, rows: Mapping[str, Sequence[Any]], **facts: Any) -> Table:
@@ -78,11 +78,6 @@ def _make_load_table(name: str, rows: Mapping[str, Sequence[Any]], **facts: Any)
         table = make_table(name, own, **facts)
         body += [make_row(load, *(to_numeric("") for _ in table.head[1:]), marked=True), *table.rows]
     return Table(name, table.caption, table.head, tuple(body))
-
-
-def _make_strain_table(states: Mapping[str, SocketState]) -> Table:
-    rows = {name: state.inside for name, state in states.items()}
-    return _make_load_table("socket-inside", rows)
 
 
 def make_interval_table(held: SocketState, title: str) -> Table | None:
@@ -99,15 +94,6 @@ def make_interval_table(held: SocketState, title: str) -> Table | None:
         rows.append(("settling", "mm", held.settling_mm, interval, causes, held.settling_change_mm))
     known = {name: head for name, head in KNOWN.items() if name in (first.change_kPa or {})}
     return make_table("socket-intervals", rows, names=sorted(first.interval_from), known=known, title=title)
-
-
-def make_published_blocks(
-    published: Sequence[PublishedFindings], held: SocketState, title: str
-) -> tuple[Block | None, ...]:
-    """What others found over this limb's regions, if they studied such limbs, and the papers to read."""
-    if not published:
-        return ()
-    return make_published_table(published, held, title), make_prose("socket papers")
 
 
 def make_published_table(published: Sequence[PublishedFindings], held: SocketState, title: str) -> Table:
