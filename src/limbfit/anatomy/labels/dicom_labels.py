@@ -7,13 +7,11 @@ that of the image.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pydicom
-from numpy.typing import NDArray
-from pydicom.dataset import FileDataset
+from pydicom.dataset import Dataset, FileDataset
 from pydicom.errors import InvalidDicomError
 
 from ...arrays import Array, Indices, Mask
@@ -77,29 +75,15 @@ def _find_storage_class(path: Path) -> str | None:
     return kind if kind in (*SEGMENTATION, STRUCTURE_SET) else None
 
 
-@dataclass(frozen=True)
-class _SegmentFrames:
-    """``pixels`` (n, rows, columns); ``segments`` (n,) their numbers, 0 where the pixels are numbers."""
-
-    pixels: NDArray[np.uint16]
-    segments: Indices
-    positions: Array
-    orientation: Array
-    pixel_spacing: Array
-    slice_spacings: tuple[float, ...]
-    names: dict[int, str]
-
-
 def read_dicom_seg(path: Path) -> LabelMap:
     """The segments of a DICOM-SEG file by their labels, on the grid of its own frames. Raises `LabelError`
     for a fractional segmentation, frames without a place or out of a stack, or a damaged file.
     """
     try:
         with silence_readers():
-            frames = _read_frames(pydicom.dcmread(path))
-        grid, index = _stack_frames(frames)
-        masks = [_build_mask(frames, grid, index, number) for number in frames.names]
-        array, names = flatten(masks, list(frames.names.values()))
+            data = pydicom.dcmread(path)
+            grid, masks = _read_masks(data)
+        array, names = flatten(masks, [normalise_name(one.SegmentLabel) for one in data.SegmentSequence])
     except LabelError:
         raise
     except Exception:  # pydicom's texts quote values of tags
@@ -109,13 +93,28 @@ def read_dicom_seg(path: Path) -> LabelMap:
     return LabelMap(array, grid.spacing, grid.origin, grid.direction, names)
 
 
-def _read_frames(data: FileDataset) -> _SegmentFrames:
+def _read_masks(data: FileDataset) -> tuple[Grid, list[Mask]]:
+    """The smallest grid that holds all frames, and a mask of each segment on it."""
     kind = str(data.get("SegmentationType", ""))
     if kind not in ("BINARY", "LABELMAP"):
         raise LabelError("a fractional segmentation", remedy="export a binary one")
-    groups = [
-        (group, data.SharedFunctionalGroupsSequence[0]) for group in data.PerFrameFunctionalGroupsSequence
-    ]
+    shared = data.SharedFunctionalGroupsSequence[0]
+    groups = [(group, shared) for group in data.PerFrameFunctionalGroupsSequence]
+    pixels = data.pixel_array.reshape(len(groups), data.Rows, data.Columns)
+    grid, slices = _stack_frames(groups, pixels.shape[1:])
+    numbers = [int(segment.SegmentNumber) for segment in data.SegmentSequence]
+    masks = {number: np.zeros(grid.array.shape, dtype=bool) for number in numbers}
+    for group, plane, k in zip(groups, pixels, slices, strict=True):
+        if kind == "BINARY":
+            identity = find_functional_group(group, "SegmentIdentificationSequence")
+            plane = np.where(plane > 0, int(identity.ReferencedSegmentNumber), 0)
+        for number, mask in masks.items():
+            mask[k] |= plane == number
+    return grid, [masks[number] for number in numbers]
+
+
+def _stack_frames(groups: list[tuple[Dataset, Dataset]], shape: tuple[int, ...]) -> tuple[Grid, Indices]:
+    """The grid of frames with these functional groups and a shape (rows, columns), and the slice of each."""
     orientations, positions = (
         np.array([getattr(find_functional_group(group, sequence), name) for group in groups], dtype=float)
         for sequence, name in (
@@ -127,38 +126,19 @@ def _read_frames(data: FileDataset) -> _SegmentFrames:
         raise LabelError("frames of several orientations", remedy="export one for each orientation")
     measures = find_functional_group(groups[0], "PixelMeasuresSequence")
     stated = (measures.get("SpacingBetweenSlices"), measures.get("SliceThickness"))
-    segments = [0] * len(groups)
-    if kind == "BINARY":
-        identities = [find_functional_group(group, "SegmentIdentificationSequence") for group in groups]
-        segments = [int(identity.ReferencedSegmentNumber) for identity in identities]
-    return _SegmentFrames(
-        data.pixel_array.reshape(len(groups), data.Rows, data.Columns),
-        np.array(segments),
-        positions,
-        orientations[0],
-        np.array(measures.PixelSpacing, dtype=float),
-        tuple(float(s) for s in stated if s),
-        {
-            int(segment.SegmentNumber): normalise_name(segment.SegmentLabel)
-            for segment in data.SegmentSequence
-        },
-    )
-
-
-def _stack_frames(frames: _SegmentFrames) -> tuple[Grid, Indices]:
-    """The smallest grid that holds all frames, and the slice (n,) of each."""
-    rows, columns = frames.orientation[:3], frames.orientation[3:]
+    rows, columns = orientations[0, :3], orientations[0, 3:]
     normal = np.cross(rows, columns)
-    heights = frames.positions @ normal
-    first = frames.positions[np.argmin(heights)]
-    sideways = frames.positions - first - np.outer(heights - heights.min(), normal)
-    spacing = _slice_spacing(heights, frames.slice_spacings)
+    heights = positions @ normal
+    first = positions[np.argmin(heights)]
+    sideways = positions - first - np.outer(heights - heights.min(), normal)
+    spacing = _slice_spacing(heights, tuple(float(s) for s in stated if s))
     if np.abs(sideways).max() > _TILT_MM or spacing is None:
         raise LabelError("frames that are no stack of slices", remedy="export it with the image as reference")
     index = np.rint((heights - heights.min()) / spacing).astype(np.int64)
+    pixel = np.array(measures.PixelSpacing, dtype=float)
     grid = Grid(
-        np.zeros((index.max() + 1, *frames.pixels.shape[1:]), np.uint8),
-        [frames.pixel_spacing[1], frames.pixel_spacing[0], spacing],  # type: ignore[arg-type]
+        np.zeros((index.max() + 1, *shape), np.uint8),
+        np.array([pixel[1], pixel[0], spacing]),
         first,
         np.column_stack([rows, columns, normal]),
     )
@@ -174,16 +154,6 @@ def _slice_spacing(heights: Array, stated: tuple[float, ...]) -> float | None:
         if step > 0 and off <= _ON_SLICE:
             return float(step)
     return None
-
-
-def _build_mask(frames: _SegmentFrames, grid: Grid, index: Indices, number: int) -> Mask:
-    mask = np.zeros(grid.array.shape, dtype=bool)
-    for pixels, segment, k in zip(frames.pixels, frames.segments, index):
-        if segment == 0:
-            mask[k] |= pixels == number
-        elif segment == number:
-            mask[k] |= pixels > 0
-    return mask
 
 
 def read_rtstruct(path: Path, like: Volume | None) -> LabelMap:

@@ -140,15 +140,10 @@ def flatten(masks: Sequence[Mask], names: Sequence[str]) -> tuple[NDArray[np.uin
         raise LabelError("the file names no segment", remedy="export it again with its segments")
     if len(set(names)) < len(names):
         raise LabelError("two segments have the same name", remedy="give them different names")
-    values = _label_values(names)
+    default = {name: value for value, name in DEFAULT_NAMES.items()}
+    free = iter(range(len(default) + 1, 256))
+    values = [default[name] if name in default else next(free) for name in names]
     flat = np.zeros(masks[0].shape, dtype=np.uint8)
     for n in sorted(range(len(masks)), key=lambda n: -int(masks[n].sum())):
         flat[masks[n]] = values[n]
     return flat, dict(zip(values, names))
-
-
-def _label_values(names: Sequence[str]) -> list[int]:
-    """The default value of a known name, free values for others."""
-    default = {name: value for value, name in DEFAULT_NAMES.items()}
-    free = iter(range(len(default) + 1, 256))
-    return [default[name] if name in default else next(free) for name in names]

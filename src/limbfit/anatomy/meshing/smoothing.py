@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 
 from ...arrays import Array, Indices, Mask
 from ...mesh import Mesh
-from ..surfaces.triangles import Surface
 from .background import Field, project_safely, project_to_level
 from .extrusion import Columns
 from .layers import LimbFields
@@ -23,40 +22,28 @@ DIRECTIONS = DIRECTIONS[np.any(DIRECTIONS != 0, axis=1)]
 # The corners of a tetrahedron opposite to each, in an order that keeps its sense; pairs of its faces.
 OPPOSITE = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 PAIRS = np.triu_indices(4, 1)
+ProposePlaces = Callable[[int, Array, Array], Array]  # places (k, 3) of a node after moves (k, 3) from (3,)
 
 
-@dataclass(frozen=True)
-class SmoothingMoves:
-    """Where nodes may go: along a plane, freely, or in the layers along the skin at the depth that they have.
+def limit_moves(points: Array, normals: Array, in_layers: Mask, fields: LimbFields) -> ProposePlaces:
+    """How nodes may go: along a plane, freely, or in the layers along the skin at the depth that they have.
 
     A plane would lead a node of the layers far out of a bent or rough skin, from where no cell lets it back.
-
-    Attributes
-    ----------
-    normals : (n, 3) of the planes; zero where a node moves freely.
-    depth : (n,) below the skin, mm; nan outside the layers.
-    skin : the surface that they go along.
+    ``normals`` (n, 3) are those of the planes, zero where a node moves freely.
     """
+    depths = np.full(len(points), np.nan)
+    depths[in_layers] = np.sqrt(fields.skin.find_nearest(points[in_layers])[0])
 
-    normals: Array
-    depth: Array
-    skin: Surface
-
-    @classmethod
-    def of(cls, points: Array, normals: Array, in_layers: Mask, fields: LimbFields) -> SmoothingMoves:
-        depth = np.full(len(points), np.nan)
-        depth[in_layers] = np.sqrt(fields.skin.find_nearest(points[in_layers])[0])
-        return cls(normals, depth, fields.skin)
-
-    def propose_places(self, node: int, here: Array, moves: Array) -> Array:
-        """Places (k, 3) of a node after ``moves`` (k, 3) from ``here``."""
-        normal, depth = self.normals[node], self.depth[node]
+    def propose_places(node: int, here: Array, moves: Array) -> Array:
+        normal, depth = normals[node], depths[node]
         places = here + moves - (moves @ normal)[:, None] * normal
         if np.isnan(depth):
             return np.asarray(places)
-        squared, _, nearest = self.skin.find_nearest(places)
+        squared, _, nearest = fields.skin.find_nearest(places)
         share = depth / np.maximum(np.sqrt(squared), 1e-12)
         return np.asarray(nearest + share[:, None] * (places - nearest))
+
+    return propose_places
 
 
 def smooth_elements(mesh: Mesh, fields: LimbFields, stack: Columns) -> Mesh:
@@ -66,8 +53,8 @@ def smooth_elements(mesh: Mesh, fields: LimbFields, stack: Columns) -> Mesh:
     two of them not at all. Where the limb was cut off about the site, the boundary has no shape to keep.
     """
     normals, movable = find_constraints(mesh, fields, stack)
-    allowed = SmoothingMoves.of(mesh.points, normals, _find_places(mesh, stack)[1], fields)
-    points = improve_angles(mesh.points, mesh.cells, IMPROVED_BELOW_DEG, allowed, movable)
+    propose = limit_moves(mesh.points, normals, _find_places(mesh, stack)[1], fields)
+    points = improve_angles(mesh.points, mesh.cells, IMPROVED_BELOW_DEG, propose, movable)
     return mesh.with_points(project_nodes(points, mesh, fields, stack))
 
 
@@ -115,7 +102,7 @@ def _find_places(mesh: Mesh, stack: Columns) -> Mask:
 
 
 def improve_angles(
-    points: Array, tets: Indices, goal_deg: float, allowed: SmoothingMoves, movable: Mask
+    points: Array, tets: Indices, goal_deg: float, propose: ProposePlaces, movable: Mask
 ) -> Array:
     """Points (n, 3) with nodes of poor tetrahedra moved so that the smallest dihedral angle about each grows.
 
@@ -123,7 +110,7 @@ def improve_angles(
     ----------
     points, tets : the mesh.
     goal_deg : tetrahedra below it are worked on.
-    allowed : where nodes may go.
+    propose : where a node may go.
     movable : (n,) nodes that may move.
     """
     points = points.copy()
@@ -137,14 +124,14 @@ def improve_angles(
             at = order[starts[node] : starts[node + 1]]
             star, corner = at // 4, at % 4
             opposite = np.take_along_axis(tets[star], OPPOSITE[corner], axis=1)
-            points[node], worst[star] = _find_best_place(points, opposite, node, allowed)
+            points[node], worst[star] = _find_best_place(points, opposite, node, propose)
         if np.array_equal(before, points):
             break
     return points
 
 
 def _find_best_place(
-    points: Array, opposite: Indices, node: int, allowed: SmoothingMoves
+    points: Array, opposite: Indices, node: int, propose: ProposePlaces
 ) -> tuple[Array, Array]:
     """Where the smallest angle of the tetrahedra about a node is greatest, among a pattern of places.
 
@@ -153,7 +140,7 @@ def _find_best_place(
     here, others = points[node], points[opposite]
     reach = np.linalg.norm(others - here, axis=2).min()
     moves = np.concatenate([step * reach * DIRECTIONS for step in STEPS])
-    places = np.vstack([here, allowed.propose_places(node, here, moves)])
+    places = np.vstack([here, propose(node, here, moves)])
     angles = compute_worst_angles(places, others)
     best = int(np.argmax(angles.min(axis=0)))
     return places[best], angles[:, best]

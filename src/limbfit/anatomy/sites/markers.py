@@ -110,7 +110,8 @@ def match_markers(markers: Sequence[Marker], hints: Mapping[str, Array]) -> dict
     if not hints:
         return {}
     names = list(hints)
-    distance = _compute_distances(markers, np.array([np.asarray(hints[name], float) for name in names]))
+    positions = np.array([marker.position for marker in markers]).reshape(-1, 3)
+    distance = np.linalg.norm(np.array(list(hints.values()), float)[:, None] - positions, axis=-1)
     # A pair beyond reach costs more than any choice of pairs within it, so reach goes before nearness.
     cost = np.where(distance <= MAX_DISTANCE_MM, distance, 1e3 * (1 + MAX_DISTANCE_MM) * len(names))
     rows, columns = linear_sum_assignment(cost)
@@ -123,13 +124,6 @@ def match_markers(markers: Sequence[Marker], hints: Mapping[str, Array]) -> dict
             remedy="correct 'near', or give the site's 'position' on the skin",
         )
     return {names[r]: markers[c] for r, c in pairs.items()}
-
-
-def _compute_distances(markers: Sequence[Marker], hints: Array) -> Array:
-    if not markers:
-        return np.empty((len(hints), 0))
-    positions = np.array([marker.position for marker in markers])
-    return np.linalg.norm(hints[:, None] - positions, axis=-1)
 
 
 def _describe_missing(names: list[str], pairs: Mapping[int, int], distance: Array) -> str:

@@ -49,25 +49,21 @@ def read_surface(
     """
     path = Path(path)
     with add_location(file=path):
-        return _read_surface(path, coordinates, UNITS_MM[unit], key)
-
-
-def _read_surface(path: Path, coordinates: str | None, unit_mm: float, key: str) -> Surface:
-    if not path.is_file():
-        raise SurfaceError("no such surface")
-    _check_suffix(path)
-    poly = _read_poly(path)
-    surface = from_pyvista(poly.triangulate())
-    if not np.all(np.isfinite(surface.points)):
-        raise SurfaceError("points that are not numbers", remedy="export the surface again")
-    stated = _read_stated_space(path, poly)
-    if coordinates and stated and coordinates != stated:
-        raise SurfaceError(
-            f"the file says that it is in {stated}, the study says {coordinates}",
-            remedy=f"correct {key}, or export the surface again",
-        )
-    sign = np.array([-1.0, -1.0, 1.0]) if (coordinates or stated) == "RAS" else np.ones(3)
-    return _merge_points(Surface(surface.points * sign * unit_mm, surface.faces))
+        if not path.is_file():
+            raise SurfaceError("no such surface")
+        _check_suffix(path)
+        poly = _read_poly(path)
+        surface = from_pyvista(poly.triangulate())
+        if not np.all(np.isfinite(surface.points)):
+            raise SurfaceError("points that are not numbers", remedy="export the surface again")
+        stated = _read_stated_space(path, poly)
+        if coordinates and stated and coordinates != stated:
+            raise SurfaceError(
+                f"the file says that it is in {stated}, the study says {coordinates}",
+                remedy=f"correct {key}, or export the surface again",
+            )
+        sign = np.array([-1.0, -1.0, 1.0]) if (coordinates or stated) == "RAS" else np.ones(3)
+        return _merge_points(Surface(surface.points * sign * UNITS_MM[unit], surface.faces))
 
 
 def _read_stated_space(path: Path, poly: pv.PolyData) -> str | None:

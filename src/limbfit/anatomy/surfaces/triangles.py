@@ -240,36 +240,32 @@ def check_closed(
     if smallest_mm is None:
         smallest_mm = _SMALLEST_MM.get(name, _SMALLEST_OTHER_MM) if file or name == "skin" else 0.0
     with add_location(file=file):
-        _check_bounds_body(surface, name, smallest_mm)
-
-
-def _check_bounds_body(surface: Surface, name: str, smallest_mm: float) -> None:
-    _check_size(surface, name, smallest_mm)
-    open_edges = len(find_open_edges(surface.faces))
-    if open_edges:
-        raise SurfaceError(
-            f"{name}: the surface is open, {open_edges} edges have a face on one side only",
-            remedy="close its holes",
-        )
-    check_sides(surface, name)
-    parts = len(find_bodies(surface))
-    if parts > 1:
-        raise SurfaceError(
-            f"{name}: {parts} separate bodies in one surface",
-            remedy="keep one closed body in each file",
-        )
-    if surface.volume <= 0:
-        raise SurfaceError(
-            f"{name}: the surface is inverted, its faces look inward",
-            remedy="flip the normals so that they point outward",
-        )
-    crossing = surface.self_intersections
-    if len(crossing):
-        place = format_place(surface.triangles[crossing[0, 0]].mean(axis=0))
-        raise SurfaceError(
-            f"{name}: the surface crosses itself ({len(crossing)} pairs of faces, the first at {place})",
-            remedy="remesh, smooth or repair it",
-        )
+        _check_size(surface, name, smallest_mm)
+        open_edges = len(find_open_edges(surface.faces))
+        if open_edges:
+            raise SurfaceError(
+                f"{name}: the surface is open, {open_edges} edges have a face on one side only",
+                remedy="close its holes",
+            )
+        check_sides(surface, name)
+        parts = len(find_bodies(surface))
+        if parts > 1:
+            raise SurfaceError(
+                f"{name}: {parts} separate bodies in one surface",
+                remedy="keep one closed body in each file",
+            )
+        if surface.volume <= 0:
+            raise SurfaceError(
+                f"{name}: the surface is inverted, its faces look inward",
+                remedy="flip the normals so that they point outward",
+            )
+        crossing = surface.self_intersections
+        if len(crossing):
+            place = format_place(surface.triangles[crossing[0, 0]].mean(axis=0))
+            raise SurfaceError(
+                f"{name}: the surface crosses itself ({len(crossing)} pairs of faces, the first at {place})",
+                remedy="remesh, smooth or repair it",
+            )
 
 
 def _check_size(surface: Surface, name: str, smallest: float) -> None:
