@@ -290,29 +290,21 @@ def _slice_spacing(slices: list[SliceHeader], normal: Array) -> float:
             place=f"between slices {worst + 1} and {worst + 2} of {len(slices)}",
             remedy="export the whole series again",
         )
-    _check_stated(slices[0], usual)
-    _check_tilt(places, normal, usual)
-    return float(gaps.mean())
-
-
-def _check_stated(header: SliceHeader, usual: float) -> None:
-    """Refuse a series that lacks every second slice: its gaps are even, only its header shows it."""
-    stated, thickness = header.stated_spacing, header.thickness
+    # A series that lacks every second slice has even gaps: only its header shows it.
+    stated, thickness = slices[0].stated_spacing, slices[0].thickness
     if stated and thickness and stated >= 0.999 * thickness and usual > 1.5 * stated:
         raise ImageError(
             f"slices lie {usual:.3g} mm apart but were taken {stated:.3g} mm apart: slices are missing",
             remedy="export the whole series again",
         )
-
-
-def _check_tilt(places: Array, normal: Array, usual: float) -> None:
     steps = np.diff(places, axis=0)
     sideways = np.linalg.norm(steps - np.outer(steps @ normal, normal), axis=1).max()
-    if sideways > _PLACE_TOLERANCE * max(usual, 0.1):
+    if sideways > tolerance:
         raise ImageError(
             f"slices shift sideways by {sideways:.3g} mm from one to the next (gantry tilt)",
             remedy="resample the series to a rectangular grid",
         )
+    return float(gaps.mean())
 
 
 def read_pixels(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
@@ -371,14 +363,12 @@ def _read_frames(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
 
 def _build_decoding_error(syntaxes: set[str]) -> ImageError:
     """What is wrong with pixels that no decoder took."""
-    names = sorted(UID(text).name for text in syntaxes if _is_compressed(UID(text)))
+    uids = [UID(text) for text in syntaxes]
+    known = [uid for uid in uids if uid.is_valid and not uid.is_private and uid.is_transfer_syntax]
+    names = sorted(uid.name for uid in known if uid.is_compressed)
     if names:
         return ImageError(
             f"the pixels, compressed as {', '.join(names)}, cannot be decoded",
             remedy="export the series again, uncompressed",
         )
     return ImageError("the pixels are cut short or cannot be decoded", remedy="export the series again")
-
-
-def _is_compressed(uid: UID) -> bool:
-    return uid.is_valid and not uid.is_private and uid.is_transfer_syntax and uid.is_compressed

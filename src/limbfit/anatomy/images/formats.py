@@ -55,7 +55,8 @@ class ImageFormat:
     is_written: bool = False
 
 
-def _read_itk(path: Path, is_placed: Callable[[sitk.ImageFileReader], bool] = lambda _: True) -> sitk.Image:
+def _read_itk(path: Path, place_keys: tuple[str, ...] = ()) -> sitk.Image:
+    """An image by ITK, whose header has one of some keys with a value, or its place would be a guess."""
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
     try:
@@ -65,7 +66,8 @@ def _read_itk(path: Path, is_placed: Callable[[sitk.ImageFileReader], bool] = la
             image = reader.Execute()
     except RuntimeError as error:
         raise _build_reading_error(path, str(error)) from None
-    if not is_placed(reader):  # its place in the patient would be a guess
+    values = [reader.GetMetaData(key).strip() for key in place_keys if reader.HasMetaDataKey(key)]
+    if place_keys and set(values) <= {"", "0"}:
         raise ImageError(
             "the file does not say how it lies in the patient",
             file=path,
@@ -86,16 +88,11 @@ def _build_reading_error(path: Path, text: str) -> ImageError:
 
 def _read_nifti(path: Path) -> sitk.Image:
     check_nifti(path)
-    return _read_itk(path, _has_form)
-
-
-def _has_form(reader: sitk.ImageFileReader) -> bool:
-    keys = set(reader.GetMetaDataKeys()) & {"qform_code", "sform_code"}
-    return any(reader.GetMetaData(key).strip() not in ("", "0") for key in keys)
+    return _read_itk(path, ("qform_code", "sform_code"))
 
 
 def _read_nrrd(path: Path) -> sitk.Image:
-    return _read_itk(path, lambda reader: "NRRD_space" in reader.GetMetaDataKeys())
+    return _read_itk(path, ("NRRD_space",))
 
 
 _BUILTIN = (

@@ -7,14 +7,12 @@ the skin around it suggests: quadratic patches, fitted to the outline so that wh
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
-from ...arrays import Array, Mask
+from ...arrays import Array, Indices, Mask
 from ...errors import ImageError
 from ..grid import Volume
 from ..morphology import Field, dilate_mask, erode_mask, find_box, find_local_maximum
@@ -22,7 +20,7 @@ from ..segmentation.body import find_limb_mask, smooth_image
 from ..segmentation.ct import is_ct
 from ..surfaces.extraction import extract_contour
 from ..surfaces.triangles import Surface
-from .markers import Bump, find_bumps, find_cap_faces, find_near_cap
+from .markers import find_bumps, find_cap_faces, find_near_cap
 
 _RIM_MM = 2.5  # the outline lies this near to the mask's, and at half of the brightest tissue this near
 _SPACING_MM = 3.0  # of the places where patches are fitted
@@ -63,20 +61,6 @@ def _extract_outline(smooth: Field, limb: Mask, spacing: Array) -> Surface:
     return Surface(contour.points - 1, contour.faces)
 
 
-@dataclass(frozen=True)
-class _Patch:
-    """A quadratic height function over a tangent plane; rows of ``frame``: two tangents and the normal."""
-
-    origin: Array
-    frame: Array
-    coefficients: Array
-
-    def local(self, points: Array) -> tuple[Array, Array]:
-        """Distance from the axis (n,) and height above the patch (n,) of points (n, 3), mm."""
-        u, v, h = self.frame @ (points - self.origin).T
-        return np.hypot(u, v), h - _evaluate_basis(u, v) @ self.coefficients
-
-
 def remove_markers(volume: Volume, skin: Surface) -> tuple[Volume, int]:
     """The image with the markers on its skin turned into air, and how many there were.
 
@@ -93,7 +77,7 @@ def remove_markers(volume: Volume, skin: Surface) -> tuple[Volume, int]:
     air = float(np.median(array[array < 0.2 * np.percentile(array, 99)]))
     normals = skin.vertex_normals
     for bump in found:
-        _clear(array, volume, *_fit_patch_under_marker(skin, normals, marked, bump), air)
+        _clear_marker(array, volume, skin, normals, marked, bump.feet, air)
     return volume.with_array(array), len(found)
 
 
@@ -151,30 +135,37 @@ def _fit_patches(offsets: Array, usable: Mask) -> Array:
     return coefficients
 
 
-def _fit_patch_under_marker(skin: Surface, normals: Array, marked: Mask, bump: Bump) -> tuple[_Patch, float]:
-    """The skin under a marker, from the skin around its foot, and the radius of the foot, mm."""
-    centre = skin.points[bump.feet].mean(axis=0)
+def _clear_marker(
+    array: NDArray[np.float32],
+    volume: Volume,
+    skin: Surface,
+    normals: Array,
+    marked: Mask,
+    feet: Indices,
+    air: float,
+) -> None:
+    """Turn a marker into air, in place: what is above the patch that fits the skin around its foot.
+
+    Voxels that the patch cuts keep their share.
+    """
+    centre = skin.points[feet].mean(axis=0)
     distance = np.linalg.norm(skin.points - centre, axis=1)
-    foot = float(distance[bump.feet].max()) + _AROUND_MM
+    foot = float(distance[feet].max()) + _AROUND_MM
     near = (distance < foot + _PATCH_MM) & (distance > foot) & ~marked
     (frame,) = _build_frames(normals[near].mean(axis=0)[None])
     near &= normals @ frame[2] > 0.3
     offsets = (skin.points[near] - centre) @ frame.T
     (coefficients,) = _fit_patches(offsets[None], np.ones((1, len(offsets)), bool))
-    return _Patch(centre, frame, coefficients), foot
-
-
-def _clear(array: NDArray[np.float32], volume: Volume, patch: _Patch, radius: float, air: float) -> None:
-    """Turn what is above a patch into air, in place; voxels that the patch cuts keep their share."""
-    reach = np.ceil((radius + _ABOVE_MM) / volume.spacing).astype(int) + 1
-    middle = np.rint(volume.point_to_index(patch.origin)).astype(int)
+    reach = np.ceil((foot + _ABOVE_MM) / volume.spacing).astype(int) + 1
+    middle = np.rint(volume.point_to_index(centre)).astype(int)
     low, high = np.maximum(middle - reach, 0), np.minimum(middle + reach + 1, volume.size)
     box = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
     index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True))), axis=-1)
     index = index.transpose(2, 0, 1, 3)  # [k, j, i]
-    aside, height = patch.local(volume.index_to_point(index).reshape(-1, 3))
-    width = float(np.abs(volume.direction.T @ patch.frame[2]) @ volume.spacing)
+    u, v, above = frame @ (volume.index_to_point(index).reshape(-1, 3) - centre).T
+    height = above - _evaluate_basis(u, v) @ coefficients
+    width = float(np.abs(volume.direction.T @ frame[2]) @ volume.spacing)
     share = np.clip(0.5 - height / width, 0, 1)
-    share[(aside > radius) | (height > _ABOVE_MM)] = 1.0
+    share[(np.hypot(u, v) > foot) | (height > _ABOVE_MM)] = 1.0
     share = share.reshape(index.shape[:3])
     array[box] = np.where(share < 1, np.minimum(array[box], air + (array[box] - air) * share), array[box])

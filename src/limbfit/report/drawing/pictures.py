@@ -165,7 +165,7 @@ def _draw_panel(ax: Axes, pixels: Array, view: View, marks: list[Mark], title: s
     ax.set_title(title, fontsize=10, loc="left", pad=3)
     for spine in ax.spines.values():
         spine.set_visible(False)
-    for mark, name_y in zip(*_place_labels(view, marks), strict=True):
+    for mark, name_y in _place_labels(view, marks):
         x, y = view.project(mark.position)[0]
         face = mark.color if mark.filled else PAPER
         ax.plot(x, y, "o", ms=6, mfc=face, mec=mark.color, mew=1.4)
@@ -186,17 +186,18 @@ def _draw_panel(ax: Axes, pixels: Array, view: View, marks: list[Mark], title: s
     ax.text(end, base - 0.012 * h, f"{length} mm", fontsize=9, ha="right", va="bottom", color=INK)
 
 
-def _place_labels(view: View, marks: Sequence[Mark]) -> tuple[list[Mark], list[float]]:
-    """Marks from top to bottom, and the heights (pixels) at which their names do not touch."""
-    ordered = sorted(marks, key=lambda m: float(view.project(m.position)[0, 1]))
+def _place_labels(view: View, marks: Sequence[Mark]) -> list[tuple[Mark, float]]:
+    """Marks from top to bottom, with the heights (pixels) at which their names do not touch."""
     placed: list[tuple[float, float]] = []
+    found = []
     line = 0.036 * view.size[1]
-    for mark in ordered:
+    for mark in sorted(marks, key=lambda m: float(view.project(m.position)[0, 1])):
         x, y = (float(v) for v in view.project(mark.position)[0])
         while any(abs(y - py) < line and abs(x - px) < line * (1 + len(mark.text)) for px, py in placed):
             y += line / 8
         placed.append((x, y))
-    return ordered, [y for _, y in placed]
+        found.append((mark, y))
+    return found
 
 
 def _name_side(direction: Array) -> str:

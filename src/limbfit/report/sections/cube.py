@@ -13,8 +13,7 @@ from ..drawing.colours import INK, MEASURED, MUTED, ONE_MATERIAL, SIMULATED, THI
 from ..drawing.plots import make_figure, make_panels, make_standalone, styled
 from ..page import Figure, Section, make_section
 from ..store import Results
-from ..tables import make_table
-from ..words import make_prose
+from ..words import make_prose, make_table
 
 KINDS = {"skin": "Figure 8. Skin, adipose tissue", "muscle": "Figure 9. Muscle, soft tissue below the skin"}
 _OWN = ((SIMULATED, "-"), (THIRD, "-"), (INK, "-"))

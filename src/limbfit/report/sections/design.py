@@ -12,8 +12,7 @@ from ..drawing.plots import add_legend, make_figure, make_panels, set_log_scale,
 from ..formats import label
 from ..page import Figure, Section, make_bullets, make_section
 from ..store import Results
-from ..tables import make_table
-from ..words import make_prose
+from ..words import make_prose, make_table
 
 Designs = Sequence[SiteDesign | ProtocolPlan]
 _STYLES = ((SIMULATED, "o"), (THIRD, "D"), (ONE_MATERIAL, "s"), (MUTED, "^"), (INK, "v"))

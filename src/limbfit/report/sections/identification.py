@@ -13,8 +13,7 @@ from ..drawing.interactive import draw_convergence_curves
 from ..formats import format_fixed, label
 from ..page import Block, Bullets, Cell, Section, Table, make_bullets, make_section
 from ..store import Results
-from ..tables import make_row, make_table
-from ..words import make_prose, write_words
+from ..words import make_prose, make_row, make_table, write_words
 
 _KINDS = {
     "folded": "elements inside out",

@@ -6,7 +6,7 @@ from ..drawing import pictures
 from ..drawing.interactive import make_explorer
 from ..page import Prose, Section, Table, make_bullets, make_section
 from ..store import Results
-from ..tables import make_table
+from ..words import make_table
 
 
 def make_model_section(store: Results) -> Section:

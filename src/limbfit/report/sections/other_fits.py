@@ -11,8 +11,7 @@ from ..drawing.plots import add_legend, make_figure, make_panels, set_log_scale,
 from ..formats import format_fixed, format_with_unit
 from ..page import Figure, Section, Table, make_bullets, make_section
 from ..store import Results
-from ..tables import make_row, make_table, to_numeric
-from ..words import make_prose
+from ..words import make_prose, make_row, make_table, to_numeric
 
 MAX_FACTOR = 1e3  # of an interval over its value, in the figure
 

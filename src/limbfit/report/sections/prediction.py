@@ -10,8 +10,7 @@ from ..drawing.pictures import draw_field_figure
 from ..formats import NOTHING, format_fixed
 from ..page import Note, Row, Section, Table, make_section
 from ..store import Results
-from ..tables import make_row, make_table, to_numeric
-from ..words import make_prose
+from ..words import make_prose, make_row, make_table, to_numeric
 
 
 def make_fit_section(store: Results) -> Section:

@@ -8,8 +8,7 @@ from typing import Any
 from ..formats import NOTHING, format_duration, format_fixed
 from ..page import Prose, Section, Table, make_section
 from ..store import Results
-from ..tables import make_row, make_table, to_numeric
-from ..words import write_words
+from ..words import make_row, make_table, to_numeric, write_words
 
 
 def make_timing_section(store: Results) -> Section:

@@ -14,8 +14,7 @@ from ..drawing.interactive import record_curves
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..page import Figure, Note, Section, Table, make_bullets, make_section
 from ..store import Curves, Results
-from ..tables import make_table
-from ..words import make_prose
+from ..words import make_prose, make_table
 
 MAX_NAMED_PHASES = 6  # whose names have room in a panel
 MARKED_ERROR = 4.0  # standardised errors from here on are marked

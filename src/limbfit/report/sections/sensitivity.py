@@ -22,8 +22,7 @@ from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import format_fixed
 from ..page import Bullets, Figure, Section, make_bullets, make_section
 from ..store import Results
-from ..tables import make_table
-from ..words import make_prose, write_words
+from ..words import make_prose, make_table, write_words
 
 _COLOURS = (SIMULATED, ONE_MATERIAL, TRUTH, THIRD, MUTED, INK)
 _LINES: tuple[Any, ...] = ("-", "--", "-.", (0, (6, 2)), ":", "-")

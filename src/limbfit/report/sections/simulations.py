@@ -12,8 +12,7 @@ from ..drawing.pictures import draw_field_figure
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..page import Bullets, Figure, Note, Section, make_bullets, make_section
 from ..store import Results
-from ..tables import make_table
-from ..words import make_prose
+from ..words import make_prose, make_table
 from .provenance import make_pair_table
 
 

@@ -22,8 +22,7 @@ from ..drawing.socket_pictures import (
 from ..formats import format_symbol
 from ..page import Note, Row, Section, Table, make_section
 from ..store import Results
-from ..tables import make_row, make_table, to_numeric
-from ..words import make_prose
+from ..words import make_prose, make_row, make_table, to_numeric
 
 # What counts as known, and how its change is headed.
 KNOWN = {

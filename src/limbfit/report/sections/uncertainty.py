@@ -22,8 +22,7 @@ from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import NOTHING, format_fixed, label
 from ..page import Block, Bullets, Figure, Note, Prose, Section, Table, make_section
 from ..store import Curves, Results, find_compared_quantity
-from ..tables import make_table
-from ..words import make_prose, write_words
+from ..words import make_prose, make_table, write_words
 
 TrueValues = dict[str, tuple[float, dict[str, Any]]]  # by name: a true parameter and its line
 MAX_DRAWS, MAX_SITES = 300, 18
