@@ -6,12 +6,12 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from ..arrays import Array
 from ..errors import InputError
 from ..laws import TissueLaw
-from ..results.base import Interval, StoredResult
+from ..results.base import Interval, ResultPart, StoredResult
 from ..results.curves import read_curves
 from ..results.identification import (
     CalibrationResult,
@@ -32,14 +32,7 @@ Curves = dict[str, Array]
 Json = dict[str, Any]
 
 
-class OfSite(Protocol):
-    """A row of a site."""
-
-    @property
-    def site(self) -> str: ...
-
-
-Row = TypeVar("Row", bound=OfSite)
+Row = TypeVar("Row", bound=ResultPart)  # of a record, or of a site
 PAPER_TISSUES = {"skin": "Skin–adipose", "muscle": "Muscle"}
 
 
@@ -176,7 +169,8 @@ class Results:
 
     def with_curves(self, stage: str, rows: Iterable[Row]) -> list[tuple[Row, Curves]]:
         """Rows of records with the curves that the stage stored, where it did."""
-        found = ((row, self.curves(stage, getattr(row, "record", row.site))) for row in rows)
+        names = ((row, getattr(row, "record", "") or getattr(row, "site", "")) for row in rows)
+        found = ((row, self.curves(stage, str(name))) for row, name in names)
         return [(row, curves) for row, curves in found if curves is not None]
 
     def vtu(self, stage: str, site: str) -> Path | None:

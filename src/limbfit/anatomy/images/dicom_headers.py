@@ -100,7 +100,7 @@ def read_headers(path: Path) -> list[SliceHeader] | None:
     try:
         with silence_readers():
             tags = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=list(_TAGS))
-            if _is_segmentation(tags):
+            if "Segmentation" in _find_class_name(tags):  # beside its image, not one of its series
                 return []
             if "Rows" not in tags or "Columns" not in tags:
                 if _is_image_class(tags):
@@ -130,21 +130,15 @@ def _is_image_class(tags: FileDataset) -> bool:
     return kind is None or kind.name.endswith(_IMAGE_CLASS)
 
 
-def _is_segmentation(tags: FileDataset) -> bool:
-    """A DICOM-SEG beside its image has rows and frames too, but is not one of its series."""
-    kind = tags.get("SOPClassUID")
-    return kind is not None and "Segmentation" in kind.name
-
-
-def _is_enhanced(tags: FileDataset) -> bool:
-    kind = tags.get("SOPClassUID")
-    return "PerFrameFunctionalGroupsSequence" in tags or (kind is not None and kind.name in _ENHANCED)
+def _find_class_name(tags: FileDataset) -> str:
+    """The name of the storage class; empty where the file ends before it."""
+    return tags.SOPClassUID.name if tags.get("SOPClassUID") is not None else ""
 
 
 def _read_slices(tags: FileDataset, path: Path) -> list[SliceHeader]:
     """A slice for each frame of an enhanced file, and the one of any other file."""
     frames = int(tags.get("NumberOfFrames", 1) or 1)
-    if not _is_enhanced(tags):
+    if "PerFrameFunctionalGroupsSequence" not in tags and _find_class_name(tags) not in _ENHANCED:
         if frames > 1:
             raise ImageError(
                 "multi-frame images without a place for each frame",

@@ -40,15 +40,12 @@ def build_region_level(fields: LimbFields, number: int) -> Field:
         gradient = np.zeros((len(points), 3))
         near = np.flatnonzero(value < FAR_MM)
         if len(near):
-            value[near], gradient[near] = _near(points[near])
+            distance, normal = _measure_to_wall(fields, number, points[near])
+            push = np.maximum(fields.bone_clearance_mm - distance, 0.0)
+            value[near], slope = evaluate_distance(surface, points[near] + push[:, None] * normal)
+            across = np.einsum("ij,ij->i", slope, normal)
+            gradient[near] = slope - np.where(push > 0.0, across, 0.0)[:, None] * normal
         return value, gradient
-
-    def _near(points: Array) -> Level:
-        distance, normal = _measure_to_wall(fields, number, points)
-        push = np.maximum(fields.bone_clearance_mm - distance, 0.0)
-        value, slope = evaluate_distance(surface, points + push[:, None] * normal)
-        across = np.einsum("ij,ij->i", slope, normal)
-        return value, slope - np.where(push > 0.0, across, 0.0)[:, None] * normal
 
     return level
 

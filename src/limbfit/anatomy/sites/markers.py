@@ -46,10 +46,7 @@ class Bump:
     area: float
 
 
-def find_markers(
-    skin_with: Surface,
-    skin_without: Surface,
-) -> tuple[Marker, ...]:
+def find_markers(skin_with: Surface, skin_without: Surface) -> tuple[Marker, ...]:
     """Markers on a limb, from the distance between its surfaces with and without them.
 
     Parameters
@@ -75,10 +72,7 @@ def find_markers(
     return tuple(sorted(found, key=lambda marker: -marker.height))
 
 
-def find_bumps(
-    surface: Surface,
-    height: Array,
-) -> list[Bump]:
+def find_bumps(surface: Surface, height: Array) -> list[Bump]:
     """What stands out high and small enough for a marker; ``height`` (n,) of each vertex, mm."""
     labels = _number_clusters(height > MIN_HEIGHT_MM / 2, surface.faces)
     areas = _compute_vertex_areas(surface)

@@ -40,10 +40,7 @@ SMALL_HOLE_EDGES, SMALL_HOLE_SHARE = 6, 0.02  # so is one of few edges that is a
 MAX_TURNED_SHARE = 0.75  # of the faces: a surface of which more look inward is inverted, as a mirrored one
 MAX_LOOSE_SHARE = 0.01  # of the faces: open pieces that hold less are left out
 MAX_CROSSINGS, MAX_SMOOTHING_MM = 200, 4.0  # pairs of faces that are smoothed until they do not cross
-GENTLE_SHARE, FIRM_SHARE = (
-    0.1,
-    0.5,
-)  # of the way to the neighbours' mean, each time
+GENTLE_SHARE, FIRM_SHARE = 0.1, 0.5  # of the way to the neighbours' mean, each time
 END_SHARE = 0.03  # of the skin's area: a smaller opening, or flat part, is not its proximal end
 FLAT_MM = 0.05  # within which a flat end lies in its plane
 LEVEL_RAD = 3e-3  # between neighbours in it

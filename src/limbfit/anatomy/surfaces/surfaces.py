@@ -22,13 +22,7 @@ from ..frame import ProximalEnd, find_proximal_end, select_layer
 from ..grid import LabelMap
 from .extraction import extract_fine_surface, extract_surface, remesh
 from .surfacefiles import read_surface, write_surface
-from .triangles import (
-    Surface,
-    check_closed,
-    find_bodies,
-    find_half_edges,
-    from_pyvista,
-)
+from .triangles import Surface, check_closed, find_bodies, find_half_edges, from_pyvista
 
 _CUT_INSIDE_MM = 2.0  # of the image's proximal end
 _STICK_OUT_MM = 6.0  # of the bones beyond the cut

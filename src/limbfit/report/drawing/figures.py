@@ -9,12 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from ...results.identification import (
-    ObservedError,
-    QuantityRange,
-    RecordPrediction,
-    SearchStage,
-)
+from ...results.identification import ObservedError, QuantityRange, RecordPrediction, SearchStage
 from ..formats import format_fixed, format_symbol, format_with_value, get_unit
 from ..page import Figure
 from ..store import Curves, Results, find_compared_quantity

@@ -362,28 +362,33 @@ def draw_mesh_figure(store: Results, sites: Sequence[str]) -> Figure | None:
     found = render_cut_meshes(store, sites)
     if not found:
         return None
-    whole = [(pixels, view, [_mark_site(row, axis=True)]) for row, _, (pixels, view, _), _ in found]
     names = [row.site for row, *_ in found]
     colours = {name: colour for _, grid, *_ in found for name, colour in choose_region_colours(grid).items()}
     paper = {"skin": "skin–adipose layer", "muscle": "muscle–soft tissue"}
     words = paper if tuple(colours) == tuple(paper) else {name: name for name in colours}
     keys = [make_key(words[name], colour) for name, colour in colours.items()]
-    rows = [
-        PictureRow(whole, [f"site {name}" for name in names]),
-        PictureRow([close for *_, close in found], [f"site {name}, near" for name in names]),
-    ]
     keys.append(make_key("wall of a bone", BONE))
-    return make_picture_figure("mesh-cut", rows, keys, names=names, regions=list(colours))
+    return make_picture_figure("mesh-cut", make_mesh_rows(found), keys, names=names, regions=list(colours))
+
+
+def make_mesh_rows(found: Sequence[tuple[PlacedSite, Grid, Shot, Shot]]) -> list[PictureRow]:
+    """Whole meshes that :func:`render_cut_meshes` gave, and below them what is near the indenter."""
+    titles = [f"site {row.site}" for row, *_ in found]
+    return [
+        PictureRow([whole for _, _, whole, _ in found], titles),
+        PictureRow([near for *_, near in found], [f"{title}, near the indenter" for title in titles]),
+    ]
 
 
 def render_cut_meshes(store: Results, sites: Sequence[str]) -> list[tuple[PlacedSite, Grid, Shot, Shot]]:
-    """Sites with their meshes: the whole mesh, cut through the site, and what is near the site."""
+    """Sites with their meshes: the whole mesh, cut through the site, and what is near it, with its axis."""
     found = []
     for row, file in find_placed_meshes(store, sites, "mesh"):
         grid, views = read_linear(file), make_cut_views(store, row, file)
         plotter = make_plotter()
         add_regions(plotter, cut_behind(grid, views[0]))
-        whole, near = render_views(plotter, views)
+        marks = [_mark_site(row, axis=True)]
+        whole, near = ((pixels, view, marks) for pixels, view, _ in render_views(plotter, views))
         found.append((row, grid, whole, near))
     return found
 

@@ -21,7 +21,6 @@ from .pictures import (
     Drawing,
     Mark,
     PictureRow,
-    Shot,
     View,
     build_figure_sheet,
     choose_inner_colour,
@@ -30,6 +29,7 @@ from .pictures import (
     make_four_views,
     make_key,
     make_limb_plotter,
+    make_mesh_rows,
     normalise,
     render_cut_meshes,
     render_views,
@@ -112,25 +112,16 @@ def draw_sites_sheet(store: Results) -> Drawing:
 def draw_mesh_sheet(store: Results) -> Drawing:
     """Meshes of some sites cut through the site, near it, and how sharp their elements are."""
     names = (store.fitted or store.site_names)[:MESHES]
-    whole: list[Shot] = []
-    near: list[Shot] = []
     angles: dict[str, Any] = {}
     colours: dict[str, str] = {}
-    for row, grid, *shots in render_cut_meshes(store, names):
+    found = render_cut_meshes(store, names)
+    for row, grid, *_ in found:
         colours |= choose_region_colours(grid)
-        mark = Mark(row.site, np.array(row.position_mm), CUT_PLANE, True, normalise(row.axis))
-        for pictures, (pixels, view, _) in zip((whole, near), shots, strict=True):
-            pictures.append((pixels, view, [mark]))
         tets = grid.cell_connectivity.reshape(-1, 4)
         angles[row.site] = compute_dihedral_angles(np.asarray(grid.points, float), tets).min(axis=1)
-    titles = [f"site {name}" for name in angles]
     keys = [make_key(name, colour) for name, colour in (colours | {"wall of a bone": BONE}).items()]
-    drawing = build_figure_sheet(
-        "Meshes, cut along the limb through the site",
-        [PictureRow(whole, titles), PictureRow(near, [f"{title}, near the indenter" for title in titles])],
-        keys,
-        spare_in=2.2,
-    )
+    title = "Meshes, cut along the limb through the site"
+    drawing = build_figure_sheet(title, make_mesh_rows(found), keys, spare_in=2.2)
     _draw_histogram(drawing, angles)
     return drawing
 

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from ...results.identification import (
-    CorrelationMatrix,
-    SearchStage,
-)
+from ...results.identification import CorrelationMatrix, SearchStage
 from ..drawing.figures import draw_convergence_figure, draw_interval_figure
 from ..drawing.interactive import draw_convergence_curves
 from ..formats import format_fixed, label

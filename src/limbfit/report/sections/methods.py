@@ -15,13 +15,7 @@ from ...laws import ACTIVE, OGDEN, split_key
 from ...results.base import Parameters, ResultPart
 from ...results.identification import ParameterBounds
 from ...shapes import SHAPES
-from ..formats import (
-    NOTHING,
-    format_fixed,
-    format_limits,
-    format_symbol,
-    format_with_value,
-)
+from ..formats import NOTHING, format_fixed, format_limits, format_symbol, format_with_value
 from ..page import Prose, Section
 from ..store import Json, Results
 from ..words import make_environment

@@ -11,11 +11,7 @@ from matplotlib.figure import Figure as Drawing
 from matplotlib.ticker import MaxNLocator
 
 from ...results.models import ModelsResult
-from ...results.uncertainty import (
-    LikelihoodProfile,
-    ParameterUncertainty,
-    UncertaintyResult,
-)
+from ...results.uncertainty import LikelihoodProfile, ParameterUncertainty, UncertaintyResult
 from ..drawing import plots
 from ..drawing.colours import INK, MEASURED, MUTED, SIMULATED, choose_truth_style
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
