@@ -5,13 +5,3 @@ from __future__ import annotations
 from .build import draw_true_parameters, make_phantom
 from .geometry import LIMBS, Limb, make_limb
 from .sites import TrueSite, build_true_sites
-
-__all__ = [
-    "LIMBS",
-    "Limb",
-    "TrueSite",
-    "build_true_sites",
-    "draw_true_parameters",
-    "make_limb",
-    "make_phantom",
-]

@@ -175,21 +175,15 @@ def _find_limb_window(grid: ScanGrid, limb: Limb, k: slice) -> tuple[slice, slic
     return window[0], window[1]
 
 
-def _build_bias_field(seed: int, amplitude: float) -> Callable[[ScanGrid, slice], NDArray[np.float32]]:
-    """Build a smooth receive profile within 1 +- ``amplitude`` over the whole image."""
+def _compute_bias(grid: ScanGrid, k: slice, seed: int, amplitude: float) -> NDArray[np.float32]:
+    """Compute, for a slab, a smooth receive profile within 1 +- ``amplitude`` over the whole image."""
     random = np.random.default_rng([seed, 4])
     linear, quadratic = random.uniform(-1, 1, 3), random.uniform(-1, 1, 3)
     scale = amplitude / (np.abs(linear).sum() + np.abs(quadratic).sum())
-
-    def profile(grid: ScanGrid, k: slice) -> NDArray[np.float32]:
-        terms = []
-        for axis, (a, b) in enumerate(zip(linear, quadratic, strict=True)):
-            u = np.linspace(-1, 1, grid.shape[axis])
-            terms.append(a * u + b * (2 * u * u - 1))
-        total = terms[0][k, None, None] + terms[1][None, :, None] + terms[2][None, None, :]
-        return (1 + scale * total).astype(np.float32)
-
-    return profile
+    axes = [np.linspace(-1, 1, count) for count in grid.shape]
+    x, y, z = (a * u + b * (2 * u * u - 1) for u, a, b in zip(axes, linear, quadratic, strict=True))
+    total = x[k, None, None] + y[None, :, None] + z[None, None, :]
+    return (1 + scale * total).astype(np.float32)
 
 
 def generate_slabs(
@@ -202,7 +196,6 @@ def generate_slabs(
 ) -> Iterator[tuple[slice, NDArray[np.float32]]]:
     """Generate slices and signal (nk, nj, ni) slab by slab, with bias and noise (None: the contrast's)."""
     random = np.random.default_rng([seed, 5, len(markers)])
-    bias = _build_bias_field(seed, levels.bias)
     deviation = levels.noise if noise is None else noise
     for start in range(0, grid.shape[0], SLAB):
         k = slice(start, min(start + SLAB, grid.shape[0]))
@@ -214,7 +207,7 @@ def generate_slabs(
             _add_marker(tissue, skin, points, grid.spacing, marker, levels)
         signal = np.full((k.stop - k.start, *grid.shape[1:]), levels.air, np.float32)
         signal[:, rows, columns] = tissue[1:-1]
-        signal *= bias(grid, k)
+        signal *= _compute_bias(grid, k, seed, levels.bias)
         signal += deviation * random.standard_normal(signal.shape, dtype=np.float32)
         if levels.rician:
             imaginary = deviation * random.standard_normal(signal.shape, dtype=np.float32)

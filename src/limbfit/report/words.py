@@ -46,15 +46,13 @@ def write_words(name: str, **facts: Any) -> str:
 
 def write_columns(name: str, **facts: Any) -> list[tuple[str, str, str, str]]:
     """A row of a table: of each column its head, ``=`` for a number, the text, and the share of its bar."""
-    lines = _read_templates()[name][1].render(facts).split("\n")
-    return [_split_column(line) for line in lines if line]
-
-
-def _split_column(line: str) -> tuple[str, str, str, str]:
-    found = _COLUMN.fullmatch(line)
-    assert found is not None, line
-    head, kind, text, share = map(_join_lines, found.groups(default=""))
-    return head, kind, text, share
+    columns = []
+    for line in filter(None, _read_templates()[name][1].render(facts).split("\n")):
+        found = _COLUMN.fullmatch(line)
+        assert found is not None, line
+        head, kind, text, share = map(_join_lines, found.groups(default=""))
+        columns.append((head, kind, text, share))
+    return columns
 
 
 def make_prose(name: str, **facts: Any) -> Prose | None:

@@ -65,7 +65,11 @@ def _read_itk(path: Path, place_keys: tuple[str, ...] = ()) -> sitk.Image:
             check_voxel_count(reader.GetSize(), path)
             image = reader.Execute()
     except RuntimeError as error:
-        raise _build_reading_error(path, str(error)) from None
+        if "orthonormal" in str(error) or "Bad direction" in str(error):
+            remedy = "resample the image to a rectangular grid"
+            raise ImageError("the image axes are not orthonormal", file=path, remedy=remedy) from None
+        remedy = "check that the file is whole"
+        raise ImageError("the image cannot be read", file=path, remedy=remedy) from None
     values = [reader.GetMetaData(key).strip() for key in place_keys if reader.HasMetaDataKey(key)]
     if place_keys and set(values) <= {"", "0"}:
         raise ImageError(
@@ -74,16 +78,6 @@ def _read_itk(path: Path, place_keys: tuple[str, ...] = ()) -> sitk.Image:
             remedy="export it with its orientation",
         )
     return image
-
-
-def _build_reading_error(path: Path, text: str) -> ImageError:
-    if "orthonormal" in text or "Bad direction" in text:
-        return ImageError(
-            "the image axes are not orthonormal",
-            file=path,
-            remedy="resample the image to a rectangular grid",
-        )
-    return ImageError("the image cannot be read", file=path, remedy="check that the file is whole")
 
 
 def _read_nifti(path: Path) -> sitk.Image:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import binary_fill_holes
 from scipy.ndimage import label as connected
 
-from ...arrays import Indices, Mask
+from ...arrays import Mask
 from ...errors import LabelError, add_location
 from ..grid import SOFT_NAMES, Grid, LabelMap, Volume
 from ..morphology import find_box
@@ -109,8 +109,9 @@ def place_on_grid(labels: LabelMap, like: Volume) -> LabelMap:
     original, labels = labels, labels.align_axes(like.direction)
     if labels.array.any():  # a margin of zeros may lie outside the image
         labels = labels.crop(find_box(labels.limb))
-    offset = _find_offset(labels, like)
-    if offset is None:
+    place = like.point_to_index(labels.index_to_point(labels.corners))
+    offset = np.round(place[0]).astype(np.int64)
+    if np.abs(place - offset - labels.corners).max() > _ON_GRID:
         raise LabelError(
             "the label map is on a different grid from the image",
             remedy=f"image {_format_shape(like)}, labels {_format_shape(original)}: "
@@ -125,15 +126,6 @@ def place_on_grid(labels: LabelMap, like: Volume) -> LabelMap:
     full = np.zeros(like.array.shape, dtype=np.uint8)
     full[tuple(slice(a, b) for a, b in zip(offset[::-1], last[::-1]))] = labels.array
     return LabelMap(full, like.spacing, like.origin, like.direction, labels.names)
-
-
-def _find_offset(labels: Grid, like: Grid) -> Indices | None:
-    """First voxel (i, j, k) of ``labels`` on the grid of ``like``, None if voxels do not coincide."""
-    place = like.point_to_index(labels.index_to_point(labels.corners))
-    whole = np.round(place[0])
-    if np.abs(place - whole - labels.corners).max() > _ON_GRID:
-        return None
-    return whole.astype(np.int64)
 
 
 def _format_shape(grid: Grid) -> str:

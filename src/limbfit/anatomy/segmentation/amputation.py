@@ -68,7 +68,8 @@ def amputate_limb(
     array = np.where(height >= 0, labels.array, 0).astype(np.uint8)
     near = np.nonzero((height < 0) & (height > -pad_mm))
     depth = section.depth_at(labels.index_to_point(np.column_stack(near[::-1])))
-    end = pad_mm * _evaluate_quarter_ellipse(depth / min(float(section.depth.max()), _ROUNDING * pad_mm))
+    share = np.clip(depth / min(float(section.depth.max()), _ROUNDING * pad_mm), 0, 1)
+    end = pad_mm * np.sqrt(1 - (1 - share) ** 2)  # a quarter ellipse, upright at the outline
     kept = -height[near] < end
     array[tuple(axis[kept] for axis in near)] = labels.soft_value
     _check_room(array, section, height, pad_mm)
@@ -148,11 +149,6 @@ def _check_bones(labels: LabelMap, height: Array) -> None:
             "the amputation plane cuts nothing off: no bone lies distal of it",
             remedy="move the plane proximally",
         )
-
-
-def _evaluate_quarter_ellipse(t: Array) -> Array:
-    """0 at the outline (t = 0) with an upright tangent, 1 from t = 1 inward."""
-    return np.sqrt(1 - (1 - np.clip(t, 0, 1)) ** 2)
 
 
 @dataclass(frozen=True)

@@ -110,31 +110,26 @@ def match_markers(markers: Sequence[Marker], hints: Mapping[str, Array]) -> dict
     cost = np.where(distance <= MAX_DISTANCE_MM, distance, 1e3 * (1 + MAX_DISTANCE_MM) * len(names))
     rows, columns = linear_sum_assignment(cost)
     pairs = {r: c for r, c in zip(rows, columns, strict=True) if distance[r, c] <= MAX_DISTANCE_MM}
-    faults = [check(names, pairs, distance) for check in (_describe_missing, _describe_spare)]
-    if any(faults):
+    nearest = distance.min(axis=1, initial=np.inf)
+    missing = [
+        f"{name} (nearest at {nearest[r]:.1f} mm)" if markers else name
+        for r, name in enumerate(names)
+        if r not in pairs
+    ]
+    spare = np.setdiff1d(np.arange(len(markers)), list(pairs.values()))
+    doubled = [names[r] for r in pairs if (distance[r, spare] <= MAX_DISTANCE_MM).any()]
+    faults = []
+    if missing:
+        faults.append(f"no marker of its own within {MAX_DISTANCE_MM:g} mm for {', '.join(missing)}")
+    if doubled:
+        faults.append(f"more than one marker within {MAX_DISTANCE_MM:g} mm of {', '.join(doubled)}")
+    if faults:
         raise SiteError(
-            "; ".join(filter(None, faults)),
+            "; ".join(faults),
             place="sites",
             remedy="correct 'near', or give the site's 'position' on the skin",
         )
     return {names[r]: markers[c] for r, c in pairs.items()}
-
-
-def _describe_missing(names: list[str], pairs: Mapping[int, int], distance: Array) -> str:
-    """Describe the places without a marker; empty if there are none."""
-    missing = [r for r in range(len(names)) if r not in pairs]
-    places = [
-        f"{names[r]} (nearest at {distance[r].min():.1f} mm)" if distance.shape[1] else names[r]
-        for r in missing
-    ]
-    return f"no marker of its own within {MAX_DISTANCE_MM:g} mm for {', '.join(places)}" if places else ""
-
-
-def _describe_spare(names: list[str], pairs: Mapping[int, int], distance: Array) -> str:
-    """Describe the places with more than one marker near them; empty if there are none."""
-    spare = np.setdiff1d(np.arange(distance.shape[1]), list(pairs.values()))
-    doubled = [names[r] for r in pairs if (distance[r, spare] <= MAX_DISTANCE_MM).any()]
-    return f"more than one marker within {MAX_DISTANCE_MM:g} mm of {', '.join(doubled)}" if doubled else ""
 
 
 def _find_foot(skin: Surface, points: Array, weights: Array) -> tuple[Array, Array]:

@@ -17,6 +17,7 @@ from ..words import make_prose, make_table
 Designs = Sequence[SiteDesign | ProtocolPlan]
 _STYLES = ((SIMULATED, "o"), (THIRD, "D"), (ONE_MATERIAL, "s"), (MUTED, "^"), (INK, "v"))
 MAX_FACTOR = 100.0  # factor that is drawn
+OWN = "the study's own"  # design
 
 
 def make_design_section(store: Results, content: DesignResult) -> Section:
@@ -25,15 +26,11 @@ def make_design_section(store: Results, content: DesignResult) -> Section:
         "design",
         "Which sites to test",
         make_prose("design", content=content),
-        make_table("designs", content.designs, marked=_is_own, most=MAX_FACTOR),
+        make_table("designs", content.designs, marked=lambda row: row.design == OWN, most=MAX_FACTOR),
         draw_expected_figure("designs", content.designs, "testing the sites of a design"),
         make_table("candidates", content.candidates, most=max(row.bits for row in content.candidates)),
         make_bullets(f"Left out: {text}." for text in content.left_out),
     )
-
-
-def _is_own(row: SiteDesign) -> bool:
-    return row.design == "the study's own"
 
 
 @styled

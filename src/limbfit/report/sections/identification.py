@@ -47,12 +47,11 @@ def make_correlation_table(correlation: CorrelationMatrix) -> Table:
     """The correlation of every pair of parameters, coloured."""
     heads = [label(name) for name in correlation.names]
     pairs = zip(heads, correlation.matrix, strict=True)
-    rows = [make_row(head, *map(_shade_cell, values)) for head, values in pairs]
+    rows = []
+    for head, values in pairs:
+        cells = [Cell(format_fixed(r, 2), number=True, shade=max(-1.0, min(1.0, r))) for r in values]
+        rows.append(make_row(head, *cells))
     return Table("correlation", write_words("table correlation"), ("", *heads), tuple(rows))
-
-
-def _shade_cell(value: float) -> Cell:
-    return Cell(format_fixed(value, 2), number=True, shade=max(-1.0, min(1.0, value)))
 
 
 def describe_relaxation(store: Results) -> tuple[Block | None, ...]:

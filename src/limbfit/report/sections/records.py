@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 
-from ...results.identification import LeftOutRecord
 from ...results.records import RecordPhase
 from ..drawing.colours import GRID, INK, MUTED, SIMULATED
 from ..drawing.figures import thin_curves
@@ -79,6 +78,7 @@ def make_trace_table(store: Results) -> Table:
 
 def make_record_check_section(store: Results) -> Section:
     """What looks wrong with records, the evidence for it, and each site as predicted from all others."""
+    fitted = [name for site in store.fitted for name in (site, *store.records_of(site))]
     flags, left_out = (store.predict.flags, store.predict.left_out) if store.predict else ((), ())
     return make_section(
         "doubts",
@@ -87,7 +87,9 @@ def make_record_check_section(store: Results) -> Section:
         make_bullets(f"{flag.text[:1].upper()}{flag.text[1:]}." for flag in flags)
         or make_prose("nothing doubtful"),
         make_table("flags", flags, format_words=_format_words) if flags else None,
-        _make_left_out_table(store, left_out) if left_out else None,
+        make_table("left-out", left_out, marked=lambda row: row.standardised > MARKED_ERROR, fitted=fitted)
+        if left_out
+        else None,
     )
 
 
@@ -104,8 +106,3 @@ def _format_words(name: str) -> str:
         if name.endswith(unit):
             return name.removesuffix(unit).replace("_", " ") + shown
     return name.replace("_", " ")
-
-
-def _make_left_out_table(store: Results, left_out: Sequence[LeftOutRecord]) -> Table:
-    fitted = [name for site in store.fitted for name in (site, *store.records_of(site))]
-    return make_table("left-out", left_out, marked=lambda row: row.standardised > MARKED_ERROR, fitted=fitted)
