@@ -445,15 +445,18 @@ def make_cut_views(store: Results, row: PlacedSite, file: Path) -> tuple[View, V
     up = read_limb_frame(store)[2]
     axis = normalise(row.axis)
     normal = normalise(np.cross(axis, up)) if abs(axis @ up) < 0.98 else read_limb_frame(store)[0]
-    points = np.asarray(pv.read(file).points)
-    height = points @ up
-    middle = points.mean(axis=0)
-    half = float(np.ptp(height)) / 2 * 1.05
-    centre = middle + ((height.max() + height.min()) / 2 - middle @ up) * up
-    reach = float(np.abs((points - centre) @ axis).max()) + 30
-    whole = View(centre, normal, up, half, (round(900 * reach / half), 900))
+    whole = make_whole_view(np.asarray(pv.read(file).points), normal, up, margin_mm=30)
     close = View(np.array(row.position_mm) + 14 * axis, normal, up, 34.0, (700, 700))
     return whole, close
+
+
+def make_whole_view(points: Array, normal: Array, up: Array, margin_mm: float) -> View:
+    """All of some points (n, 3), with a margin beside them, cut through their middle."""
+    height, middle = points @ up, points.mean(axis=0)
+    half = float(np.ptp(height)) / 2 * 1.05
+    centre = middle + ((height.max() + height.min()) / 2 - middle @ up) * up
+    reach = float(np.abs((points - centre) @ np.cross(normal, up)).max()) + margin_mm
+    return View(centre, normal, up, half, (round(900 * reach / half), 900))
 
 
 def cut_behind(grid: Grid, view: View, smooth: bool = False) -> Grid:

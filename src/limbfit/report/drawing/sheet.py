@@ -35,7 +35,8 @@ def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: Qual
     masks = {LIMB: turned.limb} | {
         name: turned.mask(name) for name in turned.names.values() if name != SOFT_TISSUE
     }
-    colours = _choose_colours(list(masks))
+    others = iter(_OTHERS * len(masks))
+    colours = {name: COLOURS.get(name) or next(others) for name in masks}
     shown = _choose_slices(turned.limb)
     odd = _choose_suspects(quality)
     large_rows = -(-len(odd) // _SUSPECT_COLUMNS)
@@ -82,11 +83,6 @@ def _choose_suspects(quality: QualityResult) -> list[tuple[int, str]]:
     if len(slices) > _MAX_SUSPECTS:
         slices = [slices[n] for n in np.linspace(0, len(slices) - 1, _MAX_SUSPECTS).round().astype(int)]
     return [(k, "; ".join(texts[k][:2])) for k in slices]
-
-
-def _choose_colours(names: list[str]) -> dict[str, str]:
-    others = iter(_OTHERS * (len(names) // len(_OTHERS) + 1))
-    return {name: COLOURS.get(name) or next(others) for name in names}
 
 
 def _draw(

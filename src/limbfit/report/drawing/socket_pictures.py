@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from .pictures import (
     make_field_plotter,
     make_four_views,
     make_picture_figure,
+    make_whole_view,
     normalise,
     read_limb_frame,
     read_linear,
@@ -126,17 +128,11 @@ def _make_cut_views(store: Results, grid: Grid, place: Array) -> tuple[View, Vie
     middle = points.mean(axis=0)
     outwards = (place - middle) - (place - middle) @ up * up
     normal = normalise(np.cross(outwards if np.linalg.norm(outwards) > 1.0 else back, up))
-    half = float(np.ptp(points @ up)) / 2 * 1.05
-    across = np.cross(normal, up)
-    reach = float(np.abs((points - middle) @ across).max()) + 10
-    height = (points @ up).max() / 2 + (points @ up).min() / 2
-    along_focal = middle + (height - middle @ up) * up + ((place - middle) @ normal) * normal
+    along = make_whole_view(points, normal, up, margin_mm=10)
+    along = replace(along, focal=along.focal + ((place - middle) @ normal) * normal)
     wide = float(np.abs((points - middle) - np.outer((points - middle) @ up, up)).max()) + 8
     across_focal = middle + ((place - middle) @ up) * up
-    return (
-        View(along_focal, normal, up, half, (round(900 * reach / half), 900)),
-        View(across_focal, -up, -back, wide, (900, 900)),
-    )
+    return along, View(across_focal, -up, -back, wide, (900, 900))
 
 
 @styled
