@@ -39,7 +39,7 @@ from limbfit.phantom.build import draw_true_parameters
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.mri import build_true_labels, make_grid
 from limbfit.phantom.record import Ramp, record
-from limbfit.phantom.surfaces import Box, extract_contour
+from limbfit.phantom.surfaces import extract_contour
 
 Array = NDArray[np.floating]
 
@@ -60,8 +60,8 @@ def thigh_bodies() -> dict[str, Surface]:
 
     cut, out = THIGH_MM, THIGH_MM + 6.0
     return {
-        "skin": extract_contour(skin, Box((-85.0, -85.0, -10.0), (85.0, 85.0, cut), 3.0)),
-        "femur": extract_contour(femur, Box((-30.0, -30.0, 20.0), (40.0, 30.0, out), 2.0)),
+        "skin": extract_contour(skin, (-85.0, -85.0, -10.0), (85.0, 85.0, cut), 3.0),
+        "femur": extract_contour(femur, (-30.0, -30.0, 20.0), (40.0, 30.0, out), 2.0),
     }
 
 

@@ -23,7 +23,7 @@ from limbfit.fe import StepControl, solve
 from limbfit.indentation import Parameters, SiteModel, build_problem
 from limbfit.phantom.build import draw_true_parameters
 from limbfit.phantom.record import HEADER, Ramp, record
-from limbfit.phantom.surfaces import Box, extract_contour
+from limbfit.phantom.surfaces import extract_contour
 from limbfit.study import IndenterTable
 
 Array = NDArray[np.float64]
@@ -63,8 +63,8 @@ class Stump:
         return np.sqrt(p[..., 0] ** 2 + (p[..., 1] + self.bone_offset) ** 2 + above**2) - self.bone_radius
 
     def anatomy(self, spacing: float) -> Anatomy:
-        skin = extract_contour(self.skin, Box((-45.0, -45.0, -5.0), (45.0, 45.0, CUT_MM), spacing))
-        bone = extract_contour(self.bone, Box((-30.0, -40.0, 5.0), (30.0, 30.0, CUT_MM + 6.0), spacing / 1.5))
+        skin = extract_contour(self.skin, (-45.0, -45.0, -5.0), (45.0, 45.0, CUT_MM), spacing)
+        bone = extract_contour(self.bone, (-30.0, -40.0, 5.0), (30.0, 30.0, CUT_MM + 6.0), spacing / 1.5)
         return Anatomy(skin, {"tibia": bone}, np.array([0.0, 0.0, CUT_MM]), np.array([0.0, 0.0, 1.0]))
 
     def at(self, degrees: float, z: float) -> Array:

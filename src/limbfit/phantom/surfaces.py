@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pyvista as pv
@@ -18,14 +18,7 @@ Array = NDArray[np.floating]
 Field = Callable[[Array], Array]
 
 
-@dataclass(frozen=True)
-class Box:
-    """A box of the limb frame and the spacing at which a field is sampled in it, mm."""
-
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    spacing: float
-
+Corner = tuple[float, float, float]  # of a box of the limb frame, mm
 
 STICK_OUT_MM = 6.0  # of the femur beyond the cut, so that the void it leaves is open there
 
@@ -39,19 +32,18 @@ def build_true_anatomy(limb: Limb, spacing: float = 2.4) -> Anatomy:
     spacing : of the grid on which the skin is contoured, mm (bones: two thirds of it, the tendon: half).
     """
     shape = limb.shape
-    box = Box((-80.0, -85.0, -4.0), (80.0, 85.0, PROXIMAL_CUT_MM), spacing)
-    skin = extract_contour(lambda p: compute_skin_field(shape, p), box)
+    low, high = (-80.0, -85.0, -4.0), (80.0, 85.0, PROXIMAL_CUT_MM)
+    skin = extract_contour(lambda p: compute_skin_field(shape, p), low, high, spacing)
     low, high = (-62.0, -66.0, 10.0), (62.0, 62.0, PROXIMAL_CUT_MM + STICK_OUT_MM)
-    bone_box = Box(low, high, spacing / 1.5)
     bones = {
-        name: extract_contour(lambda p, name=name: shape.bone_field(name, p), bone_box)  # type: ignore[misc]
+        name: extract_contour(partial(shape.bone_field, name), low, high, spacing / 1.5)
         for name in limb.bone_names
     }
     regions = {}
     if limb.has_tendon:
         z = shape.datum - 12.0
-        tendon_box = Box((-24.0, -66.0, z - 36.0), (24.0, -22.0, z + 36.0), spacing / 2)
-        tendon = extract_contour(lambda p: limb.tendon(limb.to_patient(p)), tendon_box)
+        low, high = (-24.0, -66.0, z - 36.0), (24.0, -22.0, z + 36.0)
+        tendon = extract_contour(lambda p: limb.tendon(limb.to_patient(p)), low, high, spacing / 2)
         regions[TENDON] = _to_patient_space(limb, tendon)
     return Anatomy(
         skin=_to_patient_space(limb, skin),
@@ -65,27 +57,32 @@ def build_true_anatomy(limb: Limb, spacing: float = 2.4) -> Anatomy:
 def build_outer_surface(limb: Limb, thickness_mm: float, spacing: float = 2.4) -> Surface:
     """Build the closed surface (LPS mm) about ``thickness_mm`` outside the skin: that of a liner."""
     reach = thickness_mm + 4.0
-    box = Box((-80.0 - reach, -85.0 - reach, -reach), (80.0 + reach, 85.0 + reach, PROXIMAL_CUT_MM), spacing)
-    return _to_patient_space(
-        limb, extract_contour(lambda p: compute_skin_field(limb.shape, p) - thickness_mm, box)
-    )
+    low, high = (-80.0 - reach, -85.0 - reach, -reach), (80.0 + reach, 85.0 + reach, PROXIMAL_CUT_MM)
+
+    def field(points: Array) -> Array:
+        return compute_skin_field(limb.shape, points) - thickness_mm
+
+    return _to_patient_space(limb, extract_contour(field, low, high, spacing))
 
 
 def _to_patient_space(limb: Limb, surface: Surface) -> Surface:
     return Surface(limb.to_patient(surface.points), surface.faces)
 
 
-def extract_contour(field: Field, box: Box) -> Surface:
-    """Extract the closed zero surface of a field (limb frame), capped flat where it leaves the box's top."""
-    size = [round((h - l) / box.spacing) + 1 for l, h in zip(box.low, box.high, strict=True)]
-    axes = [np.linspace(l, h, n) for l, h, n in zip(box.low, box.high, size, strict=True)]
+def extract_contour(field: Field, low: Corner, high: Corner, spacing: float) -> Surface:
+    """Extract the closed zero surface of a field (limb frame), capped flat where it leaves a box's top.
+
+    The field is sampled in the box every ``spacing`` mm.
+    """
+    size = [round((h - l) / spacing) + 1 for l, h in zip(low, high, strict=True)]
+    axes = [np.linspace(l, h, n) for l, h, n in zip(low, high, size, strict=True)]
     z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
     values = field(np.stack([x, y, z], axis=-1))
-    image = pv.ImageData(dimensions=size, spacing=[a[1] - a[0] for a in axes], origin=box.low)
+    image = pv.ImageData(dimensions=size, spacing=[a[1] - a[0] for a in axes], origin=low)
     image.point_data["field"] = values.ravel()
     poly = image.contour([0.0], scalars="field", method="flying_edges", compute_normals=False).clean()
     surface = find_bodies(from_pyvista(poly))[0]
-    surface = _cap_rim(_project_to_surface(field, surface, box.high[2]), box.high[2])
+    surface = _cap_rim(_project_to_surface(field, surface, high[2]), high[2])
     return surface if surface.volume > 0 else surface.flipped
 
 

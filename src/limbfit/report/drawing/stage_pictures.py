@@ -11,7 +11,6 @@ from scipy.spatial import KDTree
 
 from ...errors import InputError
 from ...mesh import compute_dihedral_angles
-from ...results.limb import PlacedSite
 from ..store import Results, load_store
 from .pictures import (
     BONE,
@@ -99,7 +98,9 @@ def draw_sites_sheet(store: Results) -> Drawing:
 
     def mark_facing(view: View) -> list[Mark]:
         facing = [row for row in store.sites if normalise(row.axis) @ view.direction > 0.35]
-        return [_mark_site(row, colours) for row in facing]
+        return [
+            Mark(row.site, np.array(row.position_mm), colours[row.region or ""], row.fitted) for row in facing
+        ]
 
     shots = render_views(plotter, make_four_views(store, skin), mark_facing)
     keys = [make_key(name or "no region", colour, dot=True) for name, colour in colours.items()]
@@ -161,11 +162,6 @@ def _measure_thicknesses(store: Results, skin: Any) -> list[tuple[Any, str]]:
         same = KDTree(depth.points).query(skin.points)[1]  # a surface from STL numbers its vertices anew
         maps.append((np.asarray(depth.point_data["fat_depth_mm"])[same], "depth of the fat (mm)"))
     return maps
-
-
-def _mark_site(row: PlacedSite, colours: dict[str, str]) -> Mark:
-    colour = colours[row.region or ""]
-    return Mark(row.site, np.array(row.position_mm), colour, row.fitted)
 
 
 _SHEETS = {"surfaces": draw_surfaces_sheet, "sites": draw_sites_sheet, "mesh": draw_mesh_sheet}

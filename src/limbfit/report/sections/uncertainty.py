@@ -16,7 +16,7 @@ from ..drawing import plots
 from ..drawing.colours import INK, MEASURED, MUTED, SIMULATED, choose_truth_style
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import NOTHING, format_fixed, label
-from ..page import Block, Bullets, Figure, Note, Prose, Section, Table, make_section
+from ..page import Bullets, Figure, Note, Prose, Section, Table, make_section
 from ..store import Curves, Results, find_compared_quantity
 from ..words import make_prose, make_table, write_words
 
@@ -27,6 +27,7 @@ MAX_DRAWS, MAX_SITES = 300, 18
 def make_uncertainty_section(store: Results, content: UncertaintyResult) -> Section:
     """What the experiment ``uncertainty`` found."""
     found = content.predictions
+    emulator = write_words("emulator", emulator=content.emulator, chain=content.posterior)
     return make_section(
         "uncertainty",
         "What the records determine",
@@ -40,7 +41,7 @@ def make_uncertainty_section(store: Results, content: UncertaintyResult) -> Sect
         make_table("uncertainty-sources", content.sources) if content.sources else None,
         draw_prediction_figure(store, content),
         make_table("uncertainty-predictions", found.sites, marked="fitted", found=found),
-        _describe_emulator(content),
+        Prose(emulator) if content.emulator.good_enough else Note(emulator),
     )
 
 
@@ -97,11 +98,6 @@ def _make_evidence_table(content: UncertaintyResult) -> Table | None:
         (found.second, found.heldout.get("second_percent")),
     )
     return make_table("evidence", rows, marked=lambda row: row[0].name == found.better, found=found)
-
-
-def _describe_emulator(content: UncertaintyResult) -> Block:
-    text = write_words("emulator", emulator=content.emulator, chain=content.posterior)
-    return Prose(text) if content.emulator.good_enough else Note(text)
 
 
 def read_true_values(store: Results) -> TrueValues:
