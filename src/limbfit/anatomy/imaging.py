@@ -89,22 +89,19 @@ def read_labels(path: str | Path, like: Volume | None = None) -> LabelMap:
     """
     path = Path(path)
     try:
-        labels = _read_label_file(path, like)
+        dicom = find_dicom_labels(path)
+        if dicom is not None:
+            with add_location(file=dicom):
+                labels = read_dicom_labels(dicom, like)
+        else:
+            image = read_image(path)
+            labels = read_seg_nrrd(image) if is_seg_nrrd(path) else read_label_image(path, image)
         if not labels.array.any():
             raise LabelError("the label map is empty", remedy="give one with the limb labelled")
         return labels if like is None else place_on_grid(labels, like)
     except (ImageError, LabelError) as error:  # of a label map an image's error is one of labels
         file = error.file or path
         raise LabelError(error.what, file=file, place=error.place, remedy=error.remedy) from None
-
-
-def _read_label_file(path: Path, like: Volume | None) -> LabelMap:
-    dicom = find_dicom_labels(path)
-    if dicom is not None:
-        with add_location(file=dicom):
-            return read_dicom_labels(dicom, like)
-    image = read_image(path)
-    return read_seg_nrrd(image) if is_seg_nrrd(path) else read_label_image(path, image)
 
 
 def write_labels(path: str | Path, labels: LabelMap) -> None:

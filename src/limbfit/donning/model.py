@@ -116,7 +116,9 @@ def build_socket_problem(
     motion = _build_donning(fit)
     before = None
     for load in fit.loads:
-        after = _build_wrench(load, fit)
+        force = np.asarray(load.force, dtype=float)
+        moment = np.asarray(load.moment) + np.cross(np.asarray(load.point) - fit.pivot, force)
+        after = np.concatenate([frame @ force, frame @ moment])  # about the pivot, in socket coordinates
         motion, before = motion.then(_build_loading(load, before, after)), after
     body = RigidBody(shape, mesh.face_sets[OUTER], motion, fit.friction, name="socket")
     return build_limb_problem(mesh, materials, motion.times[-1], bodies=(body,))
@@ -143,13 +145,6 @@ def _build_donning(fit: SocketFit) -> Motion:
     if fit.hold_s > 0.0:
         times, growth, z = [*times, fit.donning_s + fit.hold_s], [*growth, 1.0], [*z, 0.0]
     return Motion.of(times, growth=growth, z=z)
-
-
-def _build_wrench(load: Load, fit: SocketFit) -> Array:
-    """(6,) force, N, and moment about the pivot, N mm, in the socket's coordinates."""
-    force = np.asarray(load.force, dtype=float)
-    moment = np.asarray(load.moment) + np.cross(np.asarray(load.point) - fit.pivot, force)
-    return np.concatenate([fit.frame @ force, fit.frame @ moment])
 
 
 def _build_loading(load: Load, before: Array | None, after: Array) -> Motion:

@@ -96,27 +96,27 @@ def describe_series(folder: str | Path) -> list[dict[str, Any]]:
     folder = Path(folder)
     if not folder.is_dir():
         raise ImageError("no such folder", file=folder, remedy="give the folder that holds the DICOM files")
-    return [_collect_facts(series) for series in list_series(folder)]
-
-
-def _collect_facts(series: Series) -> dict[str, Any]:
-    first = series.slices[0]
-    facts: dict[str, Any] = {
-        "uid": series.uid,
-        "number": first.series_number if first.series_number.isdecimal() else "",
-        "modality": _redact_modality(first.modality),
-        "slices": len(series.slices),
-        "rows": first.rows,
-        "columns": first.columns,
-        "spacing_mm": None,
-        "whole": True,
-        "why_not": None,
-    }
-    try:
-        _, spacing, _ = stack_slices(series.slices)
-    except ImageError as error:
-        return facts | {"whole": False, "why_not": str(error)}
-    return facts | {"spacing_mm": [round(float(step), 6) for step in spacing]}
+    found = []
+    for series in list_series(folder):
+        first, spacing_mm, why_not = series.slices[0], None, None
+        try:
+            spacing_mm = [round(float(step), 6) for step in stack_slices(series.slices)[1]]
+        except ImageError as error:
+            why_not = str(error)
+        found.append(
+            {
+                "uid": series.uid,
+                "number": first.series_number if first.series_number.isdecimal() else "",
+                "modality": _redact_modality(first.modality),
+                "slices": len(series.slices),
+                "rows": first.rows,
+                "columns": first.columns,
+                "spacing_mm": spacing_mm,
+                "whole": why_not is None,
+                "why_not": why_not,
+            }
+        )
+    return found
 
 
 def read_series(folder: str | Path, series_uid: str | None = None) -> Volume:
