@@ -37,9 +37,9 @@ import igl
 import numpy as np
 from damage import KINDS, Kind, Whole, make_whole, read_whole
 
+from limbfit import check_study, run_study
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, load_anatomy
 from limbfit.cli import main as limbfit
-from limbfit.pipeline import check_study, run_study
 
 TIME_LIMIT_S = 300.0
 LOADED = (check_study, run_study)  # what the children would else load one by one

@@ -15,9 +15,9 @@ import pytest
 from test_execution import die, heard, nap, refuse, solve, threads, told
 
 from conftest import COARSE
+from limbfit import run_study
 from limbfit.errors import InputError, TraceError
 from limbfit.execution import THREAD_VARIABLES, DaskExecutor, Limits, SerialExecutor
-from limbfit.pipeline import run_study
 from limbfit.study import load_study
 
 distributed = pytest.importorskip("distributed")

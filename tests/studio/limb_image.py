@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from limbfit import run_study
 from limbfit.anatomy.imaging import Volume, write_volume
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.mri import build_image, make_grid
-from limbfit.pipeline import run_study
 from limbfit.study import load_study
 
 STUDY = """

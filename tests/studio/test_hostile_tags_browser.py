@@ -10,10 +10,10 @@ import pytest
 
 from browsing import PATIENCE_MS, until
 from conftest import write_trace
+from limbfit import study_status
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.mri import make_grid, write_series
 from limbfit.phantom.sites import build_true_sites
-from limbfit.pipeline import study_status
 from limbfit.study import load_study
 
 ATTACKS = (

@@ -13,8 +13,8 @@ import pytest
 from fastapi.testclient import TestClient
 from limb_image import make_segmented
 
+from limbfit import run_study, study_status
 from limbfit.anatomy.imaging import read_labels
-from limbfit.pipeline import run_study, study_status
 from limbfit.pipeline.engine.store import lock
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import AccessGuard

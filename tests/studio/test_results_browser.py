@@ -11,9 +11,8 @@ import pyvista as pv
 
 from browsing import until
 from conftest import COARSE
-from limbfit import load_study
+from limbfit import load_study, run_study
 from limbfit.febio import read_feb, to_problem
-from limbfit.pipeline import run_study
 from limbfit.studio.playback import FIELDS
 
 MOMENT = re.compile(r"(\S+) s; von Mises stress (\S+) to (\S+) kPa")

@@ -12,8 +12,8 @@ import pytest
 from limb_image import make_segmented
 
 from browsing import serious_findings, until
+from limbfit import run_study, study_status
 from limbfit.anatomy.imaging import read_labels
-from limbfit.pipeline import run_study, study_status
 from limbfit.study import load_study
 
 SIZES = ((1280, 800), (1920, 1080))

@@ -8,7 +8,7 @@ from typing import Any
 
 from fastapi import APIRouter
 
-from ..pipeline import STAGE_NAMES
+from ..pipeline.commands.run import STAGE_NAMES
 from ..pipeline.simulation.simulations import find_newest_simulation
 from ..results.curves import read_curves
 from ..results.identification import CalibrationResult

@@ -26,7 +26,7 @@ from ..errors import InputError, RunError
 from ..pipeline.engine.digests import compute_file_digest
 from ..pipeline.limb.inputs import read_plain_image
 from ..study import Study
-from .editing import set_key
+from .editing import edit_study
 from .folder import StudyFolder
 from .processes import find_running
 from .study_routes import Folder
@@ -165,8 +165,10 @@ def _save_labels(folder: StudyFolder, study: Study, shown: ShownLabels, labels: 
     finally:
         written.unlink(missing_ok=True)
     if study.segmentation.is_given and study.segmentation.labels != Path(BESIDE):
-        set_key(folder.file, "segmentation", "contours", None)
-        set_key(folder.file, "segmentation", "labels", BESIDE)
+        with edit_study(folder.file) as document:
+            table: Any = document["segmentation"]
+            table.pop("contours", None)
+            table["labels"] = BESIDE
 
 
 def paint_runs(labels: LabelMap, runs: list[tuple[int, int, int]]) -> LabelMap:

@@ -24,7 +24,7 @@ import psutil
 
 from ..errors import InputError, RunError
 from ..execution import SAFE_PATH
-from ..pipeline import STAGE_NAMES
+from ..pipeline.commands.run import STAGE_NAMES
 from ..pipeline.engine.journal import redact_paths
 from ..pipeline.engine.store import find_holder, is_held
 from ..study import load_study

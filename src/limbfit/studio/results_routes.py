@@ -13,7 +13,7 @@ from fastapi import APIRouter, Response
 from pydantic import Field
 
 from ..errors import InputError, RunError
-from ..pipeline import export_study
+from ..pipeline.commands.export import export_study
 from ..pipeline.engine.storage import read_json, write_json
 from ..results.curves import read_curves
 from ..results.identification import CalibrationResult, PredictResult

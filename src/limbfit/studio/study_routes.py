@@ -11,7 +11,7 @@ from fastapi import APIRouter, Depends, Request, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict
 
-from ..pipeline import study_status
+from ..pipeline.commands.run import study_status
 from ..pipeline.engine.provenance import list_input_files
 from ..study import Study
 from ..web.arrays import pack

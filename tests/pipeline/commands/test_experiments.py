@@ -7,9 +7,8 @@ from importlib import import_module
 
 import pytest
 
-from limbfit import run_experiment
+from limbfit import Progress, run_experiment, study_status
 from limbfit.errors import InputError
-from limbfit.pipeline import Progress, study_status
 from limbfit.pipeline.commands.experiments import EXPERIMENTS, Experiment, register_experiment
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.storage import write_json

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from limbfit import Progress, run_study
 from limbfit.anatomy.imaging import read_labels
 from limbfit.cli import main
 from limbfit.errors import InputError, LabelError, RunError
-from limbfit.pipeline import Progress, run_study
 from limbfit.study import load_study
 
 SETTINGS = {"deadline": None, "suppress_health_check": list(HealthCheck), "derandomize": True}

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from conftest import COARSE
+from limbfit import Progress, run_study, simulate_site, study_status
 from limbfit.errors import InputError
 from limbfit.mesh import read_vtu
-from limbfit.pipeline import Progress, run_study, simulate_site, study_status
 from limbfit.study import load_study
 
 

@@ -7,8 +7,8 @@ import json
 import pytest
 
 from conftest import COARSE
+from limbfit import Progress, reproduce_study, run_study
 from limbfit.errors import InputError
-from limbfit.pipeline import Progress, reproduce_study, run_study
 from limbfit.study import load_study
 
 

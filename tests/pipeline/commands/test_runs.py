@@ -14,9 +14,9 @@ import sys
 import psutil
 import pytest
 
+from limbfit import Progress, diagnose, run_batch, run_study, study_status
 from limbfit.errors import InputError, RunError
 from limbfit.execution import Limits, SerialExecutor, make_executor, share_executor
-from limbfit.pipeline import Progress, diagnose, run_batch, run_study, study_status
 from limbfit.pipeline.commands.doctor import compress_test_cube, judge_self_test
 from limbfit.pipeline.engine.journal import redact_paths
 from limbfit.study import load_study

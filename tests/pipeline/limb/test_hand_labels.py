@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from limbfit import run_study
 from limbfit.anatomy.grid import LabelMap, Volume
 from limbfit.anatomy.imaging import read_labels, write_labels, write_volume
 from limbfit.errors import StudyError
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.mri import build_image, make_grid
-from limbfit.pipeline import run_study
 from limbfit.pipeline.commands.run import study_status
 from limbfit.study import Study, load_study
 

@@ -7,9 +7,9 @@ import pytest
 
 from completing import complete
 from conftest import coarse_mesh
+from limbfit import run_study
 from limbfit.errors import InputError
 from limbfit.execution import SerialExecutor
-from limbfit.pipeline import run_study
 from limbfit.pipeline.engine.context import Context, Progress
 from limbfit.pipeline.engine.storage import read_json, write_json
 from limbfit.pipeline.engine.store import Store
