@@ -13,7 +13,7 @@ from browsing import until
 from conftest import COARSE
 from limbfit import load_study, run_study
 from limbfit.febio import read_feb, to_problem
-from limbfit.studio.playback import FIELDS
+from limbfit.studio.results_routes import FIELDS
 
 MOMENT = re.compile(r"(\S+) s; von Mises stress (\S+) to (\S+) kPa")
 PLACES = {"1": (40.0, 0.0, 60.0), "2": (0.0, 40.0, 50.0)}  # of the stump's sites, mm

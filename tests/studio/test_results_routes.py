@@ -11,8 +11,8 @@ from stored_fields import block, fields, write_outcome, write_stored
 
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import AccessGuard
-from limbfit.studio.playback import FIELDS
 from limbfit.studio.processes import find_simulating
+from limbfit.studio.results_routes import FIELDS
 from limbfit.studio.server import create_app
 from unpacking import unpack
 

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 from ..acquire import Recording, follow_recording
 from ..acquire.events import PINS
 from ..acquire.protocol import FINAL
+from ..acquire.quality import Check
 from ..errors import TraceError
 from ..pipeline.commands.acquire import FOLDER as ACQUIRED
 from ..pipeline.commands.acquire import RECORD, VERDICT
@@ -30,20 +31,11 @@ _PENDING = 1 << 16  # bytes: more than is written between two requests
 _MAX_VERDICT = 1 << 20
 
 
-class StoredCheck(BaseModel):
-    """One line of a stored verdict."""
-
-    name: str
-    passed: bool | None
-    found: str
-    remedy: str
-
-
 class StoredVerdict(BaseModel):
     """A stored verdict; ``trace`` is the file of the site's record, None where the session made none."""
 
     good: bool
-    checks: list[StoredCheck]
+    checks: list[Check]
     trace: str | None = None
 
 
@@ -83,11 +75,8 @@ def get_part(
 
 def _list_records(folder: StudyFolder) -> list[tuple[float, Path]]:
     """Records that were begun, with their ages in s."""
-    records = []
-    for file in (folder.folder / ACQUIRED).glob(f"*/*/{RECORD}"):
-        if _STAMP.fullmatch(file.parent.name) and file.is_file():
-            records.append((_compute_age(file), file))
-    return records
+    files = (folder.folder / ACQUIRED).glob(f"*/*/{RECORD}")
+    return [(_compute_age(file), file) for file in files if _STAMP.fullmatch(file.parent.name)]
 
 
 def _compute_age(file: Path) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from ..pipeline.limb.sites import place_site
 from ..pipeline.limb.surfaces import read_given_anatomy
 from ..results.limb import MeshResult, PlacedSite, SitesResult
 from ..study import Site, Study
-from ..web.shapes import Shell, build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape
+from ..web.shapes import build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape
 from .editing import add_site, remove_site, set_site
 from .folder import StudyFolder, compute_fingerprint
 from .study_routes import Folder, StrictModel, respond_block
@@ -83,7 +82,9 @@ def get_surface(folder: Folder, name: str) -> Response:
     surface = {SKIN: anatomy.skin, **anatomy.bones}.get(name) if anatomy else None
     if surface is None:
         raise InputError("the model has no such surface", remedy="run the stages until surfaces")
-    return _respond_shell(Shell(surface.points.astype(np.float32), surface.faces.astype(np.uint32)))
+    return respond_block(
+        {"points": surface.points.astype(np.float32), "faces": surface.faces.astype(np.uint32)}
+    )
 
 
 @router.get("/layer/{site}/{layer}")
@@ -92,7 +93,8 @@ def get_layer(folder: Folder, site: str, layer: str) -> Response:
     mesh = read_vtu(folder.artefact("mesh", f"{site}.vtu"))
     if layer not in mesh.region_names[:-1]:
         raise InputError("the mesh has no such layer", remedy="make the meshes again")
-    return _respond_shell(extract_interface(to_volume_shape(mesh), mesh.region_names.index(layer)))
+    face = extract_interface(to_volume_shape(mesh), mesh.region_names.index(layer))
+    return respond_block({"points": face.points, "faces": face.faces})
 
 
 @router.get("/mesh/{site}")
@@ -167,21 +169,17 @@ def project_to_skin_of_study(folder: StudyFolder, position: Sequence[float]) -> 
 
 
 def _mark_each_surface(folder: StudyFolder, study: Study, anatomy: Anatomy) -> dict[str, str]:
-    if _has_made_surfaces(folder):
-        files = {name: _find_surface_file(folder, name) for name in (SKIN, *anatomy.bones)}
+    given = study.surfaces
+    if given is None or _has_made_surfaces(folder):
+        files = {SKIN: folder.artefact("surfaces", "skin.stl")}
+        files |= {name: folder.artefact("surfaces", f"bone-{name}.stl") for name in anatomy.bones}
     else:
-        assert study.surfaces is not None
-        files = {SKIN: study.surfaces.skin, **study.surfaces.bones}
-        files = {name: study.path(file) for name, file in files.items()}
+        files = {name: study.path(file) for name, file in {SKIN: given.skin, **given.bones}.items()}
     return {name: compute_fingerprint([file]) for name, file in files.items()}
 
 
 def _has_made_surfaces(folder: StudyFolder) -> bool:
     return (folder.results / "surfaces" / "surfaces.json").is_file()
-
-
-def _find_surface_file(folder: StudyFolder, name: str) -> Path:
-    return folder.artefact("surfaces", f"{name}.stl" if name == SKIN else f"bone-{name}.stl")
 
 
 def _describe_site(
@@ -206,10 +204,6 @@ def _describe_site(
     except SiteError as error:
         row["problem"] = error.what
     return row
-
-
-def _respond_shell(shell: Shell) -> Response:
-    return respond_block({"points": shell.points, "faces": shell.faces})
 
 
 def _check_movable(study: Study, name: str) -> None:

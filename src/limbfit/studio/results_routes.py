@@ -5,21 +5,28 @@ from __future__ import annotations
 import re
 import shutil
 import tempfile
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+import pyvista as pv
 from fastapi import APIRouter, Response
 from pydantic import Field
 
 from ..errors import InputError, RunError
+from ..mesh import read_grid, read_vtu
+from ..phases import find_loading_end, find_phases
 from ..pipeline.commands.export import export_study
 from ..pipeline.engine.storage import read_json, write_json
 from ..results.curves import read_curves
 from ..results.identification import CalibrationResult, PredictResult
+from ..results.runs import SimulateResult
 from ..study import Record
-from . import playback, processes
-from .folder import StudyFolder
+from ..web.shapes import to_volume_shape
+from . import processes
+from .folder import StudyFolder, compute_fingerprint
 from .study_routes import Folder, StrictModel, list_stage_states, respond_block
 
 router = APIRouter(prefix="/api/results")
@@ -31,6 +38,36 @@ _SITE_KEYS = {
     *("error_percent", "error_one_material_percent", "peak_force_N", "penetration_mm"),
 }
 _MEAN_KEYS = {f"{kind}_error_{use}_percent" for kind in ("mean", "sd") for use in ("fitted", "heldout")}
+
+
+_FRAME = re.compile(r'<DataSet timestep="([^"]+)" part="0" file="[^"/]+/(step-\d{4,}\.vtu)"/>')
+
+
+@dataclass(frozen=True)
+class StoredField:
+    """A quantity that is stored: its array on cells or points, and which component; None is the length."""
+
+    title: str
+    unit: str
+    array: str
+    on_cells: bool = True
+    component: int | None = 0
+
+
+FIELDS = {
+    "displacement": StoredField("displacement", "mm", "displacement_mm", False, None),
+    "von_mises": StoredField("von Mises stress", "kPa", "von_mises_kPa"),
+    **{
+        f"cauchy_{name}": StoredField(f"Cauchy stress {name}", "kPa", "cauchy_kPa", True, i)
+        for i, name in enumerate(("xx", "yy", "zz", "xy", "yz", "zx"))
+    },
+    "largest_stretch": StoredField("largest principal stretch", "–", "largest_stretch"),
+    "middle_stretch": StoredField("middle principal stretch", "–", "middle_stretch"),
+    "smallest_stretch": StoredField("smallest principal stretch", "–", "smallest_stretch"),
+    "J": StoredField("volume ratio J", "–", "J"),
+    "contact_pressure": StoredField("contact pressure", "kPa", "contact_pressure_kPa", False),
+    "energy_density": StoredField("strain energy density", "kPa", "energy_density_kPa"),
+}
 
 
 class KeptRunName(StrictModel):
@@ -68,7 +105,7 @@ def get_outcome(folder: Folder, kept: str | None = None) -> dict[str, Any]:
 def get_site(folder: Folder, site: str) -> dict[str, Any]:
     """The stored fields and files of a site, and the state of its simulation."""
     return {
-        "sources": playback.list_sources(folder, folder.load().indentation(site).name),
+        "sources": _list_sources(folder, folder.load().indentation(site).name),
         "downloads": _list_site_downloads(folder, site),
         "simulating": processes.find_simulating(folder),
         "failure": processes.read_failure(folder, site),
@@ -89,14 +126,37 @@ def get_curves(folder: Folder, site: str, kept: str | None = None) -> dict[str, 
 
 @router.get("/mesh/{source}/{site}")
 def get_mesh(folder: Folder, source: str, site: str) -> Response:
-    """The mesh that the fields of a site stand on, as a block of arrays."""
-    return respond_block(*playback.read_mesh(folder, source, site))
+    """The mesh of a site's fields: the arrays of `VolumeShape`; facts: names of regions, stored fields."""
+    file = _find_file(folder, source, site, 0)
+    mesh, arrays = read_vtu(file), read_arrays(file)
+    fields = [
+        {"name": name, "title": field.title, "unit": field.unit}
+        for name, field in FIELDS.items()
+        if field.array in arrays
+    ]
+    facts = {"regions": list(mesh.region_names), "fields": fields, "cells": len(mesh.cells)}
+    return respond_block(to_volume_shape(mesh).arrays(), facts)
 
 
-@router.get("/moment/{source}/{site}/{moment}/{field}")
-def get_moment(folder: Folder, source: str, site: str, moment: int, field: str) -> Response:
-    """Displacements and a field at one moment, as a block of arrays."""
-    return respond_block(*playback.read_moment(folder, source, site, moment, field))
+@router.get("/moment/{source}/{site}/{moment}/{name}")
+def get_moment(folder: Folder, source: str, site: str, moment: int, name: str) -> Response:
+    """``moved`` (n, 3) of the drawn nodes in mm, and ``values`` of a field on cells or drawn nodes. Raises
+    `InputError` for an unknown field, or one that is not stored, and `FileNotFoundError` for a moment that is
+    not there.
+    """
+    field = FIELDS.get(name)
+    arrays = read_arrays(_find_file(folder, source, site, moment))
+    if field is None or field.array not in arrays:
+        raise InputError("no such field is stored", remedy="fields are " + ", ".join(FIELDS))
+    nodes = np.unique(arrays["cells"][:, :4])
+    values = arrays[field.array]
+    if values.ndim == 2:
+        values = np.linalg.norm(values, axis=1) if field.component is None else values[:, field.component]
+    drawn = {
+        "moved": arrays["displacement_mm"][nodes].astype(np.float32),
+        "values": (values if field.on_cells else values[nodes]).astype(np.float32),
+    }
+    return respond_block(drawn, {"on": "cells" if field.on_cells else "nodes"})
 
 
 @router.post("/simulate/{site}")
@@ -173,6 +233,86 @@ def _find_kept_run(folder: StudyFolder, name: str) -> Path:
     if not _NAME.fullmatch(name) or not (folder.results / KEPT / name / ABOUT).is_file():
         raise FileNotFoundError("the kept run")
     return folder.artefact(KEPT, name, ABOUT).parent
+
+
+def _list_sources(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
+    """The stored fields of a site: every step of a simulation, or the deepest point of the prediction.
+
+    Each has ``source``, ``title``, ``times_s``, ``deepest`` (which of them), ``parameters_from``, and
+    ``mark``, which other fields change.
+    """
+    sources = []
+    moments = _list_moments(folder, site)
+    if moments:
+        times_s = [time for time, _ in moments]
+        simulated = SimulateResult.find(folder.results, site)
+        sources.append(
+            {
+                "source": "simulate",
+                "title": "every step, simulated",
+                "times_s": times_s,
+                "deepest": _find_deepest(folder, site, times_s),
+                "parameters_from": simulated and simulated.parameters_from,
+                "mark": compute_fingerprint(file for _, file in moments),
+            }
+        )
+    predicted = folder.results / "predict" / f"{site}.vtu"
+    if predicted.is_file():
+        sources.append(
+            {
+                "source": "predict",
+                "title": "the deepest point, predicted",
+                "times_s": [_find_peak_time(folder.artefact("predict", f"{site}.csv"))],
+                "deepest": 0,
+                "parameters_from": "identified",
+                "mark": compute_fingerprint([predicted]),
+            }
+        )
+    return sources
+
+
+def _list_moments(folder: StudyFolder, site: str) -> list[tuple[float, Path]]:
+    """The time (s) and file of every stored step of an animation."""
+    collection = folder.results / "simulate" / f"{site}.pvd"
+    if not collection.is_file():
+        return []
+    named = _FRAME.findall(collection.read_text(encoding="utf-8"))
+    files = [(float(time), collection.with_suffix("") / name) for time, name in named]
+    return [(time, file) for time, file in files if file.is_file()]
+
+
+def _find_deepest(folder: StudyFolder, site: str, times_s: list[float]) -> int:
+    """The moment nearest to the deepest point; the last one while the simulation goes on."""
+    curve = folder.results / "simulate" / f"{site}.csv"
+    if not curve.is_file():
+        return len(times_s) - 1
+    return int(np.argmin(np.abs(np.array(times_s) - _find_peak_time(curve))))
+
+
+def _find_peak_time(curve: Path) -> float:
+    columns = read_curves(curve)
+    motion = columns["displacement_mm"] if "displacement_mm" in columns else columns["force_N"]
+    loading = find_loading_end(find_phases(columns["time_s"], motion))
+    return 0.0 if loading is None else loading.end_s
+
+
+def _find_file(folder: StudyFolder, source: str, site: str, moment: int) -> Path:
+    if source == "predict":
+        return folder.artefact("predict", f"{site}.vtu")
+    if source != "simulate":
+        raise InputError("fields are those of simulate or predict")
+    folder.artefact("simulate", f"{site}.pvd")  # a plain name, inside the study
+    moments = _list_moments(folder, site)
+    if not 0 <= moment < len(moments):
+        raise FileNotFoundError(f"moment {moment} of site {site}")
+    return folder.artefact("simulate", site, moments[moment][1].name)
+
+
+def read_arrays(file: Path) -> dict[str, np.ndarray]:
+    """The point and cell arrays of a VTU file, and its ``cells`` (m, k)."""
+    grid: Any = pv.wrap(read_grid(file))
+    cells = grid.cell_connectivity.reshape(grid.n_cells, -1)
+    return {**grid.point_data, **grid.cell_data, "cells": cells}
 
 
 def _list_downloads(folder: StudyFolder) -> list[dict[str, str]]:

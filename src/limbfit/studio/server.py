@@ -60,7 +60,8 @@ def serve(
     RunError
         Where the port is taken.
     """
-    folder = StudyFolder(_find_study_file(study))
+    path = Path(study).absolute()
+    folder = StudyFolder(path / "study.toml" if path.is_dir() else path)
     folder.load()
     if not is_loopback(host) and not expose:
         raise InputError(
@@ -87,11 +88,6 @@ def serve(
         opener.start()
     with listener:
         uvicorn.Server(config).run(sockets=[listener])
-
-
-def _find_study_file(study: str | Path) -> Path:
-    path = Path(study).absolute()
-    return path / "study.toml" if path.is_dir() else path
 
 
 def _open_socket(host: str, port: int) -> socket.socket:

@@ -27,8 +27,8 @@ from .editing import remove_area, set_area, set_trimline
 from .folder import StudyFolder, compute_fingerprint
 from .identification_routes import describe_last_run
 from .model_routes import Place, Text, mark_surfaces, project_to_skin_of_study, read_anatomy
-from .playback import read_arrays
 from .processes import find_running, find_starting, start_socket
+from .results_routes import read_arrays
 from .study_routes import Folder, StrictModel, respond_block
 
 router = APIRouter(prefix="/api/socket")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +24,6 @@ from .study_routes import Folder, StrictModel, list_stage_states
 
 router = APIRouter(prefix="/api/traces")
 MAX_POINTS, CURVE_POINTS = 2000, 400  # of a raw record and of a regularised one on the page
-_MAX_CACHED = 64
 
 
 class Times(StrictModel):
@@ -50,20 +49,16 @@ def get_records(folder: Folder) -> dict[str, Any]:
             "site": indentation.name,
             "region": indentation.region,
             "fitted": indentation.fitted,
+            "has_trace": indentation.trace is not None,
             "error": None,
         }
         if isinstance(indentation, Record) and study.path(indentation.trace).is_file():
             try:
-                records[indentation.name] = _read(study, indentation)
+                records[indentation.name] = _read(folder, study, indentation)
             except InputError as error:
                 row["error"] = str(error)
         content = records[indentation.name].content if indentation.name in records else {}
-        row |= {
-            "has_trace": indentation.trace is not None,
-            "facts": content.get("facts"),
-            "stated": content.get("stated"),
-        }
-        rows.append(row)
+        rows.append(row | {key: content.get(key) for key in ("facts", "stated")})
     return {"sites": rows, "flags": _collect_flags(folder, study, records)}
 
 
@@ -71,14 +66,14 @@ def get_records(folder: Folder) -> dict[str, Any]:
 def get_record(folder: Folder, name: str) -> dict[str, Any]:
     """One record raw and regularised; times in s of the record, displacement in mm, force in N."""
     study = folder.load()
-    return _read(study, _find_record(study, name)).content
+    return _read(folder, study, _find_record(study, name)).content
 
 
 @router.post("/{name}/preview")
 def preview_record(folder: Folder, name: str, times: Times) -> dict[str, Any]:
     """The record as other times would change it; nothing is stored."""
     study = folder.load()
-    return _read(study, _replace_times(_find_record(study, name), times)).content
+    return _read(folder, study, _replace_times(_find_record(study, name), times)).content
 
 
 @router.post("/{name}")
@@ -86,7 +81,7 @@ def post_times(folder: Folder, name: str, times: Times) -> dict[str, Any]:
     """Store the times in the study file, or remove them; the stage ``traces`` turns stale."""
     study = folder.load()
     record = _replace_times(_find_record(study, name), times)
-    content = _read(study, record).content
+    content = _read(folder, study, record).content
     set_record(folder.file, record, {"touch_down_s": record.touch_down_s, "peak_s": record.peak_s})
     return content
 
@@ -100,65 +95,46 @@ def _find_record(study: Study, name: str) -> Record:
 
 def _replace_times(record: Record, times: Times) -> Record:
     rounded = {key: None if at is None else round(at, 4) for key, at in times.model_dump().items()}
-    return replace(record, touch_down_s=rounded["touch_down_s"], peak_s=rounded["peak_s"])
+    return record.model_copy(update=rounded)
 
 
 class _ReadRecord(NamedTuple):
     """A record that was read, and what the page shows of it."""
 
     facts: TraceFacts
-    step_s: float
     content: dict[str, Any]
 
 
-_cache: dict[str, _ReadRecord] = {}
-
-
-def _read(study: Study, record: Record) -> _ReadRecord:
-    """A record with its curves, from the cache while neither its file nor its settings have changed."""
+def _read(folder: StudyFolder, study: Study, record: Record) -> _ReadRecord:
+    """A record with its curves; it is read again only when its file, its times or the table has changed."""
     file = study.path(record.trace)
-    key = repr(
-        (
-            record.name,
-            str(file),
-            compute_fingerprint([file]),
-            study.traces,
-            record.touch_down_s,
-            record.peak_s,
-        )
-    )
-    if key not in _cache:
-        if len(_cache) >= _MAX_CACHED:
-            _cache.clear()
-        _cache[key] = _record(study, record)
-    return _cache[key]
+    return _read_marked_record(folder, record, f"{file} {compute_fingerprint([file])} {study.traces!r}")
 
 
-def _record(study: Study, record: Record) -> _ReadRecord:
-    trace, smooth, facts = read_record(study, record)
+@lru_cache(maxsize=64)
+def _read_marked_record(folder: StudyFolder, record: Record, mark: str) -> _ReadRecord:
+    trace, smooth, facts = read_record(folder.load(), record)
     even = smooth.resample(CURVE_POINTS)
     time, force, _ = average_in_bins(trace.time_s, trace.force_N, MAX_POINTS)
     _, moved, _ = average_in_bins(trace.time_s, trace.displacement_mm, MAX_POINTS)
-    start = facts.touch_down_s
-    step_s = float(np.median(np.diff(trace.time_s)))
     content = {
         "site": record.name,
         "facts": {key: value for key, value in facts.to_plain().items() if not key.startswith("knots")},
         "stated": {"touch_down_s": record.touch_down_s, "peak_s": record.peak_s},
         "samples": len(trace.time_s),
-        "step_s": step_s,
+        "step_s": float(np.median(np.diff(trace.time_s))),
         "raw": {
             "time_s": _shorten(time),
             "displacement_mm": _shorten(moved),
             "force_N": _shorten(force),
         },
         "regularised": {
-            "time_s": _shorten(even.time_s + start),
+            "time_s": _shorten(even.time_s + facts.touch_down_s),
             "displacement_mm": _shorten(even.displacement_mm),
             "force_N": _shorten(even.force_N),
         },
     }
-    return _ReadRecord(facts, step_s, content)
+    return _ReadRecord(facts, content)
 
 
 def _shorten(values: np.ndarray) -> list[float]:
@@ -174,7 +150,7 @@ def _collect_flags(
     if sites is not None:
         anatomy = load_anatomy(folder.results / "surfaces")
     facts = {name: record.facts for name, record in records.items()}
-    steps = {name: record.step_s for name, record in records.items()}
+    steps = {name: record.content["step_s"] for name, record in records.items()}
     flags = [flag.to_dict() for flag in record_flags(study, facts, steps, placed, anatomy)]
     if (predicted := PredictResult.find(folder.results)) is not None:
         states = list_stage_states(folder)
