@@ -45,7 +45,6 @@ def bench_calibrate(folder: Path | None = None, *, listener: Listener = ignore_p
             make_phantom_study(place, detail="coarse", seed=0, listener=listener)
         else:
             source = load_study(folder)
-            assert source.file is not None
             shutil.copytree(source.file.parent, place, ignore=_select_left_out)
             if source.file.name != "study.toml":
                 (place / source.file.name).rename(place / "study.toml")

@@ -19,19 +19,19 @@ from .run import compile_in_background, run_study
 def make_phantom_study(
     folder: str | Path,
     *,
-    detail: str = "coarse",
-    seed: int = 0,
-    fat: bool = False,
-    socket: bool = False,
-    ultrasound: bool = False,
-    surface: bool = False,
-    shear_waves: bool = False,
-    tendon: bool = False,
-    limb: str = "transtibial",
     listener: Listener = ignore_progress,
     workers: int = 0,
+    **options: Any,
 ) -> dict[str, Any]:
-    """Make a synthetic patient in ``folder``; returns its truth (see ``make_phantom``)."""
+    """Make a synthetic patient in ``folder``; returns its truth.
+
+    Parameters
+    ----------
+    workers : how many simulate side by side; 0: one per core.
+    options : as :func:`limbfit.phantom.build.make_phantom` takes them: ``detail``, ``seed``, ``limb``,
+        ``sites``, and what else there is: ``fat``, ``tendon``, ``socket``, ``ultrasound``, ``surface``,
+        ``shear_waves``.
+    """
     with compile_in_background() as compiled, make_executor(workers) as executor:
 
         def mapping(function: Callable, jobs: Iterable) -> Iterable:
@@ -41,17 +41,9 @@ def make_phantom_study(
 
         return make_phantom(
             Path(folder),
-            detail=detail,
-            seed=seed,
-            fat=fat,
-            socket=socket,
-            ultrasound=ultrasound,
-            surface=surface,
-            shear_waves=shear_waves,
-            tendon=tendon,
-            limb=limb,
             mapping=mapping,
             progress=lambda text, done, total: listener(Progress(f"phantom {text}", done, total)),
+            **options,
         )
 
 

@@ -147,8 +147,6 @@ def derive_study(study: Study, name: str) -> Study:
 
     Raises `InputError` if the study cannot be changed so.
     """
-    if study.file is None:
-        raise InputError("the study has no file")
     folder = study.results / FOLDER / name
     document = tomlkit.parse(study.file.read_text(encoding="utf-8"))
     try:

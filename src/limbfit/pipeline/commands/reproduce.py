@@ -120,8 +120,6 @@ def _copy_inputs(study: Study, folder: Path) -> None:
     if folder.exists() and not (folder / "study.toml").is_file() and any(folder.iterdir()):
         raise InputError("holds something else", file=folder, remedy="give a folder that does not exist")
     folder.mkdir(parents=True, exist_ok=True)
-    if study.file is None:
-        raise InputError("the study has no file")
     root = study.folder.resolve()
     edited = find_hand_labels(study)
     for path in {*study.inputs.values(), Path(study.file.name), *([edited] if edited else [])}:

@@ -33,7 +33,7 @@ from ..engine.journal import write_journal
 from ..engine.keys import Keys, Stage, StageKey, describe_causes
 from ..engine.provenance import collect_versions, compute_input_digests, describe_machine, record_settings
 from ..engine.storage import read_json, write_result
-from ..engine.store import StageState, Store, lock
+from ..engine.store import Store, lock
 from ..identification.calibrate import run_calibrate
 from ..identification.predict import run_predict
 from ..identification.problem import check_fitted
@@ -95,10 +95,8 @@ STAGES = (
     Stage("predict", run_predict, ("sites", "traces", "mesh", "calibrate"), (), ("name", "edge"), _NAMED),
     Stage("report", run_report, ("predict",), ("study",), ("name", "region")),
 )
-_FOLDERS = frozenset(
-    ("compare", "export", "models", "simulate", *(stage.name for stage in STAGES))
-)  # of results
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
+_FOLDERS = frozenset(("compare", "export", "models", "simulate", *STAGE_NAMES))  # of results
 
 
 def list_stages(study: Study) -> tuple[Stage, ...]:
@@ -160,13 +158,11 @@ def study_status(study: Study) -> list[dict[str, Any]]:
     found = [(store.state(name, key.digest), key) for name, key in chain.items()]
     experiments = list_experiment_states(keys, below)
     found += [(state, key) for state, key, _ in experiments if state.state != "missing"]
-    return [asdict(state) | {"why": _describe_why(store, state, key)} for state, key in found]
-
-
-def _describe_why(store: Store, state: StageState, key: StageKey) -> list[str]:
-    """What changed since a stale stage was made; nothing of another."""
-    stamp = store.stamp(state.stage) if state.state == "stale" else None
-    return [] if stamp is None else describe_causes(stamp.parts, key.parts)
+    rows = []
+    for state, key in found:
+        stamp = store.stamp(state.stage) if state.state == "stale" else None
+        rows.append(asdict(state) | {"why": describe_causes(stamp.parts, key.parts) if stamp else []})
+    return rows
 
 
 def run_study(
@@ -175,6 +171,7 @@ def run_study(
     until: str | None = None,
     start: str | None = None,
     force: Sequence[str] = (),
+    check: Callable[[LimbGeometry], None] | None = None,
     listener: Listener = ignore_progress,
 ) -> dict[str, Any]:
     """Do every stage that is not done, in order; return the summary of the study.
@@ -185,6 +182,7 @@ def run_study(
     until : name of the last stage to do; default all.
     start : name of a stage that is done anew, and all after it.
     force : names of stages that are done anew. Kept simulations count: the same ones would come out.
+    check : is given the limb before anything is meshed, and raises `InputError` for one that it refuses.
     listener : is told of progress; ``results/log`` too.
 
     Raises
@@ -194,18 +192,6 @@ def run_study(
     RunError
         When another run holds the study, or the disk is full.
     """
-    return _run_stages(study, until, start, force, listener)
-
-
-def _run_stages(
-    study: Study,
-    until: str | None,
-    start: str | None,
-    force: Sequence[str],
-    listener: Listener,
-    check: Callable[[LimbGeometry], None] | None = None,
-) -> dict[str, Any]:
-    """See `run_study`; ``check`` is given the limb before anything is meshed."""
     anew = _select_stages_to_redo(study, until, start, force)
     with _open_run(study, "run", listener) as context:
         kept = keep_hand_labels(study)
@@ -302,7 +288,7 @@ def run_experiment(
     last = [stage.name for stage in STAGES if stage.name in experiment.needs][-1:]
     if last:
         check = partial(check_experiment, experiment, study, options=chosen)
-        _run_stages(study, last[0], None, (), listener, check)
+        run_study(study, until=last[0], check=check, listener=listener)
     with _open_run(study, name, listener) as context:
         keys = Keys(study)
         below = {stage: key.digest for stage, key in _compute_chain(keys).items()}
@@ -371,9 +357,8 @@ def run_record(study: Study) -> RunResult:
 
 def report_study(study: Study, *, listener: Listener = ignore_progress) -> dict[str, Any]:
     """Make the report anew from what is stored, stale or not; nothing is solved."""
-    store = Store(study.results)
     with lock(study.results), build_executor(study) as executor:
-        context = Context(study, store, executor, listener)
+        context = Context(study, Store(study.results), executor, listener)
         _do(context, STAGES[-1], _compute_chain(Keys(study))["report"])
         return summarise(study)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -57,16 +57,14 @@ def show_stage(study: Study, stage: str, *, listener: Listener = ignore_progress
         listener(Progress(stage, 0, 1, "drawing"))
         # On the executor: graphics libraries can crash, and a worker that dies is an error in words.
         with lock(study.results), build_executor(study) as executor:
-            list(executor.map(_draw, [(study.results, stage, picture)]))
+            list(executor.map(partial(draw_stage, study.results, stage), [picture]))
         listener(Progress(stage, 1, 1, "drawn"))
-        plain = stage != "surfaces"
-        facts = getattr(store.results, stage).to_plain() if plain else _describe_surfaces(study, store)
+        if stage == "surfaces":
+            facts = _describe_surfaces(study, store)
+        else:
+            facts = getattr(store.results, stage).to_plain()
     shown = str(picture) if picture.is_file() else None
     return {"study": study.study.name, "stage": stage, "picture": shown, **facts}
-
-
-def _draw(job: tuple[Path, str, Path]) -> None:
-    draw_stage(*job)
 
 
 def _describe_surfaces(study: Study, store: Store) -> dict[str, Any]:
