@@ -28,12 +28,23 @@ CORES = count_usable_cores()
 LARGE_UNKNOWNS = (125_000, 200_000, 300_000)
 
 
+def _bench(
+    name: str, run: Callable[..., Any], arguments: tuple[Any, ...], show: Callable[[Any], None], as_json: bool
+) -> None:
+    """Run a benchmark, show how far it is, and print what it found."""
+    with listen_on_console() as listener:
+
+        def tell(done: int, total: int, text: str) -> None:
+            listener(limbfit.Progress(name, done, total, text))
+
+        result = run(*arguments, tell=tell)
+    print_result(result, show, as_json)
+
+
 @app.command()
 def febio_parity(reference: Reference = None, as_json: AsJson = False) -> None:
     """Compare forces and stresses with FEBio 4.11 on the same mesh, with the same element and steps."""
-    with listen_on_console() as listener:
-        rows = limbfit.bench_febio_parity(reference, tell=build_listener(listener, "febio-parity"))
-    print_result(rows, show_parity, as_json)
+    _bench("febio-parity", limbfit.bench_febio_parity, (reference,), show_parity, as_json)
 
 
 def show_parity(rows: list[dict[str, Any]]) -> None:
@@ -67,11 +78,8 @@ def forward(
     as_json: AsJson = False,
 ) -> None:
     """Time one simulation, plain and with sensitivities, beside FEBio's time for it."""
-    with listen_on_console() as listener:
-        result = limbfit.bench_forward(
-            reference, case, element, threads, as_febio, tell=build_listener(listener, "forward")
-        )
-    print_result(result, show_facts, as_json)
+    arguments = (reference, case, element, threads, as_febio)
+    _bench("forward", limbfit.bench_forward, arguments, show_facts, as_json)
 
 
 @app.command()
@@ -82,14 +90,8 @@ def scaling(
     as_json: AsJson = False,
 ) -> None:
     """Time and memory over the number of unknowns, and of a model of the paper's size."""
-    with listen_on_console() as listener:
-        result = limbfit.bench_scaling(
-            element,
-            (*UNKNOWNS, *(LARGE_UNKNOWNS if large else ())),
-            threads,
-            tell=build_listener(listener, "scaling"),
-        )
-    print_result(result, show_scaling, as_json)
+    sizes = (*UNKNOWNS, *(LARGE_UNKNOWNS if large else ()))
+    _bench("scaling", limbfit.bench_scaling, (element, sizes, threads), show_scaling, as_json)
 
 
 def show_scaling(result: dict[str, Any]) -> None:
@@ -109,9 +111,7 @@ def meshing(
     as_json: AsJson = False,
 ) -> None:
     """Mesh random sites of five limbs: failures, angles, thickness, volume, time."""
-    with listen_on_console() as listener:
-        result = limbfit.bench_meshing(shared, sites, engine, tell=build_listener(listener, "meshing"))
-    print_result(result, show_meshing, as_json)
+    _bench("meshing", limbfit.bench_meshing, (shared, sites, engine), show_meshing, as_json)
 
 
 def show_meshing(result: dict[str, Any]) -> None:
@@ -132,12 +132,6 @@ def calibrate(
     with listen_on_console() as listener:
         result = limbfit.bench_calibrate(study, listener=listener)
     print_result(result, show_facts, as_json)
-
-
-def build_listener(
-    listener: Callable[[limbfit.Progress], None], stage: str
-) -> Callable[[int, int, str], None]:
-    return lambda done, total, text: listener(limbfit.Progress(stage, done, total, text))
 
 
 def show_facts(facts: dict[str, Any]) -> None:

@@ -89,9 +89,16 @@ def acquire_site(
         device.close()
         raise
     events = operator if operator is not None else stops if stops is not None else SimpleQueue()
-    told = _join_listeners(acquire.NoOperator(events), listener) if operator is None else listener
+    answer = acquire.NoOperator(events) if operator is None else None
+
+    def tell(update: acquire.Update) -> None:
+        if answer is not None:
+            answer(update)
+        if listener is not None:
+            listener(update)
+
     try:
-        session = acquire.Session(settings, device, site=site.name, recorder=recorder, listener=told)
+        session = acquire.Session(settings, device, site=site.name, recorder=recorder, listener=tell)
         ending = acquire.run_session(session, events)
     finally:
         recorder.close()
@@ -128,12 +135,13 @@ def check_recording(
     one = study.indentation(name)
     if _is_made(study, one) and not replace_record:
         remedy = "give --again to record it once more; the old record is kept"
-        raise InputError(f"{one.trace} exists", file=study.file, place=_place(one), remedy=remedy)
+        place = f"{_find_place(one)}.trace"
+        raise InputError(f"{one.trace} exists", file=study.file, place=place, remedy=remedy)
     if isinstance(one, Record) and one.forced:
         raise InputError(
             "the device drives by displacement, and this record is made under force",
             file=study.file,
-            place=_place(one),
+            place=f"{_find_place(one)}.trace",
             remedy='leave out control = "force", or record it elsewhere',
         )
     _check_inside(study, one)
@@ -165,9 +173,9 @@ def judge_recording(file: Path) -> dict[str, Any]:
     }
 
 
-def _place(one: Indentation) -> str:
-    """Where the study names the record's file."""
-    return f"{one.key if isinstance(one, Record) else f'sites.{one.name}'}.trace"
+def _find_place(one: Indentation) -> str:
+    """Where the study states the record."""
+    return one.key if isinstance(one, Record) else f"sites.{one.name}"
 
 
 def _check_inside(study: Study, one: Indentation) -> None:
@@ -184,7 +192,7 @@ def _check_inside(study: Study, one: Indentation) -> None:
             raise InputError(
                 f"{target.relative_to(study.folder)} lies outside the study's folder",
                 file=study.file,
-                place=_place(one),
+                place=f"{_find_place(one)}.trace",
                 remedy="nothing is recorded there; name a place inside",
             )
 
@@ -199,21 +207,15 @@ def build_device_settings(
         settings = acquire.Settings(**(study.acquire.model_dump() | stated))
     except ValidationError as error:
         what = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
-        raise InputError(what, file=study.file, place=_place(one).removesuffix(".trace")) from None
-    if depth_mm is None and isinstance(one, Record):
+        raise InputError(what, file=study.file, place=_find_place(one)) from None
+    if depth_mm is None and (unattended or isinstance(one, Record)):
         depth_mm = one.depth_mm
     if depth_mm is None and unattended:
         traces = TracesResult.find(study.results)
-        recorded = None if traces is None else traces.sites.get(one.name)
-        depth_mm = one.depth_mm or (None if recorded is None else recorded.depth_mm)
-        if depth_mm is None:
+        if traces is None or one.name not in traces.sites:
             remedy = "give --depth, or state its depth_mm"
-            raise InputError(
-                "the depth is not known",
-                file=study.file,
-                place=_place(one).removesuffix(".trace"),
-                remedy=remedy,
-            )
+            raise InputError("the depth is not known", file=study.file, place=_find_place(one), remedy=remedy)
+        depth_mm = traces.sites[one.name].depth_mm
     if depth_mm is None:
         return settings
     if not settings.min_depth_mm < depth_mm < settings.depth_limit_mm:
@@ -241,15 +243,6 @@ def _head(
         "device": identity,
         "settings": settings.model_dump(),
     }
-
-
-def _join_listeners(first: acquire.Listener, second: acquire.Listener | None) -> acquire.Listener:
-    def tell(told: acquire.Update) -> None:
-        first(told)
-        if second is not None:
-            second(told)
-
-    return tell
 
 
 def _keep(study: Study, one: Indentation, folder: Path, completed: bool) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from ..limb.inputs import check_labels, read_marked_image, read_study_image, rea
 from ..limb.sites import place_site
 from ..limb.surfaces import read_given_anatomy
 from ..records.record_checks import choose_surface_points, record_flags
-from ..records.traces import read_observed, read_record
+from ..records.traces import SecondaryMeasurement, read_observed, read_record
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, name_load, time_socket_loads
 from ..socket.shape import build_loadable_socket, build_regions, check_load, check_regions
@@ -65,16 +65,16 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
             width = read_indenter(here, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
             facts.append(f"indenter{'' if name is None else ' ' + name}: {table.file}, {width:.1f} mm wide")
     listener(Progress("check", 1, 2, "records"))
-    read = {record.name: read_record(study, record) for record in study.recorded}
-    records = {name: record for name, (_, _, record) in read.items()}
-    seen = {
-        one.name: read_observed(study, one, trace, facts_of.touch_down_s, smooth)
-        for one in study.recorded
-        for trace, smooth, facts_of in [read[one.name]]
-    }
-    for name, record in records.items():
+    records: dict[str, TraceFacts] = {}
+    seen: dict[str, SecondaryMeasurement] = {}
+    steps: dict[str, float] = {}
+    for one in study.recorded:
+        trace, smooth, record = read_record(study, one)
+        records[one.name] = record
+        seen[one.name] = read_observed(study, one, trace, record.touch_down_s, smooth)
+        steps[one.name] = float(np.median(np.diff(trace.time_s)))
         facts.append(
-            f"site {name}: peak force {record.peak_force_N:.2f} N at {record.depth_mm:.2f} mm, "
+            f"site {one.name}: peak force {record.peak_force_N:.2f} N at {record.depth_mm:.2f} mm, "
             f"touch-down after {record.touch_down_mm:.2f} +- {record.touch_down_uncertainty_mm:.2f} "
             f"mm; {record.phases_in_words}"
             + ("" if record.speed_unload_mm_s is not None else "; loading only, no unloading")
@@ -87,7 +87,6 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
     if study.priors:
         known = (f"{name} {p.median:g}, factor {p.factor:g}" for name, p in study.priors.items())
         facts.append(f"lognormal priors (median, one standard deviation): {'; '.join(known)}")
-    steps = {name: float(np.median(np.diff(trace.time_s))) for name, (trace, _, _) in read.items()}
     store, limb = Store(study.results), None
     if given is not None:
         places = {site.name: place_site(site, study, given, None) for site in study.sites}
@@ -95,9 +94,9 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
     elif store.stamp("sites") and store.state("sites", compute_keys(study)["sites"]).state == "done":
         limb = LimbGeometry.stored(store)
     placed, anatomy = (limb.places, limb.anatomy) if limb is not None else ({}, None)
-    facts += _describe_surface_motion(study, {name: one.motion for name, one in seen.items()}, limb)
-    for name, one in seen.items():
-        for place, means in one.waves:
+    facts += _describe_surface_motion(study, {name: beside.motion for name, beside in seen.items()}, limb)
+    for name, beside in seen.items():
+        for place, means in beside.waves:
             speeds = f"{means.speed_m_s.min():.2f} to {means.speed_m_s.max():.2f} m/s"
             readings = int(means.samples.sum())
             facts.append(f"site {name}: shear waves at {place.name}, {speeds} in {readings} readings")
@@ -135,25 +134,23 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
 def list_refused_commands(study: Study, limb: LimbGeometry | None) -> list[dict[str, Any]]:
     """``commands`` that would be refused, and ``why``; ``limb``: None where it is not known yet."""
     found: dict[str, list[str]] = {}
-    for command, check in _iterate_checks(study, limb):
+    checks: list[tuple[str, Callable[[], Any]]] = [("run", partial(check_fitted, study))]
+    for experiment in EXPERIMENTS:
+        name = experiment.name
+        command = _COMMANDS.get(name, name.replace("sensitivity-", "sensitivity --only "))
+        checks.append((command, partial(check_experiment, experiment, study, limb, experiment.options)))
+    checks += [(f"export --to {to}", partial(check_export, study, to)) for to in FORMATS]
+    checks += [
+        (f"acquire --site {one.name}", partial(build_device_settings, study, one, None, False))
+        for one in study.indentations
+    ]
+    for command, check in checks:
         try:
             check()
         except InputError as error:
             why = str(InputError(error.what, place=error.place, remedy=error.remedy))
             found.setdefault(why, []).append(command)
     return [{"commands": commands, "why": why} for why, commands in found.items()]
-
-
-def _iterate_checks(study: Study, limb: LimbGeometry | None) -> Iterator[tuple[str, Callable[[], Any]]]:
-    yield "run", partial(check_fitted, study)
-    for experiment in EXPERIMENTS:
-        name = experiment.name
-        command = _COMMANDS.get(name, name.replace("sensitivity-", "sensitivity --only "))
-        yield command, partial(check_experiment, experiment, study, limb, experiment.options)
-    for to in FORMATS:
-        yield f"export --to {to}", partial(check_export, study, to)
-    for one in study.indentations:
-        yield f"acquire --site {one.name}", partial(build_device_settings, study, one, None, False)
 
 
 def _describe_outside(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -72,15 +73,9 @@ def diagnose(folder: Path = Path(".")) -> dict[str, Any]:
 
 def _check_machine() -> Iterator[Finding]:
     yield Finding("limbfit", "ok", f"{__version__}, Python {describe_machine()['python']}")
-    missing = []
-    for line in metadata.requires("limbfit") or []:
-        if "extra ==" in line or ";" in line:
-            continue
-        name = line.split(">")[0].split("=")[0].strip()
-        try:
-            metadata.version(name)
-        except metadata.PackageNotFoundError:
-            missing.append(name)
+    required = [line for line in metadata.requires("limbfit") or [] if ";" not in line]  # whatever extras
+    names = [re.split("[>=~<]", line)[0].strip() for line in required]
+    missing = [name for name in names if _find_version(name) is None]
     if missing:
         yield Finding("libraries", "failed", f"missing: {', '.join(missing)}", "pip install limbfit")
     else:
@@ -90,15 +85,19 @@ def _check_machine() -> Iterator[Finding]:
     yield Finding("cores", "ok", f"{usable} of {there} may be used: {usable} workers of one thread each")
     yield Finding("threads", "ok", ", ".join(set_here) or "not set here; workers get one each")
     free = psutil.virtual_memory().available / 1e9
-    enough = free >= NEEDED_GB
-    yield Finding(
-        "memory",
-        "ok" if enough else "warning",
-        f"{free:.1f} GB free, {free / usable:.1f} GB for each of {usable} workers",
-        ""
-        if enough
-        else f"a site at the paper's size wants {NEEDED_GB:g} GB; use fewer workers (--workers 1)",
-    )
+    found = f"{free:.1f} GB free, {free / usable:.1f} GB for each of {usable} workers"
+    state, remedy = "ok", ""
+    if free < NEEDED_GB:
+        state = "warning"
+        remedy = f"a site at the paper's size wants {NEEDED_GB:g} GB; use fewer workers (--workers 1)"
+    yield Finding("memory", state, found, remedy)
+
+
+def _find_version(distribution: str) -> str | None:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def _check_solvers() -> Iterator[Finding]:
@@ -153,11 +152,9 @@ def _check_programs() -> Iterator[Finding]:
     else:
         yield Finding("browser", "ok", "none found here", "copy report.html to a machine that has one")
     for module, use in (("distributed", "--scheduler"), ("dask_jobqueue", "--dask slurm")):
-        try:
-            yield Finding(module, "ok", metadata.version(module.replace("_", "-")))
-        except metadata.PackageNotFoundError:
-            remedy = f"for {use}: pip install 'limbfit[dask]'"
-            yield Finding(module, "ok", "not installed (optional)", remedy)
+        version = _find_version(module.replace("_", "-"))
+        remedy = "" if version else f"for {use}: pip install 'limbfit[dask]'"
+        yield Finding(module, "ok", version or "not installed (optional)", remedy)
 
 
 def _check_writing(folder: Path) -> Iterator[Finding]:
