@@ -50,6 +50,15 @@ def list_stage_names() -> list[str]:
     return list(limbfit.STAGE_NAMES)
 
 
+def call_on_study(study: Path, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """Call a function of the library on a study, and show its progress; ``parameters`` are read from text."""
+    checked = limbfit.load_study(study)
+    if "parameters" in options:
+        options["parameters"] = parse_parameters(options["parameters"], checked)
+    with listen_on_console() as listener:
+        return function(checked, *arguments, listener=listener, **options)
+
+
 def demo(
     folder: Annotated[Path, typer.Argument(help="where to put the demo study")] = Path("limbfit-demo"),
     seed: Annotated[int, typer.Option(help="which synthetic patient")] = 0,
@@ -133,8 +142,7 @@ def series(
 
 def check(study: StudyPath, as_json: AsJson = False) -> None:
     """Read every input of a study and report what is wrong, before anything runs."""
-    with listen_on_console() as listener:
-        findings = limbfit.check_study(limbfit.load_study(study), listener=listener)
+    findings = call_on_study(study, limbfit.check_study)
     if as_json:
         print_json(findings)
         return
@@ -165,14 +173,7 @@ def run(
 ) -> None:
     """Run every stage that is missing or stale; a stopped run continues where it stopped."""
     began = perf_counter()
-    with listen_on_console() as listener:
-        summary = limbfit.run_study(
-            limbfit.load_study(study),
-            until=until,
-            start=start,
-            force=force or (),
-            listener=listener,
-        )
+    summary = call_on_study(study, limbfit.run_study, until=until, start=start, force=force or ())
     summary["seconds"] = round(perf_counter() - began, 1)
     show_summary(summary, as_json)
 
@@ -209,16 +210,8 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Simulate one indentation; curve and fields go to results/simulate."""
-    checked = limbfit.load_study(study)
-    with listen_on_console() as listener:
-        result = limbfit.simulate_site(
-            checked,
-            site,
-            parameters=parse_parameters(parameters, checked),
-            animation=animation,
-            solver=solver,
-            listener=listener,
-        )
+    options = {"parameters": parameters, "animation": animation, "solver": solver}
+    result = call_on_study(study, limbfit.simulate_site, site, **options)
     if as_json:
         print_json(result)
     else:
@@ -239,9 +232,7 @@ def simulate(
 
 def report(study: StudyPath, as_json: AsJson = False) -> None:
     """Make the report again from stored results; nothing is solved."""
-    with listen_on_console() as listener:
-        summary = limbfit.report_study(limbfit.load_study(study), listener=listener)
-    show_summary(summary, as_json)
+    show_summary(call_on_study(study, limbfit.report_study), as_json)
 
 
 def parse_parameters(text: str | None, study: Study) -> dict[str, dict[str, float]] | None:
@@ -350,13 +341,11 @@ def _run_until(
     study: StudyPath, stage: str, show: Callable[[StudyResults, dict[str, Any]], None], as_json: bool
 ) -> None:
     """Run the study until a stage, print what it made and where its picture is."""
-    checked = limbfit.load_study(study)
-    with listen_on_console() as listener:
-        result = limbfit.show_stage(checked, stage, listener=listener)
+    result = call_on_study(study, limbfit.show_stage, stage)
     if as_json:
         print_json(result)
         return
-    show(limbfit.load_results(checked), result)
+    show(limbfit.load_results(limbfit.load_study(study)), result)
     if result["picture"]:
         print_line(f"picture: {result['picture']}")
 

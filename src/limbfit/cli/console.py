@@ -9,6 +9,7 @@ import socket
 import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from threading import Event, Thread
 from time import perf_counter, sleep
 from types import FrameType
@@ -52,14 +53,12 @@ def print_result(content: Result, show: Callable[[Result], None], as_json: bool)
         show(content)
 
 
-def print_stored(
-    content: dict[str, Any], study: limbfit.Study, name: str, show: Callable[[Any], None], as_json: bool
-) -> None:
-    """Print what a study has stored by ``name``: as JSON, or as ``show`` prints it, and where it is."""
+def print_stored(content: dict[str, Any], name: str, show: Callable[[Any], None], as_json: bool) -> None:
+    """Print a result, stored by ``name``: as JSON, or as ``show`` prints what is stored, and where it is."""
     if as_json:
         print_json(content)
         return
-    show(getattr(limbfit.load_results(study), name))
+    show(getattr(limbfit.StudyResults(Path(content["folder"]).parent), name))
     place = f"report: {content['report']}" if "report" in content else "limbfit report shows it"
     print_line(f"stored in {content['folder']}; {place}")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,7 +17,7 @@ from ..results.models import ModelsResult
 from ..results.planning import DesignResult, ProtocolResult
 from ..results.uncertainty import CrossvalidateResult, RegionsResult, UncertaintyResult
 from ..results.variants import CubeResult, RefinementResult, VolumeResult
-from .commands import Parameters, StudyPath, parse_parameters
+from .commands import Parameters, StudyPath, call_on_study
 from .console import (
     AsJson,
     Column,
@@ -37,10 +38,8 @@ def _run_and_print(
     study: Path, name: str, show: Callable[[Any], None], as_json: bool, **options: Any
 ) -> None:
     """Do the experiment ``name`` with ``options``, print what it found and where it is stored."""
-    checked = limbfit.load_study(study)
-    with listen_on_console() as listener:
-        result = limbfit.run_experiment(checked, name, listener=listener, **options)
-    print_stored(result, checked, name, show, as_json)
+    result = call_on_study(study, limbfit.run_experiment, name, **options)
+    print_stored(result, name, show, as_json)
 
 
 def cube(
@@ -131,11 +130,9 @@ def uncertainty(
     if models is None:
         _run_and_print(study, "uncertainty", show_uncertainty, as_json)
         return
-    checked = limbfit.load_study(study)
     names = [name.strip() for name in models.split(",") if name.strip()]
-    with listen_on_console() as listener:
-        result = limbfit.compare_models(checked, names, listener=listener)
-    print_stored(result, checked, "models", show_models, as_json)
+    result = call_on_study(study, limbfit.compare_models, names)
+    print_stored(result, "models", show_models, as_json)
 
 
 def show_models(found: ModelsResult) -> None:
@@ -188,15 +185,12 @@ def sensitivity(
     as_json: AsJson = False,
 ) -> None:
     """Simulate again with another c, bulk modulus, friction, indenter or mesh."""
-    checked, results = limbfit.load_study(study), {}
-    with listen_on_console() as listener:
-        for name in parse_sensitivities(only):
-            results[name] = limbfit.run_experiment(
-                checked, f"sensitivity-{name}", listener=listener, sites=site or []
-            )
-            if not as_json:
-                show_sensitivity(name, getattr(limbfit.load_results(checked), f"sensitivity_{name}"))
-                print_line(f"stored in {results[name]['folder']}; limbfit report shows it")
+    results = {}
+    for name in parse_sensitivities(only):
+        result = call_on_study(study, limbfit.run_experiment, f"sensitivity-{name}", sites=site or [])
+        results[name] = result
+        if not as_json:
+            print_stored(result, f"sensitivity_{name}", partial(show_sensitivity, name), False)
     if as_json:
         print_json(results)
 
@@ -349,36 +343,27 @@ def design(
     With --protocol: the records (site, indenter, depth, speed, hold) of a session of stated length, judged at
     several tissues; records.toml has them as a study's [[records]].
     """
-    checked = limbfit.load_study(study)
-    values = parse_parameters(parameters, checked)
-    chosen = parse_list(depths, "--depths", "give millimetres, such as 3,5,7")
-    with listen_on_console() as listener:
-        if protocol:
-            result = limbfit.plan_protocol(
-                checked,
-                minutes=minutes,
-                speeds_mm_s=parse_list(speeds, "--speeds", "give mm/s, such as 0.96,4.8"),
-                holds_s=parse_list(holds, "--holds", "give seconds, such as 0,30", least=0.0),
-                depths_mm=chosen,
-                determine=determine.split(",") if determine else (),
-                criterion=criterion,
-                draws=draws,
-                ultrasound_sd_mm=ultrasound,
-                surface_sd_mm=surface,
-                shear_waves_sd_m_s=shear_waves,
-                parameters=values,
-                listener=listener,
-            )
-        else:
-            result = limbfit.design_study(
-                checked,
-                sites=sites,
-                depths_mm=chosen,
-                parameters=values,
-                listener=listener,
-            )
-    name, show = ("protocol", show_protocol) if protocol else ("design", show_design)
-    print_stored(result, checked, name, show, as_json)
+    depths_mm = parse_list(depths, "--depths", "give millimetres, such as 3,5,7")
+    options = {"depths_mm": depths_mm, "parameters": parameters}
+    if not protocol:
+        result = call_on_study(study, limbfit.design_study, sites=sites, **options)
+        print_stored(result, "design", show_design, as_json)
+        return
+    result = call_on_study(
+        study,
+        limbfit.plan_protocol,
+        minutes=minutes,
+        speeds_mm_s=parse_list(speeds, "--speeds", "give mm/s, such as 0.96,4.8"),
+        holds_s=parse_list(holds, "--holds", "give seconds, such as 0,30", least=0.0),
+        determine=determine.split(",") if determine else (),
+        criterion=criterion,
+        draws=draws,
+        ultrasound_sd_mm=ultrasound,
+        surface_sd_mm=surface,
+        shear_waves_sd_m_s=shear_waves,
+        **options,
+    )
+    print_stored(result, "protocol", show_protocol, as_json)
 
 
 def parse_list(text: str | None, place: str, remedy: str, least: float = 1e-3) -> tuple[float, ...]:

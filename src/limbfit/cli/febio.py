@@ -9,7 +9,7 @@ import typer
 
 import limbfit
 
-from .commands import Parameters, StudyPath, parse_parameters
+from .commands import Parameters, StudyPath, call_on_study
 from .console import (
     AsJson,
     listen_on_console,
@@ -65,16 +65,8 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write indentations as inputs of FEBio, Abaqus or CalculiX, with the numbers of limbfit simulate."""
-    checked = limbfit.load_study(study)
-    with listen_on_console() as listener:
-        result = limbfit.export_study(
-            checked,
-            to,
-            site=site,
-            output=output,
-            parameters=parse_parameters(parameters, checked),
-            listener=listener,
-        )
+    options = {"site": site, "output": output, "parameters": parameters}
+    result = call_on_study(study, limbfit.export_study, to, **options)
     if as_json:
         print_json(result)
         return
@@ -98,15 +90,8 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Solve a site by limbfit and by FEBio; curves and difference go to results/compare."""
-    checked = limbfit.load_study(study)
-    with listen_on_console() as listener:
-        result = limbfit.compare_site(
-            checked,
-            site,
-            parameters=parse_parameters(parameters, checked),
-            febio_log=febio_log,
-            listener=listener,
-        )
+    options = {"parameters": parameters, "febio_log": febio_log}
+    result = call_on_study(study, limbfit.compare_site, site, **options)
     if as_json:
         print_json(result)
     else:

@@ -14,8 +14,8 @@ from ..errors import InputError
 from ..laws import split_key
 from ..results.models import SocketOfModels
 from ..results.socket import SocketDesignResult, SocketLoad, SocketResult
-from .commands import StudyPath, parse_parameters, show_outside
-from .console import AsJson, Column, format_ends, listen_on_console, print_line, print_stored, print_table
+from .commands import StudyPath, call_on_study, show_outside
+from .console import AsJson, Column, format_ends, print_line, print_stored, print_table
 from .runs import add_execution_options
 
 
@@ -61,7 +61,6 @@ def fit(
 ) -> None:
     """Put a socket on the limb and load it: pressure and shear by region, settling, the report."""
     _check_choice(parameters, literature)
-    checked = limbfit.load_study(study)
     if models:
         if parameters is not None or literature or samples:
             raise InputError(
@@ -69,20 +68,13 @@ def fit(
                 place="--models",
                 remedy="leave out --parameters, --literature and --samples",
             )
-        with listen_on_console() as listener:
-            result = limbfit.fit_socket_of_models(checked, listener=listener)
-        print_stored(result, checked, "models_socket", show_socket_models, as_json)
+        result = call_on_study(study, limbfit.fit_socket_of_models)
+        print_stored(result, "models_socket", show_socket_models, as_json)
         return
-    with listen_on_console() as listener:
-        result = limbfit.fit_socket(
-            checked,
-            parameters=parse_parameters(parameters, checked),
-            literature=literature,
-            samples=samples or 0,
-            listener=listener,
-        )
-        result["report"] = limbfit.report_study(checked, listener=listener)["report"]
-    print_stored(result, checked, "socket", show_socket, as_json)
+    options = {"parameters": parameters, "literature": literature, "samples": samples or 0}
+    result = call_on_study(study, limbfit.fit_socket, **options)
+    result["report"] = call_on_study(study, limbfit.report_study)["report"]
+    print_stored(result, "socket", show_socket, as_json)
 
 
 def show_socket_models(found: SocketOfModels) -> None:
@@ -162,17 +154,15 @@ def design(
 ) -> None:
     """Design a socket from a target pressure, for printing; load it beside a uniformly reduced one."""
     _check_choice(parameters, literature)
-    checked = limbfit.load_study(study)
-    with listen_on_console() as listener:
-        result = limbfit.design_socket(
-            checked,
-            optimise=[name.strip() for name in optimise.split(",") if name.strip()],
-            simulations=simulations,
-            parameters=parse_parameters(parameters, checked),
-            literature=literature,
-            listener=listener,
-        )
-    print_stored(result, checked, "socket_design", show_design, as_json)
+    result = call_on_study(
+        study,
+        limbfit.design_socket,
+        optimise=[name.strip() for name in optimise.split(",") if name.strip()],
+        simulations=simulations,
+        parameters=parameters,
+        literature=literature,
+    )
+    print_stored(result, "socket_design", show_design, as_json)
 
 
 def show_design(found: SocketDesignResult) -> None:
