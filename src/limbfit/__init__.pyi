@@ -103,7 +103,7 @@ from .shapes import (
     Shape as Shape,
     register_shape as register_shape,
 )
-from .studio import serve_studio as serve_studio
+from .studio.server import serve_studio as serve_studio
 from .study import (
     Study as Study,
     load_study as load_study,

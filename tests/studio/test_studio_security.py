@@ -17,7 +17,7 @@ from limbfit.cli import app as command_line
 from limbfit.errors import InputError, RunError
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import LARGEST_BODY, AccessGuard
-from limbfit.studio.server import STATIC, create_app, serve
+from limbfit.studio.server import STATIC, create_app, serve_studio
 
 PORT = 8123
 HOST = f"127.0.0.1:{PORT}"
@@ -353,19 +353,19 @@ def test_other_addresses_must_be_asked_for_in_so_many_words(study, host):
     with pytest.raises(
         InputError, match="can be reached from other machines; leave out --host, or say --expose"
     ):
-        serve(study, host=host, browser=False, tell=print)
+        serve_studio(study, host=host, browser=False, tell=print)
 
 
 def test_even_then_it_is_one_address(study):
     with pytest.raises(InputError, match="name one address"):
-        serve(study, host="0.0.0.0", expose=True, browser=False, tell=print)
+        serve_studio(study, host="0.0.0.0", expose=True, browser=False, tell=print)
 
 
 def test_a_taken_port_and_no_study_are_one_line_each(study, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(RunError, match=rf"port {port}: .*; give another --port"):
-            serve(study, port=port, browser=False, tell=print)
+            serve_studio(study, port=port, browser=False, tell=print)
     found = CliRunner().invoke(command_line, ["studio", str(tmp_path / "none"), "--no-browser"])
     assert isinstance(found.exception, InputError)
 
@@ -374,7 +374,7 @@ def test_the_server_listens_on_loopback_and_says_where(study):
     """A real socket: the printed address opens the page, and no other address of this machine answers."""
     told: list[str] = []
     thread = threading.Thread(
-        target=serve, args=(study,), kwargs={"browser": False, "tell": told.append}, daemon=True
+        target=serve_studio, args=(study,), kwargs={"browser": False, "tell": told.append}, daemon=True
     )
     thread.start()
     until = time.monotonic() + 60

@@ -29,6 +29,7 @@ from .console import (
     print_result,
     print_table,
     print_warning,
+    print_warnings,
 )
 
 StudyPath = Annotated[
@@ -148,8 +149,8 @@ def check(study: StudyPath, as_json: AsJson = False) -> None:
         return
     for line in findings["facts"]:
         print_line(line)
-    show_flags(findings["flags"])
-    show_outside(findings["outside_text"])
+    print_warnings(flag["text"] for flag in findings["flags"])
+    print_warnings(findings["outside_text"])
     print_line("the study can be run" + (", but see the warnings" if findings["flags"] else ""))
 
 
@@ -224,7 +225,7 @@ def simulate(
             f"curve: {result['curve']}\nfields: {result['fields']}"
         )
     show_warnings([result])
-    show_outside(result["outside_text"])
+    print_warnings(result["outside_text"])
     if not result["completed"]:
         print_aside(f"error: site {site}: the simulation is partial: {result['reason']}")
         raise typer.Exit(1)
@@ -262,8 +263,8 @@ def show_summary(summary: dict[str, Any], as_json: bool) -> None:
     if "sites" in summary:  # as the report, not before its stage
         show_sites(summary)
         show_warnings(summary["sites"])
-        show_outside(summary["outside_text"])
-    show_flags(summary.get("flags", ()))
+        print_warnings(summary["outside_text"])
+    print_warnings(flag["text"] for flag in summary.get("flags", ()))
     if "report" in summary:
         print_line(f"report: {summary['report']}")
 
@@ -273,18 +274,6 @@ def show_warnings(sites: Sequence[Mapping[str, Any]]) -> None:
     for site in sites:
         for text in site["warnings"]:
             print_warning(f"site {site.get('record', site['site'])}: {text}")
-
-
-def show_outside(texts: Sequence[str]) -> None:
-    """What predictions do to the tissue that no fitted record did."""
-    for text in texts:
-        print_warning(text)
-
-
-def show_flags(flags: Sequence[Mapping[str, Any]]) -> None:
-    """What looks wrong about records, names and places."""
-    for flag in flags:
-        print_warning(flag["text"])
 
 
 def show_parameters(summary: dict[str, Any]) -> None:

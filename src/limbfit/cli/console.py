@@ -77,6 +77,11 @@ def print_warning(text: str) -> None:
     print_aside(f"warning: {text}")
 
 
+def print_warnings(texts: Iterable[str]) -> None:
+    for text in texts:
+        print_warning(text)
+
+
 def print_table(
     rows: Iterable[Any], columns: Mapping[str, Column], *, dash: str = "-", unwrapped: Container[str] = ()
 ) -> None:

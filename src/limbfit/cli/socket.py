@@ -14,8 +14,8 @@ from ..errors import InputError
 from ..laws import split_key
 from ..results.models import SocketOfModels
 from ..results.socket import SocketDesignResult, SocketLoad, SocketResult
-from .commands import StudyPath, call_on_study, show_outside
-from .console import AsJson, Column, format_ends, print_line, print_stored, print_table
+from .commands import StudyPath, call_on_study
+from .console import AsJson, Column, format_ends, print_line, print_stored, print_table, print_warnings
 from .runs import add_execution_options
 
 
@@ -111,7 +111,7 @@ def show_socket(found: SocketResult) -> None:
         f"tissues: {found.parameters_from}; contact balances the loads within "
         f"{found.balance_percent:.2g} %; not a medical device"
     )
-    show_outside(found.outside_text)
+    print_warnings(found.outside_text)
 
 
 def _format_main_cause(shares: Mapping[str, float] | None) -> str:

@@ -10,10 +10,9 @@ from __future__ import annotations
 import hmac
 import secrets
 from dataclasses import dataclass, field
-from http.cookies import CookieError, SimpleCookie
-from urllib.parse import parse_qs
 
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import MutableHeaders
+from starlette.requests import HTTPConnection
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -93,10 +92,10 @@ class GuardMiddleware:
         if scope["type"] != "http":  # there are no web sockets here
             await send({"type": "websocket.close", "code": 1008})
             return
-        headers = Headers(scope=scope)
-        token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        request = HTTPConnection(scope)
+        token = request.query_params.get("token", "")
         is_entry = scope["path"] == "/" and scope["method"] in _SAFE_METHODS
-        refused = self._refusal(scope, headers, token if is_entry else "")
+        refused = self._refusal(request, token if is_entry else "")
         if refused:
             status, reason = refused
             await JSONResponse({"error": reason}, status)(scope, receive, _add_headers(send, ""))
@@ -106,33 +105,25 @@ class GuardMiddleware:
             cookie = f"{self.guard.cookie}={self.guard.token}; Path=/; HttpOnly; SameSite=Strict"
         await self.app(scope, _limit_body(receive), _add_headers(send, cookie))
 
-    def _refusal(self, scope: Scope, headers: Headers, token: str) -> tuple[int, str] | None:
+    def _refusal(self, request: HTTPConnection, token: str) -> tuple[int, str] | None:
         """Status and reason why a request is refused; None where it is not."""
+        headers = request.headers
         if headers.getlist("host") not in [[host] for host in self.guard.hosts]:
             return 421, "this is not the address that limbfit studio printed"
         origin = headers.get("origin")
         origins = {f"http://{host}" for host in self.guard.hosts}
-        is_changing = scope["method"] not in _SAFE_METHODS
+        is_changing = request.scope["method"] not in _SAFE_METHODS
         if (origin is None and is_changing) or (origin is not None and origin not in origins):
             return 403, "requests from other pages are refused"
         site = headers.get("sec-fetch-site", "none")
         if site not in ("same-origin", "none") and (is_changing or not token):
             return 403, "requests from other pages are refused"
-        if not self.guard.opens(token) and not self.guard.opens(self._cookie(headers)):
+        if not self.guard.opens(token) and not self.guard.opens(request.cookies.get(self.guard.cookie, "")):
             return 401, "open the address that limbfit studio printed: it holds the key of this page"
         length = headers.get("content-length", "0")
         if not length.isdigit() or int(length) > LARGEST_BODY:
             return 413, f"requests have at most {LARGEST_BODY >> 20} MiB"
         return None
-
-    def _cookie(self, headers: Headers) -> str:
-        jar: SimpleCookie = SimpleCookie()
-        try:
-            jar.load(headers.get("cookie", ""))
-        except CookieError:
-            return ""
-        value = jar.get(self.guard.cookie)
-        return "" if value is None else value.value
 
 
 class TooLargeError(Exception):

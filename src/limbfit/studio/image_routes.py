@@ -74,7 +74,11 @@ def get_facts(folder: Folder) -> dict[str, Any]:
 @router.get("/volume")
 def get_volume(folder: Folder) -> Response:
     """The image as NIfTI, its voxels in the page's order."""
-    return _respond_nifti(_read_study_volume(folder.load()).align_axes(PAGE_AXES))
+    study = folder.load()
+    if study.image is None:
+        raise InputError("the study has no image", file=study.file, place="image")
+    # As stored; only the stage ``segment`` checks that it shows one limb.
+    return _respond_nifti(read_plain_image(study).align_axes(PAGE_AXES))
 
 
 @router.get("/labels")
@@ -186,13 +190,6 @@ def paint_runs(labels: LabelMap, runs: list[tuple[int, int, int]]) -> LabelMap:
     for first, count, value in table.tolist():
         flat[first : first + count] = value
     return turned.with_array(flat.reshape(turned.array.shape)).align_axes(labels.direction)
-
-
-def _read_study_volume(study: Study) -> Volume:
-    """The image as stored; only the stage ``segment`` checks that it shows one limb."""
-    if study.image is None:
-        raise InputError("the study has no image", file=study.file, place="image")
-    return read_plain_image(study)
 
 
 def _respond_nifti(grid: Volume | LabelMap) -> Response:

@@ -33,7 +33,7 @@ ROUTES = tuple(
 )
 
 
-def serve(
+def serve_studio(
     study: str | Path,
     *,
     port: int = 0,
@@ -70,7 +70,12 @@ def serve(
         )
     if host in ("0.0.0.0", "::", ""):
         raise InputError("name one address of this machine to listen on, not all of them", place="--host")
-    listener = _open_socket(host, port)
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        listener = socket.create_server((host, port), family=family)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise RunError(f"cannot listen on {host} port {port}: {reason}; give another --port") from None
     guard = AccessGuard(host, listener.getsockname()[1])
     tell(guard.address)
     config = uvicorn.Config(
@@ -88,21 +93,6 @@ def serve(
         opener.start()
     with listener:
         uvicorn.Server(config).run(sockets=[listener])
-
-
-def _open_socket(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((host, port))
-        listener.listen(128)
-    except OSError as error:
-        listener.close()
-        reason = error.strerror or str(error)
-        raise RunError(f"cannot listen on {host} port {port}: {reason}; give another --port") from None
-    listener.set_inheritable(False)
-    return listener
 
 
 def create_app(folder: StudyFolder, guard: AccessGuard) -> FastAPI:

@@ -12,7 +12,7 @@ import numpy as np
 from fastapi import APIRouter, Response
 from pydantic import Field
 
-from ..anatomy.frame import build_limb_frame
+from ..anatomy.frame import Frame, build_limb_frame
 from ..errors import InputError, SurfaceError
 from ..mesh import read_vtu
 from ..pipeline.engine.digests import compute_digest
@@ -179,9 +179,8 @@ def _find_handles(folder: StudyFolder, study: Study) -> list[list[float]]:
     anatomy, table = read_anatomy(folder, study), study.socket
     if anatomy is None or table.file is not None:
         return []
-    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     try:
-        limb = _compute_profile(folder, mark_surfaces(folder, study))
+        limb, frame = _compute_profile(folder, mark_surfaces(folder, study))
         if table.trimline and not table.trim_planes:
             return [[*map(float, row)] for row in wrap_trimline(limb, frame, np.array(table.trimline))]
         return [[*map(float, row)] for row in find_brim(limb, frame, trim_of(study, anatomy), HANDLE_COUNT)]
@@ -190,12 +189,16 @@ def _find_handles(folder: StudyFolder, study: Study) -> list[list[float]]:
 
 
 @lru_cache(maxsize=2)
-def _compute_profile(folder: StudyFolder, mark: str) -> LimbProfile:
-    """That of the bare skin; the last ones are kept, by the ``mark`` of the limb's surfaces."""
+def _compute_profile(folder: StudyFolder, mark: str) -> tuple[LimbProfile, Frame]:
+    """That of the bare skin, and its frame; the last ones are kept, by the ``mark`` of the limb's surfaces.
+
+    Raises `InputError` where there is no limb yet.
+    """
     anatomy = read_anatomy(folder, folder.load())
     if anatomy is None:
         raise InputError(NO_LIMB_YET)
-    return compute_profile(anatomy.skin, build_limb_frame(anatomy.cut_point, anatomy.cut_normal))
+    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    return compute_profile(anatomy.skin, frame), frame
 
 
 @router.get("/face")
@@ -259,12 +262,8 @@ def post_trimline(folder: Folder, line: TrimlineRequest) -> dict[str, Any]:
     it does not go once around the limb, or leaves no socket; the file is left as it was.
     """
     study = folder.load()
-    anatomy = read_anatomy(folder, study)
-    if anatomy is None:
-        raise InputError(NO_LIMB_YET)
-    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     with place_errors(study, "socket.trimline"):
-        limb = _compute_profile(folder, mark_surfaces(folder, study))
+        limb, frame = _compute_profile(folder, mark_surfaces(folder, study))
         points = wrap_trimline(limb, frame, np.array(line.points))
         trim_limb(limb, frame, Trim(line=points))
     set_trimline(folder.file, points.tolist())

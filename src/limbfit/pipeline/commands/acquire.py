@@ -19,7 +19,7 @@ from ...acquire.virtual import Fault, Serving, Surrogate, VirtualFitSocket, Virt
 from ...errors import InputError, TraceError
 from ...results.curves import read_curves
 from ...results.records import TracesResult
-from ...study import Indentation, Record, Site, Study
+from ...study import Indentation, Record, Study
 from ..engine.storage import write_curves, write_json
 from ..engine.store import translate_disk_errors
 
@@ -84,7 +84,20 @@ def acquire_site(
             stamp = f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"[:-3]
             folder = study.folder / FOLDER / one.name / stamp
             folder.mkdir(parents=True)
-            recorder = acquire.Recorder(folder / RECORD, _head(one, site, settings, device, operator is None))
+            identity = asdict(device.identity)
+            del identity["nonce"]
+            head = {
+                "site": site.name,
+                "record": one.name,
+                "indenter": one.indenter,
+                "begun": datetime.now(UTC).isoformat(timespec="milliseconds"),
+                "limbfit": __version__,
+                "unattended": operator is None,
+                "priority": acquire.prioritise(),
+                "device": identity,
+                "settings": settings.model_dump(),
+            }
+            recorder = acquire.Recorder(folder / RECORD, head)
     except BaseException:
         device.close()
         raise
@@ -225,24 +238,6 @@ def build_device_settings(
             place="--depth, or depth_mm",
         )
     return settings.model_copy(update={"search_depth_mm": depth_mm})
-
-
-def _head(
-    one: Indentation, site: Site, settings: acquire.Settings, device: acquire.LineDevice, unattended: bool
-) -> dict[str, Any]:
-    identity = asdict(device.identity)
-    del identity["nonce"]
-    return {
-        "site": site.name,
-        "record": one.name,
-        "indenter": one.indenter,
-        "begun": datetime.now(UTC).isoformat(timespec="milliseconds"),
-        "limbfit": __version__,
-        "unattended": unattended,
-        "priority": acquire.prioritise(),
-        "device": identity,
-        "settings": settings.model_dump(),
-    }
 
 
 def _keep(study: Study, one: Indentation, folder: Path, completed: bool) -> dict[str, Any]:
