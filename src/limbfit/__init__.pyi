@@ -60,7 +60,6 @@ from .pipeline.commands.acquire import (
     virtual_fitsocket as virtual_fitsocket,
     waiting as waiting,
 )
-from .pipeline.commands.batch import run_batch as run_batch
 from .pipeline.commands.calibration_bench import bench_calibrate as bench_calibrate
 from .pipeline.commands.check import check_study as check_study
 from .pipeline.commands.compare import compare_site as compare_site
@@ -87,6 +86,7 @@ from .pipeline.commands.reproduce import reproduce_study as reproduce_study
 from .pipeline.commands.run import (
     STAGE_NAMES as STAGE_NAMES,
     report_study as report_study,
+    run_batch as run_batch,
     run_experiment as run_experiment,
     run_study as run_study,
     study_status as study_status,

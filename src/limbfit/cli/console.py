@@ -13,7 +13,7 @@ from pathlib import Path
 from threading import Event, Thread
 from time import perf_counter, sleep
 from types import FrameType
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -36,7 +36,6 @@ HEARING_TIME_S = 3.0  # for an interrupt to be heard
 CLEARING_TIME_S = 15.0  # for what heard it to end its workers and files
 STDOUT = Console(highlight=False, markup=False)
 STDERR = Console(stderr=True, highlight=False, markup=False)
-Result = TypeVar("Result")
 Column = str | tuple[str, str] | Callable[[Any], str]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
 
@@ -45,7 +44,7 @@ def print_json(content: Any) -> None:
     sys.stdout.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
-def print_result(content: Result, show: Callable[[Result], None], as_json: bool) -> None:
+def print_result(content: Any, show: Callable[[Any], None], as_json: bool) -> None:
     """Print what a command found: as JSON and nothing else, or as ``show`` prints it."""
     if as_json:
         print_json(content)

@@ -23,9 +23,7 @@ def build_command_page() -> str:
     """All commands with their arguments and options, as Markdown."""
     root: Any = typer.main.get_command(app)
     counted = Counter(
-        _format_item(parameter)
-        for _, command in _list_verbs("", root)
-        for parameter in _list_parameters(command)
+        _format_item(parameter) for _, command in _list_verbs("", root) for parameter in command.params
     )
     shared = {item for item, count in counted.items() if count >= _MANY}
     parts = [HEAD, *(item for item in counted if item in shared)]
@@ -49,7 +47,7 @@ def _list_verbs(name: str, command: Any) -> Iterator[tuple[str, Any]]:
 def _format_section(name: str, command: Any, shared: set[str]) -> list[str]:
     lines = [f"### {name}\n", _format_text(command.help)] if hasattr(command, "commands") else []
     for verb, subcommand in _list_verbs(name, command):
-        parameters = _list_parameters(subcommand)
+        parameters = subcommand.params
         arguments = [p for p in parameters if p.param_type_name == "argument"]
         words = (p.name.upper() if p.required else f"[{p.name.upper()}]" for p in arguments)
         unshared = [item for item in map(_format_item, parameters) if item not in shared]
@@ -62,10 +60,6 @@ def _format_section(name: str, command: Any, shared: set[str]) -> list[str]:
         ]
         lines += [f"Also {', '.join(map(_format_names, also))}.\n"] if also else []
     return lines
-
-
-def _list_parameters(command: Any) -> list[Any]:
-    return [parameter for parameter in command.params if parameter.name != "help"]
 
 
 def _format_names(parameter: Any) -> str:

@@ -55,7 +55,7 @@ def edit_study(file: Path) -> Iterator[tomlkit.TOMLDocument]:
 def set_site(file: Path, site: str, values: Mapping[str, Any]) -> None:
     """Set keys of a site, such as ``position``, ``name``, ``fitted`` or ``touch_down_s``; None removes one.
 
-    A new place removes ``near``, and the other way round: a site has one of them.
+    A new place removes ``near``: a site has one of them.
     """
     with edit_study(file) as document:
         _assign(_find_site(document, site, file), values)
@@ -73,7 +73,7 @@ def set_record(file: Path, record: Record, values: Mapping[str, Any]) -> None:
 
 
 def add_site(file: Path, name: str, position: Sequence[float], values: Mapping[str, Any]) -> None:
-    """Append a site at a place (LPS, mm) with more keys: ``depth_mm`` or ``trace``, ``region``, ``axis``."""
+    """Append a site at a place (LPS, mm) with more keys: ``depth_mm``, ``region``."""
     with edit_study(file) as document:
         sites = document.get("sites")
         if not isinstance(sites, list):
@@ -142,9 +142,7 @@ def _assign(table: Any, values: Mapping[str, Any]) -> None:
         if value is None:
             table.pop(key, None)
             continue
-        if key in ("position", "near"):
-            table.pop("near" if key == "position" else "position", None)
+        if key == "position":
+            table.pop("near", None)
             value = [round(float(x), POSITION_DIGITS) for x in value]
-        if isinstance(value, (list, tuple)):
-            value = [float(x) if isinstance(x, float) else x for x in value]
         table[key] = value

@@ -147,7 +147,6 @@ def describe_last_run(folder: StudyFolder, is_running: bool) -> dict[str, Any] |
         "what": events[0].get("what") if events else None,
         "state": end,
         "error": events[-1].get("text") if end == "failed" else None,
-        "began": events[0]["time"] if events else None,
         "now": {key: progress[-1].get(key) for key in keys} if progress else None,
         "lines": [
             {"seconds": row["seconds"], **{k: row.get(k) for k in keys}} for row in progress[-LAST_LINES:]

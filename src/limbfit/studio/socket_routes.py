@@ -169,9 +169,9 @@ def get_shape(folder: Folder) -> dict[str, Any]:
 
 
 def _place(position: Any, region: str | None, regions: Mapping[str, Any]) -> list[float] | None:
-    if position is not None:
-        return [float(x) for x in position]
-    return [float(x) for x in regions[region].position] if region and region in regions else None
+    if position is None and region is not None and region in regions:
+        position = regions[region].position
+    return None if position is None else [float(x) for x in position]
 
 
 def _find_handles(folder: StudyFolder, study: Study) -> list[list[float]]:

@@ -47,37 +47,24 @@ def respond_block(arrays: Mapping[str, Any], facts: Mapping[str, Any] | None = N
 
 @router.get("/study")
 def get_study(folder: Folder) -> dict[str, Any]:
-    """The tables of the study without the paths of its inputs, and the name of its folder."""
+    """The name of the study, its sites, and its records and planned indentations, without paths of inputs."""
     study = folder.load()
     return {
         "name": study.study.name,
-        "description": study.study.description,
-        "folder": folder.folder.resolve().name,
         "has_image": study.image is not None,
-        "tissues": list(study.tissues),
-        "material": study.material.model_dump(mode="json"),
-        "indenter": study.indenter.model_dump(mode="json", exclude={"file"}),
-        "sites": [
-            {
-                **site.model_dump(mode="json", exclude={"trace"}),
-                "has_trace": bool(study.records_at(site)),
-                "is_recorded": study.is_recorded(site),
-            }
-            for site in study.sites
-        ],
+        "sites": [{"name": site.name} for site in study.sites],
         "indentations": [
             {
                 "name": indentation.name,
                 "region": indentation.region,
                 "fitted": indentation.fitted,
                 "has_trace": indentation.trace is not None,
-                "is_recorded": indentation.trace is not None and study.path(indentation.trace).is_file(),
+                "is_recorded": study.is_recorded(indentation),
                 "touch_down_s": indentation.touch_down_s,
                 "peak_s": indentation.peak_s,
             }
             for indentation in study.indentations
         ],
-        "notes": list(study.notes),
     }
 
 

@@ -37,7 +37,7 @@ class Times(StrictModel):
 
 @router.get("")
 def get_records(folder: Folder) -> dict[str, Any]:
-    """Every record, and every planned indentation, with what the record says, and the flags on the records.
+    """Every record and planned indentation with the error of its file, if any, and the flags on the records.
 
     ``site`` is the name of the record, or of the site.
     """
@@ -45,20 +45,13 @@ def get_records(folder: Folder) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     records: dict[str, _ReadRecord] = {}
     for indentation in study.indentations:
-        row: dict[str, Any] = {
-            "site": indentation.name,
-            "region": indentation.region,
-            "fitted": indentation.fitted,
-            "has_trace": indentation.trace is not None,
-            "error": None,
-        }
-        if isinstance(indentation, Record) and study.path(indentation.trace).is_file():
+        error = None
+        if isinstance(indentation, Record) and study.is_recorded(indentation):
             try:
                 records[indentation.name] = _read(folder, study, indentation)
-            except InputError as error:
-                row["error"] = str(error)
-        content = records[indentation.name].content if indentation.name in records else {}
-        rows.append(row | {key: content.get(key) for key in ("facts", "stated")})
+            except InputError as reason:
+                error = str(reason)
+        rows.append({"site": indentation.name, "error": error})
     return {"sites": rows, "flags": _collect_flags(folder, study, records)}
 
 
@@ -145,10 +138,9 @@ def _collect_flags(
     folder: StudyFolder, study: Study, records: dict[str, _ReadRecord]
 ) -> list[dict[str, Any]]:
     """Flags on the records as they are now, and flags of the last prediction against the model."""
-    sites, anatomy = SitesResult.find(folder.results), None
-    placed = {} if sites is None else {row.site: row for row in sites.sites}
-    if sites is not None:
-        anatomy = load_anatomy(folder.results / "surfaces")
+    sites = SitesResult.find(folder.results)
+    placed = {row.site: row for row in sites.sites} if sites else {}
+    anatomy = load_anatomy(folder.results / "surfaces") if sites else None
     facts = {name: record.facts for name, record in records.items()}
     steps = {name: record.content["step_s"] for name, record in records.items()}
     flags = [flag.to_dict() for flag in record_flags(study, facts, steps, placed, anatomy)]

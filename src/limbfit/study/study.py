@@ -231,10 +231,9 @@ class Study(TomlTable):
         """A path of the study file as a path of this machine."""
         return self.folder / relative
 
-    def is_recorded(self, site: Site) -> bool:
-        """True if all records that a site names have been made."""
-        records = self.records_at(site)
-        return bool(records) and all(self.path(record.trace).is_file() for record in records)
+    def is_recorded(self, indentation: Indentation) -> bool:
+        """True if the record of an indentation has been made."""
+        return indentation.trace is not None and self.path(indentation.trace).is_file()
 
     def site(self, name: str) -> Site:
         for site in self.sites:

@@ -29,11 +29,7 @@ RECORD, VERDICT = "record.csv", "verdict.json"
 
 def waiting(study: Study) -> list[Indentation]:
     """Sites and records that are yet to be made, site by site."""
-    return [one for one in study.indentations if not _is_made(study, one)]
-
-
-def _is_made(study: Study, one: Indentation) -> bool:
-    return one.trace is not None and study.path(one.trace).is_file()
+    return [one for one in study.indentations if not study.is_recorded(one)]
 
 
 def acquire_site(
@@ -146,7 +142,7 @@ def check_recording(
         For what can be known to be wrong before the device is asked.
     """
     one = study.indentation(name)
-    if _is_made(study, one) and not replace_record:
+    if study.is_recorded(one) and not replace_record:
         remedy = "give --again to record it once more; the old record is kept"
         place = f"{_find_place(one)}.trace"
         raise InputError(f"{one.trace} exists", file=study.file, place=place, remedy=remedy)

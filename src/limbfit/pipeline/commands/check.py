@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.imaging import Volume
 from ...anatomy.surfaces.surfaces import Anatomy
 from ...errors import InputError
 from ...identify.checks.domain import Extent, RecordedRange, describe_outside
@@ -219,12 +218,13 @@ def _describe_surface_motion(
 
 def _describe_image(study: Study) -> tuple[list[str], tuple[str, ...] | None]:
     """Facts, and the names of the bones where a label map is given."""
-    volume = read_study_image(study)
-    facts = [_describe_sampling("image", volume), *(f"warning: image: {note}" for note in volume.notes)]
-    marked = read_marked_image(study)
-    if marked is not None:
-        facts.append(_describe_sampling("image with markers", marked))
-        facts += [f"warning: image with markers: {note}" for note in marked.notes]
+    volume, facts = read_study_image(study), []
+    for name, image in (("image", volume), ("image with markers", read_marked_image(study))):
+        if image is not None:
+            size = " x ".join(str(n) for n in image.size)
+            spacing = " x ".join(f"{s:.3g}" for s in image.spacing)
+            facts.append(f"{name}: {size} voxels of {spacing} mm")
+            facts += [f"warning: {name}: {note}" for note in image.notes]
     given, bones = read_study_labels(study, volume), None
     if given is not None:
         labels, notes = given
@@ -266,12 +266,6 @@ def _describe_socket(study: Study, anatomy: Anatomy | None, bones: Collection[st
         f"socket: {socket.volume_mm3 / 1000:.0f} cm3, from {-depth.min():.1f} mm outside the skin to "
         f"{depth.max():.1f} mm inside it",
     ]
-
-
-def _describe_sampling(name: str, volume: Volume) -> str:
-    size = " x ".join(str(n) for n in volume.size)
-    spacing = " x ".join(f"{s:.3g}" for s in volume.spacing)
-    return f"{name}: {size} voxels of {spacing} mm"
 
 
 def _describe_surfaces(study: Study, anatomy: Anatomy) -> list[str]:

@@ -137,14 +137,6 @@ def register_experiment(experiment: Experiment, section: Maker | None = None) ->
         SECTIONS.add(name, section)
 
 
-def merge_options(experiment: Experiment, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The given options over the defaults."""
-    unknown = ", ".join(sorted(set(given) - set(experiment.options)))
-    if unknown:
-        raise InputError(f"{experiment.name} has no option {unknown}")
-    return {**experiment.options, **given}
-
-
 def check_experiment(
     experiment: Experiment, study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]
 ) -> None:

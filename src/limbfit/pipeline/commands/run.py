@@ -1,4 +1,4 @@
-"""Which stages there are, what each depends on, and the run that does what is missing."""
+"""Which stages there are, what each depends on, and runs of one study or many that do what is missing."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 from ... import report
 from ..._version import __version__
-from ...errors import InputError
-from ...execution import run_in_background
+from ...errors import InputError, LimbfitError
+from ...execution import make_executor, run_in_background, share_executor
 from ...extensions import load_extensions
 from ...fe import are_compiled, compile_kernels
 from ...results.identification import CalibrationResult, PredictResult
@@ -25,8 +26,8 @@ from ...results.runs import (
     StageRecord,
     StudyName,
 )
-from ...study import Site, Study
-from ..engine.context import Context, Listener, build_executor, ignore_progress
+from ...study import Site, Study, load_study
+from ..engine.context import Context, Listener, Progress, build_executor, ignore_progress
 from ..engine.digests import compute_file_digest
 from ..engine.hand_labels import keep_hand_labels
 from ..engine.journal import write_journal
@@ -45,7 +46,7 @@ from ..records.record_checks import choose_surface_points, tell_flags
 from ..records.secondary_measurements import read_motion
 from ..records.traces import run_traces
 from ..simulation.limb_geometry import LimbGeometry
-from .experiments import EXPERIMENTS, check_experiment, list_experiment_states, merge_options
+from .experiments import EXPERIMENTS, check_experiment, list_experiment_states
 
 
 def run_report(context: Context, folder: Path) -> None:
@@ -254,6 +255,54 @@ def _select_stages_to_redo(
     return {*force, *(names[names.index(start) :] if start is not None else ())}
 
 
+_FIGURES = ("mean_error_fitted_percent", "mean_error_heldout_percent", "report")
+
+
+def run_batch(
+    paths: Sequence[str | Path],
+    *,
+    until: str | None = None,
+    workers: int = 0,
+    listener: Listener = ignore_progress,
+) -> Iterator[dict[str, Any]]:
+    """Run studies one after the other on the same workers; a study that fails does not stop the others.
+
+    Parameters
+    ----------
+    paths : of studies, each a ``study.toml`` or its folder.
+    until : name of the last stage to do; default all.
+    workers : how many simulate side by side; 0: one per core.
+    listener : is told of progress.
+
+    Yields
+    ------
+    dict
+        For each study as it ends: ``study`` (its path as given), ``state`` (``done`` or ``failed``),
+        ``seconds``, ``error`` (one line, where it failed), and its mean errors and report.
+
+    Raises
+    ------
+    InputError
+        For a stage that there is not.
+    """
+    if until is not None and until not in STAGE_NAMES:
+        raise InputError(f"no stage is named {until!r}", remedy="stages are " + ", ".join(STAGE_NAMES))
+    with make_executor(workers) as executor, share_executor(executor):
+        for i, path in enumerate(paths):
+            start = perf_counter()
+            listener(Progress("batch", i, len(paths), str(path)))
+            row: dict[str, Any] = {"study": str(path), "state": "done", "error": None}
+            try:
+                summary = run_study(load_study(path), until=until, listener=listener)
+                row |= {key: summary.get(key) for key in _FIGURES}
+            except LimbfitError as error:
+                row |= {"state": "failed", "error": str(error)}
+            except Exception as error:  # one study's bad luck must not cost the others
+                row |= {"state": "failed", "error": f"internal error: {type(error).__name__}: {error}"}
+            yield row | {"seconds": round(perf_counter() - start, 1)}
+        listener(Progress("batch", len(paths), len(paths), "done"))
+
+
 def run_experiment(
     study: Study, name: str, *, listener: Listener = ignore_progress, **options: Any
 ) -> dict[str, Any]:
@@ -283,7 +332,10 @@ def run_experiment(
     experiment = EXPERIMENTS[name]
     if name in _FOLDERS:
         raise InputError(f"results/{name} is not for an experiment", remedy="give it another name")
-    chosen = merge_options(experiment, options)
+    unknown = ", ".join(sorted(set(options) - set(experiment.options)))
+    if unknown:
+        raise InputError(f"{name} has no option {unknown}")
+    chosen = {**experiment.options, **options}
     check_experiment(experiment, study, None, chosen)
     last = [stage.name for stage in STAGES if stage.name in experiment.needs][-1:]
     if last:
