@@ -36,21 +36,20 @@ def get_identification(folder: Folder) -> dict[str, Any]:
     """The stages and their states, the current or last run, the iterates of the search, and its answer."""
     study = folder.load()
     stages = list_stages(folder)
-    logs = _list_logs(folder)
-    answer = _answer(folder)
+    calibration = CalibrationResult.find(folder.results)
     run = find_running(folder)
-    state = next(row for row in stages if row["stage"] == "calibrate")
+    state = next(row["state"] for row in stages if row["stage"] == "calibrate")
     return {
         "stages": stages,
         "chain": [row["stage"] for row in stages if row["stage"] in STAGE_NAMES],
         "run": run,
         "starting": find_starting(folder) if run is None else None,
         "last": describe_last_run(folder, run is not None),
-        "iterates": _collect_iterates(folder, logs, state["state"], answer),
+        "iterates": _collect_iterates(folder, state, calibration),
         "parameters": list(study.law.keys),
         "tissues": list(study.tissues),
         "sites": [{"site": record.name, "fitted": record.fitted} for record in study.recorded],
-        "answer": answer and {**answer, "state": state["state"]},
+        "answer": calibration and _describe_answer(calibration) | {"state": state},
     }
 
 
@@ -91,41 +90,37 @@ def post_stop(folder: Folder) -> dict[str, Any]:
     return stop_run(folder)
 
 
-def _answer(folder: StudyFolder) -> dict[str, Any] | None:
-    calibration = CalibrationResult.find(folder.results)
-    if calibration is None:
-        return None
+def _describe_answer(calibration: CalibrationResult) -> dict[str, Any]:
     keys = {"name", "cost", "evaluations", "converged", "reason", "parameters"}
-    rows = {"parameters", "cost", "error_percent", "error_percent_by_site"}
     known = {"intervals_95", "correlation", "verdict", "at_bound", "combinations"}
     return {
         "stages": [stage.model_dump(include=keys) for stage in calibration.stages],
         "parameters": calibration.parameters,
         "warnings": calibration.warnings,
-        "iterates": [
-            {"of": stage.name, **row.model_dump(include=rows)}
-            for stage in calibration.stages
-            for row in stage.iterations
-        ],
         **calibration.uncertainty.model_dump(include=known),
     }
 
 
 def _collect_iterates(
-    folder: StudyFolder, logs: list[Path], state: str, answer: dict[str, Any] | None
+    folder: StudyFolder, state: str, calibration: CalibrationResult | None
 ) -> dict[str, Any]:
     """The iterates of a search that runs or was stopped; those of the stored answer otherwise."""
     if state != "done":
         stamp = folder.store.stamp("calibrate")
         finished = stamp.finished if stamp else ""
-        for log in reversed(logs[-LOGS_SEARCHED:]):
+        for log in reversed(_list_logs(folder)[-LOGS_SEARCHED:]):
             rows = [
                 row for row in _read_events(log) if row["event"] == "fit" and row.get("stage") == "calibrate"
             ]
             facts = [row["facts"] for row in rows if row.get("facts") and row["time"] > finished]
             if facts:
                 return {"of": "log", "rows": facts}
-    return {"of": "answer" if answer else "nothing", "rows": answer.pop("iterates") if answer else []}
+    if calibration is None:
+        return {"of": "nothing", "rows": []}
+    keys = {"parameters", "cost", "error_percent", "error_percent_by_site"}
+    stages = calibration.stages
+    rows = [{"of": one.name, **row.model_dump(include=keys)} for one in stages for row in one.iterations]
+    return {"of": "answer", "rows": rows}
 
 
 def _list_logs(folder: StudyFolder) -> list[Path]:

@@ -110,15 +110,11 @@ def create_app(folder: StudyFolder, guard: AccessGuard) -> FastAPI:
         Exception,
     ):
         app.add_exception_handler(kind, _respond_error)
-    app.add_api_route("/", _page, include_in_schema=False)
+    app.add_api_route("/", lambda: FileResponse(STATIC / "index.html"))
     app.mount("/static", StaticFiles(directory=STATIC))
     app.mount("/web", StaticFiles(directory=SHARED))
     app.add_middleware(GuardMiddleware, guard=guard)
     return app
-
-
-def _page() -> FileResponse:
-    return FileResponse(STATIC / "index.html")
 
 
 def _respond_error(request: Request, error: Exception) -> JSONResponse:

@@ -126,16 +126,11 @@ def _check_solvers() -> Iterator[Finding]:
 def _check_meshers() -> Iterator[Finding]:
     """In a process of their own: some crash the interpreter."""
     for name, module, required in (("MMG", "mmgpy", True), ("Netgen", "netgen.meshing", False)):
+        command = [sys.executable, "-P", "-c", f"import {module}"]
         try:
-            code = subprocess.run(
-                [sys.executable, "-P", "-c", f"import {module}"],
-                capture_output=True,
-                timeout=120,
-                check=False,
-            ).returncode
+            works = subprocess.run(command, capture_output=True, timeout=120, check=False).returncode == 0
         except subprocess.TimeoutExpired:
-            code = -1
-        works = code == 0
+            works = False
         found = "works" if works else "cannot be loaded" if required else "not installed (optional)"
         remedy = "" if works else f"pip install {'mmgpy' if required else 'limbfit[netgen]'}"
         yield Finding(f"mesher {name}", "ok" if works or not required else "failed", found, remedy)

@@ -193,11 +193,8 @@ def _build_ranges(found: Indentation, tissues: Sequence[str]) -> dict[str, febio
     study = found.context.study
     ranges = {}
     for tissue in tissues:
-        start, lower, upper = (
-            found.parameters[tissue],
-            study.material.of(tissue, "lower"),
-            study.material.of(tissue, "upper"),
-        )
+        start = found.parameters[tissue]
+        lower, upper = (study.material.of(tissue, bound) for bound in ("lower", "upper"))
         for key, value in start.items():
             if not lower[key] <= value <= upper[key]:
                 what = f"{tissue}.{key} = {value:g} lies outside its bounds, {lower[key]:g} to {upper[key]:g}"
