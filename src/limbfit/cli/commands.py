@@ -19,11 +19,11 @@ from ..study import Study
 from .console import (
     AsJson,
     Column,
+    fail,
     format_parameter_heads,
     format_use,
     listen_on_console,
     parse_numbers,
-    print_aside,
     print_json,
     print_line,
     print_result,
@@ -227,8 +227,7 @@ def simulate(
     show_warnings([result])
     print_warnings(result["outside_text"])
     if not result["completed"]:
-        print_aside(f"error: site {site}: the simulation is partial: {result['reason']}")
-        raise typer.Exit(1)
+        fail(f"site {site}: the simulation is partial: {result['reason']}", 1)
 
 
 def report(study: StudyPath, as_json: AsJson = False) -> None:

@@ -12,6 +12,7 @@ import limbfit
 from .commands import Parameters, StudyPath, call_on_study
 from .console import (
     AsJson,
+    fail,
     listen_on_console,
     print_aside,
     print_json,
@@ -44,8 +45,7 @@ def febio(
     for warning in result["warnings"]:
         print_warning(warning)
     if not result["completed"]:
-        print_aside(f"error: {file}: the simulation is partial: {result['reason']}")
-        raise typer.Exit(1)
+        fail(f"{file}: the simulation is partial: {result['reason']}", 1)
 
 
 def export(
@@ -107,8 +107,7 @@ def compare(
         print_line(", ".join(result["files"].values()))
     partial = [result[key]["reason"] for key in ("febio", "limbfit", "limbfit_matched")]
     if any(partial):
-        print_aside(f"error: site {site}: partial: {'; '.join(filter(None, partial))}")
-        raise typer.Exit(1)
+        fail(f"site {site}: partial: {'; '.join(filter(None, partial))}", 1)
 
 
 VERBS = (export, febio, compare)

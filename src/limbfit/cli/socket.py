@@ -96,7 +96,11 @@ def show_socket(found: SocketResult) -> None:
     for name, state in found.states.items():
         settled = ""
         if isinstance(state, SocketLoad):
-            settled = f", settled by {state.settling_mm:.1f} mm{_format_interval(state)}"
+            settled = f", settled by {state.settling_mm:.1f} mm"
+            if state.settling_interval_mm is not None:
+                interval = format_ends(state.settling_interval_mm, ".1f")
+                cause = _format_main_cause(state.settling_interval_from)
+                settled += f" (95 %: {interval}, mostly from {cause})"
         print_line(
             f"{name}: {state.peak_kPa:.0f} kPa at most, in touch over "
             f"{state.contact_area_mm2 / 100:.0f} cm2{settled}"
@@ -121,12 +125,6 @@ def _format_main_cause(shares: Mapping[str, float] | None) -> str:
     name, percent = next(iter(shares.items()))
     tissue, _, key = name.partition(".")
     return f"{tissue} {split_key(key)[0]} {percent:.0f} %"
-
-
-def _format_interval(load: SocketLoad) -> str:
-    interval = format_ends(load.settling_interval_mm, ".1f")
-    cause = _format_main_cause(load.settling_interval_from)
-    return f" (95 %: {interval}, mostly from {cause})" if interval else ""
 
 
 LOAD_COLUMNS: dict[str, Column] = {

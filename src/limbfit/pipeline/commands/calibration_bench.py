@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ...bench.timing import FEBIO_SECONDS
-from ...study import Study, load_study
+from ...study import load_study
 from ..engine.context import Listener, ignore_progress
 from ..engine.store import Store
 from .demo import make_phantom_study
@@ -50,7 +50,31 @@ def bench_calibrate(folder: Path | None = None, *, listener: Listener = ignore_p
                 (place / source.file.name).rename(place / "study.toml")
         study = load_study(place)
         run_study(study, until="predict", listener=listener)
-        return _collect_facts(study)
+        store = Store(study.results)
+        predicted = store.results.predict
+        seconds = {stage: store.results.stages[stage].seconds for stage in ("calibrate", "predict")}
+        names = {file.name for stage in seconds for file in store[stage].glob("runs/*.npz")}
+        calibration = store.results.calibration
+        parameters, sites = len(study.parameters), len(study.fitted)
+        febio = FEBIO_SECONDS[FEBIO_CASE] * FEBIO_ITERATIONS * sites * (parameters + 1)
+        total = seconds["calibrate"] + seconds["predict"]
+        return {
+            "study": study.study.name,
+            "seconds": total,
+            "seconds_calibrate": seconds["calibrate"],
+            "seconds_predict": seconds["predict"],
+            "forward_runs": len(names),
+            "forward_runs_calibrate": calibration.forward_runs,
+            "forward_runs_calibrate_with_sensitivities": calibration.forward_runs_with_sensitivities,
+            "sites_fitted": sites,
+            "sites_predicted": len(predicted.sites),
+            "nodes_per_site": max(site.nodes for site in store.results.mesh.sites.values()),
+            "mean_error_fitted_percent": predicted.mean_error_fitted_percent,
+            "mean_error_heldout_percent": predicted.mean_error_heldout_percent,
+            "febio_loop_seconds": febio,
+            "ratio": febio / total,
+            "ratio_calibrate": febio / seconds["calibrate"],
+        }
 
 
 def _select_left_out(folder: str, names: list[str]) -> set[str]:
@@ -58,31 +82,3 @@ def _select_left_out(folder: str, names: list[str]) -> set[str]:
     if Path(folder).name != "results":
         return set()
     return {name for name in names if name in _AFRESH or name.startswith(".")}
-
-
-def _collect_facts(study: Study) -> dict[str, Any]:
-    store = Store(study.results)
-    predicted = store.results.predict
-    seconds = {stage: store.results.stages[stage].seconds for stage in ("calibrate", "predict")}
-    names = {file.name for stage in seconds for file in store[stage].glob("runs/*.npz")}
-    calibration = store.results.calibration
-    parameters, sites = len(study.parameters), len(study.fitted)
-    febio = FEBIO_SECONDS[FEBIO_CASE] * FEBIO_ITERATIONS * sites * (parameters + 1)
-    total = seconds["calibrate"] + seconds["predict"]
-    return {
-        "study": study.study.name,
-        "seconds": total,
-        "seconds_calibrate": seconds["calibrate"],
-        "seconds_predict": seconds["predict"],
-        "forward_runs": len(names),
-        "forward_runs_calibrate": calibration.forward_runs,
-        "forward_runs_calibrate_with_sensitivities": calibration.forward_runs_with_sensitivities,
-        "sites_fitted": sites,
-        "sites_predicted": len(predicted.sites),
-        "nodes_per_site": max(site.nodes for site in store.results.mesh.sites.values()),
-        "mean_error_fitted_percent": predicted.mean_error_fitted_percent,
-        "mean_error_heldout_percent": predicted.mean_error_heldout_percent,
-        "febio_loop_seconds": febio,
-        "ratio": febio / total,
-        "ratio_calibrate": febio / seconds["calibrate"],
-    }

@@ -154,10 +154,9 @@ def derive_study(study: Study, name: str) -> Study:
         folder.mkdir(parents=True, exist_ok=True)
         _link_inputs(study, folder, document)
         (folder / "study.toml").write_text(tomlkit.dumps(document), encoding="utf-8")
-        derived = load_study(folder)
+        return load_study(folder)
     except InputError as error:
         raise InputError(f"model {name}: {error.what}", place=error.place, remedy=error.remedy) from None
-    return derived
 
 
 def _share_stages(study: Study, derived: Study) -> None:
