@@ -29,7 +29,7 @@ from ...results.identification import RecordPrediction
 from ...results.socket import LoadedRegion, SocketResult
 from ...study import Study, load_study
 from ..engine.context import Listener, Progress, ignore_progress
-from ..engine.hand_labels import find_hand_labels
+from ..engine.files import find_hand_labels
 from ..engine.storage import write_curves, write_result
 from ..engine.store import Store, lock
 from .fitting import fit_socket

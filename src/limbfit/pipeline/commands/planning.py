@@ -11,9 +11,9 @@ from ...errors import InputError
 from ...identify.checks.design import Criterion
 from ...indentation import Parameters
 from ...study import Study
+from ..design.protocol import SEEN
 from ..engine.context import Listener, ignore_progress
 from ..engine.store import Store
-from ..records.planned_records import SEEN
 from ..simulation.loading import LoadHistory, time_socket_loads
 from ..socket.intervals import CHANGE_PERCENT
 from ..socket.socket import NAME as SOCKET

@@ -15,7 +15,7 @@ from ...errors import InputError
 from ...results.curves import read_curves
 from ...study import Study, load_study
 from ..engine.context import Listener, ignore_progress
-from ..engine.hand_labels import find_hand_labels
+from ..engine.files import find_hand_labels
 from ..engine.provenance import collect_versions, compute_input_digests, record_settings
 from ..engine.storage import read_json
 from ..engine.store import Store

@@ -29,7 +29,7 @@ from ...results.runs import (
 from ...study import Site, Study, load_study
 from ..engine.context import Context, Listener, Progress, build_executor, ignore_progress
 from ..engine.digests import compute_file_digest
-from ..engine.hand_labels import keep_hand_labels
+from ..engine.files import keep_hand_labels
 from ..engine.journal import write_journal
 from ..engine.keys import Keys, Stage, StageKey, describe_causes
 from ..engine.provenance import collect_versions, compute_input_digests, describe_machine, record_settings

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomlkit
 
 from ...anatomy.sites.sites import measure_tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
@@ -32,6 +33,7 @@ from ...identify.fit.parameters import Unknowns
 from ...indentation import (
     Simulation,
     SimulationJob,
+    SiteModel,
     find_layers_under,
     find_nearby_skin_points,
     place_waves_under,
@@ -44,7 +46,6 @@ from ..engine.context import NO_PARAMETERS, Context
 from ..engine.storage import write_result
 from ..identification.problem import build_unknowns
 from ..records.deviations import compute_expected_share, is_modulus
-from ..records.planned_records import SEEN, PlannedRecord, press, write_records
 from ..records.records import build_model, estimate_surface_error_mm
 from ..simulation.limb_geometry import LimbGeometry, build_site_model, coarsen_model
 from ..simulation.loading import LoadHistory, describe_untested_times
@@ -53,7 +54,48 @@ from .design import DEEPEST_SHARE
 
 DETERMINED = 1.25  # largest factor of a 95 % interval that counts as determined
 READING_S = 1.0
+# Standard deviations of what can be read beside the force, and how their files end.
+SEEN = {
+    "ultrasound_sd_mm": "layers",  # of a thickness
+    "surface_sd_mm": "surface",  # of a component of a move of the skin
+    "shear_waves_sd_m_s": "waves",  # of a speed, of which there is one in `READING_S`
+}
 DESIGNED, PLAIN, UNSEEN = "designed", "one ramp at each site", "by force alone"
+
+
+@dataclass(frozen=True)
+class PlannedRecord:
+    """A record that could be made: the indenter pressed in at one rate, held, and taken back at that rate.
+
+    ``usual``: as deep as the site was recorded or is planned, or nearest to that.
+    """
+
+    site: str
+    indenter: str
+    depth_mm: float
+    speed_mm_s: float
+    hold_s: float
+    model: SiteModel
+    usual: bool
+
+    @property
+    def seconds(self) -> float:
+        """From the first touch to the last."""
+        return 2.0 * self.depth_mm / self.speed_mm_s + self.hold_s
+
+    @property
+    def told(self) -> str:
+        held = f", held for {self.hold_s:g} s" if self.hold_s else ""
+        return f"site {self.site}, {self.indenter}, {self.depth_mm:.1f} mm at {self.speed_mm_s:g} mm/s{held}"
+
+
+def press(model: SiteModel, depth: float, speed: float, hold: float) -> SiteModel:
+    """In to ``depth`` mm at ``speed`` mm/s, held for ``hold`` s, and out."""
+    ramp = depth / speed
+    knots = [(0.0, 0.0), (ramp, depth)] + ([(ramp + hold, depth)] if hold else [])
+    knots.append((knots[-1][0] + ramp, 0.0))
+    times, depths = zip(*knots)
+    return replace(model, knots_s=times, knots_mm=depths)
 
 
 def check_protocol(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
@@ -130,7 +172,7 @@ def run_protocol(
         _judge_plan(name, chosen, told_by[name], budget, wanted, (known.names, which), pressures)
         for name, chosen in plans.items()
     ]
-    candidates = [_to_row(one, option) for one, option in zip(found, options, strict=True)]
+    candidates = [one.to_row(rest_s) for one in found]
     chosen = (found[i].planned.model for i in plans[DESIGNED])
     histories = [LoadHistory.from_knots(model.knots_s, model.knots_mm) for model in chosen]
     left_out += describe_untested_times(histories, socket_times)
@@ -153,7 +195,7 @@ def run_protocol(
         **seen,
     )
     write_result(folder / "protocol.json", content)
-    write_records(folder / "records.toml", content.records, seen)
+    _write_records(folder / "records.toml", content.records, seen)
 
 
 def _select_named(known: Unknowns, determine: Sequence[str]) -> tuple[int, ...]:
@@ -207,7 +249,8 @@ def _plan_records(
             nearest = min(depths, key=lambda depth: abs(depth - usual))
             for depth, speed, hold in product(depths, speeds_mm_s, holds_s):
                 planned = press(model, depth, speed, hold)
-                found.append(PlannedRecord(site.name, name, depth, speed, hold, planned, depth == nearest))
+                tool, is_usual = name or "indenter", depth == nearest
+                found.append(PlannedRecord(site.name, tool, depth, speed, hold, planned, is_usual))
     return found, list(dict.fromkeys(left_out))
 
 
@@ -226,8 +269,14 @@ class _Simulated:
     def to_option(self, rest_s: float, surface_mm: float, which: int) -> RecordOption:
         """What may be chosen; its site's surfaces are off by so much."""
         planned, share = self.planned, compute_expected_share(self.planned.model, surface_mm)
-        place = planned.site, planned.tool
+        place = planned.site, planned.indenter
         return RecordOption(place, planned.seconds + rest_s, self.information[which], share)
+
+    def to_row(self, rest_s: float) -> ProtocolRecord:
+        """What is stored of it; it takes so long a rest as well."""
+        keys = ("site", "indenter", "depth_mm", "speed_mm_s", "hold_s")
+        stated = {key: getattr(self.planned, key) for key in keys}
+        return ProtocolRecord(**stated, seconds=self.planned.seconds + rest_s, peak_force_N=self.peak_N)
 
 
 def _simulate_planned(
@@ -287,14 +336,14 @@ def _build_plans(
     slow, tool = min(one.speed_mm_s for one in found), found[0].indenter
     most: dict[tuple[str, str], float] = {}
     for one in found:
-        place = one.site, one.tool
+        place = one.site, one.indenter
         most[place] = max(most.get(place, 0.0), one.depth_mm)
     kinds: dict[str, Callable[[PlannedRecord], bool]] = {
         DESIGNED: lambda one: True,
         "without holds": lambda one: not one.hold_s,
         "at one speed": lambda one: one.speed_mm_s == slow,
         "with one indenter": lambda one: one.indenter == tool,
-        "at one depth": lambda one: one.depth_mm == most[one.site, one.tool],
+        "at one depth": lambda one: one.depth_mm == most[one.site, one.indenter],
     }
     plans: dict[str, tuple[int, ...]] = {}
     for name, is_allowed in kinds.items():
@@ -345,16 +394,25 @@ def _judge_plan(
     )
 
 
-def _to_row(one: _Simulated, option: RecordOption) -> ProtocolRecord:
-    return ProtocolRecord(
-        site=one.planned.site,
-        indenter=one.planned.tool,
-        depth_mm=one.planned.depth_mm,
-        speed_mm_s=one.planned.speed_mm_s,
-        hold_s=one.planned.hold_s,
-        seconds=option.seconds,
-        peak_force_N=one.peak_N,
-    )
+def _write_records(file: Path, records: Sequence[ProtocolRecord], seen: Mapping[str, Any]) -> None:
+    """The tables ``[[records]]`` of a study that makes them."""
+    tables, number = tomlkit.aot(), dict.fromkeys((row.site for row in records), 0)
+    for row in records:
+        number[row.site] += 1
+        table = tomlkit.table()
+        name = f"{number[row.site]}"
+        table.update({"site": row.site, "name": name, "trace": f"records/{row.site}-{name}.csv"})
+        if row.indenter != "indenter":
+            table["indenter"] = row.indenter
+        for key, end in SEEN.items():
+            if seen[key] is not None:
+                table[key.partition("_sd")[0]] = f"records/{row.site}-{name}-{end}.csv"
+                table[key] = seen[key]
+        table.update({key: round(getattr(row, key), 3) for key in ("depth_mm", "speed_mm_s", "hold_s")})
+        tables.append(table)
+    document = tomlkit.document()
+    document["records"] = tables
+    file.write_text(tomlkit.dumps(document), encoding="utf-8")
 
 
 def _describe_verdict(best: ProtocolPlan, wanted: Sequence[str]) -> str:

@@ -110,14 +110,9 @@ def describe_causes(before: StageParts | None, now: StageParts) -> list[str]:
     if before is None:
         return ["made by an older version, which did not store what its key depends on"]
     found = []
-    words = {
-        "settings": "setting {} changed",
-        "inputs": "input file {} changed",
-        "stages": "stage {} changed",
-    }
-    for kind, text in words.items():
+    for kind, word in (("settings", "setting"), ("inputs", "input file"), ("stages", "stage")):
         names = _find_different(getattr(before, kind), getattr(now, kind))
-        found += [text.format(_list_few(names))] if names else []
+        found += [f"{word} {_list_few(names)} changed"] if names else []
     code, then = _find_different(before.code, now.code), before.code.get("limbfit")
     if then != __version__:
         found.append(f"limbfit was {then}, is {__version__}")

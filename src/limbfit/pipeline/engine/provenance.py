@@ -14,7 +14,7 @@ from ...anatomy.labels.labelfiles import find_sidecar
 from ...fe import StepControl
 from ...study import Study
 from .digests import compute_digest, compute_file_digest
-from .hand_labels import find_hand_labels
+from .files import find_hand_labels
 
 LIBRARIES = (
     "numpy",

@@ -61,7 +61,7 @@ def run_calibrate(context: Context, folder: Path) -> None:
     warnings = {site: list(one.warnings) for site, one in answers.items() if one.warnings}
     for site, texts in warnings.items():
         report(f"warning: site {site}, at the answer: {'; '.join(texts)}")
-    log, bounds, kept = simulator.log, problem.unknowns, cache.load_all()
+    bounds, kept = problem.unknowns, cache.load_all()
     content = stored.CalibrationResult(
         stages=[_summarise_stage(found, i, problem, simulator.starts) for i in range(len(found.stages))],
         bounds=stored.ParameterBounds(
@@ -79,11 +79,13 @@ def run_calibrate(context: Context, folder: Path) -> None:
         warnings=warnings,
         contact=summarise_contact(
             answers,
-            log.penalties,
+            simulator.penalties,
             records.select_forces(simulator.respond(simulations)),
             records.select_forces(found.responses),
         ),
-        doubts=summarise_doubts(log.warnings, answers, log.evaluations * records.simulations, found),
+        doubts=summarise_doubts(
+            simulator.warnings, answers, simulator.evaluations * records.simulations, found
+        ),
     )
     write_result(folder / "calibration.json", content)
 
@@ -138,19 +140,11 @@ def _summarise_round(
 def _summarise_starts(tried: MultistartResult, study: Study) -> stored.SearchStarts:
     """What came of every start."""
     names = [f"{tissue}.{name}" for tissue, name in study.parameters]
-    starts = [
-        stored.SearchStart(
-            start=study.by_tissue(np.array(one.start)),
-            parameters=None if one.parameters is None else study.by_tissue(np.array(one.parameters)),
-            cost=one.cost,
-            evaluations=one.evaluations,
-            converged=one.converged,
-            reason=one.reason,
-            same=one.same,
-            apart=one.apart,
-        )
-        for one in tried.starts
-    ]
+    starts = []
+    for one in tried.starts:
+        found = None if one.parameters is None else study.by_tissue(np.array(one.parameters))
+        vectors = {"start": study.by_tissue(np.array(one.start)), "parameters": found}
+        starts.append(stored.SearchStart(**vars(one) | vectors))
     return stored.SearchStarts(summary=describe_starts(tried, names), reached=tried.reached, starts=starts)
 
 
@@ -189,11 +183,10 @@ def _summarise_priors(known: Uncertainty, study: Study) -> stored.PriorShares | 
     if not study.priors:
         return None
     stated = study.calibration.prior
+    sources = {name: "the study" if name in stated else SOURCE for name in study.priors}
     return stored.PriorShares(
         stated={
-            name: stored.StatedPrior(
-                median=prior.median, factor=prior.factor, source="the study" if name in stated else SOURCE
-            )
+            name: stored.StatedPrior(median=prior.median, factor=prior.factor, source=sources[name])
             for name, prior in study.priors.items()
         },
         share=dict(zip(known.names, known.prior_share.tolist(), strict=True)),

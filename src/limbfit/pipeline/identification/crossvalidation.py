@@ -106,7 +106,10 @@ def run_crossvalidate(
     for number, without in ((1, {}), (2, regions)):
         emulator = _fit_emulator(known)
         fits = _fit_choices(context, emulator, bounds, measured, list(sites.values()), (own, chosen, without))
-        checked = fits.spread(_CHECKED)
+        # The study's own, and some from the best to the worst.
+        ranked = sorted(fits.folds, key=lambda fold: fold.mean_heldout)
+        places = np.linspace(0, len(ranked) - 1, min(_CHECKED - 1, len(ranked))).astype(int)
+        checked = [fits.own, *(ranked[i] for i in places)]
         optima = [fold.parameters for fold in checked]
         solved = simulate(optima)
         checks += _check_folds(number, checked, solved, emulator, measured, sites)
@@ -124,12 +127,6 @@ class _Fits(NamedTuple):
     own: Fold
     folds: tuple[Fold, ...]
     regions: tuple[Fold, ...]
-
-    def spread(self, count: int) -> list[Fold]:
-        """Some fits from the best to the worst, the study's own first."""
-        ranked = sorted(self.folds, key=lambda fold: fold.mean_heldout)
-        places = np.linspace(0, len(ranked) - 1, min(count - 1, len(ranked))).astype(int)
-        return [self.own, *(ranked[i] for i in places)]
 
 
 def _select_complete(
@@ -245,8 +242,8 @@ def _build_result(
                 region=regions[name],
                 fitted=i in found.own.fitted,
                 left_out_of=summary.sites,
-                mean_percent=_to_plain(summary.mean_percent),
-                sd_percent=_to_plain(summary.sd_percent),
+                mean_percent=None if np.isnan(summary.mean_percent) else summary.mean_percent,
+                sd_percent=None if np.isnan(summary.sd_percent) else summary.sd_percent,
                 own_percent=found.own.errors_percent[i],
             )
             for i, (name, summary) in enumerate(zip(sites, by_site))
@@ -256,7 +253,3 @@ def _build_result(
         at_limit_share=float(np.mean([bool(fold.at_limit) for fold in found.folds])),
         emulator=emulator,
     )
-
-
-def _to_plain(value: float) -> float | None:
-    return None if np.isnan(value) else value

@@ -59,7 +59,7 @@ def sample_intervals(
     records = simulator.records
     known = estimate_linearised(problem, records.own, found.parameters, correction)
     evaluations = EvaluationStore()
-    for point, run in zip(simulator.log.store.points, simulator.log.store.responses, strict=True):
+    for point, run in zip(simulator.store.points, simulator.store.responses, strict=True):
         evaluations.add(point, correction.as_fine(list(run)))
 
     def simulate(parameters: Array) -> Responses:

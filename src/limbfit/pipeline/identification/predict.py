@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from ...study import Study
 from ..engine.context import Context
 from ..engine.storage import write_curves, write_result
 from ..records.deviations import estimate_site_deviation, estimate_site_noise
-from ..records.outliers import check_records
+from ..records.record_checks import check_records
 from ..records.records import (
     RecordSet,
     SiteRecord,
@@ -43,8 +43,7 @@ _MISSING = {
 
 def run_predict(context: Context, folder: Path) -> None:
     """Force at every recorded site with all materials and with one, intervals, and the fields at the peak."""
-    study = context.study
-    calibration = context.results.calibration
+    study, calibration = context.study, context.results.calibration
     answers = [Answer.of(stage, study) for stage in calibration.stages]
     one, best = answers[0].parameters, answers[-1].parameters
     known = PredictionModel.from_stored(calibration.uncertainty)
@@ -55,34 +54,15 @@ def run_predict(context: Context, folder: Path) -> None:
     jobs = build_answer_jobs(records, answers[-1])
     if len(answers) > 1:
         jobs += _build_one_material_jobs(records, answers[0], best)
-    simulations = []
-    for simulation in cache.run(jobs, context.executor):
-        simulations.append(simulation)
-        context.tell("predict", len(simulations), len(jobs) + len(records.own), f"site {simulation.site}")
-    n = len(records.own)
-    near = simulations[n : 2 * n] if records.is_coarsened else None
-    ours = own = [to_response(simulation) for simulation in simulations[:n]]
-    others = [to_response(simulation) for simulation in simulations[n:]]
-    correction = None
-    if records.is_coarsened:
-        coarse, others = others[:n], others[n:]
-        correction = MeshCorrection(coarse, own)
-        ours = correction(coarse)
-        fine = correction(others) if others else []
-        others = [as_is if r.site.fitted else held for r, as_is, held in zip(records.own, others, fine)]
-    sites = [SitePrediction(*parts) for parts in zip_longest(records.own, simulations[:n], ours, others)]
-    whole = [job for site, job in zip(sites, jobs) if site.own.completed]
-    strains = _write_fields(context, folder, whole, len(jobs))
-    bands = [_Band.compute(study, site, best, known) if site.ours.completed else None for site in sites]
-    for site, band in zip(sites, bands, strict=True):
-        _write_curves(folder, site, band)
-    observed = [
-        _write_observed(folder, site, None if near is None else near[i], best, known)
-        for i, site in enumerate(sites)
-    ]
+    sites, correction = _simulate_records(context, cache, records, jobs)
+    strains = _write_fields(context, folder, sites, len(jobs))
+    bands = [_compute_band(study, site, best, known) if site.ours.completed else None for site in sites]
     tested, loadings = _compare_with_records(context, sites, strains)
-    rows = [_summarise_site(*parts) for parts in zip(sites, observed, loadings, strict=True)]
-    outside = {f"site {row.record}": row.outside_records for row in rows if not row.fitted}
+    rows = []
+    for site, band, loading in zip(sites, bands, loadings, strict=True):
+        _write_curves(folder, site, band)
+        rows.append(_summarise_site(site, _write_observed(folder, site, best, known), loading))
+    ours = [site.ours for site in sites]
     warnings = check_records(context, cache, records.own, ours, best, one, records.searched, correction)
     judged = [(site, band) for site, band in zip(sites, bands, strict=True) if band is not None]
     of_mesh = calibration.uncertainty.residuals.mesh_misfit
@@ -90,12 +70,9 @@ def run_predict(context: Context, folder: Path) -> None:
     content = stored.PredictResult(
         sites=rows,
         recorded_range=stored.RecordedExtents.model_validate(tested),
-        outside_text=describe_outside(outside),
-        flags=warnings.flags,
-        left_out=warnings.left_out,
-        failed=warnings.failed,
+        outside_text=describe_outside({f"site {r.record}": r.outside_records for r in rows if not r.fitted}),
         fit_quality=stored.FitSummary(verdict=summarise_fit(quality), records=quality),
-        **_compute_means(rows),
+        **warnings | _compute_means(rows),
     )
     write_result(folder / "predict.json", content)
 
@@ -145,11 +122,16 @@ def _build_one_material_jobs(records: RecordSet, one: Answer, best: Array) -> li
 
 @dataclass(frozen=True)
 class SitePrediction:
-    """A record at the answer: its own mesh's simulation, the same with derivatives, and with one
-    material (None where that is the answer). Force and derivatives at the times of the record."""
+    """A record at the answer, by the ``job`` of its own mesh.
+
+    ``near`` is the simulation with derivatives where that is another than the ``own`` one. ``ours`` is with
+    derivatives, ``one`` with one material (None where that is the answer), at the times of the record.
+    """
 
     record: SiteRecord
+    job: SimulationJob
     own: Simulation
+    near: Simulation | None
     ours: SiteResponse
     one: SiteResponse | None
 
@@ -170,6 +152,31 @@ class SitePrediction:
         return [*doubts, *(f"{_MISSING[what]}: {reason}" for what, reason in self.missing.items())]
 
 
+def _simulate_records(
+    context: Context, cache: SimulationCache, records: RecordSet, jobs: Sequence[SimulationJob]
+) -> tuple[list[SitePrediction], MeshCorrection | None]:
+    """Every record by the ``jobs`` of the answer, which those with one material follow if that is another.
+
+    Beside them is what brings simulations of the search to the records' own meshes, if these differ.
+    """
+    n, simulations = len(records.own), list[Simulation]()
+    for simulation in cache.run(jobs, context.executor):
+        simulations.append(simulation)
+        context.tell("predict", len(simulations), len(jobs) + n, f"site {simulation.site}")
+    responses = [to_response(simulation) for simulation in simulations]
+    ours, others, correction = responses[:n], responses[n:], None
+    near: Sequence[Simulation | None] = [None] * n
+    if records.is_coarsened:
+        near = simulations[n : 2 * n]
+        coarse, others = others[:n], others[n:]
+        correction = MeshCorrection(coarse, ours)
+        ours, fine = correction(coarse), correction(others) if others else []
+        others = [as_is if r.site.fitted else held for r, as_is, held in zip(records.own, others, fine)]
+    single: Sequence[SiteResponse | None] = others or [None] * n
+    parts = zip(records.own, jobs, simulations, near, ours, single)
+    return [SitePrediction(*of_site) for of_site in parts], correction
+
+
 def store_fields(wanted: tuple[SimulationJob, Path]) -> list[Extent]:
     """Store the fields of a job at its deepest point, if not done yet; the strains near the indenter.
 
@@ -182,11 +189,12 @@ def store_fields(wanted: tuple[SimulationJob, Path]) -> list[Extent]:
 
 
 def _write_fields(
-    context: Context, folder: Path, jobs: Sequence[SimulationJob], before: int
+    context: Context, folder: Path, sites: Sequence[SitePrediction], before: int
 ) -> dict[str, list[Extent]]:
-    """Store the fields of the jobs; return the strains near the indenter of each record."""
-    names, found = [job.model.name for job in jobs], {}
-    wanted = [(job, folder / f"{name}.vtu") for job, name in zip(jobs, names, strict=True)]
+    """Store the fields of what came to its end; return the strains near the indenter of each record."""
+    whole, found = [site for site in sites if site.own.completed], {}
+    names = [site.record.name for site in whole]
+    wanted = [(site.job, folder / f"{name}.vtu") for site, name in zip(whole, names, strict=True)]
     for name, strains in zip(names, context.executor.map(store_fields, wanted, keys=names), strict=True):
         found[name] = strains
         context.tell("predict", before + len(found), before + len(wanted), f"fields of site {name}")
@@ -221,41 +229,35 @@ def _compare_with_records(
     tested = RecordedRange.from_records(loading.values(), map(float, axis.measure_angle(places)))
     found: list[Loading] = []
     for site in sites:
-        if (own := loading.get(site.record.name)) is not None:
-            found.append((own, ()))
-        else:
-            own = describe(site, tested)
-            found.append((own, tested.find_outside(own)))
+        own = loading.get(site.record.name) or describe(site, tested)
+        found.append((own, () if site.record.site.fitted else tested.find_outside(own)))
     return tested, found
 
 
-@dataclass(frozen=True)
-class _Band:
+class _Band(NamedTuple):
     """The 95 % band of a record (n,), and one standard deviation (n,) of what its site may be off by."""
 
     deviation: Array
     low: Array
     high: Array
 
-    @classmethod
-    def compute(cls, study: Study, site: SitePrediction, best: Array, known: PredictionModel) -> _Band:
-        record, ours = site.record, site.ours
-        deviation = estimate_site_deviation(study, record, ours, best)
-        of_site = 0.0 if record.site.fitted else deviation
-        unit = record.record.unit
-        low, high = known.compute_interval_95(ours, best, record.name, unit, of_site, record.times_s)
-        return cls(deviation, np.maximum(low, 0.0), high)
+
+def _compute_band(study: Study, site: SitePrediction, best: Array, known: PredictionModel) -> _Band:
+    record, ours = site.record, site.ours
+    deviation = estimate_site_deviation(study, record, ours, best)
+    of_site, unit = 0.0 if record.site.fitted else deviation, record.record.unit
+    low, high = known.compute_interval_95(ours, best, record.name, unit, of_site, record.times_s)
+    return _Band(deviation, np.maximum(low, 0.0), high)
 
 
 def _write_curves(folder: Path, site: SitePrediction, band: _Band | None) -> None:
     """The record beside its prediction; a column that is not predicted is not there."""
     record, missing = site.record, site.missing
-    name, unit = ("displacement" if record.record.forced else "force"), record.record.unit
-    columns = {"time_s": record.times_s}
-    columns |= (
-        {"force_N": record.force_N} if record.record.forced else {"displacement_mm": record.displacement_mm}
-    )
-    columns[f"{name}_measured_{unit}"] = record.compared
+    name, driven, driving = "force", "displacement_mm", record.displacement_mm
+    if record.record.forced:
+        name, driven, driving = "displacement", "force_N", record.force_N
+    unit = record.record.unit
+    columns = {"time_s": record.times_s, driven: driving, f"{name}_measured_{unit}": record.compared}
     if "force" not in missing:
         columns[f"{name}_simulated_{unit}"] = site.own.force_N
     if site.one is not None and "one_material" not in missing:
@@ -277,20 +279,20 @@ def _assess_fits(
     Forces are smoothed as the record is: else the corner at its peak would be taken for an error of the
     model.
     """
-    sites = [site for site, _ in judged]
-    forces = [site.record.smoothing @ site.ours.force_N for site in sites]
-    allowed, residuals = [], [F - site.record.compared for F, site in zip(forces, sites, strict=True)]
-    for force, (site, band) in zip(forces, judged, strict=True):
+    allowed, residuals = [], []
+    for site, band in judged:
+        force = site.record.smoothing @ site.ours.force_N
+        residuals.append(force - site.record.compared)
         noise = estimate_site_noise(study, site.record, force).covariance
         errors = [band.deviation, known.find_mesh_error(site.record.name, force)]
         covariance = noise + sum(np.outer(error, error) for error in errors)
         if of_mesh is not None:
             covariance += compute_mesh_covariance(of_mesh, site.record.times_s, find_largest_magnitude(force))
         allowed.append(covariance)
-    fitted = [i for i, site in enumerate(sites) if site.record.site.fitted]
+    fitted = {i: site for i, (site, _) in enumerate(judged) if site.record.site.fitted}
     refitted = refit_residuals(
         [residuals[i] for i in fitted],
-        [sites[i].record.smoothing @ sites[i].ours.jacobian * best for i in fitted],
+        [site.record.smoothing @ site.ours.jacobian * best for site in fitted.values()],
         [allowed[i] for i in fitted],
     )
     left = dict(zip(fitted, refitted, strict=True))
@@ -314,24 +316,17 @@ def _assess_fits(
 
 
 def _write_observed(
-    folder: Path,
-    site: SitePrediction,
-    near: Simulation | None,
-    best: Array,
-    known: PredictionModel,
+    folder: Path, site: SitePrediction, best: Array, known: PredictionModel
 ) -> list[stored.ObservedError]:
-    """Everything that was seen beside a record's force with its prediction, as files and rows.
-
-    ``near`` is the simulation with derivatives where that is another than the site's own.
-    """
+    """Everything that was seen beside a record's force with its prediction, as files and rows."""
     rows = []
     for one in site.record.split()[1:]:
         assert one.seen is not None
         ours = whole = one.respond(site.own)
-        if near is not None:
-            searched = one.respond(near)
+        if site.near is not None:
+            searched = one.respond(site.near)
             ours = MeshCorrection([searched], [whole])([searched])[0]
-        seen, what, unit = one.seen, one.seen.quantity, one.seen.ending
+        seen, what, unit = one.seen, one.seen.quantity, one.seen.unit.replace("/", "_")
         columns = seen.columns | {f"{what}_measured_{unit}": one.compared}
         if whole.completed:
             columns[f"{what}_simulated_{unit}"] = whole.force_N

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -63,44 +63,36 @@ class SearchWarning:
     doubt: SimulationWarning
 
 
-@dataclass
-class SearchLog:
-    """What a search leaves behind: its complete evaluations, the penalty of contact by site, and doubts."""
-
-    evaluations: int = 0
-    store: EvaluationStore = field(default_factory=EvaluationStore)
-    penalties: dict[str, float | None] = field(default_factory=dict)
-    warnings: list[SearchWarning] = field(default_factory=list)
-
-
 class RecordSimulator:
     """Simulates records at parameters (p,), on an executor; what a cache holds is not done again.
 
-    ``report`` is given a line for each simulation.
+    ``report`` is given a line for each simulation. A search leaves behind the number of its ``evaluations``,
+    those that were complete (``store``), the penalty of contact by site (``penalties``), and ``warnings``.
     """
 
     def __init__(
         self, records: RecordSet, cache: SimulationCache, executor: Executor, report: Report
     ) -> None:
         self.records, self.cache, self.executor, self.report = records, cache, executor, report
-        self.starts, self.log = WarmStarts(), SearchLog()
+        self.starts, self.store, self.evaluations = WarmStarts(), EvaluationStore(), 0
+        self.penalties: dict[str, float | None] = {}
+        self.warnings: list[SearchWarning] = []
         self._corrections = 0
 
     def search(self, parameters: Array) -> Responses:
-        """Force and derivatives on the meshes of the search; they are remembered in ``log``."""
-        log = self.log
-        log.evaluations += 1
+        """Force and derivatives on the meshes of the search; they are remembered."""
+        self.evaluations += 1
         starts = self.starts.find(parameters)
         jobs = [record.job(parameters, starts=starts) for record in self.records.searched]
-        simulations = self.run(jobs, f"evaluation {log.evaluations}")
+        simulations = self.run(jobs, f"evaluation {self.evaluations}")
         for simulation in self.records.select_forces(simulations):
-            log.penalties[simulation.site] = simulation.facts.get("penalty_per_mm")
-            log.warnings += [
-                SearchWarning(log.evaluations, simulation.site, tuple(parameters.tolist()), doubt)
+            self.penalties[simulation.site] = simulation.facts.get("penalty_per_mm")
+            self.warnings += [
+                SearchWarning(self.evaluations, simulation.site, tuple(parameters.tolist()), doubt)
                 for doubt in simulation.doubts
             ]
         responses = self.respond(simulations)
-        log.store.add(parameters, responses)
+        self.store.add(parameters, responses)
         return responses
 
     def check(self, parameters: Array) -> Responses:

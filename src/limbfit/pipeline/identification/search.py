@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -46,9 +47,7 @@ def search_parameters(
     Where the last of the ``stages`` ends at a bound, it is searched again from inside.
     """
 
-    def search(start: Unknowns, stages: Sequence[Grouping]) -> SearchResult:
-        return _search_once(problem, simulator, start, stages)
-
+    search = partial(_search_once, problem, simulator)
     first = search(start, stages)
     if problem.settings.stopping == "paper":
         return first
@@ -72,7 +71,7 @@ def _search_once(
         facts = {
             "of": title,
             "iterate": len(state.history) - 1,
-            "evaluations": simulator.log.evaluations,
+            "evaluations": simulator.evaluations,
             "cost": last.cost,
             "error_percent": float(np.mean(last.errors_percent)),
             "error_percent_by_site": dict(zip((one.name for one in records.own), errors, strict=True)),

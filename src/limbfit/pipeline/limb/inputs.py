@@ -13,8 +13,7 @@ from ...anatomy.segmentation.body import check_one_limb
 from ...anatomy.segmentation.segmentation import segment
 from ...anatomy.surfaces.thickness import check_fat
 from ...study import Study
-from ..engine.hand_labels import find_hand_labels
-from .files import find_labelled_file, name_file_in_errors
+from ..engine.files import find_hand_labels, find_labelled_file, name_file_in_errors
 from .surfaces import has_mapped_fat, list_labelled_regions
 
 

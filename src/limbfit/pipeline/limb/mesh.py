@@ -18,9 +18,9 @@ from ...mesh import Mesh, write_vtu
 from ...results.limb import MeshingSettings, MeshMeasures, MeshResult, MeshSet
 from ...study import Study
 from ..engine.context import Context
+from ..engine.files import THICKNESS
 from ..engine.storage import write_result
 from ..engine.store import COARSE
-from .files import THICKNESS
 
 
 @dataclass(frozen=True)

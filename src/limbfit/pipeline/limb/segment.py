@@ -18,9 +18,8 @@ from ...results.limb import MarkerImageMotion, SegmentResult
 from ...study import Study
 from ..engine.context import Context
 from ..engine.digests import compute_file_digest
-from ..engine.hand_labels import LABELS
+from ..engine.files import LABELS, MARKED_SKIN, name_file_in_errors
 from ..engine.storage import write_result
-from .files import MARKED_SKIN, name_file_in_errors
 from .inputs import read_marked_image, read_study_image, read_study_labels, segment_automatically
 
 

@@ -13,8 +13,8 @@ from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy, read_surface
 from ...results.limb import MarkerEvidence, PlacedSite, SitesResult
 from ...study import Site, Study
 from ..engine.context import Context
+from ..engine.files import MARKED_SKIN, name_file_in_errors
 from ..engine.storage import write_result
-from .files import MARKED_SKIN, name_file_in_errors
 
 
 def run_sites(context: Context, folder: Path) -> None:

@@ -15,7 +15,7 @@ from ...anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, 
 from ...anatomy.surfaces.thickness import measure_fat_depth, write_thickness
 from ...study import Study
 from ..engine.context import Context
-from .files import THICKNESS, find_labelled_file, name_file_in_errors
+from ..engine.files import THICKNESS, find_labelled_file, name_file_in_errors
 
 
 def run_surfaces(context: Context, folder: Path) -> None:

@@ -18,8 +18,8 @@ from ...mesh import read_vtu
 from ...results.curves import read_curves
 from ...study import Indentation, Record, Site, Study
 from ..engine.context import Context
+from ..engine.files import SMOOTHING
 from ..engine.store import Store
-from ..limb.files import SMOOTHING
 from ..simulation.limb_geometry import build_site_model, coarsen_model
 from .secondary_measurements import (
     SecondaryValues,

@@ -34,8 +34,8 @@ from ...results.curves import read_curves
 from ...results.records import LayerRecord, TraceFacts, WaveRecord
 from ...study import Record, Study, Vector
 from ...traces import SurfaceMotion, Thinning, WaveMeans
+from ..engine.files import LAYERS, WAVES
 from ..engine.storage import write_curves
-from ..limb.files import LAYERS, WAVES
 
 Ints = NDArray[np.int64]
 
@@ -74,11 +74,6 @@ class SecondaryValues:
         if slopes is None:
             return values, np.zeros((len(values), 0))
         return values, np.einsum("nt,ntp->np", self.at, slopes[self.gauge])
-
-    @property
-    def ending(self) -> str:
-        """The unit, in the heads of stored curves."""
-        return self.unit.replace("/", "_")
 
     @property
     def noise_sd(self) -> float:
@@ -347,19 +342,24 @@ def choose_points(
     motion : in the frame that the study states.
     """
     assert record.surface is not None
+    file = study.path(record.surface)
     indenter = read_indenter(study.indenter_of(record), *place, record.site.edge)
     axes, points = np.eye(3), motion.points
     if record.surface_frame == "site":
         axes = indenter.frame
         points = np.array(place[0]) + points @ axes
+
+    def build_error(what: str) -> TraceError:
+        remedy = 'give LPS millimetres of the skin at rest, or surface_frame = "site"'
+        if record.surface_frame == "site":
+            remedy = 'give millimetres from the site, or surface_frame = "limb"'
+        return TraceError(what, file=file, place="x_mm, y_mm, z_mm", remedy=remedy)
+
     away = np.linalg.norm(points - place[0], axis=1)
     if away.min() > NEAR_MM:
-        raise TraceError(
+        raise build_error(
             f"no point lies within {NEAR_MM:g} mm of site {record.site.name}: the nearest is "
-            f"{away.min():.0f} mm away",
-            file=study.path(record.surface),
-            place="x_mm, y_mm, z_mm",
-            remedy=_describe_remedy(record),
+            f"{away.min():.0f} mm away"
         )
     found = find_nearest_points(*skin, points)
     reasons = {
@@ -375,12 +375,7 @@ def choose_points(
         left &= ~bad
     if not left.any():
         told = ", ".join(f"{number} {why}" for why, number in left_out.items())
-        raise TraceError(
-            f"no point can be compared: {told}",
-            file=study.path(record.surface),
-            place="x_mm, y_mm, z_mm",
-            remedy=_describe_remedy(record),
-        )
+        raise build_error(f"no point can be compared: {told}")
     usable = np.flatnonzero(left)
     which = usable[_spread(found.points[usable], int(np.argmin(away[usable])))]
     if len(which) < len(usable):
@@ -388,12 +383,6 @@ def choose_points(
     chosen = tuple(to_vector3(point) for point in found.points[which])
     x, y, z = (to_vector3(axis) for axis in axes)
     return ChosenPoints(chosen, (x, y, z), which, left_out)
-
-
-def _describe_remedy(record: Record) -> str:
-    if record.surface_frame == "site":
-        return 'give millimetres from the site, or surface_frame = "limb"'
-    return 'give LPS millimetres of the skin at rest, or surface_frame = "site"'
 
 
 def _spread(points: Array, first: int) -> Ints:

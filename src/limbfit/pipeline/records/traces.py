@@ -32,8 +32,8 @@ from ...traces import (
     select_frames_in_contact,
 )
 from ..engine.context import Context
+from ..engine.files import LAYERS, SMOOTHING, WAVES, name_file_in_errors
 from ..engine.storage import write_curves, write_result
-from ..limb.files import LAYERS, SMOOTHING, WAVES, name_file_in_errors
 from ..simulation.simulations import CURVE_POINTS
 from .secondary_measurements import write_motion
 
@@ -96,23 +96,13 @@ def run_traces(context: Context, folder: Path) -> None:
     for i, record in enumerate(recorded):
         context.tell("traces", i, len(recorded), f"site {record.name}")
         trace, smooth, told = read_record(context.study, record)
-        write_curves(
-            folder / f"{record.name}-raw.csv",
-            time_s=trace.time_s,
-            displacement_mm=trace.displacement_mm,
-            force_N=trace.force_N,
-        )
         even = smooth.resample(CURVE_POINTS)
-        write_curves(
-            folder / f"{record.name}.csv",
-            time_s=even.time_s,
-            displacement_mm=even.displacement_mm,
-            force_N=even.force_N,
-        )
+        for name, curves in ((f"{record.name}-raw", trace), (record.name, even)):
+            columns = {key: getattr(curves, key) for key in ("time_s", "displacement_mm", "force_N")}
+            write_curves(folder / f"{name}.csv", **columns)
         np.save(folder / SMOOTHING.format(record.name), smooth.curve.compute_response(even.time_s))
         seen = read_observed(context.study, record, trace, told.touch_down_s, smooth)
-        facts[record.name] = told = told.model_copy(update=observed_to_facts(record, seen))
-        store_observed(folder, record, seen)
+        facts[record.name] = told = told.model_copy(update=_store_observed(folder, record, seen))
         still = [f"ultrasound: {name}" for name, one in told.layers.items() if not one.compared]
         if told.surface is not None and not told.surface.compared:
             still.append("surface: the skin")
@@ -165,10 +155,16 @@ def _check_tissues(study: Study, file: Path, unit: str, named: Sequence[str]) ->
             raise TraceError(what, file=file, place="header", remedy=remedy)
 
 
-def observed_to_facts(record: Record, seen: SecondaryMeasurement) -> dict[str, Any]:
-    """What ``traces.json`` says of it."""
+def _store_observed(folder: Path, record: Record, seen: SecondaryMeasurement) -> dict[str, Any]:
+    """Write the curves of a record's tissues, the moves of its surface and the speeds of its shear waves.
+
+    Returns what ``traces.json`` says of them.
+    """
     facts: dict[str, Any] = {}
-    if seen.layers:
+    if layers := seen.layers:
+        columns = {f"{one.tissue}_mm": one.compression_mm for one in layers}
+        file = folder / LAYERS.format(record.name)
+        write_curves(file, time_s=layers[0].time_s, samples=layers[0].samples, **columns)
         facts["layers"] = {
             one.tissue: stored.LayerRecord(
                 thickness_mm=one.thickness_mm,
@@ -177,9 +173,10 @@ def observed_to_facts(record: Record, seen: SecondaryMeasurement) -> dict[str, A
                 sd_mm=one.sd_mm,
                 compared=one.is_detectable,
             )
-            for one in seen.layers
+            for one in layers
         }
     if (motion := seen.motion) is not None:
+        write_motion(folder, record, motion)
         frames, points, _ = motion.moved_mm.shape
         facts["surface"] = stored.SurfaceRecord(
             points=points,
@@ -189,31 +186,20 @@ def observed_to_facts(record: Record, seen: SecondaryMeasurement) -> dict[str, A
             compared=motion.max_motion_mm > SEEN * record.surface_sd_mm,
         )
     if seen.waves:
-        facts["waves"] = [
-            stored.WaveRecord(
-                name=place.name,
-                tissue=place.tissue,
-                depth_mm=place.depth_mm,
-                readings=int(means.samples.sum()),
-                from_m_s=float(means.speed_m_s.min()),
-                to_m_s=float(means.speed_m_s.max()),
-            )
-            for place, means in seen.waves
-        ]
-    return facts
-
-
-def store_observed(folder: Path, record: Record, seen: SecondaryMeasurement) -> None:
-    """Write the curves of a record's tissues, the moves of its surface and the speeds of its shear waves."""
-    if layers := seen.layers:
-        columns = {f"{one.tissue}_mm": one.compression_mm for one in layers}
-        file = folder / LAYERS.format(record.name)
-        write_curves(file, time_s=layers[0].time_s, samples=layers[0].samples, **columns)
-    if seen.motion is not None:
-        write_motion(folder, record, seen.motion)
-    if seen.waves:
         means = [one for _, one in seen.waves]
         number = np.repeat(np.arange(len(means)), [len(one.time_s) for one in means])
         keys = ("time_s", "speed_m_s", "samples")
         columns = {key: np.concatenate([getattr(one, key) for one in means]) for key in keys}
         write_curves(folder / WAVES.format(record.name), place=number.astype(np.float64), **columns)
+        facts["waves"] = [
+            stored.WaveRecord(
+                name=place.name,
+                tissue=place.tissue,
+                depth_mm=place.depth_mm,
+                readings=int(one.samples.sum()),
+                from_m_s=float(one.speed_m_s.min()),
+                to_m_s=float(one.speed_m_s.max()),
+            )
+            for place, one in seen.waves
+        ]
+    return facts

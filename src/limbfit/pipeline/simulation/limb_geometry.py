@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...arrays import Array
-from ...indentation import Direction, SiteModel, build_clamping_pins, read_indenter
+from ...indentation import Direction, SiteModel, build_clamping_pins, read_indenter, to_vector3
 from ...mesh import read_vtu
 from ...results.limb import PlacedSite
 from ...study import Indentation, IndenterTable, Record, Site, Study, Vector
 from ..engine.context import Context
 from ..engine.digests import compute_file_digest
+from ..engine.files import name_file_in_errors
 from ..engine.store import COARSE, Store
-from ..limb.files import name_file_in_errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,14 +43,12 @@ class LimbGeometry:
 
         Raises `ProblemError` where they cannot be placed, with the study's file.
         """
-        skin, (x, y, z) = self.anatomy.skin, map(float, self.anatomy.cut_normal)
-        found = {}
+        skin, along, found = self.anatomy.skin, to_vector3(self.anatomy.cut_normal), {}
+        faces = skin.points, skin.faces
         for site in study.sites:
-            one, faces = (study.records_at(site) or (site,))[0], (skin.points, skin.faces)
-            place = self.place(site)
-            found[site.name] = count_pins_met(
-                study, one.name, study.indenter_of(one), place, faces, (x, y, z)
-            )
+            one, place = (study.records_at(site) or (site,))[0], self.place(site)
+            indenter = study.indenter_of(one)
+            found[site.name] = count_pins_met(study, one.name, indenter, place, faces, along)
         return found
 
 
@@ -164,16 +162,12 @@ def find_fibre_directions(context: Context) -> tuple[tuple[str, Direction], ...]
     def find(stated: str | Vector) -> Direction:
         if isinstance(stated, str):
             return "flow" if stated == "flow" else read_limb_axis(context)
-        return _normalise(stated)
+        return to_vector3(np.array(stated) / np.linalg.norm(stated))
 
     return tuple((tissue, find(stated)) for tissue, stated in context.study.fibres.items())
 
 
 def read_limb_axis(context: Context) -> Vector:
     """The limb's axis, proximally: the unit normal of its proximal cut."""
-    return _normalise(context.results.surfaces.cut_normal)
-
-
-def _normalise(along: Sequence[float]) -> Vector:
-    x, y, z = (float(value) for value in np.array(along) / np.linalg.norm(along))
-    return x, y, z
+    normal = np.array(context.results.surfaces.cut_normal)
+    return to_vector3(normal / np.linalg.norm(normal))

@@ -86,16 +86,9 @@ class LimbAxis:
         slices = ((self._heights - first) / _SLICE_MM).astype(int)
         count = np.bincount(slices)
         known = np.flatnonzero(count)
-        at = self.measure_level(points)
-        middles = np.stack(
-            [
-                np.interp(
-                    at, (known + 0.5) * _SLICE_MM, np.bincount(slices, skin[:, i])[known] / count[known]
-                )
-                for i in range(3)
-            ],
-            axis=1,
-        )
+        at, levels = self.measure_level(points), (known + 0.5) * _SLICE_MM
+        means = [np.bincount(slices, places)[known] / count[known] for places in skin.T]
+        middles = np.stack([np.interp(at, levels, mean) for mean in means], axis=1)
         along, across = compute_square_edges(self.anatomy.cut_normal)
         off = points - middles
         return np.degrees(np.arctan2(off @ across, off @ along))

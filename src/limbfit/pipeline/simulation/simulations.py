@@ -57,19 +57,10 @@ class SimulationCache:
 
     def keep(self, job: SimulationJob, simulation: Simulation) -> None:
         """Store a simulation, as it may have been done elsewhere."""
-        arrays = {
-            name: values
-            for name in ("force_N", "jacobian", "observed", "observed_jacobian")
-            if (values := getattr(simulation, name)) is not None
-        }
-        facts = {
-            "site": simulation.site,
-            "completed": simulation.completed,
-            "reason": simulation.reason,
-            "penetration_mm": simulation.penetration_mm,
-            "facts": simulation.facts,
-            "doubts": [asdict(doubt) for doubt in simulation.doubts],
-        }
+        stated = {name: value for name, value in vars(simulation).items() if value is not None}
+        stated["doubts"] = [asdict(doubt) for doubt in simulation.doubts]
+        arrays = {name: value for name, value in stated.items() if isinstance(value, np.ndarray)}
+        facts = {name: value for name, value in stated.items() if name not in arrays}
         self.kept.put(compute_job_digest(job), (facts, arrays))
 
     def load_all(self) -> list[Simulation]:

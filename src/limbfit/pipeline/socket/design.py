@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from ...execution import Executor
 from ...indentation import build_fibre_field
 from ...laws import Parameters
 from ...mesh import write_vtu
-from ...results.socket import SocketDesignResult
+from ...results.socket import SocketDesignResult, SocketSimulation, SocketState
 from ...socket import Recipe, Socket, rectify_limb
 from ...socket.rays import compute_offsets, compute_profile
 from ...socket.rectify import reduce_to_volume
@@ -122,8 +121,7 @@ def run_socket_design(
         reduced, percent = reduce_to_volume(designed.volume_mm3, limb.outer.skin, limb.frame, plain)
         control = _Design(replace(unloaded, name=CONTROL, face=reduced), {"reduction_percent": percent})
         design = _Design(replace(unloaded, name=DESIGN, face=designed), {"depths_mm": {}})
-        found, told = None, partial(_tell_after, tell, 1)
-        designs = _solve_designs([control, design], context.executor, told)
+        designs, found = _solve_designs([control, design], context.executor, tell, 1), None
         if optimise:
             best, found = _optimise_depths(context, recipe, designs, optimise, simulations, tell)
             designs.append(best)
@@ -132,8 +130,7 @@ def run_socket_design(
     write_surface(folder / "socket.stl", walled)
     thickness = measure_thickness(walled, last.face)
     content = {
-        "target": {"pressure": target.kind, "pressure_kPa": target.pressure_kPa}
-        | {"regions": dict(target.regions)},
+        "target": {"pressure": target.kind, "pressure_kPa": target.pressure_kPa, "regions": target.regions},
         "designs": [_summarise_design(one) for one in designs],
         "optimisation": found,
         "wall": {
@@ -146,13 +143,14 @@ def run_socket_design(
         "parameters": parameters,
         "parameters_from": parameters_from,
         "liner": limb.liner,
-        "balance_percent": max(one.simulation["balance_percent"] for one in designs),
+        "balance_percent": max(one.simulation.balance_percent for one in designs if one.simulation),
         "mesh": facts,
     }
-    write_result(folder / f"{NAME}.json", SocketDesignResult(**content))
+    result = SocketDesignResult.model_validate(content)
+    write_result(folder / f"{NAME}.json", result)
     for one in designs:
         _write_fields(folder, one)
-    _write_tables(folder, content)
+    _write_tables(folder, result)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,22 +159,23 @@ class _Design:
 
     run: SocketRun
     made: Mapping[str, Any]
-    simulation: Mapping[str, Any] = field(default_factory=dict)
+    simulation: SocketSimulation | None = None
     fields: Mapping[str, Array] = field(default_factory=dict)
 
     @property
+    def loaded(self) -> Sequence[SocketState]:
+        """The limb under each load; after donning where there are none."""
+        assert self.simulation is not None
+        return self.simulation.loads or [self.simulation.donning]
+
+    @property
     def peaks(self) -> dict[str, float]:
-        """The largest pressure of each region over all loads, kPa; after donning where there are none."""
+        """The largest pressure of each region over all loads, kPa."""
         peaks: dict[str, float] = {}
-        for held in self.simulation["loads"] or [self.simulation["donning"]]:
-            for row in held["regions"]:
-                peaks[row["region"]] = max(row["peak_kPa"], peaks.get(row["region"], 0.0))
+        for held in self.loaded:
+            for row in held.regions:
+                peaks[row.region] = max(row.peak_kPa, peaks.get(row.region, 0.0))
         return peaks
-
-
-def _tell_after(tell: Tell, before: int, done: float, words: str) -> None:
-    """Progress of one of several parts, of which some were done ``before``."""
-    tell(before + done, words)
 
 
 def _compute_pressed_recipe(unloaded: SocketRun, plain: Recipe, target: Target, tell: Tell) -> Recipe:
@@ -216,17 +215,23 @@ def _build_face(limb: SocketLimb, recipe: Recipe, depths: Mapping[str, float]) -
     return face
 
 
-def _solve_designs(designs: Sequence[_Design], executor: Executor, tell: Tell) -> list[_Design]:
-    """With what happens when each is put on and loaded: several side by side on the study's workers."""
-    for reason in filter(None, run_sockets([one.run for one in designs], executor, tell)):
+def _solve_designs(designs: Sequence[_Design], executor: Executor, tell: Tell, before: int) -> list[_Design]:
+    """With what happens when each is put on and loaded: several side by side on the study's workers.
+
+    Simulations done ``before`` them count as progress.
+    """
+    runs = [one.run for one in designs]
+    reasons = run_sockets(runs, executor, lambda done, words: tell(before + done, words))
+    for reason in filter(None, reasons):
         raise RunError(reason)
-    done = []
+    solved = []
     for one in designs:
         facts, fields = simulate_socket(one.run)
-        peak = max(held["peak_kPa"] for held in facts["loads"] or [facts["donning"]])
-        tell(len(designs), f"{one.run.name}: {peak:.0f} kPa at most")
-        done.append(replace(one, simulation=facts, fields=fields))
-    return done
+        one = replace(one, simulation=SocketSimulation(**facts), fields=fields)
+        peak = max(held.peak_kPa for held in one.loaded)
+        tell(before + len(designs), f"{one.run.name}: {peak:.0f} kPa at most")
+        solved.append(one)
+    return solved
 
 
 def _summarise_design(one: _Design) -> dict[str, Any]:
@@ -284,13 +289,13 @@ def _optimise_depths(
         if proposed is None:
             break
         depths = dict(zip(optimise, map(float, proposed), strict=True))
-        name, told = f"{OPTIMISED}, {number}", partial(_tell_after, tell, 2 + number)
+        name, before = f"{OPTIMISED}, {number}", 2 + number
         try:
             face = _build_face(best.run.limb, recipe, depths)
             tried = _Design(replace(best.run, name=name, face=face), {"depths_mm": depths})
-            (made,) = _solve_designs([tried], context.executor, told)
+            (made,) = _solve_designs([tried], context.executor, tell, before)
         except (SurfaceError, RunError) as error:
-            told(1.0, f"{name}: {error}")
+            tell(before + 1.0, f"{name}: {error}")
             rows.append(_to_row(search.tell(proposed, None), optimise, None, str(error)))
             continue
         trial = search.tell(proposed, vector(made.peaks))
@@ -325,29 +330,21 @@ def _to_row(
     }
 
 
-def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:
+def _write_tables(folder: Path, result: SocketDesignResult) -> None:
     columns = ("mean_kPa", "peak_kPa", "shear_kPa", "shear_peak_kPa")
     rows = [
-        [design["name"], name, region["region"], *(region[key] for key in columns)]
-        for design in content["designs"]
-        for name, held in (
-            ("donning", design["simulation"]["donning"]),
-            *((one["name"], one) for one in design["simulation"]["loads"]),
-        )
-        for region in held["regions"]
+        [design.name, name, region.region, *(getattr(region, key) for key in columns)]
+        for design in result.designs
+        for name, held in design.simulation.states.items()
+        for region in held.regions
     ]
     write_table(folder / "regions.csv", ["design", "load", "region", *columns], rows)
-    found = content["optimisation"]
-    if found is None:
+    if (found := result.optimisation) is None:
         return
-    names = found["regions"]
-    heads = [*(f"{name}_{unit}" for unit in ("depth_mm", "peak_kPa") for name in names), "reason"]
-    lines = [
-        [
-            *(trial["depths_mm"][name] for name in names),
-            *((trial["peaks_kPa"] or {}).get(name) for name in names),
-            trial["reason"],
-        ]
-        for trial in found["trials"]
-    ]
+    heads = [*(f"{name}_{unit}" for unit in ("depth_mm", "peak_kPa") for name in found.regions), "reason"]
+    lines = []
+    for trial in found.trials:
+        depths, peaks = trial.depths_mm, trial.peaks_kPa or {}
+        values = (of_region.get(name) for of_region in (depths, peaks) for name in found.regions)
+        lines.append([*values, trial.reason])
     write_table(folder / "trials.csv", heads, lines)

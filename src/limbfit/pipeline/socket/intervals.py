@@ -81,16 +81,17 @@ class SimulationSpread:
 
         ``known`` is of all of the study's parameters, tissue by tissue.
         """
-        laws = dict.fromkeys(study.tissues, study.law)
         own = [(tissue, parameter.name) for tissue in study.tissues for parameter in study.law.parameters]
         simulated = np.array([name in names for name in own])  # fibres that a tissue has not change nothing
         order = [list(names).index(name) for name in own if name in names]
-        keys = {
-            tissue: {parameter.name: parameter.key for parameter in law.parameters}
-            for tissue, law in laws.items()
-        }
-        liner = {parameter.name: parameter.key for parameter in LAWS[OGDEN].parameters}
-        keyed = [f"{region}.{keys.get(region, liner)[name]}" for region, name in names]
+        tissue_keys, liner_keys = (
+            {parameter.name: parameter.key for parameter in law.parameters}
+            for law in (study.law, LAWS[OGDEN])
+        )
+        keyed = [
+            f"{region}.{(tissue_keys if region in study.tissues else liner_keys)[name]}"
+            for region, name in names
+        ]
         return cls(keyed, order, known.select(simulated))
 
     def told(

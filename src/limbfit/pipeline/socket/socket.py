@@ -17,7 +17,7 @@ from ...donning.model import OUTER
 from ...identify.checks.domain import Extent, RecordedRange, describe_outside
 from ...identify.fit.prediction import RelaxationSpread
 from ...indentation import Parameters
-from ...mesh import Mesh, write_vtu
+from ...mesh import write_vtu
 from ...results.identification import RecordedExtents, RelaxationBeyond
 from ...results.socket import SocketResult
 from ...socket import Socket
@@ -73,8 +73,8 @@ def run_socket(
     samples : draws from it that are simulated too, and more friction; the intervals then count what
         derivatives miss.
     """
-    limb = SocketLimb.of(context, NAME)
-    socket = build_loadable_socket(context.study, limb.anatomy, limb.outer.skin)
+    study, limb = context.study, SocketLimb.of(context, NAME)
+    socket = build_loadable_socket(study, limb.anatomy, limb.outer.skin)
     write_surface(folder / "socket.stl", socket.surface)
     mesh, facts = limb.mesh(context, NAME, folder, socket)
     covariance = None if covariance_log is None else np.array(covariance_log)
@@ -83,34 +83,39 @@ def run_socket(
     found = solve_run(run, partial(context.tell, NAME))
     known = None
     if covariance is not None:
-        at, probable = (context.study.vector(one) for one in (parameters, most_probable or parameters))
+        at, probable = (study.vector(one) for one in (parameters, most_probable or parameters))
         known = ParameterSpread(covariance, np.log(probable / at))
         if relaxation is not None:
             spread = RelaxationSpread.from_stored(RelaxationBeyond.model_validate(relaxation))
-            known = known.relax(spread.own_weight, *spread.interpolate(context.study.socket.worn_s))
-    content = summarise_run(run, found, known) | {
+            known = known.relax(spread.own_weight, *spread.interpolate(study.socket.worn_s))
+    content = summarise_run(run, found, known)
+    compared = _compare_with_records(run, found, recorded_range)
+    for held in (content["donning"], *content["loads"]):
+        held |= compared[held.get("name", "donning")]
+    outside_text, simulated = list[str](), None
+    if covariance is not None:
+        outside = {name_load(name): one["outside_records"] for name, one in compared.items()}
+        outside_text = describe_outside(outside) if recorded_range else [NOT_COMPARED]
+        if samples:
+            steps = [draw_step(covariance, number) for number in range(samples)]
+            simulated = _simulate_samples(context, run, content, steps)
+    own = {
         "parameters": parameters,
         "parameters_from": parameters_from,
         "socket": _describe_shape(limb, socket),
         "mesh": facts,
         # All that was found is of transtibial limbs.
         "published": select_published_findings(run.faces) if find_bone(limb.anatomy, "tibia") else [],
-        "samples": None,
-        "worn_s": None if relaxation is None else context.study.socket.worn_s,
+        "samples": simulated,
+        "worn_s": None if relaxation is None else study.socket.worn_s,
+        "outside_text": outside_text,
     }
-    compared = _compare_with_records(run, found, recorded_range)
-    for held in (content["donning"], *content["loads"]):
-        held |= compared[held.get("name", "donning")]
-    content["outside_text"] = []
-    if covariance is not None:
-        outside = {name_load(name): one["outside_records"] for name, one in compared.items()}
-        content["outside_text"] = describe_outside(outside) if recorded_range else [NOT_COMPARED]
-    if covariance is not None and samples:
-        steps = [draw_step(covariance, number) for number in range(samples)]
-        content["samples"] = _simulate_samples(context, run, content, steps)
-    write_result(folder / "socket.json", SocketResult(**content))
-    _write_fields(folder, mesh, found)
-    _write_tables(folder, content)
+    result = SocketResult(**content | own)
+    write_result(folder / "socket.json", result)
+    for i, one in enumerate(found.held.values()):
+        fields = {"pressure_kPa": one.pressure, "shear_kPa": one.shear, "displacement_mm": one.displacement}
+        write_vtu(mesh, folder / f"held-{i}.vtu", point_data=fields, cell_data=one.strains.fields)
+    _write_tables(folder, result)
     kept.drop(run.begun)
 
 
@@ -133,10 +138,7 @@ def _compare_with_records(
             mesh, mesh.face_sets[OUTER], held, before, histories[name], study.tissues, near_mm, axis,
             tested,
         )  # fmt: skip
-        compared[name] = {
-            "loading": before,
-            "outside_records": tested.find_outside(before),
-        }
+        compared[name] = {"loading": before, "outside_records": tested.find_outside(before)}
     return compared
 
 
@@ -171,9 +173,8 @@ def _simulate_samples(
         for step, facts in zip(steps, ended[: len(steps)], strict=True)
         if facts is not None
     ]
-    if len(found) < 2:  # one says nothing of a spread
-        found = []
-    else:
+    found = found if len(found) > 1 else []  # one says nothing of a spread
+    if found:
         widen_intervals(content, found)
     return {"simulated": len(found), "failed": [reason for reason in reasons if reason]}
 
@@ -192,30 +193,23 @@ def _describe_shape(limb: SocketLimb, socket: Socket) -> dict[str, Any]:
     }
 
 
-def _write_fields(folder: Path, mesh: Mesh, found: DonningResult) -> None:
-    """One VTU for donning and each load: pressure, shear, displacement at the nodes, strains of the cells."""
-    for i, one in enumerate(found.held.values()):
-        fields = {"pressure_kPa": one.pressure, "shear_kPa": one.shear, "displacement_mm": one.displacement}
-        write_vtu(mesh, folder / f"held-{i}.vtu", point_data=fields, cell_data=one.strains.fields)
-
-
-def _write_tables(folder: Path, content: Mapping[str, Any]) -> None:
+def _write_tables(folder: Path, result: SocketResult) -> None:
     """Regions and steps as CSV."""
     columns = ("mean_kPa", "peak_kPa", "shear_kPa", "shear_peak_kPa")
     rows = [
         [
             name,
-            region["region"],
-            *(region[key] for key in columns),
-            *(region["interval_kPa"] or ("", "")),
-            next(iter(region["interval_from"] or {}), ""),
+            region.region,
+            *(getattr(region, key) for key in columns),
+            *(region.interval_kPa or ("", "")),
+            next(iter(region.interval_from or {}), ""),
         ]
-        for name, held in (("donning", content["donning"]), *((one["name"], one) for one in content["loads"]))
-        for region in held["regions"]
+        for name, held in result.states.items()
+        for region in held.regions
     ]
     heads = ["load", "region", *columns, "low_kPa", "high_kPa", "mostly_from"]
     write_table(folder / "regions.csv", heads, rows)
     keys = ("time_s", "peak_kPa", "mean_kPa", "contact_area_mm2", "imbalance_percent")
     heads = [*keys, *(f"force_{axis}_N" for axis in "xyz"), "settling_mm"]
-    lines = [[*(row[key] for key in keys), *row["force_N"], row["move_mm"][2]] for row in content["steps"]]
+    lines = [[*(getattr(row, key) for key in keys), *row.force_N, row.move_mm[2]] for row in result.steps]
     write_table(folder / "steps.csv", heads, lines)

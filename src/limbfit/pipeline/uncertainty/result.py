@@ -13,11 +13,9 @@ from scipy.special import stdtrit
 from ...arrays import Array
 from ...errors import InputError
 from ...identify.fit.objective import SiteResponse
-from ...identify.fit.parameters import Unknowns
 from ...identify.fit.prediction import MIN_FREEDOM, combine_freedom
 from ...identify.uncertainty.emulator import Emulator
 from ...identify.uncertainty.exploration import Exploration
-from ...identify.uncertainty.noise import SiteNoise
 from ...identify.uncertainty.uncertainty import (
     DETERMINED,
     GIVEN,
@@ -33,7 +31,9 @@ from ...identify.uncertainty.uncertainty import (
 from ...results import uncertainty as stored
 from ...results.base import ResultPart
 from ...results.identification import CorrelationMatrix
+from ...study import Study
 from ..engine.storage import write_atomically, write_curves, write_result, write_rows, write_table
+from ..records.deviations import estimate_site_deviation, estimate_site_noise
 from ..records.records import SiteRecord
 from .sources import Change
 
@@ -85,7 +85,6 @@ class Found:
     evidence: stored.EvidenceComparison | None
     gain: FitSensitivity
     changes: tuple[Change, ...]
-    unknowns: Unknowns
 
     @property
     def source_covariance(self) -> Array:
@@ -95,25 +94,16 @@ class Found:
         return np.sum([np.zeros_like(self.known.covariance), *parts], axis=0)
 
 
-@dataclass(frozen=True)
-class Predicted:
-    """A recorded site as predicted at the identified parameters, beside its record and the record's noise
-    (None where the prediction failed).
+def write_results(
+    folder: Path, study: Study, found: Found, predicted: Sequence[tuple[SiteRecord, SiteResponse]]
+) -> None:
+    """``uncertainty.json``, and CSV: parameters, draws, profiles, sources, predictions.
 
-    ``site_N`` (n,) is one standard deviation of the stiffness that is expected of a site that was not fitted.
+    ``predicted`` is every record with what is predicted of it at the identified parameters.
     """
-
-    record: SiteRecord
-    response: SiteResponse
-    noise: SiteNoise | None
-    site_N: Array
-
-
-def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) -> None:
-    """``uncertainty.json``, and CSV: parameters, draws, profiles, sources, predictions."""
     (folder / "predictions").mkdir(exist_ok=True)
     parameters, combinations = _summarise_parameters(found), _summarise_combinations(found)
-    rows = [_write_prediction(folder, found, one) for one in predicted]
+    rows = [_write_prediction(folder, study, found, *one) for one in predicted]
     explored, posterior = found.explored, found.explored.posterior
     emulator = explored.likelihood.emulator
     inside = [(row.fitted, row.inside_percent) for row in rows if row.inside_percent is not None]
@@ -150,34 +140,32 @@ def write_results(folder: Path, found: Found, predicted: Sequence[Predicted]) ->
         verdict=_describe_verdict(found, parameters, combinations, predictions),
     )
     write_result(folder / "uncertainty.json", content)
-    _write_table(folder / "parameters.csv", [_flatten_row(row) for row in parameters])
-    _write_table(folder / "sources.csv", [_flatten_row(row) for row in content.sources])
+    _write_flat(folder / "parameters.csv", parameters)
+    _write_flat(folder / "sources.csv", content.sources)
     write_rows(folder / "predictions.csv", rows)
     write_runs(folder / EMULATOR, found.known.names, explored.likelihood.emulator.points, explored.runs)
     draws = posterior.samples[:: max(len(posterior.samples) // _DRAWS, 1)]
     write_curves(folder / "draws.csv", **dict(zip(found.known.names, draws.T)))
-    _write_table(
-        folder / "profiles.csv",
-        [
-            {"parameter": one.name, "value": value, "rise": rise, "extrapolated": bool(beyond)}
-            for one in explored.profiles
-            for value, rise, beyond in zip(one.values, one.rise, one.extrapolated, strict=True)
-        ],
-    )
+    heads = ("parameter", "value", "rise", "extrapolated")
+    lines = [
+        (one.name, value, rise, bool(beyond))
+        for one in explored.profiles
+        for value, rise, beyond in zip(one.values, one.rise, one.extrapolated, strict=True)
+    ]
+    write_table(folder / "profiles.csv", heads, lines)
 
 
 def _summarise_parameters(found: Found) -> list[stored.ParameterUncertainty]:
     """One row for every parameter: calibrated, its interval by every method, the verdict on all sources."""
-    known, explored = found.known, found.explored
-    posterior = explored.posterior
-    profiles = {one.name: one for one in explored.profiles}
+    known, posterior, unknowns = found.known, found.explored.posterior, found.explored.likelihood.unknowns
+    profiles = {one.name: one for one in found.explored.profiles}
     more = np.sqrt(np.diag(posterior.covariance) + np.diag(found.source_covariance))
     ours = np.sqrt(np.diag(posterior.covariance))
     rows = []
     for i, name in enumerate(known.names):
         median, (low, high) = posterior.median[i], posterior.intervals_95[i]
         wider = more[i] / max(ours[i], 1e-300)
-        bounds = found.unknowns.lower[i], found.unknowns.upper[i]
+        bounds = unknowns.lower[i], unknowns.upper[i]
         with_sources = (
             float(max(median * (low / median) ** wider, bounds[0])),
             float(min(median * (high / median) ** wider, bounds[1])),
@@ -207,9 +195,10 @@ def _summarise_combinations(found: Found) -> list[stored.ParameterCombination]:
     """The principal axes of the posterior, as its draws, the linearisation and the sources see them."""
     known, explored = found.known, found.explored
     logs = np.log(explored.posterior.samples)
-    prior_sd = np.log(found.unknowns.upper / found.unknowns.lower) / np.sqrt(12.0)
+    unknowns, space = explored.likelihood.unknowns, explored.likelihood.space
+    prior_sd = np.log(unknowns.upper / unknowns.lower) / np.sqrt(12.0)
     rows = []
-    for weights in compute_principal_axes(explored.posterior.covariance, explored.likelihood.space):
+    for weights in compute_principal_axes(explored.posterior.covariance, space):
         drawn = logs @ weights
         low, high = np.quantile(drawn, [0.025, 0.975])
         sd = float(drawn.std(ddof=1))
@@ -254,33 +243,37 @@ def _summarise_source(found: Found, change: Change) -> stored.SourceEffect:
     )
 
 
-def _write_prediction(folder: Path, found: Found, one: Predicted) -> stored.IntervalParts:
-    """A site's interval as CSV, and its row: how wide, why, and how much of the record lies inside.
+def _write_prediction(
+    folder: Path, study: Study, found: Found, record: SiteRecord, response: SiteResponse
+) -> stored.IntervalParts:
+    """A record's interval as CSV, and its row: how wide, why, and how much of the record lies inside.
 
-    Of a site whose prediction failed there is the reason only.
+    Where the prediction failed there is the reason only.
     """
-    model, record = found.known.residual_model, one.record
+    model, parameters, force = found.known.residual_model, found.known.parameters, response.force_N
     facts: dict[str, Any] = {
         "site": record.site.name,
         "record": record.name,
         "fitted": record.site.fitted,
-        "reason": one.response.reason,
+        "reason": response.reason,
     }
-    if one.noise is None:
+    if not response.completed:
         missing = ("inside_percent", "half_width_percent", *_SHARES.values())
         return stored.IntervalParts(**facts | dict.fromkeys(missing))
-    parameters = found.known.parameters
-    force, measured = one.response.force_N, record.compared
+    site_N = np.zeros(len(force))
+    if not record.site.fitted:
+        site_N = estimate_site_deviation(study, record, response, parameters)
+    measured, noise = record.compared, estimate_site_noise(study, record, force)
     what, unit = ("displacement" if record.record.forced else "force"), record.record.unit
     peak = float(force.max())
     names = [noise.name for noise in model.noise]
     share = model.misfit[names.index(record.name)] if record.name in names else model.misfit_elsewhere
-    scaled = one.response.jacobian * parameters
+    scaled = response.jacobian * parameters
     variances = {
         "parameters": np.einsum("ni,ij,nj->n", scaled, found.explored.posterior.covariance, scaled),
         "sources": np.einsum("ni,ij,nj->n", scaled, found.source_covariance, scaled),
-        "site": (model.site_factor * one.site_N) ** 2,
-        "noise": np.diag(one.noise.covariance),
+        "site": (model.site_factor * site_N) ** 2,
+        "noise": np.diag(noise.covariance),
         "misfit": np.full(len(force), (share * peak) ** 2),
     }
     total = np.sum(list(variances.values()), axis=0)
@@ -380,6 +373,12 @@ def _describe_profiles(explored: Exploration) -> list[str]:
     return words
 
 
+def _write_flat(file: Path, rows: Sequence[ResultPart]) -> None:
+    """Rows with the same keys as CSV, their lists and dictionaries as columns."""
+    flat = [_flatten_row(row) for row in rows]
+    write_table(file, list(flat[0]) if flat else [], [list(row.values()) for row in flat])
+
+
 def _flatten_row(row: ResultPart) -> dict[str, Any]:
     """Lists and dictionaries of a row as columns."""
     flat: dict[str, Any] = {}
@@ -393,8 +392,3 @@ def _flatten_row(row: ResultPart) -> dict[str, Any]:
         else:
             flat[key] = value
     return flat
-
-
-def _write_table(file: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Rows with the same columns as CSV."""
-    write_table(file, list(rows[0]) if rows else [], [list(row.values()) for row in rows])

@@ -7,7 +7,7 @@ the fit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import cycle
@@ -27,18 +27,17 @@ from ..engine.context import Context
 from ..identification.fine_meshes import estimate_own_mesh_error
 from ..limb.mesh import build_coarse_settings, mesh_settings, plan_meshes, scale_edges
 from ..limb.remesh import mesh_models
-from ..records.records import RecordSet, SiteRecord
+from ..records.records import RecordSet
 from ..simulation.extrapolation import MESH_ORDERS, estimate_coarse_error
 from ..simulation.simulations import SimulationCache
 
 FINER = 0.75  # edges of the finer mesh, where the study has no coarse one to compare with
 MORE_STEPS = 2
-Vary = Callable[..., "SourceVariant"]
 
 
 @dataclass(frozen=True)
 class SourceVariant:
-    """A changed model of every fitted site: ``jobs``, beside the jobs of what they are compared with.
+    """A changed model of every fitted site, as ``jobs``.
 
     ``shared``: the change is the same at all sites, or each site has its own. ``counted``: it is a spread
     that enters the covariance, or an alternative that is only told. ``scale``: of the difference of forces.
@@ -47,7 +46,6 @@ class SourceVariant:
     source: str
     change: str
     jobs: tuple[SimulationJob, ...]
-    compared_with: tuple[SimulationJob, ...]
     shared: bool
     counted: bool
     scale: float = 1.0
@@ -67,72 +65,84 @@ class Change:
     failed: tuple[str, ...]
 
 
-def build_variants(
-    context: Context, folder: Path, records: RecordSet, parameters: Array
+def simulate_sources(
+    context: Context, folder: Path, cache: SimulationCache, records: RecordSet, parameters: Array
+) -> list[Change]:
+    """Simulate all variants of the study, on the meshes of the search, and the records as they are."""
+    plain = [record.job(parameters, sensitivities=False) for record in records.searched]
+    variants = _build_variants(context, folder, records, plain)
+    jobs = plain + [job for variant in variants for job in variant.jobs]
+    forces: list[Array | None] = []
+    for record, simulation in zip(cycle(records.own), cache.run(jobs, context.executor)):
+        answer = simulation.force_N if record.seen is None else record.respond(simulation).force_N
+        forces.append(answer if simulation.completed else None)
+        context.tell("uncertainty", len(forces), len(jobs), f"sources, site {simulation.site}")
+    before, *rows = (forces[i : i + len(plain)] for i in range(0, len(jobs), len(plain)))
+    found = []
+    for variant, after in zip(variants, rows, strict=True):
+        differences, failed = [], []
+        for record, job, old, new in zip(records.own, variant.jobs, before, after, strict=True):
+            if old is None or new is None:
+                failed.append(job.model.name)
+                differences.append(np.zeros(len(record.compared)))
+            else:
+                differences.append(variant.scale * (new - old))
+        found.append(Change(variant, tuple(differences), tuple(failed)))
+    return found
+
+
+def _build_variants(
+    context: Context, folder: Path, records: RecordSet, plain: Sequence[SimulationJob]
 ) -> list[SourceVariant]:
-    """All variants of the study, on the meshes of the search, their meshes made."""
-    table = context.study.uncertainty
-    plain = tuple(record.job(parameters, sensitivities=False) for record in records.searched)
-
-    def vary(
-        source: str, change: str, models: Sequence[SiteModel], shared: bool, counted: bool
-    ) -> SourceVariant:
-        jobs = tuple(replace(job, model=model) for job, model in zip(plain, models, strict=True))
-        return SourceVariant(source, change, jobs, plain, shared, counted)
-
+    """All variants of the study, their meshes made."""
+    study, table, found = context.study, context.study.uncertainty, list[SourceVariant]()
     models = [record.model for record in records.searched]
-    found = [
-        vary(
-            "layer thickness",
-            f"{table.layer_mm:g} mm thicker",
-            _thicken_layer(context, folder, models),
-            True,
-            True,
-        )
-    ]
-    for number, word in enumerate(("along the limb", "around the limb")):
+
+    def add(
+        source: str, change: str, changed: Sequence[SiteModel], shared: bool, counted: bool, scale: float = 1
+    ) -> None:
+        jobs = tuple(replace(job, model=model) for job, model in zip(plain, changed, strict=True))
+        found.append(SourceVariant(source, change, jobs, shared, counted, scale))
+
+    thicker = _thicken_layer(context, folder, models)
+    add("layer thickness", f"{table.layer_mm:g} mm thicker", thicker, True, True)
+    directions = tuple(enumerate(("along the limb", "around the limb")))
+    for number, word in directions:
         moved = [_move_site(context, model, number, table.position_mm) for model in models]
-        found.append(vary("site position", f"{table.position_mm:g} mm {word}", moved, False, True))
-    for number, word in enumerate(("along the limb", "around the limb")):
-        angle = np.radians(table.axis_degrees)
-        axes = [
-            np.cos(angle) * np.array(m.axis) + np.sin(angle) * _build_tangents(np.array(m.axis))[number]
-            for m in models
+        add("site position", f"{table.position_mm:g} mm {word}", moved, False, True)
+    for number, word in directions:
+        tilted = [_rotate_axis(model, number, table.axis_degrees) for model in models]
+        add("site axis", f"{table.axis_degrees:g} degrees {word}", tilted, False, True)
+    radius, doubted = table.edge_radius_mm, [SHAPES[m.indenter.shape].is_edge_doubted for m in models]
+    if radius > 0 and any(doubted):
+        rounded = [
+            _change_indenter(m, edge_radius_mm=m.indenter.edge_radius_mm + radius) if is_doubted else m
+            for m, is_doubted in zip(models, doubted, strict=True)
         ]
-        tilted = [replace(m, axis=to_vector3(axis)) for m, axis in zip(models, axes, strict=True)]
-        found.append(vary("site axis", f"{table.axis_degrees:g} degrees {word}", tilted, False, True))
-    found += _build_contact_variants(context.study, models, vary)
+        add("indenter edge", f"radius {radius:g} mm larger", rounded, True, True)
+    # Friction and bulk modulus are alternatives, no spreads. All but frictionless ones slip freely then.
+    others = [
+        _change_indenter(m, friction="sticky" if m.indenter.friction == "frictionless" else "frictionless")
+        for m in models
+    ]
+    word = " or ".join(dict.fromkeys(str(m.indenter.friction) for m in others))
+    add("friction", word, others, True, False)
+    add("bulk modulus", "half", [replace(m, kappa_ratio=m.kappa_ratio / 2) for m in models], True, False)
     finer = []
     for m in models:
         counts = {key: MORE_STEPS * getattr(m.steps, key) for key in ("load_steps", "unload_steps")}
         finer.append(replace(m, steps=m.steps.model_copy(update=counts)))
     change = f"{MORE_STEPS} times as many, extrapolated at order {ORDER_IN_TIME:g}"
-    in_time = vary("time steps", change, finer, True, True)
-    found.append(replace(in_time, scale=estimate_coarse_error(ORDER_IN_TIME, MORE_STEPS)))
-    found.append(_build_mesh_variant(context, folder, records, plain))
-    return found
-
-
-def _build_contact_variants(study: Study, models: Sequence[SiteModel], vary: Vary) -> list[SourceVariant]:
-    """Edge radius, friction and bulk modulus; the last two are alternatives, no spreads."""
-    radius = study.uncertainty.edge_radius_mm
-    found = []
-    if radius > 0 and any(SHAPES[m.indenter.shape].is_edge_doubted for m in models):
-        rounded = [
-            _change_indenter(m, edge_radius_mm=m.indenter.edge_radius_mm + radius)
-            if SHAPES[m.indenter.shape].is_edge_doubted
-            else m
-            for m in models
-        ]
-        found.append(vary("indenter edge", f"radius {radius:g} mm larger", rounded, True, True))
-    swapped = {"frictionless": "sticky"}  # all others slip freely
-    others = [
-        _change_indenter(m, friction=swapped.get(str(m.indenter.friction), "frictionless")) for m in models
-    ]
-    word = " or ".join(dict.fromkeys(str(m.indenter.friction) for m in others))
-    found.append(vary("friction", word, others, True, False))
-    softer = [replace(m, kappa_ratio=m.kappa_ratio / 2) for m in models]
-    found.append(vary("bulk modulus", "half", softer, True, False))
+    add("time steps", change, finer, True, True, estimate_coarse_error(ORDER_IN_TIME, MORE_STEPS))
+    # How far forces are from those of an infinitely fine mesh, from two. With coarse meshes the residuals'
+    # covariance has it already.
+    if study.mesh.coarse is not None:
+        remeshed = [replace(record.model, within_mm=study.within_mm) for record in records.own]
+    else:
+        edges = scale_edges(choose_searched_settings(study), FINER)
+        remeshed = _mesh(context, folder / "finer", models, edges)
+    change, scale = mesh_share(study)
+    add("mesh", change, remeshed, False, study.mesh.coarse is None, scale)
     return found
 
 
@@ -146,6 +156,12 @@ def _build_tangents(axis: Array) -> tuple[Array, Array]:
     along = up - (up @ axis) * axis
     along /= np.linalg.norm(along)
     return along, np.cross(axis, along)
+
+
+def _rotate_axis(model: SiteModel, number: int, degrees: float) -> SiteModel:
+    axis, angle = np.array(model.axis), np.radians(degrees)
+    tilted = np.cos(angle) * axis + np.sin(angle) * _build_tangents(axis)[number]
+    return replace(model, axis=to_vector3(tilted))
 
 
 def _move_site(context: Context, model: SiteModel, number: int, distance_mm: float) -> SiteModel:
@@ -190,27 +206,6 @@ def _mesh(
     return mesh_models(jobs, models, context.executor, partial(context.tell, "uncertainty", 0, 0))
 
 
-def _build_mesh_variant(
-    context: Context,
-    folder: Path,
-    records: RecordSet,
-    plain: tuple[SimulationJob, ...],
-) -> SourceVariant:
-    """How far forces are from those of an infinitely fine mesh, from two."""
-    study = context.study
-    settings = choose_searched_settings(study)
-    if study.mesh.coarse is not None:
-        models = [replace(record.model, within_mm=study.within_mm) for record in records.own]
-    else:
-        finer = scale_edges(settings, FINER)
-        models = _mesh(context, folder / "finer", [record.model for record in records.searched], finer)
-    jobs = [replace(job, model=model) for job, model in zip(plain, models, strict=True)]
-    change, scale = mesh_share(study)
-    # With coarse meshes the residuals' covariance has it already.
-    counted = study.mesh.coarse is None
-    return SourceVariant("mesh", change, tuple(jobs), plain, False, counted, scale)
-
-
 def mesh_share(study: Study) -> tuple[str, float]:
     """In words and as a factor: what the mesh of the answer lacks, over the difference of two meshes."""
     order = MESH_ORDERS[study.mesh.element]
@@ -221,29 +216,3 @@ def mesh_share(study: Study) -> tuple[str, float]:
         )
     what = f"error of the mesh, from edges {FINER:g} times as long: {how}"
     return what, estimate_coarse_error(order, 1 / FINER)
-
-
-def simulate_changes(
-    context: Context, cache: SimulationCache, wanted: Sequence[SourceVariant], records: Sequence[SiteRecord]
-) -> list[Change]:
-    """Simulate the variants of the ``records``."""
-    jobs = [job for variant in wanted for job in (*variant.jobs, *variant.compared_with)]
-    forces: list[Array | None] = []
-    for record, simulation in zip(cycle(records), cache.run(jobs, context.executor)):
-        answer = simulation.force_N if record.seen is None else record.respond(simulation).force_N
-        forces.append(answer if simulation.completed else None)
-        context.tell("uncertainty", len(forces), len(jobs), f"sources, site {simulation.site}")
-    found, at = [], 0
-    for variant in wanted:
-        n = len(variant.jobs)
-        pairs = list(zip(forces[at : at + n], forces[at + n : at + 2 * n]))
-        at += 2 * n
-        failed = [
-            job.model.name for job, (new, old) in zip(variant.jobs, pairs) if new is None or old is None
-        ]
-        difference = [
-            np.zeros(len(record.compared)) if new is None or old is None else variant.scale * (new - old)
-            for record, (new, old) in zip(records, pairs)
-        ]
-        found.append(Change(variant, tuple(difference), tuple(failed)))
-    return found

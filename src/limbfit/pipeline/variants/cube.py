@@ -195,7 +195,11 @@ def compress_cube(
         stress_kPa=stresses,
     )
     if output is not None:
-        _write(output, content)
+        output.mkdir(parents=True, exist_ok=True)
+        write_result(output / "cube.json", content)
+        curves = {format_column(name, "kPa"): np.array([0.0, *stress]) for name, stress in stresses.items()}
+        write_curves(output / "cube.csv", time_s=np.array([0.0, *times]), **curves)
+        (output / "cube.svg").write_text(report.draw_cube(content), encoding="utf-8")
     return content.to_plain()
 
 
@@ -256,14 +260,8 @@ def _list_tissues(
     for known in PUBLISHED:
         yield (
             known.material(relaxation[known.kind]),
-            {
-                "tissue": known.name,
-                "kind": known.kind,
-                "law": "sum of Ogden terms",
-                "values": known.values,
-                "conversion": known.conversion,
-                "source": known.source,
-            },
+            {"tissue": known.name, "law": "sum of Ogden terms"}
+            | {key: getattr(known, key) for key in ("kind", "values", "conversion", "source")},
         )
 
 
@@ -301,11 +299,3 @@ def compress(material: Material, times: Array, compression_percent: float) -> tu
         raise RunError(f"the cube could not be solved beyond {missing[0]:.3g} s; compress it less far")
     stress, volume = np.array([found[t] for t in times]).T
     return stress / KPA, float(volume.min()), float(volume.max())
-
-
-def _write(folder: Path, content: CubeResult) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    write_result(folder / "cube.json", content)
-    columns = {format_column(name, "kPa"): np.array([0.0, *v]) for name, v in content.stress_kPa.items()}
-    write_curves(folder / "cube.csv", time_s=np.array([0.0, *content.time_s]), **columns)
-    (folder / "cube.svg").write_text(report.draw_cube(content), encoding="utf-8")

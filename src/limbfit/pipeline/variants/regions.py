@@ -9,7 +9,7 @@ from typing import Any
 
 from ...arrays import Array
 from ...errors import InputError, StudyError
-from ...identify.checks.crossvalidation import RegionFit, RegionRecords, average_errors, fit_regions
+from ...identify.checks.crossvalidation import RegionRecords, average_errors, fit_regions
 from ...identify.fit.calibration import Calibration
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
@@ -25,7 +25,7 @@ from ..identification.record_simulator import RecordSimulator
 from ..identification.search import search_parameters
 from ..records.records import load_records, load_site_record, to_response
 from ..simulation.limb_geometry import LimbGeometry
-from ..simulation.simulations import open_experiment_cache
+from ..simulation.simulations import SimulationCache, open_experiment_cache
 
 CHOICES = ("all", "fitted")
 
@@ -45,21 +45,10 @@ def run_regions(context: Context, folder: Path, *, sites: str = "all") -> None:
         used = mine if sites == "all" else [site for site in mine if site.fitted]
         if used:
             members[name] = (used, mine)
-    stages = context.results.calibration.stages
-    whole = study.vector(stages[-1].parameters)
-    cache = open_experiment_cache(context, folder)
-    report, problem = partial(context.tell, "regions", 0, 0), build_problem(study)
-    simulators = {}
-    for name, (fitted, _) in members.items():
-        records = load_records(context, study.records_at(*fitted), secondary=True)
-        simulators[name] = RecordSimulator(records, cache, context.executor, report)
-    regions = {
-        name: _build_region(context, problem, simulators[name], mine) for name, (_, mine) in members.items()
-    }
-    found = fit_regions(regions, problem.unknowns, whole)
+    stages, problem = context.results.calibration.stages, build_problem(study)
+    whole, cache = study.vector(stages[-1].parameters), open_experiment_cache(context, folder)
     rows = [
-        _summarise_region(context, problem, simulators[name], name, members[name], fit, folder)
-        for name, fit in found.items()
+        _fit_region(context, folder, problem, cache, whole, name, *chosen) for name, chosen in members.items()
     ]
     without = [site.name for site in recorded if not site.region]
     unfitted = dict.fromkeys(site.region for site in recorded if site.region and site.region not in members)
@@ -95,37 +84,38 @@ def check_regions(study: Study, limb: LimbGeometry | None, options: Mapping[str,
         )
 
 
-def _build_region(
-    context: Context, problem: CalibrationProblem, simulator: RecordSimulator, mine: Sequence[Site]
-) -> RegionRecords:
-    records = [load_site_record(context, record) for record in context.study.records_at(*mine)]
+def _fit_region(
+    context: Context,
+    folder: Path,
+    problem: CalibrationProblem,
+    cache: SimulationCache,
+    whole: Array,
+    name: str,
+    fitted: Sequence[Site],
+    mine: Sequence[Site],
+) -> RegionFitted:
+    """Fit a region on some of its sites, and judge it and the ``whole`` limb's parameters (p,) at all.
+
+    What is compared is simulated on the study's own meshes; with derivatives where the study's prediction
+    has made them so.
+    """
+    study, report = context.study, partial(context.tell, "regions", 0, 0)
+    records = load_records(context, study.records_at(*fitted), secondary=True)
+    simulator = RecordSimulator(records, cache, context.executor, report)
+    judged = [load_site_record(context, record) for record in study.records_at(*mine)]
 
     def identify(start: Unknowns) -> Calibration:
         return search_parameters(problem, simulator, start, problem.stages[-1:])[0]
 
     def simulate(parameters: Array) -> list[SiteResponse]:
-        """On the study's own meshes; with derivatives where the study's prediction has made them so."""
-        apart = context.study.is_searched_apart
-        jobs = [record.own_job(parameters) if apart else record.job(parameters) for record in records]
-        return [to_response(one) for one in simulator.cache.run(jobs, context.executor)]
+        apart = study.is_searched_apart
+        jobs = [record.own_job(parameters) if apart else record.job(parameters) for record in judged]
+        return [to_response(one) for one in cache.run(jobs, context.executor)]
 
-    return RegionRecords(identify, simulate, tuple(record.measured for record in records))
-
-
-def _summarise_region(
-    context: Context,
-    problem: CalibrationProblem,
-    simulator: RecordSimulator,
-    name: str,
-    chosen: tuple[list[Site], list[Site]],
-    fit: RegionFit,
-    folder: Path,
-) -> RegionFitted:
-    """What ``regions.json`` holds of a region."""
-    study, found = context.study, fit.calibration
-    fitted, mine = chosen
-    responses = list(found.responses)
-    coarser = plan_coarser_meshes(context, simulator.records, folder / "coarser")
+    region = RegionRecords(identify, simulate, tuple(record.measured for record in judged))
+    fit = fit_regions({name: region}, problem.unknowns, whole)[name]
+    found, responses = fit.calibration, list(fit.calibration.responses)
+    coarser = plan_coarser_meshes(context, records, folder / "coarser")
     correction, spent = correct_answer(problem, simulator, found.parameters, responses, coarser)
     _, known = sample_intervals(problem, simulator, found, correction, spent, moves=False)
     return RegionFitted(

@@ -329,16 +329,14 @@ def _find_limit(
     }
     own = next(v for v in variants if v.chosen is one and v.base)
     edge = float(own.facts["edge_near_mm"])
-    nothing = dict.fromkeys(("limit_N", "order", "order_measured", "error_percent"))
-    if len(done) < 2 or edge not in done:
-        return nothing
-    found = extrapolate_richardson(list(done), list(done.values()), MESH_ORDERS[own.facts["element"]])
-    finest = done[min(done)]
-    if abs(found.limit - finest) > FARTHEST * finest:
-        return nothing
-    return {
-        "limit_N": found.limit,
-        "order": found.order,
-        "order_measured": found.measured,
-        "error_percent": found.error_percent(done[edge]),
-    }
+    if len(done) >= 2 and edge in done:
+        found = extrapolate_richardson(list(done), list(done.values()), MESH_ORDERS[own.facts["element"]])
+        finest = done[min(done)]
+        if abs(found.limit - finest) <= FARTHEST * finest:
+            return {
+                "limit_N": found.limit,
+                "order": found.order,
+                "order_measured": found.measured,
+                "error_percent": found.error_percent(done[edge]),
+            }
+    return dict.fromkeys(("limit_N", "order", "order_measured", "error_percent"))

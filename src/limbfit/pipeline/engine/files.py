@@ -1,18 +1,27 @@
-"""Label maps that someone corrected by hand and saved over what the segment stage wrote.
+"""Files that one stage writes and another reads, labels corrected by hand, and files that errors name.
 
-Such a file is moved to ``results/by-hand/labels.seg.nrrd`` before anything runs. From there on it is an input
-of the study like any other, until it is deleted; the stage never writes there.
+A label map that someone corrected by hand and saved over what the segment stage wrote is moved to
+``results/by-hand/labels.seg.nrrd`` before anything runs. From there on it is an input of the study like any
+other, until it is deleted; the stage never writes there.
 """
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from ...errors import InputError
 from ...study import Study
 from .digests import compute_file_digest
 from .storage import read_json, write_atomically
 
+THICKNESS = "fat-depth.vtp"
+MARKED_SKIN = "skin-markers.stl"
+SMOOTHING = "{}-smoothing.npy"  # of a record, as a matrix
+WAVES = "{}-waves.csv"  # of a record: how fast shear waves were
+LAYERS = "{}-layers.csv"  # of a record: how its tissues gave way
 LABELS = "labels.seg.nrrd"
 _BY_HAND = Path("results") / "by-hand" / LABELS
 
@@ -47,3 +56,22 @@ def _is_edited(study: Study) -> bool:
         return False
     kept = study.path(_BY_HAND)
     return not (kept.is_file() and compute_file_digest(kept) == compute_file_digest(labels))
+
+
+def find_labelled_file(study: Study) -> Path:
+    """What the labels of a study come from: its label map, or the image."""
+    assert study.image is not None
+    table = study.segmentation
+    return study.path(table.labels or table.contours or find_hand_labels(study) or study.image.path)
+
+
+@contextmanager
+def name_file_in_errors(file: Path | None, place: str | None = None, about: str = "") -> Iterator[None]:
+    """Say which file, and place in it, an error is about, where it names none itself; and what ``about``."""
+    try:
+        yield
+    except InputError as error:
+        if error.file is not None:
+            raise
+        what, place = about + error.what, place or error.place
+        raise type(error)(what, file=file, place=place, remedy=error.remedy) from None
