@@ -63,11 +63,14 @@ def test_an_interval_counts_relaxation_beyond_the_records_and_holds_the_value():
     assert high == 50.0
 
 
-def test_an_interval_reaches_to_the_farthest_fall_and_loses_nothing_at_the_other_end():
-    plain, *_ = spread_of().told(50.0, SLOPES)
-    (low, high), *_, (_, _, fall) = spread_of(fall=[0.5, 0.0]).told(50.0, SLOPES)
-    assert fall == pytest.approx(3.0 * 0.5)
-    assert (low, high) == pytest.approx((plain[0] - 1.5, plain[1]))
+@pytest.mark.parametrize("fall_log", [0.5, 3.0])
+def test_an_interval_reaches_to_the_farthest_fall_and_loses_nothing_at_the_other_end(fall_log):
+    """A pressure that is proportional to a modulus falls by the same factor, and stays positive."""
+    slopes = np.array([50.0, *SLOPES[1:]])
+    plain, *_ = spread_of().told(50.0, slopes)
+    (low, high), *_, (_, _, fall) = spread_of(fall=[fall_log, 0.0]).told(50.0, slopes)
+    assert fall == pytest.approx(50.0 * (1 - np.exp(-fall_log)))
+    assert (low, high) == pytest.approx((plain[0] * np.exp(-fall_log), plain[1]))
 
 
 def test_what_is_stored_has_the_same_keys_with_and_without_intervals():

@@ -112,6 +112,9 @@ class SimulationSpread:
         variance = float(own @ along)
         moved, further = float(own @ known.shift), max(float(own @ known.relaxation @ own), 0.0)
         fall = float(np.sum(own * known.fall))
+        # Moduli fall by factors, and so do pressures: to first order they could become negative.
+        kept = float(np.exp(-max(fall, 0.0) / max(value, np.finfo(float).tiny)))
+        fall = min(fall, value * (1.0 - kept))
         half = NORMAL_95 * np.sqrt(max(variance, 0.0) + further)
         scale = np.maximum(np.diag(known.covariance) * variance, np.finfo(float).tiny)
         shares = 100.0 * along**2 / scale
@@ -119,7 +122,7 @@ class SimulationSpread:
         by = _CHANGE * slopes
         changes = dict(zip(self.names, map(float, by), strict=True))
         low, high = sorted((value, value + float(own @ known.off)))
-        low, high = low + moved - half - max(fall, 0.0), high + moved + half - min(fall, 0.0)
+        low, high = kept * (low + moved - half), high + moved + half - min(fall, 0.0)
         interval = [max(min(low, value), 0.0), max(high, value)]
         return interval, found, changes, [moved, float(np.sqrt(further)), fall]
 
