@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, get_args, get_origin
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
 
 from limbfit.results.base import ResultPart
 
@@ -36,6 +37,8 @@ def _make_empty(kind: Any) -> Any:
         return complete(kind, {})
     if type(None) in get_args(kind):
         return None
+    if get_origin(kind) in (UnionType, Union):
+        return _make_empty(get_args(kind)[0])
     if get_origin(kind) is tuple:
         return [_make_empty(part) for part in get_args(kind)]
     return {Mapping: {}, dict: {}, Sequence: [], str: "", bool: False, int: 0, float: 0.0}[

@@ -13,11 +13,12 @@ from completing import complete
 from limbfit import load_study
 from limbfit.mesh import write_vtu
 from limbfit.results.runs import StageStamp
+from limbfit.results.socket import SocketDesignResult, SocketResult
 
 
-def held(name: str, share: float) -> dict:
+def held(share: float, **more) -> dict:
     row = {"region": "left middle", "mean_kPa": share, "peak_kPa": 10 * share, "shear_kPa": 0.5}
-    return {"name": name, "settling_mm": 7.5, "regions": [row | {"interval_kPa": [0.5 * share, 2 * share]}]}
+    return {"regions": [row | {"interval_kPa": [0.5 * share, 2 * share]}], **more}
 
 
 def write_run(results, folder: str, begin: str, factor: float) -> dict:
@@ -28,7 +29,12 @@ def write_run(results, folder: str, begin: str, factor: float) -> dict:
         pressure = share * (1.0 + mesh.points[:, 0] - mesh.points[:, 0].min())
         data = {"pressure_kPa": pressure, "shear_kPa": 0.1 * pressure}
         write_vtu(mesh, results / folder / f"{begin}-{i}.vtu", point_data=data)
-    return {"donning": held("donning", 1.0), "loads": [held("stance", factor)]}
+    return {"donning": held(1.0), "loads": [held(factor, name="stance", settling_mm=7.5)]}
+
+
+def write_designs(results, designs: list[dict]) -> None:
+    content = complete(SocketDesignResult, {"designs": designs})
+    (results / "socket_design" / "socket_design.json").write_text(json.dumps(content))
 
 
 @pytest.mark.slow
@@ -37,9 +43,9 @@ def test_pressure_is_stepped_through_and_read_under_the_pointer(study, serve, op
     page.get_by_text("No run of the socket is stored yet.").wait_for()
     results = study / "results"
     content = write_run(results, "socket", "held", 5.0)
-    (results / "socket" / "socket.json").write_text(json.dumps(content))
+    (results / "socket" / "socket.json").write_text(json.dumps(complete(SocketResult, content)))
     design = {"name": "design", "simulation": write_run(results, "socket_design", "design", 2.0)}
-    (results / "socket_design" / "socket_design.json").write_text(json.dumps({"designs": [design]}))
+    write_designs(results, [design])
     for folder in ("socket", "socket_design"):
         (results / folder / "stage.json").write_text(json.dumps(complete(StageStamp, {})))
     words, slider = page.locator(".view.socket .player-words"), page.get_by_label("step", exact=True)
@@ -74,7 +80,7 @@ def test_two_runs_stand_beside_each_other_on_one_scale_and_turn_together(study, 
         {"name": name, "simulation": write_run(results, "socket_design", name, factor)}
         for name, factor in (("control", 5.0), ("design", 2.0))
     ]
-    (results / "socket_design" / "socket_design.json").write_text(json.dumps({"designs": designs}))
+    write_designs(results, designs)
     (results / "socket_design" / "stage.json").write_text(json.dumps(complete(StageStamp, {})))
     page = open_page(serve(study) + "#/socket")
     words, canvas = page.locator(".view.socket .player-words"), page.locator(".view.socket .lf-canvas")
