@@ -81,7 +81,7 @@ def test_side_by_side_they_are_what_they_are_one_after_the_other(designed, said,
     with place_jobs(Placement(workers=1)):
         alone = design_socket(load_study(tmp_path))
     for one, other in zip(designed["designs"], alone["designs"], strict=True):
-        assert one["volume_cm3"] == other["volume_cm3"]
+        assert one["volume_cm3"] == pytest.approx(other["volume_cm3"], rel=1e-12)  # sums in another order
         assert one["peaks_kPa"] == pytest.approx(other["peaks_kPa"], rel=1e-3)
         assert one["simulation"]["steps"][-1]["move_mm"] == pytest.approx(
             other["simulation"]["steps"][-1]["move_mm"], abs=1e-3
