@@ -2,3 +2,5 @@
 
 from .fitting import Fit, calibrate
 from .solution import Solution, solve
+
+__all__ = ["Fit", "Solution", "calibrate", "solve"]
