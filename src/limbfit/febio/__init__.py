@@ -20,3 +20,34 @@ from .program import (
 from .reading.model import FebModel, read_feb
 from .running import FebRun, run_feb
 from .writing import FebSettings, build_contact, describe_differences, write_feb
+
+__all__ = [
+    "TIME_TOLERANCE",
+    "FacePenalties",
+    "FebModel",
+    "FebRun",
+    "FebSettings",
+    "FebioLog",
+    "FebioRun",
+    "ParameterRange",
+    "RunVerdict",
+    "build_contact",
+    "build_result",
+    "build_step_control",
+    "check_optimisable",
+    "compute_axial_force",
+    "compute_end_time",
+    "compute_mean_penalty",
+    "describe_differences",
+    "find_febio",
+    "judge_run",
+    "read_feb",
+    "read_log",
+    "run_feb",
+    "run_febio",
+    "to_problem",
+    "turn_to_indenter_frame",
+    "write_feb",
+    "write_inp",
+    "write_optimisation",
+]

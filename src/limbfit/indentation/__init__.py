@@ -5,7 +5,8 @@ from typing import Any
 from ..laws import Parameters, list_flat_names, to_parameters, to_vector
 from ..renamed import find_renamed
 from .cell_fields import Direction, build_fibre_field
-from .clamps import build_clamping_pins, clamp_problem
+from .clamps import build_clamping_pins
+from .clamps import clamp_problem as clamp_problem
 from .neighbourhood import Extension, cut_neighbourhood
 from .observing import (
     OFF_SKIN_MM,
