@@ -12,10 +12,17 @@ import pytest
 import layered
 from layered import layered_block, store_blocks
 from limbfit.execution import SerialExecutor
+from limbfit.identify.uncertainty.uncertainty import Uncertainty
 from limbfit.indentation import Parameters, Simulation, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, write_vtu
 from limbfit.phantom.record import Ramp, RobotRecord, record
 from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.identification.fine_meshes import FineMeshCorrection, correct_to_fine_meshes
+from limbfit.pipeline.identification.intervals import estimate_linearised
+from limbfit.pipeline.identification.problem import build_problem
+from limbfit.pipeline.identification.record_simulator import RecordSimulator
+from limbfit.pipeline.records.records import RecordSet, load_records
+from limbfit.pipeline.simulation.simulations import SimulationCache
 from limbfit.study import Study, load_study
 
 TRUTH = {
@@ -97,3 +104,13 @@ class SeenBlock:
         for place in (store["mesh"], store["mesh"] / "coarse"):
             write_vtu(mesh, place / "a.vtu")
         return Context(study, store, SerialExecutor(), lambda event: None)
+
+
+def estimate_at_truth(context: Context) -> tuple[RecordSet, FineMeshCorrection, Uncertainty]:
+    """The records of a stored study, what is simulated of them at the true parameters, and what they tell."""
+    study, problem = context.study, build_problem(context.study)
+    records = load_records(context, study.recorded, secondary=True)
+    cache, truth = SimulationCache(study.folder / "runs"), study.vector(TRUTH)
+    simulator = RecordSimulator(records, cache, context.executor, lambda text: None)
+    at = correct_to_fine_meshes(problem, simulator, truth)
+    return records, at, estimate_linearised(problem, records.own, truth, at)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.interpolate import interp1d
-from seen_blocks import TRUTH, Made, SeenBlock
+from seen_blocks import TRUTH, Made, SeenBlock, estimate_at_truth
 
 from limbfit.errors import TraceError
 from limbfit.indentation import (
@@ -20,15 +20,9 @@ from limbfit.indentation import (
 from limbfit.mesh import Mesh
 from limbfit.phantom.record import write_surface
 from limbfit.pipeline.identification.calibrate import run_calibrate
-from limbfit.pipeline.identification.fine_meshes import correct_to_fine_meshes
-from limbfit.pipeline.identification.intervals import estimate_linearised
 from limbfit.pipeline.identification.predict import run_predict
-from limbfit.pipeline.identification.problem import build_problem
-from limbfit.pipeline.identification.record_simulator import RecordSimulator
-from limbfit.pipeline.records.records import load_records
 from limbfit.pipeline.records.secondary_measurements import MAX_POINTS, ChosenPoints, choose_points
 from limbfit.pipeline.records.traces import run_traces
-from limbfit.pipeline.simulation.simulations import SimulationCache
 from limbfit.report.drawing.figures import draw_skin_figure
 from limbfit.report.sections.prediction import make_observed_table
 from limbfit.report.store import load_store
@@ -82,17 +76,11 @@ def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -
     for name, more in (("force", ""), ("both", SEEN)):
         (tmp_path / name).mkdir()
         context = BLOCK.stored(tmp_path / name, monkeypatch, more)
-        study = context.study
-        records = load_records(context, study.recorded, secondary=True)
-        cache = SimulationCache(tmp_path / name / "runs")
-        simulator = RecordSimulator(records, cache, context.executor, lambda text: None)
-        problem = build_problem(study)
-        at = correct_to_fine_meshes(problem, simulator, study.vector(TRUTH))
-        known = estimate_linearised(problem, records.own, study.vector(TRUTH), at)
+        records, at, known = estimate_at_truth(context)
         widths.append(np.sqrt(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
     assert [one.name for one in records.own] == ["a", "a+surface"]
     assert [one.unit for one in records.measured] == ["N", "mm"]
-    assert {one.where for one in records.measured} == {"a"}  # left out together
+    assert {one.site_name for one in records.measured} == {"a"}  # left out together
     seen, noise = records.own[1], known.residual_model.noise[1]
     off = at.responses[1].force_N - seen.compared
     assert len(off) > 300
@@ -118,7 +106,7 @@ def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -
     assert (surface["kind"], surface["left_out"]) == ("surface", {})
     assert surface["compared"].startswith("24 points, ")
     assert surface["error_percent"] < 10.0
-    results = load_store(study.results)
+    results = load_store(context.study.results)
     figure, shown = draw_skin_figure(results, fitted=True), make_observed_table(results)
     assert figure is not None
     assert "a: " in figure.markup
@@ -136,10 +124,7 @@ def test_one_component_in_the_frame_of_the_indenter(tmp_path: Path, monkeypatch)
         file, rows[:, [0, 1, 2, 3, 6]], delimiter=",", header="time_s,x_mm,y_mm,z_mm,uz_mm", comments=""
     )
     run_traces(context, context.store["traces"])
-    records = load_records(context, context.study.recorded, secondary=True)
-    cache = SimulationCache(tmp_path / "runs")
-    simulator = RecordSimulator(records, cache, context.executor, lambda text: None)
-    at = correct_to_fine_meshes(build_problem(context.study), simulator, context.study.vector(TRUTH))
+    records, at, _ = estimate_at_truth(context)
     seen = records.own[1]
     assert set(seen.seen.components.tolist()) == {2}
     assert seen.compared.max() > 0.2  # into the limb

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from seen_blocks import PUNCH, TRUTH, Made, SeenBlock
+from seen_blocks import PUNCH, Made, SeenBlock, estimate_at_truth
 
 import layered
 from layered import layered_block
@@ -18,13 +18,7 @@ from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, 
 from limbfit.mesh import find_gauges_along
 from limbfit.phantom.record import write_ultrasound
 from limbfit.pipeline.identification.calibrate import run_calibrate
-from limbfit.pipeline.identification.fine_meshes import correct_to_fine_meshes
-from limbfit.pipeline.identification.intervals import estimate_linearised
 from limbfit.pipeline.identification.predict import run_predict
-from limbfit.pipeline.identification.problem import build_problem
-from limbfit.pipeline.identification.record_simulator import RecordSimulator
-from limbfit.pipeline.records.records import load_records
-from limbfit.pipeline.simulation.simulations import SimulationCache
 from limbfit.report.drawing.figures import draw_layer_figure
 from limbfit.report.store import load_store
 from limbfit.study import SolverTable, Study
@@ -168,13 +162,7 @@ def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatc
     for name, more in (("force", ""), ("both", 'ultrasound = "a-layers.csv"\n')):
         (tmp_path / name).mkdir()
         context = BLOCK.stored(tmp_path / name, monkeypatch, more)
-        study = context.study
-        records = load_records(context, study.recorded, secondary=True)
-        cache = SimulationCache(tmp_path / name / "runs")
-        simulator = RecordSimulator(records, cache, context.executor, lambda text: None)
-        problem = build_problem(study)
-        at = correct_to_fine_meshes(problem, simulator, study.vector(TRUTH))
-        known = estimate_linearised(problem, records.own, study.vector(TRUTH), at)
+        records, at, known = estimate_at_truth(context)
         widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
     assert [one.name for one in records.own] == ["a", "a+skin", "a+muscle"]
     assert [one.unit for one in records.measured] == ["N", "mm", "mm"]
@@ -198,6 +186,6 @@ def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatc
         {"skin": 3.0, "muscle": 9.0}, abs=0.1
     )
     assert (context.store["predict"] / "a+muscle.csv").is_file()
-    figure = draw_layer_figure(load_store(study.results), fitted=True)
+    figure = draw_layer_figure(load_store(context.study.results), fitted=True)
     assert figure is not None
     assert "a, muscle" in figure.markup

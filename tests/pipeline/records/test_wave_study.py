@@ -7,21 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from seen_blocks import PUNCH, TRUTH, Made, SeenBlock
+from seen_blocks import PUNCH, TRUTH, Made, SeenBlock, estimate_at_truth
 
 from limbfit.errors import TraceError
 from limbfit.indentation import Simulation, SiteModel, place_waves_under
 from limbfit.phantom.record import write_waves
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.identification.calibrate import run_calibrate
-from limbfit.pipeline.identification.fine_meshes import correct_to_fine_meshes
-from limbfit.pipeline.identification.intervals import estimate_linearised
 from limbfit.pipeline.identification.predict import run_predict
-from limbfit.pipeline.identification.problem import build_problem
-from limbfit.pipeline.identification.record_simulator import RecordSimulator
-from limbfit.pipeline.records.records import build_model, load_records
+from limbfit.pipeline.records.records import build_model
 from limbfit.pipeline.records.traces import run_traces
-from limbfit.pipeline.simulation.simulations import SimulationCache
 from limbfit.report.drawing.figures import draw_wave_figure
 from limbfit.report.sections.prediction import make_observed_table
 from limbfit.report.store import load_store
@@ -59,17 +54,11 @@ def test_speeds_are_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
     for name, more in (("force", ""), ("both", WAVES)):
         (tmp_path / name).mkdir()
         context = BLOCK.stored(tmp_path / name, monkeypatch, more)
-        study = context.study
-        records = load_records(context, study.recorded, secondary=True)
-        cache = SimulationCache(tmp_path / name / "runs")
-        simulator = RecordSimulator(records, cache, context.executor, lambda text: None)
-        problem = build_problem(study)
-        at = correct_to_fine_meshes(problem, simulator, study.vector(TRUTH))
-        known = estimate_linearised(problem, records.own, study.vector(TRUTH), at)
+        records, at, known = estimate_at_truth(context)
         widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
     assert [one.name for one in records.own] == ["a", "a+skin-waves", "a+muscle-waves"]
     assert [one.unit for one in records.measured] == ["N", "m/s", "m/s"]
-    assert {one.where for one in records.measured} == {"a"}
+    assert {one.site_name for one in records.measured} == {"a"}
     for one, response, noise in zip(
         records.own[1:], at.responses[1:], known.residual_model.noise[1:], strict=True
     ):
@@ -93,7 +82,7 @@ def test_speeds_are_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
     assert (skin["kind"], skin["unit"], skin["what"]) == ("shear waves", "m/s", "skin-waves")
     assert muscle["error_percent"] < 10.0
     assert (context.store["predict"] / "a+muscle-waves.csv").is_file()
-    results = load_store(study.results)
+    results = load_store(context.study.results)
     figure, shown = draw_wave_figure(results, fitted=True), make_observed_table(results)
     assert figure is not None
     assert "a, skin-waves" in figure.markup

@@ -33,6 +33,20 @@ def combine_freedom(*parts: tuple[Array | float, float]) -> Array:
     return np.asarray(1.0 / np.clip(inverse, 1.0 / MAX_FREEDOM, 1.0))
 
 
+def compute_half_width_95(
+    variance: Array, misfit: Array | float, site: Array | float, known_scale: float, site_freedom: float
+) -> Array:
+    """Return half the 95 % interval (n,) of what has a ``variance`` (n,), by Student's quantile.
+
+    Of the variance, ``misfit`` is known from ``known_scale`` independent residuals, and ``site`` with
+    ``site_freedom`` degrees of freedom.
+    """
+    whole = np.maximum(variance, 1e-300)
+    misfit_known = max(known_scale, MIN_FREEDOM)
+    freedom = combine_freedom((misfit / whole, misfit_known), (site / whole, site_freedom))
+    return np.asarray(stdtrit(freedom, 0.975) * np.sqrt(variance))
+
+
 @dataclass(frozen=True)
 class ErrorSummary:
     """Mean and standard deviation (n - 1) of errors in percent; nan where there are too few sites."""
@@ -202,12 +216,8 @@ class PredictionModel:
             lower_N, higher_N, relaxation_N = self.relaxation.compute_beyond_N(slopes, times_s)
             own_N = np.hypot(own_N, relaxation_N)
         sd = compute_prediction_sd(response.jacobian, parameters, self.covariance_log, own_N)
-        variance = np.maximum(sd, 1e-150) ** 2
-        misfit_known = max(self.known_scale, MIN_FREEDOM)
-        freedom = combine_freedom(
-            (misfit_N**2 / variance, misfit_known), (site_N**2 / variance, self.site_freedom)
-        )
-        half, off = stdtrit(freedom, 0.975) * sd, np.log(self.most_probable / parameters)
+        half = compute_half_width_95(sd**2, misfit_N**2, site_N**2, self.known_scale, self.site_freedom)
+        off = np.log(self.most_probable / parameters)
         other = response.force_N + response.jacobian @ (parameters * off)
         low, high = np.minimum(response.force_N, other), np.maximum(response.force_N, other)
         return low + np.minimum(lower_N, 0.0) - half, high + np.maximum(higher_N, 0.0) + half

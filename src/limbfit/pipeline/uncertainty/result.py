@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
 
 from ...arrays import Array
 from ...errors import InputError
 from ...identify.fit.objective import SiteResponse
-from ...identify.fit.prediction import MIN_FREEDOM, combine_freedom
+from ...identify.fit.prediction import compute_half_width_95
 from ...identify.uncertainty.emulator import Emulator
 from ...identify.uncertainty.exploration import Exploration
 from ...identify.uncertainty.uncertainty import (
@@ -277,10 +276,8 @@ def _write_prediction(
         "misfit": np.full(len(force), (share * peak) ** 2),
     }
     total = np.sum(list(variances.values()), axis=0)
-    misfit, site = (variances[part] / np.maximum(total, 1e-300) for part in ("misfit", "site"))
-    misfit_known = max(model.known_scale, MIN_FREEDOM)
-    freedom = combine_freedom((misfit, misfit_known), (site, model.site_freedom))
-    half = stdtrit(freedom, 0.975) * np.sqrt(total)
+    estimated = variances["misfit"], variances["site"]
+    half = compute_half_width_95(total, *estimated, model.known_scale, model.site_freedom)
     low, high = np.maximum(force - half, 0.0), force + half
     write_curves(
         folder / "predictions" / f"{record.name}.csv",
