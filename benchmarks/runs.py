@@ -113,7 +113,7 @@ def simulation(divisions: int, sites: int) -> list[dict[str, Any]]:
             for sensitivities in (True, False):
                 job = job_of(model, STIFF, sensitivities)
                 ((made, facts),) = executor.map(measured, [job], [model.name])
-                cache._keep(job, made)
+                cache.keep(job, made)
                 size = max((folder / "runs").glob("*.npz"), key=lambda file: file.stat().st_mtime_ns)
                 rows.append(
                     {"site": i, "derivatives": sensitivities, "completed": made.completed}

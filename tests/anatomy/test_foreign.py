@@ -209,7 +209,7 @@ def test_a_node_that_the_mesher_left_on_the_skin_is_put_back():
     """Over a ridge MMG put a node of the inner face 0.1 mm under the skin: an angle of 0.5 degrees."""
     found = foreign_meshes.read_limb("limb-6", foreign_meshes.limb_files(SHARED)["limb-6"], 0.0, False)
     settings = foreign_meshes.default_settings()["own"]
-    site = foreign_meshes.random_sites(found.anatomy, 10)[9]
+    site = foreign_meshes.draw_random_sites(found.anatomy, 10)[9]
     row = foreign_meshes.site_row(found, build_base_mesh(found.anatomy, settings), settings, site)
     assert row["sound"], row["failure"]
 
@@ -223,6 +223,6 @@ def test_limbs_of_an_atlas_are_meshed_as_they_come(name):
     assert any("skin: open at one end" in note for note in found.notes)
     assert set(found.anatomy.bones) == {"tibia", "fibula", "femur", "patella"}
     settings = foreign_meshes.default_settings()["coarse"]
-    sites = foreign_meshes.random_sites(found.anatomy, 1, 3)
+    sites = foreign_meshes.draw_random_sites(found.anatomy, 1, 3)
     row = foreign_meshes.site_row(found, build_base_mesh(found.anatomy, settings), settings, sites[0])
     assert row["sound"], row["failure"]
