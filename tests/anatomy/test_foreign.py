@@ -222,7 +222,7 @@ def test_limbs_of_an_atlas_are_meshed_as_they_come(name):
     found = foreign_meshes.read_limb(name, file, 0.0, False)
     assert any("skin: open at one end" in note for note in found.notes)
     assert set(found.anatomy.bones) == {"tibia", "fibula", "femur", "patella"}
-    settings = foreign_meshes.default_settings()["coarse"]
+    settings = foreign_meshes.default_settings()["own"]
     sites = foreign_meshes.draw_random_sites(found.anatomy, 1, 3)
     row = foreign_meshes.site_row(found, build_base_mesh(found.anatomy, settings), settings, sites[0])
     assert row["sound"], row["failure"]
