@@ -75,9 +75,11 @@ TRUE: Values = {
     "muscle": {"c_kPa": 4.7, "m": 4.6, "gamma": 3.2, "tau_s": 0.3},
 }
 SPREAD_LOG, SPEED_MM_S, FASTER, HOLD_S = 0.1, 0.96, 10.0, 60.0
-DIVISIONS, COARSE_DIVISIONS, TRUE_DIVISIONS = 10, 7, 12
-MODEL_STEPS = SolverTable(load_steps=6, unload_steps=5)
+DIVISIONS, COARSE_DIVISIONS, TRUE_DIVISIONS = 10, 8, 12
+MODEL_STEPS = SolverTable(load_steps=6, unload_steps=8)
 TRUE_STEPS = SolverTable(load_steps=14, unload_steps=12)
+# A rounded edge: of a sharp one, meshes that can be solved so often leave the force wrong by some percent.
+INDENTER = IndenterTable(shape="cylinder", width_mm=20.0, edge_radius_mm=4.0)
 PAD = IndenterTable(shape="cylinder", width_mm=34.0, edge_radius_mm=4.0)
 POINTS = 121
 POWER_SPAN_S = (0.03, 3000.0)
@@ -86,6 +88,10 @@ TEXT = """
 name = "blocks"
 [surfaces]
 skin = "skin.stl"
+[indenter]
+shape = "cylinder"
+width_mm = 20.0
+edge_radius_mm = 4.0
 [solver]
 load_steps = {load}
 unload_steps = {unload}
@@ -183,8 +189,8 @@ def list_cases(depth_mm: float) -> dict[str, tuple[tuple[float, ...], tuple[floa
     ramp = depth_mm / SPEED_MM_S
     fast, shallow = ramp / FASTER, 0.6 * depth_mm
     return {
-        "fast": ((0.0, fast, 2 * fast), (0.0, depth_mm, 0.0), IndenterTable()),
-        "hold": ((0.0, ramp, ramp + HOLD_S), (0.0, depth_mm, depth_mm), IndenterTable()),
+        "fast": ((0.0, fast, 2 * fast), (0.0, depth_mm, 0.0), INDENTER),
+        "hold": ((0.0, ramp, ramp + HOLD_S), (0.0, depth_mm, depth_mm), INDENTER),
         "pad": ((0.0, 0.6 * ramp, 0.6 * ramp + HOLD_S), (0.0, shallow, shallow), PAD),
     }
 
@@ -245,7 +251,7 @@ class World:
         begins = truth.early_mm / SPEED_MM_S  # the robot calls it touch-down so much later
         knots = (0.0, begins + ramp, 2 * (begins + ramp))
         times = np.linspace(0.0, knots[-1], 241)
-        force = self.simulate(name, knots, (0.0, deepest, 0.0), IndenterTable(), times)
+        force = self.simulate(name, knots, (0.0, deepest, 0.0), INDENTER, times)
         made = record(Ramp(depth, SPEED_MM_S), lambda t: np.interp(t + begins, times, force), random)
         made.write(self.folder.parent / f"{name}.csv")
 
