@@ -13,7 +13,7 @@ from limbfit.fe import History, OgdenQLV, solve
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import build_space, group_separately
-from limbfit.identify.fit.prediction import PredictionModel
+from limbfit.identify.fit.prediction import PredictionModel, RelaxationSpread
 from limbfit.identify.uncertainty.noise import SiteNoise
 from limbfit.identify.uncertainty.relaxation import (
     GIVES_WAY,
@@ -242,6 +242,20 @@ def test_an_interval_after_the_records_holds_any_fall_within_the_bound(of_model)
         _, (later_low, later_high) = of_model.state_modulus(number, 100 * longest)
         assert later_low == pytest.approx(low * 100.0**-MAX_SLOPE, rel=0.05)
         assert later_high == pytest.approx(high, rel=0.05)
+
+
+def test_a_force_falls_by_the_factor_of_its_moduli_and_stays_positive(of_model):
+    """All moduli lower by a factor lower the force by it, however large the fall."""
+    falling = np.tile([1.0, 0.0, 0.0, 0.0] * 2, (2, 1))  # of both tissues' c
+    spread = RelaxationSpread(
+        1.0, 1.0, np.array([1.0, 1e4]), 0.0 * falling, np.zeros((2, 8, 8)), 3.0 * falling
+    )
+    force, times = np.array([2.0, 5.0]), np.array([10.0, 1e4])
+    slopes = force[:, None] * np.tile([0.3, 0.0, 0.0, 0.0, 0.7, 0.0, 0.0, 0.0], (2, 1))
+    low, high, sd = spread.compute_beyond_N(force, slopes, times)
+    assert force + low == pytest.approx(force * np.exp(-3.0))
+    assert not high.any()
+    assert not sd.any()
 
 
 def test_a_limb_that_gives_way_is_named_where_the_records_cannot_tell_it_from_relaxation(of_power_law):

@@ -82,6 +82,14 @@ def compute_prediction_sd(
     return np.sqrt(np.einsum("ni,ij,nj->n", scaled, covariance_log, scaled) + noise_N**2)
 
 
+def limit_fall(value: float, fall: float) -> float:
+    """By how much a force or pressure falls where moduli do, of what is ``fall`` to first order.
+
+    Moduli fall by factors, and so does the value: to first order it could become negative.
+    """
+    return min(fall, -value * float(np.expm1(-max(fall, 0.0) / max(value, np.finfo(float).tiny))))
+
+
 @dataclass(frozen=True)
 class RelaxationSpread:
     """What other relaxations that fit the records say of the parameters ``durations_s`` (d,) after a step.
@@ -107,16 +115,18 @@ class RelaxationSpread:
         shift, fall = weights @ self.shift_log[i : i + 2], weights @ self.fall_log[i : i + 2]
         return shift, np.tensordot(weights, self.covariance_log[i : i + 2], 1), fall
 
-    def compute_beyond_N(self, slopes: Array, times_s: Array) -> tuple[Array, Array, Array]:
+    def compute_beyond_N(self, force_N: Array, slopes: Array, times_s: Array) -> tuple[Array, Array, Array]:
         """Return the lowest and the highest shift and the standard deviation (n,) of forces beyond the
         records' longest load.
 
-        ``slopes`` (n, p) are by the logarithms of the parameters. All are zero within the records' times.
+        ``slopes`` (n, p) of ``force_N`` (n,) are by the logarithms of the parameters. All are zero within the
+        records' times.
         """
         low, high, sd = np.zeros((3, len(times_s)))
         for i in np.flatnonzero(times_s > self.longest_s):
             shift_log, covariance, fall_log = self.interpolate(float(times_s[i]))
-            shift, fall = float(slopes[i] @ shift_log), float(slopes[i] @ fall_log)
+            shift = float(slopes[i] @ shift_log)
+            fall = limit_fall(float(force_N[i]), float(slopes[i] @ fall_log))
             low[i], high[i] = shift - max(fall, 0.0), shift - min(fall, 0.0)
             sd[i] = np.sqrt(slopes[i] @ covariance @ slopes[i])
         return low, high, sd
@@ -213,7 +223,9 @@ class PredictionModel:
         higher_N: Array | float = 0.0
         if self.relaxation is not None and times_s is not None:
             slopes = response.jacobian * parameters
-            lower_N, higher_N, relaxation_N = self.relaxation.compute_beyond_N(slopes, times_s)
+            lower_N, higher_N, relaxation_N = self.relaxation.compute_beyond_N(
+                response.force_N, slopes, times_s
+            )
             own_N = np.hypot(own_N, relaxation_N)
         sd = compute_prediction_sd(response.jacobian, parameters, self.covariance_log, own_N)
         half = compute_half_width_95(sd**2, misfit_N**2, site_N**2, self.known_scale, self.site_freedom)

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
+from ...identify.fit.prediction import limit_fall
 from ...identify.uncertainty.uncertainty import NORMAL_95
 from ...laws import LAWS, OGDEN
 from ...study import Study
@@ -111,10 +112,8 @@ class SimulationSpread:
         along = known.covariance @ own
         variance = float(own @ along)
         moved, further = float(own @ known.shift), max(float(own @ known.relaxation @ own), 0.0)
-        fall = float(np.sum(own * known.fall))
-        # Moduli fall by factors, and so do pressures: to first order they could become negative.
-        kept = float(np.exp(-max(fall, 0.0) / max(value, np.finfo(float).tiny)))
-        fall = min(fall, value * (1.0 - kept))
+        fall = limit_fall(value, float(np.sum(own * known.fall)))
+        kept = 1.0 - max(fall, 0.0) / max(value, np.finfo(float).tiny)
         half = NORMAL_95 * np.sqrt(max(variance, 0.0) + further)
         scale = np.maximum(np.diag(known.covariance) * variance, np.finfo(float).tiny)
         shares = 100.0 * along**2 / scale
