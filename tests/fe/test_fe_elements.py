@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from blocks import block
+from numba import typeof
 
 from limbfit.fe import ELEMENTS, History, OgdenQLV, Problem, Support, System
 from limbfit.fe.kernel.laws import Laws
@@ -44,6 +47,12 @@ def full(system: System, data: np.ndarray) -> np.ndarray:
 def rotation(seed: int) -> np.ndarray:
     Q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     return Q * np.sign(np.linalg.det(Q))
+
+
+def test_kernels_are_compiled_once_for_all_elements_with_and_without_prestretch():
+    """Each memory layout of an array would be compiled anew, which takes ten seconds and more."""
+    problems = [replace(body(name), prestretch=G) for name in NAMES for G in (None, np.diag([1.1, 1.0, 0.9]))]
+    assert len({typeof(System(problem).elements(slice(None))) for problem in problems}) == 1
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -165,7 +165,7 @@ class System:
         ``w/det G`` every kernel sees the tissue on its own; only ``F G = G + sum_a u_a x G^T grad N_a``
         knows ``G`` itself.
         """
-        G = np.ascontiguousarray(np.broadcast_to(stretches, (len(self.weights), 3, 3)))
+        G = np.array(np.broadcast_to(stretches, (len(self.weights), 3, 3)), order="C")
         gradients = np.einsum("mji,mqjk->mqik", G, self.gradients)
         self.prestretch, self.gradients = G, np.ascontiguousarray(gradients)
         self.weights = self.weights / np.linalg.det(G)[:, None]

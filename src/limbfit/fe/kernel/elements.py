@@ -123,7 +123,8 @@ def compute_reference_gradients(
     with np.errstate(all="ignore"):
         safe = np.where((np.abs(weights) > 0)[..., None, None], jacobian, np.eye(3))
     gradients = np.einsum("qkj,mqji->mqik", dN, np.linalg.inv(safe), optimize=True)
-    return np.ascontiguousarray(gradients), weights
+    # One memory layout for every element, or each layout would have kernels of its own to compile.
+    return np.ascontiguousarray(gradients), np.ascontiguousarray(weights)
 
 
 def build_face_quadrature(
