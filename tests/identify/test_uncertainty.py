@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bars import BARS, PAPER, SITES, TRUE_THREE, TRUTH, records, simulate, three_tissues
+from bars import BARS, PAPER, SITES, TRUE_THREE, TRUTH, Bars, records, simulate, three_tissues
 from scipy.linalg import block_diag
 
 from limbfit.identify.fit.calibration import calibrate
@@ -216,6 +216,27 @@ def test_intervals_are_useful_where_the_model_is_wrong_a_little():
     assert u.verdicts[4] == DETERMINED
     assert sum(verdict != UNDETERMINED for verdict in u.verdicts) >= 6
     assert np.min(u.degrees_of_freedom) > 5
+
+
+def test_a_misfit_that_jumps_where_the_indenter_turns_is_not_many_times_larger_than_what_is_seen():
+    """Tissue relaxes with two times, 0.15 and 3 s, where the model has one."""
+
+    def relax(site: Bars, gamma: float, tau_s: float) -> np.ndarray:
+        p = TRUTH.copy()
+        p[[2, 6]], p[[3, 7]] = gamma, tau_s
+        return site.force(p)
+
+    rng = np.random.default_rng(0)
+    forces = [relax(site, 2.0, 0.15) + relax(site, 2.0, 3.0) - relax(site, 0.0, 1.0) for site in SITES]
+    data = [MeasuredCurve(f"s{k}", f + 0.01 * rng.standard_normal(f.size)) for k, f in enumerate(forces)]
+    found, u = fitted(data)
+    seen = [
+        np.sqrt(np.mean((response.force_N - own.force_N) ** 2))
+        for response, own in zip(found.responses, data)
+    ]
+    misfit = u.residual_model.misfit * u.residual_model.peaks_N
+    assert np.all(np.array(seen) < misfit)
+    assert np.all(misfit < 4 * np.array(seen))
 
 
 def test_uninformative_data_flip_the_verdict():

@@ -25,6 +25,7 @@ import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve, eigh
 from scipy.optimize import brentq, minimize
 from scipy.special import ndtr, stdtrit
+from scipy.stats import chi2
 
 from ...arrays import Array, Indices
 from ...results.identification import MeshMisfitSummary, RecordResiduals, ResidualsSummary
@@ -260,9 +261,44 @@ def estimate_discrepancy(
         known_scale=rows.known_scale(logs),
         criterion=value,
     )
-    if not model.site_N:
+    if model.site_N:
+        factors = rows.sample_site_factors(logs)
+        found = replace(found, site_factor=float(np.exp(logs[-1])), site_factors=factors)
+    by = _compare_with_mean_square(found, residuals, jacobians)
+    if by >= 1.0:
         return found
-    return replace(found, site_factor=float(np.exp(logs[-1])), site_factors=rows.sample_site_factors(logs))
+    least = _SITE_FACTOR_BOUNDS[0]
+    return replace(
+        found,
+        misfit=np.maximum(by * found.misfit, _MIN_MISFIT),
+        site_factor=max(by * found.site_factor, least),
+        site_factors=np.maximum(by * found.site_factors, least),
+    )
+
+
+def _compare_with_mean_square(
+    model: ResidualModel, residuals: Sequence[Array], jacobians: Sequence[Array]
+) -> float:
+    """Return by which factor misfits and site factor may be multiplied, by the mean square of the residuals.
+
+    The likelihood goes by how residuals change from one moment to the next. Residuals that are smooth but for
+    a few kinks, as a wrong law of relaxation leaves where the indenter turns, seem to it a long process that
+    is many times larger than they are, most of which the parameters must have absorbed. Their mean square
+    tells whether that can be. Here it is compared with what is left of the model's covariance after a fit by
+    least squares, by a chi-squared distribution of the same mean and variance (Satterthwaite 1946): below
+    the factor that is returned, residuals as small as these have a probability of at least 2.5 %.
+    """
+    scale = np.concatenate([np.full(len(r), len(r) ** -0.5 / p) for r, p in zip(residuals, model.peaks_N)])
+    residual, jacobian = scale * np.concatenate(residuals), scale[:, None] * np.concatenate(jacobians)
+    own = block_diag(*(model.own_covariance(i) for i in range(len(residuals))))
+    sites = np.concatenate(model.site_deviations)
+    directions = np.linalg.qr(jacobian)[0]
+    left = np.eye(len(residual)) - directions @ directions.T
+    covariance = left @ (scale[:, None] * (own + sites @ sites.T) * scale) @ left
+    expected = float(np.trace(covariance))
+    freedom = expected**2 / float(np.sum(covariance**2))
+    share = float(residual @ residual) / expected * freedom / chi2.ppf(0.025, freedom)
+    return float(np.sqrt(share))
 
 
 def estimate_mesh_misfit(
