@@ -38,8 +38,10 @@ def test_a_folder_with_one_of_them_is_taken(tmp_path):
         read_labels(tmp_path, image)
 
 
-def test_segments_as_highdicom_writes_them(tmp_path):
-    """Another implementation: only filled slices, references to the source images, a frame of reference."""
+@pytest.mark.parametrize("kind", ["BINARY", "LABELMAP"])
+def test_segments_as_highdicom_writes_them(tmp_path, kind):
+    """Another implementation: only filled slices, references to the source images, a frame of reference; a
+    label map describes its background as a segment."""
     highdicom = pytest.importorskip("highdicom")
     from highdicom.seg import Segmentation, SegmentDescription
     from pydicom.sr.codedict import codes
@@ -56,11 +58,12 @@ def test_segments_as_highdicom_writes_them(tmp_path):
     sources.sort(key=lambda source: float(np.array(source.ImagePositionPatient, float) @ normal))
     labels = labels_on(image)
     names = {1: "Soft_Tissue", 2: "Tibia"}
+    masks = np.stack([labels.limb, labels.mask("tibia")], axis=-1).astype(np.uint8)
     tissue = codes.SCT.Tissue
     segmentation = Segmentation(
         source_images=sources,
-        pixel_array=np.stack([labels.limb, labels.mask("tibia")], axis=-1).astype(np.uint8),
-        segmentation_type="BINARY",
+        pixel_array=masks if kind == "BINARY" else masks.sum(axis=-1, dtype=np.uint8),
+        segmentation_type=kind,
         segment_descriptions=[
             SegmentDescription(number, name, tissue, tissue, algorithm_type="MANUAL")
             for number, name in names.items()

@@ -120,8 +120,10 @@ def test_nifti_without_a_stated_orientation_is_refused(tmp_path):
         read_volume(tmp_path / "bare.nii")
 
 
-def test_nrrd_without_a_space_is_refused(tmp_path):
-    nrrd.write(str(tmp_path / "bare.nrrd"), np.ones((3, 4, 5), np.float32))
+@pytest.mark.parametrize("space", [None, "scanner-xyz", "3D-right-handed", "3D-left-handed"])
+def test_nrrd_without_a_space_of_the_patient_is_refused(tmp_path, space):
+    header = {} if space is None else {"space": space, "space directions": np.eye(3)}
+    nrrd.write(str(tmp_path / "bare.nrrd"), np.ones((3, 4, 5), np.float32), header)
     with pytest.raises(ImageError, match="does not say how it lies"):
         read_volume(tmp_path / "bare.nrrd")
 

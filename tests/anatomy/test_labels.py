@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
 import nrrd
 import numpy as np
 import pytest
@@ -166,3 +169,27 @@ def test_unreadable_sidecar_is_named(tmp_path):
     (tmp_path / "labels.nrrd.json").write_text("[1, 2]")
     with pytest.raises(LabelError, match=r"labels\.nrrd\.json"):
         read_labels(tmp_path / "labels.nrrd")
+
+
+def test_a_named_background_is_no_bone(tmp_path):
+    image = volume(np.eye(3))
+    labels = labels_on(image)
+    named = {0: "background", **labels.names}
+    write_volume(tmp_path / "labels.nrrd", image.with_array(labels.array))
+    (tmp_path / "labels.nrrd.json").write_text(json.dumps(named))
+    assert read_labels(tmp_path / "labels.nrrd", image).bone_names == labels.bone_names
+    write_labels(tmp_path / "labels.seg.nrrd", replace(labels, names=named))
+    assert read_labels(tmp_path / "labels.seg.nrrd", image).bone_names == labels.bone_names
+
+
+def test_two_values_of_one_name_are_refused_with_the_file(tmp_path):
+    image = volume(np.eye(3))
+    write_volume(tmp_path / "labels.nrrd", image.with_array(labels_on(image).array))
+    (tmp_path / "labels.nrrd.json").write_text('{"1": "soft tissue", "2": "Tibia", "7": "tibia"}')
+    with pytest.raises(LabelError, match=r"labels\.nrrd: two labels have the same name"):
+        read_labels(tmp_path / "labels.nrrd")
+
+
+def test_a_label_is_one_region():
+    with pytest.raises(LabelError, match="two regions have one label"):
+        labels_on(volume(np.eye(3))).with_regions({"scar": "tibia", "tendon": "tibia"})

@@ -219,6 +219,14 @@ class LabelMap(Grid):
     names: Mapping[int, str] = field(default_factory=lambda: dict(DEFAULT_NAMES))
     regions: Mapping[str, str] = field(default_factory=dict)
 
+    def _check(self) -> None:
+        super()._check()
+        # Other programs name the background, too: as a tissue it would be a bone.
+        names = {value: name for value, name in self.names.items() if value != 0}
+        object.__setattr__(self, "names", names)
+        if len(set(names.values())) < len(names):
+            raise LabelError("two labels have the same name", remedy="give them different names")
+
     def _as_array(self, array: ArrayLike) -> NDArray[Any]:
         raw = np.asarray(array)
         if raw.dtype == np.uint8:
@@ -226,11 +234,6 @@ class LabelMap(Grid):
         if raw.size and (raw.min() < 0 or raw.max() > 255 or np.any(raw != np.round(raw))):
             raise LabelError("labels must be whole numbers from 0 to 255")
         return raw.astype(np.uint8)
-
-    @classmethod
-    def from_sitk(cls, image: sitk.Image, names: Mapping[int, str] | None = None) -> LabelMap:
-        array = sitk.GetArrayFromImage(image)
-        return cls(array, *read_geometry(image), names=dict(names or DEFAULT_NAMES))
 
     @property
     def limb(self) -> Mask:
@@ -248,8 +251,10 @@ class LabelMap(Grid):
 
     def with_regions(self, regions: Mapping[str, str]) -> LabelMap:
         """Return the map with some labels as regions, given by the label of each region's name. Raises
-        `LabelError` for a label that has no voxel, or that is soft tissue as a whole.
+        `LabelError` for a label that has no voxel, is soft tissue as a whole, or is that of two regions.
         """
+        if len(set(regions.values())) < len(regions):
+            raise LabelError("two regions have one label", place="geometry.regions", remedy="leave one out")
         present = {self.names.get(value) for value in np.unique(self.array).tolist()} - {None}
         for name, label in regions.items():
             if label not in present - SOFT_NAMES:
@@ -316,6 +321,7 @@ def resample_cubic(
 def read_geometry(image: sitk.Image) -> tuple[Array, Array, Array]:
     """Spacing, origin and direction of a three-dimensional SimpleITK image."""
     if image.GetDimension() != 3:
-        raise ImageError(f"an image needs three dimensions, this one has {image.GetDimension()}")
+        what = f"an image needs three dimensions, this one has {image.GetDimension()}"
+        raise ImageError(what, remedy="give one volume of the series")
     direction = np.array(image.GetDirection()).reshape(3, 3)
     return np.array(image.GetSpacing()), np.array(image.GetOrigin()), direction

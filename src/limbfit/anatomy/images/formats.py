@@ -12,6 +12,7 @@ import gzip
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -33,6 +34,8 @@ _OFFSETS = (0, 40, 70, 72, 76, 108, 123, 252, 256, 280)
 _HEADER = np.dtype({"names": _NAMES, "formats": _TYPES, "offsets": _OFFSETS, "itemsize": 348})
 _CHUNK = 1 << 22
 _FLOATS: dict[int, np.dtype[np.floating]] = {16: np.dtype("f4"), 64: np.dtype("f8")}  # codes of datatype
+# Codes of NIfTI and spaces of NRRD that say nothing of the patient; ITK takes such a space for LPS.
+_PLACELESS = {"", "0", "scanner-xyz", "3D-right-handed", "3D-left-handed"}
 _SAME_VOXELS = 0.5  # within which two statements of a voxel's place are one
 _UNITS_MM = {1: 1000.0, 2: 1.0, 3: 1e-3}  # by the code of the unit of length
 
@@ -71,7 +74,7 @@ def _read_itk(path: Path, place_keys: tuple[str, ...] = ()) -> sitk.Image:
         remedy = "check that the file is whole"
         raise ImageError("the image cannot be read", file=path, remedy=remedy) from None
     values = [reader.GetMetaData(key).strip() for key in place_keys if reader.HasMetaDataKey(key)]
-    if place_keys and set(values) <= {"", "0"}:
+    if place_keys and set(values) <= _PLACELESS:
         raise ImageError(
             "the file does not say how it lies in the patient",
             file=path,
@@ -85,13 +88,9 @@ def _read_nifti(path: Path) -> sitk.Image:
     return _read_itk(path, ("qform_code", "sform_code"))
 
 
-def _read_nrrd(path: Path) -> sitk.Image:
-    return _read_itk(path, ("NRRD_space",))
-
-
 _BUILTIN = (
     ImageFormat("NIfTI", (".nii", ".nii.gz"), _read_nifti, is_written=True),
-    ImageFormat("NRRD", (".nrrd", ".nhdr"), _read_nrrd, is_written=True),
+    ImageFormat("NRRD", (".nrrd", ".nhdr"), partial(_read_itk, place_keys=("NRRD_space",)), is_written=True),
     ImageFormat("MetaImage", (".mha", ".mhd"), _read_itk, is_written=True),
 )
 IMAGE_FORMATS = Registry("image format", {known.name: known for known in _BUILTIN})
@@ -159,7 +158,9 @@ def check_nifti(path: Path) -> None:
     except (OSError, EOFError, zlib.error, ValueError, OverflowError):
         whole, bad = False, 0
     if not whole:
-        raise ImageError("the image is cut short or damaged", file=path, remedy="copy or export it again")
+        raise ImageError(
+            "the image is cut short, damaged or NIfTI-2", file=path, remedy="export it as NIfTI-1"
+        )
     if bad:
         raise ImageError(f"{bad} voxels are not numbers", file=path, remedy="export the image again")
     forms = _read_forms(path)

@@ -32,11 +32,7 @@ def find_dicom_labels(path: Path) -> Path | None:
     Raises `LabelError` for a folder without or with several of them, and for DICOM of another kind.
     """
     if path.is_dir():
-        found = [
-            file
-            for file in sorted(path.rglob("*"))
-            if file.is_file() and _find_storage_class(file) is not None
-        ]
+        found = [file for file in sorted(path.rglob("*")) if file.is_file() and _find_storage_class(file)]
         if len(found) != 1:
             raise LabelError(
                 f"{len(found) or 'no'} DICOM segmentations or structure sets in this folder",
@@ -82,8 +78,8 @@ def read_dicom_seg(path: Path) -> LabelMap:
     try:
         with silence_readers():
             data = pydicom.dcmread(path)
-            grid, masks = _read_masks(data)
-        array, names = flatten(masks, [normalise_name(one.SegmentLabel) for one in data.SegmentSequence])
+            grid, masks, labels = _read_masks(data)
+        array, names = flatten(masks, [normalise_name(label) for label in labels])
     except LabelError:
         raise
     except Exception:  # pydicom's texts quote values of tags
@@ -93,8 +89,11 @@ def read_dicom_seg(path: Path) -> LabelMap:
     return LabelMap(array, grid.spacing, grid.origin, grid.direction, names)
 
 
-def _read_masks(data: FileDataset) -> tuple[Grid, list[Mask]]:
-    """The smallest grid that holds all frames, and a mask of each segment on it."""
+def _read_masks(data: FileDataset) -> tuple[Grid, list[Mask], list[str]]:
+    """The smallest grid that holds all frames, and a mask on it and the label of each segment.
+
+    A label map may describe its background as a segment, too (``PixelPaddingValue``): that is none.
+    """
     kind = str(data.get("SegmentationType", ""))
     if kind not in ("BINARY", "LABELMAP"):
         raise LabelError("a fractional segmentation", remedy="export a binary one")
@@ -102,15 +101,17 @@ def _read_masks(data: FileDataset) -> tuple[Grid, list[Mask]]:
     groups = [(group, shared) for group in data.PerFrameFunctionalGroupsSequence]
     pixels = data.pixel_array.reshape(len(groups), data.Rows, data.Columns)
     grid, slices = _stack_frames(groups, pixels.shape[1:])
-    numbers = [int(segment.SegmentNumber) for segment in data.SegmentSequence]
-    masks = {number: np.zeros(grid.array.shape, dtype=bool) for number in numbers}
+    labels = {int(segment.SegmentNumber): segment.SegmentLabel for segment in data.SegmentSequence}
+    if kind == "LABELMAP":
+        labels.pop(int(data.get("PixelPaddingValue", 0)), None)
+    masks = {number: np.zeros(grid.array.shape, dtype=bool) for number in labels}
     for group, plane, k in zip(groups, pixels, slices, strict=True):
         if kind == "BINARY":
             identity = find_functional_group(group, "SegmentIdentificationSequence")
             plane = np.where(plane > 0, int(identity.ReferencedSegmentNumber), 0)
         for number, mask in masks.items():
             mask[k] |= plane == number
-    return grid, [masks[number] for number in numbers]
+    return grid, list(masks.values()), list(labels.values())
 
 
 def _stack_frames(groups: list[tuple[Dataset, Dataset]], shape: tuple[int, ...]) -> tuple[Grid, Indices]:

@@ -80,7 +80,7 @@ def read_label_image(path: Path, image: sitk.Image) -> LabelMap:
     """Any scalar label image; names from ``<file>.json`` (``{"2": "tibia"}``) or the default ones."""
     if image.GetNumberOfComponentsPerPixel() != 1:
         raise LabelError("a label image has one value per voxel")
-    return LabelMap.from_sitk(image, _read_sidecar_names(path))
+    return LabelMap(sitk.GetArrayFromImage(image), *read_geometry(image), _read_sidecar_names(path))
 
 
 def find_sidecar(path: Path) -> Path:
