@@ -74,3 +74,24 @@ def test_a_file_cut_short_is_refused_and_takes_nothing_down(tmp_path, suffix, sh
     with pytest.raises(SurfaceError) as refused:
         check_closed(read_surface(file), "skin", file)
     assert str(file) in str(refused.value)
+
+
+@pytest.mark.parametrize("suffix", [".vtp", ".obj", ".ply"])
+def test_a_file_without_triangles_is_refused(tmp_path, suffix):
+    file, points = tmp_path / f"cloud{suffix}", np.eye(3)
+    if suffix == ".obj":
+        file.write_text("\n".join("v {} {} {}".format(*point) for point in points))
+    else:
+        pv.PolyData(points).save(file)
+    with pytest.raises(SurfaceError, match=f"cloud{suffix}: .*export the surface again"):
+        read_surface(file)
+
+
+def test_a_ply_file_with_more_than_points_and_faces_is_refused_and_ends_nothing(tmp_path, capfd):
+    lines = (
+        write(tmp_path / "ball.ply", None).read_bytes().replace(b"end_header", b"element edge 0\nend_header")
+    )
+    (tmp_path / "ball.ply").write_bytes(lines)
+    with pytest.raises(SurfaceError, match=r"ball\.ply: the surface cannot be read"):
+        read_surface(tmp_path / "ball.ply")
+    assert capfd.readouterr() == ("", "")

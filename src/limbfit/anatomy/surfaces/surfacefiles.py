@@ -63,7 +63,10 @@ def read_surface(
                 remedy=f"correct {key}, or export the surface again",
             )
         sign = np.array([-1.0, -1.0, 1.0]) if (coordinates or stated) == "RAS" else np.ones(3)
-        return _merge_points(Surface(surface.points * sign * UNITS_MM[unit], surface.faces))
+        merged = _merge_points(Surface(surface.points * sign * UNITS_MM[unit], surface.faces))
+        if not len(merged.faces):
+            raise SurfaceError("the file holds no triangles", remedy="export the surface again")
+        return merged
 
 
 def _read_stated_space(path: Path, poly: pv.PolyData) -> str | None:
@@ -92,7 +95,7 @@ def _read_poly(path: Path) -> pv.PolyData:
             poly = _read_ply(path) if path.suffix.lower() == ".ply" else pv.read(str(path))
     except Exception:  # readers raise many kinds; all mean the same to the user
         raise SurfaceError("the surface cannot be read", remedy="export the surface again") from None
-    if not isinstance(poly, pv.PolyData) or poly.n_cells == 0:
+    if not isinstance(poly, pv.PolyData):
         raise SurfaceError("the file holds no triangles", remedy="export the surface again")
     corners = vtk_to_numpy(poly.GetPolys().GetConnectivityArray())
     if len(corners) and not 0 <= corners.min() <= corners.max() < poly.n_points:  # VTK would take any memory
@@ -116,7 +119,7 @@ def _check_stated_counts(path: Path) -> None:
 
 def _read_ply(path: Path) -> pv.PolyData:
     """By meshio: VTK's reader takes the whole process down with it when the file is cut short."""
-    found = meshio.read(path, "ply")
+    found = meshio.ply.read(path)  # meshio.read would print what is wrong, and end the process
     faces = [np.insert(block.data, 0, block.data.shape[1], axis=1).ravel() for block in found.cells]
     return pv.PolyData(found.points.astype(float), np.concatenate(faces))
 

@@ -144,6 +144,5 @@ def read_thickness(path: str | Path, skin: Surface) -> Array:
     if not Path(path).is_file():
         raise SurfaceError("no such thickness map", file=Path(path), remedy="run the surfaces stage again")
     poly = pv.read(path)
-    faces = np.asarray(poly.faces).reshape(-1, 4)[:, 1:]
-    stored = Surface(np.asarray(poly.points), faces)
+    stored = Surface(np.asarray(poly.points), np.asarray(poly.regular_faces))
     return transfer_values(stored, np.asarray(poly.point_data[FAT_DEPTH], dtype=float)[None], skin.points)[0]

@@ -171,9 +171,8 @@ class Surface:
 
 def from_pyvista(poly: pv.PolyData) -> Surface:
     """A surface from triangulated poly-data; points that no face uses are dropped."""
-    return remove_unused_points(
-        Surface(np.asarray(poly.points), np.asarray(poly.regular_faces, dtype=np.int64))
-    )
+    faces = np.asarray(poly.regular_faces, dtype=np.int64).reshape(-1, 3)
+    return remove_unused_points(Surface(np.asarray(poly.points), faces))
 
 
 def remove_unused_points(surface: Surface) -> Surface:
