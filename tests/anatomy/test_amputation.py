@@ -9,7 +9,7 @@ from limbs import DIRECTIONS, leg_image
 from limbfit.anatomy.imaging import LabelMap
 from limbfit.anatomy.segmentation.amputation import amputate_limb
 from limbfit.anatomy.surfaces.surfaces import build_anatomy, check_anatomy
-from limbfit.errors import LabelError
+from limbfit.errors import LabelError, SurfaceError
 
 PAD = 16.0
 
@@ -87,7 +87,7 @@ def test_the_stump_becomes_surfaces(plane, stump):
 )
 def test_impossible_planes_are_refused(leg, plane, shift, factor, pad, expected):
     point, normal = plane
-    with pytest.raises(LabelError, match=expected):
+    with pytest.raises(SurfaceError if factor == 0 else LabelError, match=expected):
         amputate_limb(leg, point + shift * normal, factor * normal, pad)
 
 

@@ -277,7 +277,7 @@ def test_a_given_cut_is_kept(leg):
 
 
 def test_a_cut_without_a_direction_is_refused(anatomy):
-    with pytest.raises(SurfaceError, match="normal of the proximal cut is zero"):
+    with pytest.raises(SurfaceError, match="normal of the plane is zero"):
         replace(anatomy, cut_normal=[0, 0, 0])
 
 
@@ -355,3 +355,15 @@ def test_stl_keeps_coordinates_to_a_hundredth_of_a_millimetre(tmp_path):
     back = read_surface(tmp_path / "far.stl")
     order, other = (np.lexsort(np.round(s.points, 2).T) for s in (far, back))
     assert np.abs(far.points[order] - back.points[other]).max() < 0.01
+
+
+def test_the_limb_goes_on_beyond_a_given_cut_and_not_at_its_other_end():
+    """An arm that is held up: both ends reach the image's border, and the lower one is proximal."""
+    j, i = np.mgrid[:25, :25]
+    away = np.hypot(i - 12.0, j - 12.0) * 4.0
+    array = np.repeat([(away < 40.0) + np.uint8(away < 12.0)], 30, axis=0)
+    labels = LabelMap(array, [4.0, 4.0, 4.0], [0.0, 0.0, 0.0], np.eye(3))
+    arm = build_anatomy(labels, 8.0, ((48.0, 48.0, 20.0), (0.0, 0.0, -1.0)))
+    assert arm.skin.points[:, 2].min() == pytest.approx(20.0, abs=1e-3)
+    assert arm.skin.points[:, 2].max() == pytest.approx(118.0, abs=2.0)
+    assert arm.bones["tibia"].points[:, 2].min() < 18.0

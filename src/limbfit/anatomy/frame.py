@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..arrays import Array, Mask
 from ..errors import LabelError
 from .grid import Grid
+from .morphology import find_box
 
 
 @dataclass(frozen=True)
@@ -69,21 +70,29 @@ class ProximalEnd:
 
 def find_longest_axis(limb: Mask, grid: Grid) -> int:
     """The grid axis (0, 1, 2 for i, j, k) along which a mask is longest."""
-    extents = [_find_extent(limb, axis) for axis in range(3)]
-    return int(np.argmax([(b - a + 1) * grid.spacing[axis] for axis, (a, b) in enumerate(extents)]))
+    extents = [part.stop - part.start for part in find_box(limb)[::-1]]
+    return int(np.argmax(extents * grid.spacing))
 
 
-def find_proximal_end(limb: Mask, grid: Grid, axis: int | None = None) -> ProximalEnd:
+def find_proximal_end(
+    limb: Mask, grid: Grid, axis: int | None = None, normal: Array | None = None
+) -> ProximalEnd:
     """Where the limb was cut: at the border of the image that it reaches, else at its thicker end.
 
     The limb's axis is the grid axis along which it is longest, if it is not given. Of two ends at the
-    border, as of an intact leg, the superior one is proximal.
+    border, as of an intact leg, the superior one is proximal. A proximal direction, ``normal`` (3,) in LPS,
+    decides about both: a short limb may be wider than long, an arm may be held up.
     """
     if not limb.any():
         raise LabelError("the label map is empty", remedy="give one with the limb labelled")
+    if normal is not None:
+        axis = int(np.abs(normal @ grid.direction).argmax())
     axis = find_longest_axis(limb, grid) if axis is None else axis
-    low, high = _find_extent(limb, axis)
+    part = find_box(limb)[2 - axis]
+    low, high = part.start, part.stop - 1
     ends = [ProximalEnd(axis, -1, low), ProximalEnd(axis, 1, high)]
+    if normal is not None:
+        return max(ends, key=lambda end: end.direction(grid) @ normal)
     border = [end for end in ends if end.layer in (0, grid.size[axis] - 1)]
     if len(border) == 1:
         return border[0]
@@ -96,9 +105,3 @@ def find_proximal_end(limb: Mask, grid: Grid, axis: int | None = None) -> Proxim
 def select_layer(mask: Mask, axis: int, index: int) -> Mask:
     """One layer of ``[k, j, i]`` across grid axis 0, 1, 2 (i, j, k)."""
     return np.take(mask, index, axis=2 - axis)
-
-
-def _find_extent(mask: Mask, axis: int) -> tuple[int, int]:
-    others = tuple(n for n in range(3) if n != 2 - axis)
-    filled = np.flatnonzero(mask.any(axis=others))
-    return int(filled[0]), int(filled[-1])

@@ -10,10 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
-from vtkmodules.util.numpy_support import vtk_to_numpy
-from vtkmodules.vtkImagingStencil import vtkImageStencilToImage, vtkPolyDataToImageStencil
 
 from ...arrays import Array, Mask
 from ...errors import LabelError
@@ -21,7 +20,7 @@ from ..frame import build_limb_frame, find_proximal_end
 from ..grid import SOFT_TISSUE, Grid, LabelMap
 from ..morphology import find_largest_piece
 from ..surfaces.extraction import compute_signed_distance_to
-from ..surfaces.surfaces import Anatomy, build_anatomy
+from ..surfaces.surfaces import Anatomy, build_anatomy, normalise_plane
 from ..surfaces.triangles import Surface
 
 _STEP_MM = 0.5  # of the cross-section
@@ -55,9 +54,9 @@ def amputate_limb(
     ------
     LabelError
         For a plane that misses the limb, lies along it, points distally or cuts no bone off, or an image too
-        short for the pad.
+        short for the pad; `SurfaceError` for a normal of no length.
     """
-    point, normal = _normalise_plane(plane_point, plane_normal)
+    point, normal = normalise_plane(plane_point, plane_normal)
     if pad_mm <= 0:
         raise LabelError(f"the pad of soft tissue must be thicker than {pad_mm} mm")
     _check_direction(labels, normal)
@@ -113,14 +112,6 @@ def _interpolate_along(field: NDArray[np.float32], place: Array, axis: int) -> N
     part = np.expand_dims((place - low).astype(np.float32), tuple(n for n in range(3) if n != axis))
     below, above = np.take(field, low, axis), np.take(field, np.minimum(low + 1, last), axis)
     return below + part * (above - below)
-
-
-def _normalise_plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
-    vector = np.asarray(normal, dtype=float)
-    length = float(np.linalg.norm(vector))
-    if not length > 0:
-        raise LabelError("the normal of the amputation plane is zero", remedy="give a proximal direction")
-    return np.asarray(point, dtype=float), vector / length
 
 
 def _check_direction(labels: LabelMap, normal: Array) -> None:
@@ -254,18 +245,6 @@ def label_map(grid: Grid, limb: Mask, bones: Mapping[str, Mask]) -> LabelMap:
 
 def fill_surface(surface: Surface, grid: Grid) -> Mask:
     """``[k, j, i]``: which voxels' centres lie inside a closed surface."""
-    index = Surface(grid.point_to_index(surface.points), surface.faces)
-    stencil = vtkPolyDataToImageStencil()
-    stencil.SetInputData(index.to_pyvista())
-    stencil.SetOutputSpacing(1.0, 1.0, 1.0)
-    stencil.SetOutputOrigin(0.0, 0.0, 0.0)
-    i, j, k = grid.size
-    stencil.SetOutputWholeExtent(0, i - 1, 0, j - 1, 0, k - 1)
-    image = vtkImageStencilToImage()
-    image.SetInputConnection(stencil.GetOutputPort())
-    image.SetInsideValue(1)
-    image.SetOutsideValue(0)
-    image.SetOutputScalarTypeToUnsignedChar()
-    image.Update()
-    values = vtk_to_numpy(image.GetOutput().GetPointData().GetScalars())
-    return values.reshape(grid.array.shape).astype(bool)
+    body = Surface(grid.point_to_index(surface.points), surface.faces).to_pyvista()
+    image = body.voxelize_binary_mask(reference_volume=pv.ImageData(dimensions=grid.size))
+    return np.asarray(image["mask"]).reshape(grid.array.shape).astype(bool)

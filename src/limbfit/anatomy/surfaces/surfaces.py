@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from .extraction import extract_fine_surface, extract_surface, remesh
 from .surfacefiles import read_surface, write_surface
 from .triangles import Surface, check_closed, find_bodies, find_half_edges, from_pyvista
 
+ON_CUT_MM = 0.01  # nearer to the proximal cut, a point lies on it
 _CUT_INSIDE_MM = 2.0  # of the image's proximal end
 _STICK_OUT_MM = 6.0  # of the bones beyond the cut
 _SKIN_TOLERANCE_MM = 0.05  # how far a bone may lie outside the skin: rounding of files
@@ -55,13 +57,19 @@ class Anatomy:
     regions: Mapping[str, Surface] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        point, normal = _normalise_plane(self.cut_point, self.cut_normal)
+        point, normal = normalise_plane(self.cut_point, self.cut_normal)
         object.__setattr__(self, "cut_normal", normal)
         object.__setattr__(self, "cut_point", point)
 
     def height(self, points: ArrayLike) -> Array:
         """(...) distance of points beyond the cut plane, mm; negative inside the limb."""
         return (np.asarray(points, dtype=float) - self.cut_point) @ self.cut_normal
+
+    @cached_property
+    def open_skin(self) -> Surface:
+        """The skin up to the cut: without the flat cap that closes it there, or what goes on beyond it."""
+        below = self.height(self.skin.points) < -ON_CUT_MM
+        return Surface(self.skin.points, self.skin.faces[below[self.skin.faces].any(axis=1)])
 
 
 def build_anatomy(
@@ -90,9 +98,8 @@ def build_anatomy(
         end = find_proximal_end(labels.limb, labels)
         point, normal = _choose_default_cut(labels, end)
     else:
-        # A short limb may be wider than long: its axis follows from the cut.
-        point, normal = _normalise_plane(*proximal_cut)
-        end = find_proximal_end(labels.limb, labels, int(np.abs(normal @ labels.direction).argmax()))
+        point, normal = normalise_plane(*proximal_cut)
+        end = find_proximal_end(labels.limb, labels, normal=normal)
     own_point = np.round(labels.direction.T @ (point - labels.origin), 4)
     own_normal = np.round(labels.direction.T @ normal, 6)
     built = _build_anatomy(
@@ -155,11 +162,12 @@ def _extend_labels(labels: LabelMap, end: ProximalEnd, length_mm: float) -> Labe
     return replace(labels, array=np.pad(kept, pad, mode="edge"), origin=labels.index_to_point(start))
 
 
-def _normalise_plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
+def normalise_plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
+    """A point (3,) and the unit normal (3,) of a plane. Raises `SurfaceError` for a normal of no length."""
     vector = np.asarray(normal, dtype=float)
     length = float(np.linalg.norm(vector))
-    if length == 0:
-        raise SurfaceError("the normal of the proximal cut is zero", remedy="give a direction")
+    if not length > 0:
+        raise SurfaceError("the normal of the plane is zero", remedy="give a proximal direction")
     return np.asarray(point, dtype=float), vector / length
 
 
