@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import pyvista as pv
+from bodies import limb
 from limbs import SHARED
 
 from limbfit.anatomy.sites.sites import compute_indenter_axis, compute_square_edges, project_to_skin
@@ -80,3 +82,28 @@ def test_axes_of_the_mean_limb_agree_with_those_given() -> None:
             np.arccos(compute_indenter_axis(anatomy.skin, point, 20.0) @ np.array(site["axis"]))
         )
         assert angle < 1.0
+
+
+def test_a_site_at_the_cut_or_beyond_it_is_refused() -> None:
+    """Where a skin goes on beyond the cut, as one from a file does, and where a cap closes it there."""
+    for cut in (limb(), replace(limb(), cut_point=[12.0, -80.0, 280.0])):
+        here, up = cut.cut_point + np.array([33.0, 0.0, 0.0]), cut.cut_normal
+        for height in (0.0, 2.0):
+            with pytest.raises(SiteError, match="1: lies on the proximal cut or beyond it; move the site"):
+                project_to_skin(cut, here + height * up, "1")
+        assert cut.height(project_to_skin(cut, here - 2.0 * up)[0]) < -1.0
+
+
+def test_the_cap_at_the_cut_does_not_tilt_the_axis_of_a_site_near_it() -> None:
+    """On a limb that is narrower proximally the cap is seen from the side of the indenter."""
+    whole, taper = limb(), -0.008
+    points = whole.skin.points - whole.cut_point
+    points[:, :2] *= 1.0 + taper * np.maximum(points[:, 2:] + 70.0, 0.0)
+    cut = replace(whole, skin=replace(whole.skin, points=points + whole.cut_point))
+    radius, slope = 34.0 - 3.0 * 6.0 / 70.0, 6.0 / 70.0  # of the limb without that taper, 3 mm below the cut
+    where = np.array([radius * (1.0 + 67.0 * taper), 0.0, -3.0])
+    place, _ = project_to_skin(cut, cut.cut_point + where)
+    axis = compute_indenter_axis(cut.open_skin, place, 20.0)
+    expected = np.degrees(np.arctan(slope * (1.0 + 67.0 * taper) + radius * taper))
+    assert np.degrees(np.arcsin(axis[2])) == pytest.approx(expected, abs=1.0)
+    assert np.degrees(np.arcsin(compute_indenter_axis(cut.skin, place, 20.0)[2])) < expected - 20.0

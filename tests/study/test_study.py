@@ -226,3 +226,17 @@ def test_a_map_needs_an_image_and_one_thickness(folder: Path) -> None:
     assert "needs the fat of an [image]" in refusal(write(folder, GOOD + mapped))
     both = LAYERS.replace("thickness_mm = 4.0", 'thickness_mm = 4.0, thickness = "map"')
     assert "either thickness_mm or thickness" in refusal(write(folder, GOOD + both))
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("axis = [0, 0, 0]", r"sites\.0\.axis: a direction of no length"),
+        ("edge = [0, 0, 0]", r"sites\.0\.edge: a direction of no length"),
+        ("axis = [0, 2, 0]\nedge = [0, -1, 0]", r"sites\.0: edge is along axis"),
+    ],
+)
+def test_directions_that_are_none_are_refused(folder: Path, line: str, expected: str) -> None:
+    assert re.search(
+        expected, refusal(write(folder, GOOD.replace("fitted = true", f"fitted = true\n{line}")))
+    )

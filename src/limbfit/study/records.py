@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import Field, field_validator
 
-from .tables import Positive, TomlTable, Vector
+from .tables import Direction, Positive, TomlTable, Vector
 
 Control = Literal["displacement", "force"]
 Frame = Literal["limb", "site"]
@@ -64,13 +65,15 @@ class Site(_RecordKeys):
     speed_mm_s: Positive = 0.96
     position: Vector | None = None
     near: Vector | None = None
-    axis: Vector | None = None
-    edge: Vector | None = None
+    axis: Direction | None = None
+    edge: Direction | None = None
 
     def check_keys(self) -> None:
         super().check_keys()
         if (self.position is None) == (self.near is None):
             raise ValueError("give either position (on the skin) or near (to be matched to a marker)")
+        if self.axis and self.edge and not np.cross(self.axis, self.edge).any():
+            raise ValueError("edge is along axis; give a direction across it, or leave edge out")
         for key in ("touch_down_s", "peak_s", "ultrasound", "surface", "shear_waves"):
             if self.trace is None and getattr(self, key) is not None:
                 raise ValueError(f"{key} belongs to a record, and the site has no trace")

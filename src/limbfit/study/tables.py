@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -39,6 +40,13 @@ def _check_friction(value: Any) -> Any:
     return value
 
 
+def _check_length(vector: Vector) -> Vector:
+    if not any(vector):
+        raise ValueError("a direction of no length; give [x, y, z], not all zero")
+    return vector
+
+
+Direction = Annotated[Vector, AfterValidator(_check_length)]
 Friction = Annotated[Literal["frictionless", "sticky"] | float, BeforeValidator(_check_friction)]
 
 
@@ -139,7 +147,7 @@ class Plane(TomlTable):
     """A plane by a point and the normal that points proximally."""
 
     point: Vector
-    normal: Vector = (0.0, 0.0, 1.0)
+    normal: Direction = (0.0, 0.0, 1.0)
 
 
 class Layer(TomlTable):

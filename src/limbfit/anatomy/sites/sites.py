@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-import igl
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...arrays import Array
 from ...errors import SiteError
-from ..surfaces.surfaces import Anatomy
+from ..surfaces.surfaces import ON_CUT_MM, Anatomy
 from ..surfaces.triangles import Surface
 
 MAX_OFF_SKIN_MM = 5.0
 SAMPLE_EDGE_MM = 1.0
 AXIS_STEPS = 4
-_ON_CUT_MM = 0.01
 MAX_DEPTH_MM = 40.0  # beyond it, bone no longer stiffens what is felt
 _TICKS = np.linspace(-0.5, 0.5, 5)
 
 
 def project_to_skin(anatomy: Anatomy, position: ArrayLike, name: str | None = None) -> tuple[Array, float]:
     """The skin point (3,) nearest to a position (3,), LPS mm, and its distance in mm. Raises `SiteError` when
-    the position lies more than 5 mm off the skin; ``name`` says which site.
+    the position lies more than 5 mm off the skin, or at the proximal cut or beyond it, where the model has no
+    skin; ``name`` says which site.
     """
     query = np.asarray(position, dtype=float)
     if query.shape != (3,) or not np.isfinite(query).all():
@@ -35,15 +34,20 @@ def project_to_skin(anatomy: Anatomy, position: ArrayLike, name: str | None = No
             place=name,
             remedy="give the position in LPS millimetres of the image (3D Slicer shows RAS: negate x and y)",
         )
+    if anatomy.height(nearest[0]) > -ON_CUT_MM:
+        raise SiteError(
+            "lies on the proximal cut or beyond it",
+            place=name,
+            remedy="move the site distally, or geometry.proximal_cut, whose normal points proximally",
+        )
     return np.asarray(nearest[0], dtype=float), distance
 
 
 def find_thinnest_tissue(anatomy: Anatomy, bone: str) -> tuple[float, Array]:
     """Least distance (mm) from a bone to the skin, and where it is on the bone (3,); the cut is no skin."""
-    skin, points = anatomy.skin, anatomy.bones[bone].points
-    open_faces = skin.faces[(np.abs(anatomy.height(skin.points)) > _ON_CUT_MM)[skin.faces].any(axis=1)]
-    inner = np.ascontiguousarray(points[anatomy.height(points) < 0])
-    squared = igl.point_mesh_squared_distance(inner, skin.points, np.ascontiguousarray(open_faces))[0]
+    points = anatomy.bones[bone].points
+    inner = points[anatomy.height(points) < 0]
+    squared = anatomy.open_skin.find_nearest(inner)[0]
     least = int(np.argmin(squared))
     return float(np.sqrt(squared[least])), inner[least]
 
@@ -55,7 +59,7 @@ def compute_indenter_axis(
 
     Parameters
     ----------
-    skin : closed, outward.
+    skin : outward; of a limb its `Anatomy.open_skin`, as the cap at the cut is no skin.
     position : (3,) the footprint's centre, on the skin.
     width : side of the square, mm.
     edge : (3,) an edge direction of the square; the cross product of axis and z (or x) when not given.

@@ -67,7 +67,7 @@ def _draw(job: tuple[Path, Path, tuple[Path, ...]]) -> None:
     report.build_report(results, out)
 
 
-_PLACE = ("name", "position", "near", "axis", "region", "fitted", "indenter")
+_PLACE = ("name", "position", "near", "axis", "edge", "region", "fitted", "indenter")
 _WAVES = ("shear_waves", "shear_waves_sd_m_s", "shear_waves_bias_m_s")
 _SEEN = ("ultrasound", "ultrasound_sd_mm", "surface", "surface_sd_mm", "surface_frame", *_WAVES)
 _RECORD = ("trace", "touch_down_s", "peak_s", "control", *_SEEN)

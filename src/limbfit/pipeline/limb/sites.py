@@ -41,7 +41,8 @@ def place_site(site: Site, study: Study, anatomy: Anatomy, marker: Any) -> Place
     wanted = np.array(site.position) if marker is None else marker.position
     with name_file_in_errors(study.file, f"sites.{site.name}"):
         point, off = project_to_skin(anatomy, wanted)
-        axis = site.axis or compute_indenter_axis(anatomy.skin, point, study.width_at(site))
+        width = study.width_at(site)
+        axis = site.axis or compute_indenter_axis(anatomy.open_skin, point, width, site.edge)
     evidence = None
     if marker is not None:
         assert site.near is not None

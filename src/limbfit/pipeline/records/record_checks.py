@@ -92,7 +92,7 @@ def _collect_facts(
     if row is not None and anatomy is not None:
         width = radius * np.sqrt(np.pi)
         axis = np.array(row.axis)
-        normal = compute_indenter_axis(anatomy.skin, row.position_mm, width)
+        normal = compute_indenter_axis(anatomy.open_skin, row.position_mm, width, stated.site.edge)
         facts = {
             "position_mm": row.position_mm,
             "thickness_mm": measure_tissue_under(anatomy, row.position_mm, normal, width),

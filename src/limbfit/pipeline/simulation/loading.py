@@ -161,7 +161,7 @@ def describe_indentation(
         found.append(Extent(PRESSURE, "kPa", 0.0, 1e3 * force_N / (np.pi * radius**2)))
     if place is not None and axis is not None:
         position, width = np.array(place[0]), radius * np.sqrt(np.pi)
-        inwards = compute_indenter_axis(axis.anatomy.skin, position, width)
+        inwards = compute_indenter_axis(axis.anatomy.open_skin, position, width)
         thickness = measure_tissue_under(axis.anatomy, position, inwards, width)
         found.append(Extent(DEPTH, "", 0.0, depth_mm / thickness))
         level = float(axis.measure_level(position[None])[0])

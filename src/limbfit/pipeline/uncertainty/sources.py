@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ...anatomy.meshing.meshing import MeshSettings
-from ...anatomy.sites.sites import compute_indenter_axis, project_to_skin
+from ...anatomy.sites.sites import compute_indenter_axis
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...arrays import Array
 from ...fe import ORDER_IN_TIME
@@ -166,15 +166,13 @@ def _rotate_axis(model: SiteModel, number: int, degrees: float) -> SiteModel:
 
 def _move_site(context: Context, model: SiteModel, number: int, distance_mm: float) -> SiteModel:
     """The site elsewhere on the skin, its axis found anew; the mesh is refined widely enough around it."""
-    anatomy = load_anatomy(context.store["surfaces"])
+    skin = load_anatomy(context.store["surfaces"]).open_skin
     axis = np.array(model.axis)
     wanted = np.array(model.position) + distance_mm * _build_tangents(axis)[number]
-    point, _ = project_to_skin(anatomy, wanted)
+    (point,) = skin.find_nearest(wanted)[2]
     width = context.study.width_at(context.study.site(model.site))
-    turned = compute_indenter_axis(anatomy.skin, point, width) - compute_indenter_axis(
-        anatomy.skin, model.position, width
-    )
-    axis = axis + turned
+    here, there = (compute_indenter_axis(skin, place, width, model.edge) for place in (model.position, point))
+    axis = axis + there - here
     axis /= np.linalg.norm(axis)
     return replace(model, position=to_vector3(point), axis=to_vector3(axis))
 
