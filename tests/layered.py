@@ -15,7 +15,7 @@ from limbfit.bench.blocks import build_block_site
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
-from limbfit.mesh.boxes import SIX_TETS, build_boxes, turn_upright
+from limbfit.mesh.boxes import SIX_TETS, build_boxes
 from limbfit.phantom.record import Ramp, record
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.storage import write_json
@@ -23,6 +23,7 @@ from limbfit.pipeline.engine.store import COARSE, Store
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.pipeline.simulation.limb_geometry import find_fibre_directions
 from limbfit.study import Study, load_study
+from tetrahedra import turn_upright
 
 TISSUES = ("skin", "fat", "muscle")
 TRUTH = {

@@ -13,8 +13,9 @@ from limbfit.errors import ProblemError
 from limbfit.fe import StepControl, System, solve
 from limbfit.indentation import build_clamping_pins, clamp_problem
 from limbfit.mesh import Mesh
-from limbfit.mesh.boxes import SIX_TETS, build_boxes, turn_upright
+from limbfit.mesh.boxes import SIX_TETS, build_boxes
 from limbfit.study import ClampsTable
+from tetrahedra import turn_upright
 
 INNER, OUTER, LENGTH = 15.0, 45.0, 100.0  # mm
 UP = np.array([0.0, 0.0, 1.0])

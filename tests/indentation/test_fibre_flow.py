@@ -11,7 +11,8 @@ from limbfit.errors import ProblemError
 from limbfit.indentation import build_fibre_field, cut_neighbourhood
 from limbfit.indentation.cell_fields import compute_flow_directions
 from limbfit.mesh import Mesh
-from limbfit.mesh.boxes import HEX, SIX_TETS, build_boxes, turn_upright
+from limbfit.mesh.boxes import HEX, SIX_TETS, build_boxes
+from tetrahedra import turn_upright
 
 
 def bar(bent: bool = False) -> Mesh:

@@ -14,8 +14,9 @@ from bodies import limb
 from limbfit.donning import LoadedState, Strains
 from limbfit.identify.checks.domain import ANGLE, LEVEL, PRESSURE, RATE, SHEAR, TIME, Extent, RecordedRange
 from limbfit.mesh import Mesh, boundary_faces, cell_volumes
-from limbfit.mesh.boxes import SIX_TETS, build_boxes, turn_upright
+from limbfit.mesh.boxes import SIX_TETS, build_boxes
 from limbfit.pipeline.simulation.loading import LimbAxis, LoadHistory, describe_socket_load
+from tetrahedra import turn_upright
 
 
 @pytest.fixture(scope="module")

@@ -18,11 +18,3 @@ def build_boxes(x: Array, y: Array, z: Array) -> tuple[Array, Indices]:
     low, high = slice(None, -1), slice(1, None)
     corners = [index[i, j, k].ravel() for i in (low, high) for j in (low, high) for k in (low, high)]
     return grid.reshape(-1, 3), np.stack(corners, axis=1)
-
-
-def turn_upright(points: Array, tets: Indices) -> Indices:
-    """The tetrahedra (m, 4) with those turned over that are inside out."""
-    edges = points[tets[:, 1:]] - points[tets[:, :1]]
-    flip = np.linalg.det(edges) < 0.0
-    tets[flip] = tets[flip][:, [0, 2, 1, 3]]
-    return tets
