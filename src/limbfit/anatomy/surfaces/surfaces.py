@@ -25,7 +25,7 @@ from .extraction import extract_fine_surface, extract_surface, remesh
 from .surfacefiles import read_surface, write_surface
 from .triangles import Surface, check_closed, find_bodies, find_half_edges, from_pyvista
 
-ON_CUT_MM = 0.01  # nearer to the proximal cut, a point lies on it
+ON_CUT_MM = 0.1  # nearer to the proximal cut, a point lies on it: flat ends of files are flat to half of that
 _CUT_INSIDE_MM = 2.0  # of the image's proximal end
 _STICK_OUT_MM = 6.0  # of the bones beyond the cut
 _SKIN_TOLERANCE_MM = 0.05  # how far a bone may lie outside the skin: rounding of files
