@@ -275,10 +275,13 @@ def show_crossvalidation(found: CrossvalidateResult) -> None:
     print_line(
         f"{found.choices} of {found.choices_possible} choices of {found.fitted_sites} sites: "
         f"mean held-out error {own.median_percent:.2f} % (median; 5 to 95 %: {own.low_percent:.2f} to "
-        f"{own.high_percent:.2f} %)\n"
-        f"the study's own choice ({', '.join(own.fitted)}): {own.mean_error_heldout_percent:.2f} %; "
-        f"{100 * own.share_better:.0f} % of the choices do better"
+        f"{own.high_percent:.2f} %)"
     )
+    if own.share_better is not None:  # the study's own choice leaves sites to be predicted
+        print_line(
+            f"the study's own choice ({', '.join(own.fitted)}): {own.mean_error_heldout_percent:.2f} %; "
+            f"{100 * own.share_better:.0f} % of the choices do better"
+        )
     known = [row for row in found.sites if row.mean_percent is not None]
     rows = [{"name": f"site {row.site}", "error": row.mean_percent} for row in known]
     for fit in found.regions:

@@ -193,7 +193,7 @@ class FoldFit(ResultPart):
     parameters: Mapping[str, float] = Field(description="Its parameters, by `tissue.key`.")
     errors_percent: Mapping[str, float] = Field(description="Error of each site.")
     mean_error_fitted_percent: float = Field(description="Mean error of the fitted sites.")
-    mean_error_heldout_percent: float | None = Field(description="Mean error of the others.")
+    mean_error_heldout_percent: float | None = Field(description="Mean error of the others; null: none.")
     converged: bool = Field(description="Whether the search converged.")
     at_limit: Sequence[str] = Field(description="Parameters that ended on a bound.")
 
@@ -201,7 +201,9 @@ class FoldFit(ResultPart):
 class OwnFold(FoldFit):
     """The study's own choice among the others."""
 
-    share_better: float = Field(description="Share of the choices with a smaller held-out error.")
+    share_better: float | None = Field(
+        description="Share of the choices with a smaller held-out error; null where it fits every site."
+    )
     median_percent: float = Field(description="Median of the held-out errors.")
     low_percent: float = Field(description="Their lower quantile.")
     high_percent: float = Field(description="Their upper quantile.")

@@ -23,8 +23,9 @@ from ...errors import CalibrationError
 from ...results.uncertainty import FoldFit
 from ..fit.calibration import Calibration, CalibrationSettings, calibrate
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
-from ..fit.parameters import Unknowns, group_separately
+from ..fit.parameters import Grouping, SearchSpace, Unknowns, group_separately
 from ..fit.prediction import ErrorSummary, compute_error_percent, summarise_errors
+from ..uncertainty.uncertainty import reduce_covariance
 
 Choice = tuple[int, ...]
 Identify = Callable[[Unknowns], Calibration]
@@ -59,10 +60,6 @@ class Fold:
         errors = [self.errors_percent[i] for i in self.heldout]
         return float(np.mean(errors)) if errors else float("nan")
 
-    @property
-    def mean_fitted(self) -> float:
-        return float(np.mean([self.errors_percent[i] for i in self.fitted]))
-
     def summarise(self, sites: Sequence[str], names: Sequence[str]) -> FoldFit:
         """Return what is stored, by the names of sites and parameters."""
         return FoldFit(
@@ -70,7 +67,7 @@ class Fold:
             fitted=[sites[i] for i in self.fitted],
             parameters=dict(zip(names, self.parameters.tolist(), strict=True)),
             errors_percent=dict(zip(sites, self.errors_percent, strict=True)),
-            mean_error_fitted_percent=self.mean_fitted,
+            mean_error_fitted_percent=float(np.mean([self.errors_percent[i] for i in self.fitted])),
             mean_error_heldout_percent=self.mean_heldout if self.heldout else None,
             converged=self.converged,
             at_limit=self.at_limit,
@@ -124,13 +121,15 @@ def fit_sites(
     chosen: Choice,
     settings: CalibrationSettings | None = None,
     label: str = "",
+    grouping: Grouping | None = None,
 ) -> Fold:
-    """Fit the ``chosen`` sites with every tissue its own material, and predict all of them.
+    """Fit the ``chosen`` sites, and predict all of them.
 
     Parameters
     ----------
     simulate : returns all sites of ``measured``, in order.
     unknowns : start at the study's own answer.
+    grouping : parameters that move together, as in the study's last stage; by default each by itself.
     """
 
     def of_chosen(parameters: Array) -> list[SiteResponse]:
@@ -142,7 +141,7 @@ def fit_sites(
         [measured[i] for i in chosen],
         unknowns,
         settings or CalibrationSettings(),
-        stages=(group_separately(unknowns.names),),
+        stages=(grouping or group_separately(unknowns.names),),
     )
     errors = [
         compute_error_percent(response.force_N, site.force_N)
@@ -160,28 +159,31 @@ def cross_validate(
     choices: Sequence[Choice] | Mapping[str, Choice],
     settings: CalibrationSettings | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    grouping: Grouping | None = None,
 ) -> tuple[Fold, ...]:
     """Fit every choice (with its label if ``choices`` have names) and predict the other sites."""
     pairs = list(choices.items()) if isinstance(choices, Mapping) else [("", choice) for choice in choices]
     folds = []
     for i, (label, choice) in enumerate(pairs):
-        folds.append(fit_sites(simulate, measured, unknowns, tuple(choice), settings, label))
+        folds.append(fit_sites(simulate, measured, unknowns, tuple(choice), settings, label, grouping))
         progress(i + 1, len(pairs))
     return tuple(folds)
 
 
-def rank_fold(ranked: Fold, folds: Sequence[Fold]) -> dict[str, float]:
+def rank_fold(ranked: Fold, folds: Sequence[Fold]) -> dict[str, float | None]:
     """Rank the mean held-out error of a fold in the distribution over ``folds`` (5, 50 and 95 %).
 
-    Returns the keys of `OwnFold`: ``share_better`` of the folds have a smaller error.
+    Returns the keys of `OwnFold`: ``share_better`` of the folds have a smaller error; None where the fold
+    holds no site out.
     """
     means = np.array([fold.mean_heldout for fold in folds])
     low, middle, high = np.percentile(means, [5, 50, 95]).tolist()
     # Ties, itself above all, count half.
     ties = np.abs(means - ranked.mean_heldout) <= 1e-9
     better = float(np.mean(means < ranked.mean_heldout - 1e-9) + 0.5 * np.mean(ties))
+    share = better if ranked.heldout else None
     return {
-        "share_better": better, "median_percent": middle, "low_percent": low, "high_percent": high
+        "share_better": share, "median_percent": middle, "low_percent": low, "high_percent": high
     }  # fmt: skip
 
 
@@ -256,25 +258,25 @@ def average_errors(errors_percent: Mapping[str, float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def spread_points(centre: Array, covariance_log: Array, unknowns: Unknowns, count: int, seed: int) -> Array:
+def spread_points(centre: Array, covariance_log: Array, space: SearchSpace, count: int, seed: int) -> Array:
     """Spread ``count`` points (count, p) around a fit's answer, far from one another and inside the bounds.
 
-    An emulator learns there what fits to other records will ask of it.
+    An emulator learns there what fits to other records, which move in the same ``space``, will ask of it.
 
     Parameters
     ----------
     centre : (p,) the answer.
     covariance_log : (p, p) of the logarithms of the parameters.
     """
-    rng = np.random.default_rng(seed)
-    values, axes = np.linalg.eigh(covariance_log)
+    rng, middle = np.random.default_rng(seed), space.reduce(np.log(centre))
+    values, axes = np.linalg.eigh(reduce_covariance(covariance_log, space))
     sd = np.clip(_WIDENING * np.sqrt(np.maximum(values, 0.0)), _MIN_SD_LOG, _MAX_SD_LOG)
-    unit = rng.standard_normal((_CANDIDATES, len(centre)))
-    unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True) / np.sqrt(len(centre)), 1.0)
+    unit = rng.standard_normal((_CANDIDATES, len(middle)))
+    unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True) / np.sqrt(len(middle)), 1.0)
     found: list[int] = []
     distance = np.linalg.norm(unit, axis=1)  # to the answer, which is simulated too
     for _ in range(count):
         found.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(unit - unit[found[-1]], axis=1))
-    points = centre * np.exp((unit[found] * sd) @ axes.T)
-    return np.clip(points, unknowns.lower, unknowns.upper)
+    points = np.clip(middle + (unit[found] * sd) @ axes.T, space.lower, space.upper)
+    return np.array([space.expand(point) for point in points])

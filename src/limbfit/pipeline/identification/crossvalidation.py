@@ -30,9 +30,8 @@ from ...identify.checks.crossvalidation import (
     spread_points,
     summarise_errors_by_site,
 )
-from ...identify.fit.calibration import CalibrationSettings
 from ...identify.fit.objective import MeasuredCurve, SiteResponse
-from ...identify.fit.parameters import Unknowns
+from ...identify.fit.parameters import Unknowns, build_space
 from ...identify.fit.prediction import compute_error_percent
 from ...identify.uncertainty.emulator import Emulator
 from ...results.uncertainty import CrossvalidateResult, FoldCheck, FoldEmulator, HeldoutSite, OwnFold
@@ -43,7 +42,7 @@ from ..records.records import load_records
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import open_experiment_cache
 from .fine_meshes import correct_to_fine_meshes
-from .problem import build_problem
+from .problem import CalibrationProblem, build_problem
 from .record_simulator import RecordSimulator
 
 Runs = list[list[SiteResponse]]
@@ -84,6 +83,7 @@ def run_crossvalidate(
     )
     problem, best = build_problem(study), study.vector(stored.parameters)
     bounds, measured = problem.unknowns.with_start(best), simulator.records.measured
+    problem = replace(problem, unknowns=bounds)
     sites: dict[str, tuple[int, ...]] = {}
     for i, one in enumerate(measured):
         sites[one.site_name] = (*sites.get(one.site_name, ()), i)
@@ -98,18 +98,21 @@ def run_crossvalidate(
 
     # Where nothing is known, fits go anywhere; the emulator must not.
     covariance = np.array(stored.uncertainty.covariance_log)
-    drawn = list(spread_points(best, covariance, bounds, runs, seed))
+    space = build_space(bounds, problem.stages[-1])
+    drawn = list(spread_points(best, covariance, space, runs, seed))
     known = [(best, correction.responses), *_select_complete(context, drawn, simulate(drawn))]
     own = tuple(i for i, site in enumerate(recorded) if site.fitted)
     chosen = list_choices(len(recorded), size, choices, seed)
     regions, checks = list_choices_without_regions([site.region for site in recorded]), []
     for number, without in ((1, {}), (2, regions)):
         emulator = _fit_emulator(known)
-        fits = _fit_choices(context, emulator, bounds, measured, list(sites.values()), (own, chosen, without))
-        # The study's own, and some from the best to the worst.
+        fits = _fit_choices(
+            context, emulator, problem, measured, list(sites.values()), (own, chosen, without)
+        )
+        # The study's own where it leaves a site out, and some from the best to the worst.
         ranked = sorted(fits.folds, key=lambda fold: fold.mean_heldout)
         places = np.linspace(0, len(ranked) - 1, min(_CHECKED - 1, len(ranked))).astype(int)
-        checked = [fits.own, *(ranked[i] for i in places)]
+        checked = [*([fits.own] if fits.own.heldout else []), *(ranked[i] for i in places)]
         optima = [fold.parameters for fold in checked]
         solved = simulate(optima)
         checks += _check_folds(number, checked, solved, emulator, measured, sites)
@@ -151,7 +154,7 @@ def _fit_emulator(known: Sequence[tuple[Array, list[SiteResponse]]]) -> Emulator
 def _fit_choices(
     context: Context,
     emulator: Emulator,
-    bounds: Unknowns,
+    problem: CalibrationProblem,
     measured: Sequence[MeasuredCurve],
     groups: Sequence[Choice],
     choices: tuple[Choice, Sequence[Choice], Mapping[str, Choice]],
@@ -160,8 +163,8 @@ def _fit_choices(
 
     ``groups`` are the numbers of each site's records.
     """
-    table, (own, chosen, regions) = context.study.calibration, choices
-    settings = CalibrationSettings(objective=table.objective, relative_tolerance=1e-3, max_iterations=40)
+    (own, chosen, regions), bounds = choices, problem.unknowns
+    settings = replace(problem.settings, relative_tolerance=1e-3, max_iterations=40, stopping="relative")
     low = np.maximum(emulator.lower * np.exp(-_MARGIN), bounds.lower)
     high = np.minimum(emulator.upper * np.exp(_MARGIN), bounds.upper)
     unknowns = Unknowns(bounds.names, bounds.start, low, high, bounds.priors)
@@ -173,7 +176,7 @@ def _fit_choices(
         choices: Mapping[str, Choice], told: Callable[[int, int], None] = lambda done, total: None
     ) -> tuple[Fold, ...]:
         records = {label: expand_to_records(choice, groups) for label, choice in choices.items()}
-        folds = cross_validate(emulator, measured, unknowns, records, settings, told)
+        folds = cross_validate(emulator, measured, unknowns, records, settings, told, problem.stages[-1])
         pairs = zip(folds, choices.values(), strict=True)
         return tuple(average_by_site(fold, choice, groups) for fold, choice in pairs)
 

@@ -23,12 +23,7 @@ from ..engine.context import Context
 from ..engine.storage import write_curves, write_result
 from ..records.deviations import estimate_site_deviation, estimate_site_noise
 from ..records.record_checks import check_records
-from ..records.records import (
-    RecordSet,
-    SiteRecord,
-    load_records,
-    to_response,
-)
+from ..records.records import RecordSet, SiteRecord, load_records, to_response
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
 from ..simulation.simulations import SimulationCache

@@ -371,13 +371,14 @@ def _describe_profiles(explored: Exploration) -> list[str]:
 
 
 def _write_flat(file: Path, rows: Sequence[ResultPart]) -> None:
-    """Rows with the same keys as CSV, their lists and dictionaries as columns."""
+    """Rows of one kind as CSV, their lists and dictionaries as columns."""
     flat = [_flatten_row(row) for row in rows]
-    write_table(file, list(flat[0]) if flat else [], [list(row.values()) for row in flat])
+    fullest: dict[str, Any] = max(flat, key=len, default={})  # a row without an interval lacks its columns
+    write_table(file, list(fullest), [[row.get(head) for head in fullest] for row in flat])
 
 
 def _flatten_row(row: ResultPart) -> dict[str, Any]:
-    """Lists and dictionaries of a row as columns."""
+    """Lists and dictionaries of a row as columns; what is None has none."""
     flat: dict[str, Any] = {}
     for key, value in row.to_plain().items():
         if isinstance(value, dict):
@@ -386,6 +387,6 @@ def _flatten_row(row: ResultPart) -> dict[str, Any]:
             flat |= {f"{key}_low": value[0], f"{key}_high": value[1]}
         elif isinstance(value, list):
             flat[key] = " ".join(map(str, value))
-        else:
+        elif value is not None:
             flat[key] = value
     return flat

@@ -13,7 +13,7 @@ import numpy as np
 from ...arrays import Array
 from ...identify.fit.multifidelity import MeshCorrection
 from ...identify.fit.objective import SiteResponse
-from ...identify.fit.parameters import build_space, group_by_kind
+from ...identify.fit.parameters import build_space
 from ...identify.uncertainty.exploration import Exploration, ExplorationSettings, explore_posterior
 from ...identify.uncertainty.likelihood import Likelihood
 from ...identify.uncertainty.model_comparison import compare_models, fit_alternative
@@ -72,7 +72,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
         report=report,
     )
     evidence = None
-    if len(study.tissues) > 1:
+    if len(problem.stages) > 1:
         evidence = _compare_groupings(context, problem, explored)
     gain = FitSensitivity.linearise(known, correction.responses)
     changes = simulate_sources(context, folder, cache, records, best) if table.sources else []
@@ -99,7 +99,7 @@ def _compare_groupings(
 ) -> EvidenceComparison:
     """One material against the study's own, on one emulator and covariance, and where nothing was fitted."""
     unknowns, titles, likelihood = problem.unknowns, problem.titles, explored.likelihood
-    space = build_space(unknowns, group_by_kind(unknowns.names))
+    space = build_space(unknowns, problem.stages[0])
     single = Likelihood(likelihood.emulator, likelihood.measured, likelihood.model, unknowns, space)
     start = context.study.vector(context.results.calibration.stages[0].parameters)
     one, _ = fit_alternative(titles[0], single, space.reduce(np.log(start)))

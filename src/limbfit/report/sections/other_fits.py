@@ -38,8 +38,8 @@ def _draw_errors(content: CrossvalidateResult) -> Figure:
     drawing, axes = make_panels(2, 2, 2.8)
     ax = axes[0]
     ax.hist(means, bins=min(24, max(5, len(means) // 3)), color=SIMULATED, alpha=0.6, label="choices")
-    assert own.mean_error_heldout_percent is not None
-    ax.axvline(own.mean_error_heldout_percent, color=ONE_MATERIAL, lw=2, label="the study's choice")
+    if own.mean_error_heldout_percent is not None:
+        ax.axvline(own.mean_error_heldout_percent, color=ONE_MATERIAL, lw=2, label="the study's choice")
     ax.axvline(own.median_percent, color=INK, lw=1, ls="--", label="middle")
     ax.set_xlabel("Mean held-out error (%)")
     ax.set_ylabel("Choices of sites")
