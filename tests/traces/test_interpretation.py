@@ -11,7 +11,7 @@ import pytest
 from conftest import write_trace
 from limbfit import check_study, load_study
 from limbfit.errors import InputError, StudyError, TraceError
-from limbfit.traces import Trace, find_touch_down, interpret_record
+from limbfit.traces import Trace, check_trace, find_touch_down, interpret_record
 
 pytestmark = pytest.mark.usefixtures("commands_unasked")
 NOISE_N = 0.03
@@ -277,3 +277,45 @@ def test_a_mesh_of_billions_of_cells_is_refused(study, table):
     text = (study / "study.toml").read_text()
     (study / "study.toml").write_text(text.replace("0.01", str(least)))
     load_study(study)
+
+
+@pytest.mark.parametrize("value", [9.0, 9999.0])
+@pytest.mark.parametrize("place", [0, 300, -1])
+def test_one_sample_that_sticks_out_is_replaced_wherever_it_is(place, value):
+    trace, _ = record(clear=1.0)
+    for column in ("displacement_mm", "force_N"):
+        values = getattr(trace, column).copy()
+        values[place] = value if column == "displacement_mm" else 10 * value
+        spiked = replace(trace, **{column: values})
+        check_trace(spiked)
+        found = interpret_record(spiked)
+        assert kinds(found) == ["spikes"]
+        assert found.touch_down.displacement_mm == pytest.approx(1.0, abs=0.1)
+
+
+def test_samples_of_another_indentation_before_a_record_are_refused():
+    trace, _ = record()
+    displacement = trace.displacement_mm.copy()
+    displacement[:2] = 6.0
+    with pytest.raises(TraceError, match=r"starts at 6 mm and falls to .* at once; cut off the samples"):
+        check_trace(replace(trace, displacement_mm=displacement))
+
+
+def test_rows_left_out_leave_what_was_said_of_reading_the_record():
+    trace, _ = record()
+    twice = np.repeat(np.arange(len(trace.time_s)), np.arange(len(trace.time_s)) % 50 // 49 + 1)
+    columns = (trace.time_s[twice], trace.displacement_mm[twice], trace.force_N[twice])
+    found = interpret_record(Trace(*columns, ("the force is converted",)))
+    assert "rows" in kinds(found)
+    assert found.trace.notes == ("the force is converted",)
+
+
+def test_a_stated_force_that_rises_within_a_sample_is_refused():
+    time = np.arange(0.0, 22.6, 0.1)
+    random = np.random.default_rng(0)
+    force = np.interp(time, [1.0, 1.1, 21.1, 21.2], [0.0, 5.0, 5.0, 0.0])
+    creep = 3.0 * (force / 5.0) ** 0.6 * (1.2 - 0.2 * np.exp(-np.maximum(time - 1.0, 0.0) / 5.0))
+    depth = np.interp(time, [0.0, 1.0], [0.0, 0.5]) + creep + 0.005 * random.standard_normal(time.size)
+    trace = Trace(time, depth, force + 0.02 * random.standard_normal(time.size))
+    with pytest.raises(TraceError, match="does not rise where the skin is met; sample it faster"):
+        interpret_record(trace, forced=True)

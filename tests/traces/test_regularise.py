@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 import pytest
-from made_records import OPENLIMB, needs_openlimb, record
+from made_records import OPENLIMB, needs_openlimb, path_record, record
 
 from limbfit.traces import Trace, find_touch_down, read_trace, regularise
 from limbfit.traces.regularise import _fit_spline
@@ -133,3 +133,11 @@ def test_foreign_records_keep_their_peak(site):
     assert curve.peak_force_N == pytest.approx(facts["peak_force_N"], abs=0.03)
     assert curve.noise_N == pytest.approx(0.03, rel=0.1)
     assert curve.speed_load_mm_s == pytest.approx(facts["speed_mm_s"], rel=2e-3)
+
+
+@pytest.mark.parametrize("samples", range(3, 12))
+def test_a_hold_of_a_few_samples_is_smoothed_too(samples):
+    hold = samples / 50.0
+    trace, force = path_record([0.0, 1.5, 1.5 + hold, 3.0 + hold], [0.0, 5.4, 5.4, 0.0], rate=50.0)
+    smooth = regularise(trace, find_touch_down(trace))
+    assert smooth.peak_force_N == pytest.approx(force(np.array([1.5]))[0], rel=0.03)

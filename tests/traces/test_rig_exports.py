@@ -121,6 +121,16 @@ def test_what_would_need_a_guess_is_refused_and_the_column_option_named(tmp_path
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("unit", ["kg", "g", "lb", "V"])
+def test_a_unit_beside_the_name_that_is_no_force_is_refused(tmp_path, truth, unit):
+    names = ("Time", "Extension", f"Load [{unit}]")
+    path = write(tmp_path / "a.csv", ["\t".join(names), *rows(truth)])
+    with pytest.raises(
+        TraceError, match=rf"units: the unit '{unit}' of column 'Load \[{unit}\]' is none of N, "
+    ):
+        read_trace(path, names)
+
+
 def test_units_that_contradict_each_other_are_refused(tmp_path, truth):
     lines = ["Time\tExtension (m)\tLoad", "s\tmm\tN", *rows(truth)]
     with pytest.raises(TraceError, match=r"the unit 'mm and m' of column .*displacement_mm = "):

@@ -48,7 +48,7 @@ def mend_times(trace: Trace) -> tuple[Trace, list[TraceWarning]]:
         return trace, []
     twice = same & np.r_[False, (np.diff(trace.displacement_mm) == 0.0) & (np.diff(trace.force_N) == 0.0)]
     if np.array_equal(twice, same) and count < _MAX_REPEATED * n:
-        kept = Trace(time[~same], trace.displacement_mm[~same], trace.force_N[~same])
+        kept = Trace(time[~same], trace.displacement_mm[~same], trace.force_N[~same], trace.notes)
         what = f"{count} of {n} rows are there twice and were left out once"
         cause = "an export that repeats rows"
         return kept, [TraceWarning("rows", what, cause, "check the export", {"doubled_rows": float(count)})]

@@ -170,7 +170,7 @@ def _remove_spikes(trace: Trace) -> tuple[Trace, list[TraceWarning]]:
 
 def _find_spikes(values: Array) -> Mask:
     """Find the samples (n,) that stick out from the median of their neighbours, one or two in a row."""
-    off = values - median_filter(values, 2 * _SPIKE_WIDTH + 1, mode="nearest")
+    off = values - median_filter(values, 2 * _SPIKE_WIDTH + 1, mode="mirror")
     noise = max(1.4826 * float(np.median(np.abs(off))), estimate_noise_level(values))
     share = _SPIKE_SHARE * float(np.ptp(np.percentile(values, [1, 99])))
     out = np.abs(off) > max(_SPIKE_NOISE * noise, share, _SPIKE_RESOLUTION * find_resolution(values))

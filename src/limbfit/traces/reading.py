@@ -33,6 +33,8 @@ _UNITS: Mapping[str, Mapping[str, float]] = {  # by the end of a column's key; "
         "lbf": 4.4482216152605,
     },
 }
+# Of a load cell that shows a mass or is not calibrated: in brackets these are units too, and not known ones
+_OTHER_UNITS = ("kg", "g", "t", "lb", "lbs", "oz", "gf", "kp", "V", "mV", "%")
 _BRACKETED = re.compile(r".*[\[(]\s*(?P<unit>[^\[\]()]+?)\s*[\])]")
 _DAY_S = 86400.0
 _CLOCK = re.compile(
@@ -126,7 +128,8 @@ def _find_factor(unit: str, key: str, name: str, notes: list[str]) -> float:
     beside = _BRACKETED.fullmatch(name)
     below = _BRACKETED.fullmatch(unit)
     units = [below["unit"] if below else unit] if unit else []
-    if beside and _get_factor(known, beside["unit"]):  # other brackets hold other things than units
+    # Other brackets hold other things than units.
+    if beside and (_get_factor(known, beside["unit"]) or beside["unit"] in _OTHER_UNITS):
         units.append(beside["unit"])
     factors = {_get_factor(known, one) for one in units} or {1.0}
     factor = factors.pop()

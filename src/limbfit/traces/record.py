@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from ..errors import TraceError
 from .numerics import Array, average_in_bins, estimate_noise_level
@@ -97,27 +98,31 @@ def _check_contact(trace: Trace, columns: tuple[str, str, str]) -> None:
 
 
 def _check_units(trace: Trace, columns: tuple[str, str, str]) -> None:
-    start = float(np.median(trace.displacement_mm[:5]))
-    inward = float(trace.displacement_mm.max()) - start
-    if inward <= 0.5 * (start - float(trace.displacement_mm.min())):
+    # Single samples that stick out are replaced later, and say nothing of units.
+    u, force = (median_filter(one, 5, mode="mirror") for one in (trace.displacement_mm, trace.force_N))
+    start = float(np.median(u[:5]))
+    inward = float(u.max()) - start
+    if inward <= 0.5 * (start - float(u.min())):
         remedy = "displacement into the limb must be positive: change the sign"
         raise TraceError("the displacement falls", place=columns[1], remedy=remedy)
     _check_range(inward, TRAVEL_RANGE, "travel", "mm", {1e3: "metres", 1e-3: "micrometres"}, columns[1])
-    speed = _compute_typical_speed(trace)
+    speed = _compute_typical_speed(trace.time_s, u)
     guesses = {1e3: "milliseconds", 1e6: "microseconds", 1 / 60: "minutes"}
     _check_range(speed, SPEED_RANGE, "speed", "mm/s", guesses, columns[0])
-    peak = float(trace.force_N.max())
+    peak = float(force.max())
     guesses = {1e3: "kilonewtons", 1e-3: "millinewtons", 9.81e-3: "grams"}
     _check_range(peak, PEAK_RANGE, "peak force", "N", guesses, columns[2])
 
 
-def _compute_typical_speed(trace: Trace) -> float:
-    """Speed on the way in between 20 and 80 % of the travel, mm/s."""
-    u = trace.displacement_mm
+def _compute_typical_speed(time: Array, u: Array) -> float:
+    """Speed on the way in between 20 and 80 % of the travel, mm/s, from displacements (n,) mm."""
     low, high = np.median(u[:5]), u.max()
     top = int(np.argmax(u >= low + 0.8 * (high - low)))
-    foot = int(np.flatnonzero(u[: top + 1] <= low + 0.2 * (high - low))[-1])
-    return float((u[top] - u[foot]) / (trace.time_s[top] - trace.time_s[foot]))
+    below = np.flatnonzero(u[: top + 1] <= low + 0.2 * (high - low))
+    if not len(below):
+        what = f"the displacement starts at {u[0]:.3g} mm and falls to {low:.3g} mm at once"
+        raise TraceError(what, remedy="cut off the samples before the indenter moves in")
+    return float((u[top] - u[below[-1]]) / (time[top] - time[below[-1]]))
 
 
 def _check_range(

@@ -21,7 +21,8 @@ from .numerics import Array, average_in_bins, build_cubic_interpolation, compute
 from .record import Trace
 from .touchdown import TouchDown
 
-_MIN_SAMPLES = 5  # of a part
+_MIN_SAMPLES = 5  # of a part: a spline's
+_MIN_CROWDED = 8  # of a hold: fewer, averaged over ever longer runs, are fewer averages than a spline needs
 _MAX_BINS = 200  # per part: a smoothing spline of so many averages equals that of all samples
 _TIME_TOLERANCE = 1e-9  # of a corner and a point there
 _END_WEIGHT = 1e3  # weight of a shared end point, in weights of its whole part
@@ -181,8 +182,9 @@ class SmoothCurve:
             self._clocks.append(_PhaseClock(start, end, DENSER if is_hold else 1.0))
         parts = [(time >= clock.start_s) & (time <= clock.end_s) for clock in self._clocks]
         self._bins = [
-            average_in_bins(clock(time[part]), force[part], _MAX_BINS, clock.power)
+            average_in_bins(clock(time[part]), force[part], _MAX_BINS, clock.power if enough else 1.0)
             for clock, part in zip(self._clocks, parts)
+            for enough in [part.sum() >= _MIN_CROWDED]
         ]
         given = [(smoothing, smoothing)] * len(self._bins)
         self._splines, self._penalties = self._fit_splines([averages for _, averages, _ in self._bins], given)

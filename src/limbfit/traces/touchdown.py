@@ -226,6 +226,10 @@ def _weigh_onsets(part: OnsetPart, whiten: Array, places: Array, zeroed: bool) -
     if zeroed:
         weight -= np.log1p((baseline / (_ZERO_SHARE * part.rise_N)) ** 2)
     least, free = float(misfit.min()), max(len(force) - 5, 1)
+    if not np.isfinite(least):
+        raise TraceError(
+            "the force does not rise where the skin is met", remedy="sample it faster, or check it"
+        )
     weight -= 0.5 * misfit / max(1.0, least / free)
     share = np.exp(weight - weight.max())
     share /= share.sum()
