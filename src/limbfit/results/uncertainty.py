@@ -201,9 +201,7 @@ class FoldFit(ResultPart):
 class OwnFold(FoldFit):
     """The study's own choice among the others."""
 
-    share_better: float | None = Field(
-        description="Share of the choices with a smaller held-out error; null where it fits every site."
-    )
+    share_better: float | None = Field(description="Share of choices with less held-out error; null: none.")
     median_percent: float = Field(description="Median of the held-out errors.")
     low_percent: float = Field(description="Their lower quantile.")
     high_percent: float = Field(description="Their upper quantile.")

@@ -24,7 +24,7 @@ from ...results.uncertainty import FoldFit
 from ..fit.calibration import Calibration, CalibrationSettings, calibrate
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
 from ..fit.parameters import Grouping, SearchSpace, Unknowns, group_separately
-from ..fit.prediction import ErrorSummary, compute_error_percent, summarise_errors
+from ..fit.prediction import ErrorSummary, compute_error_percent, compute_errors_percent, summarise_errors
 from ..uncertainty.uncertainty import reduce_covariance
 
 Choice = tuple[int, ...]
@@ -143,13 +143,10 @@ def fit_sites(
         settings or CalibrationSettings(),
         stages=(grouping or group_separately(unknowns.names),),
     )
-    errors = [
-        compute_error_percent(response.force_N, site.force_N)
-        for response, site in zip(simulate(found.parameters), measured, strict=True)
-    ]
+    errors = compute_errors_percent(simulate(found.parameters), measured)
     is_at_bound = unknowns.is_at_bound(found.parameters)
     at_limit = tuple(name for name, stuck in zip(unknowns.names, is_at_bound) if stuck)
-    return Fold(chosen, found.parameters, tuple(errors), found.converged, at_limit, label)
+    return Fold(chosen, found.parameters, errors, found.converged, at_limit, label)
 
 
 def cross_validate(

@@ -25,7 +25,7 @@ from .objective import (
     find_new_warnings,
 )
 from .parameters import Grouping, SearchSpace, Unknowns, build_space, build_stage_groupings
-from .prediction import compute_error_percent
+from .prediction import compute_errors_percent
 from .trust_region import FIRST_RADIUS, SearchPoint, SearchStep, minimise
 
 # Where the very first simulation fails: once more, then ever closer to the middle of the bounds.
@@ -287,10 +287,7 @@ class _Search:
 
     def build_iterate(self, stage: int, point: SearchPoint) -> Iterate:
         parameters = self.build_space(stage).expand(point.z)
-        errors = tuple(
-            compute_error_percent(response.force_N, site.force_N)
-            for response, site in zip(self.responses_at(parameters), self.measured)
-        )
+        errors = compute_errors_percent(self.responses_at(parameters), self.measured)
         return Iterate(stage, tuple(parameters.tolist()), point.cost, errors, self.evaluations, self.failures)
 
     def iterate_states(self, state: SearchState | None) -> Iterator[SearchState]:
@@ -450,10 +447,7 @@ def move_answer(
     prior_deviations = calibration.settings.force_error_percent / 100 * (rows @ np.log(parameters) - target)
     cost = 0.5 * float(left @ left + prior_deviations @ prior_deviations)
     before, last = calibration.history[-1], calibration.stages[-1]
-    errors = tuple(
-        compute_error_percent(one.force_N, site.force_N)
-        for one, site in zip(responses, measured, strict=True)
-    )
+    errors = compute_errors_percent(responses, measured)
     end = tuple(map(float, parameters))
     iterate = Iterate(before.stage, end, cost, errors, before.evaluations + 1, before.failures)
     stage = replace(

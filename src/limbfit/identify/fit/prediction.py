@@ -10,7 +10,7 @@ from scipy.special import stdtrit
 
 from ...arrays import Array
 from ...results.identification import CalibrationUncertainty, RecordResiduals, RelaxationBeyond
-from .objective import SiteResponse, find_largest_magnitude
+from .objective import MeasuredCurve, SiteResponse, find_largest_magnitude
 
 MAX_FREEDOM = 1e6  # of Student's distribution: a normal one
 MIN_FREEDOM = 3.0  # of a misfit: it is similar at other sites and in other studies
@@ -22,6 +22,14 @@ def compute_error_percent(simulated_N: Array, measured_N: Array) -> float:
     Measured lengths may be negative; their largest magnitude is taken.
     """
     return float(100 * np.mean(np.abs(simulated_N - measured_N)) / find_largest_magnitude(measured_N))
+
+
+def compute_errors_percent(
+    responses: Sequence[SiteResponse], measured: Sequence[MeasuredCurve]
+) -> tuple[float, ...]:
+    """Return the error of each record in percent."""
+    pairs = zip(responses, measured, strict=True)
+    return tuple(compute_error_percent(response.force_N, site.force_N) for response, site in pairs)
 
 
 def combine_freedom(*parts: tuple[Array | float, float]) -> Array:
@@ -54,16 +62,15 @@ class ErrorSummary:
     sites: int
     mean_percent: float
     sd_percent: float
-    largest_percent: float
 
 
 def summarise_errors(errors_percent: Sequence[float]) -> ErrorSummary:
     """Summarise the errors of a group of sites."""
     errors = np.asarray(errors_percent, dtype=float)
     if errors.size == 0:
-        return ErrorSummary(0, np.nan, np.nan, np.nan)
+        return ErrorSummary(0, np.nan, np.nan)
     sd = float(errors.std(ddof=1)) if errors.size > 1 else np.nan
-    return ErrorSummary(errors.size, float(errors.mean()), sd, float(errors.max()))
+    return ErrorSummary(errors.size, float(errors.mean()), sd)
 
 
 def compute_prediction_sd(

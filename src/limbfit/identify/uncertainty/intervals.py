@@ -16,7 +16,7 @@ import numpy as np
 
 from ...arrays import Array
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
-from ..fit.prediction import compute_error_percent
+from ..fit.prediction import compute_errors_percent
 from .emulator import Emulator
 from .likelihood import Likelihood
 from .posterior import Posterior, sample_by_importance, sample_posterior
@@ -58,10 +58,7 @@ class EvaluationStore:
 
     def select_near(self, measured: Sequence[MeasuredCurve]) -> EvaluationStore:
         """Return the evaluations whose forces came near the records, the nearest first."""
-        errors = [
-            float(np.mean([compute_error_percent(r.force_N, site.force_N) for r, site in zip(run, measured)]))
-            for run in self.responses
-        ]
+        errors = [float(np.mean(compute_errors_percent(run, measured))) for run in self.responses]
         order = [i for i in np.argsort(errors) if errors[i] <= _NEAR_FACTOR * min(errors) + _NEAR_PERCENT]
         chosen = order[:_MAX_EVALUATIONS]
         return EvaluationStore([self.points[i] for i in chosen], [self.responses[i] for i in chosen])

@@ -266,10 +266,6 @@ class Uncertainty:
         """True for each parameter that lies at one of its bounds."""
         return tuple(map(bool, self.unknowns.is_at_bound(self.parameters)))
 
-    @property
-    def sd_log(self) -> Array:
-        return np.sqrt(np.diag(self.covariance))
-
 
 def estimate_uncertainty(
     parameters: Array,

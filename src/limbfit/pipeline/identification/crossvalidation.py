@@ -7,7 +7,7 @@ from those too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from math import comb
@@ -31,7 +31,6 @@ from ...identify.checks.crossvalidation import (
     summarise_errors_by_site,
 )
 from ...identify.fit.objective import MeasuredCurve, SiteResponse
-from ...identify.fit.parameters import Unknowns, build_space
 from ...identify.fit.prediction import compute_error_percent
 from ...identify.uncertainty.emulator import Emulator
 from ...results.uncertainty import CrossvalidateResult, FoldCheck, FoldEmulator, HeldoutSite, OwnFold
@@ -82,8 +81,8 @@ def run_crossvalidate(
         partial(context.tell, "crossvalidate", 0, 0),
     )
     problem, best = build_problem(study), study.vector(stored.parameters)
-    bounds, measured = problem.unknowns.with_start(best), simulator.records.measured
-    problem = replace(problem, unknowns=bounds)
+    problem = replace(problem, unknowns=problem.unknowns.with_start(best))
+    measured = simulator.records.measured
     sites: dict[str, tuple[int, ...]] = {}
     for i, one in enumerate(measured):
         sites[one.site_name] = (*sites.get(one.site_name, ()), i)
@@ -94,18 +93,20 @@ def run_crossvalidate(
         for i, point in enumerate(points):
             context.tell("crossvalidate", i, len(points), f"simulation {i + 1} of {len(points)}")
             found.append(correction.as_fine(simulator.search(point)))
+            if failed := _describe_failed(found[-1]):
+                told = f"warning: a simulation failed at site {failed}: the emulator does without it"
+                context.tell("crossvalidate", 0, 0, told)
         return found
 
     # Where nothing is known, fits go anywhere; the emulator must not.
     covariance = np.array(stored.uncertainty.covariance_log)
-    space = build_space(bounds, problem.stages[-1])
-    drawn = list(spread_points(best, covariance, space, runs, seed))
-    known = [(best, correction.responses), *_select_complete(context, drawn, simulate(drawn))]
+    drawn = list(spread_points(best, covariance, problem.space, runs, seed))
+    points, known = [best, *drawn], [correction.responses, *simulate(drawn)]
     own = tuple(i for i, site in enumerate(recorded) if site.fitted)
     chosen = list_choices(len(recorded), size, choices, seed)
     regions, checks = list_choices_without_regions([site.region for site in recorded]), []
     for number, without in ((1, {}), (2, regions)):
-        emulator = _fit_emulator(known)
+        emulator = Emulator(np.array(points), known)
         fits = _fit_choices(
             context, emulator, problem, measured, list(sites.values()), (own, chosen, without)
         )
@@ -116,11 +117,13 @@ def run_crossvalidate(
         optima = [fold.parameters for fold in checked]
         solved = simulate(optima)
         checks += _check_folds(number, checked, solved, emulator, measured, sites)
-        known += _select_complete(context, optima, solved)
-    last = _fit_emulator(known)
-    summary = FoldEmulator(runs=len(known), loo_percent=float(np.median(last.loo_percent)), checks=checks)
+        points, known = points + optima, known + solved
+    last = Emulator(np.array(points), known)
+    summary = FoldEmulator(
+        runs=len(last.points), loo_percent=float(np.median(last.loo_percent)), checks=checks
+    )
     possible = comb(len(recorded), size)
-    content = _build_result(study, bounds.names, tuple(sites), fits, size, possible, summary)
+    content = _build_result(study, problem.unknowns.names, tuple(sites), fits, size, possible, summary)
     write_result(folder / "crossvalidate.json", content)
 
 
@@ -130,25 +133,6 @@ class _Fits(NamedTuple):
     own: Fold
     folds: tuple[Fold, ...]
     regions: tuple[Fold, ...]
-
-
-def _select_complete(
-    context: Context, points: Iterable[Array], runs: Runs
-) -> list[tuple[Array, list[SiteResponse]]]:
-    """The points whose simulations came to their end, with these; the others are told."""
-    found = []
-    for point, run in zip(points, runs, strict=True):
-        if failed := _describe_failed(run):
-            told = f"warning: a simulation failed at site {failed}: the emulator does without it"
-            context.tell("crossvalidate", 0, 0, told)
-        else:
-            found.append((point, run))
-    return found
-
-
-def _fit_emulator(known: Sequence[tuple[Array, list[SiteResponse]]]) -> Emulator:
-    points, runs = zip(*known, strict=True)
-    return Emulator(np.array(points), list(runs))
 
 
 def _fit_choices(
@@ -167,7 +151,7 @@ def _fit_choices(
     settings = replace(problem.settings, relative_tolerance=1e-3, max_iterations=40, stopping="relative")
     low = np.maximum(emulator.lower * np.exp(-_MARGIN), bounds.lower)
     high = np.minimum(emulator.upper * np.exp(_MARGIN), bounds.upper)
-    unknowns = Unknowns(bounds.names, bounds.start, low, high, bounds.priors)
+    unknowns = replace(bounds, lower=low, upper=high)
 
     def tell(done: int, total: int) -> None:
         context.tell("crossvalidate", done, total, f"{done} of {total} choices fitted")
