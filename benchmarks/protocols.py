@@ -46,7 +46,7 @@ from limbfit.pipeline.design.protocol import DETERMINED
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.storage import read_json
 from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.identification.problem import build_unknowns
+from limbfit.pipeline.identification.problem import build_problem
 from limbfit.pipeline.simulation.limb_geometry import build_site_model, coarsen_model
 from limbfit.pipeline.simulation.simulations import (
     SimulationCache,
@@ -162,7 +162,7 @@ def told_of(
 def wanted_of(folder: Path, limb: Limb, edge_mm: float | None) -> DesignTarget:
     """All eight parameters, given the study's bounds."""
     return DesignTarget(
-        compute_bounds_information(build_unknowns(plan_study(folder, limb, edge_mm))), np.eye(8)
+        compute_bounds_information(build_problem(plan_study(folder, limb, edge_mm)).space), np.eye(8)
     )
 
 

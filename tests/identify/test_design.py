@@ -24,11 +24,14 @@ from limbfit.identify.checks.design import (
     compute_field_information,
     evaluate_design,
     plan_records,
+    sample_tissues,
 )
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
+from limbfit.identify.fit.parameters import build_space, constrain, group_separately
 
-PRIOR = compute_bounds_information(PAPER)
+SPACE = build_space(PAPER, group_separately(PAPER.names))
+PRIOR = compute_bounds_information(SPACE)
 
 
 def lines(slopes, noise=0.1):
@@ -267,3 +270,35 @@ def test_records_of_a_site_share_what_it_is_off_by():
         many, range(5), 1
     )[0]
     assert np.diag(known) == pytest.approx([share**2, 0.0, 0.0], rel=1e-2, abs=1e-8)
+
+
+def test_what_a_study_fixes_is_known_and_what_it_ties_is_one():
+    """skin.m is fixed; the records tell tau_s of both tissues only together."""
+    fixed, tied = ["skin.m"], [["skin.tau_s", "muscle.tau_s"]]
+    space = build_space(PAPER, constrain(group_separately(PAPER.names), PAPER.names, fixed, tied))
+    candidates = [
+        build_candidate(f"s{k}", 4.0, site.respond(TRUTH), TRUTH, NoiseModel(0.05))
+        for k, site in enumerate(SITES)
+    ]
+    prior = compute_bounds_information(space)
+    factors = evaluate_design(candidates, [0, 1], prior).factors_95
+    assert factors[1] == pytest.approx(1.0, abs=1e-3)
+    assert factors[3] == pytest.approx(factors[7], rel=1e-3)
+    # Exactly: the information in the space of what moves.
+    inside = [space.tie.T @ one.information @ space.tie for one in candidates]
+    bounds = np.diag(12.0 / (space.upper - space.lower) ** 2)
+    exact = np.linalg.inv(bounds + inside[0] + inside[1])
+    assert np.log(factors[0]) == pytest.approx(1.959964 * np.sqrt(exact[0, 0]), rel=1e-4)
+    pair, single = (evaluate_design(candidates, chosen, prior) for chosen in ([0, 1], [0]))
+    ratio = np.linalg.det(bounds + inside[0]) / np.linalg.det(bounds + inside[0] + inside[1])
+    assert compute_efficiency(single, pair, "D") == pytest.approx(ratio ** (1 / 6), rel=1e-3)
+
+
+def test_sampled_tissues_keep_what_a_study_fixes_and_ties():
+    fixed, tied = ["skin.m"], [["skin.tau_s", "muscle.tau_s"]]
+    known = PAPER.with_start(np.where(np.arange(8) % 4 == 3, 0.4, TRUTH))
+    space = build_space(known, constrain(group_separately(PAPER.names), PAPER.names, fixed, tied))
+    tissues = sample_tissues(known, space, known.start, 9, seed=1)
+    assert np.all(tissues[:, 1] == known.start[1])
+    assert tissues[:, 3] == pytest.approx(tissues[:, 7])
+    assert len(np.unique(tissues[:, 0])) == 9

@@ -91,7 +91,7 @@ def test_what_the_study_file_decides_is_said_at_once(study, command):
 
 
 def test_options_are_judged_at_once(study):
-    given = load_study(study)
+    given = with_change(study, ("[[sites]]", '[calibration]\nfixed = ["skin.m"]\n[[sites]]'))
     for call, words in (
         (experiment("crossvalidate", fit=2), "2 of 2 recorded sites"),
         (experiment("sensitivity-mesh", factors=[1.0]), "one mesh cannot be compared"),
@@ -100,6 +100,7 @@ def test_options_are_judged_at_once(study):
         (lambda s: design_study(s, sites=3), "3 sites are wanted of 2"),
         (lambda s: plan_protocol(s, determine=("bone.c_kPa",)), r"no parameter is named 'bone\.c_kPa'"),
         (lambda s: plan_protocol(s, minutes=1), "no record fits into 1 min"),
+        (lambda s: plan_protocol(s, determine=("skin.m",)), r"the study fixes 'skin\.m'"),
     ):
         with pytest.raises(InputError, match=words):
             call(given)

@@ -13,7 +13,7 @@ from conftest import COARSE
 from limbfit.errors import InputError
 from limbfit.identify.checks.design import sample_tissues
 from limbfit.pipeline.design.protocol import DESIGNED, PLAIN, UNSEEN
-from limbfit.pipeline.identification.problem import build_unknowns
+from limbfit.pipeline.identification.problem import build_problem
 
 BALL = '[indenters.ball]\nshape = "sphere"\nwidth_mm = 12.0\n[acquire]\nforce_limit_N = 45.0\n'
 
@@ -86,8 +86,9 @@ def test_the_records_are_a_study_s_own(found, tmp_path) -> None:
 
 def test_the_tissues_lie_within_bounds_and_about_what_is_known(found) -> None:
     study, _ = found
-    known = build_unknowns(study)
-    tissues = sample_tissues(known, known.start, 64, seed=1)
+    problem = build_problem(study)
+    known = problem.unknowns
+    tissues = sample_tissues(known, problem.space, known.start, 64, seed=1)
     assert np.array_equal(tissues[0], known.start)
     assert (tissues >= known.lower).all()
     assert (tissues <= known.upper).all()

@@ -28,7 +28,7 @@ from scipy.stats import norm, qmc
 from ...arrays import Array
 from ...errors import CalibrationError
 from ..fit.objective import SiteResponse
-from ..fit.parameters import Unknowns
+from ..fit.parameters import SearchSpace, Unknowns
 from ..uncertainty.noise import compute_skin_similarity
 from ..uncertainty.uncertainty import NORMAL_95
 
@@ -37,6 +37,7 @@ Cost = Callable[[Sequence[int]], float]
 
 MAX_EXHAUSTIVE_CHOICES = 20_000  # choices that are all looked at; more are searched by exchanges
 _RESTARTS = 20
+_GIVEN_INFORMATION = 1e8  # on a logarithm that is given
 _MAX_VARIANCE = 25.0  # of a logarithm: no factor is reported beyond exp(50), however little is known
 
 
@@ -114,9 +115,14 @@ def compute_field_information(
     return np.einsum("abp,abq->pq", rotated / variances[..., None], rotated)
 
 
-def compute_bounds_information(unknowns: Unknowns) -> Array:
-    """Return the information (p, p) of the bounds, as of a uniform distribution between them."""
-    return np.diag(12.0 / np.log(unknowns.upper / unknowns.lower) ** 2)
+def compute_bounds_information(space: SearchSpace) -> Array:
+    """Return the information (p, p) of the bounds, as of a uniform distribution between them.
+
+    What does not move in the space is given, and so is the ratio of what moves together.
+    """
+    mean = space.tie / space.tie.sum(axis=0)
+    given = np.eye(len(mean)) - mean @ space.tie.T
+    return mean @ np.diag(12.0 / (space.upper - space.lower) ** 2) @ mean.T + _GIVEN_INFORMATION * given
 
 
 @dataclass(frozen=True)
@@ -157,7 +163,8 @@ def compute_efficiency(design: Design, best: Design, criterion: Criterion) -> fl
     """
     if criterion == "A":
         return best.trace / design.trace
-    return float(np.exp((design.log_det - best.log_det) / len(best.covariance)))
+    free = np.sum(np.linalg.eigvalsh(best.covariance) > 2.0 / _GIVEN_INFORMATION)
+    return float(np.exp((design.log_det - best.log_det) / free))
 
 
 def choose_design(
@@ -368,18 +375,18 @@ class DesignTarget:
         return float(np.linalg.slogdet(part)[1].mean())
 
 
-def sample_tissues(unknowns: Unknowns, centre: Array, draws: int, seed: int) -> Array:
-    """Sample tissues (d, p) that the limb may have: ``centre``, then others about it within the bounds.
+def sample_tissues(unknowns: Unknowns, space: SearchSpace, centre: Array, draws: int, seed: int) -> Array:
+    """Sample tissues (d, p) that the limb may have: ``centre``, then others about it in the ``space``.
 
     A parameter with a prior scatters by the prior's factor, another by half of what its bounds allow. A Latin
     hypercube spreads few samples well.
     """
-    spread = 0.5 * np.log(unknowns.upper / unknowns.lower) / np.sqrt(12.0)
+    spread = 0.5 * (space.upper - space.lower) / np.sqrt(12.0)
     for prior in unknowns.priors:
-        spread[unknowns.names.index(prior.name)] = np.log(prior.factor)
-    others = qmc.LatinHypercube(len(centre), rng=seed).random(max(draws - 1, 0))
-    scattered = np.log(centre) + spread * norm.ppf(np.clip(others, 0.05, 0.95))
-    return np.vstack([centre, np.exp(np.clip(scattered, np.log(unknowns.lower), np.log(unknowns.upper)))])
+        spread[space.tie[unknowns.names.index(prior.name)] > 0] = np.log(prior.factor)
+    others = qmc.LatinHypercube(len(spread), rng=seed).random(max(draws - 1, 0))
+    scattered = space.reduce(np.log(centre)) + spread * norm.ppf(np.clip(others, 0.05, 0.95))
+    return np.vstack([centre, *map(space.expand, np.clip(scattered, space.lower, space.upper))])
 
 
 def compute_factors_95(covariances: Array) -> Array:

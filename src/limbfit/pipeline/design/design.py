@@ -30,7 +30,7 @@ from ...results.planning import DesignCandidate, DesignResult, DesignSite, Expec
 from ...study import Study
 from ..engine.context import NO_PARAMETERS, Context
 from ..engine.storage import write_result
-from ..identification.problem import build_unknowns
+from ..identification.problem import build_problem
 from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import build_curve_job, open_experiment_cache
@@ -147,8 +147,8 @@ def _choose_designs(
     every = [one for one, _ in found]
     if len({one.site for one in every}) < sites:
         raise RunError(f"only {len(every)} candidates could be simulated: {'; '.join(left_out)}")
-    bounds = build_unknowns(study)
-    prior = compute_bounds_information(bounds)
+    problem = build_problem(study)
+    bounds, prior = problem.unknowns, compute_bounds_information(problem.space)
     designs = {
         "D-optimal": choose_design(every, sites, prior, "D"),
         "A-optimal": choose_design(every, sites, prior, "A"),

@@ -29,7 +29,7 @@ from ...identify.checks.design import (
     sample_tissues,
 )
 from ...identify.fit.objective import SiteResponse
-from ...identify.fit.parameters import Unknowns
+from ...identify.fit.parameters import build_space
 from ...indentation import (
     Simulation,
     SimulationJob,
@@ -44,7 +44,7 @@ from ...results.planning import ExpectedNoise, ProtocolPlan, ProtocolRecord, Pro
 from ...study import Study
 from ..engine.context import NO_PARAMETERS, Context
 from ..engine.storage import write_result
-from ..identification.problem import build_unknowns
+from ..identification.problem import build_problem
 from ..records.deviations import compute_expected_share, is_modulus
 from ..records.records import build_model, estimate_surface_error_mm
 from ..simulation.limb_geometry import LimbGeometry, build_site_model, coarsen_model
@@ -100,7 +100,7 @@ def press(model: SiteModel, depth: float, speed: float, hold: float) -> SiteMode
 
 def check_protocol(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
     """Refuse unknown parameters, and a session too short for set-up, rest and hold alone."""
-    _select_named(build_unknowns(study), options["determine"])
+    _select_named(study, options["determine"])
     budget = Budget(60.0 * options["minutes"], options["setup_s"])
     _check_minutes([options["rest_s"] + min(options["holds_s"], default=0.0)], budget)
 
@@ -145,10 +145,11 @@ def run_protocol(
     donning and each load that they are of.
     """
     study = context.study
-    known = build_unknowns(study)
-    which = _select_named(known, determine)
+    problem, centre, which = build_problem(study), study.vector(parameters), _select_named(study, determine)
+    known = problem.unknowns.with_start(centre)
+    space = build_space(known, problem.stages[-1])
     rows = np.array(list(pressures.values())) if pressures else np.eye(len(known.names))[list(which)]
-    tissues = sample_tissues(known, study.vector(parameters), draws, seed)
+    tissues = sample_tissues(known, space, centre, draws, seed)
     noises = RecordNoise.from_sds(NoiseModel(**noise), **seen)
     planned, left_out = _plan_records(context, speeds_mm_s, holds_s, depths_mm, noises)
     budget = Budget(60.0 * minutes, setup_s)
@@ -159,7 +160,7 @@ def run_protocol(
         raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
     stiffness = is_modulus(study).astype(np.float64)
     wanted = DesignTarget(
-        compute_bounds_information(known), rows, "A" if criterion == "A" else "D", stiffness
+        compute_bounds_information(space), rows, "A" if criterion == "A" else "D", stiffness
     )
     off_mm = estimate_surface_error_mm(study, context.store)
     options, blind = ([one.to_option(rest_s, off_mm, which) for one in found] for which in (0, 1))
@@ -198,16 +199,15 @@ def run_protocol(
     _write_records(folder / "records.toml", content.records, seen)
 
 
-def _select_named(known: Unknowns, determine: Sequence[str]) -> tuple[int, ...]:
-    """Numbers of the parameters to be determined: all where none is named."""
-    strange = [name for name in determine if name not in known.names]
-    if strange:
-        raise InputError(
-            f"no parameter is named {strange[0]!r}",
-            place="--determine",
-            remedy=f"use {', '.join(known.names)}",
-        )
-    return tuple(i for i, name in enumerate(known.names) if not determine or name in determine)
+def _select_named(study: Study, determine: Sequence[str]) -> tuple[int, ...]:
+    """Numbers of the parameters to be determined: all that the study does not fix where none is named."""
+    names = [f"{tissue}.{name}" for tissue, name in study.parameters]
+    free = [name for name in names if name not in study.fixed]
+    for name in determine:
+        if name not in free:
+            what = "the study fixes" if name in names else "no parameter is named"
+            raise InputError(f"{what} {name!r}", place="--determine", remedy=f"use {', '.join(free)}")
+    return tuple(names.index(name) for name in free if not determine or name in determine)
 
 
 def _plan_records(
