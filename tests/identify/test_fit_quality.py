@@ -85,6 +85,10 @@ def test_other_parameters_are_tried_before_the_model_is_blamed() -> None:
     assert wrong[1].verdict.startswith("the model cannot follow the unloading at 06")
 
 
+def test_nothing_is_refitted_where_no_fitted_record_could_be_simulated() -> None:
+    assert refit_residuals([], [], []) == []
+
+
 def test_a_held_out_record_is_judged_by_its_band() -> None:
     drift = compute_matern(TIMES, 0.3)[0] * 0.8
     off = assess(draw_noise(5) + drift, fitted=False, inside=np.arange(81) < 20)

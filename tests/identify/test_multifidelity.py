@@ -220,7 +220,7 @@ def test_two_equal_models_need_one_correction_per_stage():
     found = calibrate_with_correction(simulate, plain, records(0.03), PAPER, CalibrationSettings())
     assert [one.stage for one in found.rounds][:3] == [-1, 0, 1]
     assert max(found.rounds[0].expected_percent) < 1e-9
-    assert found.correction.scales == pytest.approx([1.0] * 4)
+    assert found.rounds[-1].scales == pytest.approx([1.0] * 4)
     alone = calibrate(simulate, records(0.03), PAPER)
     assert found.calibration.parameters == pytest.approx(alone.parameters, rel=0.02)
 

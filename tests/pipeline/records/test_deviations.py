@@ -12,8 +12,11 @@ from scipy.signal import lfilter
 
 from layered import block_context, block_study
 from limbfit.identify.fit.objective import SiteResponse
+from limbfit.identify.fit.prediction import PredictionModel
+from limbfit.indentation import Simulation
 from limbfit.mesh import read_vtu, write_vtu
 from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.identification.predict import SitePrediction, _write_observed
 from limbfit.pipeline.records.deviations import (
     LEAST_SHARE,
     compute_expected_share,
@@ -31,6 +34,7 @@ from limbfit.pipeline.records.records import (
 )
 from limbfit.pipeline.records.secondary_measurements import WaveMeasurement
 from limbfit.pipeline.records.traces import read_record
+from limbfit.results.curves import read_curves
 
 TRUTH = {"skin": {"c_kPa": 8.0, "m": 5.0, "gamma": 2.0, "tau_s": 0.5}}
 TRUTH["muscle"] = TRUTH["skin"] | {"c_kPa": 4.0}
@@ -133,3 +137,34 @@ def test_slow_noise_of_a_record_is_not_taken_for_the_force(tmp_path: Path, lag: 
         np.savetxt(file, rows, delimiter=",", header=file.read_text().splitlines()[0], comments="")
         stated.append(estimate_site_noise(found.study, record, record.force_N).sd_N)
     assert np.mean(stated) == pytest.approx(sd, rel=0.2 if lag else 0.03)
+
+
+def test_what_is_seen_at_a_held_out_site_is_off_as_the_site_is(tmp_path: Path) -> None:
+    """Speeds of waves: beside what noise and parameters leave open, by the thickness of the tissue."""
+    found = context(tmp_path)
+    record, parameters = over_bone(found), found.study.vector(TRUTH)
+    speeds, times = np.array([4.0, 5.0, 6.0]), record.times_s[:3]
+    at = np.eye(3, len(record.times_s))
+    seen = WaveMeasurement(
+        "w", speeds, times, np.zeros(3, int), at, 0.01 * np.eye(3), {"sd": 0.1, "compared": ""}
+    )
+    known = PredictionModel(0.0 * np.eye(len(parameters)), parameters, {}, 0.01, 100.0)
+    n = len(record.times_s)
+    observed = np.r_[speeds, np.zeros(n - 3)][None]
+    slopes = np.zeros((1, n, len(parameters)))
+    own = Simulation("a", np.ones(n), slopes[0], True, "", 0.0, {}, (), observed, slopes)
+    widths = []
+    for fitted in (True, False):
+        site = record.site.model_copy(update={"fitted": fitted})
+        one = replace(record, record=record.record.model_copy(update={"site": site}), secondary=(seen,))
+        _write_observed(
+            tmp_path, found.study, SitePrediction(one, None, own, None, None, None), parameters, known
+        )
+        curves = read_curves(tmp_path / f"{one.name}+w.csv")
+        widths.append(curves["speed_high_m_s"] - curves["speed_low_m_s"])
+    thickness = measure_bone_distance_mm(record.model)
+    assert widths[0].min() > 0.2 * 1.96  # the readings' own noise, as no fitted record has a speed
+    assert widths[1][0] == pytest.approx(widths[0][0])  # at rest
+    off = (speeds - 4.0) * GIVEN_MM / thickness
+    assert np.all(widths[1][1:] > 2 * 1.96 * np.hypot(off, 0.01 * 6.0)[1:])
+    assert np.all(widths[0][1:] < widths[1][1:])

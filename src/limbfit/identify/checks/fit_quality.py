@@ -38,6 +38,8 @@ def refit_residuals(
     That is one generalised least-squares step of the logarithms of the parameters, by about one at most;
     ``jacobians_log`` (n, p) are the derivatives with respect to these.
     """
+    if not residuals_N:  # no fitted record could be simulated
+        return []
     rows = [_whiten(J, C) for J, C in zip(jacobians_log, covariances, strict=True)]
     left = [_whiten(r, C) for r, C in zip(residuals_N, covariances, strict=True)]
     A = np.eye(rows[0].shape[1]) + sum(J.T @ J for J in rows)

@@ -191,7 +191,6 @@ class CorrectedCalibration:
 
     calibration: Calibration
     rounds: tuple[CorrectionRound, ...]
-    correction: MeshCorrection | None
 
 
 def calibrate_with_correction(
@@ -400,4 +399,4 @@ class _CorrectionLoop:
             settings=self.settings,
             responses=tuple(self.model(parameters)),
         )
-        return CorrectedCalibration(calibration, self.rounds, self.model.correction)
+        return CorrectedCalibration(calibration, self.rounds)

@@ -212,6 +212,7 @@ class PredictionModel:
         unit: str = "N",
         site_N: Array | float = 0.0,
         times_s: Array | None = None,
+        noise_N: float = 0.0,
     ) -> tuple[Array, Array]:
         """Return the 95 % interval of a new record, two arrays (n,) in N.
 
@@ -221,11 +222,12 @@ class PredictionModel:
         the spread between sites from few sites, so the interval takes Student's quantile. ``site_N`` (n,) is
         one standard deviation of the stiffness that is expected of a site that was not fitted. Beyond the
         longest load in the records, by ``times_s`` (n,), the interval counts what relaxation may do there.
+        ``noise_N`` is taken where no fitted record tells the noise of the unit.
         """
-        noise_N, misfit = self.find_residual_sd(name, unit)
+        known_N, misfit = self.find_residual_sd(name, unit)
         misfit_N = misfit * find_largest_magnitude(response.force_N)
         site_N = self.site_factor * np.abs(site_N)
-        own_N = np.hypot(np.hypot(noise_N, misfit_N), site_N)
+        own_N = np.hypot(np.hypot(known_N or noise_N, misfit_N), site_N)
         lower_N: Array | float = 0.0
         higher_N: Array | float = 0.0
         if self.relaxation is not None and times_s is not None:

@@ -56,7 +56,7 @@ def run_predict(context: Context, folder: Path) -> None:
     rows = []
     for site, band, loading in zip(sites, bands, loadings, strict=True):
         _write_curves(folder, site, band)
-        rows.append(_summarise_site(site, _write_observed(folder, site, best, known), loading))
+        rows.append(_summarise_site(site, _write_observed(folder, study, site, best, known), loading))
     ours = [site.ours for site in sites]
     warnings = check_records(context, cache, records.own, ours, best, one, records.searched, correction)
     judged = [(site, band) for site, band in zip(sites, bands, strict=True) if band is not None]
@@ -311,7 +311,7 @@ def _assess_fits(
 
 
 def _write_observed(
-    folder: Path, site: SitePrediction, best: Array, known: PredictionModel
+    folder: Path, study: Study, site: SitePrediction, best: Array, known: PredictionModel
 ) -> list[stored.ObservedError]:
     """Everything that was seen beside a record's force with its prediction, as files and rows."""
     rows = []
@@ -326,7 +326,9 @@ def _write_observed(
         if whole.completed:
             columns[f"{what}_simulated_{unit}"] = whole.force_N
         if ours.completed:
-            low, high = known.compute_interval_95(ours, best, one.name, one.unit)
+            of_site = 0.0 if one.site.fitted else estimate_site_deviation(study, one, ours, best)
+            about = ours, best, one.name, one.unit, of_site
+            low, high = known.compute_interval_95(*about, noise_N=seen.noise_sd)
             columns |= {f"{what}_low_{unit}": low, f"{what}_high_{unit}": high}
         write_curves(folder / f"{one.name}.csv", **columns)
         rows.append(
