@@ -12,6 +12,7 @@ import pytest
 sys.path.append(str(Path(__file__).parents[2] / "identify"))
 from bars import PAPER, TRUTH, Bars
 
+from limbfit.cli.experiments import show_crossvalidation
 from limbfit.identify.checks.crossvalidation import list_choices, rank_fold, spread_points
 from limbfit.identify.fit.objective import MeasuredCurve
 from limbfit.identify.fit.parameters import build_space
@@ -20,6 +21,7 @@ from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.crossvalidation import _build_result, _check_folds, _fit_choices
 from limbfit.pipeline.identification.problem import build_problem
+from limbfit.report.sections.other_fits import make_crossvalidation_section
 from limbfit.results.uncertainty import FoldEmulator
 from limbfit.study import load_study
 
@@ -72,12 +74,17 @@ def test_choices_keep_what_the_study_fixes_and_tie_what_it_ties(found):
         assert fold.parameters[3] == fold.parameters[7]
 
 
-def test_a_study_that_fits_every_site_has_no_held_out_error_of_its_own_choice(found):
+def test_a_study_that_fits_every_site_has_no_held_out_error_of_its_own_choice(found, capsys):
     study, problem, emulator, fits = found
     assert rank_fold(fits.own, fits.folds)["share_better"] is None
     solved = [[bar.respond(fold.parameters) for bar in BARS] for fold in fits.folds]
     checks = _check_folds(1, fits.folds, solved, emulator, MEASURED, {"0": (0,), "1": (1,), "2": (2,)})
     summary = FoldEmulator(runs=13, loo_percent=0.1, checks=checks)
-    stored = _build_result(study, problem.unknowns.names, ("0", "1", "2"), fits, 2, 3, summary).to_plain()
+    result = _build_result(study, problem.unknowns.names, ("0", "1", "2"), fits, 2, 3, summary)
+    assert "The study itself fits every site." in str(make_crossvalidation_section(None, result))
+    show_crossvalidation(result)
+    assert "3 of 3 choices of 2 sites" in (said := capsys.readouterr().out)
+    assert "own choice" not in said
+    stored = result.to_plain()
     assert stored["own"]["mean_error_heldout_percent"] is stored["own"]["share_better"] is None
     assert [row["left_out_of"] for row in stored["sites"]] == [1, 1, 1]
