@@ -16,7 +16,7 @@ class StudyName(ResultPart):
 
     name: str = Field(description="Name of the study.")
     description: str = Field(description="Its description.")
-    extensions: Sequence[str] = Field(description="Files that register laws and shapes of its own.")
+    extensions: Sequence[str] = Field(description="Digests of its files that register laws and shapes.")
 
 
 class MachineFacts(ResultPart):

@@ -381,10 +381,11 @@ def run_record(study: Study) -> RunResult:
     """``run.json``: versions, settings, digests of the inputs, how long each stage took."""
     store, inputs, keys = Store(study.results), compute_input_digests(study), Keys(study)
     below = {name: key.digest for name, key in _compute_chain(keys).items()}
+    settings = record_settings(study, inputs)
     return RunResult(
         limbfit=__version__,
-        study=StudyName(**study.study.model_dump(mode="json")),
-        settings=record_settings(study, inputs),
+        study=StudyName(**settings["study"]),
+        settings=settings,
         versions=collect_versions(),
         machine=MachineFacts(**describe_machine()),
         inputs=inputs,

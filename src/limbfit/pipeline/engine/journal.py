@@ -23,7 +23,7 @@ from .store import translate_disk_errors
 
 FOLDER = "log"
 KEPT = 50  # logs of a study; older ones go
-_PATH = re.compile(r"(?<![\w.<])(?:[A-Za-z]:)?[/\\](?:[^\s/\\:;,'\"]+[/\\])+[^\s:;,'\"]*")
+_PATH = re.compile(r"(?<![\w.<])(?:[A-Za-z]:)?[/\\](?!\s)(?:[^/\\:;,'\"]+[/\\])+[^\s:;,'\"]*")
 
 
 @contextmanager
@@ -74,7 +74,7 @@ def redact_paths(text: str, study: Study) -> str:
     """A text without the names of input files, and without paths outside the study."""
     for key, path in sorted(study.inputs.items(), key=lambda item: -len(str(item[1]))):
         for name in (str(study.path(path)), str(path)):
-            text = text.replace(name, f"<{key}>")
+            text = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", f"<{key}>", text)
     for folder in (study.folder, study.folder.resolve()):
         if folder != Path("."):
             text = text.replace(f"{folder}{os.sep}", "").replace(str(folder), "<study>")

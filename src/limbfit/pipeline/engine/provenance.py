@@ -91,7 +91,8 @@ def record_settings(study: Study, digests: Mapping[str, str]) -> dict[str, Any]:
 
     def plain(value: Any) -> Any:
         if isinstance(value, Path):
-            return by_path[value]
+            # Of `febio.program`, which is no input, the name alone: each machine has it elsewhere.
+            return by_path.get(value, f"sha256:{compute_digest(value.name)}")
         if isinstance(value, dict):
             return {key: plain(part) for key, part in value.items()}
         return [plain(part) for part in value] if isinstance(value, list | tuple) else value
