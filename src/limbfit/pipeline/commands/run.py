@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
@@ -221,10 +221,9 @@ def run_study(
                     _do(context, stage, chain[name])
                 else:
                     context.tell(name, 1, 1, "is up to date")
-        summary = summarise(study)
-    if until is not None:
-        summary["until"] = until
-    return summary
+        after = [context.store.state(name, key.digest) for name, key in chain.items()]
+    summary = summarise(study, [one.stage for one in after if one.state == "done"])
+    return summary if until is None else summary | {"until": until}
 
 
 def _check_limb(context: Context, check: Callable[[LimbGeometry], None] | None, meshing: bool) -> None:
@@ -413,19 +412,19 @@ def report_study(study: Study, *, listener: Listener = ignore_progress) -> dict[
     with lock(study.results), build_executor(study) as executor:
         context = Context(study, Store(study.results), executor, listener)
         _do(context, STAGES[-1], _compute_chain(Keys(study))["report"])
-        return summarise(study)
+        return summarise(study, STAGE_NAMES)
 
 
-def summarise(study: Study) -> dict[str, Any]:
-    """The figures of a study from what is stored: parameters, sites with errors, where the report is."""
+def summarise(study: Study, stages: Collection[str]) -> dict[str, Any]:
+    """The figures of a study from what ``stages`` have stored: parameters, sites with errors, the report."""
     summary: dict[str, Any] = {"study": study.study.name, "results": str(study.results)}
-    if (calibration := CalibrationResult.find(study.results)) is not None:
+    if "calibrate" in stages and (calibration := CalibrationResult.find(study.results)) is not None:
         summary["parameters"] = calibration.parameters
         summary["intervals_95"] = calibration.uncertainty.to_plain()["intervals_95"]
         if calibration.uncertainty.relaxation is not None:
             relaxation = calibration.uncertainty.relaxation.to_plain()
             summary["relaxation"] = {key: relaxation[key] for key in ("prefers", "words", "moduli")}
-    if (found := PredictResult.find(study.results)) is not None:
+    if "predict" in stages and (found := PredictResult.find(study.results)) is not None:
         predicted = found.to_plain()
         columns = ("site", "record", "region", "fitted", "peak_force_N", "error_percent", "warnings")
         summary["sites"] = [
@@ -435,7 +434,7 @@ def summarise(study: Study) -> dict[str, Any]:
         summary |= {key: predicted[key] for key in keys}
         summary["fit_quality"] = found.fit_quality.verdict
     report = study.results / "report" / "report.html"
-    if report.is_file():
+    if "report" in stages and report.is_file():
         summary["report"] = str(report)
     return summary
 
