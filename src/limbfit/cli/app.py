@@ -76,6 +76,8 @@ def main() -> None:
         fail(str(error), 2 if isinstance(error, InputError) else 1)
     except KeyboardInterrupt:
         fail(INTERRUPTED, 130)
+    except PermissionError as error:
+        fail(f"{error.filename}: no permission to read or write it; check its owner and mode", 2)
     except BrokenPipeError:
         sys.exit(1)
     except Exception as error:

@@ -129,6 +129,8 @@ def _describe_error(error: Exception) -> tuple[int, str]:
             return (422 if isinstance(error, InputError) else 409), str(error)
         case FileNotFoundError():
             return 404, f"not there (yet): {error.args[0] if len(error.args) == 1 else 'a file of the study'}"
+        case OSError() if error.strerror:
+            return 409, f"a file of the study: {error.strerror}; check the folder's owner, mode and disk"
         case TooLargeError():
             return 413, "the request is too large"
         case HTTPException():

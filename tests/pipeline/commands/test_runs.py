@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import psutil
 import pytest
@@ -18,8 +19,12 @@ from limbfit import Progress, diagnose, run_batch, run_study, study_status
 from limbfit.errors import InputError, RunError
 from limbfit.execution import Limits, SerialExecutor, make_executor, share_executor
 from limbfit.pipeline.commands.doctor import compress_test_cube, judge_self_test
+from limbfit.pipeline.commands.run import run_record
 from limbfit.pipeline.engine.journal import redact_paths
+from limbfit.pipeline.engine.store import LOCK, lock
 from limbfit.study import load_study
+
+STORED = Path(__file__).parents[2] / "results" / "stored"
 
 
 def quiet(event: Progress) -> None:
@@ -85,6 +90,88 @@ def test_the_log_tells_what_happened_and_no_names_of_files(alone):
         assert "Doe" not in text
         assert str(alone) not in text
     assert redact_paths("see /home/jane/x/y.dcm", load_study(alone)) == "see <path>"
+
+
+def test_a_log_names_no_folder_with_spaces_and_keeps_words_that_hold_the_name_of_an_input(alone):
+    (alone / "e").mkdir()
+    file = alone / "study.toml"
+    (alone / "1.csv").rename(alone / "e" / "ring")
+    file.write_text(file.read_text().replace("1.csv", "e/ring"))
+    study = load_study(alone)
+    said = redact_paths(
+        r"touring: e/ring is not C:\Users\Jane Doe\scan.dcm, nor /home/Jane Q Doe/x/y.dcm", study
+    )
+    assert said == "touring: <sites.1.trace> is not <path>, nor <path>"
+    (alone / "ring").write_bytes((alone / "e" / "ring").read_bytes())
+    file.write_text(file.read_text().replace("e/ring", "ring"))
+    assert redact_paths("touring with ring", load_study(alone)) == "touring with <sites.1.trace>"
+
+
+def test_a_run_until_a_stage_tells_nothing_of_later_stages_that_are_not_up_to_date(alone):
+    for name in ("calibrate/calibration.json", "predict/predict.json"):
+        (alone / "results" / name).parent.mkdir(parents=True)
+        shutil.copy(STORED / name, alone / "results" / name)
+    (alone / "results" / "report").mkdir()
+    (alone / "results" / "report" / "report.html").touch()
+    summary = run_study(load_study(alone), until="traces", listener=quiet)
+    assert summary.keys() == {"study", "results", "until"}
+    (row,) = run_batch([alone], until="traces", workers=1, listener=quiet)
+    assert (row["mean_error_fitted_percent"], row["report"]) == (None, None)
+    predicted = alone / "results" / "predict" / "predict.json"
+    predicted.write_text(predicted.read_text().replace("{", '{"of another version": 1,', 1))
+    assert run_study(load_study(alone), until="traces", listener=quiet) == summary
+
+
+def test_a_stage_whose_stamp_is_cut_short_is_made_anew(alone):
+    run_study(load_study(alone), until="traces", listener=quiet)
+    (alone / "results" / "traces" / "stage.json").write_text("")  # as a power cut leaves it
+    assert rows_of(alone)["traces"]["state"] == "missing"
+    run_study(load_study(alone), until="traces", listener=quiet)
+    assert rows_of(alone)["traces"]["state"] == "done"
+
+
+def test_the_record_of_a_run_names_no_program_and_no_extension(alone, tmp_path):
+    outside = tmp_path / "jane"
+    outside.mkdir()
+    (outside / "own.py").write_text("")
+    file = alone / "study.toml"
+    stated = file.read_text().replace("[study]", f'[study]\nextensions = ["{outside}/own.py"]')
+    file.write_text(f'{stated}[febio]\nprogram = "{outside}/febio4"\n')
+    record = run_record(load_study(alone))
+    assert "jane" not in record.model_dump_json()
+    assert record.settings["febio"]["program"].startswith("sha256:")
+
+
+def test_an_input_that_may_not_be_read_is_one_clear_line(alone):
+    (alone / "1.csv").chmod(0)
+    done = call_without_rights("-m", "limbfit", "status", alone)
+    assert done.returncode == 2
+    assert (
+        done.stderr
+        == f"error: {alone / '1.csv'}: no permission to read or write it; check its owner and mode\n"
+    )
+
+
+def test_a_study_that_another_user_runs_counts_as_held(alone):
+    (alone / "results").mkdir()
+    with lock(alone / "results"):
+        (alone / "results" / LOCK).chmod(0o400)
+        code = "import pathlib, sys; from limbfit.pipeline.engine.store import is_held"
+        done = call_without_rights(
+            "-c", f"{code}; print(is_held(pathlib.Path(sys.argv[1])))", alone / "results"
+        )
+    assert done.stdout == "True\n", done.stderr
+
+
+def call_without_rights(*words) -> subprocess.CompletedProcess:
+    """Python with these words as a user to whom the modes of files matter."""
+    head = []
+    if os.geteuid() == 0:
+        head = ["setpriv", "--bounding-set=-dac_override,-dac_read_search", "--inh-caps=-all"]
+        if shutil.which(head[0]) is None or subprocess.run([*head, "true"], check=False).returncode:
+            pytest.skip("the superuser may read anything, and keeps that right here")
+    command = [*head, sys.executable, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
 
 
 def test_a_batch_lists_failures_and_does_the_rest(alone, tmp_path):

@@ -20,7 +20,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from ...errors import RunError
+from ...errors import InputError, RunError
 from ...results.runs import StageStamp
 from ...results.study_results import StudyResults
 from .storage import DRAFT, read_json, write_json, write_result
@@ -59,7 +59,11 @@ class Store:
         return StudyResults(self.folder)
 
     def stamp(self, stage: str) -> StageStamp | None:
-        return StageStamp.find(self.folder, stage)
+        """The stamp of a stage; None also for one that is not readable: then the stage is made anew."""
+        try:
+            return StageStamp.find(self.folder, stage)
+        except InputError:
+            return None
 
     def work_folder(self, stage: str, key: str) -> Path:
         return self.folder / f".work-{stage}-{key}"
@@ -210,5 +214,5 @@ def is_held(folder: Path) -> bool:
     try:
         with FileLock(folder / LOCK, timeout=0):
             return False
-    except Timeout:
+    except (Timeout, PermissionError):  # of somebody else's run, or one that was killed
         return True
