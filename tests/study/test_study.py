@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from limbfit.errors import StudyError
+from limbfit.studio.editing import edit_study
 from limbfit.study import load_study
 
 GOOD = """
@@ -91,6 +92,32 @@ def test_no_study(folder: Path) -> None:
 def test_not_toml(folder: Path, content: bytes) -> None:
     (folder / "study.toml").write_bytes(content)
     assert re.search(r"study\.toml: not valid TOML: .+", refusal(folder))
+
+
+def test_a_file_that_begins_with_a_mark_is_read(folder: Path) -> None:
+    """Editors on Windows put a byte-order mark there, and end lines with two characters."""
+    plain = load_study(write(folder, GOOD))
+    (folder / "study.toml").write_bytes(b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").encode())
+    assert load_study(folder) == plain
+    with edit_study(folder / "study.toml") as document:
+        document["study"]["name"] = "another"
+    assert load_study(folder).study.name == "another"
+
+
+def test_a_folder_of_images_that_holds_the_results_is_refused(folder: Path) -> None:
+    surfaces = GOOD[GOOD.index("[surfaces]") : GOOD.index("[mesh]")]
+    write(folder, GOOD.replace(surfaces, '[image]\npath = "."\n'))
+    assert "image.path: . holds the results of the study, and so changes with every run; give" in refusal(
+        folder
+    )
+
+
+@pytest.mark.parametrize("ending", ["raw", "layers", "surface", "waves", "model", "optimize"])
+def test_no_site_has_the_name_of_another_ones_file(folder: Path, ending: str) -> None:
+    write(folder, GOOD.replace('name = "2"', f'name = "1-{ending}"'))
+    assert f"1-{ending} is a file of '1' in results; give another name" in refusal(folder)
+    write(folder, GOOD.replace('name = "2"', f'name = "2-{ending}"'))
+    load_study(folder)
 
 
 # what to replace in the good study, by what, and what the refusal says: place, fault

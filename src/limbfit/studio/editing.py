@@ -32,7 +32,7 @@ def edit_study(file: Path) -> Iterator[tomlkit.TOMLDocument]:
     was.
     """
     try:
-        document = tomlkit.parse(file.read_text(encoding="utf-8"))
+        document = tomlkit.parse(file.read_text(encoding="utf-8-sig"))
     except (TOMLKitError, UnicodeDecodeError) as error:
         raise StudyError(f"not valid TOML: {error}", file=file) from None
     yield document

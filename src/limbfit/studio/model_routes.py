@@ -213,7 +213,7 @@ def _check_movable(study: Study, name: str) -> None:
     site = study.site(name)
     if study.markups is None:
         return
-    for row in tomllib.loads(study.file.read_text(encoding="utf-8")).get("sites", []):
+    for row in tomllib.loads(study.file.read_text(encoding="utf-8-sig")).get("sites", []):
         if str(row.get("name")) == site.name and ("position" in row or "near" in row):
             return
     raise InputError(

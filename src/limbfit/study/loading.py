@@ -32,21 +32,24 @@ def load_study(path: str | Path, *, recorded: bool = True) -> Study:
         file = file / "study.toml"
     if not file.is_file():
         raise StudyError("no such study", file=file, remedy="give a study.toml or the folder that holds one")
-    try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
+    try:  # "-sig": editors on Windows may begin a file with a mark
+        content = tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise StudyError(f"not valid TOML: {error}", file=file) from None
-    content = {key: value for key, value in content.items() if key not in ("file", "notes")}
     notes = _place_by_markups(content, file)
     _load_extensions(content, file)
     with add_location(file=file):
         try:
-            study = Study(**content, file=file, notes=notes)
+            study = Study(**(content | {"file": file, "notes": notes}))
         except ValidationError as error:
             raise _build_study_error(error) from None
         for place, path in study.inputs.items():
-            if (recorded or not place.startswith(("sites.", "records."))) and not study.path(path).exists():
+            at = study.path(path)
+            if (recorded or not place.startswith(("sites.", "records."))) and not at.exists():
                 raise StudyError(f"{path} does not exist", place=place)
+            if study.results.resolve().is_relative_to(at.resolve()):
+                what = f"{path} holds the results of the study, and so changes with every run"
+                raise StudyError(what, place=place, remedy="give it a folder of its own")
         check_unused_keys(study, content)
     unused = [name for name in study.indenters if name not in study.used_indenters]
     what = "no record names it; only limbfit design --protocol does"

@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from .tables import Direction, Positive, TomlTable, Vector
 
 Control = Literal["displacement", "force"]
 Frame = Literal["limb", "site"]
 RECORDED = ("trace", "ultrasound", "surface", "shear_waves")  # files of a record
+STORED_ENDINGS = ("raw", "layers", "surface", "waves", "model", "optimize")  # of a record's files in results
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$"
 
 
@@ -90,13 +91,6 @@ class RecordTable(_RecordKeys):
     depth_mm: Positive | None = None
     speed_mm_s: Positive | None = None
     hold_s: Annotated[float, Field(ge=0)] | None = None
-
-    @field_validator("name")
-    @classmethod
-    def _check_name(cls, name: str) -> str:
-        if name == "raw":
-            raise ValueError("'raw' is what limbfit calls a record as it was recorded; give another name")
-        return name
 
 
 class Record(_RecordKeys):

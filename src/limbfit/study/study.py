@@ -25,7 +25,7 @@ from ..laws import (
 from ..priors import of_tissues
 from .material import MaterialTable
 from .meshing import MeshTable, list_indenter_widths, replace_edges
-from .records import RECORDED, Indentation, Record, RecordTable, Site, list_records
+from .records import RECORDED, STORED_ENDINGS, Indentation, Record, RecordTable, Site, list_records
 from .socket import SocketTable
 from .tables import (
     AcquireTable,
@@ -290,6 +290,9 @@ class Study(TomlTable):
             raise ValueError(
                 f"two records, or a record and a site, have the name {doubled[0]!r}; name one anew"
             )
+        for other, ending in (name.rsplit("-", 1) for name in names if "-" in name):
+            if other in names and ending in STORED_ENDINGS:
+                raise ValueError(f"{other}-{ending} is a file of {other!r} in results; give another name")
         for number, site in enumerate(self.sites):
             records, place = self.records_at(site), f"sites.{number}"
             if site.fitted and not records:

@@ -148,7 +148,7 @@ def derive_study(study: Study, name: str) -> Study:
     Raises `InputError` if the study cannot be changed so.
     """
     folder = study.results / FOLDER / name
-    document = tomlkit.parse(study.file.read_text(encoding="utf-8"))
+    document = tomlkit.parse(study.file.read_text(encoding="utf-8-sig"))
     try:
         MODELS[name].change(study, document)
         folder.mkdir(parents=True, exist_ok=True)
