@@ -16,7 +16,7 @@ from typing import Generic, TypeVar
 from .errors import InputError
 
 T = TypeVar("T")
-_loaded: dict[str, Path] = {}  # files that have been run, by their digest
+_loaded: dict[Path, str] = {}  # digests of the files that have been run, as they were last
 _running: list[Path] = []  # the file that is being run
 
 
@@ -63,10 +63,11 @@ def load_extensions(files: Iterable[Path]) -> None:
     run, with what it raised.
     """
     for file in files:
-        digest = _compute_digest(file)
-        if digest not in _loaded:
-            _run(file.resolve(), f"limbfit_extension_{digest[:16]}")
-            _loaded[digest] = file
+        digest, place = _compute_digest(file), file.resolve()
+        if digest not in _loaded.values():
+            _loaded.pop(place, None)  # what it registered is replaced; if it comes back, it is run again
+            _run(place, f"limbfit_extension_{digest[:16]}")
+            _loaded[place] = digest
 
 
 def compute_extensions_digest(files: Iterable[Path]) -> str:

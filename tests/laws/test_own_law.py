@@ -195,6 +195,14 @@ def test_an_export_of_the_exponential_law_is_refused_at_once(tmp_path):
         check_export(load_study(tmp_path), "feb")
 
 
+def test_an_extension_whose_change_is_taken_back_is_run_again(tmp_path):
+    file, state = tmp_path / "own.py", tmp_path / "state"
+    for text in ("one", "two", "one", "one"):
+        file.write_text(f"with open({str(state)!r}, 'a') as stream:\n    stream.write('{text} ')\n")
+        load_extensions([file])
+    assert state.read_text() == "one two one "
+
+
 def test_what_an_extension_raises_names_it(tmp_path):
     (tmp_path / "broken.py").write_text("import unheard_of_module\n")
     with pytest.raises(InputError, match=r"broken\.py: extension: ModuleNotFoundError"):
