@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from in_process import Bench
 
+from limbfit import check_recording, load_study
 from limbfit.acquire import Recorder, check_record, find_ramps, follow_recording, read_recording
 from limbfit.acquire.events import PINS, Sample
 from limbfit.acquire.recording import COLUMNS
-from limbfit.errors import TraceError
+from limbfit.errors import InputError, TraceError
 from limbfit.traces import find_touch_down, regularise
 
 
@@ -210,3 +211,11 @@ def test_ramps_that_do_not_repeat_are_named(tmp_path) -> None:
     second = [event["at_us"] for event in recording.events if event.get("phase") == "load"][2]
     recording.force_mN[recording.host_us > second, 0] *= 2
     assert checks(recording)["repeatability"] is False
+
+
+@pytest.mark.parametrize("trace", ["../elsewhere.csv", "/elsewhere/1.csv"])
+def test_no_record_is_made_outside_the_studys_folder(study, trace):
+    file = study / "study.toml"
+    file.write_text(file.read_text().replace("1.csv", trace))
+    with pytest.raises(InputError, match=rf"{trace} lies outside the study's folder; nothing is recorded"):
+        check_recording(load_study(file, recorded=False), "1", depth_mm=5.0)

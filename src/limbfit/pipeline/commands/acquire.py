@@ -190,16 +190,15 @@ def _find_place(one: Indentation) -> str:
 def _check_inside(study: Study, one: Indentation) -> None:
     """Nothing outside the study's folder is written."""
     root = study.folder.resolve()
-    targets = [study.folder / FOLDER / one.name]
-    targets += [study.path(one.trace)] if one.trace is not None else []
+    targets = [Path(FOLDER) / one.name, *([] if one.trace is None else [one.trace])]
     if (study.folder / FOLDER).exists() and not (study.folder / FOLDER).is_dir():
         raise InputError(
             "is a file, where records are kept", file=study.folder / FOLDER, remedy="move it away"
         )
     for target in targets:
-        if not target.resolve().is_relative_to(root):
+        if not study.path(target).resolve().is_relative_to(root):
             raise InputError(
-                f"{target.relative_to(study.folder)} lies outside the study's folder",
+                f"{target} lies outside the study's folder",
                 file=study.file,
                 place=f"{_find_place(one)}.trace",
                 remedy="nothing is recorded there; name a place inside",
