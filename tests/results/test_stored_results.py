@@ -134,6 +134,11 @@ def test_a_result_that_is_not_there_names_its_command(results):
         _ = limbfit.load_results(results.parent).cube
 
 
+def test_results_are_those_beside_the_file_of_the_study(results):
+    (results.parent / "study.toml").touch()
+    assert limbfit.load_results(results.parent / "study.toml").folder == results
+
+
 def test_results_of_a_study_that_was_not_run(tmp_path):
     with pytest.raises(InputError, match="nothing is stored there; run limbfit run first"):
         limbfit.load_results(tmp_path)

@@ -6,7 +6,8 @@ import time
 
 import psutil
 
-from limbfit.studio.processes import find_command, interrupt_process, start_command
+from limbfit.studio.folder import StudyFolder
+from limbfit.studio.processes import find_command, interrupt_process, start_command, start_run
 
 
 def ended(process, within_s=60.0):
@@ -34,3 +35,13 @@ def test_a_command_is_found_and_interrupted(tmp_path):
     interrupt_process(process)
     ended(process)
     assert find_command(words) is None
+
+
+def test_a_run_works_beside_the_link_that_names_the_study_file(study, tmp_path):
+    other = tmp_path / "other"
+    other.mkdir()
+    (study / "study.toml").rename(other / "study.toml")
+    (study / "study.toml").symlink_to(other / "study.toml")
+    ended(start_run(StudyFolder(study / "study.toml"), "traces", None, ())["process"])
+    assert (study / "results" / "traces" / "stage.json").is_file()
+    assert not (other / "results").exists()

@@ -116,7 +116,7 @@ def load_results(study: HasResults | str | Path) -> StudyResults:
 
     Parameters
     ----------
-    study : a study, or its folder.
+    study : a study, its file or its folder.
 
     Returns
     -------
@@ -128,7 +128,9 @@ def load_results(study: HasResults | str | Path) -> StudyResults:
     InputError
         Where nothing is stored.
     """
-    folder = Path(study) / "results" if isinstance(study, str | Path) else study.results
+    if isinstance(study, str | Path):
+        study = Path(study).parent if Path(study).is_file() else Path(study)
+    folder = study / "results" if isinstance(study, Path) else study.results
     if not folder.is_dir():
         raise InputError("nothing is stored there", file=folder, remedy="run limbfit run first")
     return StudyResults(folder)

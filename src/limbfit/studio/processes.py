@@ -52,7 +52,7 @@ def find_starting(folder: StudyFolder) -> int | None:
 
 
 def _build_run_words(folder: StudyFolder, *verb: str) -> list[str]:
-    return [*PROGRAM, *verb, str(folder.file.resolve())]
+    return [*PROGRAM, *verb, str(folder.file.absolute())]  # not what a link names: results are beside it
 
 
 def start_run(
