@@ -17,7 +17,7 @@ from .console import (
     print_aside,
     print_json,
     print_line,
-    print_warning,
+    print_warnings,
 )
 
 
@@ -42,8 +42,7 @@ def febio(
             f"{peak}{result['steps']} steps, {result['element']}, {result['unknowns']} unknowns; "
             f"{', '.join(result['files']) or 'no table asked for'}"
         )
-    for warning in result["warnings"]:
-        print_warning(warning)
+    print_warnings(result["warnings"])
     if not result["completed"]:
         fail(f"{file}: the simulation is partial: {result['reason']}", 1)
 

@@ -38,8 +38,6 @@ _SITE_KEYS = {
     *("error_percent", "error_one_material_percent", "peak_force_N", "penetration_mm"),
 }
 _MEAN_KEYS = {f"{kind}_error_{use}_percent" for kind in ("mean", "sd") for use in ("fitted", "heldout")}
-
-
 _FRAME = re.compile(r'<DataSet timestep="([^"]+)" part="0" file="[^"/]+/(step-\d{4,}\.vtu)"/>')
 
 

@@ -177,9 +177,11 @@ def _draw_panel(ax: Axes, pixels: Array, view: View, marks: list[Mark], title: s
         ax.text(x + 0.014 * h, name_y, mark.text, fontsize=10, va="center", color=INK, path_effects=_HALO)
     right = np.array([view.right, -view.up])
     for (dx, dy), direction in zip(((1, 0), (0, 1)), right, strict=True):
+        axis = int(np.abs(direction).argmax())  # of LPS: the letter is that of the side of the body
         for sign in (1, -1):
             x, y = (0.5 + sign * dx * 0.475) * w, (0.5 + sign * dy * 0.478) * h
-            ax.text(x, y, _name_side(sign * direction), fontsize=9, ha="center", va="center", color="#5a5a5a")
+            side = _SIDES[axis][0 if sign * direction[axis] > 0 else 1]
+            ax.text(x, y, side, fontsize=9, ha="center", va="center", color="#5a5a5a")
     length = next(mm for mm in (50, 20, 10, 5) if mm * view.pixels_per_mm < 0.4 * w)
     end, base = 0.97 * w, 0.965 * h
     ax.plot([end - length * view.pixels_per_mm, end], [base, base], color=INK, lw=2)
@@ -198,12 +200,6 @@ def _place_labels(view: View, marks: Sequence[Mark]) -> list[tuple[Mark, float]]
         placed.append((x, y))
         found.append((mark, y))
     return found
-
-
-def _name_side(direction: Array) -> str:
-    """The letter of the side of the body to which a direction (LPS) points."""
-    axis = int(np.abs(direction).argmax())
-    return _SIDES[axis][0 if direction[axis] > 0 else 1]
 
 
 SKIN, MUSCLE, BONE = "#e3c878", "#c8717a", "#e9e6dc"
