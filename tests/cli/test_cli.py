@@ -333,3 +333,14 @@ def test_a_run_that_ends_with_the_calibration_shows_the_parameters(capsys):
     values = {"c_kPa": 6.5, "m": 7.0, "gamma": 2.5, "tau_s": 0.5}
     show_summary({"parameters": {"skin": values}, "until": "calibrate", "results": "results"}, as_json=False)
     assert "skin, identified" in capsys.readouterr().out
+
+
+def test_letters_that_the_output_cannot_show_end_no_command(study):
+    """As on Windows, where what is redirected has the letters of one country."""
+    edit(study, "fitted = true", 'fitted = true\nregion = "łydka"')
+    words = [sys.executable, "-m", "limbfit", "sites", str(study)]
+    done = subprocess.run(
+        words, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "cp1252"}, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert rb"\u0142ydka" in done.stdout

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping
+from io import TextIOWrapper
 from typing import Annotated, Any
 
 import typer
@@ -69,6 +70,8 @@ app.add_typer(bench.app, name="bench")
 def main() -> None:
     """The entry point: errors become one line and an exit code."""
     os.environ.update(SAFE_PATH)  # for all that a verb starts
+    if isinstance(sys.stdout, TextIOWrapper):  # letters that its encoding lacks must not end a command
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         with prompt_interrupt():
             app()

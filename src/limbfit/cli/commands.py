@@ -35,8 +35,6 @@ from .console import (
 StudyPath = Annotated[
     Path, typer.Argument(help="study.toml, or the folder that holds it", show_default=False)
 ]
-
-
 Parameters = Annotated[
     str | None,
     typer.Option(

@@ -404,8 +404,7 @@ def show_protocol(found: ProtocolResult) -> None:
     print_table(found.records, columns)
     expected = {one.design: {**one.factor_95, **one.pressures_95} for one in found.protocols}
     _show_expected(expected, found.verdict)
-    for text in found.left_out:
-        print_line(f"told: {text}")
+    _show_left_out(found.left_out)
 
 
 def _show_expected(choices: Mapping[str, Mapping[str, float]], verdict: str) -> None:
