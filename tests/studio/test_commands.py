@@ -5,7 +5,9 @@ from __future__ import annotations
 import time
 
 import psutil
+import pytest
 
+from limbfit.errors import InputError
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.processes import find_command, interrupt_process, start_command, start_run
 
@@ -45,3 +47,9 @@ def test_a_run_works_beside_the_link_that_names_the_study_file(study, tmp_path):
     ended(start_run(StudyFolder(study / "study.toml"), "traces", None, ())["process"])
     assert (study / "results" / "traces" / "stage.json").is_file()
     assert not (other / "results").exists()
+
+
+def test_a_stage_to_repeat_that_comes_after_the_last_one_is_refused_at_once(study):
+    folder = StudyFolder(study / "study.toml")
+    with pytest.raises(InputError, match="predict comes after mesh"):
+        start_run(folder, "mesh", None, ("predict",))

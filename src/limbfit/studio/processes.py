@@ -22,9 +22,9 @@ from typing import IO, Any
 
 import psutil
 
-from ..errors import InputError, RunError
+from ..errors import RunError
 from ..execution import SAFE_PATH
-from ..pipeline.commands.run import STAGE_NAMES
+from ..pipeline.commands.run import select_stages_to_redo
 from ..pipeline.engine.journal import redact_paths
 from ..pipeline.engine.store import find_holder, is_held
 from ..study import load_study
@@ -59,13 +59,11 @@ def start_run(
     folder: StudyFolder, until: str | None, start: str | None, force: Sequence[str]
 ) -> dict[str, Any]:
     """Start ``limbfit run`` on the study; what it reports goes to the study's log, as always. Raises
-    `InputError` where the study cannot be read, a record is yet to be made, or a stage does not exist, and
-    `RunError` where a run holds the study.
+    `InputError` where the study cannot be read, a record is yet to be made, or a stage does not exist or
+    comes after the last, and `RunError` where a run holds the study.
     """
     _refuse_busy(folder)
-    for name in (until, start, *force):
-        if name is not None and name not in STAGE_NAMES:
-            raise InputError(f"no stage is named {name!r}", remedy="stages are " + ", ".join(STAGE_NAMES))
+    select_stages_to_redo(folder.load(), until, start, force)
     options = [*(["--until", until] if until else []), *(["--from", start] if start else [])]
     options += [word for name in force for word in ("--force", name)]
     return {"process": start_command([*_build_run_words(folder, "run"), *options], folder.folder)}

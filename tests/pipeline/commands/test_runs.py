@@ -67,8 +67,9 @@ def test_stages_are_done_anew_where_asked_for(alone):
     assert done(start="sites") == ["traces", "sites"]
     with pytest.raises(InputError, match="no stage is named 'meshing'"):
         done(start="meshing")
-    with pytest.raises(InputError, match="comes after"):
-        done(start="report")
+    for how in ({"start": "report"}, {"force": ["traces", "predict"]}):
+        with pytest.raises(InputError, match="comes after traces"):
+            done(**how)
 
 
 def test_the_log_tells_what_happened_and_no_names_of_files(alone):

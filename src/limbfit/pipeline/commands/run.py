@@ -193,7 +193,7 @@ def run_study(
     RunError
         When another run holds the study, or the disk is full.
     """
-    anew = _select_stages_to_redo(study, until, start, force)
+    anew = select_stages_to_redo(study, until, start, force)
     with _open_run(study, "run", listener) as context:
         kept = keep_hand_labels(study)
         if kept is not None:
@@ -241,7 +241,7 @@ def _check_limb(context: Context, check: Callable[[LimbGeometry], None] | None, 
         check(limb)
 
 
-def _select_stages_to_redo(
+def select_stages_to_redo(
     study: Study, until: str | None, start: str | None, force: Sequence[str]
 ) -> set[str]:
     """Stages that are done whether they are up to date or not."""
@@ -249,8 +249,9 @@ def _select_stages_to_redo(
     for name in (until, start, *force):
         if name is not None and name not in names:
             raise InputError(f"no stage is named {name!r}", remedy="stages are " + ", ".join(names))
-    if until is not None and start is not None and names.index(start) > names.index(until):
-        raise InputError(f"{start} comes after {until}", remedy="leave out one of the two")
+    for name in filter(None, (start, *force)):
+        if until is not None and names.index(name) > names.index(until):
+            raise InputError(f"{name} comes after {until}", remedy="leave out one of the two")
     return {*force, *(names[names.index(start) :] if start is not None else ())}
 
 
