@@ -27,10 +27,12 @@ from typing import Any
 import numpy as np
 from runs_jobs import TISSUES, answer, bind, measured, nothing, stored_fields
 
-from limbfit.bench.blocks import DEPTH, INDENTATION, build_block_site, build_layered_block
+from limbfit.bench.blocks import DEPTH, build_block_model, build_layered_block
 from limbfit.execution import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
 from limbfit.indentation import SimulationJob, SiteModel, simulate
+from limbfit.mesh import write_vtu
 from limbfit.pipeline.simulation.simulations import CURVE_POINTS, SimulationCache
+from limbfit.study import SolverTable
 from limbfit.study.meshing import MeshTable
 
 SOFT, STIFF = (6.0, 5.0, 1.5, 0.6, 4.0, 4.0, 1.5, 0.6), (9.0, 6.0, 2.0, 0.5, 4.0, 4.0, 3.0, 0.3)
@@ -41,7 +43,8 @@ def site(folder: Path, name: str, divisions: int) -> SiteModel:
     block = build_layered_block("tet10", divisions)
     low = np.flatnonzero(block.points[:, 2] <= -DEPTH)
     mesh = replace(block, node_sets={"fixed_bottom": low})
-    return build_block_site(name, folder / f"{name}.vtu", mesh, INDENTATION, element=MeshTable().element)
+    write_vtu(mesh, folder / f"{name}.vtu")
+    return build_block_model(name, folder / f"{name}.vtu", SolverTable(), MeshTable().element)
 
 
 def job_of(model: SiteModel, parameters: tuple[float, ...], sensitivities: bool = True) -> SimulationJob:

@@ -11,7 +11,7 @@ import numpy as np
 
 from limbfit.anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from limbfit.anatomy.surfaces.triangles import Surface
-from limbfit.bench.blocks import build_block_site
+from limbfit.bench.blocks import build_block_model
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
@@ -22,7 +22,7 @@ from limbfit.pipeline.engine.storage import write_json
 from limbfit.pipeline.engine.store import COARSE, Store
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.pipeline.simulation.limb_geometry import find_fibre_directions
-from limbfit.study import Study, load_study
+from limbfit.study import SolverTable, Study, load_study
 from tetrahedra import turn_upright
 
 TISSUES = ("skin", "fat", "muscle")
@@ -67,6 +67,14 @@ def block_context(study: Study, truth: Parameters) -> Context:
     """That of a `block_study`, 18 mm of skin and muscle pressed by 3 mm, up to its records."""
     store = store_blocks(study, {"a": ((3.0, 15.0), 3.0, True)}, truth, 3)
     return Context(study, store, SerialExecutor(), lambda event: None)
+
+
+def build_block_site(
+    name: str, file: Path, mesh: Mesh, depth_mm: float, steps: SolverTable | None = None, element: str = ""
+) -> SiteModel:
+    """A site in the middle of a block's top, its mesh stored in ``file``; in and out at the usual speed."""
+    write_vtu(mesh, file)
+    return build_block_model(name, file, steps or SolverTable(), element, depth_mm)
 
 
 def layered_block(

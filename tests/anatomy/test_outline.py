@@ -18,7 +18,8 @@ from limbfit.anatomy.segmentation.fat import find_bright_fat, select_subcutaneou
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.errors import ImageError
 from limbfit.phantom.geometry import SKIN_AND_FAT, Limb, make_limb
-from limbfit.phantom.mri import CONTRASTS, build_image, make_grid
+from limbfit.phantom.mri import CONTRASTS, make_grid
+from scanned import build_image
 
 SEED = 2
 

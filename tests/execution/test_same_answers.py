@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from layered import layered_block
-from limbfit.bench.blocks import build_block_site
+from layered import build_block_site, layered_block
 from limbfit.execution import ProcessExecutor, SerialExecutor
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.study import SolverTable

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array, triu
 
-from layered import layered_block
-from limbfit.bench.blocks import build_block_site
+from layered import build_block_site, layered_block
 from limbfit.errors import ProblemError
 from limbfit.fe import System, compute_tangent_at_rest
 from limbfit.indentation import (

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.bench.blocks import build_block_site, build_layered_block
+from layered import build_block_site
+from limbfit.bench.blocks import build_layered_block
 from limbfit.errors import ProblemError
 from limbfit.fe import History, OgdenQLV, Problem, Result, StepControl, Support, solve
 from limbfit.indentation import SimulationJob, SiteModel, WavePlace, place_waves_under, simulate, to_vector

@@ -15,13 +15,14 @@ from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.errors import InputError, StudyError
 from limbfit.phantom import Limb, build_true_sites, make_limb, make_phantom
 from limbfit.phantom.forces import choose_discretisation
-from limbfit.phantom.mri import LABELS_FILE, build_image, make_grid, write_true_labels
+from limbfit.phantom.mri import LABELS_FILE, make_grid, write_true_labels
 from limbfit.phantom.sites import DETAIL_SITES, SAFE_SHARE
 from limbfit.phantom.socket import LINER_MM, make_socket
 from limbfit.phantom.surfaces import build_outer_surface, build_true_anatomy
 from limbfit.pipeline.commands.check import check_study
 from limbfit.pipeline.socket.shape import build_regions, load_of
 from limbfit.study import load_study
+from scanned import build_image
 
 THIGH = "transfemoral"
 

@@ -7,8 +7,9 @@ from pathlib import Path
 from limbfit import run_study
 from limbfit.anatomy.imaging import Volume, write_volume
 from limbfit.phantom.geometry import make_limb
-from limbfit.phantom.mri import build_image, make_grid
+from limbfit.phantom.mri import make_grid
 from limbfit.study import load_study
+from scanned import build_image
 
 STUDY = """
 [study]

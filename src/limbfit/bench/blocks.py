@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import ProblemError
 from ..fe import ELEMENTS, History, Indenter, OgdenQLV, Problem
 from ..indentation import SiteModel
-from ..mesh import Mesh, to_tet10, write_vtu
+from ..mesh import Mesh, to_tet10
 from ..mesh.boxes import HEX, SIX_TETS, build_boxes
 from ..study import SolverTable
 
@@ -32,14 +32,6 @@ def build_punched_block(element: str, divisions: int) -> Problem:
         history=History(np.array([0.0, ramp, 2 * ramp]), np.array([0.0, INDENTATION, 0.0])),
         element=element,
     )
-
-
-def build_block_site(
-    name: str, file: Path, mesh: Mesh, depth_mm: float, steps: SolverTable | None = None, element: str = ""
-) -> SiteModel:
-    """A site in the middle of a block's top, its mesh stored in ``file``; in and out at the usual speed."""
-    write_vtu(mesh, file)
-    return build_block_model(name, file, steps or SolverTable(), element, depth_mm)
 
 
 def build_block_model(

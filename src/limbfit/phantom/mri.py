@@ -23,7 +23,7 @@ from pydicom.uid import UID, ExplicitVRLittleEndian, MRImageStorage, generate_ui
 from pydicom.valuerep import format_number_as_ds
 from scipy.special import ndtr
 
-from ..anatomy.grid import DEFAULT_NAMES, Volume
+from ..anatomy.grid import DEFAULT_NAMES
 from ..anatomy.imaging import LabelMap, write_labels
 from .geometry import Limb, build_rotation
 from .limb_shapes import PROXIMAL_CUT_MM
@@ -213,20 +213,6 @@ def generate_slabs(
             imaginary = deviation * random.standard_normal(signal.shape, dtype=np.float32)
             signal = np.hypot(signal, imaginary)
         yield k, signal
-
-
-def build_image(
-    limb: Limb,
-    grid: ScanGrid,
-    markers: Sequence[SkinMarker] = (),
-    *,
-    seed: int = 0,
-    noise: float | None = None,
-    levels: Contrast = UTE,
-) -> Volume:
-    """The whole image in memory, without a detour by files; ``levels`` is one of ``CONTRASTS``."""
-    array = np.concatenate([signal for _, signal in generate_slabs(limb, grid, markers, seed, noise, levels)])
-    return Volume(array, np.array(grid.spacing), grid.origin, grid.direction)
 
 
 def write_series(

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from layered import layered_block
-from limbfit.bench.blocks import SPEED, build_block_site
+from layered import build_block_site, layered_block
+from limbfit.bench.blocks import SPEED
 from limbfit.errors import StudyError
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.indentation.sites import ROUGHLY

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from layered import layered_block
-from limbfit.bench.blocks import build_block_site
+from layered import build_block_site, layered_block
 from limbfit.identify.fit.calibration import CalibrationSettings, calibrate
 from limbfit.identify.fit.objective import MeasuredCurve
 from limbfit.identify.fit.parameters import FIXED, Unknowns

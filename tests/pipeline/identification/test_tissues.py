@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from layered import TISSUES, TRUTH, layered_block, store_blocks
-from limbfit.bench.blocks import build_block_site
+from layered import TISSUES, TRUTH, build_block_site, layered_block, store_blocks
 from limbfit.cli.commands import parse_parameters
 from limbfit.errors import InputError, StudyError
 from limbfit.execution import SerialExecutor

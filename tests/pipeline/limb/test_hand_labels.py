@@ -13,9 +13,10 @@ from limbfit.anatomy.grid import LabelMap, Volume
 from limbfit.anatomy.imaging import read_labels, write_labels, write_volume
 from limbfit.errors import StudyError
 from limbfit.phantom.geometry import make_limb
-from limbfit.phantom.mri import build_image, make_grid
+from limbfit.phantom.mri import make_grid
 from limbfit.pipeline.commands.run import study_status
 from limbfit.study import Study, load_study
+from scanned import build_image
 
 TEXT = """
 [study]

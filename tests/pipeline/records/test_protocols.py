@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from layered import layered_block
+from layered import build_block_site, layered_block
 from limbfit import check_study, load_study
-from limbfit.bench.blocks import build_block_site
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import SimulationJob, simulate, to_vector
 from limbfit.pipeline.engine.context import Context

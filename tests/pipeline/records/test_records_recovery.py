@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import layered
-from layered import layered_block, store_blocks
-from limbfit.bench.blocks import build_block_site
+from layered import build_block_site, layered_block, store_blocks
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import SimulationJob, SiteModel, simulate
 from limbfit.mesh import write_vtu

@@ -10,8 +10,7 @@ import pytest
 from seen_blocks import PUNCH, Made, SeenBlock, estimate_at_truth
 
 import layered
-from layered import layered_block
-from limbfit.bench.blocks import build_block_site
+from layered import build_block_site, layered_block
 from limbfit.bench.blocks import build_layered_block as block_of
 from limbfit.errors import ProblemError, TraceError
 from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_vector
