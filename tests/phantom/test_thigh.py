@@ -11,11 +11,12 @@ import pytest
 from test_phantom_folder import cubic_law
 
 from limbfit import run_study
+from limbfit.anatomy.imaging import write_labels
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.errors import InputError, StudyError
 from limbfit.phantom import Limb, build_true_sites, make_limb, make_phantom
 from limbfit.phantom.forces import choose_discretisation
-from limbfit.phantom.mri import LABELS_FILE, make_grid, write_true_labels
+from limbfit.phantom.mri import LABELS_FILE, build_true_labels, make_grid
 from limbfit.phantom.sites import DETAIL_SITES, SAFE_SHARE
 from limbfit.phantom.socket import LINER_MM, make_socket
 from limbfit.phantom.surfaces import build_outer_surface, build_true_anatomy
@@ -106,7 +107,9 @@ def test_its_study_needs_no_tibia(tmp_path: Path) -> None:
     assert force == pytest.approx(800.0 * anatomy.cut_normal)
     assert not moment.any()
     assert point == pytest.approx(socket.points[socket.brim].mean(axis=0), abs=5.0)
-    write_true_labels(tmp_path / "study", thigh(0), make_grid(thigh(0), "coarse", 0))
+    labels = build_true_labels(thigh(0), make_grid(thigh(0), "coarse", 0))
+    (tmp_path / "study" / LABELS_FILE.parent).mkdir()
+    write_labels(tmp_path / "study" / LABELS_FILE, labels)
     with (tmp_path / "study" / "study.toml").open("a") as file:
         file.write(
             f'[[socket.loads]]\nname = "x"\npreset = "toe-off"\n[segmentation]\nlabels = "{LABELS_FILE}"\n'

@@ -11,6 +11,7 @@ from limbfit.anatomy.surfaces.mending import build_closed_anatomy
 from limbfit.anatomy.surfaces.surfacefiles import read_surface
 from limbfit.anatomy.surfaces.surfaces import Anatomy
 from limbfit.anatomy.surfaces.triangles import Surface, find_bodies
+from limbfit.socket.shape import cut_section
 
 SHARED = Path(__file__).parents[2] / ".." / "shared" / "data"
 FILES = {
@@ -74,3 +75,9 @@ def real_limb(name: str) -> Anatomy:
     high = sorted(bones[2:], key=lambda part: len(part.faces))
     named = {"fibula": low[0], "tibia": low[1], "patella": high[0], "femur": high[1]}
     return build_closed_anatomy(skin, named, None, {})[0]
+
+
+def measure_circumference(surface: Surface, point: np.ndarray, normal: np.ndarray) -> float:
+    """Length of a surface's section by a plane, mm: what a thread along the surface measures."""
+    segments = cut_section(surface, point, normal)
+    return float(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).sum())

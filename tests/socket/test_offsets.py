@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from socket_limbs import CUT_NORMAL, round_limb
+from socket_limbs import CUT_NORMAL, measure_circumference, round_limb
 from test_wall import thickness as measured_by_trimesh
 
 from limbfit.anatomy.frame import build_limb_frame
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
-from limbfit.socket import Recipe, Zone, measure_circumference, rectify_limb
+from limbfit.socket import Recipe, Zone, rectify_limb
 from limbfit.socket.rays import Offsets, compute_offsets, compute_profile
 from limbfit.socket.rectify import reduce_to_volume
 from limbfit.socket.trim import Trim

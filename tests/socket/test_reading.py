@@ -111,6 +111,23 @@ def test_an_open_end(tmp_path: Path) -> None:
     assert socket.points[socket.brim, 2].min() > 100.0
 
 
+def test_skin_and_bones_below_an_open_end_are_not_those_of_the_socket(tmp_path: Path) -> None:
+    """The tibia reaches down to z = 25, out of a tube that ends at 50."""
+    keep = face().triangles[:, :, 2].min(axis=1) > 50.0
+    write_surface(tmp_path / "tube.stl", Surface(face().points, face().faces[keep]))
+    socket, limb = read(tmp_path / "tube.stl"), round_limb()
+    height = limb.skin.triangles.mean(axis=1)[:, 2]
+    covered = socket.find_covered(limb.skin.triangles.mean(axis=1))
+    assert not covered[height < 50.0].any()
+    assert not covered[height > 112.0].any()
+    assert covered[(height > 60.0) & (height < 105.0)].all()
+    low = limb.bones["tibia"].points - np.array([38.0, 0.0, 0.0])
+    frame = build_limb_frame(limb.cut_point, limb.cut_normal)
+    aside = {"tibia": Surface(low, limb.bones["tibia"].faces)}
+    with pytest.raises(SurfaceError, match="into the bone tibia"):  # through the tube's side
+        read_socket(tmp_path / "tube.stl", outer=limb.skin, frame=frame, bones=aside)
+
+
 @pytest.mark.parametrize("turned", [False, True])
 def test_of_a_wall_the_inner_side_is_taken(tmp_path: Path, turned: bool) -> None:
     body = walled()

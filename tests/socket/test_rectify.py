@@ -8,13 +8,13 @@ from functools import cache
 import igl
 import numpy as np
 import pytest
-from socket_limbs import CUT_NORMAL, FILES, TOP, real_limb, revolved, round_limb
+from socket_limbs import CUT_NORMAL, FILES, TOP, measure_circumference, real_limb, revolved, round_limb
 
 from limbfit.anatomy.frame import Frame, build_limb_frame
 from limbfit.anatomy.surfaces.surfaces import Anatomy
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
-from limbfit.socket import Area, Recipe, Socket, measure_circumference, rectify_limb
+from limbfit.socket import Area, Recipe, Socket, rectify_limb
 from limbfit.socket.landmarks import find_knee_centre
 from limbfit.socket.trim import Trim
 

@@ -11,7 +11,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "anatomy"))
 from bodies import limb
 
-from limbfit.donning import LoadedState, Strains
+from limbfit.donning import Load, LoadedState, SocketFit, Strains, build_socket_steps
 from limbfit.identify.checks.domain import ANGLE, LEVEL, PRESSURE, RATE, SHEAR, TIME, Extent, RecordedRange
 from limbfit.mesh import Mesh, boundary_faces, cell_volumes
 from limbfit.mesh.boxes import SIX_TETS, build_boxes
@@ -78,3 +78,14 @@ def test_directions_go_around_the_limb():
         steps = np.diff(axis.measure_angle(ring)) % 360.0
         assert np.allclose(steps, 90.0, atol=6.0) or np.allclose(steps, 270.0, atol=6.0)
         np.testing.assert_allclose(np.diff(axis.measure_level(ring)), 0.0, atol=1e-9)
+
+
+def test_a_hold_of_hours_ends_once():
+    """Not again in the steps of a load that comes on within seconds of its end."""
+    up, hours = np.array([0.0, 0.0, 1.0]), 8 * 3600.0
+    load = Load("stance", 800.0 * up, np.zeros(3), np.zeros(3), 1.0, 2.0)
+    fit = SocketFit(np.zeros(3), up, np.array([0.0, -1.0, 0.0]), hold_s=hours, loads=[load])
+    ends = [
+        (time, name) for time in build_socket_steps(fit, 0.01).times or () for name in fit.find_held(time)
+    ]
+    assert ends == [(pytest.approx(2.0 + hours), "donning"), (pytest.approx(5.0 + hours), "stance")]

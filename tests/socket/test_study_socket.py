@@ -14,7 +14,9 @@ from limbfit.anatomy.surfaces.surfacefiles import write_surface
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import StudyError
 from limbfit.pipeline.commands.check import check_study
+from limbfit.pipeline.commands.fitting import choose_tissues
 from limbfit.pipeline.socket.shape import build_regions, build_socket, load_of
+from limbfit.priors import of_tissues
 from limbfit.socket import Socket
 from limbfit.socket.landmarks import find_knee_centre
 from limbfit.study import Study, load_study
@@ -139,6 +141,16 @@ BAD: dict[str, tuple[str, str, bool]] = {
     ),
     "trimline needs three points": ("[socket]\ntrimline = [[0, 0, 90]]\n", "", True),
     "names must differ": ((AREA + "position = [0, -44, 60]\n") * 2, "", True),
+    "'donning' is a name of the results' own": (
+        '[[socket.loads]]\nname = "donning"\nforce_N = [0, 0, 9]\n',
+        "give another",
+        True,
+    ),
+    "'the limb' is a name of the results' own": (
+        '[[socket.regions]]\nname = "the limb"\nposition = [0, -46, 80]\nradius_mm = 15\n',
+        "give another",
+        True,
+    ),
     "give either preset": ('[[socket.loads]]\nname = "x"\n', "", True),
     "a preset has its own moment": (
         '[[socket.loads]]\nname = "x"\npreset = "toe-off"\nmoment_Nmm = [0, 0, 1]\n',
@@ -177,6 +189,19 @@ def test_what_is_wrong_is_told_by_key(tmp_path: Path, words: str) -> None:
     assert "study.toml" in told
     assert "socket" in told
     assert "\n" not in told
+
+
+def test_tissues_of_people_are_taken_though_they_know_nothing_of_another_tissue(tmp_path: Path) -> None:
+    """Skin and muscle are people's; the band between them, and what nobody knows of any, starts as stated."""
+    layers = '{ name = "skin", thickness_mm = 2 }, { name = "band", thickness_mm = 3 }'
+    study = study_of(tmp_path, f"[geometry]\nlayers = [{layers}]\n")
+    people, start = of_tissues(("skin", "muscle")), study.material.of("band", "start")
+    found, origin = choose_tissues(study, literature=True)
+    assert origin == "literature"
+    assert found["band"] == start
+    for tissue in ("skin", "muscle"):
+        assert found[tissue]["c_kPa"] == people[f"{tissue}.c_kPa"][0] != start["c_kPa"]
+        assert found[tissue]["tau_s"] == start["tau_s"]
 
 
 def test_a_table_without_shape_is_a_study_of_its_keys(tmp_path: Path) -> None:

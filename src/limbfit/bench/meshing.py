@@ -25,7 +25,7 @@ from ..arrays import Array
 from ..errors import InputError, LimbfitError
 from ..phantom.geometry import make_limb
 from ..phantom.mri import make_grid
-from .parity import Tell, find_reference
+from .parity import Row, Tell, find_reference
 
 SITES = 20
 SEEDS = (0, 1, 2)
@@ -35,7 +35,6 @@ BELOW_CUT_MM = 25.0  # sites keep this far from the proximal cut
 CALF_PLANE = (-36.7, 13.3, -94.4), (-0.10164, -0.16645, 0.98080)
 CALF_PAD_MM = 15.0
 OPENLIMB_CUT = (0.0, 0.0, 5.0), (0.0, 0.0, 1.0)
-Row = dict[str, Any]
 
 
 def bench_meshing(

@@ -96,6 +96,10 @@ class SocketFit:
             start += ramp + hold
         return tuple(ends)
 
+    def find_held(self, time_s: float) -> list[str]:
+        """Name of what has been held until a time, donning or a load; none at any other time."""
+        return [name for name, _, off in self.ends if np.isclose(time_s, off, rtol=1e-9, atol=0.0)]
+
 
 def build_socket_problem(
     mesh: Mesh, materials: Mapping[str, Material], socket: Socket, fit: SocketFit

@@ -10,9 +10,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Mask
 from ..fe import (
     Checkpoints,
     Problem,
@@ -30,7 +29,6 @@ from ..fe.kernel.laws import Laws
 from ..fe.observables import compute_element_fields
 from .model import SocketFit, build_socket_steps
 
-Mask = NDArray[np.bool_]
 Facts = dict[str, Any]
 
 WHOLE, SETTLING = "the limb", "settling"
@@ -77,12 +75,11 @@ def simulate_donning(
     def record(step: Step) -> None:
         found = compute_tractions(system, laws, step.state)
         rows.append(_build_row(step, found, patches))
-        for name, _, off in fit.ends:
-            if np.isclose(step.time, off):
-                pressure, shear = found.at_nodes(len(problem.mesh.points))
-                slopes = _compute_slopes(problem, system, laws, step.state, patches) if sensitivities else {}
-                strains = Strains.of(system, laws, step.state)
-                held[name] = LoadedState(rows[-1], pressure, shear, step.state.u, strains, slopes)
+        for name in fit.find_held(step.time):
+            pressure, shear = found.at_nodes(len(problem.mesh.points))
+            slopes = _compute_slopes(problem, system, laws, step.state, patches) if sensitivities else {}
+            strains = Strains.of(system, laws, step.state)
+            held[name] = LoadedState(rows[-1], pressure, shear, step.state.u, strains, slopes)
         if on_row is not None:
             on_row(rows[-1])
 

@@ -25,6 +25,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from scipy.interpolate import interp1d
 
+from ..anatomy.imaging import write_labels
 from ..anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from ..arrays import Array
 from ..errors import InputError
@@ -38,7 +39,7 @@ from .forces import (
     simulate_true_force,
 )
 from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, make_limb
-from .mri import DETAIL_GRIDS, LABELS_FILE, TENDON_LABEL, make_grid, write_series, write_true_labels
+from .mri import DETAIL_GRIDS, LABELS_FILE, TENDON_LABEL, build_true_labels, make_grid, write_series
 from .record import SecondaryMeasurements, record, write_surface, write_ultrasound, write_waves
 from .sites import (
     DETAIL_SITES,
@@ -180,7 +181,8 @@ def _write_images(
 ) -> None:
     grid = make_grid(limb, detail, seed)
     if limb.has_tendon:
-        write_true_labels(work, limb, grid)
+        (work / LABELS_FILE.parent).mkdir()
+        write_labels(work / LABELS_FILE, build_true_labels(limb, grid))
     series = (("plain", (), "UTE residuum"), ("markers", build_markers(everywhere), "UTE residuum, markers"))
     for number, (name, markers, description) in enumerate(series, start=1):
         write_series(

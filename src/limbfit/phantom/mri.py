@@ -24,7 +24,7 @@ from pydicom.valuerep import format_number_as_ds
 from scipy.special import ndtr
 
 from ..anatomy.grid import DEFAULT_NAMES
-from ..anatomy.imaging import LabelMap, write_labels
+from ..anatomy.imaging import LabelMap
 from .geometry import Limb, build_rotation
 from .limb_shapes import PROXIMAL_CUT_MM
 
@@ -315,9 +315,3 @@ def build_true_labels(limb: Limb, grid: ScanGrid) -> LabelMap:
     names = {value: name for value, name in DEFAULT_NAMES.items() if (array == value).any()}
     tendon = {TENDON_VALUE: TENDON_LABEL} if limb.has_tendon else {}
     return LabelMap(array, np.array(grid.spacing), grid.origin, grid.direction, names | tendon)
-
-
-def write_true_labels(folder: Path, limb: Limb, grid: ScanGrid) -> None:
-    """Write the label map to ``LABELS_FILE`` below a folder."""
-    (folder / LABELS_FILE.parent).mkdir()
-    write_labels(folder / LABELS_FILE, build_true_labels(limb, grid))

@@ -7,17 +7,13 @@ from functools import partial
 
 import numpy as np
 import pyvista as pv
-from numpy.typing import NDArray
 
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
 from ..anatomy.surfaces.triangles import find_bodies, find_open_edges, from_pyvista
 from .geometry import TENDON, Limb, compute_gradient
-from .limb_shapes import PROXIMAL_CUT_MM, compute_skin_field
+from .limb_shapes import PROXIMAL_CUT_MM, Array, compute_skin_field
 
-Array = NDArray[np.floating]
 Field = Callable[[Array], Array]
-
-
 Corner = tuple[float, float, float]  # of a box of the limb frame, mm
 
 STICK_OUT_MM = 6.0  # of the femur beyond the cut, so that the void it leaves is open there

@@ -214,7 +214,7 @@ class RegionGain(ResultPart):
     control_kPa: float = Field(description="Largest pressure with the control.")
     design_kPa: float = Field(description="Largest pressure with the design.")
     optimised_kPa: float = Field(description="Largest pressure with the optimised design.")
-    change_percent: float = Field(description="Change from the control.")
+    change_percent: float | None = Field(description="Change from the control; null: that does not touch.")
 
 
 class DesignTrial(ResultPart):

@@ -3,4 +3,4 @@
 from .areas import Area, Zone
 from .reading import read_socket
 from .rectify import Recipe, rectify_limb
-from .shape import Socket, measure_circumference
+from .shape import Socket

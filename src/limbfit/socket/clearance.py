@@ -8,6 +8,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from ..anatomy.frame import Frame
+from ..anatomy.surfaces.mending import open_loops
 from ..anatomy.surfaces.triangles import Surface, find_half_edges
 from ..arrays import Array, Indices
 from ..errors import SurfaceError
@@ -72,7 +73,7 @@ def refuse_bones(
     remedy: str,
     spare_mm: float = 0.0,
 ) -> None:
-    """Refuse a face that a bone reaches through, below the brim.
+    """Refuse a face that a bone reaches through, below the brim and above an open end.
 
     Parameters
     ----------
@@ -89,9 +90,11 @@ def refuse_bones(
     face = Surface(frame.to_limb(face.points), face.faces)
     closed = close_by_fans(face.flipped)
     lowest = float(face.points[brim, 2].min())
+    ends = [face.points[loop, 2].max() for loop in open_loops(face) if loop[0] not in brim]
     for name, bone in bones.items():
         local = frame.to_limb(bone.points)
-        below = local[local[:, 2] < lowest - BONE_ROUGHNESS_MM]
+        height = local[:, 2]
+        below = local[(height < lowest - BONE_ROUGHNESS_MM) & (height > max(ends, default=-np.inf))]
         if not len(below):
             continue
         out = float(closed.signed_distance(below).max()) - spare_mm

@@ -128,7 +128,7 @@ def build_default_regions(
 
     Parameters
     ----------
-    known : where anterior and medial are; where medial is not, the sides are ``left`` and ``right``.
+    directions : where anterior and medial are; where medial is not, the sides are ``left`` and ``right``.
     below : height over the proximal cut (negative, mm) at which the highest level starts, such as the brim's;
         by default that of the knee centre, or 30 mm below the cut.
     """
@@ -205,22 +205,14 @@ def _select_skin_over_bones(anatomy: Anatomy, directions: Directions) -> dict[st
     return found
 
 
-def _find_thinnest_tissue(skin: Surface, ends: Array, allowed: Mask) -> tuple[Array, Array]:
-    """Find the point (3,) of the skin with the least tissue over bone points (n, 3), and its normal."""
-    faces = np.flatnonzero(allowed)
-    middles = skin.triangles[faces].mean(axis=1)
-    distance = np.linalg.norm(middles[:, None] - ends[None], axis=2).min(axis=1)
-    best = faces[distance.argmin()]
-    return skin.triangles[best].mean(axis=0), skin.face_normals[best]
-
-
 def _select_skin_over_end(anatomy: Anatomy, surface: Surface, *, distal: bool) -> Mask:
     """Select the skin around the place with the least tissue over an end of a bone."""
     skin, height = anatomy.skin, anatomy.height(surface.points)
     near = height < height.min() + BONE_END_MM if distal else height > height.max() - BONE_END_MM
-    below_cut = anatomy.height(skin.triangles.mean(axis=1)) < -1.0
-    middle, outward = _find_thinnest_tissue(skin, surface.points[near], below_cut)
-    return _select_disc(skin, middle, PROMINENCE_MM, outward)
+    middles = skin.triangles.mean(axis=1)
+    distance = np.linalg.norm(middles[:, None] - surface.points[near][None], axis=2).min(axis=1)
+    best = np.where(anatomy.height(middles) < -1.0, distance, np.inf).argmin()
+    return _select_disc(skin, middles[best], PROMINENCE_MM, skin.face_normals[best])
 
 
 def _select_crest(anatomy: Anatomy, directions: Directions, tibia: Surface) -> Mask:

@@ -36,11 +36,6 @@ class StandardLoad:
     inside_mm: float = 0.0
     source: str = ""
 
-    @property
-    def beside_knee(self) -> bool:
-        """True if its line passes beside the knee centre, which then must be known."""
-        return bool(self.ahead_mm or self.inside_mm)
-
     def force(self, body_weight: float, directions: Directions) -> Array:
         """(3,) N, LPS, on the socket."""
         force = self.proximal * directions.proximal + self.anterior * directions.anterior

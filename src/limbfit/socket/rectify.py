@@ -139,12 +139,11 @@ def _draw_surface(lines: TrimmedLimb, recipe: Recipe) -> SocketSurface:
         shares = np.vstack(
             [shares, lengths - flare + flare * np.arange(1, FLARE_ROWS + 1)[:, None] / FLARE_ROWS]
         )
-    rings, at = [lines.pole[None]], [np.zeros(1)]
+    rings, at = [lines.meridians[0, :1]], [np.zeros(1)]
     below, up = [np.array([lengths.mean()])], [np.zeros((1, 3))]
     for number, way in enumerate(shares):
         dense = lines.along(way)
-        around = float(np.linalg.norm(dense - np.roll(dense, 1, axis=0), axis=1).sum())
-        count = max(MIN_RING_POINTS, round(around / recipe.edge_mm))
+        count = max(MIN_RING_POINTS, round(_close_ring(dense)[1][-1] / recipe.edge_mm))
         points, where = _resample_ring(dense, count, 0.5 * (number % 2))
         rings.append(points)
         at.append(where)
@@ -159,11 +158,15 @@ def _draw_surface(lines: TrimmedLimb, recipe: Recipe) -> SocketSurface:
 
 def _interpolate_along_ring(dense: Array, values: Array, shares: Array) -> Array:
     """Interpolate values (n, d) at the points of a dense ring at shares of its length."""
-    closed = np.vstack([dense, dense[:1]])
-    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1)))
-    length /= length[-1]
+    _, length = _close_ring(dense)
     around = np.vstack([values, values[:1]])
-    return np.column_stack([np.interp(shares, length, column) for column in around.T])
+    return np.column_stack([np.interp(shares, length / length[-1], column) for column in around.T])
+
+
+def _close_ring(ring: Array) -> tuple[Array, Array]:
+    """Return a ring (n, 3) with its first point again at its end, and its length up to each point, mm."""
+    closed = np.vstack([ring, ring[:1]])
+    return closed, np.append(0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1)))
 
 
 def _rectify_points(surface: SocketSurface, limb: LimbProfile, frame: Frame, recipe: Recipe) -> Array:
@@ -229,8 +232,7 @@ def _resample_ring(ring: Array, count: int, turn: float) -> tuple[Array, Array]:
     points : (count, 3) on the periodic cubic spline through the ring.
     shares : (count,) of the ring's length at which they lie.
     """
-    closed = np.vstack([ring, ring[:1]])
-    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1)))
+    closed, length = _close_ring(ring)
     shares = (np.arange(count) + turn) / count
     return CubicSpline(length / length[-1], closed, bc_type="periodic")(shares), shares
 

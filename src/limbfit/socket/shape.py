@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..anatomy.surfaces.mending import open_loops
 from ..anatomy.surfaces.triangles import Surface
-from ..arrays import Array, Indices
+from ..arrays import Array, Indices, Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +48,12 @@ class Socket:
     def volume_mm3(self) -> float:
         """The volume up to the brim."""
         return self.closed.volume
+
+    def find_covered(self, points: Array) -> Mask:
+        """True (n,) for points (n, 3) that the face reaches: what of it is nearest is at no open edge."""
+        nearest = self.surface.find_nearest(points)[1]
+        edges = np.concatenate(open_loops(self.surface))
+        return np.asarray(~np.isin(self.faces[nearest], edges).any(axis=1))
 
     def offset(self, limb: Surface) -> Array:
         """(n,) how deep each point lies inside a closed limb surface, mm; negative outside."""
@@ -91,9 +97,3 @@ def measure_section(segments: Array) -> Array:
     twice = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     area = twice.sum() / 2
     return np.append((twice[:, None] * (a + b)).sum(axis=0) / (6 * area), abs(area))
-
-
-def measure_circumference(surface: Surface, point: ArrayLike, normal: ArrayLike) -> float:
-    """Length of a surface's section by a plane, mm: what a thread along the surface measures."""
-    segments = cut_section(surface, point, normal)
-    return float(np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).sum())

@@ -80,8 +80,7 @@ class Target:
             preset = PRESETS[self.kind]
             found = np.full(len(points), self.pressure_kPa * preset.limb)
             values = {name: share * self.pressure_kPa for name, share in preset.regions.items()}
-            values = {name: value for name, value in values.items() if name in regions}
-        rest = {name: value for name, value in values.items() if name not in self.regions}
+        rest = {name: values[name] for name in values if name in regions and name not in self.regions}
         for name, value in (*rest.items(), *self.regions.items()):  # where they overlap, what is stated wins
             share = build_zone(name, anatomy, regions, 0.0).share(below)
             found = (1.0 - share) * found + share * value
@@ -111,7 +110,5 @@ def _compute_depth_share(points: Array, anatomy: Anatomy) -> Array:
 
 def _compute_brim_share(points: Array, socket: Socket) -> Array:
     """Compute the share (n,) of the pressure at points: 0 beyond the brim, growing smoothly below it."""
-    nearest = socket.surface.find_nearest(points)[1]
-    covered = ~np.isin(socket.faces[nearest], socket.brim).any(axis=1)
     t = np.clip(KDTree(socket.points[socket.brim]).query(points)[0] / BRIM_MM, 0.0, 1.0)
-    return np.where(covered, t**2 * (3.0 - 2.0 * t), 0.0)
+    return np.where(socket.find_covered(points), t**2 * (3.0 - 2.0 * t), 0.0)

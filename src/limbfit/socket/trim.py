@@ -52,10 +52,6 @@ class TrimmedLimb:
     length: Array
     brim_station: Array
 
-    @property
-    def pole(self) -> Array:
-        return np.asarray(self.meridians[0, 0])
-
     def along(self, way: Array) -> Array:
         """(angles, 3) the point of each meridian this far (angles,) from the pole."""
         rows = np.arange(len(way))

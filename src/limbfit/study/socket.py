@@ -20,6 +20,10 @@ LINERS: dict[str, dict[str, float]] = {
 }
 
 
+# Names that results have for something else.
+TAKEN_NAMES = {"areas": set[str](), "loads": {"donning"}, "regions": {"the limb", "settling"}}
+
+
 class DesignRegionTable(TomlTable):
     """A region with a pressure of its own, or a limit that ``--optimise`` keeps to."""
 
@@ -148,8 +152,11 @@ class SocketTable(TomlTable):
             raise ValueError(f"trim_mm is a plane of its own: leave it or {stated[1]} out")
         if self.trimline and len(self.trimline) < 3:
             raise ValueError("trimline needs three points or more, in order around the limb")
-        for kind in ("areas", "loads", "regions"):
-            if doubled := find_repeated(one.name for one in getattr(self, kind)):
+        for kind, taken in TAKEN_NAMES.items():
+            names = [one.name for one in getattr(self, kind)]
+            if doubled := find_repeated(names):
                 raise ValueError(f"{kind}: names must differ; given twice: {doubled[0]}")
+            if own := sorted(taken.intersection(names)):
+                raise ValueError(f"{kind}: {own[0]!r} is a name of the results' own; give another")
         if self.edge_mm is not None and self.edge_mm < 0.5 * self.face_edge_mm:
             raise ValueError("edge_mm is shorter than half of face_edge_mm: the face would show its facets")

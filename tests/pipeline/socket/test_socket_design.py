@@ -14,7 +14,12 @@ import trimesh
 
 from limbfit import design_socket, load_study, report_study
 from limbfit.errors import InputError
-from limbfit.execution import Placement, place_jobs
+from limbfit.execution import Placement, SerialExecutor, place_jobs
+from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.socket.design import _Design, _optimise_depths
+from limbfit.pipeline.socket.simulation import SocketRun
+from limbfit.results.socket import LoadedRegion, RegionGain, SocketSimulation, SocketState
 from small_limb import small_limb
 
 SOCKET = """hold_s = 0.0
@@ -166,3 +171,21 @@ def test_what_cannot_be_designed_is_one_line(folder):
     with pytest.raises(InputError, match="--optimise: no region is named 'heel'") as caught:
         design_socket(study, optimise=["heel"])
     assert "tibial crest" in str(caught.value.remedy)
+
+
+def test_a_region_that_the_control_does_not_touch_has_no_percent_of_change(folder):
+    """A control that leaves the end of the limb free presses nothing there, and the search still ends."""
+    study = load_study(folder)
+    context = Context(study, Store(study.results), SerialExecutor(), lambda progress: None)
+
+    def press(name: str, distal_kPa: float, crest_kPa: float) -> _Design:
+        peaks = {"distal tibia": distal_kPa, NAMED: crest_kPa}
+        rows = [LoadedRegion.model_construct(region=region, peak_kPa=peak) for region, peak in peaks.items()]
+        state = SocketState.model_construct(regions=rows)
+        run = SocketRun(name, *[None] * 4)
+        return _Design(run, {}, SocketSimulation.model_construct(donning=state, loads=[]))
+
+    designs = [press("control", 0.0, 90.0), press("design", 12.0, 60.0)]
+    _, found = _optimise_depths(context, None, designs, ["distal tibia", NAMED], 0, lambda done, words: None)
+    changes = [RegionGain(**gain).change_percent for gain in found["gains"]]
+    assert changes == [None, pytest.approx(-100.0 / 3.0)]

@@ -268,9 +268,6 @@ def _write_ramp(study: Study, file: Path, ramp: acquire.RecordedRamp) -> None:
     work.replace(file)
 
 
-# -- the device that is a program
-
-
 def virtual_fitsocket(
     study: Study, *, seed: int = 0, faults: tuple[Fault, ...] = (), paced: bool = False
 ) -> VirtualFitSocket:

@@ -252,10 +252,7 @@ def _describe_socket(study: Study, anatomy: Anatomy | None, bones: Collection[st
         if bones is not None:
             for load in table.loads:
                 check_load(study, load, bones)
-        return [
-            *facts,
-            "the socket's shape is checked after limbfit run --until sites",
-        ]
+        return [*facts, "the socket's shape is checked after limbfit run --until sites"]
     socket = build_loadable_socket(study, anatomy, anatomy.skin)
     named = [one.region for one in table.design.regions]
     check_regions(study, named, "socket.design.regions", build_regions(study, anatomy))

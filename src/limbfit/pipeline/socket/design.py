@@ -309,7 +309,7 @@ def _optimise_depths(
             "control_kPa": control[name],
             "design_kPa": start[name],
             "optimised_kPa": peaks[name],
-            "change_percent": 100.0 * (peaks[name] / control[name] - 1.0),
+            "change_percent": 100.0 * (peaks[name] / control[name] - 1.0) if control[name] else None,
         }
         for name in optimise
     ]

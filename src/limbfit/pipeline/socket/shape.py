@@ -6,7 +6,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +23,6 @@ from ...socket.landmarks import (
     build_stated_region,
     find_bone,
     find_directions,
-    find_knee_centre,
     find_load_point,
 )
 from ...socket.loads import STANDARD_LOADS
@@ -107,9 +105,8 @@ def trim_of(study: Study, anatomy: Anatomy) -> Trim:
     line = np.array(table.trimline) if table.trimline else None
     if planes or line is not None:
         return Trim(planes, line)
-    knee = find_knee_centre(anatomy)
-    below = table.trim_mm if table.trim_mm is not None else (BELOW_CUT_MM if knee is None else BELOW_KNEE_MM)
     tibia = find_bone(anatomy, "tibia")
+    below = table.trim_mm if table.trim_mm is not None else (BELOW_CUT_MM if tibia is None else BELOW_KNEE_MM)
     top = 0.0 if tibia is None else float(anatomy.height(tibia.points).max())  # over the proximal cut, mm
     return Trim([(anatomy.cut_point + (top - below) * anatomy.cut_normal, anatomy.cut_normal)])
 
@@ -166,7 +163,7 @@ def check_load(study: Study, load: SocketLoadTable, bones: Collection[str]) -> N
         return
     standard, place = STANDARD_LOADS[load.preset], f"socket.loads.{load.name}.preset"
     named = [any(bone in name.lower() for name in bones) for bone in ("tibia", "fibula")]
-    if standard.beside_knee and load.point is None and not named[0]:
+    if (standard.ahead_mm or standard.inside_mm) and load.point is None and not named[0]:
         raise StudyError(
             f"{load.preset!r} passes beside the knee centre, which is not known: no bone is named tibia",
             file=study.file,
@@ -214,9 +211,7 @@ def find_covered_regions(
 
     A face belongs to a region where the nearest skin does. Regions that no socket reaches are left out.
     """
-    below = igl.point_mesh_squared_distance(middles, skin.points, skin.faces)[1]
-    nearest = igl.point_mesh_squared_distance(middles, socket.points, socket.faces)[1]
-    covered = ~np.isin(socket.faces[nearest], socket.brim).any(axis=1)
+    below, covered = skin.find_nearest(middles)[1], socket.find_covered(middles)
     masks = {name: region.faces[below] & covered for name, region in regions.items()}
     return {name: mask for name, mask in masks.items() if mask.any()}
 
