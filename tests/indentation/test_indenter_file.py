@@ -10,7 +10,9 @@ import pyvista as pv
 
 from limbfit.errors import InputError, StudyError
 from limbfit.indentation import SiteModel, read_indenter
+from limbfit.pipeline.commands.experiments import EXPERIMENTS
 from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.engine.keys import Keys
 from limbfit.pipeline.simulation.simulations import SimulationJob, compute_job_digest
 from limbfit.study import IndenterTable, Study, load_study
 
@@ -72,11 +74,15 @@ def test_a_file_that_is_no_stl_is_named(study):
 
 
 def test_a_changed_file_makes_calibration_and_simulations_stale(study):
-    before = compute_keys(study)
+    def keys() -> dict[str, str]:
+        chain = compute_keys(study)
+        return chain | {one.name: Keys(study).of(one, chain).digest for one in EXPERIMENTS}
+
+    before = keys()
     pv.Sphere(radius=8.0).save(table(study).file)
-    after = compute_keys(study)
-    stale = {name for name in before if before[name] != after[name]}
-    assert stale == {"calibrate", "predict", "report"}
+    after = keys()
+    fresh = {name for name in before if before[name] == after[name]}
+    assert fresh == {"surfaces", "sites", "traces", "mesh", "socket", "socket_design"}
     model = SiteModel("1", Path("1.vtu"), "", (0, 0, 0), (0, 0, -1), (0, 1), (0, 1), indenter=table(study))
     other = SiteModel(**{**vars(model), "indenter_digest": "changed"})
     moved = SiteModel(**{**vars(model), "indenter": study.indenter})

@@ -23,7 +23,7 @@ class StoppedError(Exception):
     """Stands for a kill: nothing in limbfit catches it."""
 
 
-def run_peaks(context, folder, *, factor: float = 1.0):
+def run_peaks(context, folder, *, factor: float = 1.0, parameters_from: str = ""):
     """The largest forces of the records times a factor; halfway it can be stopped."""
     seen = folder / "seen.txt"
     if not seen.is_file():
@@ -35,7 +35,7 @@ def run_peaks(context, folder, *, factor: float = 1.0):
     return {}
 
 
-PEAKS = Experiment("peaks", run_peaks, needs=("traces",), tables=("material",), options={"factor": 1.0})
+PEAKS = Experiment("peaks", run_peaks, needs=("traces",), tables=("material",))
 
 
 @pytest.fixture(autouse=True)
@@ -86,6 +86,17 @@ def test_options_settings_and_records_decide_an_experiment(study):
     run_experiment(load_study(study), "peaks", listener=quiet)
     change(study, 'trace = "2.csv"', 'trace = "1.csv"')
     assert state(study) == "stale"
+
+
+@pytest.mark.parametrize(("origin", "after"), [("identified", "stale"), ("given", "done")])
+def test_what_was_done_with_identified_parameters_is_stale_where_others_are_identified(study, origin, after):
+    """It does not need the calibration; it says that its parameters are from there."""
+    run_experiment(load_study(study), "peaks", parameters_from=origin, listener=quiet)
+    assert state(study) == "done"
+    change(study, "[surfaces]", "[calibration]\nmax_iterations = 3\n[surfaces]")
+    assert state(study) == after
+    (row,) = [row for row in study_status(load_study(study)) if row["stage"] == "peaks"]
+    assert row["why"] == ["stage calibrate changed"] * (after == "stale")
 
 
 def test_the_report_is_stale_once_there_is_an_experiment_to_show(study):

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 
+import numpy as np
 import pytest
 
 from conftest import COARSE
 from limbfit import Progress, reproduce_study, run_study
+from limbfit.anatomy.grid import Volume
+from limbfit.anatomy.imaging import read_volume, write_volume
 from limbfit.errors import InputError
+from limbfit.pipeline.commands.run import run_record
 from limbfit.study import load_study
 
 
@@ -25,6 +30,36 @@ def test_what_is_no_record_is_refused(study, tmp_path):
         record.write_text(text)
         with pytest.raises(InputError, match="not the record of a run"):
             reproduce_study(record, tmp_path / "again", listener=quiet)
+
+
+class StoppedError(Exception):
+    """Ends a run before it does anything."""
+
+
+def stop(event: Progress) -> None:
+    raise StoppedError
+
+
+def test_an_image_goes_with_its_voxels_and_a_study_by_any_name(study, tmp_path):
+    """A header of MetaImage, whose voxels lie in a file of their own; and a name with brackets."""
+    image = Volume(np.zeros((5, 6, 7), dtype=np.float32), np.ones(3), np.zeros(3), np.eye(3))
+    write_volume(study / "scan [1].mhd", image)
+    text = (study / "study.toml").read_text()
+    text = re.sub(r"\[surfaces\].*?\n(?=\[)", '[image]\npath = "scan [1].mhd"\n', text, flags=re.DOTALL)
+    (study / "study.toml").unlink()
+    (study / "limb.toml").write_text(text)
+    named = load_study(study / "limb.toml")
+    record = run_record(named).to_plain() | {"stages": {"calibrate": {}, "predict": {}}}
+    named.results.mkdir()
+    (named.results / "run.json").write_text(json.dumps(record))
+    with pytest.raises(StoppedError):
+        reproduce_study(study / "limb.toml", tmp_path / "again", listener=stop)
+    again = load_study(tmp_path / "again")
+    assert read_volume(again.path(again.image.path)).size == (7, 6, 5)
+    changed = Volume(image.array + 1.0, image.spacing, image.origin, image.direction)
+    write_volume(study / "scan [1].mhd", changed)
+    with pytest.raises(InputError, match=r"has changed since: image\.path"):
+        reproduce_study(study / "limb.toml", tmp_path / "other", listener=stop)
 
 
 @pytest.mark.slow

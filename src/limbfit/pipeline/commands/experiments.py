@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from inspect import Parameter, signature
 from typing import Any
 
@@ -59,6 +59,7 @@ class Experiment(Stage):
             object.__setattr__(self, "options", defaults)
 
 
+IDENTIFIED = "identified"  # where parameters are from
 _MESHED, _SIMULATED = ("sites", "traces", "mesh"), ("sites", "traces", "mesh", "calibrate")
 _TABLES = ("material", "solver", "indenter", "indenters", "clamps")
 _SOCKET = ("socket", "geometry", "mesh", "material")
@@ -150,6 +151,18 @@ def check_experiment(
         experiment.check(study, limb, options)
 
 
+def compute_experiment_key(
+    keys: Keys, experiment: Experiment, below: Mapping[str, str], options: Mapping[str, Any]
+) -> StageKey:
+    """The key of an experiment with its ``options``; ``below`` are the keys of the chain.
+
+    What was done with identified parameters stands on the calibration that they are from.
+    """
+    if options.get("parameters_from") == IDENTIFIED:
+        experiment = replace(experiment, needs=(*experiment.needs, "calibrate"))
+    return keys.of(experiment, below, options)
+
+
 def list_experiment_states(
     keys: Keys, below: Mapping[str, str]
 ) -> list[tuple[StageState, StageKey, dict[str, Any]]]:
@@ -161,6 +174,6 @@ def list_experiment_states(
     for experiment in EXPERIMENTS:
         stamp = store.stamp(experiment.name)
         options = {**experiment.options, **(stamp.options if stamp else {})}
-        key = keys.of(experiment, below, options)
+        key = compute_experiment_key(keys, experiment, below, options)
         found.append((store.state(experiment.name, key.digest), key, options))
     return found

@@ -7,12 +7,13 @@ from typing import Any
 
 from ...errors import InputError
 from ...indentation import Parameters
-from ...priors import of_tissues
+from ...priors import NONE, TISSUES, of_tissues
 from ...study import Study
 from ..engine.context import Listener, ignore_progress
 from ..engine.store import Store
+from .experiments import IDENTIFIED
 from .run import run_experiment
-from .simulate import IDENTIFIED, choose_parameters, read_recorded_range
+from .simulate import choose_parameters, read_recorded_range
 
 LITERATURE = "literature"
 SIMULATIONS = 6
@@ -126,17 +127,17 @@ def choose_tissues(
 ) -> tuple[Parameters, str]:
     """Parameters of a study's tissues, and where they are from.
 
-    They are ``given``, else identified, else, or with ``literature``, those of people.
+    They are ``given``, else identified, else, or with ``literature``, those of people. A tissue or parameter
+    that these do not know starts as the study says.
     """
     if given or (not literature and Store(study.results).stamp("calibrate") is not None):
         return choose_parameters(study, given)
-    values = {tissue: study.material.of(tissue, "start") for tissue in study.tissues}
-    try:
-        medians = of_tissues(study.tissues, study.calibration.prior_tissues)
-    except InputError:
-        return values, "start of the study"
+    values = {tissue: dict(study.material.of(tissue, "start")) for tissue in study.tissues}
+    origin = "start of the study"
+    others = {one: NONE for one in study.tissues if one not in TISSUES}
+    medians = of_tissues(study.tissues, others | study.calibration.prior_tissues)
     for name, (median, _) in medians.items():
         tissue, key = name.split(".")
         if key in values[tissue]:
-            values[tissue] = {**values[tissue], key: median}
-    return values, LITERATURE
+            values[tissue][key], origin = median, LITERATURE
+    return values, origin

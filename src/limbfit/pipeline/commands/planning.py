@@ -17,8 +17,9 @@ from ..engine.store import Store
 from ..simulation.loading import LoadHistory, time_socket_loads
 from ..socket.intervals import CHANGE_PERCENT
 from ..socket.socket import NAME as SOCKET
+from .experiments import IDENTIFIED
 from .run import run_experiment, study_status
-from .simulate import IDENTIFIED, choose_parameters
+from .simulate import choose_parameters
 
 _SENSOR_N, _MISFIT = 0.05, 0.02  # where no calibration tells: noise, and the model's error over the peak
 _HOLD_S = 30.0

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 
 from ..._version import __version__
+from ...anatomy.labels.labelfiles import find_sidecar
 from ...errors import InputError
 from ...results.curves import read_curves
 from ...study import Study, load_study
 from ..engine.context import Listener, ignore_progress
+from ..engine.digests import find_data_files
 from ..engine.files import find_hand_labels
 from ..engine.provenance import collect_versions, compute_input_digests, record_settings
 from ..engine.storage import read_json
@@ -53,9 +55,9 @@ def reproduce_study(
         Where the record is not one, or the study's inputs or settings are no longer those of the record.
     """
     record, folder = Path(record), Path(folder)
-    file = record if record.name == RECORD else load_study(record).results / RECORD
+    study = load_study(record.absolute().parent.parent if record.name == RECORD else record)
+    file = study.results / RECORD
     known = _read(file)
-    study = load_study(file.parent.parent)
     _check_unchanged(study, known, file)
     _copy_inputs(study, folder)
     summary = run_study(load_study(folder), listener=listener)
@@ -135,8 +137,10 @@ def _copy_inputs(study: Study, folder: Path) -> None:
         if source.is_dir():
             shutil.copytree(source, target, dirs_exist_ok=True)
         else:
-            for one in source.parent.glob(f"{source.name}*"):  # a label map's names lie beside it
-                shutil.copyfile(one, target.with_name(target.name + one.name[len(source.name) :]))
+            shutil.copyfile(source, target)
+            for one in (find_sidecar(source), *find_data_files(source)):  # names of labels, and voxels
+                if one.is_file() and one.parent == source.parent:
+                    shutil.copyfile(one, target.with_name(one.name))
 
 
 def _compare_forces(then: Path, now: Path) -> Iterator[tuple[str, float]]:

@@ -46,7 +46,7 @@ from ..records.record_checks import choose_surface_points, tell_flags
 from ..records.secondary_measurements import read_motion
 from ..records.traces import run_traces
 from ..simulation.limb_geometry import LimbGeometry
-from .experiments import EXPERIMENTS, check_experiment, list_experiment_states
+from .experiments import EXPERIMENTS, check_experiment, compute_experiment_key, list_experiment_states
 
 
 def run_report(context: Context, folder: Path) -> None:
@@ -344,7 +344,7 @@ def run_experiment(
     with _open_run(study, name, listener) as context:
         keys = Keys(study)
         below = {stage: key.digest for stage, key in _compute_chain(keys).items()}
-        key = keys.of(experiment, below, chosen)
+        key = compute_experiment_key(keys, experiment, below, chosen)
         if context.store.state(name, key.digest).state == "done":
             context.tell(name, 1, 1, "is up to date")
         else:

@@ -24,9 +24,9 @@ from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
 from ..simulation.simulations import CURVE_POINTS
+from .experiments import IDENTIFIED
 from .run import compute_keys, run_study
 
-IDENTIFIED = "identified"
 FEB_NAME, FORCES = "model.feb", "forces.txt"
 
 

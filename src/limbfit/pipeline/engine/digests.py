@@ -30,10 +30,21 @@ def compute_digest(*parts: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+def find_data_files(path: Path) -> list[Path]:
+    """The files that hold the voxels of an image of which ``path`` is the header (.mhd, .nhdr); else none."""
+    if path.suffix.lower() not in (".mhd", ".nhdr"):
+        return []
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    names = [re.split("[=:]", line, maxsplit=1)[-1].strip() for line in lines]
+    return [file for name in names if name and (file := path.parent / name).is_file()]
+
+
 def compute_file_digest(path: Path) -> str:
-    """SHA-256 of a file, or of the names and contents of all files below a folder."""
+    """SHA-256 of a file, with that of its voxels apart, or of names and contents of all below a folder."""
     sha = hashlib.sha256()
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    files = [path, *find_data_files(path)]
+    if path.is_dir():
+        files = sorted(p for p in path.rglob("*") if p.is_file())
     for file in files:
         if path.is_dir():
             sha.update(str(file.relative_to(path)).encode())

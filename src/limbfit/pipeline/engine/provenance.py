@@ -70,7 +70,8 @@ def list_input_files(study: Study) -> dict[str, list[Path]]:
     files["surfaces"] += [one.surface for one in study.geometry.regions if one.surface is not None]
     files_of_indenters = [one.file for one in study.all_indenters.values() if one.file is not None]
     if files_of_indenters:
-        files["calibrate"] = files_of_indenters
+        # What needs the calibration is stale with it.
+        files |= dict.fromkeys(("calibrate", "design", "protocol"), files_of_indenters)
     if study.socket.file is not None:
         files["socket"] = [study.socket.file]
     files["traces"] += [path for record in study.recorded for path in record.files]
