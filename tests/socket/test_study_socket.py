@@ -15,6 +15,7 @@ from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import StudyError
 from limbfit.pipeline.commands.check import check_study
 from limbfit.pipeline.commands.fitting import choose_tissues
+from limbfit.pipeline.commands.run import run_experiment
 from limbfit.pipeline.socket.shape import build_regions, build_socket, load_of
 from limbfit.priors import of_tissues
 from limbfit.socket import Socket
@@ -202,6 +203,16 @@ def test_tissues_of_people_are_taken_though_they_know_nothing_of_another_tissue(
     for tissue in ("skin", "muscle"):
         assert found[tissue]["c_kPa"] == people[f"{tissue}.c_kPa"][0] != start["c_kPa"]
         assert found[tissue]["tau_s"] == start["tau_s"]
+
+
+def test_a_tissue_that_is_called_as_the_liner_is_refused(tmp_path: Path) -> None:
+    """A limb that was scanned in its liner: it would become the silicone of the liner over it."""
+    study = study_of(tmp_path, '[geometry]\nlayers = [{ name = "liner", thickness_mm = 3 }]\n')
+    for experiment in ("socket", "socket_design"):
+        with pytest.raises(
+            StudyError, match=r"geometry: a tissue is named 'liner', .*; give it another name"
+        ):
+            run_experiment(study, experiment)
 
 
 def test_a_table_without_shape_is_a_study_of_its_keys(tmp_path: Path) -> None:

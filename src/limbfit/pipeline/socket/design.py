@@ -44,8 +44,8 @@ from .shape import (
     build_regions,
     build_socket_wall,
     build_target,
-    check_at_rest,
     check_regions,
+    check_tissues,
     find_covered_regions,
     load_of,
     place_errors,
@@ -58,8 +58,8 @@ CONTROL, DESIGN, OPTIMISED = "control", "design", "optimised"
 
 
 def check_socket_design(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
-    """Refuse tissues that are not at rest, and a shape, load, region or target that the limb cannot have."""
-    check_at_rest(study)
+    """Refuse tissues as `check_tissues`, and a shape, load, region or target that the limb cannot have."""
+    check_tissues(study)
     if limb is not None:
         build_undeformed_socket(study, limb.anatomy, limb.anatomy.skin, options["optimise"])
 

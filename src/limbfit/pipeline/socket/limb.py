@@ -22,9 +22,9 @@ from ...study import Study
 from ..engine.context import Context
 from ..limb.mesh import is_meshed, keep_mesh, mesh_settings, read_mesh_facts, read_stored_depth
 from ..simulation.limb_geometry import find_fibre_directions
-from .shape import build_regions, mesh_edge_mm
+from .shape import LINER, build_regions, mesh_edge_mm
 
-LINER, MESH = "liner", "limb.vtu"
+MESH = "limb.vtu"
 BELOW_BRIM_MM = 15.0  # edges are short from so far above the brim on
 FAR, GROWTH, FLATNESS = 3.5, 0.5, 1.6  # edges near the proximal cut over those below, and how elements grow
 

@@ -32,6 +32,7 @@ from ...socket.wall import build_wall
 from ...study import Study
 from ...study.socket import SocketLoadTable
 
+LINER = "liner"  # its name among the tissues
 BELOW_KNEE_MM = 10.0  # of the top of the tibia: the brim, where nothing is stated
 BELOW_CUT_MM = 30.0  # of the proximal cut, where no bone is a tibia
 # Edges of a limb's mesh under a socket whose face is no larger than this; larger ones have as many edges.
@@ -179,17 +180,16 @@ def check_load(study: Study, load: SocketLoadTable, bones: Collection[str]) -> N
         )
 
 
-def check_at_rest(study: Study) -> None:
-    """Refuse tissues that contract or are stretched at rest.
-
-    Raises `StudyError`.
-    """
-    for place, states, remedy in (
-        ("material.law", study.material.course, f'give a study of its own with the law "{FIBRED}"'),
-        ("material.prestretch", study.material.prestretch, "give a study of its own without it"),
+def check_tissues(study: Study) -> None:
+    """Raise `StudyError` for tissues that contract or are stretched at rest, and one called as the liner."""
+    rest = "the limb in a socket is at rest, without contraction and pre-stretch"
+    named = f"a tissue is named {LINER!r}, as what is put over the skin"
+    for place, is_refused, what, remedy in (
+        ("material.law", study.material.course, rest, f'give a study of its own with the law "{FIBRED}"'),
+        ("material.prestretch", study.material.prestretch, rest, "give a study of its own without it"),
+        ("geometry", LINER in study.tissues, named, "give it another name"),
     ):
-        if states:
-            what = "the limb in a socket is at rest, without contraction and pre-stretch"
+        if is_refused:
             raise StudyError(what, file=study.file, place=place, remedy=remedy)
 
 

@@ -34,8 +34,8 @@ from ...socket.landmarks import find_directions, find_load_point
 from ..engine.digests import code_digest, compute_digest, compute_file_digest
 from ..engine.partial_results import Made, ResultFiles
 from .intervals import ParameterSpread, SimulationSpread, spread_to_facts
-from .limb import LINER, MESH, SocketLimb
-from .shape import find_covered_regions, load_of
+from .limb import MESH, SocketLimb
+from .shape import LINER, find_covered_regions, load_of
 
 
 @dataclass(frozen=True, eq=False)

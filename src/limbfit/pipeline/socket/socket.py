@@ -32,7 +32,7 @@ from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import NEAR_MM, LimbAxis, describe_socket_load, name_load, time_socket_loads
 from .intervals import CHANGE_PERCENT, FRICTION, ParameterSpread, draw_step, store_change, widen_intervals
 from .limb import SocketLimb
-from .shape import build_loadable_socket, check_at_rest
+from .shape import build_loadable_socket, check_tissues
 from .simulation import SocketRun, run_sockets, simulate_socket, solve_run, summarise_run
 
 NAME = "socket"
@@ -43,8 +43,8 @@ NOT_COMPARED = (
 
 
 def check_socket(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
-    """Refuse tissues that are not at rest, and a shape or load that the limb cannot have."""
-    check_at_rest(study)
+    """Refuse tissues as `check_tissues`, and a shape or load that the limb cannot have."""
+    check_tissues(study)
     if limb is not None:
         build_loadable_socket(study, limb.anatomy, limb.anatomy.skin)
 
