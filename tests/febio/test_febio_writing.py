@@ -18,6 +18,7 @@ from limbfit.febio import (
     FebSettings,
     ParameterRange,
     RunVerdict,
+    build_contact,
     build_result,
     build_step_control,
     find_febio,
@@ -306,6 +307,59 @@ def test_abaqus(tmp_path):
     assert (g, tau) == (skin.gamma / (1 + skin.gamma), skin.tau)
     sides = lines[lines.index("*SURFACE, NAME=contact_patch, TYPE=ELEMENT") + 1 :]
     assert sum("S" in line for line in sides[: len(problem.contact_faces)]) == len(problem.contact_faces)
+
+
+def read_step_times(text: str) -> np.ndarray:
+    """First, whole, smallest and largest increment of every step of a file for Abaqus, s."""
+    lines = text.split("\n")
+    return np.array([[float(v) for v in lines[i + 1].split(",")] for i, line in enumerate(lines)
+                     if line.startswith(("*VISCO,", "*STATIC"))])  # fmt: skip
+
+
+def test_abaqus_meets_every_phase_in_increments_finer_than_it(tmp_path):
+    """A quick ramp after a long hold; in one step its peak could lie within an increment."""
+    times = np.array([0.0, 0.3, 300.3, 300.6, 300.9])
+    problem = replace(block(), history=History(times, np.array([0.0, 1.0, 1.0, 4.0, 0.0])))
+    write_inp(problem, tmp_path / "m.inp", "abaqus", FebSettings())
+    text = (tmp_path / "m.inp").read_text()
+    first, whole, _, largest = read_step_times(text).T
+    np.testing.assert_allclose(np.cumsum(whole), times[1:])
+    assert (largest <= whole / 10.0).all()
+    assert (first <= 0.3 / 10.0).all()
+    assert (whole / largest < 10_000).all()  # no more increments than a step may have
+    assert text.count("*BOUNDARY, AMPLITUDE=advance") == len(whole)
+    assert "*AMPLITUDE, NAME=advance, TIME=TOTAL TIME" in text
+
+
+def test_abaqus_gets_the_contact_stiffness_that_limbfit_holds_at_the_site(tmp_path):
+    found = []
+    for penalty in (None, 400.0):
+        settings = FebSettings(steps=StepControl(penalty=penalty))
+        write_inp(block(), tmp_path / "m.inp", "abaqus", settings)
+        lines = (tmp_path / "m.inp").read_text().split("\n")
+        found.append(float(lines[lines.index("*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR") + 1]))
+        assert found[-1] == pytest.approx(build_contact(block(), settings).penalty)  # as FEBio does
+    assert found[1] == pytest.approx(4.0 * found[0])
+
+
+def test_a_coefficient_of_friction_of_nothing_is_none_for_abaqus(tmp_path):
+    write_inp(replace(block(), friction=0.0), tmp_path / "m.inp", "abaqus", FebSettings())
+    with pytest.raises(ProblemError, match="friction is not written for Abaqus"):
+        write_inp(replace(block(), friction=0.1), tmp_path / "m.inp", "abaqus", FebSettings())
+
+
+def test_under_a_force_the_displacement_is_that_of_the_table(tmp_path):
+    """The table of the exported file, whose force is the stated one and whose place is the answer."""
+    history = History(np.array([0.0, 1.0, 2.0]), force=np.array([0.0, 2.0, 1.0]))
+    problem = replace(block("tet4", divisions=4), history=history)
+    same = {"times": (0.5, 1.0, 1.5, 2.0), "stress": "linear", "penalty": 20.0, "penetration": 1.0}
+    direct = solve(problem, StepControl(**same), store="none")
+    write_feb(problem, tmp_path / "model.feb", FebSettings(steps=StepControl(**same)))
+    run = run_feb(tmp_path / "model.feb", tmp_path / "out", **same)
+    found = build_result(problem, read_log(run.files[0]), RunVerdict("normal", "", 2.0, ""))
+    np.testing.assert_allclose(found.force[1:], direct.force[1:], rtol=1e-3)
+    np.testing.assert_allclose(found.displacement, direct.displacement, atol=0.02 * direct.displacement.max())
+    assert np.abs(found.displacement - history.at(found.times)).max() > 0.1  # which are N
 
 
 def test_calculix_says_no_to_relaxation(tmp_path):

@@ -21,7 +21,7 @@ from ..fe import Indenter, Material, Problem, System
 from ..mesh import Mesh
 from .conditions import FIXED_SET
 from .meshes import FRONT, INDENTER, PATCH, RigidMesh, build_indenter_mesh
-from .penalty import find_cells_behind
+from .penalty import compute_explicit_penalty, find_cells_behind
 from .rendering import write_template
 from .writing import FebSettings, check_simple_indentation
 
@@ -85,8 +85,8 @@ def _describe_file(
     parts.append({"name": INDENTER, "element": "C3D8", "rows": rows})
     whole = Mesh(tool.points, tool.cells, "hex8", np.zeros(len(tool.cells), np.int64), (INDENTER,))
     laws = [problem.materials[name] for name in mesh.region_names]
-    stiffness = 2000.0 / indenter.width * float(np.mean([law.instantaneous_modulus for law in laws]))
-    end = float(history.times[-1])
+    ramps = [phase.duration_s for phase in history.phases if phase.kind != "hold"]
+    shortest = min(ramps, default=float(history.times[-1]))
     return {
         "title": " ".join(settings.title.split()),
         "program": program,
@@ -105,11 +105,15 @@ def _describe_file(
             PATCH: _find_sides(mesh, np.asarray(problem.contact_faces), numbers),
             FRONT: _find_sides(whole, tool.front, own),
         },
-        "stiffness": stiffness,  # limbfit's own contact's, MPa per mm
+        "stiffness": compute_explicit_penalty(problem, settings.steps),
         "advance": np.column_stack([history.times, history.driver]),
         "fixed_set": FIXED_SET,
         "is_relaxing": any(g for law in laws for g, _ in law.table().prony),
-        "step": (history.loading_s / 64.0, end, end * 1e-8, history.loading_s / 16.0),
+        # One for each phase, whose end is met: first increment, whole, smallest and largest one, s.
+        "steps": [
+            (min(t, shortest) / 64.0, t, t * 1e-8, t / 16.0)
+            for t in (one.duration_s for one in history.phases)
+        ],
         "axis": indenter.frame[2].tolist(),
     }
 

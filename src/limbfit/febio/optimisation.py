@@ -40,7 +40,10 @@ class ParameterRange:
 
 
 def check_optimisable(problem: Problem) -> None:
-    """Raise `ProblemError` if what comes before the indentation moves with the fitted parameters."""
+    """Raise `ProblemError` if a given force, or what comes before the indentation, rules out FEBio's fit."""
+    if problem.history.forced:
+        what = 'FEBio\'s fit compares forces, which are given where a record has control = "force"'
+        raise ProblemError(what, remedy="identify with limbfit")
     if problem.touch_down_s or problem.prestretch is not None or problem.bodies:
         raise ProblemError(
             "FEBio's fit cannot follow where a clamped, tensed or pre-strained limb is touched: it moves "

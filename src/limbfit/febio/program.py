@@ -16,7 +16,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError, ProblemError, RunError
-from ..fe import Problem, Result
+from ..fe import Problem, Result, System
 from .preparation import Preparation
 
 PROGRAM_VARIABLE = "FEBIO_CMD"
@@ -141,17 +141,17 @@ def build_result(problem: Problem, log: FebioLog | None, verdict: RunVerdict, se
 
     FEBio's table does not contain penetration and area. Forces across the axis, moments and coordinates are
     not read. All of these are NaN, and there are no states. Raises `ProblemError` if the table holds no force
-    along the indenter's axis, or goes beyond the history.
+    along the indenter's axis (or no place, where a force drives it), or goes beyond the history.
     """
-    times, force = np.zeros(1), np.zeros(1)
+    forced, times, force, moved = problem.history.forced, np.zeros(0), np.zeros(0), np.zeros(0)
     if log is not None:
         begun = Preparation.from_problem(problem).seconds
         own = log.times >= begun * (1.0 - TIME_TOLERANCE)
         times, force = np.maximum(log.times[own] - begun, 0.0), compute_axial_force(problem, log)[own]
-    if not len(times):  # FEBio did not come so far
-        times, force = np.zeros(1), np.zeros(1)
-    if times[0] > 0.0:
-        times, force = np.concatenate([[0.0], times]), np.concatenate([[0.0], force])
+        if forced and (start := System(problem).indenter):
+            moved = _project_on_axis(problem, log, ("x", "y", "z"), np.asarray(start.centre))[own]
+    if not len(times) or times[0] > 0.0:  # FEBio did not come so far, or has not written the beginning
+        times, force, moved = (np.append(0.0, column) for column in (times, force, moved))
     if times[-1] > problem.history.times[-1] * (1.0 + TIME_TOLERANCE):
         raise ProblemError(
             f"the table goes on to {times[-1]:.4g} s, the indentation to {problem.history.times[-1]:.4g} s",
@@ -162,7 +162,7 @@ def build_result(problem: Problem, log: FebioLog | None, verdict: RunVerdict, se
     return Result(
         problem=problem,
         times=times,
-        displacement=problem.history.at(times),
+        displacement=moved if forced else problem.history.at(times),
         force=force,
         force_sensitivity=None,
         parameter_names=problem.parameter_names,
@@ -188,14 +188,19 @@ def compute_axial_force(problem: Problem, log: FebioLog) -> Array:
     """Return the force (n,) of the indenter on the tissue along its axis, N. Raises `ProblemError` if the
     table lacks a component of it.
     """
+    return _project_on_axis(problem, log, ("Fx", "Fy", "Fz"), np.zeros(3))
+
+
+def _project_on_axis(problem: Problem, log: FebioLog, names: tuple[str, ...], origin: Array) -> Array:
+    """Return columns of three components, less an origin (3,), along the indenter's axis (n,)."""
     assert problem.indenter is not None
-    force = np.zeros(len(log.times))
-    for name, share in zip(("Fx", "Fy", "Fz"), problem.indenter.frame[2]):
+    found = np.zeros(len(log.times))
+    for name, share, zero in zip(names, problem.indenter.frame[2], origin):
         if name in log.names:
-            force += share * log.column(name)
+            found += share * (log.column(name) - zero)
         elif abs(share) > 1e-3:
             raise ProblemError(f"the table has no {name}, along which the indenter moves")
-    return force
+    return found
 
 
 @dataclass(frozen=True)

@@ -191,14 +191,14 @@ def check_simple_indentation(problem: Problem, program: str) -> None:
     check_element(problem, program)
     moves_first = problem.prestretch is not None or problem.touch_down_s or problem.activation is not None
     without = "leave them out of the study, or export for FEBio"
-    history = problem.history
+    history, slides = problem.history, problem.friction not in ("frictionless", 0.0)
     for is_there, what, remedy in (
         (moves_first, "a limb that clamps, contraction or pre-stretch move first is", without),
         (problem.indenter is None or problem.supports, "other than an indentation with fixed nodes is", None),
         (history.across is not None, "a move across the indenter's axis is", None),
         (history.forced or problem.bodies, "an indenter under force, or further rigid bodies, are", None),
         (problem.pressures, "a pressure is", None),
-        (problem.friction != "frictionless", "friction is", 'export with friction = "frictionless"'),
+        (slides, "friction is", 'export with friction = "frictionless"'),
     ):
         if is_there:
             raise ProblemError(f"{what} not written for {program}", remedy=remedy)
@@ -217,9 +217,12 @@ def _describe_file(
     curves, settled = CurveList(), Preparation.from_problem(problem).settling_s
     ends = find_step_ends([body.motion for body in bodies], float(prepared.history.times[-1]), settled)
     rigid = [list_conditions(body.name, body.motion, ends, curves) for body in bodies]
-    steps = [_find_step_size(problem, settled, *span) for span in pairwise([0.0, *ends])]
-    for k, step in enumerate(steps):
-        step["conditions"] = [one for body in rigid for one in body[k]]
+    steps: list[dict[str, Any]] = []
+    for k, (begin, end) in enumerate(pairwise([0.0, *ends])):
+        largest = PRESTRAIN_S / 10.0 if end <= settled else _compute_largest_step(problem)
+        size = _divide_evenly(end - begin, 0.25 * largest)  # of the first steps, s, which FEBio enlarges
+        conditions = [one for body in rigid for one in body[k]]
+        steps.append({"count": round((end - begin) / size), "size": size, "conditions": conditions})
     meshes = {body.name: body.tool for body in bodies}
     centres = {body.name: body.centre for body in bodies}
     everywhere = steps[0]["conditions"] if len(steps) == 1 else []
@@ -264,13 +267,6 @@ def _describe_file(
         "gradient": GRADIENT,
         "curves": curves,
     }
-
-
-def _find_step_size(problem: Problem, settled: float, begin: float, end: float) -> dict[str, Any]:
-    """Return number and size, s, of the first steps from ``begin`` to ``end``, which FEBio enlarges."""
-    largest = PRESTRAIN_S / 10.0 if end <= settled else _compute_largest_step(problem)
-    size = _divide_evenly(end - begin, 0.25 * largest)
-    return {"count": round((end - begin) / size), "size": size}
 
 
 def _find_must_points(problem: Problem, settings: FebSettings) -> Array:
