@@ -23,13 +23,7 @@ from ..laws import LAWS, OGDEN, to_parameters
 from ..mesh import read_vtu
 from .neighbourhood import Extension, cut_neighbourhood
 from .observing import observe_result
-from .sites import (
-    Parameters,
-    SiteModel,
-    build_problem,
-    build_site_materials,
-    build_steps,
-)
+from .sites import Parameters, SiteModel, build_problem, build_site_materials, build_steps
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,11 @@ class _RecordKeys(TomlTable):
     shear_waves_sd_m_s: Positive = 0.1
     shear_waves_bias_m_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.1
 
+    @property
+    def forced(self) -> bool:
+        """True if a force drove the indenter, so that depths are compared."""
+        return self.control == "force"
+
     def check_keys(self) -> None:
         if None not in (self.touch_down_s, self.peak_s) and self.touch_down_s >= self.peak_s:  # type: ignore[operator]
             raise ValueError("touch_down_s must come before peak_s")
@@ -120,11 +125,6 @@ class Record(_RecordKeys):
         """The kind of measurement beside the force; empty if there is none."""
         kinds = {"ultrasound": "ultrasound", "surface": "surface displacement", "shear_waves": "shear waves"}
         return next((word for key, word in kinds.items() if getattr(self, key) is not None), "")
-
-    @property
-    def forced(self) -> bool:
-        """True if a force drove the indenter, so that depths are compared."""
-        return self.control == "force"
 
     @property
     def unit(self) -> Literal["N", "mm"]:

@@ -11,10 +11,19 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 
+import numpy as np
 import pytest
 
+from layered import block_context, block_study
 from limbfit import compare_site, export_study, load_study, simulate_feb, simulate_site
 from limbfit.errors import InputError
+from limbfit.fe import StepControl, solve
+from limbfit.indentation import build_problem
+from limbfit.mesh import read_vtu
+from limbfit.pipeline.commands.export import check_export
+from limbfit.pipeline.commands.simulate import write_site_curve
+from limbfit.pipeline.records.records import build_model
+from limbfit.results.curves import read_curves
 
 MESH = "\n[mesh]\nedge_near_mm = 6.0\nedge_far_mm = 18.0\n[indenter]\nedge_radius_mm = 2.0\n"
 TISSUES = {
@@ -47,6 +56,61 @@ def test_formats_and_sites_are_checked(coarse):
     for to, site, words in (("xyz", None, "is no format"), ("feb", "9", "no site"), ("feb", "", "no site")):
         with pytest.raises(InputError, match=words):
             export_study(coarse, to, site=site, listener=quiet)
+
+
+OWN_LAW = """
+from limbfit import Parameter, TissueLaw, register_law
+from limbfit.fe import NeoHookean
+
+MODULUS = Parameter("mu", 4.0, 0.1, 50.0, "kPa", "shear modulus")
+register_law(TissueLaw("own-neo-hookean", "neo-Hookean", "W = mu/2 (I1 - 3)", (MODULUS,), NeoHookean))
+"""
+
+
+@pytest.mark.parametrize(
+    ("material", "more", "site", "words"),
+    [
+        (
+            "",
+            "",
+            'control = "force"',
+            'compares forces, which are given where a record has control = "force"',
+        ),
+        ('law = "own-neo-hookean"', '[study]\nextensions = ["own.py"]', "", 'not for "own-neo-hookean"'),
+        ('law = "ogden-power"', "", "", 'written for "ogden", whatever its relaxation terms, not for'),
+    ],
+)
+def test_what_febios_fit_cannot_identify_is_refused_early(tmp_path, material, more, site, words):
+    (tmp_path / "own.py").write_text(OWN_LAW, encoding="utf-8")
+    block_study(tmp_path, "", "", site)
+    file = tmp_path / "study.toml"
+    text = file.read_text().replace("[material]", f"[material]\n{material}")
+    if more:
+        text = text.replace("[study]", more, 1)
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=f"study.toml: a: FEBio's fit .*{words}"):
+        check_export(load_study(tmp_path), "febio-optimize")
+    check_export(load_study(tmp_path), "feb")
+
+
+def test_a_record_under_force_has_no_forces_to_compare(tmp_path):
+    study = block_study(tmp_path, "", "", 'control = "force"')
+    with pytest.raises(
+        InputError, match=r"study.toml: a: a force drives the indenter, and there is none to be"
+    ):
+        compare_site(study, "a", febio_log=tmp_path / "forces.txt", listener=quiet)
+
+
+def test_the_curve_of_a_partial_simulation_ends_where_that_ends(tmp_path):
+    context = block_context(block_study(tmp_path, ""), TISSUES)
+    model = build_model(context, context.study.recorded[0])
+    problem = build_problem(model, read_vtu(model.mesh), TISSUES)
+    found = solve(problem, StepControl(most_iterations=12), store="none")
+    assert not found.completed
+    write_site_curve(model, found, tmp_path / "a.csv")
+    curve = read_curves(tmp_path / "a.csv")
+    assert 0.0 < curve["time_s"][-1] <= found.times[-1] < 0.9 * model.knots_s[-1]
+    assert (np.diff(curve["force_N"]) > 0.0).all()  # no plateau of its last force
 
 
 @pytest.mark.slow

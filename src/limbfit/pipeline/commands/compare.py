@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from ... import febio
 from ...arrays import Array
-from ...errors import ProblemError
+from ...errors import InputError, ProblemError
 from ...fe import Problem, Result, System, solve
 from ...fe.solution.control import schedule_steps
 from ...indentation import Parameters, build_first_steps
@@ -50,6 +50,9 @@ def compare_site(
         Where FEBio is absent and no table is given, where the table is not one of this indentation, and as
         `prepare_site`.
     """
+    if study.indentation(name).forced:
+        what = f"{name}: a force drives the indenter, and there is none to be compared"
+        raise InputError(what, file=study.file, remedy="compare limbfit simulate --solver limbfit and febio")
     program = febio.find_febio(study.febio.program) if febio_log is None else None
     log = None if febio_log is None else febio.read_log(febio_log)
     found = prepare_site(study, name, parameters=parameters, listener=listener)

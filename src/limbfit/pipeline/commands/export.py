@@ -17,11 +17,12 @@ from ...errors import InputError
 from ...execution import SerialExecutor
 from ...fe import ELEMENTS, Problem
 from ...indentation import Parameters, SiteModel, build_problem
-from ...laws import POWER
+from ...laws import OGDEN, is_ogden
 from ...mesh import write_vtu
 from ...study import Indentation as Planned
 from ...study import Record, Study
 from ..engine.context import Context, Listener, ignore_progress
+from ..engine.files import name_file_in_errors
 from ..engine.store import Store
 from ..records.records import load_site_record
 from .simulate import Indentation, build_feb_settings, build_site_problem, choose_parameters, prepare_site
@@ -94,7 +95,7 @@ def check_export(
     chosen, store = _select_chosen(study, to, site), Store(study.results)
     used, origin = choose_parameters(study, parameters)
     context = Context(study, store, SerialExecutor(), ignore_progress)
-    kinds = {(one.indenter, _is_forced(one)): one for one in chosen}
+    kinds = {(one.indenter, one.forced): one for one in chosen}
     with TemporaryDirectory() as folder:
         file = Path(folder) / "block.vtu"
         # In layers of the study's tissues, under a skin, held below.
@@ -115,12 +116,9 @@ def check_export(
                 later = problem.history.delay(study.clamps.begun_s)
                 problem = replace(problem, history=later, touch_down_s=study.clamps.begun_s)
             found = Indentation(context, one, model, used, origin)
-            _write(found, problem, to, Path(folder), _NO_CURVE)
+            with name_file_in_errors(study.file, about=f"{one.name}: "):
+                _write(found, problem, to, Path(folder), _NO_CURVE)
     return chosen
-
-
-def _is_forced(one: Planned) -> bool:
-    return isinstance(one, Record) and one.forced
 
 
 def _build_block_model(study: Study, one: Planned, file: Path) -> SiteModel:
@@ -133,7 +131,7 @@ def _build_block_model(study: Study, one: Planned, file: Path) -> SiteModel:
     along = (0.0, 0.0, 1.0)
     return replace(
         model,
-        knots_N=(0.0, 1.0, 0.0) if _is_forced(one) else (),
+        knots_N=(0.0, 1.0, 0.0) if one.forced else (),
         indenter=study.indenter_of(one),
         kappa_ratio=study.material.kappa_ratio,
         law=study.material.law,
@@ -168,11 +166,10 @@ def _write(
         febio.write_feb(problem, folder / f"{name}.feb", settings)
         return (folder / f"{name}.feb",), febio.describe_differences(problem, settings)
     if to == FITTED:
-        if problem.fibres is not None:
-            raise InputError("FEBio's fit is written for tissues without fibres", place="--to")
-        if found.context.study.material.law == POWER:
-            what = f'FEBio\'s fit cannot tie the relaxation terms that make the power of time of "{POWER}"'
-            raise InputError(what, place="--to", remedy="identify with limbfit")
+        law = found.context.study.material.law
+        if not is_ogden(law):
+            what = f'FEBio\'s fit is written for "{OGDEN}", whatever its relaxation terms, not for "{law}"'
+            raise InputError(what, remedy="identify with limbfit")
         febio.check_optimisable(problem)
         control, model = folder / f"{name}-optimize.feb", folder / f"{name}-model.feb"
         # FEBio's fit takes its automatic penalty of a step of no time: another one than in a plain run.

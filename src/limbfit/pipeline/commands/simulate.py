@@ -109,16 +109,9 @@ def simulate_site(
         fields = folder / f"{name}.vtu"
         result = simulate_fields(model, found.parameters, fields, played)
     context.tell("simulate", 1, 1, f"site {name}")
-    times = model.curve_times(CURVE_POINTS)
-    curve = folder / f"{name}.csv"
-    write_curves(
-        curve,
-        time_s=times,
-        displacement_mm=result.displacement_at(times) if model.forced else model.history.at(times),
-        force_N=result.force_at(times + model.waits_s),
-    )
+    write_site_curve(model, result, folder / f"{name}.csv")
     files = {
-        "curve": curve,
+        "curve": folder / f"{name}.csv",
         "fields": fields if fields.is_file() and (by_febio or result.states) else None,
         "animation": played,
     }
@@ -132,7 +125,7 @@ def simulate_site(
         parameters=found.parameters,
         parameters_from=found.origin,
         peak_force_N=result.peak_force,
-        depth_mm=_measure_depth(found, result),
+        depth_mm=float(result.displacement.max()),
         # FEBio says nothing of its penetration.
         penetration_mm=float(result.penetration.max(initial=0.0)) if program is None else None,
         completed=result.completed,
@@ -145,6 +138,19 @@ def simulate_site(
     )
     write_result(folder / f"{name}.json", stored)
     return stored.to_plain() | {kind: file and str(file) for kind, file in files.items()}
+
+
+def write_site_curve(model: SiteModel, result: Result, file: Path) -> None:
+    """Write displacement and force of an indentation over the time from touch-down, as far as it came."""
+    times = model.curve_times(CURVE_POINTS)
+    if not result.completed:
+        times = times[times + model.waits_s <= result.times[-1]]
+    write_curves(
+        file,
+        time_s=times,
+        displacement_mm=result.displacement_at(times) if model.forced else model.history.at(times),
+        force_N=result.force_at(times + model.waits_s),
+    )
 
 
 def _compare_with_records(found: Indentation, result: Result, fields: Path | None) -> dict[str, Any]:
@@ -161,7 +167,7 @@ def _compare_with_records(found: Indentation, result: Result, fields: Path | Non
     rows = tested.find_outside(
         describe_indentation(
             LoadHistory.from_knots(model.knots_s, model.knots_N or model.knots_mm),
-            _measure_depth(found, result),
+            float(result.displacement.max()),
             model.indenter,
             limb.place(site),
             LimbAxis(limb.anatomy),
@@ -171,11 +177,6 @@ def _compare_with_records(found: Indentation, result: Result, fields: Path | Non
         )
     )
     return {"outside_records": rows, "outside_text": describe_outside({f"site {found.name}": rows})}
-
-
-def _measure_depth(found: Indentation, result: Result) -> float:
-    """The largest displacement, mm: that of a force is the simulated one."""
-    return float(result.displacement.max()) if found.model.forced else max(found.model.knots_mm)
 
 
 def build_site_problem(found: Indentation) -> Problem:
