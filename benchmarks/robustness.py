@@ -64,7 +64,7 @@ def broken_laws(result: Result) -> list[str]:
         broken.append("force not finite")
     if force.min() < -1e-9 * max(force.max(), 1e-12):
         broken.append("negative force")
-    if not result.problem.history.forced and find_slip(result.displacement, force):
+    if not result.problem.history.forced and find_slip(result.times, result.displacement, force):
         broken.append("force falls in loading")
     if force[-1] > 0.01 * force.max():
         broken.append("force after unloading")

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from blocks import punch
 
-from limbfit.fe import Problem, Result, StepControl, solve
+from limbfit import OgdenQLV
+from limbfit.bench.blocks import build_punched_block
+from limbfit.fe import History, Problem, Result, StepControl, solve
 from limbfit.fe.diagnostics import find_inverted_elements
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.observables import compute_contact_pressure
@@ -40,6 +42,25 @@ def reactions(result: Result) -> np.ndarray:
         increment = Increment(state.time, state.displacement, nothing, nothing, penalty, state.drives)
         found.append(result.system.contact_force(state.u, increment).sum(axis=0)[2])
     return np.array(found)
+
+
+@pytest.mark.parametrize(
+    "history",
+    [
+        History(np.array([0.0, 0.3, 8.3]), np.array([0.0, 3.0, 4.0])),
+        History(np.array([0.0, 0.2, 2.2]), force=np.array([0.0, 2.0, 1.5])),
+    ],
+)
+def test_what_a_quick_ramp_left_relaxes_while_the_indenter_goes_on_slowly_and_no_tissue_slips(history):
+    """A slower second ramp, and a force that is let off while the tissue still creeps."""
+    law = OgdenQLV(0.005, 4.0, 9.0, 3.0)
+    block = replace(build_punched_block("hex8", 4), history=history, materials={"skin": law, "muscle": law})
+    times = (0.5, 1.0, 2.2) if history.forced else (1.3, 3.3, 8.3)
+    found = solve(block, StepControl(times=(history.times[1], *times)), store="none")
+    assert found.completed
+    assert (np.diff(found.displacement) > 0.01 * found.displacement.max()).all()
+    assert (found.force[2:] < 0.9 * found.force[1:-1]).any()
+    assert not kinds(found)
 
 
 def test_a_state_s_penalty_is_the_one_that_holds_it(problem):

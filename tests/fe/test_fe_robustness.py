@@ -166,14 +166,14 @@ def test_a_step_that_never_converges_is_given_up():
 
 def test_a_force_that_falls_while_the_indenter_advances_is_told():
     """A fifth of it lost between two steps of loading; less than a tenth, and what relaxes, are none."""
-    displacement = np.array([1.0, 2.0, 3.0, 3.0, 2.0])
+    times, displacement = np.arange(5.0), np.array([1.0, 2.0, 3.0, 3.0, 2.0])
     force = np.array([2.0, 5.0, 4.0, 2.0, 0.5])
-    (doubt,) = find_slip(displacement, force)
+    (doubt,) = find_slip(times, displacement, force)
     assert doubt.text.startswith("the force falls from 5 N to 4 N while the indenter advances from 2 to 3 mm")
     assert (doubt.kind, doubt.count, doubt.depth_mm) == ("slipped", 1, 2.0)
     assert doubt.share == pytest.approx(2 / 3)
-    assert not find_slip(displacement, np.where(force == 4.0, 4.8, force))
-    assert not find_slip(np.zeros(1), np.zeros(1))
+    assert not find_slip(times, displacement, np.where(force == 4.0, 4.8, force))
+    assert not find_slip(np.zeros(1), np.zeros(1), np.zeros(1))
 
 
 def test_what_is_not_reached_is_said(robustness):

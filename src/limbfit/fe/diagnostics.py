@@ -17,6 +17,7 @@ from ..mesh import Mesh, node_jacobians
 Kind = Literal["folded", "slipped", "sunk", "unbalanced", "unsettled", "inexact"]
 
 RELAXATION_SHARE = 0.9  # a force below this share of the one before, in an advancing step, is no relaxation
+SLOWER_SHARE = 0.75  # unless the step is slower than this share of a speed before it: what was quick relaxes
 # Share of the strain energy that folded elements may hold: their stiffness lost, the force would fall by
 # about as much, and less than by the error of the mesh.
 FOLDED_ENERGY = 0.01
@@ -83,12 +84,15 @@ def find_inverted_elements(
     return _build_warning("folded", text, count, depth_mm, displacement)
 
 
-def find_slip(displacement: Array, force: Array) -> tuple[SimulationWarning, ...]:
-    """A warning if the force (n,), N, falls while the indenter advances (n,), mm.
+def find_slip(times: Array, displacement: Array, force: Array) -> tuple[SimulationWarning, ...]:
+    """A warning if the force (n,), N, falls while the indenter advances (n,), mm, as quickly as before.
 
     The tissue has lost its equilibrium.
     """
-    advancing = np.diff(displacement) > 1e-2 * displacement.max()
+    advance = np.diff(displacement)
+    speeds = advance / np.diff(times)
+    steady = speeds > SLOWER_SHARE * np.maximum.accumulate(speeds)
+    advancing = steady & (advance > 1e-2 * displacement.max())
     falls = np.flatnonzero(advancing & (force[1:] < RELAXATION_SHARE * force[:-1]))
     if not len(falls):
         return ()

@@ -85,8 +85,7 @@ def _describe_file(
     parts.append({"name": INDENTER, "element": "C3D8", "rows": rows})
     whole = Mesh(tool.points, tool.cells, "hex8", np.zeros(len(tool.cells), np.int64), (INDENTER,))
     laws = [problem.materials[name] for name in mesh.region_names]
-    ramps = [phase.duration_s for phase in history.phases if phase.kind != "hold"]
-    shortest = min(ramps, default=float(history.times[-1]))
+    seconds = [phase.duration_s for phase in history.phases]
     return {
         "title": " ".join(settings.title.split()),
         "program": program,
@@ -110,10 +109,7 @@ def _describe_file(
         "fixed_set": FIXED_SET,
         "is_relaxing": any(g for law in laws for g, _ in law.table().prony),
         # One for each phase, whose end is met: first increment, whole, smallest and largest one, s.
-        "steps": [
-            (min(t, shortest) / 64.0, t, t * 1e-8, t / 16.0)
-            for t in (one.duration_s for one in history.phases)
-        ],
+        "steps": [(min(seconds) / 64.0, t, t * 1e-8, t / 16.0) for t in seconds],
         "axis": indenter.frame[2].tolist(),
     }
 

@@ -200,6 +200,7 @@ def _build_result(
     run: SteppedRun, rows: list[Step], kept: list[State], deepest: State | None, seconds: float
 ) -> Result:
     columns = _collect_columns(rows)
+    doubts = _collect_warnings(run, deepest, columns)
     del columns["newton_iterations"]
     return Result(
         problem=run.problem,
@@ -208,9 +209,7 @@ def _build_result(
         states=tuple(kept),
         completed=not run.reason,
         reason=run.reason,
-        doubts=_collect_warnings(
-            run, deepest, columns["displacement"], columns["force"], columns["penetration"]
-        ),
+        doubts=doubts,
         statistics=_collect_statistics(run, seconds, int((columns["penetration"] > run.deepest).sum())),
         system=run.system,
         **columns,
@@ -218,9 +217,10 @@ def _build_result(
 
 
 def _collect_warnings(
-    run: SteppedRun, deepest: State | None, displacement: Array, force: Array, penetration: Array
+    run: SteppedRun, deepest: State | None, columns: Mapping[str, Any]
 ) -> tuple[SimulationWarning, ...]:
     """The warnings about the steps of a run, of which ``deepest`` is the one farthest in."""
+    times, displacement, force = (columns[name] for name in ("time", "displacement", "force"))
     folds: tuple[SimulationWarning, ...] = ()
     if deepest is not None:
         volumes = run.system.weights.sum(axis=1)
@@ -231,8 +231,8 @@ def _collect_warnings(
         )  # fmt: skip
     return (
         *folds,
-        *find_slip(displacement, force),
-        *find_penetration(displacement, penetration, run.deepest, run.stiffness),
+        *(() if run.problem.history.forced else find_slip(times, displacement, force)),
+        *find_penetration(displacement, columns["penetration"], run.deepest, run.stiffness),
         *find_inexact_steps("unbalanced", displacement, run.unbalanced, run.control.tolerance),
         *find_inexact_steps("unsettled", displacement, run.unsettled, run.control.tolerance),
         *find_inexact_sensitivities(displacement, run.slopes.counts["inexact"]),
