@@ -21,7 +21,6 @@ PRESTRAIN_S = 1.0  # in which the pre-strain grows
 RELAXATION_TIMES = 30.0  # of the longest relaxation time: what is left is 1e-13
 APPROACH_S = 1.0  # of an indenter that does not wait for anything else
 # Share of the time since the tissue's drive last changed, in which the indenter is brought to the tissue.
-
 APPROACH_SHARE = 0.1
 
 

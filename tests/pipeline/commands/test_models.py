@@ -30,7 +30,7 @@ from limbfit.report.store import load_store
 from limbfit.results.identification import PredictResult
 from limbfit.results.models import ModelsResult, ModelWeight, SocketOfModels
 from limbfit.results.socket import SocketResult
-from limbfit.study import Study
+from limbfit.study import Study, load_study
 
 STATED = """
 start = { m = 4.0 }
@@ -97,6 +97,16 @@ def test_the_model_of_a_study_is_a_study_with_the_same_inputs(tmp_path):
     assert derived.folder == study.results / "models" / "friction"
     assert derived.path(derived.recorded[0].trace).read_text(encoding="utf-8") == "a record"
     assert derived.indenter.friction == 0.4
+
+
+@pytest.mark.parametrize("spelled", ["../records/a.csv", "../records/./a.csv", "..//records/a.csv"])
+def test_an_input_beside_the_study_is_the_same_of_a_model_however_its_path_is_spelled(tmp_path, spelled):
+    file = study_of(tmp_path / "s").file
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / "a.csv").write_text("a record", encoding="utf-8")
+    file.write_text(file.read_text(encoding="utf-8").replace('"a.csv"', f'"{spelled}"'), encoding="utf-8")
+    derived = derive_study(load_study(tmp_path / "s"), "friction")
+    assert derived.path(derived.recorded[0].trace).read_text(encoding="utf-8") == "a record"
 
 
 def test_impossible_models_are_refused_in_one_line(tmp_path):

@@ -93,6 +93,16 @@ def test_what_febios_fit_cannot_identify_is_refused_early(tmp_path, material, mo
     check_export(load_study(tmp_path), "feb")
 
 
+@pytest.mark.parametrize("lacking", ["muscle", "tau_s"])
+def test_parameters_that_lack_something_are_refused(tmp_path, lacking):
+    given = {tissue: {k: v for k, v in values.items() if k != lacking} for tissue, values in TISSUES.items()}
+    given.pop(lacking, None)
+    with pytest.raises(
+        InputError, match=r"lack some of c_kPa, m, gamma, tau_s; give all .* each of skin, muscle"
+    ):
+        check_export(block_study(tmp_path, ""), "feb", parameters=given)
+
+
 def test_a_record_under_force_has_no_forces_to_compare(tmp_path):
     study = block_study(tmp_path, "", "", 'control = "force"')
     with pytest.raises(

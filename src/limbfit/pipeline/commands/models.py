@@ -179,7 +179,7 @@ def _link_inputs(study: Study, folder: Path, document: Document) -> None:
     for path in sorted({*study.inputs.values(), *filter(None, [find_hand_labels(study)])}):
         if path.is_absolute() or ".." in path.parts:
             if not path.is_absolute():
-                _replace_path(document, str(path), os.path.relpath(root / path, folder.resolve()))
+                _replace_path(document, path, os.path.relpath(root / path, folder.resolve()))
             continue
         top = Path(path.parts[0])
         if top.name == study.results.name:
@@ -192,11 +192,11 @@ def _link_inputs(study: Study, folder: Path, document: Document) -> None:
                 (shutil.copytree if (root / top).is_dir() else shutil.copyfile)(root / top, place)
 
 
-def _replace_path(table: Any, old: str, new: str) -> None:
+def _replace_path(table: Any, old: Path, new: str) -> None:
     for key, value in table.items() if isinstance(table, Mapping) else enumerate(table):
         if isinstance(value, Mapping | list):
             _replace_path(value, old, new)
-        elif isinstance(value, str) and value == old:
+        elif isinstance(value, str) and Path(value) == old:
             table[key] = new
 
 

@@ -217,6 +217,9 @@ def choose_parameters(study: Study, given: Parameters | None = None) -> tuple[Pa
     """
     store = Store(study.results)
     if given:
+        if not all(key in given.get(tissue, {}) for tissue, key in study.parameters):
+            what = f"the parameters lack some of {', '.join(study.law.keys)}"
+            raise InputError(what, remedy=f"give all of them for each of {', '.join(study.tissues)}")
         return given, "given"
     if store.stamp("calibrate") is None:
         start = {tissue: study.material.of(tissue, "start") for tissue in study.tissues}
