@@ -73,7 +73,7 @@ BY_STUDY = {
     "export --to febio-optimize": (
         FIBRED,
         lambda s: export_study(s, "febio-optimize"),
-        "fit is written for tissues without fibres",
+        'fit is written for "ogden", whatever its relaxation terms',
     ),
 }
 
