@@ -150,6 +150,7 @@ def test_pins_that_miss_are_refused_with_the_study_s_file(context):
         ("[clamps]\nforce_N = 0.0", "clamps.force_N: Input should be greater than 0"),
         ("[clamps]\nangles_degrees = [0.0, 90.0]", "clamps.angles_degrees: 0 is where the test pin is"),
         ("[clamps]\nangles_degrees = [90.0, 90.0]", "clamps.angles_degrees: two pins are at one angle"),
+        ("[clamps]\nangles_degrees = [180.0, -180.0]", "clamps.angles_degrees: two pins are at one angle"),
         ("[clamps]\nlevels_mm = [0.0, 5.0]", "clamps: levels_mm has 2 levels for 11 pins"),
         ("[clamps]\nforce = 1.0", "clamps.force: unknown key"),
         ("[calibration]\nsearch_radius_mm = 50.0\n[clamps]", "calibration.search_radius_mm: without effect"),

@@ -22,7 +22,7 @@ from keyed_studies import (
 from test_study_docs import KEYS
 
 from limbfit.errors import StudyError
-from limbfit.study.unused_keys import UNUSED_KEYS, UNUSED_SITE_KEYS
+from limbfit.study.unused_keys import UNUSED_KEYS, UNUSED_RECORD_KEYS, UNUSED_SITE_KEYS
 
 # Studies that state a key in vain: what is set in which study, and the key that is refused.
 AMPUTATED = ("geometry.amputation", {"point": [0.0, 0.0, 0.0]})
@@ -170,6 +170,28 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     (GIVEN, {"sites.0.surface_frame": "site"}, "sites.surface_frame"),
     (GIVEN, {"sites.0.shear_waves_sd_m_s": 0.2}, "sites.shear_waves_sd_m_s"),
     (GIVEN, {"sites.0.shear_waves_bias_m_s": 0.2}, "sites.shear_waves_bias_m_s"),
+    *[
+        (
+            GIVEN,
+            {"records": [{"site": "1", "name": "fast", "trace": "1.csv", key: value}]},
+            f"records.1-fast.{key}",
+        )
+        for key, value in {
+            **{"ultrasound_sd_mm": 0.2, "surface_sd_mm": 0.2, "surface_frame": "site"},
+            **{"shear_waves_sd_m_s": 0.2, "shear_waves_bias_m_s": 0.2},
+        }.items()
+    ],
+    (IMAGED, {"image.markers": "labels.nrrd", "image.markers_series": "1.2"}, "image.markers_series"),
+    (
+        GIVEN,
+        {"socket.design": {"adapter_diameter_mm": 0, "adapter_mm": 9.0}},
+        "socket.design.adapter_mm",
+    ),
+    (
+        IMAGED,
+        {"calibration.fixed": ["skin.c_kPa"]},
+        "calibration.prior.skin.c_kPa",
+    ),
     (GIVEN, {"sites.1.weight": 2.0}, "sites.weight"),
     (GIVEN, {"sites.0.speed_mm_s": 2.0}, "sites.speed_mm_s"),
     (GIVEN, {"indenter.shape": "cylinder", "sites.0.edge": [0.0, 0.0, 1.0]}, "sites.edge"),
@@ -210,8 +232,16 @@ def test_a_key_without_effect_is_refused(folder: Path, content: Any, changes: An
 def test_every_refusal_is_tried() -> None:
     tried = {key for _, _, key in IN_VAIN}
     stated = {key for rule in UNUSED_KEYS for key in rule.keys}
-    by_name = {"mesh.accuracy", "indenters.ball.edge_radius_mm"}
-    assert stated | {f"sites.{key}" for rule in UNUSED_SITE_KEYS for key in rule.keys} | by_name == tried
+    stated |= {f"sites.{key}" for rule in UNUSED_SITE_KEYS for key in rule.keys}
+    stated |= {f"records.1-fast.{key}" for rule in UNUSED_RECORD_KEYS for key in rule.keys}
+    by_name = {"mesh.accuracy", "indenter.edge_radius_mm", "indenters.ball.edge_radius_mm"}
+    by_name |= {"calibration.prior.skin.c_kPa"}
+    assert stated | by_name == tried
+
+
+def test_an_accuracy_that_adds_a_coarse_mesh_acts_beside_all_edges(folder: Path) -> None:
+    edges = {"edge_near_mm": 3.0, "edge_far_mm": 24.0, "near_radius_mm": 14.0, "growth": 0.6, "flatness": 1.6}
+    assert loaded(folder, changed(GIVEN, "mesh", {"accuracy": "fine", **edges})).mesh.coarse is not None
 
 
 def test_what_an_amputation_takes_is_not_in_vain(folder: Path) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from ..errors import InputError
-from ..laws import ACTIVE, LAWS, OGDEN, POWER, TissueLaw
+from ..laws import ACTIVE, LAWS, OGDEN
 from ..relaxation import DEFAULT_SPAN_S, choose_relaxation_times
 from .tables import Positive, TomlTable, Vector
 
@@ -68,15 +67,6 @@ class MaterialTable(TomlTable):
             return ()
         stated = self.activation
         return ((0.0, 1.0),) if stated is None else tuple(zip(stated.time_s, stated.share, strict=True))
-
-    @property
-    def tissue_law(self) -> TissueLaw:
-        """The law with the study's relaxation times, where it has some."""
-        law = LAWS[self.law]
-        if self.law != POWER:
-            return law
-        times = choose_relaxation_times(*self.relaxation_span_s)
-        return replace(law, relaxation_times_s=tuple(times.tolist()))
 
     @property
     def keys(self) -> tuple[str, ...]:

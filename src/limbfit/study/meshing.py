@@ -24,13 +24,6 @@ def estimate_cells(edge_near_mm: float, edge_far_mm: float, near_radius_mm: floa
     return float(np.sum(volume * _CELLS_PER_CUBE / ((edge[1:] + edge[:-1]) / 2) ** 3))
 
 
-def find_smallest_edge_mm(edge_far_mm: float, near_radius_mm: float, growth: float) -> float:
-    """Find the shortest ``edge_near_mm`` that keeps a mesh within `MAX_CELLS`; the far edge follows."""
-    edges = np.geomspace(0.01, 20.0, 400)
-    cells = [estimate_cells(e, max(edge_far_mm, e), near_radius_mm, growth) for e in edges]
-    return float(edges[np.argmax(np.array(cells) <= MAX_CELLS)])
-
-
 def _check_cell_count(table: CoarseMeshTable | MeshTable) -> None:
     """Refuse edge lengths that make more than `MAX_CELLS` cells per site."""
     far, radius, growth = table.edge_far_mm, table.near_radius_mm, table.growth
@@ -39,8 +32,10 @@ def _check_cell_count(table: CoarseMeshTable | MeshTable) -> None:
         return
     counted = f"{cells / 1e9:.2g} billion" if cells > 5e8 else f"{cells / 1e6:.2g} million"
     where = f"edge_near_mm = {table.edge_near_mm:g} with edge_far_mm = {far:g}"
-    least = find_smallest_edge_mm(far, radius, growth)
-    finest = np.ceil(100 * least) / 100
+    edges = np.geomspace(0.01, 20.0, 400)
+    # The shortest edge that keeps the mesh within the limit; the far edge follows.
+    few = [estimate_cells(e, max(far, e), radius, growth) <= MAX_CELLS for e in edges]
+    finest = np.ceil(100 * edges[np.argmax(few)]) / 100
     raise ValueError(
         f"{where} makes about {counted} cells per site, and {MAX_CELLS / 1e6:g} million are the most; give "
         f"edge_near_mm of {finest:g} or more (edge_far_mm no less), or a smaller near_radius_mm"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +14,9 @@ from pydantic import Field, field_validator, model_validator
 from ..errors import InputError, StudyError
 from ..laws import (
     FIBRE_KEYS,
+    LAWS,
     OGDEN,
+    POWER,
     Parameters,
     TissueLaw,
     has_fibres,
@@ -23,6 +26,7 @@ from ..laws import (
     to_vector,
 )
 from ..priors import of_tissues
+from ..relaxation import choose_relaxation_times
 from .material import MaterialTable
 from .meshing import MeshTable, list_indenter_widths, replace_edges
 from .records import RECORDED, STORED_ENDINGS, Indentation, Record, RecordTable, Site, list_records
@@ -119,8 +123,12 @@ class Study(TomlTable):
 
     @property
     def law(self) -> TissueLaw:
-        """The law of all tissues."""
-        return self.material.tissue_law
+        """The law of all tissues, with the study's relaxation times, where it has some."""
+        law = LAWS[self.material.law]
+        if law.name != POWER:
+            return law
+        times = choose_relaxation_times(*self.material.relaxation_span_s)
+        return replace(law, relaxation_times_s=tuple(times.tolist()))
 
     @property
     def fibres(self) -> dict[str, Literal["axis", "flow"] | Vector]:
@@ -334,9 +342,12 @@ class Study(TomlTable):
         layers = [layer.name for layer in self.geometry.model_layers]
         self.material.check_tissues(self.tissues, tuple(dict.fromkeys((*layers, *self.fibres))))
         known = [f"{tissue}.{name}" for tissue, name in self.parameters]
-        for name in self.calibration.named:
+        tied = [name for group in self.calibration.tied for name in group]
+        for name in (*self.calibration.fixed, *tied, *self.calibration.prior):
             if name not in known:
                 raise ValueError(f"calibration: no parameter is named {name!r}; they are {', '.join(known)}")
+        if bare := [name for name in tied if name in self.fixed]:
+            raise ValueError(f"calibration.tied: the tissue of {bare[0]} has no fibres; leave it out")
         if self.calibration.priors is None:
             return
         if not is_ogden(self.material.law):

@@ -343,11 +343,6 @@ class CalibrationTable(TomlTable):
         """True if any part of the calibration is the paper's method."""
         return "paper" in (self.objective, self.stopping)
 
-    @property
-    def named(self) -> tuple[str, ...]:
-        """Every parameter that is fixed, tied or has a prior."""
-        return (*self.fixed, *(name for group in self.tied for name in group), *self.prior)
-
 
 class UncertaintyTable(TomlTable):
     """What ``limbfit uncertainty`` may spend, and how well geometry and contact are known (one deviation).
@@ -474,7 +469,7 @@ class ClampsTable(TomlTable):
     @field_validator("angles_degrees")
     @classmethod
     def _check_angles(cls, angles: tuple[float, ...]) -> tuple[float, ...]:
-        if len(set(angles)) < len(angles):
+        if len({angle % 360.0 for angle in angles}) < len(angles):
             raise ValueError("two pins are at one angle; give each angle once")
         if 0.0 in angles:
             raise ValueError("0 is where the test pin is; leave it out")

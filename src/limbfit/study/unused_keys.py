@@ -23,15 +23,21 @@ class UnusedKeys:
     remedy: str = "leave it out"
 
 
-def _is_uniform(table: MeshTable | CoarseMeshTable | None) -> bool:
-    return table is not None and table.edge_far_mm <= table.edge_near_mm
+def _list_edge_rules(
+    place: str, find: Callable[[Study], MeshTable | CoarseMeshTable | None]
+) -> tuple[UnusedKeys, ...]:
+    def find_excess(study: Study) -> float:
+        table = find(study)
+        return 1.0 if table is None else table.edge_far_mm - table.edge_near_mm
+
+    one = "edge_far_mm is no longer than edge_near_mm, so edges have one length"
+    shorter = "edge_far_mm is shorter, and no edge longer"
+    return (
+        UnusedKeys((f"{place}.near_radius_mm", f"{place}.growth"), lambda s: find_excess(s) <= 0.0, one),
+        UnusedKeys((f"{place}.edge_near_mm",), lambda s: find_excess(s) < 0.0, shorter),
+    )
 
 
-def _is_capped(table: MeshTable | CoarseMeshTable | None) -> bool:
-    return table is not None and table.edge_far_mm < table.edge_near_mm
-
-
-_ONE_LENGTH = "edge_far_mm is no longer than edge_near_mm, so edges have one length"
 _AUTOMATIC_KEYS = ("contrast", "seeds", "bias_correction", "min_bone_volume_mm3")
 _SHAPE_KEYS = (
     *("reduction_percent", "areas", "trim_mm", "trim_planes", "trimline", "flare_mm", "distal"),
@@ -62,6 +68,11 @@ UNUSED_KEYS: tuple[UnusedKeys, ...] = (
         "image.path is a file, not a folder of series",
     ),
     UnusedKeys(
+        ("image.markers_series",),
+        lambda s: s.image is not None and s.image.marked is not None and s.path(s.image.marked).is_file(),
+        "image.markers is a file, not a folder of series",
+    ),
+    UnusedKeys(
         ("image.markers",),
         lambda s: s.image is not None and s.image.marked is not None and all(t.near is None for t in s.sites),
         "no site is matched to a marker",
@@ -83,29 +94,12 @@ UNUSED_KEYS: tuple[UnusedKeys, ...] = (
         lambda s: s.surfaces is not None and not s.surfaces.bones,
         "[surfaces] has no bones",
     ),
-    UnusedKeys(("mesh.near_radius_mm", "mesh.growth"), lambda s: _is_uniform(s.mesh), _ONE_LENGTH),
-    UnusedKeys(
-        ("mesh.edge_near_mm",), lambda s: _is_capped(s.mesh), "edge_far_mm is shorter, and no edge longer"
-    ),
-    UnusedKeys(
-        ("mesh.coarse.near_radius_mm", "mesh.coarse.growth"),
-        lambda s: _is_uniform(s.mesh.coarse),
-        _ONE_LENGTH,
-    ),
-    UnusedKeys(
-        ("mesh.coarse.edge_near_mm",),
-        lambda s: _is_capped(s.mesh.coarse),
-        "edge_far_mm is shorter, and no edge longer",
-    ),
+    *_list_edge_rules("mesh", lambda s: s.mesh),
+    *_list_edge_rules("mesh.coarse", lambda s: s.mesh.coarse),
     UnusedKeys(
         ("indenter",),
         lambda s: all(one.indenter is not None for one in s.indentations),
         "every record and every planned indentation names another one",
-    ),
-    UnusedKeys(
-        ("indenter.edge_radius_mm",),
-        lambda s: not SHAPES[s.indenter.shape].has_edge,
-        "the indenter has no edge to round",
     ),
     UnusedKeys(
         ("traces",),
@@ -198,6 +192,11 @@ UNUSED_KEYS: tuple[UnusedKeys, ...] = (
         'give donning = "insertion", or leave it out',
     ),
     UnusedKeys(
+        ("socket.design.adapter_mm",),
+        lambda s: s.socket.design.adapter_diameter_mm == 0,
+        "a diameter of 0 mm is no adapter",
+    ),
+    UnusedKeys(
         tuple(f"socket.liner.{key}" for key in ("material", "c_kPa", "m", "gamma", "tau_s")),
         lambda s: s.socket.liner.thickness_mm == 0,
         "a liner of 0 mm is none",
@@ -215,6 +214,17 @@ UNUSED_KEYS: tuple[UnusedKeys, ...] = (
     ),
 )
 
+# Of a record, whether its site states it or a table of its own.
+UNUSED_RECORD_KEYS: tuple[UnusedKeys, ...] = (
+    UnusedKeys(("ultrasound_sd_mm",), lambda s, one: one.ultrasound is None, "it has no ultrasound"),
+    UnusedKeys(("surface_sd_mm", "surface_frame"), lambda s, one: one.surface is None, "it has no surface"),
+    UnusedKeys(
+        ("shear_waves_sd_m_s", "shear_waves_bias_m_s"),
+        lambda s, one: one.shear_waves is None,
+        "it has no shear waves",
+    ),
+)
+
 UNUSED_SITE_KEYS: tuple[UnusedKeys, ...] = (
     UnusedKeys(("weight",), lambda s, site: not s.records_at(site), "the site has no record to be weighted"),
     UnusedKeys(
@@ -223,15 +233,7 @@ UNUSED_SITE_KEYS: tuple[UnusedKeys, ...] = (
     UnusedKeys(
         ("control",), lambda s, site: site.trace is None, "it is of the site's trace, and there is none"
     ),
-    UnusedKeys(("ultrasound_sd_mm",), lambda s, site: site.ultrasound is None, "the site has no ultrasound"),
-    UnusedKeys(
-        ("surface_sd_mm", "surface_frame"), lambda s, site: site.surface is None, "the site has no surface"
-    ),
-    UnusedKeys(
-        ("shear_waves_sd_m_s", "shear_waves_bias_m_s"),
-        lambda s, site: site.shear_waves is None,
-        "the site has no shear waves",
-    ),
+    *UNUSED_RECORD_KEYS,
     UnusedKeys(
         ("indenter",),
         lambda s, site: site.trace is None and bool(s.records_at(site)),
@@ -263,20 +265,25 @@ def check_unused_keys(study: Study, content: Mapping[str, Any]) -> None:
         for key in rule.keys:
             if _is_stated(content, key) and rule.when(study):
                 raise _build_unused_key_error(key, rule.why, rule.remedy)
-    for name, indenter in study.indenters.items():
-        if "edge_radius_mm" in content["indenters"][name] and not SHAPES[indenter.shape].has_edge:
-            place = f"indenters.{name}.edge_radius_mm"
+    for name, indenter in study.all_indenters.items():
+        place = "indenter.edge_radius_mm" if name is None else f"indenters.{name}.edge_radius_mm"
+        if _is_stated(content, place) and not SHAPES[indenter.shape].has_edge:
             raise _build_unused_key_error(place, "the indenter has no edge to round", "leave it out")
-    mesh = content.get("mesh", {})
-    if "accuracy" in mesh and ACCURACIES["standard"][0].keys() <= mesh.keys():
+    edges = ACCURACIES["standard"][0].keys() | ({"coarse"} if study.mesh.coarse is not None else set())
+    if "accuracy" in (mesh := content.get("mesh", {})) and edges <= mesh.keys():
         why = "all edge lengths are stated"
         raise _build_unused_key_error("mesh.accuracy", why, "leave it or them out")
-    for site, stated in zip(study.sites, content["sites"], strict=True):
-        for site_rule in UNUSED_SITE_KEYS:
-            for key in site_rule.keys:
-                if key in stated and site_rule.when(study, site):
-                    place = f"sites.{site.name}.{key}"
-                    raise _build_unused_key_error(place, site_rule.why, site_rule.remedy)
+    for name in sorted(study.calibration.prior.keys() & set(study.fixed)):
+        why, place = "the parameter stays at its start", f"calibration.prior.{name}"
+        raise _build_unused_key_error(place, why, "leave it out, or let the parameter move")
+    tables: list[tuple[str, Any, tuple[UnusedKeys, ...]]]
+    tables = [(f"sites.{one.name}", one, UNUSED_SITE_KEYS) for one in study.sites]
+    tables += [(f"records.{one.site}-{one.name}", one, UNUSED_RECORD_KEYS) for one in study.records]
+    for (place, table, rules), stated in zip(tables, (*content["sites"], *content.get("records", ()))):
+        for rule in rules:
+            for key in rule.keys:
+                if key in stated and rule.when(study, table):
+                    raise _build_unused_key_error(f"{place}.{key}", rule.why, rule.remedy)
 
 
 def _is_stated(content: Mapping[str, Any], key: str) -> bool:
