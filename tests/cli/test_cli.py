@@ -56,7 +56,16 @@ def test_check_tells_the_facts(limbfit, study):
     assert "site 1: peak force 6.0" in out
     assert "tibia" in out
     assert "1 of 2 sites are fitted" in out
+    assert out.endswith("the study can be run\n")
     assert not (study / "results").exists()
+
+
+def test_check_does_not_say_that_a_study_without_a_fitted_site_can_be_run(limbfit, study):
+    edit(study, "fitted = true\n", "")
+    code, out, _ = limbfit("check", study)
+    assert code == 0
+    assert "cannot run: limbfit run" in out
+    assert out.endswith("the study cannot be run to its end\n")
 
 
 def test_help_lists_every_verb_once_with_its_whole_sentence(limbfit):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from bars import NAMES, PAPER, SITES, TRUTH, Counted, records, simulate
 
-from limbfit.errors import CalibrationError, ProblemError
+from limbfit.errors import CalibrationError
 from limbfit.identify.fit.calibration import Calibration, CalibrationSettings, calibrate
 from limbfit.identify.fit.multistart import (
     combine_searches,
@@ -60,20 +60,6 @@ def test_all_tied_is_one_material():
     assert constrain(group_separately(NAMES), NAMES, tied=ties) == group_by_kind(NAMES)
 
 
-@pytest.mark.parametrize(
-    ("fixed", "tied", "words"),
-    [
-        (["skin.kappa"], [], "no parameter is named 'skin.kappa'"),
-        ([], [["skin.m"]], "skin.m cannot be tied"),
-        ([], [["skin.m", "muscle.gamma"]], "cannot be tied"),
-        (["skin.m"], [["skin.m", "muscle.m"]], "tied and fixed"),
-    ],
-)
-def test_impossible_constraints_are_bad_input(fixed, tied, words):
-    with pytest.raises(ProblemError, match=words):
-        constrain(group_separately(NAMES), NAMES, fixed, tied)
-
-
 def test_a_prior_holds_what_the_data_do_not_show_and_hardly_what_they_do():
     """At a site with hardly any skin the force says nothing about it."""
     muscle = tuple(replace(site, sections=(0.002, site.sections[1])) for site in SITES)
@@ -108,16 +94,6 @@ def test_forces_weigh_less_against_priors_where_their_error_is_larger():
         for error in (0.1, 1.0, 10.0)
     ]
     assert found[0] > found[1] > found[2]
-
-
-def test_priors_that_make_no_sense_are_bad_input():
-    with pytest.raises(ProblemError, match="median > 0 and factor > 1"):
-        Prior("skin.m", 3.0, 1.0)
-    with pytest.raises(ProblemError, match=r"'skin\.k', which is not a parameter"):
-        replace(PAPER, priors=(Prior("skin.k", 3.0, 2.0),))
-    known = replace(PAPER, priors=(Prior("skin.m", 3.0, 2.0),))
-    with pytest.raises(ProblemError, match="no place for priors"):
-        calibrate(simulate, records(), known, CalibrationSettings(objective="paper"))
 
 
 def test_a_heavier_record_is_fitted_closer():

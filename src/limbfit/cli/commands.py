@@ -149,7 +149,10 @@ def check(study: StudyPath, as_json: AsJson = False) -> None:
         print_line(line)
     print_warnings(flag["text"] for flag in findings["flags"])
     print_warnings(findings["outside_text"])
-    print_line("the study can be run" + (", but see the warnings" if findings["flags"] else ""))
+    if any("run" in row["commands"] for row in findings["refused"]):
+        print_line("the study cannot be run to its end")
+    else:
+        print_line("the study can be run" + (", but see the warnings" if findings["flags"] else ""))
 
 
 def run(

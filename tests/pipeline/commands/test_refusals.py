@@ -90,6 +90,17 @@ def test_what_the_study_file_decides_is_said_at_once(study, command):
     assert not begun(given)
 
 
+def test_a_study_that_fixes_every_parameter_is_refused_before_it_is_meshed(study):
+    names = [f'"{tissue}.{key}"' for tissue in ("skin", "muscle") for key in ("c_kPa", "m", "gamma", "tau_s")]
+    given = with_change(study, ("[[sites]]", f"[calibration]\nfixed = [{', '.join(names)}]\n[[sites]]"))
+    words = "calibration: no parameter is left to move"
+    rows = [row for row in list_refused_commands(given, None) if "run" in row["commands"]]
+    assert words in rows[0]["why"]
+    with pytest.raises(InputError, match=words):
+        run_study(given)
+    assert not begun(given)
+
+
 def test_options_are_judged_at_once(study):
     given = with_change(study, ("[[sites]]", '[calibration]\nfixed = ["skin.m"]\n[[sites]]'))
     for call, words in (
@@ -97,6 +108,12 @@ def test_options_are_judged_at_once(study):
         (experiment("sensitivity-mesh", factors=[1.0]), "one mesh cannot be compared"),
         (experiment("sensitivity-c", sites=["9"]), "no site is named '9'"),
         (experiment("cube", compression_percent=90.0), "is not possible here"),
+        (
+            experiment("crossvalidate", fit="two"),
+            "cannot be 'two'; its default is 0",
+        ),
+        (experiment("sensitivity-c", sites=15), "option sites of sensitivity-c cannot be 15; its default is"),
+        (experiment("sensitivity-mesh", factors="0.7"), "cannot be '0.7'; its default is"),
         (lambda s: design_study(s, sites=3), "3 sites are wanted of 2"),
         (lambda s: plan_protocol(s, determine=("bone.c_kPa",)), r"no parameter is named 'bone\.c_kPa'"),
         (lambda s: plan_protocol(s, minutes=1), "no record fits into 1 min"),

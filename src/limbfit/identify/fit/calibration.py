@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from ...arrays import Array
-from ...errors import CalibrationError, ProblemError
+from ...errors import CalibrationError
 from .objective import (
     MeasuredCurve,
     Objective,
@@ -167,12 +167,8 @@ def calibrate(
     ------
     CalibrationError
         If no first simulation completes.
-    ProblemError
-        If priors are given together with the paper's objective.
     """
     groupings = tuple(stages) or build_stage_groupings(unknowns.names)
-    if unknowns.priors and settings is not None and settings.objective == "paper":
-        raise ProblemError("the paper's objective has no place for priors", remedy="use pointwise")
     run = _Search(simulate, tuple(measured), unknowns, settings or CalibrationSettings(), groupings)
     for current in run.iterate_states(state):
         if on_iterate:

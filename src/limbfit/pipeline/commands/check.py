@@ -54,10 +54,15 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
     facts = list(study.notes)
     listener(Progress("check", 0, 2, "geometry"))
     given, notes = read_given_anatomy(study) if study.surfaces is not None else (None, ())
-    told, bones = (
-        _describe_image(study) if given is None else ([*notes, *_describe_surfaces(study, given)], None)
-    )
+    told, bones = _describe_image(study) if given is None else ([*notes, *_describe_surfaces(given)], None)
     facts += told
+    store, limb = Store(study.results), None
+    if given is not None:
+        places = {site.name: place_site(site, study, given, None) for site in study.sites}
+        limb = LimbGeometry(given, places)
+    elif store.stamp("sites") and store.state("sites", compute_keys(study)["sites"]).state == "done":
+        limb = LimbGeometry.stored(store)
+    placed, anatomy = (limb.places, limb.anatomy) if limb is not None else ({}, None)
     for name, table in study.used_indenters.items():
         if table.file is not None:
             here = table.model_copy(update={"file": study.path(table.file)})
@@ -86,13 +91,6 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
     if study.priors:
         known = (f"{name} {p.median:g}, factor {p.factor:g}" for name, p in study.priors.items())
         facts.append(f"lognormal priors (median, one standard deviation): {'; '.join(known)}")
-    store, limb = Store(study.results), None
-    if given is not None:
-        places = {site.name: place_site(site, study, given, None) for site in study.sites}
-        limb = LimbGeometry(given, places)
-    elif store.stamp("sites") and store.state("sites", compute_keys(study)["sites"]).state == "done":
-        limb = LimbGeometry.stored(store)
-    placed, anatomy = (limb.places, limb.anatomy) if limb is not None else ({}, None)
     facts += _describe_surface_motion(study, {name: beside.motion for name, beside in seen.items()}, limb)
     for name, beside in seen.items():
         for place, means in beside.waves:
@@ -265,12 +263,10 @@ def _describe_socket(study: Study, anatomy: Anatomy | None, bones: Collection[st
     ]
 
 
-def _describe_surfaces(study: Study, anatomy: Anatomy) -> list[str]:
+def _describe_surfaces(anatomy: Anatomy) -> list[str]:
     facts = [
         f"{name}: {surface.volume / 1000:.1f} cm3, {len(surface.faces)} triangles"
         for name, surface in {"skin": anatomy.skin, **anatomy.bones, **anatomy.regions}.items()
     ]
-    for site in study.sites:
-        place_site(site, study, anatomy, None)
     largest = np.ptp(anatomy.skin.points, axis=0)
     return [*facts, "extent of the skin: " + " x ".join(f"{x:.0f}" for x in largest) + " mm"]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -255,6 +256,7 @@ def select_stages_to_redo(
     return {*force, *(names[names.index(start) :] if start is not None else ())}
 
 
+_KINDS = (bool, Real, str, Mapping, Collection)  # of options: a switch is no number, a text no list
 _FIGURES = ("mean_error_fitted_percent", "mean_error_heldout_percent", "report")
 
 
@@ -335,6 +337,11 @@ def run_experiment(
     unknown = ", ".join(sorted(set(options) - set(experiment.options)))
     if unknown:
         raise InputError(f"{name} has no option {unknown}")
+    for option, value in options.items():
+        default = experiment.options[option]
+        if value is not None and _find_kind(default) not in (-1, _find_kind(value)):
+            what = f"option {option} of {name} cannot be {value!r}"
+            raise InputError(what, remedy=f"its default is {default!r}")
     chosen = {**experiment.options, **options}
     check_experiment(experiment, study, None, chosen)
     last = [stage.name for stage in STAGES if stage.name in experiment.needs][-1:]
@@ -351,6 +358,11 @@ def run_experiment(
             _do(context, experiment, key, chosen)
         folder = context.store[name]
     return read_json(folder / f"{name}.json") | {"folder": str(folder)}
+
+
+def _find_kind(value: Any) -> int:
+    """Which of `_KINDS` the value of an option is; -1 for none of them."""
+    return next((i for i, kind in enumerate(_KINDS) if isinstance(value, kind)), -1)
 
 
 @contextmanager

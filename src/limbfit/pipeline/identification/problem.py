@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ...arrays import Array
-from ...errors import StudyError
+from ...errors import StudyError, add_location
 from ...identify.fit.calibration import CalibrationSettings
 from ...identify.fit.parameters import (
     Grouping,
@@ -40,13 +40,15 @@ class CalibrationProblem:
 
 
 def check_fitted(study: Study) -> None:
-    """Refuse a study that has nothing to identify parameters from.
+    """Refuse a study that has nothing to identify parameters from, or no parameter to identify.
 
     Raises `StudyError` with the remedy.
     """
     if not study.fitted:
         remedy = "set fitted = true where there is a record, or stop before it: limbfit run --until mesh"
         raise StudyError("no site is fitted", file=study.file, place="sites", remedy=remedy)
+    with add_location(file=study.file, place="calibration"):
+        build_problem(study)
 
 
 def build_problem(study: Study) -> CalibrationProblem:
