@@ -98,12 +98,10 @@ def test_all_records_in_another_unit_are_told_from_a_limb():
 def test_axes_places_and_depths():
     facts = study()
     facts[0] = replace(facts[0], axis_deg=40.0)
-    facts[1] = replace(facts[1], axis_deg=178.0)
     facts[2] = replace(facts[2], off_skin_mm=4.5)
     facts[3] = replace(facts[3], hint_mm=20.0)
     found = {flag.sites[0]: flag for flag in check_plausibility(facts)}
-    assert set(found) == {"s0", "s1", "s2", "s3"}
-    assert "negate" in found["s1"].remedy
+    assert set(found) == {"s0", "s2", "s3"}
     assert found["s0"].evidence == {"axis_deg": 40.0}
 
 

@@ -37,3 +37,12 @@ def test_a_site_beyond_the_cut_is_refused_with_the_study_file_and_its_name(tmp_p
     anatomy, _ = read_given_anatomy(study)
     with pytest.raises(SiteError, match=r"study\.toml: sites\.1: lies on the proximal cut or beyond it"):
         place_site(study.sites[0], study, anatomy, None)
+
+
+def test_an_axis_that_points_out_of_the_limb_is_refused_whether_or_not_a_record_tells(tmp_path: Path) -> None:
+    file = small_limb(tmp_path, "") / "study.toml"
+    file.write_text(file.read_text().replace("depth_mm = 3.0", "depth_mm = 3.0\naxis = [1.0, 0.0, 0.1]"))
+    study = load_study(file)
+    anatomy, _ = read_given_anatomy(study)
+    with pytest.raises(SiteError, match=r"study\.toml: sites\.1: the axis points out of the limb; negate it"):
+        place_site(study.sites[0], study, anatomy, None)

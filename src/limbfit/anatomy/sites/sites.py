@@ -17,27 +17,25 @@ MAX_DEPTH_MM = 40.0  # beyond it, bone no longer stiffens what is felt
 _TICKS = np.linspace(-0.5, 0.5, 5)
 
 
-def project_to_skin(anatomy: Anatomy, position: ArrayLike, name: str | None = None) -> tuple[Array, float]:
+def project_to_skin(anatomy: Anatomy, position: ArrayLike) -> tuple[Array, float]:
     """The skin point (3,) nearest to a position (3,), LPS mm, and its distance in mm. Raises `SiteError` when
     the position lies more than 5 mm off the skin, or at the proximal cut or beyond it, where the model has no
-    skin; ``name`` says which site.
+    skin.
     """
     query = np.asarray(position, dtype=float)
     if query.shape != (3,) or not np.isfinite(query).all():
-        raise SiteError("a position has three finite coordinates", place=name, remedy="give LPS millimetres")
+        raise SiteError("a position has three finite coordinates", remedy="give LPS millimetres")
     skin = anatomy.skin
     squared, _, nearest = skin.find_nearest(query[None])
     distance = float(np.sqrt(squared[0]))
     if distance > MAX_OFF_SKIN_MM:
         raise SiteError(
             f"lies {distance:.1f} mm off the skin",
-            place=name,
             remedy="give the position in LPS millimetres of the image (3D Slicer shows RAS: negate x and y)",
         )
     if anatomy.height(nearest[0]) > -ON_CUT_MM:
         raise SiteError(
             "lies on the proximal cut or beyond it",
-            place=name,
             remedy="move the site distally, or geometry.proximal_cut, whose normal points proximally",
         )
     return np.asarray(nearest[0], dtype=float), distance

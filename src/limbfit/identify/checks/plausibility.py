@@ -164,10 +164,9 @@ def _check_places(facts: Sequence[RecordFacts]) -> Iterator[RecordWarning]:
             continue
         seen_sites.add(f.site_name)
         if f.axis_deg is not None and f.axis_deg > MAX_AXIS_DEG:
-            outward = f.axis_deg > 90
             what = f"the axis is {f.axis_deg:.0f} degrees from the inward normal of the skin"
-            cause = "an axis that points out of the limb" if outward else "an axis of another site or frame"
-            remedy = "negate it" if outward else "check it, or leave axis out to take the skin's normal"
+            cause = "an axis of another site or frame"
+            remedy = "check it, or leave axis out to take the skin's normal"
             yield RecordWarning((f.site_name,), "axis", what, {"axis_deg": f.axis_deg}, cause, remedy)
         if f.off_skin_mm is not None and f.off_skin_mm > MAX_OFF_SKIN_MM:
             what = f"the stated position is {f.off_skin_mm:.1f} mm off the skin"

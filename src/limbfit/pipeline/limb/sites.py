@@ -10,6 +10,7 @@ import numpy as np
 from ...anatomy.sites.markers import find_markers, match_markers
 from ...anatomy.sites.sites import compute_indenter_axis, project_to_skin
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy, read_surface
+from ...errors import SiteError
 from ...results.limb import MarkerEvidence, PlacedSite, SitesResult
 from ...study import Site, Study
 from ..engine.context import Context
@@ -36,13 +37,16 @@ def run_sites(context: Context, folder: Path) -> None:
 def place_site(site: Site, study: Study, anatomy: Anatomy, marker: Any) -> PlacedSite:
     """A site on the skin with its axis; ``marker`` is what was matched to it, or None.
 
-    Raises `SiteError` when the site is too far off the skin.
+    Raises `SiteError` when the site is too far off the skin, or its stated axis points out of the limb.
     """
     wanted = np.array(site.position) if marker is None else marker.position
     with name_file_in_errors(study.file, f"sites.{site.name}"):
         point, off = project_to_skin(anatomy, wanted)
-        width = study.width_at(site)
-        axis = site.axis or compute_indenter_axis(anatomy.open_skin, point, width, site.edge)
+        edge = None if site.axis else site.edge  # which may be along the skin's normal where axis is stated
+        normal = compute_indenter_axis(anatomy.open_skin, point, study.width_at(site), edge)
+        axis = normal if site.axis is None else np.array(site.axis)
+        if axis @ normal < 0:
+            raise SiteError("the axis points out of the limb", remedy="negate it: it points into the limb")
     evidence = None
     if marker is not None:
         assert site.near is not None
@@ -50,7 +54,7 @@ def place_site(site: Site, study: Study, anatomy: Anatomy, marker: Any) -> Place
         evidence = MarkerEvidence(
             height_mm=round(float(marker.height), 3), distance_to_hint_mm=round(distance, 3)
         )
-    unit = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    unit = axis / np.linalg.norm(axis)
     return PlacedSite(
         site=site.name,
         region=site.region,
