@@ -128,6 +128,17 @@ def test_contours_of_another_image_are_refused(tmp_path, options, expected):
         read_labels(tmp_path / "labels.dcm", image)
 
 
+def test_structures_whose_names_become_one_are_refused(tmp_path):
+    """As one structure a bone inside another, or drawn twice, would be a hole."""
+    image = volume(DIRECTIONS["oblique"])
+    write_rtstruct(tmp_path / "labels.dcm", labels_on(image))
+    data = pydicom.dcmread(tmp_path / "labels.dcm")
+    data.StructureSetROISequence[1].ROIName, data.StructureSetROISequence[2].ROIName = "Tibia", "tibia_"
+    data.save_as(tmp_path / "labels.dcm")
+    with pytest.raises(LabelError, match="two segments have the same name"):
+        read_labels(tmp_path / "labels.dcm", image)
+
+
 def test_contours_without_an_image_are_refused(tmp_path):
     write_rtstruct(tmp_path / "labels.dcm", labels_on(volume(np.eye(3))))
     with pytest.raises(LabelError, match="need the image"):

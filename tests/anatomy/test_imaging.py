@@ -45,6 +45,21 @@ def test_round_trip_through_files(tmp_path, suffix, direction):
     assert back.has_same_grid(image)
 
 
+@pytest.mark.parametrize("name", ["image.MHA", "image.MHD", "image.NRRD", "image.NII", "image.NII.GZ"])
+def test_a_suffix_in_capitals_is_read(tmp_path, name):
+    image = volume(DIRECTIONS["oblique"])
+    write_volume(tmp_path / name.lower(), image)
+    (tmp_path / name.lower()).rename(tmp_path / name)
+    assert np.array_equal(read_volume(tmp_path / name).array, image.array)
+
+
+def test_a_suffix_that_nifti_does_not_know_is_to_be_renamed(tmp_path):
+    write_volume(tmp_path / "image.nii.gz", volume(np.eye(3)))
+    (tmp_path / "image.nii.gz").rename(tmp_path / "image.nii.GZ")
+    with pytest.raises(ImageError, match=r"rename it to end in \.nii\.gz"):
+        read_volume(tmp_path / "image.nii.GZ")
+
+
 def test_nifti_is_turned_from_ras_to_lps(tmp_path):
     nibabel = pytest.importorskip("nibabel")
     affine = np.diag([2.0, 3.0, 4.0, 1.0])

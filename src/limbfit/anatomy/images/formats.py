@@ -58,9 +58,10 @@ class ImageFormat:
     is_written: bool = False
 
 
-def _read_itk(path: Path, place_keys: tuple[str, ...] = ()) -> sitk.Image:
+def _read_itk(path: Path, place_keys: tuple[str, ...] = (), by: str = "") -> sitk.Image:
     """An image by ITK, whose header has one of some keys with a value, or its place would be a guess."""
     reader = sitk.ImageFileReader()
+    reader.SetImageIO(by)  # a format whose suffixes ITK knows in small letters only
     reader.SetFileName(str(path))
     try:
         with mute_libraries():
@@ -71,7 +72,8 @@ def _read_itk(path: Path, place_keys: tuple[str, ...] = ()) -> sitk.Image:
         if "orthonormal" in str(error) or "Bad direction" in str(error):
             remedy = "resample the image to a rectangular grid"
             raise ImageError("the image axes are not orthonormal", file=path, remedy=remedy) from None
-        remedy = "check that the file is whole"
+        mixed = path.name.lower().endswith(".nii.gz") and not path.name.endswith((".nii.gz", ".NII.GZ"))
+        remedy = "rename it to end in .nii.gz" if mixed else "check that the file is whole"
         raise ImageError("the image cannot be read", file=path, remedy=remedy) from None
     values = [reader.GetMetaData(key).strip() for key in place_keys if reader.HasMetaDataKey(key)]
     if place_keys and set(values) <= _PLACELESS:
@@ -91,7 +93,7 @@ def _read_nifti(path: Path) -> sitk.Image:
 _BUILTIN = (
     ImageFormat("NIfTI", (".nii", ".nii.gz"), _read_nifti, is_written=True),
     ImageFormat("NRRD", (".nrrd", ".nhdr"), partial(_read_itk, place_keys=("NRRD_space",)), is_written=True),
-    ImageFormat("MetaImage", (".mha", ".mhd"), _read_itk, is_written=True),
+    ImageFormat("MetaImage", (".mha", ".mhd"), partial(_read_itk, by="MetaImageIO"), is_written=True),
 )
 IMAGE_FORMATS = Registry("image format", {known.name: known for known in _BUILTIN})
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import csv
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -113,7 +113,7 @@ def read_contours(path: str | Path, like: Volume) -> LabelMap:
         With the file and the line or the structure.
     """
     with add_location(file=path):
-        return build_labels(_read_polygons(Path(path)), like)
+        return build_labels([*_read_polygons(Path(path)).items()], like)
 
 
 def _read_polygons(path: Path) -> dict[str, list[Array]]:
@@ -135,19 +135,19 @@ def _read_polygons(path: Path) -> dict[str, list[Array]]:
     return {name: [np.array(points) for points in contours.values()] for name, contours in found.items()}
 
 
-def build_labels(contours: Mapping[str, Sequence[Array]], like: Grid) -> LabelMap:
-    """Contours, LPS mm, of each structure as a label map on the grid of ``like``.
+def build_labels(structures: Sequence[tuple[str, Sequence[Array]]], like: Grid) -> LabelMap:
+    """Structures, by name and contours (LPS mm), as a label map on the grid of ``like``.
 
     Raises
     ------
     LabelError
-        With the structure that cannot be rasterised.
+        With the structure that cannot be rasterised, or for two of one name.
     """
     masks = []
-    for name, polygons in contours.items():
+    for name, polygons in structures:
         with add_location(place=name):
             masks.append(rasterise_polygons(polygons, like))
-    array, names = flatten(masks, list(contours))
+    array, names = flatten(masks, [name for name, _ in structures])
     return LabelMap(array, like.spacing, like.origin, like.direction, names)
 
 

@@ -175,10 +175,10 @@ def read_rtstruct(path: Path, like: Volume | None) -> LabelMap:
     return build_labels(contours, like)
 
 
-def _read_contours(data: FileDataset) -> dict[str, list[Array]]:
-    """Closed contours, LPS mm, by the name of their structure; structures without any are left out."""
+def _read_contours(data: FileDataset) -> list[tuple[str, list[Array]]]:
+    """Each structure's name and closed contours, LPS mm; structures without any are left out."""
     names = {int(roi.ROINumber): normalise_name(roi.ROIName) for roi in data.StructureSetROISequence}
-    found: dict[str, list[Array]] = {}
+    found: dict[int, list[Array]] = {}
     for item in data.ROIContourSequence:
         closed = [
             np.array(contour.ContourData, dtype=float).reshape(-1, 3)
@@ -186,5 +186,5 @@ def _read_contours(data: FileDataset) -> dict[str, list[Array]]:
             if str(contour.ContourGeometricType) in ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
         ]
         if closed:
-            found.setdefault(names[int(item.ReferencedROINumber)], []).extend(closed)
-    return found
+            found.setdefault(int(item.ReferencedROINumber), []).extend(closed)
+    return [(names[number], closed) for number, closed in found.items()]
