@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from limbfit.anatomy.grid import BONES
 from limbfit.anatomy.surfaces.surfaces import check_closed
 from limbfit.phantom.geometry import Limb, build_rotation, make_limb
-from limbfit.phantom.sites import DETAIL_SITES, FITTED, SAFE_SHARE, build_true_sites
+from limbfit.phantom.sites import DETAIL_SITES, FITTED, SAFE_SHARE, build_true_sites, select_sites
 from limbfit.phantom.surfaces import build_true_anatomy
 
 SEEDS = (0, 1, 2, 3)
@@ -142,3 +142,9 @@ def test_the_coarse_phantom_has_all_fitted_sites_and_two_more() -> None:
     coarse = DETAIL_SITES["coarse"]
     assert set(FITTED) < set(coarse)
     assert len(coarse) == len(set(coarse)) == 6
+
+
+def test_sites_that_are_all_held_out_elsewhere_are_fitted_where_they_are_alone():
+    sites = build_true_sites(make_limb(0), 0)
+    assert [site.fitted for site in select_sites(sites, ["02", "05"])] == [False, True]
+    assert [site.fitted for site in select_sites(sites, ["02", "03"])] == [True, True]

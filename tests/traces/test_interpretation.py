@@ -97,6 +97,17 @@ def test_spikes_of_the_displacement_are_taken_out():
     assert np.abs(found.trace.displacement_mm - trace.displacement_mm).max() < 0.05
 
 
+def test_one_spike_in_a_short_record_is_taken_out():
+    trace, clean = record()
+    some = slice(None, None, len(clean) // 60)
+    short = Trace(trace.time_s[some], trace.displacement_mm[some], trace.force_N[some])
+    force = short.force_N.copy()
+    force[30] += 5.0
+    found = interpret_record(replace(short, force_N=force))
+    assert "spikes" in kinds(found)
+    assert abs(found.trace.force_N[30] - short.force_N[30]) < 0.3
+
+
 def test_a_broken_cable_is_refused():
     trace, _ = record()
     force, _ = spiked(trace.force_N, 5.0, per_mille=30)

@@ -8,7 +8,7 @@ changes the limb.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,8 +98,8 @@ def build_true_sites(limb: Limb, seed: int) -> tuple[TrueSite, ...]:
 
 
 def select_sites(sites: Sequence[TrueSite], names: Sequence[str]) -> tuple[TrueSite, ...]:
-    """Select the named sites, in the order of the limb's list. Raises `SiteError` when a name is not among
-    them.
+    """Select the named sites, in the order of the limb's list; all are fitted where none would be. Raises
+    `SiteError` when a name is not among them.
     """
     available = {site.name for site in sites}
     unknown = [name for name in names if name not in available]
@@ -107,7 +107,9 @@ def select_sites(sites: Sequence[TrueSite], names: Sequence[str]) -> tuple[TrueS
         raise SiteError(
             f"the phantom has no site {unknown[0]!r}", remedy=f"choose from {', '.join(sorted(available))}"
         )
-    return tuple(site for site in sites if site.name in set(names))
+    found = [site for site in sites if site.name in set(names)]
+    unfitted = not any(site.fitted for site in found)
+    return tuple(replace(site, fitted=site.fitted or unfitted) for site in found)
 
 
 def build_markers(sites: Sequence[TrueSite]) -> tuple[SkinMarker, ...]:

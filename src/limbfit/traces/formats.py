@@ -153,13 +153,10 @@ def _build_table(header: Row, rows: Sequence[Row], columns: Names, has_preamble:
     number, names = header
     notes = (f"what stands before the header in line {number} is skipped",) if has_preamble else ()
     first = (rows[0][1] if rows else []) + [""] * len(names)
-    if all(_is_word(first[names.index(name)]) for name in columns.values()):
+    below = [first[names.index(name)] for name in columns.values()]
+    if all(cell and not is_number(cell) and not any(c.isdigit() for c in cell) for cell in below):
         return ColumnTable(names, first[: len(names)], rows[1:], notes=notes)
     return ColumnTable(names, [""] * len(names), rows, notes=notes)
-
-
-def _is_word(cell: str) -> bool:
-    return bool(cell) and not is_number(cell) and not any(c.isdigit() for c in cell)
 
 
 # --- LabVIEW's measurement files

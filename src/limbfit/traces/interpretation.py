@@ -35,7 +35,7 @@ _SPIKE_NOISE = 8.0  # standard deviations
 _SPIKE_STEPS = 6.0  # times the usual step between the samples around it: a corner is no spike
 _SPIKE_RESOLUTION = 2.5  # steps in which the values come
 _SPIKE_SHARE = 0.02  # of the range: less does no harm
-_MAX_SPIKES = 0.01  # of the samples
+_MAX_SPIKES = 0.01  # of the samples; one spike is allowed in a short record, too
 _NEIGHBOURS = 4  # samples on either side
 _CLEAR_MM = 0.1  # and two standard deviations of touch-down: off the skin
 _MIN_CLEAR = 20  # samples
@@ -147,7 +147,7 @@ def _remove_spikes(trace: Trace) -> tuple[Trace, list[TraceWarning]]:
         count = int(spikes.sum())
         if not count:
             continue
-        if count > _MAX_SPIKES * len(values):
+        if count > max(_SPIKE_WIDTH, _MAX_SPIKES * len(values)):
             raise TraceError(
                 f"{count} of {len(values)} samples stick out from their neighbours",
                 place=column,
