@@ -8,7 +8,7 @@ from importlib import import_module
 import pytest
 
 from limbfit import Progress, run_experiment, study_status
-from limbfit.errors import InputError
+from limbfit.errors import InputError, RunError
 from limbfit.pipeline.commands.experiments import EXPERIMENTS, Experiment, register_experiment
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.storage import write_json
@@ -74,6 +74,26 @@ def test_a_stopped_experiment_goes_on_in_its_own_folder(study):
     assert state(study) == "begun"
     run_experiment(load_study(study), "peaks", listener=stop)  # what it had begun is there: no second half
     assert state(study) == "done"
+
+
+def test_an_experiment_that_was_stopped_at_its_first_try_has_begun_whatever_its_options(study):
+    def stop(event: Progress) -> None:
+        if event.text == "halfway":
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        run_experiment(load_study(study), "peaks", factor=2.0, listener=stop)
+    assert state(study) == "begun"
+
+
+def test_an_experiment_is_not_done_on_records_that_are_others_by_now(study):
+    def edit(event: Progress) -> None:
+        if event.stage == "traces" and event.text.startswith("done"):
+            (study / "2.csv").write_bytes((study / "2.csv").read_bytes() + b"\n")
+
+    with pytest.raises(RunError, match=r"study\.toml: an input of the stage traces has changed .*run the"):
+        run_experiment(load_study(study), "peaks", listener=edit)
+    assert state(study) == "missing"
 
 
 def test_options_settings_and_records_decide_an_experiment(study):

@@ -15,7 +15,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from limbfit import Progress, diagnose, run_batch, run_study, study_status
+from limbfit import Progress, diagnose, report_study, run_batch, run_study, study_status
 from limbfit.errors import InputError, RunError
 from limbfit.execution import Limits, SerialExecutor, make_executor, share_executor
 from limbfit.pipeline.commands.doctor import compress_test_cube, judge_self_test
@@ -70,6 +70,13 @@ def test_stages_are_done_anew_where_asked_for(alone):
     for how in ({"start": "report"}, {"force": ["traces", "predict"]}):
         with pytest.raises(InputError, match="comes after traces"):
             done(**how)
+
+
+def test_a_report_of_what_there_is_before_a_run_is_not_that_of_the_run(alone):
+    run_study(load_study(alone), until="traces", listener=quiet)
+    report_study(load_study(alone), listener=quiet)
+    row = rows_of(alone)["report"]
+    assert (row["state"], row["why"]) == ("stale", ["stage predict changed"])
 
 
 def test_the_log_tells_what_happened_and_no_names_of_files(alone):

@@ -101,7 +101,9 @@ _OWN: tuple[Experiment, ...] = (
         _RECORD,
         check=check_crossvalidate,
     ),
-    Experiment("design", run_design, _MESHED, _TABLES, _PLANNED, _RECORD, check=check_design),
+    Experiment(
+        "design", run_design, _MESHED, ("calibration", *_TABLES), _PLANNED, _RECORD, check=check_design
+    ),
     Experiment(
         "protocol",
         run_protocol,
@@ -109,6 +111,7 @@ _OWN: tuple[Experiment, ...] = (
         ("calibration", "acquire", *_TABLES),
         _PLANNED,
         _RECORD,
+        plans=True,
         check=check_protocol,
     ),
     Experiment("socket", run_socket, ("surfaces",), _SOCKET, apart=("socket.design",), check=check_socket),
@@ -168,12 +171,15 @@ def list_experiment_states(
 ) -> list[tuple[StageState, StageKey, dict[str, Any]]]:
     """State, key and options of every experiment, each judged with the options that it was run with.
 
-    ``below`` are the keys of the chain.
+    ``below`` are the keys of the chain. One that was never done has begun with whatever options it was given.
     """
     store, found = Store(keys.study.results), []
     for experiment in EXPERIMENTS:
         stamp = store.stamp(experiment.name)
         options = {**experiment.options, **(stamp.options if stamp else {})}
         key = compute_experiment_key(keys, experiment, below, options)
-        found.append((store.state(experiment.name, key.digest), key, options))
+        state = store.state(experiment.name, key.digest)
+        if state.state == "missing" and any(store.folder.glob(f".work-{experiment.name}-*")):
+            state = replace(state, state="begun")
+        found.append((state, key, options))
     return found

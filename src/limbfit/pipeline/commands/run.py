@@ -14,7 +14,7 @@ from typing import Any
 
 from ... import report
 from ..._version import __version__
-from ...errors import InputError, LimbfitError
+from ...errors import InputError, LimbfitError, RunError
 from ...execution import make_executor, run_in_background, share_executor
 from ...extensions import load_extensions
 from ...fe import are_compiled, compile_kernels
@@ -94,7 +94,14 @@ STAGES = (
         ("name", "fitted", "weight", "edge", "indenter"),
         (*_NAMED, "indenter"),
     ),
-    Stage("predict", run_predict, ("sites", "traces", "mesh", "calibrate"), (), ("name", "edge"), _NAMED),
+    Stage(
+        "predict",
+        run_predict,
+        ("sites", "traces", "mesh", "calibrate"),
+        ("solver",),
+        ("name", "edge"),
+        _NAMED,
+    ),
     Stage("report", run_report, ("predict",), ("study",), ("name", "region")),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
@@ -352,6 +359,10 @@ def run_experiment(
         keys = Keys(study)
         below = {stage: key.digest for stage, key in _compute_chain(keys).items()}
         key = compute_experiment_key(keys, experiment, below, chosen)
+        for stage, digest in key.parts.stages.items():
+            if context.store.state(stage, digest).state == "stale":
+                what = f"an input of the stage {stage} has changed since limbfit was started"
+                raise RunError(f"{study.file}: {what}; run the command again")
         if context.store.state(name, key.digest).state == "done":
             context.tell(name, 1, 1, "is up to date")
         else:
@@ -421,10 +432,17 @@ def run_record(study: Study) -> RunResult:
 
 
 def report_study(study: Study, *, listener: Listener = ignore_progress) -> dict[str, Any]:
-    """Make the report anew from what is stored, stale or not; nothing is solved."""
+    """Make the report anew from what is stored, stale or not; nothing is solved.
+
+    That of a stale prediction, or of none yet, is stale too: the next run makes it anew.
+    """
     with lock(study.results), build_executor(study) as executor:
-        context = Context(study, Store(study.results), executor, listener)
-        _do(context, STAGES[-1], _compute_chain(Keys(study))["report"])
+        context, keys = Context(study, Store(study.results), executor, listener), Keys(study)
+        chain, predicted = _compute_chain(keys), context.store.stamp("predict")
+        key = chain["report"]
+        if predicted is None or predicted.key != chain["predict"].digest:
+            key = keys.of(STAGES[-1], {} if predicted is None else {"predict": predicted.key})
+        _do(context, STAGES[-1], key)
         return summarise(study, STAGE_NAMES)
 
 

@@ -56,7 +56,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def list_input_files(study: Study) -> dict[str, list[Path]]:
-    """The study's input files and folders by the stage that reads them."""
+    """The study's input files and folders by the stage that reads them; ``indenters``: all that simulate."""
     files: dict[str, list[Path]] = {"segment": [], "surfaces": [], "traces": []}
     if study.image is not None:
         files["segment"] += [study.image.path, *filter(None, [study.image.marked])]
@@ -68,10 +68,7 @@ def list_input_files(study: Study) -> dict[str, list[Path]]:
     if study.surfaces is not None:
         files["surfaces"] += [study.surfaces.skin, *study.surfaces.bones.values()]
     files["surfaces"] += [one.surface for one in study.geometry.regions if one.surface is not None]
-    files_of_indenters = [one.file for one in study.all_indenters.values() if one.file is not None]
-    if files_of_indenters:
-        # What needs the calibration is stale with it.
-        files |= dict.fromkeys(("calibrate", "design", "protocol"), files_of_indenters)
+    files["indenters"] = [one.file for one in study.all_indenters.values() if one.file is not None]
     if study.socket.file is not None:
         files["socket"] = [study.socket.file]
     files["traces"] += [path for record in study.recorded for path in record.files]
