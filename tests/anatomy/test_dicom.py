@@ -134,6 +134,15 @@ def test_a_damaged_file_is_named_by_its_number_and_by_a_name_that_is_nobodys(tmp
     assert (files[2].name in refusal(folder)) == bool(shown)
 
 
+def test_what_a_system_leaves_beside_the_slices_is_passed_over(tmp_path):
+    """A Mac writes a file ._NAME beside each on disks of another kind."""
+    write_dicom(tmp_path, volume(DIRECTIONS["oblique"]))
+    first = min(path.name for path in tmp_path.iterdir())
+    (tmp_path / f"._{first}.dcm").write_bytes(b"\0\5\x16\7\0\2\0\0Mac OS X" + bytes(4000))
+    (tmp_path / ".DS_Store").write_bytes(b"\0\0\0\1Bud1")
+    assert len(list_series(tmp_path)) == 1
+
+
 def test_folders_without_images_are_refused(tmp_path):
     assert "no DICOM images" in refusal(tmp_path)
     write_dicom(tmp_path, volume(np.eye(3)), skip=(0, 1, 2, 3, 4))

@@ -56,6 +56,38 @@ def test_a_key_of_no_stage_is_read(key: str) -> None:
     assert key.rpartition(".")[2] in read
 
 
+def test_an_indenter_that_no_fitted_record_names_is_no_reason_to_identify_again(folder: Path) -> None:
+    def differ(content: Mapping[str, Any], key: str, value: Any) -> set[str]:
+        found = decided(loaded(folder, content)), decided(loaded(folder, changed(content, key, value)))
+        return {name for name, digest in found[0].items() if digest != found[1][name]}
+
+    planned = changed(GIVEN, "indenters.big", {"width_mm": 30.0})
+    assert differ(GIVEN, "indenters.big", {"width_mm": 30.0}) == set()
+    assert "calibrate" not in differ(planned, "sites.1.indenter", "big")
+    assert "predict" in differ(planned, "sites.1.indenter", "big")
+    studies = [loaded(folder, content) for content in (GIVEN, planned)]
+    protocol = EXPERIMENTS["protocol"]
+    keys = [Keys(one).of(protocol, compute_keys(one), protocol.options).digest for one in studies]
+    assert keys[0] != keys[1]
+
+
+def test_a_design_is_stale_where_the_study_fixes_something_else(folder: Path) -> None:
+    other = decided(loaded(folder, changed(GIVEN, "calibration.fixed", ["muscle.gamma"])))
+    assert other["design"] != before(folder, False)["design"]
+
+
+def test_what_a_system_leaves_in_a_folder_of_images_makes_nothing_stale(folder: Path) -> None:
+    was = before(folder, True)
+    left = [folder / "mri" / name for name in (".DS_Store", "._image", "Thumbs.db")]
+    for file in left:
+        file.write_text("seen")
+    study = loaded(folder, IMAGED)
+    now = decided(study)
+    for file in left:
+        file.unlink()
+    assert now == was
+
+
 def test_the_design_of_a_socket_is_no_reason_to_put_it_on_again(folder: Path) -> None:
     def of(content: Mapping[str, Any]) -> list[str]:
         study = loaded(folder, content)

@@ -26,7 +26,7 @@ from pydicom.uid import UID
 from ...arrays import Array
 from ...errors import ImageError, add_location
 from ..grid import Volume, check_voxel_count
-from .dicom_headers import SliceHeader, read_headers, silence_readers
+from .dicom_headers import SliceHeader, list_files, read_headers, silence_readers
 
 _PLAIN_WORDS = {"dcm", "dicom", "ima", "im", "img", "image", "i", "slice", "mr", "ct", "pt", "ser", "series"}
 _MAX_COUNT = 9999  # of files; a larger number may be that of a person
@@ -55,7 +55,7 @@ def list_series(folder: str | Path) -> list[Series]:
     `ImageError` for a folder without images, or a damaged file in it.
     """
     groups: dict[str, list[SliceHeader]] = defaultdict(list)
-    files = [path for path in sorted(Path(folder).rglob("*")) if path.is_file()]
+    files = list_files(Path(folder))
     for number, path in enumerate(files, 1):
         place = f"file {number} of {len(files)} by name{_redact_name(path.relative_to(folder))}"
         with add_location(file=folder, place=place):

@@ -17,7 +17,7 @@ from pydicom.errors import InvalidDicomError
 from ...arrays import Array, Indices, Mask
 from ...errors import LabelError
 from ..grid import Grid, LabelMap, Volume
-from ..images.dicom_headers import find_functional_group, silence_readers
+from ..images.dicom_headers import find_functional_group, list_files, silence_readers
 from .contours import build_labels
 from .labelfiles import flatten, normalise_name
 
@@ -32,7 +32,7 @@ def find_dicom_labels(path: Path) -> Path | None:
     Raises `LabelError` for a folder without or with several of them, and for DICOM of another kind.
     """
     if path.is_dir():
-        found = [file for file in sorted(path.rglob("*")) if file.is_file() and _find_storage_class(file)]
+        found = [file for file in list_files(path) if _find_storage_class(file)]
         if len(found) != 1:
             raise LabelError(
                 f"{len(found) or 'no'} DICOM segmentations or structure sets in this folder",

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..._version import __version__
+from ...anatomy.images.dicom_headers import list_files
 
 PACKAGE = Path(__file__).parents[2]
 _DEFINITION = re.compile(r"^(?:def |class |async |@)", re.MULTILINE)
@@ -42,12 +43,9 @@ def find_data_files(path: Path) -> list[Path]:
 def compute_file_digest(path: Path) -> str:
     """SHA-256 of a file, with that of its voxels apart, or of names and contents of all below a folder."""
     sha = hashlib.sha256()
-    files = [path, *find_data_files(path)]
-    if path.is_dir():
-        files = sorted(p for p in path.rglob("*") if p.is_file())
-    for file in files:
+    for file in list_files(path) if path.is_dir() else [path, *find_data_files(path)]:
         if path.is_dir():
-            sha.update(str(file.relative_to(path)).encode())
+            sha.update(file.relative_to(path).as_posix().encode())
         with file.open("rb") as stream:
             while block := stream.read(1 << 20):
                 sha.update(block)
