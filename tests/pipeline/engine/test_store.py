@@ -7,10 +7,12 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from limbfit.errors import RunError
 from limbfit.pipeline.engine.digests import compute_file_digest
+from limbfit.pipeline.engine.partial_results import ResultFiles
 from limbfit.pipeline.engine.storage import read_json, write_json
 from limbfit.pipeline.engine.store import EARLIER, Store, lock, translate_disk_errors
 
@@ -65,6 +67,43 @@ def test_simulations_of_unfinished_work_of_other_inputs_are_kept_until_the_stage
 
     store.make("calibrate", "new", produce)
     assert [p.name for p in store["calibrate"].iterdir()] == ["stage.json"]
+
+
+@pytest.mark.parametrize("left", [b"", b"1x", bytes(8)])
+def test_a_clock_that_a_power_cut_has_left_in_part_starts_anew(tmp_path, left):
+    store = Store(tmp_path)
+    work = store.work_folder("mesh", "a")
+    work.mkdir()
+    (work / ".seconds").write_bytes(left)
+    assert store.make("mesh", "a", lambda folder: {}).seconds < 10.0
+
+
+def test_a_stage_whose_result_is_cut_short_is_made_anew(tmp_path):
+    store = Store(tmp_path)
+    store.make("calibrate", "a", lambda folder: write_json(folder / "calibration.json", {"c": 1}) or {})
+    whole = (store["calibrate"] / "calibration.json").read_bytes()
+    for left in (b"", whole[:-2], bytes(len(whole))):
+        (store["calibrate"] / "calibration.json").write_bytes(left)
+        assert store.state("calibrate", "a").state == "begun"
+    store.make("calibrate", "a", lambda folder: write_json(folder / "calibration.json", {"c": 1}) or {})
+    assert store.state("calibrate", "a").state == "done"
+
+
+def test_a_kept_simulation_that_is_cut_short_is_none(tmp_path):
+    kept = ResultFiles(tmp_path / "runs", also=[tmp_path / "earlier"])
+    made = {"reason": ""}, {"force_N": np.arange(500.0)}
+    kept.put("a", made)
+    file = tmp_path / "runs" / "a.npz"
+    whole = file.read_bytes()
+    for size in (0, 1, 60, len(whole) // 2, len(whole) - 30):
+        file.write_bytes(whole[:size])
+        assert kept.find("a") is None
+    (tmp_path / "earlier").mkdir()
+    (tmp_path / "earlier" / "a.npz").write_bytes(whole)
+    facts, arrays = kept.find("a")
+    assert facts == made[0]
+    np.testing.assert_array_equal(arrays["force_N"], made[1]["force_N"])
+    assert file.read_bytes() == whole
 
 
 def test_a_stage_that_was_complete_when_killed_is_only_put_in_place(tmp_path):

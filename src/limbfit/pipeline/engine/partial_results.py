@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,22 +37,24 @@ class ResultFiles:
         return list(self.folder.glob("*.npz"))
 
     def find(self, key: str) -> Made | None:
-        """What is kept under a key; facts are those that JSON gives back."""
+        """What is kept whole under a key; facts are those that JSON gives back."""
         own = self._place(key)
-        found = next((file for place in self.places if (file := place / own.name).is_file()), None)
-        if found is None:
-            return None
-        if found != own:
-            with write_atomically(own) as stream:
-                stream.write(found.read_bytes())
-        return read_made(own)
+        for file in (place / own.name for place in self.places):
+            found = read_made(file)
+            if found is not None:
+                if file != own:
+                    with write_atomically(own) as stream:
+                        stream.write(file.read_bytes())
+                return found
+        return None
 
     def get(self, key: str, make: Callable[[], Made]) -> Made:
         """What is kept under a key, or is made now."""
         found = self.find(key)
         if found is None:
             self.put(key, make())
-            found = read_made(self._place(key))
+            found = self.find(key)
+            assert found is not None
         return found
 
     def put(self, key: str, made: Made) -> None:
@@ -68,8 +71,11 @@ class ResultFiles:
         return self.folder / f"{key}.npz"
 
 
-def read_made(file: Path) -> Made:
-    """Facts and arrays of a file of `ResultFiles`."""
-    with np.load(file) as stored:
-        arrays = {part: stored[part] for part in stored.files if part != "facts"}
-        return json.loads(str(stored["facts"])), arrays
+def read_made(file: Path) -> Made | None:
+    """Facts and arrays of a file of `ResultFiles`; None where there is none, or one that was cut short."""
+    try:
+        with np.load(file) as stored:
+            arrays = {part: stored[part] for part in stored.files if part != "facts"}
+            return json.loads(str(stored["facts"])), arrays
+    except (FileNotFoundError, EOFError, ValueError, KeyError, BadZipFile):
+        return None

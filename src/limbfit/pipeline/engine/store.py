@@ -11,7 +11,7 @@ import errno
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -70,11 +70,18 @@ class Store:
 
     def state(self, stage: str, key: str) -> StageState:
         stamp = self.stamp(stage)
-        if stamp and stamp.key == key:
+        if stamp and stamp.key == key and self._is_whole(stage):
             return StageState(stage, "done", stamp.seconds, stamp.finished)
-        if self.work_folder(stage, key).is_dir():
+        if (stamp and stamp.key == key) or self.work_folder(stage, key).is_dir():
             return StageState(stage, "begun")
         return StageState(stage, "stale" if stamp else "missing")
+
+    def _is_whole(self, stage: str) -> bool:
+        """False if a power cut, or a copy that was ended, has left a part of what the stage says in JSON."""
+        try:
+            return all(read_json(file) is not None for file in self[stage].glob("*.json"))
+        except ValueError:
+            return False
 
     def make(self, stage: str, key: str, produce: Callable[[Path], dict[str, Any]]) -> StageStamp:
         """Run ``produce(folder)`` in the stage's work folder and put the folder in its place.
@@ -93,7 +100,9 @@ class Store:
 
     def _complete(self, stage: str, key: str, work: Path, produce: Callable[[Path], dict[str, Any]]) -> None:
         clock, start = work / ".seconds", perf_counter()  # seconds add up over attempts
-        before = float(read_json(clock)) if clock.is_file() else 0.0
+        before = 0.0
+        with suppress(OSError, ValueError):  # none there, or a part that a power cut has left
+            before = float(read_json(clock))
         try:
             facts = produce(work)
         finally:

@@ -65,7 +65,7 @@ class SimulationCache:
 
     def load_all(self) -> list[Simulation]:
         """Every simulation that is kept in the folder."""
-        return [_to_simulation(*read_made(file)) for file in self.kept.files]
+        return [_to_simulation(*made) for file in self.kept.files if (made := read_made(file))]
 
 
 def _build_lost(job: SimulationJob, reason: str) -> Simulation:
@@ -116,5 +116,6 @@ def open_experiment_cache(context: Context, folder: Path) -> SimulationCache:
 def find_newest_simulation(folder: Path, site: str) -> Simulation | None:
     """The last kept simulation of a site, while a stage goes on; None where there is none."""
     files = [(file.stat().st_mtime_ns, file) for file in folder.glob("*.npz")]
-    simulations = (_to_simulation(*read_made(file)) for _, file in sorted(files, reverse=True))
+    kept = (read_made(file) for _, file in sorted(files, reverse=True))
+    simulations = (_to_simulation(*made) for made in kept if made is not None)
     return next((one for one in simulations if one.site == site), None)
