@@ -141,6 +141,14 @@ def test_site_table_marks_the_fitted(report: str) -> None:
     assert "0.9 ± 0.3" in table.group()
 
 
+def test_labels_of_an_image_that_the_study_has_no_more_are_not_reported(tmp_path: Path) -> None:
+    folder = write_results(tmp_path / "results")
+    run = json.loads((folder / "run.json").read_text())
+    del run["stages"]["segment"]
+    (folder / "run.json").write_text(json.dumps(run))
+    assert load_store(folder).segment is None
+
+
 def test_mesh_facts(report: str) -> None:
     text = section_of(report, "meshes")
     assert "3.00 ± 0.02" in text

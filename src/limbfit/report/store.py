@@ -207,7 +207,8 @@ def load_store(results: Path) -> Results:
     return Results(
         folder=results,
         run=run,
-        segment=SegmentResult.find(results),
+        # Of a study that has surfaces now it is what an image left that it had before.
+        segment=None if run and "segment" not in run.stages else SegmentResult.find(results),
         surfaces=SurfacesResult.find(results),
         sites=sites.sites if sites else (),
         traces=traces.sites if traces else {},

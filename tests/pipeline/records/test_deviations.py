@@ -35,6 +35,7 @@ from limbfit.pipeline.records.records import (
 from limbfit.pipeline.records.secondary_measurements import WaveMeasurement
 from limbfit.pipeline.records.traces import read_record
 from limbfit.results.curves import read_curves
+from limbfit.study.tables import ImageTable
 
 TRUTH = {"skin": {"c_kPa": 8.0, "m": 5.0, "gamma": 2.0, "tau_s": 0.5}}
 TRUTH["muscle"] = TRUTH["skin"] | {"c_kPa": 4.0}
@@ -74,7 +75,7 @@ def test_a_site_is_off_by_its_surfaces_and_a_little_more(tmp_path: Path) -> None
 
 
 def test_where_surfaces_are_known_from(tmp_path: Path) -> None:
-    """Of files, of an image by its voxels, or as stated."""
+    """Of files, whatever an earlier image has left, of an image by its voxels, or as stated."""
     (tmp_path / "stated").mkdir()
     found = context(tmp_path)
     assert estimate_surface_error_mm(found.study, found.store) == GIVEN_MM
@@ -82,7 +83,9 @@ def test_where_surfaces_are_known_from(tmp_path: Path) -> None:
     labels.SetSpacing((1.0, 1.0, 8.0))
     found.store["segment"].mkdir(parents=True)
     sitk.WriteImage(labels, str(found.store["segment"] / "labels.seg.nrrd"))
-    assert estimate_surface_error_mm(found.study, found.store) == pytest.approx(2.0 * OF_A_VOXEL)
+    assert estimate_surface_error_mm(found.study, found.store) == GIVEN_MM
+    imaged = found.study.model_copy(update={"image": ImageTable(path=Path("mri"))})
+    assert estimate_surface_error_mm(imaged, found.store) == pytest.approx(2.0 * OF_A_VOXEL)
     stated = context(tmp_path / "stated", "[calibration]\nsurface_error_mm = 0.1\n")
     assert estimate_surface_error_mm(stated.study, stated.store) == 0.1
 

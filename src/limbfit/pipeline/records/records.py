@@ -231,7 +231,7 @@ def estimate_surface_error_mm(study: Study, store: Store) -> float:
     labels = store["segment"] / "labels.seg.nrrd"
     if stated is not None:
         return stated
-    if not labels.is_file():
+    if study.image is None:  # labels may be there of one that it had before
         return GIVEN_MM
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(labels))

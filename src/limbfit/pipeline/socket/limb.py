@@ -82,7 +82,7 @@ class SocketLimb:
             element="tet10",
             layers=layers,
             edge_near_mm=edge_mm,
-            edge_far_mm=max(FAR * edge_mm, settings.edge_far_mm),
+            edge_far_mm=max(FAR * edge_mm, self.study.mesh.edge_far_mm),  # no pins press there
             growth=GROWTH,
             flatness=FLATNESS,
         )
