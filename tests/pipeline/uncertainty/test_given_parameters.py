@@ -1,4 +1,4 @@
-"""`limbfit uncertainty` of a study that fixes parameters: its tables, and one material against several."""
+"""Parts of `limbfit uncertainty`: its tables, one material against several, intervals of predictions."""
 
 from __future__ import annotations
 
@@ -11,20 +11,26 @@ from types import SimpleNamespace
 import numpy as np
 
 from completing import complete
+from layered import block_context, block_study
 
 sys.path.append(str(Path(__file__).parents[2] / "identify"))
 from bars import PAPER, TRUTH, records, simulate
 
+from limbfit.identify.fit.objective import SiteResponse
 from limbfit.identify.fit.parameters import build_space
+from limbfit.identify.fit.prediction import RelaxationSpread
 from limbfit.identify.uncertainty.emulator import Emulator
 from limbfit.identify.uncertainty.likelihood import Likelihood
 from limbfit.identify.uncertainty.noise import estimate_curve_noise
-from limbfit.identify.uncertainty.uncertainty import estimate_uncertainty
+from limbfit.identify.uncertainty.uncertainty import ResidualModel, estimate_uncertainty
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.problem import build_problem
-from limbfit.pipeline.uncertainty.result import _write_flat
+from limbfit.pipeline.records.deviations import estimate_site_noise
+from limbfit.pipeline.records.records import load_site_record
+from limbfit.pipeline.uncertainty.result import Found, _write_flat, _write_prediction
 from limbfit.pipeline.uncertainty.uncertainty import _compare_groupings
+from limbfit.results.curves import read_curves
 from limbfit.results.identification import CalibrationResult, PredictResult
 from limbfit.results.uncertainty import ParameterUncertainty
 from limbfit.study import load_study
@@ -80,3 +86,32 @@ def test_one_material_keeps_what_the_study_fixes(tmp_path):
     context = Context(study, Store(study.results), None, lambda event: None)
     found = _compare_groupings(context, problem, explored)
     assert found.second.parameters - found.first.parameters == 3  # c, m and gamma of one tissue more
+
+
+def test_intervals_of_predictions_widen_beyond_the_longest_load_as_those_of_a_run(tmp_path):
+    """No record shows the moduli later on: they may have fallen by half."""
+    tissue = {"c_kPa": 8.0, "m": 5.0, "gamma": 2.0, "tau_s": 0.5}
+    context = block_context(block_study(tmp_path, "", ""), {"skin": tissue, "muscle": tissue})
+    record = load_site_record(context, context.study.recorded[0])
+    times, n = record.times_s, len(record.times_s)
+    parameters = context.study.vector({"skin": tissue, "muscle": tissue})
+    response = SiteResponse(np.full(n, 3.0), 3.0 / np.tile(8 * parameters, (n, 1)))
+    no_spread, half = np.zeros((8, 8)), np.full((2, 8), np.log(2.0))
+    relaxation = RelaxationSpread(
+        0.6 * times[-1], 1.0, np.array([0.1, 100.0]), 0.0 * half, np.zeros((2, 8, 8)), half
+    )
+    noise = estimate_site_noise(context.study, record, response.force_N)
+    model = ResidualModel((noise,), np.array([3.0]), np.array([0.01]), 0.2, 10.0)
+    known = SimpleNamespace(residual_model=model, parameters=parameters, covariance=no_spread)
+    explored = SimpleNamespace(posterior=SimpleNamespace(covariance=no_spread))
+    rows, curves = [], []
+    for one in (None, relaxation):
+        found = Found(known, explored, None, None, (), one)
+        folder = tmp_path / str(len(rows))
+        (folder / "predictions").mkdir(parents=True)
+        rows.append(_write_prediction(folder, context.study, found, record, response))
+        curves.append(read_curves(folder / "predictions" / f"{record.name}.csv"))
+    (low, wide), later = (one["force_low_N"] for one in curves), times > 0.6 * times[-1]
+    np.testing.assert_array_equal(wide[~later], low[~later])
+    np.testing.assert_allclose(wide[later], np.maximum(low[later] - 1.5, 0.0), atol=1e-6)
+    assert rows[1].half_width_percent > rows[0].half_width_percent + 5.0

@@ -12,7 +12,7 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError
 from ...identify.fit.objective import SiteResponse
-from ...identify.fit.prediction import compute_half_width_95
+from ...identify.fit.prediction import RelaxationSpread, compute_half_width_95
 from ...identify.uncertainty.emulator import Emulator
 from ...identify.uncertainty.exploration import Exploration
 from ...identify.uncertainty.uncertainty import (
@@ -84,6 +84,7 @@ class Found:
     evidence: stored.EvidenceComparison | None
     gain: FitSensitivity
     changes: tuple[Change, ...]
+    relaxation: RelaxationSpread | None
 
     @property
     def source_covariance(self) -> Array:
@@ -276,9 +277,14 @@ def _write_prediction(
         "misfit": np.full(len(force), (share * peak) ** 2),
     }
     total = np.sum(list(variances.values()), axis=0)
+    lower, higher = np.zeros((2, len(force)))
+    if found.relaxation is not None:
+        lower, higher, sd = found.relaxation.compute_beyond_N(force, scaled, record.times_s)
+        total += sd**2
     estimated = variances["misfit"], variances["site"]
     half = compute_half_width_95(total, *estimated, model.known_scale, model.site_freedom)
-    low, high = np.maximum(force - half, 0.0), force + half
+    low, high = force + np.minimum(lower, 0.0) - half, force + np.maximum(higher, 0.0) + half
+    half, low = (high - low) / 2.0, np.maximum(low, 0.0)
     write_curves(
         folder / "predictions" / f"{record.name}.csv",
         time_s=record.times_s,
