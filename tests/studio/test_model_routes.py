@@ -90,6 +90,15 @@ def test_a_click_becomes_a_site_of_the_study_within_a_millimetre(page, study):
     assert "# the first one" in (study / "study.toml").read_text()
 
 
+def test_the_records_of_a_site_follow_its_new_name(page, study):
+    file = study / "study.toml"
+    more = '[[records]]\nsite = "{}"\nname = "slow"  # by hand\ntrace = "2.csv"\n'
+    file.write_text(file.read_text() + more.format("2") + more.format("1"))
+    assert page.post("/api/model/sites/2", json={"name": "heel"}).status_code == 200
+    assert [record.name for record in load_study(study).recorded] == ["1", "1-slow", "heel", "heel-slow"]
+    assert file.read_text().count('name = "slow"  # by hand') == 2
+
+
 def test_a_site_is_moved_named_and_switched(page, study):
     (point,) = skin_points(study, 1)
     assert page.post("/api/model/sites/2", json={"position": point.tolist()}).status_code == 200

@@ -128,6 +128,8 @@ FAULTS = {
         r"mesh\.edge_naer_mm: unknown key; see docs/study",
     ),
     "unknown table": ("[mesh]", "[meshes]", r"meshes: unknown key; see docs/study"),
+    "notes before the tables": ("[study]", 'notes = ["ask"]\n[study]', r"notes: unknown key; see docs/study"),
+    "a file before the tables": ("[study]", 'file = "limb.toml"\n[study]', r"file: unknown key; see docs/"),
     "negative": ("edge_near_mm = 3.0", "edge_near_mm = -3.0", r"mesh\.edge_near_mm: .*greater than 0"),
     "zero": ("edge_near_mm = 3.0", "edge_near_mm = 0", r"mesh\.edge_near_mm: .*greater than 0"),
     "infinite": ("edge_near_mm = 3.0", "edge_near_mm = inf", r"mesh\.edge_near_mm: .*finite"),

@@ -55,10 +55,13 @@ def edit_study(file: Path) -> Iterator[tomlkit.TOMLDocument]:
 def set_site(file: Path, site: str, values: Mapping[str, Any]) -> None:
     """Set keys of a site, such as ``position``, ``name``, ``fitted`` or ``touch_down_s``; None removes one.
 
-    A new place removes ``near``: a site has one of them.
+    A new place removes ``near``: a site has one of them. Its ``[[records]]`` follow a new name.
     """
     with edit_study(file) as document:
         _assign(_find_site(document, site, file), values)
+        for table in document.get("records", []):
+            if table["site"] == site:
+                table["site"] = values.get("name", site)
 
 
 def set_record(file: Path, record: Record, values: Mapping[str, Any]) -> None:

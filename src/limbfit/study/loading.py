@@ -39,6 +39,9 @@ def load_study(path: str | Path, *, recorded: bool = True) -> Study:
     notes = _place_by_markups(content, file)
     _load_extensions(content, file)
     with add_location(file=file):
+        for key in ("file", "notes"):  # of a study, but none of its file
+            if key in content:
+                raise StudyError("unknown key", place=key, remedy="see docs/study.md for the keys")
         try:
             study = Study(**(content | {"file": file, "notes": notes}))
         except ValidationError as error:
