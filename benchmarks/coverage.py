@@ -48,13 +48,24 @@ from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.problem import build_unknowns
 from limbfit.pipeline.records.deviations import estimate_site_deviation
 from limbfit.pipeline.records.records import SiteRecord, load_site_record
-from limbfit.pipeline.uncertainty.result import EMULATOR, read_emulator
+from limbfit.pipeline.uncertainty.result import EMULATOR
 from limbfit.traces import Regularised, TouchDown, Trace, find_touch_down, regularise
 
 Array = NDArray[np.float64]
 BEFORE_S = 0.3  # in the air
 CLEARANCE_MM = 0.5
 SMOOTHINGS = tuple(10.0**k for k in range(-4, 4))  # s^3
+
+
+def read_emulator(file: Path) -> Emulator:
+    """The emulator of the runs that `limbfit uncertainty` has stored."""
+    with np.load(file, allow_pickle=False) as stored:
+        ends = np.cumsum(stored["sizes"])[:-1]
+        runs = [
+            [SiteResponse(f, j) for f, j in zip(np.split(force, ends), np.split(jacobian, ends))]
+            for force, jacobian in zip(stored["forces"], stored["jacobians"])
+        ]
+        return Emulator(stored["points"], runs)
 
 
 @dataclass(frozen=True)

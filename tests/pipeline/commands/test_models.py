@@ -18,6 +18,7 @@ from limbfit.pipeline.commands.models import (
     OWN,
     _mix_predictions,
     _mix_pressures,
+    _share_stages,
     compare_models,
     derive_study,
     fit_socket_of_models,
@@ -107,6 +108,20 @@ def test_an_input_beside_the_study_is_the_same_of_a_model_however_its_path_is_sp
     file.write_text(file.read_text(encoding="utf-8").replace('"a.csv"', f'"{spelled}"'), encoding="utf-8")
     derived = derive_study(load_study(tmp_path / "s"), "friction")
     assert derived.path(derived.recorded[0].trace).read_text(encoding="utf-8") == "a record"
+
+
+def test_labels_corrected_by_hand_are_those_of_the_study_each_time(tmp_path):
+    study = study_of(tmp_path)
+    derived = derive_study(study, "fung")
+    given, taken = (one.results / "by-hand" / "labels.seg.nrrd" for one in (study, derived))
+    given.parent.mkdir(parents=True)
+    for content in ("once", "again"):
+        given.write_text(content)
+        _share_stages(study, derived)
+        assert taken.read_text() == content
+    given.unlink()
+    _share_stages(study, derived)
+    assert not taken.exists()
 
 
 def test_impossible_models_are_refused_in_one_line(tmp_path):

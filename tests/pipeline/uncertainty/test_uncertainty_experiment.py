@@ -9,7 +9,7 @@ import pytest
 
 from conftest import COARSE
 from limbfit import report_study, run_experiment
-from limbfit.pipeline.uncertainty.result import EMULATOR, read_emulator
+from limbfit.pipeline.uncertainty.result import EMULATOR
 from limbfit.study import load_study
 
 QUICK = (
@@ -52,11 +52,11 @@ def test_the_experiment_on_a_stump(done):
     assert {row["site"]: row["fitted"] for row in stored["predictions"]["sites"]} == {"1": True, "2": False}
     for file in ("parameters.csv", "sources.csv", "predictions.csv", "profiles.csv", "draws.csv"):
         assert len((folder / file).read_text().splitlines()) > 1
-    emulator = read_emulator(folder / EMULATOR)
-    assert len(emulator.points) == stored["emulator"]["runs"]
-    assert np.isfinite(
-        emulator(np.array([row["calibrated"] for row in stored["parameters"]]))[0].force_N
-    ).all()
+    with np.load(folder / EMULATOR) as runs:
+        assert len(runs["points"]) == stored["emulator"]["runs"]
+        assert list(runs["names"]) == [row["name"] for row in stored["parameters"]]
+        assert runs["jacobians"].shape == (*runs["forces"].shape, 8)
+        assert np.isfinite(runs["forces"]).all()
     for profile in stored["profiles"].values():
         assert len(profile["extrapolated"]) == len(profile["values"])
     assert [check["why"] for check in stored["checks"]] == ["narrowest", "widest"]

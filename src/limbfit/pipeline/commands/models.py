@@ -161,9 +161,10 @@ def derive_study(study: Study, name: str) -> Study:
 
 def _share_stages(study: Study, derived: Study) -> None:
     """Give a model what is stored of its study and would come out the same."""
-    by_hand = Path("by-hand")
-    if (study.results / by_hand).is_dir() and not (derived.results / by_hand).exists():
-        shutil.copytree(study.results / by_hand, derived.results / by_hand)
+    by_hand, copy = (one.results / "by-hand" for one in (study, derived))
+    shutil.rmtree(copy, ignore_errors=True)  # the labels may have been corrected again, or taken back
+    if by_hand.is_dir():
+        shutil.copytree(by_hand, copy)
     done, own = Store(study.results), Store(derived.results)
     for stage, key in compute_keys(derived).items():
         if done.state(stage, key).state != "done" or own.state(stage, key).state == "done":

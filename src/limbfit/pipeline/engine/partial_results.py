@@ -31,11 +31,6 @@ class ResultFiles:
         self.places = (folder, folder.parent / EARLIER, *also)
         folder.mkdir(parents=True, exist_ok=True)
 
-    @property
-    def files(self) -> list[Path]:
-        """Those of the folder itself."""
-        return list(self.folder.glob("*.npz"))
-
     def find(self, key: str) -> Made | None:
         """What is kept whole under a key; facts are those that JSON gives back."""
         own = self._place(key)

@@ -10,6 +10,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from ...anatomy.labels.labelfiles import find_sidecar
 from ...fe import StepControl
 from ...study import Study
@@ -44,15 +46,13 @@ def collect_versions() -> dict[str, str]:
 
 def describe_machine() -> dict[str, Any]:
     """The machine in figures, without its name or its user's."""
-    facts: dict[str, Any] = {
+    return {
         "cores": os.cpu_count(),
         "python": platform.python_version(),
         "system": platform.system(),
         "processor": platform.machine(),
+        "memory_GB": round(psutil.virtual_memory().total / 1e9, 1),
     }
-    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        facts["memory_GB"] = round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)
-    return facts
 
 
 def list_input_files(study: Study) -> dict[str, list[Path]]:

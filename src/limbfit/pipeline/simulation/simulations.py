@@ -65,7 +65,8 @@ class SimulationCache:
 
     def load_all(self) -> list[Simulation]:
         """Every simulation that is kept in the folder."""
-        return [_to_simulation(*made) for file in self.kept.files if (made := read_made(file))]
+        files = self.kept.folder.glob("*.npz")
+        return [_to_simulation(*made) for file in files if (made := read_made(file))]
 
 
 def _build_lost(job: SimulationJob, reason: str) -> Simulation:

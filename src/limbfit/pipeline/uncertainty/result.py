@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
-from ...errors import InputError
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.prediction import RelaxationSpread, compute_half_width_95
-from ...identify.uncertainty.emulator import Emulator
 from ...identify.uncertainty.exploration import Exploration
 from ...identify.uncertainty.uncertainty import (
     DETERMINED,
@@ -52,22 +50,6 @@ def write_runs(
             forces=np.array([np.concatenate([r.force_N for r in run]) for run in responses]),
             jacobians=np.array([np.concatenate([r.jacobian for r in run]) for run in responses]),
         )
-
-
-def read_emulator(file: Path) -> Emulator:
-    """The emulator of stored runs.
-
-    Raises `InputError` where there are none.
-    """
-    if not file.is_file():
-        raise InputError("no emulator is stored", file=file, remedy="run limbfit uncertainty first")
-    with np.load(file, allow_pickle=False) as stored:
-        ends = np.cumsum(stored["sizes"])[:-1]
-        runs = [
-            [SiteResponse(f, j) for f, j in zip(np.split(force, ends), np.split(jacobian, ends))]
-            for force, jacobian in zip(stored["forces"], stored["jacobians"])
-        ]
-        return Emulator(stored["points"], runs)
 
 
 _DRAWS = 1500  # written
