@@ -26,6 +26,8 @@ from limbfit.pipeline.commands.experiments import EXPERIMENTS
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.keys import Keys
 
+SURFACE_FILE = {"shape": "stl", "file": "1.stl"}
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -61,10 +63,17 @@ def test_an_indenter_that_no_fitted_record_names_is_no_reason_to_identify_again(
         found = decided(loaded(folder, content)), decided(loaded(folder, changed(content, key, value)))
         return {name for name, digest in found[0].items() if digest != found[1][name]}
 
+    (folder / "1.stl").write_text("one")
     planned = changed(GIVEN, "indenters.big", {"width_mm": 30.0})
     assert differ(GIVEN, "indenters.big", {"width_mm": 30.0}) == set()
     assert "calibrate" not in differ(planned, "sites.1.indenter", "big")
     assert "predict" in differ(planned, "sites.1.indenter", "big")
+    pressed = changed(changed(planned, "sites.1.indenter", "big"), "indenters.big", SURFACE_FILE)
+    study = loaded(folder, pressed)
+    was = decided(study)
+    (folder / "1.stl").write_text("another")
+    assert {"predict", "design", "uncertainty"} <= {name for name in was if was[name] != decided(study)[name]}
+    assert was["calibrate"] == decided(study)["calibrate"]
     studies = [loaded(folder, content) for content in (GIVEN, planned)]
     protocol = EXPERIMENTS["protocol"]
     keys = [Keys(one).of(protocol, compute_keys(one), protocol.options).digest for one in studies]

@@ -111,7 +111,6 @@ _OWN: tuple[Experiment, ...] = (
         ("calibration", "acquire", *_TABLES),
         _PLANNED,
         _RECORD,
-        plans=True,
         check=check_protocol,
     ),
     Experiment("socket", run_socket, ("surfaces",), _SOCKET, apart=("socket.design",), check=check_socket),

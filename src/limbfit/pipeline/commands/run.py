@@ -94,14 +94,7 @@ STAGES = (
         ("name", "fitted", "weight", "edge", "indenter"),
         (*_NAMED, "indenter"),
     ),
-    Stage(
-        "predict",
-        run_predict,
-        ("sites", "traces", "mesh", "calibrate"),
-        ("solver",),
-        ("name", "edge"),
-        _NAMED,
-    ),
+    Stage("predict", run_predict, ("sites", "traces", "mesh", "calibrate"), (), ("name", "edge"), _NAMED),
     Stage("report", run_report, ("predict",), ("study",), ("name", "region")),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)

@@ -24,8 +24,7 @@ class Stage:
     """A stage: what it stands on, which tables it reads, and which keys of ``[[sites]]`` and ``[[records]]``.
 
     ``run(context, folder)`` does it, and may return facts for its stamp. ``apart`` are keys of its tables,
-    such as ``socket.design``, that it does not read. Of ``[indenters]`` only one that ``plans`` records reads
-    those that no record names. Its code is that of `digests.find_sources`.
+    such as ``socket.design``, that it does not read. Its code is that of `digests.find_sources`.
     """
 
     name: str
@@ -35,7 +34,6 @@ class Stage:
     site_keys: tuple[str, ...] = ()
     record_keys: tuple[str, ...] = ()
     apart: tuple[str, ...] = ()
-    plans: bool = False
 
     def read(self, stated: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
         """What it reads of a study: each value with its name, such as ``records.1-slow.trace``."""
@@ -86,12 +84,12 @@ class Keys:
         study : a part of the study, instead of the whole.
         """
         study = study or self.study
-        if not stage.plans:
+        if "acquire" not in stage.tables:  # only who plans records presses with indenters that none names
             used = {name: table for name, table in study.used_indenters.items() if name is not None}
             study = study.model_copy(update={"indenters": used})
         names = {path: key for key, path in study.inputs.items()}
         by_stage = list_input_files(study)
-        files = [*by_stage.get(stage.name, ()), *(by_stage["indenters"] if "solver" in stage.tables else ())]
+        files = [*by_stage.get(stage.name, ()), *(by_stage["indenters"] if "mesh" in stage.needs else ())]
         read = dict(stage.read(study.model_dump(mode="json")))
         parts = StageParts(
             settings={name: compute_digest(value) for name, value in read.items()},

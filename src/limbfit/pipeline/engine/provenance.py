@@ -56,7 +56,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def list_input_files(study: Study) -> dict[str, list[Path]]:
-    """The study's input files and folders by the stage that reads them; ``indenters``: all that simulate."""
+    """The study's input files and folders by the stage that reads them; ``indenters``: all on meshes."""
     files: dict[str, list[Path]] = {"segment": [], "surfaces": [], "traces": []}
     if study.image is not None:
         files["segment"] += [study.image.path, *filter(None, [study.image.marked])]
