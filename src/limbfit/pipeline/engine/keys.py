@@ -85,7 +85,7 @@ class Keys:
         """
         study = study or self.study
         if "acquire" not in stage.tables:  # only who plans records presses with indenters that none names
-            used = {name: table for name, table in study.used_indenters.items() if name is not None}
+            used = {name: table for name, table in study.indenters.items() if name in study.used_indenters}
             study = study.model_copy(update={"indenters": used})
         names = {path: key for key, path in study.inputs.items()}
         by_stage = list_input_files(study)

@@ -79,7 +79,7 @@ class Store:
     def _is_whole(self, stage: str) -> bool:
         """False if a power cut, or a copy that was ended, has left a part of what the stage says in JSON."""
         try:
-            return all(read_json(file) is not None for file in self[stage].glob("*.json"))
+            return bool([read_json(file) for file in self[stage].glob("*.json")])
         except ValueError:
             return False
 
