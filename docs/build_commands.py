@@ -8,11 +8,11 @@ from typing import Any
 
 import typer.main
 
-from .app import GROUPS, app
+from limbfit.cli.app import GROUPS, app
 
 HEAD = """# Commands
 
-Made by `python -m limbfit.cli.reference`; `limbfit COMMAND --help` says the same. The exit code is 0 when
+Made by `python docs/build_commands.py`; `limbfit COMMAND --help` says the same. The exit code is 0 when
 done, 1 when something failed, 2 for bad usage or bad input, 130 when interrupted.
 `limbfit --install-completion` completes commands and options in the shell. The same in many commands:
 """
