@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +12,27 @@ from febfiles import FEB, written
 from limbfit import OgdenQLV
 from limbfit.bench.blocks import build_punched_block
 from limbfit.errors import ProblemError
-from limbfit.fe import Fibred, StepControl, solve
-from limbfit.febio import FebSettings, read_feb, to_problem, write_feb, write_inp
+from limbfit.fe import (
+    Activation,
+    Contractile,
+    Fibred,
+    History,
+    Indenter,
+    Motion,
+    RigidBody,
+    StepControl,
+    solve,
+)
+from limbfit.febio import (
+    FebSettings,
+    build_result,
+    find_febio,
+    read_feb,
+    run_febio,
+    to_problem,
+    write_feb,
+    write_inp,
+)
 
 GROUND = OgdenQLV(0.004, 5.0, (0.8, 0.3), (0.2, 1.5))
 ELASTIC = '<elastic type="Ogden"><k>0.2</k><c1>0.004</c1><m1>6</m1><c2>0.004</c2><m2>-6</m2></elastic>'
@@ -39,10 +59,42 @@ def test_fibres_are_read_back(tmp_path, ground, field):
     inside = found.mesh.regions == found.mesh.region_names.index("muscle")
     mine = np.broadcast_to(fibres, (count, 3))[order]
     np.testing.assert_array_equal(found.fibres[inside], mine[inside])
+    # FEBio takes axes of elements in every material, and ends at once where a fibre states no vector.
+    text = (tmp_path / "model.feb").read_text()
+    assert '<fiber type="vector">1.0,0.0,0.0</fiber>' in text
+    assert text.count("mat_axis") == 1
+    assert 'ElementData type="mat_axis" elem_set="muscle"' in text
     if field:
         steps = StepControl(load_steps=3, unload_steps=2)
 
         assert solve(found, steps, store="none").peak_force > 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("FEBIO_CMD" not in os.environ, reason="FEBIO_CMD names no FEBio")
+@pytest.mark.parametrize("active", [0.0, 0.01], ids=["at rest", "contracting"])
+def test_febio_itself_runs_fibres_that_relax(tmp_path, active):
+    """A plate on a block whose fibres run otherwise in every cell: as hard as limbfit's."""
+    problem = build_punched_block("hex8", 6)
+    passive = Fibred(GROUND, 0.03, 2.5)
+    plate = Indenter("square", 90.0, 4.0, centre=(0.0, 0.0, 0.2), axis=(0, 0, -1))
+    press = Motion.of([0.0, 1.0], z=[0.0, 4.2])
+    problem = replace(
+        problem,
+        indenter=None,
+        history=History(np.array([0.0, 1.0]), np.zeros(2)),
+        bodies=(RigidBody(plate, problem.mesh.face_sets["skin"], press, name="plate"),),
+        materials={"skin": GROUND, "muscle": Contractile(passive, active) if active else passive},
+        fibres=np.random.default_rng(0).normal(size=(len(problem.mesh.cells), 3)),
+        activation=Activation([0.0, 1.0], [0.0, 1.0]) if active else None,
+    )
+    steps = StepControl(times=(0.5, 1.0), penalty=100.0, hold_penalty=True)
+    write_feb(problem, tmp_path / "model.feb", FebSettings(steps=steps))
+    run = run_febio(find_febio(), tmp_path, 1.0, "forces.txt", time_limit_s=120.0)
+    assert run.verdict.completed, run.verdict.reason
+    assert build_result(problem, run.log, run.verdict).force[-1] == pytest.approx(
+        solve(problem, steps).force[-1], rel=0.03
+    )
 
 
 def mixed(folder, old=ELASTIC, new=MIXED, axis=""):
@@ -68,6 +120,7 @@ def test_an_input_with_fibres_is_read(tmp_path):
         ("<ksi>", "<k>1</k><ksi>", "bulk modulus of its own"),
         ("<alpha>3</alpha>", "<alpha>0</alpha>", "k2 = 0.0 is not positive"),
         ("<ksi>", "<theta>3</theta><ksi>", "parameter of the material is not known"),
+        ("<beta>2", '<fiber type="vector">0,1,0</fiber><beta>2', "along the first of the local axes"),
         ("<Boundary>", "<MeshData><NodeData/></MeshData><Boundary>", "only the mat_axis of elements"),
     ],
 )

@@ -3,8 +3,8 @@
 Numbers are written so that they are read back exactly. Units: mm, N, s, MPa.
 
 In a tissue, a contraction stands beside what relaxes, because an active stress is given as it is. A
-pre-strain stands around all of it, and FEBio's pressure does not see it. A material has one axis of fibres if
-all its cells have the same direction, else each cell has its own.
+pre-strain stands around all of it, and FEBio's pressure does not see it. Each cell has
+an axis of its own along its fibres.
 
 Source: FEBio User Manual 4.0, chapter 4, and the section on ``MeshData``; ``FEActiveFiberStressUC`` and
 ``FEPreStrainUncoupledElastic``.
@@ -51,7 +51,7 @@ from .meshes import (
 )
 from .penalty import compute_explicit_penalty, compute_mean_stiffness
 from .preparation import PRESTRAIN_S, Preparation, prepare_problem
-from .reading.materials import ACTIVE, FIBRE, GRADIENT, MIXTURE, PRESTRAINED, RELAXED
+from .reading.materials import ACTIVE, FIBRE, FIRST_AXIS, GRADIENT, MIXTURE, PRESTRAINED, RELAXED
 from .reading.model import Contact
 from .rendering import write_template
 
@@ -231,7 +231,7 @@ def _describe_file(
         centres[FRAME_BODY] = meshes[FRAME_BODY].points[0]
         everywhere = [*everywhere, *list_conditions(FRAME_BODY, REST, ends[-1:], curves)[0]]
     remarks = (f"limbfit: {settings.title}; mm, N, s, MPa", *describe_differences(problem, settings))
-    history, axes, prestrains = prepared.history, _find_fibre_directions(problem), _find_prestrains(problem)
+    history, prestrains = prepared.history, _find_prestrains(problem)
     return {
         "problem": problem,
         "bodies": bodies,
@@ -247,7 +247,7 @@ def _describe_file(
         "node_sets": name_node_sets(problem),
         "surfaces": name_surfaces(problem, bodies),
         "quadrature": QUADRATURE[problem.formulation.name],
-        "fibre_maps": {name: own for name, own in axes.items() if len(own) > 1},
+        "fibre_maps": _find_fibre_directions(problem),
         "prestrain_maps": {name: own for name, own in prestrains.items() if len(own) > 1},
         "prestrain_names": {name: re.sub(r"\W", "_", f"prestrain of {name}") for name in prestrains},
         "fixed_set": FIXED_SET,
@@ -264,6 +264,7 @@ def _describe_file(
         "materials": list(_describe_materials(prepared, curves, settled)),
         "kinds": {"fibre": FIBRE, "relaxed": RELAXED, "active": ACTIVE, "prestrained": PRESTRAINED},
         "mixture": MIXTURE,
+        "first_axis": FIRST_AXIS,
         "gradient": GRADIENT,
         "curves": curves,
     }
@@ -288,7 +289,7 @@ def _describe_materials(problem: Problem, curves: CurveList, settled: float) -> 
 
     Raises `ProblemError` for more terms than FEBio takes.
     """
-    axes, strained, course = _find_fibre_directions(problem), _find_prestrains(problem), 0
+    strained, course = _find_prestrains(problem), 0
     if problem.activation is not None:
         shares = np.column_stack([problem.activation.times, problem.activation.shares])
         course = curves.add("activation", shares)
@@ -308,7 +309,6 @@ def _describe_materials(problem: Problem, curves: CurveList, settled: float) -> 
             "solids": solids,
             "course": course,
             "ramp": ramp,
-            "axes": axes.get(name, ()),
             "prestrains": strained.get(name, ()),
             "pressure_model": PRESSURE_MODELS[table.volumetric],
         }
@@ -336,6 +336,7 @@ def _find_prestrains(problem: Problem) -> dict[str, Array]:
     Raises `ProblemError` if one changes the volume, which FEBio's pressure would not see.
     """
     found = {} if problem.prestretch is None else _divide_by_region(problem.mesh, problem.prestretch, (3, 3))
+    found = {name: own[:1] if (own == own[:1]).all() else own for name, own in found.items()}
     for name, own in found.items():
         if np.abs(np.linalg.det(own) - 1.0).max(initial=0.0) > 1e-9:
             raise ProblemError(
@@ -346,13 +347,15 @@ def _find_prestrains(problem: Problem) -> dict[str, Array]:
 
 
 def _divide_by_region(mesh: Mesh, values: Any, shape: tuple[int, ...]) -> dict[str, Array]:
-    """Return values of cells (or the one of all), of a ``shape``, by region: (1, ...) where all are alike."""
+    """Return values of cells (or the one of all), of a ``shape``, by region."""
     given = np.broadcast_to(np.asarray(values, dtype=float), (len(mesh.cells), *shape))
-    found = {name: given[mesh.regions == r] for r, name in enumerate(mesh.region_names)}
-    return {name: own[:1] if (own == own[:1]).all() else own for name, own in found.items()}
+    return {name: given[mesh.regions == r] for r, name in enumerate(mesh.region_names)}
 
 
 def _find_fibre_directions(problem: Problem) -> dict[str, Array]:
-    """Return the fibre directions of each region that has some: (1, 3), or one for each of its cells."""
+    """Return the fibre direction in each cell (m, 3) of the regions that have some.
+
+    FEBio takes axes of a material in some kinds of materials only, those of elements in all.
+    """
     found = {} if problem.fibres is None else _divide_by_region(problem.mesh, problem.fibres, (3,))
     return {name: own for name, own in found.items() if problem.materials[name].table().has_fibres}

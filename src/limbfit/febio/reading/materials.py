@@ -41,7 +41,7 @@ _VOLUMETRIC = {
     "Abaqus (GOH)": "abaqus-goh", "3": "abaqus-goh",
 }  # fmt: skip
 GRADIENT, MATRIX = "prestrain gradient", "mat3"
-_DEFAULT_AXIS = (1.0, 0.0, 0.0)  # FEBio's, where nothing is said
+FIRST_AXIS = (1.0, 0.0, 0.0)  # FEBio's, where nothing is said
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,10 @@ def _read_mixture(node: XmlNode, solids: list[XmlNode], around: _Surroundings) -
     for one in solids:
         if one.number("k", 0.0) != 0.0:
             raise one.error("has a bulk modulus of its own in a mixture", "give that of the mixture alone")
-    _check_parameters(fibre, {"ksi", "alpha", "beta", "k", "density"})
+    _check_parameters(fibre, {"ksi", "alpha", "beta", "fiber", "k", "density"})
+    stated = fibre.find("fiber")
+    if stated is not None and (stated.attribute("type") != "vector" or stated.numbers(3) != [*FIRST_AXIS]):
+        raise stated.error("fibres run along the first of the local axes", "state it as mat_axis")
     if fibre.number("beta") != 2.0:
         raise fibre.child("beta").error("limbfit's fibres have beta = 2")
     return Fibred(_read_elastic(ground, around), around.scale * fibre.number("ksi"), fibre.number("alpha"))
@@ -208,7 +211,7 @@ def _check_parameters(node: XmlNode, allowed: set[str]) -> None:
         if child.tag not in allowed:
             raise child.error("this parameter of the material is not known")
         varies = child.attributes.get("lc") or child.attributes.get("type") not in (None, "const")
-        if varies and child.tag not in ("elastic", "solid", "mat_axis", "prestrain", "activation"):
+        if varies and child.tag not in ("elastic", "solid", "mat_axis", "fiber", "prestrain", "activation"):
             raise child.error("a parameter that changes in time or space is not supported")
     if node.flag("laugon"):
         raise node.child("laugon").error("augmented incompressibility is not supported")
@@ -363,7 +366,7 @@ def read_fibres(
 def _read_material_axis(node: XmlNode) -> Array:
     axis = node.find("mat_axis")
     if axis is None:
-        return np.array(_DEFAULT_AXIS)
+        return np.array(FIRST_AXIS)
     if axis.attribute("type") != "vector":
         raise axis.error("is not given by vectors", 'use type="vector" with <a> and <d>')
     return _read_vector(axis)
