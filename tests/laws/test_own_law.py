@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +24,10 @@ from limbfit.indentation.sites import build_materials
 from limbfit.laws import FUNG, LAWS, Parameter, TissueLaw, register_law
 from limbfit.pipeline.commands.export import check_export
 from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.engine.partial_results import ResultFiles
+from limbfit.pipeline.socket.limb import SocketLimb
+from limbfit.pipeline.socket.simulation import SocketRun
+from limbfit.socket import Socket
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "fe"))
 from blocks import block, check_tangent, punch
@@ -184,6 +190,28 @@ def test_a_study_names_it_and_follows_its_file(tmp_path, file, law):
     (tmp_path / "study.toml").write_text(wrong)
     with pytest.raises(InputError, match="c_kPa is no parameter of the law; they are a_kPa, b, gamma, tau_s"):
         load_study(tmp_path)
+
+
+def test_a_socket_knows_it_in_a_process_that_has_read_no_study_and_follows_its_file(tmp_path, file):
+    for name in ("skin.stl", "1.csv", "limb.vtu"):
+        (tmp_path / name).write_text(name)
+    (tmp_path / "study.toml").write_text(GIVEN.replace("yeoh.py", str(file)))
+    study, corners = load_study(tmp_path), np.eye(3)
+    socket = Socket(corners, np.array([[0, 1, 2]]), corners, np.arange(3))
+    limb = SocketLimb(study, None, None, None, {}, ())
+    run = SocketRun("socket", limb, None, {"skin": TRUTH}, socket, ResultFiles(tmp_path / "runs"))
+    (tmp_path / "run.pickle").write_bytes(pickle.dumps(run))
+    code = "import pickle, sys; print(pickle.load(open(sys.argv[1], 'rb')).laws['skin'].parameters)"
+    told = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "run.pickle"], capture_output=True, text=True, check=False
+    )
+    assert told.stdout.strip() == str(run.laws["skin"].parameters), told.stderr
+    shutil.copy(file, tmp_path / "yeoh.py")
+    (tmp_path / "yeoh.py").write_text(file.read_text() + "# another thought\n")
+    changed = study.model_copy(
+        update={"study": study.study.model_copy(update={"extensions": (tmp_path / "yeoh.py",)})}
+    )
+    assert replace(run, limb=replace(limb, study=changed)).key != run.key
 
 
 def test_an_export_of_the_exponential_law_is_refused_at_once(tmp_path):

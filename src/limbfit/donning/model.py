@@ -117,8 +117,12 @@ def build_socket_problem(
     local = (socket.points - fit.pivot) @ frame.T
     clear = None if fit.travel_mm is not None else (socket.clear - fit.pivot) @ frame.T
     shape = SmoothSurface.of(local, socket.faces, clear, centre=fit.pivot, axis=frame[2], edge=frame[0])
-    motion = _build_donning(fit)
-    before = None
+    times, growth, z = [0.0, fit.donning_s], [0.0, 1.0], [0.0, 0.0]
+    if fit.travel_mm is not None:
+        growth, z = [1.0, 1.0], [-fit.travel_mm, 0.0]
+    if fit.hold_s > 0.0:
+        times, growth, z = [*times, fit.donning_s + fit.hold_s], [*growth, 1.0], [*z, 0.0]
+    motion, before = Motion.of(times, growth=growth, z=z), None
     for load in fit.loads:
         force = np.asarray(load.force, dtype=float)
         moment = np.asarray(load.moment) + np.cross(np.asarray(load.point) - fit.pivot, force)
@@ -140,15 +144,6 @@ def build_limb_problem(mesh: Mesh, materials: Mapping[str, Material], end_s: flo
         element=ELEMENT,
         **loads,
     )
-
-
-def _build_donning(fit: SocketFit) -> Motion:
-    times, growth, z = [0.0, fit.donning_s], [0.0, 1.0], [0.0, 0.0]
-    if fit.travel_mm is not None:
-        growth, z = [1.0, 1.0], [-fit.travel_mm, 0.0]
-    if fit.hold_s > 0.0:
-        times, growth, z = [*times, fit.donning_s + fit.hold_s], [*growth, 1.0], [*z, 0.0]
-    return Motion.of(times, growth=growth, z=z)
 
 
 def _build_loading(load: Load, before: Array | None, after: Array) -> Motion:

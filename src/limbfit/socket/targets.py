@@ -84,7 +84,9 @@ class Target:
         for name, value in (*rest.items(), *self.regions.items()):  # where they overlap, what is stated wins
             share = build_zone(name, anatomy, regions, 0.0).share(below)
             found = (1.0 - share) * found + share * value
-        return found * _compute_brim_share(points, socket)
+        # Nothing beyond the brim; below it the pressure grows smoothly.
+        t = np.clip(KDTree(socket.points[socket.brim]).query(points)[0] / BRIM_MM, 0.0, 1.0)
+        return np.where(socket.find_covered(points), found * t**2 * (3.0 - 2.0 * t), 0.0)
 
 
 def build_zone(name: str, anatomy: Anatomy, regions: Mapping[str, SkinRegion], depth_mm: float) -> Zone:
@@ -106,9 +108,3 @@ def _compute_depth_share(points: Array, anatomy: Anatomy) -> Array:
         )
     squared = [bone.find_nearest(points)[0] for bone in anatomy.bones.values()]
     return np.asarray(np.clip(np.sqrt(np.min(squared, axis=0)) / FULL_DEPTH_MM, 0.0, 1.0))
-
-
-def _compute_brim_share(points: Array, socket: Socket) -> Array:
-    """Compute the share (n,) of the pressure at points: 0 beyond the brim, growing smoothly below it."""
-    t = np.clip(KDTree(socket.points[socket.brim]).query(points)[0] / BRIM_MM, 0.0, 1.0)
-    return np.where(socket.find_covered(points), t**2 * (3.0 - 2.0 * t), 0.0)

@@ -98,16 +98,21 @@ class SimulationSpread:
     def told(
         self, value: float, slopes: Array
     ) -> tuple[list[float], dict[str, float], dict[str, float], list[float]]:
-        """What is known of a positive value by its slopes (p,) by the logarithms of all parameters.
+        """What is known of a value by its slopes (p,) by the logarithms of all parameters.
 
         Returns
         -------
-        interval : 95 %, the value itself included.
+        interval : 95 %, the value itself included; without what has another sign than the value.
         shares : of its variance by the parameters, percent, that would go if one were known, largest first.
         changes : of the value where each parameter of the simulation is ``CHANGE_PERCENT`` larger.
         relaxation : by which relaxation beyond the records moves the value, its standard deviation, and by
             how much the value may be lower beside that.
         """
+        if value < 0.0:  # a load that pulls the socket off moves it the other way
+            (low, high), found, changes, relaxation = self.told(-value, -slopes)
+            moved, further, fall = relaxation
+            changes = {name: -by for name, by in changes.items()}
+            return [0.0 - high, 0.0 - low], found, changes, [0.0 - moved, further, 0.0 - fall]
         known, own = self.known, slopes[list(self.identified)]
         along = known.covariance @ own
         variance = float(own @ along)
@@ -142,12 +147,6 @@ def draw_step(covariance: Array, number: int, seed: int = 0) -> Array:
     return random.multivariate_normal(np.zeros(len(covariance)), covariance, method="eigh")
 
 
-def predict_change(row: Mapping[str, Any], name: str, unit: str, step: Mapping[str, float]) -> float:
-    """A stored value's change by its derivatives, where the logarithms of parameters change by ``step``."""
-    slopes = row[f"{name}change_{unit}"]
-    return float(sum(slopes[key] * by for key, by in step.items() if key in slopes)) / _CHANGE
-
-
 def widen_intervals(
     facts: Mapping[str, Any], draws: Sequence[tuple[Mapping[str, float], Mapping[str, Any]]]
 ) -> None:
@@ -159,13 +158,15 @@ def widen_intervals(
     others = [list(_iterate_values(found)) for _, found in draws]
     for i, (row, key, name, unit) in enumerate(_iterate_values(facts)):
         value, (low, high) = row[key], row[f"{name}interval_{unit}"]
-        missed = [
-            other[i][0][key] - value - predict_change(row, name, unit, step)
-            for (step, _), other in zip(draws, others, strict=True)
-        ]
+        changes, missed = row[f"{name}change_{unit}"], []
+        for (step, _), other in zip(draws, others, strict=True):
+            predicted = sum(changes[one] * by for one, by in step.items() if one in changes) / _CHANGE
+            missed.append(other[i][0][key] - value - predicted)
         mean, sd = float(np.mean(missed)), float(np.std(missed, ddof=1))
         below, above = (float(np.hypot(end - value, NORMAL_95 * sd)) for end in (low, high))
-        row[f"{name}interval_{unit}"] = [max(value + mean - below, 0.0), value + mean + above]
+        ends = np.array([value + mean - below, value + mean + above])
+        ends = np.maximum(ends, 0.0) if value >= 0.0 else np.minimum(ends, 0.0)
+        row[f"{name}interval_{unit}"] = [float(end) for end in ends]
         row[f"{name}missed_{unit}"] = [mean, sd]
 
 

@@ -25,6 +25,7 @@ from ...donning import (
 from ...donning.model import OUTER
 from ...errors import RunError
 from ...execution import Executor, SerialExecutor, report_progress
+from ...extensions import compute_extensions_digest, load_extensions
 from ...fe import SimulationWarning
 from ...fe.materials import Material
 from ...indentation import Parameters, build_fibre_field, build_materials
@@ -85,6 +86,7 @@ class SocketRun:
     @property
     def laws(self) -> dict[str, Material]:
         """Of the tissues and the liner."""
+        load_extensions(self.limb.study.extensions)  # a worker has not read the study
         table, liner = self.limb.study.material, self.limb.study.socket.liner
         kappa, fibres = table.kappa_ratio, dict(self.limb.fibres)
         laws = build_materials(self.parameters, kappa, table.law, fibres, table.relaxation_span_s)
@@ -99,7 +101,7 @@ class SocketRun:
         return compute_digest(
             *(table, study.material.model_dump(mode="json"), self.parameters, self.sensitivities),
             *(compute_file_digest(self.kept.folder.parent / MESH), code_digest(solve_run)),
-            *(face.points.tolist(), face.clear.tolist()),
+            *(face.points.tolist(), face.clear.tolist(), compute_extensions_digest(study.extensions)),
         )
 
     @property
