@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from layered import block_context, block_study
-from limbfit.errors import InputError, StudyError
+from limbfit.errors import InputError, ProblemError, StudyError
 from limbfit.indentation import SimulationJob, build_problem, simulate
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.commands.run import compute_keys
@@ -47,6 +47,13 @@ def test_it_decides_the_calibration_on_whole_meshes(tmp_path):
     assert {stage for stage in before if before[stage] != after[stage]} == {"calibrate", "predict", "report"}
     assert plain.within_mm == 65.0
     assert taut.within_mm is None
+
+
+def test_what_would_count_from_its_equilibrium_is_refused_before_it_is_simulated(context):
+    model = replace(build_model(context, context.study.recorded[0]), layers=("skin",))
+    job = SimulationJob(model, context.study.tissues, tuple(context.study.vector(TRUTH)), (1.0,))
+    with pytest.raises(ProblemError, match="waves of pre-stretched tissue"):
+        simulate(job)
 
 
 def test_force_follows_tissue_by_its_derivatives(context):

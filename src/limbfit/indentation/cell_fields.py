@@ -15,7 +15,6 @@ from typing import Literal
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..arrays import Array, Indices, Mask
@@ -121,14 +120,9 @@ def build_prestretch_field(
         if fibres is not None and tissue in fibred:
             found[own] = isochoric_stretch(fibres[own], stretch)
         else:
-            found[own] = isochoric_stretch(_find_normals(mesh, own), stretch**-2.0)
+            corners = mesh.points[mesh.face_sets["skin"][:, :3]]
+            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            middles = mesh.points[mesh.corners[own]].mean(axis=1)
+            nearest = cKDTree(corners.mean(axis=1)).query(middles)[1]  # of the skin
+            found[own] = isochoric_stretch(normals[nearest], stretch**-2.0)
     return found
-
-
-def _find_normals(mesh: Mesh, cells: NDArray[np.intp]) -> Array:
-    """Normals (k, 3) of the skin where it is nearest to the middle of the cells."""
-    corners = mesh.points[mesh.face_sets["skin"][:, :3]]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    middles = mesh.points[mesh.corners[cells]].mean(axis=1)
-    nearest = cKDTree(corners.mean(axis=1)).query(middles)[1]
-    return np.asarray(normals[nearest])

@@ -136,8 +136,7 @@ def observe_result(result: Result, model: SiteModel, times_s: Array) -> tuple[Ar
     (``store="all"``). Tissue that the indenter has left recovers gradually, so readings continue after the
     force has ended.
     """
-    states = result.states
-    mesh = result.problem.mesh
+    states, mesh = result.states, result.problem.mesh
     gauges = (*_build_layer_gauges(model, mesh), *_build_skin_gauges(model, mesh))
     if not states:
         return np.zeros((model.gauges, len(times_s))), None

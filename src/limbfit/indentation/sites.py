@@ -187,6 +187,11 @@ def build_problem(model: SiteModel, mesh: Mesh, parameters: Parameters) -> Probl
     `SiteModel.waits_s`.
     """
     load_extensions(model.extensions)
+    if model.prestretch and model.gauges:  # the equilibrium that they would count from is no state
+        raise ProblemError(
+            f"site {model.site or model.name}: lengths, moves, waves of pre-stretched tissue are not known",
+            remedy="leave layers, skin_points, waves or the pre-stretch out",
+        )
     cut, fibres = np.empty(0, dtype=np.int64), build_fibre_field(model.fibres, mesh)
     strained = build_prestretch_field(model.prestretch, mesh, fibres, dict(model.fibres))
     if model.within_mm is not None:

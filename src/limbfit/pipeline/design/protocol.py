@@ -99,8 +99,13 @@ def press(model: SiteModel, depth: float, speed: float, hold: float) -> SiteMode
 
 
 def check_protocol(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
-    """Refuse unknown parameters, and a session too short for set-up, rest and hold alone."""
+    """Refuse unknown parameters, what sees nothing, and a session too short for set-up, rest and hold."""
     _select_named(study, options["determine"])
+    taut, tense = study.material.prestretch, study.material.course
+    blind = [key for key, seen in SEEN.items() if options.get(key) and (taut or (tense and seen == "waves"))]
+    if blind:
+        what = f"{blind[0]} is planned, which sees no {'pre-stretch' if taut else 'contraction'}"
+        raise InputError(what, file=study.file, place="material", remedy="plan without it")
     budget = Budget(60.0 * options["minutes"], options["setup_s"])
     _check_minutes([options["rest_s"] + min(options["holds_s"], default=0.0)], budget)
 
