@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import MUSCLE, SKIN, block, press_fit, punch, quarter_tube, sector
+from blocks import MUSCLE, SKIN, block, parameter_slope, press_fit, punch, quarter_tube, sector
 from scipy.spatial.transform import Rotation
 
 from limbfit.errors import ProblemError
@@ -28,6 +28,7 @@ from limbfit.fe.contact.friction import Coulomb
 from limbfit.fe.contact.tool import Pose
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.motion import Drives
+from limbfit.fe.solution.control import schedule_steps
 from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.system import Increment
 
@@ -76,7 +77,9 @@ def test_forces_and_stiffness_of_a_free_body_are_derivatives_of_its_energy(mu, t
     drives, grips = Drives(loads, np.ones((1, 6), dtype=bool), np.ones(1)), ()
     if mu:
         before = u - 0.05 * d
-        grip = Coulomb.none(mu, system.surface).advance(system.bodies.tools(before, drives)[0], None)
+        grip = Coulomb.none(mu, system.bodies.first.surface).advance(
+            system.bodies.tools(before, drives)[0], None
+        )
         grips = (grip.renew(system.bodies.tools(u, drives)[0]),)
         assert grips[0].held.any()
 
@@ -182,6 +185,40 @@ def test_a_force_that_is_taken_over_depends_on_the_parameters():
         step = 2e-3 * problem.parameters[i]
         difference = (ways[0].coordinates[:, 0, 2] - ways[1].coordinates[:, 0, 2]) / step
         np.testing.assert_allclose(slopes[:, i], difference[1:], atol=1e-3 * np.abs(difference).max())
+
+
+def test_the_force_of_a_body_that_turned_with_friction_has_derivatives():
+    """Along the axis at its start, whereto its anchors turn with it."""
+    problem = punch("tet10", 3, 1)
+    ball = Indenter("sphere", 20.0, centre=(0.0, 0.0, 0.05), axis=(0, 0, -1))
+    motion = Motion.of(
+        [0.0, 1.0, 2.0], z=[0.0, 2.5, 2.5], x=[0, 0, 1.5], turn_x=[0, 0, 0.5], turn_y=[0, 0, 0.4]
+    )
+    body = RigidBody(ball, problem.contact_faces, motion, 0.3, pivot=(0.0, 0.0, 10.0))
+    problem = replace(problem, indenter=None, bodies=(body,), history=STILL)
+    control = replace(CONTROL, times=(0.5, 1.0, 1.5, 2.0))
+    centre = solve(problem, control, sensitivities=True, store="all")
+    slope, difference = parameter_slope(centre, control, "muscle", "c")
+    np.testing.assert_allclose(slope, difference, atol=1e-4 * np.abs(difference).max())
+
+
+def test_steps_go_on_for_what_moves_when_the_indenter_has_left():
+    """A second body that comes down meanwhile is met; what supports move is stepped through as asked."""
+    up = History(np.array([0.0, 2.0, 4.0]), np.array([0.0, 2.0, 0.0]))
+    problem = punch("tet10", 2, 1, history=up)
+    pin = Indenter("square", 16.0, 1.0, axis=(0, 0, -1), centre=(20.0, 18.0, 0.0))
+    down = Motion.of([0.0, 3.5, 3.8, 4.0], z=[0.0, 0.0, 2.0, 0.0])
+    steps = StepControl(load_steps=3, unload_steps=5)
+    other = RigidBody(pin, problem.contact_faces, down, name="pin")
+    found = solve(replace(problem, bodies=(other,)), steps)
+    assert found.completed, found.reason
+    assert np.isclose(found.times[:, None], down.times[1:]).any(axis=0).all()
+    assert found.reactions[:, 1, 2].max() > 0.2
+    top = Support(np.unique(problem.contact_faces), 2, -1.0)
+    pulled = solve(
+        replace(problem, indenter=None, contact_faces=problem.contact_faces[:0], supports=(top,)), steps
+    )
+    assert (pulled.times > 2.0).sum() == len(schedule_steps(up, steps)) - 3
 
 
 def test_a_free_plate_lies_down_on_what_is_askew():

@@ -39,7 +39,7 @@ class Dragged:
         self.rng = np.random.default_rng(1)
         self.u = self.field(0.01)
         start = self.system.bodies.tools(self.u, drive(3.2))[0]
-        grip = Coulomb.none(mu, self.system.surface).advance(start, None)
+        grip = Coulomb.none(mu, self.system.bodies.first.surface).advance(start, None)
         self.u = self.u + self.field(0.05)
         self.grip = self.renew(grip, self.u)
 
@@ -230,7 +230,7 @@ def partial_slip(mu: float, radius: float, depth: float) -> tuple[np.ndarray, np
     )  # fmt: skip
     result = solve(problem, StepControl(times=(0.5, 1.0, *np.linspace(1.1, 2.0, 10)), penalty=2000.0))
     assert result.completed, result.reason
-    drag = np.array([history.across_at(t)[0] for t in result.times])[2:]
+    drag = np.array([np.interp(t, history.times, history.across[:, 0]) for t in result.times])[2:]
     return drag, 2.0 * result.reaction[2:, 0], 2.0 * result.force[2], a
 
 

@@ -180,7 +180,7 @@ def iterations(divisions: int) -> int:
     data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
     factor = Factor(system, laws.moduli, "multigrid")
     factor.factorise(data)
-    b = system.bodies.spread_forces(np.ones((system.surface.areas.size, 3, 1)))
+    b = system.bodies.spread_forces(np.ones((system.bodies.first.surface.areas.size, 3, 1)))
     found = factor.solve(data, b, None, 1e-3)
     assert found.converged
     assert np.linalg.norm(b - factor.multiply(data, found.x)) <= 1.1e-3 * np.linalg.norm(b)

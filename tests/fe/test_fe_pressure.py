@@ -25,6 +25,7 @@ from limbfit.fe import (
     solve,
 )
 from limbfit.fe.kernel.laws import Laws
+from limbfit.fe.observables import compute_nodal_forces
 from limbfit.fe.pressure import PressedSurface
 from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.system import Increment
@@ -159,6 +160,18 @@ def test_derivatives_of_the_force_beside_a_pressure_with_a_free_rim():
     np.testing.assert_allclose(
         centre.force_sensitivity @ change, difference, atol=1e-3 * np.abs(difference).max()
     )
+
+
+def test_a_pressure_that_stays_is_stepped_to_where_it_is_reached_and_leaves_no_force_at_free_nodes():
+    problem = punch("tet10", 2, 1, indenter=None, history=History(np.array([0.0, 3.0]), np.zeros(2)))
+    problem = replace(problem, pressures=(Pressure(problem.contact_faces, [0.0, 1.0], [0.0, 0.002]),))
+    problem = replace(problem, contact_faces=problem.contact_faces[:0])
+    found = solve(problem, StepControl(unload_steps=3))
+    assert found.completed, found.reason
+    assert np.isclose(found.times, 1.0).any()
+    forces = compute_nodal_forces(found.system, Laws.build([SKIN, MUSCLE]), found.deepest)
+    free = np.setdiff1d(np.arange(len(forces)), problem.fixed)
+    assert np.abs(forces[free]).max() < 1e-3 * np.linalg.norm(forces[problem.fixed].sum(axis=0))
 
 
 def test_a_pressure_that_cannot_be_is_refused():

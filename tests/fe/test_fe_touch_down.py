@@ -61,15 +61,19 @@ def test_it_touches_the_tissue_where_that_is_by_then():
     assert result.force[before.sum()] > 0.0
 
 
-def test_what_nothing_moves_is_touched_where_it_is():
+@pytest.mark.parametrize("how", [{}, {"friction": 0.3, "sticking": "stepwise"}], ids=["plain", "stepwise"])
+def test_what_nothing_moves_is_touched_where_it_is(how):
     """A block at rest that waits is indented as one that does not wait."""
-    problem = punch("tet10", 2, 1, history=COURSE, touch_down_s=HELD_S)
+    ball = Indenter("sphere", 40.0, axis=(0, 0, -1), centre=(2.0, 0.0, 5.0))
+    problem = punch("tet10", 2, 1, history=COURSE, touch_down_s=HELD_S, indenter=ball, **how)
     later = solve(problem, CONTROL)
     history = History(COURSE.times[1:] - HELD_S, np.asarray(COURSE.displacement)[1:])
     at_once = solve(replace(problem, history=history, touch_down_s=0.0), CONTROL)
     np.testing.assert_allclose(
         later.force_at(HELD_S + at_once.times), at_once.force, atol=1e-4 * at_once.peak_force
     )
+    own, its = later.reaction[later.times > HELD_S][:3], at_once.reaction[1:4]
+    np.testing.assert_allclose(own, its, atol=1e-4 * at_once.peak_force)
 
 
 def test_derivatives_of_tensed_tissue():

@@ -215,9 +215,10 @@ class Bodies:
                 self.levers[at, :, columns] = tool.levers
                 turning[at, :, columns] = tool.pose.turning(forces[at], body.free) * units
                 bent = tool.pose.bending(places, forces[at][pushed], body.free)
-                bending[columns, columns] = bent * units * units[:, None] + _couple_moves_and_turns(
-                    np.einsum("cij,cik->jk", self.levers[at, :, columns], turning[at, :, columns]), body.free
-                )
+                moved = np.einsum("cij,cik->jk", self.levers[at, :, columns], turning[at, :, columns])
+                # Between moves and turns: lever of row times turning of column.
+                moved = np.where((body.free[:, None] < 3) & (body.free > 2), moved, 0.0)
+                bending[columns, columns] = bent * units * units[:, None] + moved + moved.T
         touch = Touch(gaps, normals, weights, blocks, stick, forces)
         return Contacts(energy, deepest, area, reactions, residual, touch, turning, bending, tools)
 
@@ -375,12 +376,6 @@ def impose_coordinates(body: _Body, u: Array, value: Array, forced: NDArray[np.b
         rows[held] = (value * body.scale)[held]
         u[body.row : body.row + 2] = rows.reshape(2, 3)
     return u
-
-
-def _couple_moves_and_turns(moved: Array, free: NDArray[np.intp]) -> Array:
-    """The part (k, k) between moves and turns, for ``moved``: lever of row times turning of column."""
-    cross = np.where((free[:, None] < 3) & (free > 2), moved, 0.0)
-    return cross + cross.T
 
 
 def _place_start(problem: Problem, stated: RigidBody, surface: ContactSurface) -> RigidShape:

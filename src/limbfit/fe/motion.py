@@ -143,9 +143,7 @@ class Motion:
 
     def moving_s(self, t: float) -> float:
         """For how long anything has changed up to time ``t``, s."""
-        steps = np.diff(self.times)
-        moving = (np.diff(self._driven, axis=0) != 0.0).any(axis=1)
-        return float((np.clip(t - self.times[:-1], 0.0, steps) * moving).sum())
+        return measure_moving_time(self.times, self._driven, t)
 
     @property
     def _driven(self) -> Array:
@@ -248,6 +246,12 @@ def read_course(what: str, of: str, times: ArrayLike, values: ArrayLike) -> tupl
     return t, v
 
 
+def measure_moving_time(times: Array, values: Array, t: float) -> float:
+    """For how long ``values (n, ...)``, linear between ``times (n,)`` s, have changed up to time ``t``, s."""
+    moving = (np.diff(values, axis=0) != 0.0).reshape(len(times) - 1, -1).any(axis=1)
+    return float((np.clip(t - times[:-1], 0.0, np.diff(times)) * moving).sum())
+
+
 @dataclass(frozen=True)
 class Activation:
     """The share of full activation over time, piecewise linear; the last one holds on.
@@ -284,5 +288,4 @@ class Activation:
 
     def moving_s(self, t: float) -> float:
         """For how long the share has changed up to time ``t``, s."""
-        times, steps = np.asarray(self.times), np.diff(self.times)
-        return float((np.clip(t - times[:-1], 0.0, steps) * (np.diff(self.shares) != 0.0)).sum())
+        return measure_moving_time(np.asarray(self.times), np.asarray(self.shares), t)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from numba import njit
-from numpy.typing import NDArray
 
 from ..arrays import Array
 from .kernel.elements import compute_face_areas
@@ -45,15 +44,18 @@ def compute_element_fields(system: System, laws: Laws, state: State) -> ElementF
 
 
 def compute_nodal_forces(system: System, laws: Laws, state: State) -> Array:
-    """Force (n, 3) from outside that every node of a state needs to stay where it is, N, but for contact.
+    """Force (n, 3) that every node of a state needs to stay where it is, N, beside contact and pressures.
 
     At supports their reactions; at free nodes what Newton's iteration left.  The state must have kept its
     memory, as for `compute_element_fields`.
     """
+    pressures = tuple(one.at(state.time) for one in system.problem.pressures)
+    rims = system.pressures.compute_rims(state.rows, pressures) if pressures else 0.0
     increment = Increment(
         state.time, state.displacement, np.ones(len(laws.prony)),
         _compute_relaxing_stress(system, laws, state),
         state.penalty * laws.modulus, state.drives, state.grips, activation=state.activation,
+        pressures=pressures, rims=rims,
     )  # fmt: skip
     found = system.evaluate(state.rows, laws, increment, tangent=False)
     return found.residual[: system.nodes]
@@ -90,8 +92,11 @@ def compute_contact_pressure(system: System, laws: Laws, state: State) -> Array:
     N, areas = compute_face_areas(system.element, system.points + state.u, faces, "gauss")
     parts = np.einsum("fqi,qk->fki", areas, N).reshape(-1, 3)
     share = np.stack([np.bincount(faces.ravel(), part, len(pressure)) for part in parts.T], axis=1)
-    to_middles = _build_corner_mean(len(pressure), faces) if faces.shape[1] == 6 else None
-    if to_middles is not None:
+    to_middles = None
+    if faces.shape[1] == 6:  # of corners the mean over the mid-edge nodes beside
+        corners, beside = faces[:, [0, 0, 1, 1, 2, 2]].ravel(), faces[:, [3, 5, 3, 4, 4, 5]].ravel()
+        means = 1.0 / np.bincount(corners, minlength=len(pressure))[corners]
+        to_middles = sp.csr_matrix((means, (corners, beside)), shape=(len(pressure),) * 2)
         force, share = (values + to_middles.T @ values for values in (force, share))
     size = np.linalg.norm(share, axis=1)
     bearing = size > 0.0
@@ -100,13 +105,6 @@ def compute_contact_pressure(system: System, laws: Laws, state: State) -> Array:
         corners = np.unique(faces[:, :3])
         pressure[corners] = (to_middles @ pressure)[corners]
     return pressure
-
-
-def _build_corner_mean(n: int, faces: NDArray[np.int64]) -> sp.csr_matrix:
-    """Matrix (n, n): at the corners of quadratic faces (f, 6) the mean over the mid-edge nodes beside."""
-    corners, beside = faces[:, [0, 0, 1, 1, 2, 2]].ravel(), faces[:, [3, 5, 3, 4, 4, 5]].ravel()
-    count = np.bincount(corners, minlength=n)
-    return sp.csr_matrix((1.0 / count[corners], (corners, beside)), shape=(n, n))
 
 
 def average_at_nodes(system: System, values: Array) -> Array:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array
 from .kernel.elements import Element
-from .motion import read_course
+from .motion import measure_moving_time, read_course
 from .pattern import Pattern, find_positions
 
 
@@ -45,6 +45,10 @@ class Pressure:
         """The same after so many seconds at its first value."""
         times, values = np.asarray(self.times), np.asarray(self.values)
         return Pressure(self.faces, np.append(0.0, times + seconds), np.append(values[0], values))
+
+    def moving_s(self, t: float) -> float:
+        """For how long it has changed up to time ``t``, s."""
+        return measure_moving_time(np.asarray(self.times), np.asarray(self.values), t)
 
     def at(self, t: float) -> float:
         """The pressure at time ``t``, MPa."""

@@ -75,16 +75,10 @@ class History:
             values[:, :2] = self.across
         return Motion(self.times, values, (False, False, self.forced, False, False, False))
 
-    def across_at(self, t: float) -> tuple[float, float]:
-        """Move across the axis at time ``t``, mm."""
-        if self.across is None:
-            return 0.0, 0.0
-        x, y = (float(np.interp(t, self.times, values)) for values in self.across.T)
-        return x, y
-
     def travel(self, t: float) -> float:
         """The sum of driver and moves across, which changes while the indenter moves in any direction."""
-        return float(self.at(t)) + sum(self.across_at(t))
+        across = () if self.across is None else self.across.T
+        return float(self.at(t)) + sum(float(np.interp(t, self.times, values)) for values in across)
 
     @cached_property
     def phases(self) -> tuple[MotionPhase, ...]:
@@ -230,10 +224,14 @@ class Problem:
             touch_down_s=self.touch_down_s + seconds if self.touch_down_s else 0.0,
         )
 
+    def moving_s(self, t: float) -> float:
+        """For how long further bodies, pressures and the activation have changed up to time ``t``, s."""
+        others = (*(body.motion for body in self.bodies), *self.pressures, self.activation)
+        return sum(one.moving_s(t) for one in others if one is not None)
+
     def travel(self, t: float) -> float:
-        """A measure that grows evenly while the indenter, further bodies or the activation change."""
-        contracting = 0.0 if self.activation is None else self.activation.moving_s(t)
-        return contracting + self.history.travel(t) + sum(b.motion.moving_s(t) for b in self.bodies)
+        """A measure that grows evenly while the indenter, or what else drives the problem, changes."""
+        return self.moving_s(t) + self.history.travel(t)
 
     def activation_at(self, t: float) -> float:
         """Share of the active stress at time ``t``, s."""
@@ -242,7 +240,7 @@ class Problem:
     @property
     def turns(self) -> NDArray[np.float64]:
         """Times at which a further body, a pressure or the activation turns, or contact begins, s."""
-        knots = [np.asarray(one.times)[1:-1] for one in self.pressures]
+        knots = [np.asarray(one.times)[1:] for one in self.pressures]
         if self.touch_down_s:
             knots.append(np.array([self.touch_down_s]))
         if self.activation is not None:

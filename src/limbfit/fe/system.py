@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..arrays import Array
 from .bodies import Bodies, Contacts, count_body_rows
 from .checking import check
-from .contact.contact import ContactSurface, Touch
+from .contact.contact import Touch
 from .contact.friction import StickyContact
 from .contact.rigid import Indenter
 from .contact.tool import Tool
@@ -141,11 +141,6 @@ class System:
         self.pressures = Pressures(self.element, self.points, problem.pressures, pattern)
         if problem.rigid_bodies:
             self.bodies = Bodies(problem, self.element, self.points, pattern)
-
-    @property
-    def surface(self) -> ContactSurface | None:
-        """The contact faces of the indenter, or of the first body."""
-        return None if self.bodies is None else self.bodies.first.surface
 
     @property
     def indenter(self) -> Indenter | None:

@@ -174,11 +174,6 @@ class Tool:
             found += (self.levers @ change).reshape(found.shape)
         return np.einsum("ij,fqjp->fqip", self.body.frame, found, optimize=True)
 
-    def distribute_body_forces(self, forces: Array) -> Array:
-        """Forces (f, q, 3, p) at the points, in the body's frame, as those of ``u (r, 3, p)``."""
-        in_space = np.einsum("ij,fqip->fqjp", self.body.frame, forces).reshape(-1, 3, forces.shape[-1])
-        return self.distribute_forces(in_space)
-
     def distribute_forces(self, forces: Array) -> Array:
         """Forces (f q, 3, p) at the points, in space, as those of ``u (r, 3, p)``."""
         n, p = len(self.surface.points), forces.shape[-1]

@@ -145,7 +145,8 @@ class SteppedRun:
             forces.append(found.force)
             if t == targets[0]:
                 targets = targets[1:]
-                if self.control.times is None:
+                rests = self.problem.moving_s(self.planned[-1]) == self.problem.moving_s(t)
+                if self.control.times is None and rests and self.problem.indenter is not None:
                     targets = predict_remaining_times(
                         self.problem.history, self.planned, targets, times, forces
                     )
@@ -307,7 +308,10 @@ class SteppedRun:
         after = self.memory.advance(self.system, self.laws, stress, dt)
         if self._has_turned(increment.time, at.force):
             after, self.slope = after.drop_past(), self.slope and self.slope.drop_past()
-        tools = self.system.tools(u, increment)
+        drives = self.problem.drives(increment.time)
+        if self.touch.waits and increment.time >= self.problem.touch_down_s * (1.0 - 1e-9):
+            self.touch = self.touch.touch_down(self.system, u, drives, du)
+        tools = self.system.tools(u, replace(increment, drives=self.touch.shift_drives(drives)))
         apart = [self.touch.relative_to_touch(self.system, du), *[du] * len(tools)]
         self.grips = tuple(g and g.advance(tool, d) for g, tool, d in zip(increment.grips, tools, apart))
         self.memory, self.stiffness = after, stiffness
@@ -329,8 +333,6 @@ class SteppedRun:
             increment.grips,
         )
         self.states = [*self.states[-2:], state]
-        if self.touch.waits and increment.time >= self.problem.touch_down_s * (1.0 - 1e-9):
-            self.touch = self.touch.touch_down(self.system, u, self.problem.drives(increment.time), du)
         if found.residual > self.control.tolerance:
             self.unbalanced.append((displacement, found.residual))
         if found.unsettled > self.control.tolerance:
@@ -383,9 +385,10 @@ class SteppedRun:
                 continue
             stiff = (increment.penalty * tool.surface.areas)[..., None, None]
             held = stiff * grip.differentiate_anchors(tool)
-            change += tool.distribute_body_forces(held)
-            if i == 0:
-                d_reaction -= held[:, :, 2].sum(axis=(0, 1))
+            held = np.einsum("ij,fqip->fqjp", tool.body.frame, held).reshape(-1, 3, laws.count)  # in space
+            change += tool.distribute_forces(held)
+            if i == 0 and system.bodies is not None:
+                d_reaction -= system.bodies.first.frame[2] @ held.sum(axis=0)
         if self.takeover is not None and system.bodies is not None:
             change[system.nodes :] -= self.takeover.remaining(
                 self.problem.rigid_bodies, system.bodies, increment.time

@@ -115,7 +115,7 @@ def solve(
             kept.append(step.state if deepest else replace(step.state, memory=None))
         if on_step is not None:
             on_step(step)
-        if checkpoints is not None and checkpoints.is_due(step.time):
+        if checkpoints is not None and np.isclose(step.time, checkpoints.times, rtol=1e-9, atol=0.0).any():
             checkpoints.keep(_take_snapshot(run, rows, time.perf_counter() - started))
             for factor in {id(one): one for one in (run.factor, run.slopes)}.values():
                 factor.reset()  # as that of a run that begins here does
@@ -305,9 +305,6 @@ class Checkpoints:
 
     times: Sequence[float]
     keep: Callable[[Snapshot], None]
-
-    def is_due(self, time: float) -> bool:
-        return bool(np.isclose(time, self.times, rtol=1e-9, atol=0.0).any())
 
 
 def _flatten(name: str, value: Any, facts: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
