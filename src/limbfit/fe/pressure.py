@@ -81,12 +81,10 @@ class PressedSurface:
         forces = np.einsum("q,qk,fqi->fki", self.weights, self.N, normal)
         gradient = forces + np.einsum("q,qk,fqi->fki", self.weights, self.dN[..., 0], across)
         gradient = (gradient + np.einsum("q,qk,fqi->fki", self.weights, self.dN[..., 1], along)) / 3.0
-        return volume, self._sum_at_nodes(gradient, len(x)), self._sum_at_nodes(forces, len(x))
-
-    def _sum_at_nodes(self, parts: Array, n: int) -> Array:
-        out = np.zeros((n, 3))
-        np.add.at(out, self.faces, parts)
-        return out
+        at_nodes = np.zeros((2, len(x), 3))
+        np.add.at(at_nodes[0], self.faces, gradient)
+        np.add.at(at_nodes[1], self.faces, forces)
+        return volume, at_nodes[0], at_nodes[1]
 
     def hessian(self, x: Array) -> Array:
         """Second derivative (f, k, k, 3, 3) of the volume of every face."""

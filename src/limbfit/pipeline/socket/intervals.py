@@ -147,6 +147,12 @@ def draw_step(covariance: Array, number: int, seed: int = 0) -> Array:
     return random.multivariate_normal(np.zeros(len(covariance)), covariance, method="eigh")
 
 
+def predict_change(row: Mapping[str, Any], name: str, unit: str, step: Mapping[str, float]) -> float:
+    """A stored value's change by its derivatives, where the logarithms of parameters change by ``step``."""
+    slopes = row[f"{name}change_{unit}"]
+    return float(sum(slopes[key] * by for key, by in step.items() if key in slopes)) / _CHANGE
+
+
 def widen_intervals(
     facts: Mapping[str, Any], draws: Sequence[tuple[Mapping[str, float], Mapping[str, Any]]]
 ) -> None:
@@ -158,10 +164,10 @@ def widen_intervals(
     others = [list(_iterate_values(found)) for _, found in draws]
     for i, (row, key, name, unit) in enumerate(_iterate_values(facts)):
         value, (low, high) = row[key], row[f"{name}interval_{unit}"]
-        changes, missed = row[f"{name}change_{unit}"], []
-        for (step, _), other in zip(draws, others, strict=True):
-            predicted = sum(changes[one] * by for one, by in step.items() if one in changes) / _CHANGE
-            missed.append(other[i][0][key] - value - predicted)
+        missed = [
+            other[i][0][key] - value - predict_change(row, name, unit, step)
+            for (step, _), other in zip(draws, others, strict=True)
+        ]
         mean, sd = float(np.mean(missed)), float(np.std(missed, ddof=1))
         below, above = (float(np.hypot(end - value, NORMAL_95 * sd)) for end in (low, high))
         ends = np.array([value + mean - below, value + mean + above])
