@@ -12,6 +12,7 @@ from limbfit.errors import InputError, ProblemError, StudyError
 from limbfit.indentation import SimulationJob, build_problem, simulate
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.design.protocol import check_protocol
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.records.records import build_model
 from limbfit.pipeline.simulation.simulations import compute_job_digest
@@ -54,6 +55,13 @@ def test_what_would_count_from_its_equilibrium_is_refused_before_it_is_simulated
     job = SimulationJob(model, context.study.tissues, tuple(context.study.vector(TRUTH)), (1.0,))
     with pytest.raises(ProblemError, match="waves of pre-stretched tissue"):
         simulate(job)
+
+
+def test_a_protocol_that_plans_what_sees_no_pre_stretch_is_refused(context):
+    options = {"determine": (), "minutes": 25.0, "setup_s": 60.0, "rest_s": 30.0, "holds_s": ()}
+    check_protocol(context.study, None, options)
+    with pytest.raises(InputError, match="surface_sd_mm is planned, which sees no pre-stretch"):
+        check_protocol(context.study, None, options | {"surface_sd_mm": 0.2})
 
 
 def test_force_follows_tissue_by_its_derivatives(context):
