@@ -264,29 +264,20 @@ def estimate_discrepancy(
     if model.site_N:
         factors = rows.sample_site_factors(logs)
         found = replace(found, site_factor=float(np.exp(logs[-1])), site_factors=factors)
-    by = _compare_with_mean_square(found, residuals, jacobians)
-    if by >= 1.0:
-        return found
-    least = _SITE_FACTOR_BOUNDS[0]
-    return replace(
-        found,
-        misfit=np.maximum(by * found.misfit, _MIN_MISFIT),
-        site_factor=max(by * found.site_factor, least),
-        site_factors=np.maximum(by * found.site_factors, least),
-    )
+    return found
 
 
-def _compare_with_mean_square(
+def limit_to_mean_square(
     model: ResidualModel, residuals: Sequence[Array], jacobians: Sequence[Array]
-) -> float:
-    """Return by which factor misfits and site factor may be multiplied, by the mean square of the residuals.
+) -> ResidualModel:
+    """Lower the misfits and the site factor of `estimate_discrepancy` to what residuals so small allow.
 
     The likelihood goes by how residuals change from one moment to the next. Residuals that are smooth but for
     a few kinks, as a wrong law of relaxation leaves where the indenter turns, seem to it a long process that
     is many times larger than they are, most of which the parameters must have absorbed. Their mean square
     tells whether that can be. Here it is compared with what is left of the model's covariance after a fit by
-    least squares, by a chi-squared distribution of the same mean and variance (Satterthwaite 1946): below
-    the factor that is returned, residuals as small as these have a probability of at least 2.5 %.
+    least squares, by a chi-squared distribution of the same mean and variance (Satterthwaite 1946): then
+    residuals as small as these have a probability of at least 2.5 %.
     """
     scale = np.concatenate([np.full(len(r), len(r) ** -0.5 / p) for r, p in zip(residuals, model.peaks_N)])
     residual, jacobian = scale * np.concatenate(residuals), scale[:, None] * np.concatenate(jacobians)
@@ -298,7 +289,15 @@ def _compare_with_mean_square(
     expected = float(np.trace(covariance))
     freedom = expected**2 / float(np.sum(covariance**2))
     share = float(residual @ residual) / expected * freedom / chi2.ppf(0.025, freedom)
-    return float(np.sqrt(share))
+    if share >= 1.0:
+        return model
+    by, least = float(np.sqrt(share)), _SITE_FACTOR_BOUNDS[0]
+    return replace(
+        model,
+        misfit=np.maximum(by * model.misfit, _MIN_MISFIT),
+        site_factor=max(by * model.site_factor, least),
+        site_factors=np.maximum(by * model.site_factors, least),
+    )
 
 
 def estimate_mesh_misfit(

@@ -30,7 +30,12 @@ from ..fit.calibration import CalibrationSettings
 from ..fit.objective import MeasuredCurve, SiteResponse
 from ..fit.parameters import Grouping, SearchSpace, Unknowns, build_space, group_separately
 from ..fit.prediction import combine_freedom
-from .discrepancy import ResidualModel, estimate_discrepancy, estimate_mesh_misfit
+from .discrepancy import (
+    ResidualModel,
+    estimate_discrepancy,
+    estimate_mesh_misfit,
+    limit_to_mean_square,
+)
 from .noise import SiteNoise
 
 DETERMINED, WEAK, UNDETERMINED = "determined", "weakly determined", "not determined by these data"
@@ -300,7 +305,8 @@ def estimate_uncertainty(
     misfit = np.zeros(len(peaks))
     model = ResidualModel(tuple(noise), peaks, misfit, mesh_N=tuple(mesh_N), site_N=tuple(site_N))
     mesh_misfit = estimate_mesh_misfit(model, scaled, prior.precision)
-    model = replace(estimate_discrepancy(model, residuals, scaled, prior.precision), mesh_misfit=mesh_misfit)
+    model = estimate_discrepancy(model, residuals, scaled, prior.precision)
+    model = replace(limit_to_mean_square(model, residuals, scaled), mesh_misfit=mesh_misfit)
     curvatures = [
         one.compute_cost_curvature(settings.objective, r) for r, one in zip(residuals, measured, strict=True)
     ]
