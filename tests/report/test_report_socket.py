@@ -60,6 +60,14 @@ def test_a_simulated_change_of_friction_has_a_column_of_its_own():
     assert table.rows[0].cells[-1].text == "1.2 kPa"
 
 
+def test_relaxation_beyond_the_records_has_a_column_of_its_own():
+    relaxed = {**REGION, "interval_from": {"relaxation": 90.0, "skin.c_kPa": 8.0}}
+    table = make_interval_table(don(relaxed), "stance")
+    assert isinstance(table, Table)
+    assert table.head[3:5] == ("relaxation (%)", "skin c (%)")
+    assert "or relaxation beyond the records" in table.caption
+
+
 def test_without_identified_tissues_there_is_no_such_table():
     unknown = {**REGION, "interval_kPa": None, "interval_from": None, "change_kPa": None}
     assert make_interval_table(don(unknown), "donning") is None

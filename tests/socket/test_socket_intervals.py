@@ -73,6 +73,37 @@ def test_an_interval_reaches_to_the_farthest_fall_and_loses_nothing_at_the_other
     assert (low, high) == pytest.approx((plain[0] * np.exp(-fall_log), plain[1]))
 
 
+def test_most_of_an_interval_comes_from_relaxation_where_that_makes_it_wide():
+    slopes = np.array([50.0, *SLOPES[1:]])
+    plain, alone, *_ = spread_of().told(50.0, slopes)
+    worn, shares, *_ = spread_of(fall=[0.8, 0.0]).told(50.0, slopes)
+    left = ((plain[1] - plain[0]) / (worn[1] - worn[0])) ** 2
+    assert next(iter(shares)) == "relaxation"
+    assert shares["relaxation"] == pytest.approx(100.0 * (1.0 - left))
+    assert [shares[name] for name in alone] == pytest.approx([left * alone[name] for name in alone])
+
+
+@pytest.mark.parametrize("fall_log", [0.0, 1.5])
+def test_a_socket_that_moves_off_the_limb_has_an_interval_about_its_move(fall_log):
+    spread = spread_of(fall=[fall_log, 0.0])
+    onto = spread_to_facts(spread, "settling_", "mm", 2.0, SLOPES)
+    off = spread_to_facts(spread, "settling_", "mm", -2.0, -SLOPES)
+    low, high = off["settling_interval_mm"]
+    assert low < -2.0 < high
+    assert [-high, -low] == onto["settling_interval_mm"]
+    assert off["settling_relaxation_mm"] == [
+        -one if i != 1 else one for i, one in enumerate(onto["settling_relaxation_mm"])
+    ]
+
+
+def test_an_interval_that_draws_widen_still_holds_the_simulated_value():
+    found = facts(50.0, interval_kPa=[49.0, 51.0], change_kPa={})
+    widen_intervals(found, [({}, facts(value)) for value in (52.9, 53.0, 53.1)])
+    (load,) = found["loads"]
+    assert load["regions"][0]["interval_kPa"][0] == 50.0 < 53.0 < load["regions"][0]["interval_kPa"][1]
+    assert load["settling_interval_mm"][0] == 50.0
+
+
 def test_what_is_stored_has_the_same_keys_with_and_without_intervals():
     spread = spread_of()
     known = spread_to_facts(spread, "settling_", "mm", 5.0, SLOPES)

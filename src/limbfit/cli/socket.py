@@ -123,8 +123,7 @@ def _format_main_cause(shares: Mapping[str, float] | None) -> str:
     if not shares:
         return ""
     name, percent = next(iter(shares.items()))
-    tissue, _, key = name.partition(".")
-    return f"{tissue} {split_key(key)[0]} {percent:.0f} %"
+    return f"{split_key(name)[0].replace('.', ' ')} {percent:.0f} %"
 
 
 LOAD_COLUMNS: dict[str, Column] = {

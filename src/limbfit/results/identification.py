@@ -110,7 +110,7 @@ class PriorShares(ResultPart):
     """The priors that counted."""
 
     stated: Mapping[str, StatedPrior] = Field(description="The prior of each parameter that has one.")
-    share: Mapping[str, float] = Field(description="Share of each interval that comes from priors.")
+    share: Mapping[str, float] = Field(description="Share of the variance of each logarithm from priors.")
     wider_without: Mapping[str, float] = Field(description="Factor by which intervals are wider without.")
 
 
@@ -146,7 +146,7 @@ class ResidualsSummary(ResultPart):
     )
     misfit_elsewhere: float = Field(description="Misfit expected elsewhere, over the largest force.")
     mesh_misfit: MeshMisfitSummary | None = Field(description="The part that the mesh may cause.")
-    correlation: float = Field(description="Correlation of neighbouring residuals.")
+    correlation: float = Field(description="Correlation length of the misfit over the record's duration.")
     known_scale: float = Field(description="Independent residuals that tell the size of the misfit.")
     effective_samples: float = Field(description="Number of independent residuals.")
 
@@ -361,8 +361,8 @@ class LeftOutRecord(ResultPart):
     """A record predicted without itself."""
 
     site: str = Field(description="Name of the record.")
-    error: float = Field(description="Root mean square error over the largest force.")
-    expected: float = Field(description="What is expected of it.")
+    error: float = Field(description="Root mean square error over the largest force, measured or simulated.")
+    expected: float = Field(description="That of the others when it is left out; 0.02 at least.")
     ratio: float = Field(description="Best factor from predicted to measured force.")
     cook: float = Field(description="Cook's distance: how much the record moves all forces.")
     standardised: float = Field(description="The error over the expected one.")

@@ -22,7 +22,7 @@ class LoadedRegion(ResultPart):
     shear_peak_kPa: float = Field(description="Largest mean shear over a face.")
     interval_kPa: Interval | None = Field(description="95 % interval of the mean pressure.")
     interval_from: Mapping[str, float] | None = Field(
-        description="Share of its variance that would go if a parameter were known, in percent."
+        description="Percent of its squared width that each parameter, or `relaxation`, is the cause of."
     )
     change_kPa: Mapping[str, float] | None = Field(
         description="Change of the mean pressure where a parameter is 10 % larger."
@@ -77,7 +77,7 @@ class SocketLoad(SocketState):
     settling_mm: float = Field(description="How far the limb goes into the socket.")
     settling_interval_mm: Interval | None = Field(description="95 % interval of the settling.")
     settling_interval_from: Mapping[str, float] | None = Field(
-        description="Share of its variance that would go if a parameter were known, in percent."
+        description="Percent of its squared width that each parameter, or `relaxation`, is the cause of."
     )
     settling_change_mm: Mapping[str, float] | None = Field(
         description="Change of the settling where a parameter is 10 % larger."
@@ -147,7 +147,7 @@ class SocketShape(ResultPart):
     """The shape of the socket."""
 
     source: str = Field(description="`rectified`, or the name of its file.")
-    reduction_percent: float | None = Field(description="Reduction of the volume; null for a file.")
+    reduction_percent: float | None = Field(description="Reduction of every circumference; null for a file.")
     areas: Sequence[str] = Field(description="Names of the rectified areas.")
     volume_cm3: float = Field(description="Volume inside.")
     deepest_mm: float = Field(description="How far it is inside the limb's surface at most.")
@@ -203,7 +203,7 @@ class SocketDesigned(ResultPart):
     offset_mm: Interval = Field(description="Least and greatest distance of its face from the limb.")
     peaks_kPa: Mapping[str, float] = Field(description="Largest pressure of each region over all loads.")
     depths_mm: Mapping[str, float] = Field(default={}, description="Depth of its face over regions.")
-    reduction_percent: float | None = Field(default=None, description="Reduction of the volume.")
+    reduction_percent: float | None = Field(default=None, description="Reduction of every circumference.")
     simulation: SocketSimulation = Field(description="What happens on the limb.")
 
 

@@ -6,7 +6,9 @@ the squared correlation of the two.  Parameters are correlated, so that shares d
 simulated parameters fit best, others are most probable: intervals cover both, as those of parameters do.
 
 A socket is worn for longer than any record lasts, and how far tissue relaxes by then is known less well
-(`limbfit.identify.uncertainty.relaxation`). That moves the value and adds to its variance.
+(`limbfit.identify.uncertainty.relaxation`). That moves the value, adds to its variance and bounds how far it
+may fall. Its share is what of the squared width of the interval would go without it; those of the parameters
+are of the rest.
 
 Contact and large strain are not of first order.  Where parameters drawn from C were simulated too, the mean
 of what g misses of them is added to the value, and its variance to that of the value.
@@ -28,6 +30,8 @@ from ...study import Study
 
 CHANGE_PERCENT = 10.0  # of a parameter, for which the change of a value is told
 FRICTION = "friction"  # one that has no derivatives
+RELAXATION = "relaxation"  # beyond the records, among what an interval comes from
+_LEAST = {"kPa": 0.0, "mm": -np.inf}  # contact does not pull; a socket may also move off the limb
 _CHANGE = float(np.log1p(CHANGE_PERCENT / 100.0))
 
 
@@ -52,6 +56,11 @@ class ParameterSpread:
     def relax(self, own_weight: float, shift: Array, relaxation: Array, fall: Array) -> ParameterSpread:
         """The same when a socket has been worn for long, of what `RelaxationSpread` says."""
         return ParameterSpread(own_weight * self.covariance, own_weight * self.off, shift, relaxation, fall)
+
+    @property
+    def is_relaxed(self) -> bool:
+        """True if relaxation beyond the records counts."""
+        return any(np.any(one) for one in (self.shift, self.relaxation, self.fall))
 
     def select(self, chosen: Array) -> ParameterSpread:
         """Those of which ``chosen`` (p,) is True."""
@@ -96,39 +105,41 @@ class SimulationSpread:
         return cls(keyed, order, known.select(simulated))
 
     def told(
-        self, value: float, slopes: Array
+        self, value: float, slopes: Array, least: float = 0.0
     ) -> tuple[list[float], dict[str, float], dict[str, float], list[float]]:
         """What is known of a value by its slopes (p,) by the logarithms of all parameters.
 
         Returns
         -------
-        interval : 95 %, the value itself included; without what has another sign than the value.
-        shares : of its variance by the parameters, percent, that would go if one were known, largest first.
+        interval : 95 %, the value itself included, from ``least`` on.
+        shares : of its squared width by the parameters and `RELAXATION`, percent, that would go if one were
+            known, largest first.
         changes : of the value where each parameter of the simulation is ``CHANGE_PERCENT`` larger.
         relaxation : by which relaxation beyond the records moves the value, its standard deviation, and by
             how much the value may be lower beside that.
         """
-        if value < 0.0:  # a load that pulls the socket off moves it the other way
-            (low, high), found, changes, relaxation = self.told(-value, -slopes)
-            moved, further, fall = relaxation
-            changes = {name: -by for name, by in changes.items()}
-            return [0.0 - high, 0.0 - low], found, changes, [0.0 - moved, further, 0.0 - fall]
-        known, own = self.known, slopes[list(self.identified)]
+        known, sign = self.known, -1.0 if value < 0.0 else 1.0
+        size, own = sign * value, sign * slopes[list(self.identified)]
         along = known.covariance @ own
-        variance = float(own @ along)
+        variance = max(float(own @ along), 0.0)
         moved, further = float(own @ known.shift), max(float(own @ known.relaxation @ own), 0.0)
-        fall = limit_fall(value, float(np.sum(own * known.fall)))
-        kept = 1.0 - max(fall, 0.0) / max(value, np.finfo(float).tiny)
-        half = NORMAL_95 * np.sqrt(max(variance, 0.0) + further)
+        fall = limit_fall(size, float(np.sum(own * known.fall)))
+        kept = 1.0 - max(fall, 0.0) / max(size, np.finfo(float).tiny)
+        low, high = sorted((size, size + float(own @ known.off)))
+        width = high - low + 2.0 * NORMAL_95 * np.sqrt(variance)
+        half = NORMAL_95 * np.sqrt(variance + further)
+        low, high = kept * (low + moved - half), high + moved + half - min(fall, 0.0)
+        ends = sorted((sign * min(low, size), sign * max(high, size)))
+        rest = min(width / max(high - low, np.finfo(float).tiny), 1.0) ** 2 if known.is_relaxed else 1.0
         scale = np.maximum(np.diag(known.covariance) * variance, np.finfo(float).tiny)
-        shares = 100.0 * along**2 / scale
-        found = {self.names[self.identified[i]]: float(shares[i]) for i in np.argsort(-shares)}
+        shares = dict(zip((self.names[i] for i in self.identified), 100.0 * rest * along**2 / scale))
+        if known.is_relaxed:
+            shares[RELAXATION] = 100.0 * (1.0 - rest)
+        found = {name: float(shares[name]) for name in sorted(shares, key=lambda name: -shares[name])}
         by = _CHANGE * slopes
         changes = dict(zip(self.names, map(float, by), strict=True))
-        low, high = sorted((value, value + float(own @ known.off)))
-        low, high = kept * (low + moved - half), high + moved + half - min(fall, 0.0)
-        interval = [max(min(low, value), 0.0), max(high, value)]
-        return interval, found, changes, [moved, float(np.sqrt(further)), fall]
+        relaxation = [sign * moved, float(np.sqrt(further)), sign * fall]
+        return [max(end, least) for end in ends], found, changes, relaxation
 
 
 def spread_to_facts(
@@ -137,7 +148,9 @@ def spread_to_facts(
     """As it is stored: interval, shares, changes and relaxation, by keys with its name and unit; or none."""
     keys = tuple(f"{name}{key}" for key in (f"interval_{unit}", "interval_from", f"change_{unit}"))
     keys += (f"{name}relaxation_{unit}",)
-    found = (None,) * len(keys) if spread is None or slopes is None else spread.told(value, slopes)
+    found = (
+        (None,) * len(keys) if spread is None or slopes is None else spread.told(value, slopes, _LEAST[unit])
+    )
     return dict(zip(keys, found, strict=True))
 
 
@@ -159,7 +172,7 @@ def widen_intervals(
     """Widen the intervals of stored facts by what derivatives miss of ``draws``: steps, and facts there.
 
     That, mean and standard deviation, is stored beside each interval: ``missed_kPa``, ``settling_missed_mm``.
-    There are two draws or more.
+    The simulated values stay inside. There are two draws or more.
     """
     others = [list(_iterate_values(found)) for _, found in draws]
     for i, (row, key, name, unit) in enumerate(_iterate_values(facts)):
@@ -170,9 +183,8 @@ def widen_intervals(
         ]
         mean, sd = float(np.mean(missed)), float(np.std(missed, ddof=1))
         below, above = (float(np.hypot(end - value, NORMAL_95 * sd)) for end in (low, high))
-        ends = np.array([value + mean - below, value + mean + above])
-        ends = np.maximum(ends, 0.0) if value >= 0.0 else np.minimum(ends, 0.0)
-        row[f"{name}interval_{unit}"] = [float(end) for end in ends]
+        ends = min(value, value + mean - below), max(value, value + mean + above)
+        row[f"{name}interval_{unit}"] = [max(end, _LEAST[unit]) for end in ends]
         row[f"{name}missed_{unit}"] = [mean, sd]
 
 
