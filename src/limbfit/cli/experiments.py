@@ -218,8 +218,12 @@ def show_sensitivity(name: str, found: Any) -> None:
     print_table(found.runs, columns)
     for row in found.sites if isinstance(found, RefinementResult) else ():
         if row.limit_N is not None:
-            text = f"site {row.site}: tends to {row.limit_N:.3f} N, order {row.order:.2g}"
-            print_line(f"{text}; the study's mesh is {row.error_percent:+.2f} % off")
+            text = (
+                f"tends to {row.limit_N:.3f} N, order {row.order:.2g}"
+                if row.order
+                else (f"{row.limit_N:.3f} N on the finest mesh, from which nothing can be extrapolated")
+            )
+            print_line(f"site {row.site}: {text}; the study's mesh is {row.error_percent:+.2f} % off")
     for row in found.runs:
         if not row.completed:
             print_warning(f"partial: site {row.site}, {row.label}: {row.reason}")

@@ -8,6 +8,7 @@ import pytest
 from completing import complete
 from conftest import coarse_mesh
 from limbfit import run_study
+from limbfit.cli.experiments import show_sensitivity
 from limbfit.errors import InputError
 from limbfit.execution import SerialExecutor
 from limbfit.pipeline.engine.context import Context, Progress
@@ -24,6 +25,7 @@ from limbfit.pipeline.variants.sensitivity import (
 )
 from limbfit.pipeline.variants.variants import choose_sites
 from limbfit.results.identification import CalibrationResult
+from limbfit.results.variants import RefinementResult
 from limbfit.study import IndenterTable, load_study
 
 SETTINGS = coarse_mesh("tet4", 9.0) + "[indenter]\nedge_radius_mm = 2.0\n"
@@ -129,6 +131,16 @@ def test_extrapolation_assumes_an_order_where_none_shows():
     assert not swinging.measured
     assert not two.measured
     assert two.limit == pytest.approx(10.0)
+
+
+def test_the_command_says_that_nothing_is_extrapolated_where_an_element_has_no_order(capsys):
+    site = {"site": "01", "limit_N": 5.1, "order": None, "error_percent": -2.0}
+    show_sensitivity(
+        "mesh", RefinementResult.model_validate(complete(RefinementResult, {"sites": [site], "runs": []}))
+    )
+    told = capsys.readouterr().out
+    assert "site 01: 5.100 N on the finest mesh" in told
+    assert "-2.00 % off" in told
 
 
 def test_volumes_are_weighed():
