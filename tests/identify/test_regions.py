@@ -74,3 +74,8 @@ def test_a_partial_simulation_has_no_error():
         np.mean([fit.own_percent[f"s{i}"] for i in range(3)])
     )
     assert average_errors({"s3": None}) is None
+
+
+def test_the_records_of_a_site_count_as_that_site():
+    errors = {"a-slow": 1.0, "a-fast": 3.0, "b": 5.0, "c": None}
+    assert average_errors(errors, {"a-slow": "a", "a-fast": "a"}) == pytest.approx(3.5)

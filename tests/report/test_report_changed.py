@@ -16,9 +16,16 @@ from limbfit import compress_cube, load_study
 from limbfit.errors import InputError
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.report import build_report
+from limbfit.report.page import Prose
+from limbfit.report.sections.contents import build_summary
+from limbfit.report.sections.other_fits import make_error_table
+from limbfit.report.sections.prediction import make_site_table
 from limbfit.report.store import load_store
+from limbfit.report.words import write_words
 from limbfit.results.models import ModelsResult
 from limbfit.results.runs import RunResult, SimulateResult
+from limbfit.results.uncertainty import RegionsResult
+from limbfit.results.variants import StiffnessResult
 
 SKIN = {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.5}
 
@@ -152,6 +159,67 @@ def test_what_is_not_predicted_is_said_with_its_reason(copy: Path) -> None:
     assert "Sites not compared with the others: PO-6." in section_of(text, "doubts")
     assert "Not simulated: site PO-6, one material: lost." in section_of(text, "doubts")
     assert "not predicted" in text
+
+
+def double_a_site(copy: Path, site: str) -> None:
+    """Its record twice, in predictions and traces; the second is off by much more."""
+    file = copy / "predict" / "predict.json"
+    content = json.loads(file.read_text())
+    at = next(i for i, row in enumerate(content["sites"]) if row["site"] == site)
+    row = content["sites"][at]
+    twins = [row | {"record": f"{site}-slow"}, row | {"record": f"{site}-fast"}]
+    twins[1] |= {"error_percent": 30.0, "error_one_material_percent": 60.0}
+    content["sites"][at : at + 1] = twins
+    file.write_text(json.dumps(content))
+    file = copy / "traces" / "traces.json"
+    content = json.loads(file.read_text())
+    facts = content["sites"].pop(site)
+    content["sites"] |= {f"{site}-slow": facts, f"{site}-fast": facts}
+    file.write_text(json.dumps(content))
+
+
+def test_the_summary_and_the_table_count_the_records_of_a_site_as_that_site(copy: Path) -> None:
+    double_a_site(copy, "TI-5")
+    store = load_store(copy)
+    assert store.predict
+    table = make_site_table(store)
+    in_table = table.foot[1].cells[-2].text
+    found = build_summary(store)[0]
+    assert isinstance(found, Prose)
+    assert f"With one material for all soft tissue the held-out error is {in_table} %" in found.text
+    assert [len(errors) for errors in store.predict.compare_held_out()] == [3, 3]
+
+
+def test_records_of_a_fitted_site_are_fitted_in_the_errors_of_regions(copy: Path) -> None:
+    double_a_site(copy, "TI-2")
+    names = ("TI-2-slow", "TI-2-fast", "TI-5")
+    errors = dict.fromkeys(names, 2.0)
+    region = {"region": "tibia", "sites": ["TI-2", "TI-5"], "fitted_sites": ["TI-2"]}
+    region |= {"own_error_percent_by_site": errors, "whole_error_percent_by_site": errors}
+    content = RegionsResult.model_validate(complete(RegionsResult, {"regions": [region]}))
+    table = make_error_table(load_store(copy), content)
+    assert [[cell.text for cell in row.cells[1:3]] for row in table.rows] == [
+        ["TI-2-slow", "fitted"],
+        ["TI-2-fast", "fitted"],
+        ["TI-5", "held out"],
+    ]
+    assert [row.marked for row in table.rows] == [True, True, False]
+
+
+def test_sites_that_were_not_predicted_from_one_another_are_not_said_to_be(copy: Path) -> None:
+    file = copy / "predict" / "predict.json"
+    content = json.loads(file.read_text())
+    file.write_text(json.dumps(content | {"flags": [], "left_out": []}))
+    text = section_of(build_report(copy, copy / "report").read_text(encoding="utf-8"), "doubts")
+    assert "Nothing looks wrong" in text
+    assert "every site is predicted from the others" not in text
+
+
+@pytest.mark.parametrize("equal_m", [None, 4.7])
+def test_only_a_law_with_m_is_compared_at_equal_m(equal_m: float | None) -> None:
+    content = StiffnessResult.model_validate(complete(StiffnessResult, {"equal_m": equal_m}))
+    words = [write_words(name, content=content) for name in ("sensitivity-c", "table sensitivity-c")]
+    assert [" m" in text for text in words] == [equal_m is not None] * 2
 
 
 def test_indentations_without_records(copy: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import ClassVar
 
 from pydantic import Field
@@ -357,6 +357,15 @@ class RecordPrediction(ResultPart):
     outside_records: Sequence[OutsideRecords] = Field(description="What of it no fitted record did.")
 
 
+def average_records(errors: Iterable[tuple[str, float | None]]) -> list[float]:
+    """Average the errors of each site's records, given with its name; left out is a site that has none."""
+    found: dict[str, list[float]] = {}
+    for site, error in errors:
+        if error is not None:
+            found.setdefault(site, []).append(error)
+    return [sum(values) / len(values) for values in found.values()]
+
+
 class LeftOutRecord(ResultPart):
     """A record predicted without itself."""
 
@@ -414,3 +423,13 @@ class PredictResult(StoredResult):
     left_out: Sequence[LeftOutRecord] = Field(description="Each record predicted without itself.")
     failed: Sequence[str] = Field(description="Simulations of these checks that failed, in words.")
     fit_quality: FitSummary = Field(description="How well the model follows the records.")
+
+    def compare_held_out(self) -> tuple[list[float], list[float]]:
+        """Errors with one material, and with several, of the held-out sites that both predict."""
+        pairs = [
+            (row.site, row.error_one_material_percent, row.error_percent)
+            for row in self.sites
+            if not row.fitted and None not in (row.error_one_material_percent, row.error_percent)
+        ]
+        one, several = (average_records((pair[0], pair[column]) for pair in pairs) for column in (1, 2))
+        return one, several

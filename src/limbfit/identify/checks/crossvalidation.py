@@ -20,6 +20,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import CalibrationError
+from ...results.identification import average_records
 from ...results.uncertainty import FoldFit
 from ..fit.calibration import Calibration, CalibrationSettings, calibrate
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
@@ -249,9 +250,14 @@ def compute_site_errors(
     }
 
 
-def average_errors(errors_percent: Mapping[str, float | None]) -> float | None:
-    """Return the mean over the sites that have an error; None if none has."""
-    known = [error for error in errors_percent.values() if error is not None]
+def average_errors(
+    errors_percent: Mapping[str, float | None], sites: Mapping[str, str] | None = None
+) -> float | None:
+    """Return the mean over the sites that have an error, of their records' means; None if none has.
+
+    ``sites`` of the records, by name; by default a record is a site of its own.
+    """
+    known = average_records(((sites or {}).get(name, name), one) for name, one in errors_percent.items())
     return float(np.mean(known)) if known else None
 
 

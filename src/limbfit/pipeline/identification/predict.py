@@ -386,11 +386,8 @@ def _compute_means(rows: Sequence[stored.RecordPrediction]) -> dict[str, float |
     """
     found: dict[str, float | None] = {}
     for kind, fitted in (("fitted", True), ("heldout", False)):
-        errors: dict[str, list[float]] = {}
-        for row in rows:
-            if row.fitted == fitted and row.error_percent is not None:
-                errors.setdefault(row.site, []).append(row.error_percent)
-        summary = summarise_errors([float(np.mean(of_site)) for of_site in errors.values()])
+        chosen = [(row.site, row.error_percent) for row in rows if row.fitted == fitted]
+        summary = summarise_errors(stored.average_records(chosen))
         for name, value in (("mean", summary.mean_percent), ("sd", summary.sd_percent)):
             found[f"{name}_error_{kind}_percent"] = None if np.isnan(value) else value
     return found

@@ -107,12 +107,7 @@ def _compare_groupings(
     start = context.study.vector(context.results.calibration.stages[0].parameters)
     one, _ = fit_alternative(titles[0], single, space.reduce(np.log(start)))
     several, _ = fit_alternative(titles[1], likelihood, explored.best.z)
-    errors = [
-        (row.error_one_material_percent, row.error_percent)
-        for row in context.results.predict.sites
-        if not row.fitted and row.error_one_material_percent is not None and row.error_percent is not None
-    ]
-    return compare_models(one, several, [first for first, _ in errors], [second for _, second in errors])
+    return compare_models(one, several, *context.results.predict.compare_held_out())
 
 
 def _predict_records(

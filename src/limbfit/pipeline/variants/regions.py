@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,6 +50,7 @@ def run_regions(context: Context, folder: Path, *, sites: str = "all") -> None:
     rows = [
         _fit_region(context, folder, problem, cache, whole, name, *chosen) for name, chosen in members.items()
     ]
+    sites_of = {record.name: record.site.name for record in study.recorded}
     without = [site.name for site in recorded if not site.region]
     unfitted = dict.fromkeys(site.region for site in recorded if site.region and site.region not in members)
     left_out = [f"region {name}: none of its sites is fitted" for name in unfitted]
@@ -64,11 +65,15 @@ def run_regions(context: Context, folder: Path, *, sites: str = "all") -> None:
             fitted_sites=[site.name for site in study.fitted],
         ),
         regions=rows,
-        mean_own_error_percent=_average_sites(row.own_error_percent_by_site for row in rows),
-        mean_whole_error_percent=_average_sites(row.whole_error_percent_by_site for row in rows),
+        mean_own_error_percent=average_errors(
+            {name: one for row in rows for name, one in row.own_error_percent_by_site.items()}, sites_of
+        ),
+        mean_whole_error_percent=average_errors(
+            {name: one for row in rows for name, one in row.whole_error_percent_by_site.items()}, sites_of
+        ),
     )
     write_result(folder / "regions.json", content)
-    _write_tables(folder, content)
+    _write_tables(folder, content, sites_of)
 
 
 def check_regions(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
@@ -103,6 +108,7 @@ def _fit_region(
     records = load_records(context, study.records_at(*fitted), secondary=True)
     simulator = RecordSimulator(records, cache, context.executor, report)
     judged = [load_site_record(context, record) for record in study.records_at(*mine)]
+    sites = {record.name: record.site.name for record in judged}
 
     def identify(start: Unknowns) -> Calibration:
         return search_parameters(problem, simulator, start, problem.stages[-1:])[0]
@@ -128,20 +134,15 @@ def _fit_region(
         evaluations=found.evaluations,
         converged=found.converged,
         reason=found.reason,
-        own_error_percent=average_errors(fit.own_percent),
-        whole_error_percent=average_errors(fit.whole_percent),
+        own_error_percent=average_errors(fit.own_percent, sites),
+        whole_error_percent=average_errors(fit.whole_percent, sites),
         own_error_percent_by_site=fit.own_percent,
         whole_error_percent_by_site=fit.whole_percent,
     )
 
 
-def _average_sites(errors: Iterable[Mapping[str, float | None]]) -> float | None:
-    """Mean error over the sites of all regions."""
-    return average_errors({site: error for of_region in errors for site, error in of_region.items()})
-
-
-def _write_tables(folder: Path, content: RegionsResult) -> None:
-    """Table 3 as CSV: parameters by region, and errors by site."""
+def _write_tables(folder: Path, content: RegionsResult, sites: Mapping[str, str]) -> None:
+    """Table 3 as CSV: parameters by region, and errors by record, whose ``sites`` are given by name."""
     whole, rows = content.whole, content.regions
     heads = ["tissue", "parameter", "start", "whole_limb"]
     lines = []
@@ -151,9 +152,9 @@ def _write_tables(folder: Path, content: RegionsResult) -> None:
             lines.append([*cells, *(row.parameters[tissue][key] for row in rows)])
     write_table(folder / "parameters.csv", [*heads, *(row.region for row in rows)], lines)
     errors = [
-        [row.region, site, site in row.fitted_sites, own, row.whole_error_percent_by_site[site]]
+        [row.region, name, sites[name] in row.fitted_sites, own, row.whole_error_percent_by_site[name]]
         for row in rows
-        for site, own in row.own_error_percent_by_site.items()
+        for name, own in row.own_error_percent_by_site.items()
     ]
     heads = ["region", "site", "fitted", "own_error_percent", "whole_limb_error_percent"]
     write_table(folder / "errors.csv", heads, errors)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable
+from statistics import fmean
 from typing import Any
 
 from ...extensions import Registry
@@ -128,15 +128,13 @@ def _label_modulus(store: Results, tissue: str) -> str:
 def build_summary(store: Results) -> tuple[Block, ...]:
     """One paragraph in plain words, then the verdict."""
     heldout = [row for row in store.predicted if not row.fitted]
-    pairs = [(row.error_one_material_percent, row.error_percent) for row in heldout]
-    known = [(one, several) for one, several in pairs if one is not None and several is not None]
     prose = make_prose(
         "summary",
         store=store,
         heldout=heldout,
         sites=len({row.site for row in heldout}),
         errors=[row.error_percent for row in heldout if row.error_percent is not None],
-        means=[statistics.fmean(column) for column in zip(*known, strict=True)],
+        means=[fmean(one) for one in store.predict.compare_held_out() if one] if store.predict else [],
     )
     return make_section("summary", "Summary", prose, make_bullets(_list_verdicts(store))).blocks
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
-from ...results.uncertainty import CrossvalidateResult, RegionsResult
+from ...results.uncertainty import CrossvalidateResult, RegionFitted, RegionsResult
 from ..drawing.colours import HELD_OUT, INK, MUTED, ONE_MATERIAL, SIMULATED, choose_tissue_style
 from ..drawing.plots import add_legend, make_figure, make_panels, set_log_scale, styled
 from ..formats import format_fixed, format_with_unit
@@ -70,13 +70,20 @@ def make_regions_section(store: Results, content: RegionsResult) -> Section:
         make_prose("regions", content=content, verdicts=verdicts),
         make_bullets(f"Left out: {text}." for text in content.left_out),
         make_table("regions", parameters, store=store, content=content),
-        _make_error_table(content),
+        make_error_table(store, content),
         _draw_regions(store, content),
     )
 
 
-def _make_error_table(content: RegionsResult) -> Table:
-    rows = [(region, site) for region in content.regions for site in region.own_error_percent_by_site]
+def make_error_table(store: Results, content: RegionsResult) -> Table:
+    """The errors of each region's records with its own model and with the whole limb's."""
+
+    def is_fitted(row: tuple[RegionFitted, str]) -> bool:
+        region, record = row
+        facts = store.traces.get(record)
+        return (facts.site if facts else record) in region.fitted_sites
+
+    rows = [(region, record) for region in content.regions for record in region.own_error_percent_by_site]
     foot = []
     for region in content.regions:
         errors = region.own_error_percent, region.whole_error_percent
@@ -84,7 +91,7 @@ def _make_error_table(content: RegionsResult) -> Table:
         number_of_sites = f"{len(region.sites)} site{'s' if len(region.sites) > 1 else ''}"
         end = "" if region.converged else "not converged"
         foot.append(make_row(f"Mean, {region.region}", number_of_sites, end, *means))
-    return make_table("region-errors", rows, marked=lambda row: row[1] in row[0].fitted_sites, foot=foot)
+    return make_table("region-errors", rows, marked=is_fitted, foot=foot, is_fitted=is_fitted)
 
 
 @styled

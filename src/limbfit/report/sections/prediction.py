@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from ...results.identification import RecordPrediction
+from ...results.identification import RecordPrediction, average_records
 from ..drawing import figures
 from ..drawing.pictures import draw_field_figure
 from ..formats import NOTHING, format_fixed
@@ -82,26 +82,17 @@ def make_site_table(store: Results) -> Table:
 def _make_mean_rows(store: Results) -> Iterable[Row]:
     for fitted, use, key in ((True, "fitted", "fitted"), (False, "held out", "heldout")):
         chosen = [row for row in store.predicted if row.fitted == fitted]
-        one = _average_by_site((row.site, row.error_one_material_percent) for row in chosen)
+        one = average_records((row.site, row.error_one_material_percent) for row in chosen)
         if chosen:
             mean = to_numeric(format_fixed(sum(one) / len(one)) if one else NOTHING)
             cells = (_count_sites(chosen), use, to_numeric(""), to_numeric(""), mean)
             yield make_row(f"Mean, {use}", *cells, to_numeric(store.mean_error(key)))
 
 
-def _average_by_site(errors: Iterable[tuple[str, float | None]]) -> list[float]:
-    """A value of each site: the mean over its records that have one."""
-    found: dict[str, list[float]] = {}
-    for site, error in errors:
-        if error is not None:
-            found.setdefault(site, []).append(error)
-    return [sum(values) / len(values) for values in found.values()]
-
-
 def _count_sites(rows: Sequence[RecordPrediction]) -> str:
     """How many sites, and how many of them the mean lacks."""
     sites = len({row.site for row in rows})
-    lacking = sites - len(_average_by_site((row.site, row.error_percent) for row in rows))
+    lacking = sites - len(average_records((row.site, row.error_percent) for row in rows))
     return f"{sites} site{'s' if sites > 1 else ''}" + (f", without {lacking}" if lacking else "")
 
 

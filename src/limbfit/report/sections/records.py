@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 
+from ...identify.checks.outliers import MAX_STANDARDISED_ERROR, MIN_ERROR_SHARE
 from ...results.records import RecordPhase
 from ..drawing.colours import GRID, INK, MUTED, SIMULATED
 from ..drawing.figures import thin_curves
@@ -16,7 +17,6 @@ from ..store import Curves, Results
 from ..words import make_prose, make_table
 
 MAX_NAMED_PHASES = 6  # whose names have room in a panel
-MARKED_ERROR = 4.0  # standardised errors from here on are marked
 
 
 def make_record_section(store: Results) -> Section:
@@ -85,9 +85,15 @@ def make_record_check_section(store: Results) -> Section:
         "Records in doubt",
         _list_failures(store),
         make_bullets(f"{flag.text[:1].upper()}{flag.text[1:]}." for flag in flags)
-        or make_prose("nothing doubtful"),
+        or make_prose("nothing doubtful", left_out=left_out),
         make_table("flags", flags, format_words=_format_words) if flags else None,
-        make_table("left-out", left_out, marked=lambda row: row.standardised > MARKED_ERROR, fitted=fitted)
+        make_table(
+            "left-out",
+            left_out,
+            marked=lambda row: row.standardised > MAX_STANDARDISED_ERROR,
+            fitted=fitted,
+            least=100 * MIN_ERROR_SHARE,
+        )
         if left_out
         else None,
     )

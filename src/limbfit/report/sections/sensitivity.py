@@ -46,7 +46,7 @@ def make_sensitivity_section(store: Results, content: Compared, name: str) -> Se
         make_prose(name, content=content, **facts),
         make_prose("leading tissues", found=_find_leading_tissues(stiffness)) if stiffness else None,
         draw_figure(store, content),
-        make_table(name, content.runs, marked="base", words=words, title=title),
+        make_table(name, content.runs, marked="base", words=words, title=title, content=content),
         make_table("sensitivity-c-local", stiffness.local, content=content) if stiffness else None,
         _list_warnings(content),
     )
@@ -76,7 +76,7 @@ def _draw_stiffness_figure(store: Results, content: StiffnessResult) -> Figure:
     _draw_derivatives(axes[-1], content, tissues)
     axes[0].set_ylabel("Force (N)")
     add_legend(drawing, axes[0], columns=5)
-    return make_figure(drawing, "sensitivity-c")
+    return make_figure(drawing, "sensitivity-c", content=content)
 
 
 def _draw_curves(ax: Axes, store: Results, name: str, site: VariedSite, content: Compared) -> None:
