@@ -52,6 +52,10 @@ def test_an_unloading_that_the_model_cannot_follow_is_named() -> None:
     assert max(phase.times_noise for phase in found.phases[:2]) < 1.5
     assert found.verdict.startswith("the model cannot follow the unloading at 05: 4.")
     assert "of the largest force" in found.verdict
+    crept = assess_fit(
+        "05", True, TIMES, DEPTH, draw_noise(1) + bump, PEAK, COVARIANCE, compared="displacement"
+    )
+    assert crept.verdict == found.verdict.replace("force", "displacement")
     others = [assess(draw_noise(seed)) for seed in (2, 3)]
     assert summarise_fit([*others, found]) == found.verdict
 

@@ -222,6 +222,20 @@ def test_only_a_law_with_m_is_compared_at_equal_m(equal_m: float | None) -> None
     assert [" m" in text for text in words] == [equal_m is not None] * 2
 
 
+def test_records_under_a_stated_force_have_errors_of_displacement(copy: Path) -> None:
+    file = copy / "predict" / "predict.json"
+    content = json.loads(file.read_text())
+    content["sites"] = [row | {"control": "force"} for row in content["sites"]]
+    file.write_text(json.dumps(content))
+    text = build_report(copy, copy / "report").read_text(encoding="utf-8")
+    assert "the model predicts the displacement with a mean error of" in text
+    assert "mean displacement error at the held-out sites" in text
+    prediction = section_of(text, "prediction")
+    assert "divided by the largest measured displacement" in prediction
+    assert "largest force, by phase" not in prediction
+    assert "mean absolute displacement difference over the trace" in section_of(text, "method")
+
+
 def test_indentations_without_records(copy: Path) -> None:
     for part in ("traces", "calibrate", "predict"):
         shutil.rmtree(copy / part)

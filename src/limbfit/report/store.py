@@ -71,6 +71,12 @@ class Results:
         """A row of each record."""
         return self.predict.sites if self.predict else ()
 
+    @property
+    def compared_quantity(self) -> str:
+        """What records compare: ``force``, ``displacement`` where they state the force, or either."""
+        forced = [row.control == "force" for row in self.predicted]
+        return "force" if not any(forced) else "displacement" if all(forced) else "force or displacement"
+
     def records_of(self, site: str) -> tuple[str, ...]:
         """Names of the records of a site that are stored."""
         return tuple(name for name, facts in self.traces.items() if facts.site == site)

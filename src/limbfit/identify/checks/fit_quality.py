@@ -57,13 +57,15 @@ def assess_fit(
     covariance: Array,
     inside: Mask | None = None,
     refitted_N: Array | None = None,
+    compared: str = "force",
 ) -> RecordFit:
     """Assess ``residual_N`` (n,), simulated minus measured, with ``covariance`` (n, n) of what may be off.
 
     ``depth_mm`` (n,) tells the phases, ``peak_N`` is the largest measured force, ``inside`` (n,) whether each
     point lies in its 95 % band. ``refitted_N`` (n,) are the residuals of `refit_residuals`, which are beside
-    the covariance; by default those of the answer. A held-out record is judged by the band, which counts how
-    well the parameters are known.
+    the covariance; by default those of the answer. Where the force is stated, ``depth_mm`` holds it, all else
+    is lengths, and ``compared`` is the displacement. A held-out record is judged by the band, which counts
+    how well the parameters are known.
     """
     refitted = residual_N if refitted_N is None else refitted_N
     white = _whiten(refitted, covariance)
@@ -82,7 +84,7 @@ def assess_fit(
         phases=phases,
         verdict="",
     )
-    verdict = _describe_fitted(found) if fitted else _describe_held_out(found)
+    verdict = _describe_fitted(found, compared) if fitted else _describe_held_out(found, compared)
     return found.model_copy(update={"verdict": verdict})
 
 
@@ -155,23 +157,23 @@ def _is_clear(phase: PhaseFit) -> bool:
     return phase.times_noise >= _MIN_TIMES_NOISE and phase.error_percent >= 100 * _MIN_SHARE
 
 
-def _describe_fitted(found: RecordFit) -> str:
+def _describe_fitted(found: RecordFit, compared: str) -> str:
     clear = [phase for phase in found.phases if _is_clear(phase)]
     if not clear or found.ljung_box_p > _CLEAR_P:
         return ""
     worst = max(clear, key=lambda phase: phase.error_percent)
     return (
         f"the model cannot follow the {worst.phase} at {found.record}: {worst.error_percent:.2g} % of the "
-        f"largest force, {worst.times_noise:.2g} times what noise, touch-down, mesh and site explain"
+        f"largest {compared}, {worst.times_noise:.2g} times what noise, touch-down, mesh and site explain"
     )
 
 
-def _describe_held_out(found: RecordFit) -> str:
+def _describe_held_out(found: RecordFit, compared: str) -> str:
     inside = found.inside_95
     if inside is None or inside >= _FEW_INSIDE or not any(map(_is_clear, found.phases)):
         return ""
     worst = max(found.phases, key=lambda phase: phase.error_percent)
     return (
         f"{found.record} is not predicted: {100 * inside:.0f} % of its points lie in the 95 % band, "
-        f"and the {worst.phase} is off by {worst.error_percent:.2g} % of the largest force"
+        f"and the {worst.phase} is off by {worst.error_percent:.2g} % of the largest {compared}"
     )

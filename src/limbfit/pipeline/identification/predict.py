@@ -305,6 +305,7 @@ def _assess_fits(
                 allowed[i],
                 (record.compared >= band.low) & (record.compared <= band.high),
                 left.get(i),
+                "displacement" if record.record.forced else "force",
             )
         )
     return found

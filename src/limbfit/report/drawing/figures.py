@@ -195,8 +195,10 @@ def draw_error_figure(store: Results) -> Figure | None:
         ax.barh(at, error, color=color, alpha=0.75, hatch=hatch, height=0.62)
         ax.text(error, at, f" {format_fixed(error)}", va="center", fontsize=8)
     plots.set_rows(ax, [f"{row.record} ({'fitted' if row.fitted else 'held out'})" for row, _ in rows])
-    ax.set_xlabel("Mean absolute error over largest force (%)")
-    return plots.make_figure(drawing, "errors", rows=[row for row, _ in rows])
+    ax.set_xlabel(f"Mean absolute error over largest {store.compared_quantity} (%)")
+    return plots.make_figure(
+        drawing, "errors", rows=[row for row, _ in rows], compared=store.compared_quantity
+    )
 
 
 @plots.styled

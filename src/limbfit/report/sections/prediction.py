@@ -37,7 +37,9 @@ def make_prediction_section(store: Results) -> Section:
         "prediction",
         "All sites, held-out sites",
         make_site_table(store) if store.predicted else None,
-        make_table("fit-quality", quality.records, marked="fitted", found=quality)
+        make_table(
+            "fit-quality", quality.records, marked="fitted", found=quality, compared=store.compared_quantity
+        )
         if quality and quality.records
         else None,
         figures.draw_error_figure(store),
