@@ -27,7 +27,7 @@ from limbfit.identify.uncertainty.superposition import (
     Superposition,
     find_tissue_parameters,
 )
-from limbfit.identify.uncertainty.uncertainty import DETERMINED, estimate_uncertainty
+from limbfit.identify.uncertainty.uncertainty import DETERMINED, WEAK, estimate_uncertainty
 
 SPACE = build_space(PAPER, group_separately(NAMES))
 TISSUES = find_tissue_parameters(NAMES, SPACE)
@@ -188,6 +188,13 @@ def test_records_of_the_model_prefer_it_and_leave_the_long_term_open(of_model):
         for number, (c, _, gamma, tau) in enumerate(TRUTH.reshape(2, 4)):
             low, high = of_model.state_modulus(number, time)[1]
             assert low < c * (1 + gamma * np.exp(-time / tau)) < high
+
+
+def test_a_modulus_that_is_weakly_determined_at_all_times_is_not_called_undetermined(of_model):
+    spread = of_model.spread
+    open_log = np.broadcast_to(0.03 * np.eye(len(NAMES)), spread.covariance_log.shape)
+    wider = replace(spread, covariance_log=open_log, fall_log=0 * spread.fall_log)
+    assert replace(of_model, spread=wider).qualify_verdicts()[4] == WEAK
 
 
 def test_records_of_a_power_law_are_told_and_later_moduli_lie_inside(of_power_law):

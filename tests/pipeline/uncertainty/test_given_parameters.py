@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from completing import complete
 from layered import block_context, block_study
@@ -63,13 +64,22 @@ def test_every_row_of_a_table_has_its_values_under_their_heads(tmp_path):
         assert sorted(line["profile_95_low"] for line in lines) == ["", "1"]
 
 
-def test_one_material_keeps_what_the_study_fixes(tmp_path):
+HELD_OUT = [
+    {"site": site, "fitted": False, "error_one_material_percent": one, "error_percent": 1.0}
+    for site, one in (("2", 2.0), ("2", 2.1), ("2", 2.2), ("3", 1.5))
+]
+
+
+def test_one_material_keeps_what_the_study_fixes_and_is_judged_at_each_site_once(tmp_path):
     (tmp_path / "study.toml").write_text(STUDY)
     (tmp_path / "skin.stl").touch()
     study = load_study(tmp_path)
     answer = study.by_tissue(TRUTH)
     stage = {"parameters": answer}
-    for model, content in ((CalibrationResult, {"stages": [stage, stage]}), (PredictResult, {})):
+    for model, content in (
+        (CalibrationResult, {"stages": [stage, stage]}),
+        (PredictResult, {"sites": HELD_OUT}),
+    ):
         file = study.results / model.FILE
         file.parent.mkdir(parents=True)
         file.write_text(json.dumps(complete(model, content)))
@@ -86,6 +96,8 @@ def test_one_material_keeps_what_the_study_fixes(tmp_path):
     context = Context(study, Store(study.results), None, lambda event: None)
     found = _compare_groupings(context, problem, explored)
     assert found.second.parameters - found.first.parameters == 3  # c, m and gamma of one tissue more
+    assert (found.heldout["sites"], found.heldout["first_percent"]) == pytest.approx((2.0, 1.8))
+    assert "at 2 held-out sites both predict alike" in found.verdict
 
 
 def test_intervals_of_predictions_widen_beyond_the_longest_load_as_those_of_a_run(tmp_path):
@@ -103,7 +115,7 @@ def test_intervals_of_predictions_widen_beyond_the_longest_load_as_those_of_a_ru
     noise = estimate_site_noise(context.study, record, response.force_N)
     model = ResidualModel((noise,), np.array([3.0]), np.array([0.01]), 0.2, 10.0)
     known = SimpleNamespace(residual_model=model, parameters=parameters, covariance=no_spread)
-    explored = SimpleNamespace(posterior=SimpleNamespace(covariance=no_spread))
+    explored = SimpleNamespace(posterior=SimpleNamespace(covariance=no_spread, median=parameters))
     rows, curves = [], []
     for one in (None, relaxation):
         found = Found(known, explored, None, None, (), one)
@@ -115,3 +127,37 @@ def test_intervals_of_predictions_widen_beyond_the_longest_load_as_those_of_a_ru
     np.testing.assert_array_equal(wide[~later], low[~later])
     np.testing.assert_allclose(wide[later], np.maximum(low[later] - 1.5, 0.0), atol=1e-6)
     assert rows[1].half_width_percent > rows[0].half_width_percent + 5.0
+
+
+def test_an_interval_covers_what_is_most_probable_beside_the_answer(tmp_path):
+    data, response = records(0.01)[0], simulate(TRUTH)[0]
+    (noise, *_) = estimate_curve_noise([response], [data])
+    known = estimate_uncertainty(
+        TRUTH, simulate(TRUTH), records(0.01), PAPER, estimate_curve_noise(simulate(TRUTH), records(0.01))
+    )
+    likely = TRUTH * np.exp(0.3)
+    posterior = SimpleNamespace(covariance=1e-6 * np.eye(len(TRUTH)), median=likely)
+    found = SimpleNamespace(
+        known=known,
+        explored=SimpleNamespace(posterior=posterior),
+        source_covariance=0 * posterior.covariance,
+        relaxation=None,
+    )
+    record = SimpleNamespace(
+        name=data.name,
+        site=SimpleNamespace(name=data.name, fitted=True),
+        compared=data.force_N,
+        record=SimpleNamespace(forced=False, unit="N"),
+        times_s=noise.times_s,
+        touch_down_sd_mm=0.0,
+        displacement_mm=noise.times_s,
+        seen=SimpleNamespace(noise=lambda *_: noise),
+    )
+    (tmp_path / "predictions").mkdir()
+    row = _write_prediction(tmp_path, None, found, record, response)
+    curves = read_curves(tmp_path / "predictions" / f"{data.name}.csv")
+    elsewhere = response.force_N + response.jacobian @ (0.3 * TRUTH)
+    for force in (response.force_N, elsewhere):
+        assert np.all(curves["force_low_N"] <= np.maximum(force, 0.0) + 1e-3)
+        assert np.all(curves["force_high_N"] >= force - 1e-3)
+    assert row.half_width_percent > 50 * np.abs(elsewhere - response.force_N).mean() / response.force_N.max()

@@ -89,6 +89,15 @@ def compute_prediction_sd(
     return np.sqrt(np.einsum("ni,ij,nj->n", scaled, covariance_log, scaled) + noise_N**2)
 
 
+def cover_most_probable(
+    response: SiteResponse, parameters: Array, most_probable: Array
+) -> tuple[Array, Array]:
+    """Return the lower and the higher (n,) of the force at the parameters (p,), and of that at the most
+    probable ones (p,), linearised."""
+    other = response.force_N + response.jacobian @ (parameters * np.log(most_probable / parameters))
+    return np.minimum(response.force_N, other), np.maximum(response.force_N, other)
+
+
 def limit_fall(value: float, fall: float) -> float:
     """By how much a force or pressure falls where moduli do, of what is ``fall`` to first order.
 
@@ -238,7 +247,5 @@ class PredictionModel:
             own_N = np.hypot(own_N, relaxation_N)
         sd = compute_prediction_sd(response.jacobian, parameters, self.covariance_log, own_N)
         half = compute_half_width_95(sd**2, misfit_N**2, site_N**2, self.known_scale, self.site_freedom)
-        off = np.log(self.most_probable / parameters)
-        other = response.force_N + response.jacobian @ (parameters * off)
-        low, high = np.minimum(response.force_N, other), np.maximum(response.force_N, other)
+        low, high = cover_most_probable(response, parameters, self.most_probable)
         return low + np.minimum(lower_N, 0.0) - half, high + np.maximum(higher_N, 0.0) + half

@@ -31,7 +31,6 @@ from .superposition import RelaxationModel, Superposition, TissueParameters, fin
 from .uncertainty import (
     DETERMINED,
     NORMAL_95,
-    UNDETERMINED,
     WEAK,
     PriorPrecision,
     Uncertainty,
@@ -136,13 +135,13 @@ class RelaxationAssessment:
     def qualify_verdicts(self) -> tuple[str, ...]:
         """Return the verdicts (p,) on parameters for what relaxation beyond the records leaves of them.
 
-        A modulus is determined if it is so `LONG_TERM_S` after a step, amplitudes and times if the records
+        A modulus is as well determined as `LONG_TERM_S` after a step, amplitudes and times if the records
         prefer the model's terms to other relaxations.
         """
 
-        def is_determined(number: int, duration_s: float) -> bool:
+        def judge(number: int, duration_s: float) -> str:
             low, high = self.state_modulus(number, duration_s)[1]
-            return choose_verdict(float(np.sqrt(high / low)), 0.0) == DETERMINED
+            return choose_verdict(float(np.sqrt(high / low)), 0.0)
 
         verdicts = list(self.known.verdicts)
         for number, tissue in enumerate(self.tissues):
@@ -150,9 +149,10 @@ class RelaxationAssessment:
                 if verdicts[i] in (DETERMINED, WEAK) and self.preferred != OWN:
                     verdicts[i] = NOT_ALONE
             modulus = tissue.moduli[0]
-            if verdicts[modulus] in (DETERMINED, WEAK) and not is_determined(number, LONG_TERM_S):
-                times = [f"{time:g} s" for time in STATED_S if is_determined(number, time)]
-                verdicts[modulus] = NOT_LONG_TERM.format(" and ".join(times)) if times else UNDETERMINED
+            long_term = judge(number, LONG_TERM_S)
+            if verdicts[modulus] in (DETERMINED, WEAK) and long_term != DETERMINED:
+                times = [f"{time:g} s" for time in STATED_S if judge(number, time) == DETERMINED]
+                verdicts[modulus] = NOT_LONG_TERM.format(" and ".join(times)) if times else long_term
         return tuple(verdicts)
 
     def summarise(self) -> RelaxationSummary:
