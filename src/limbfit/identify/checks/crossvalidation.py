@@ -5,7 +5,7 @@ choice, or a sample of them, is fitted and predicts the sites that it did not se
 leaves a region out. It takes thousands of fits, so ``simulate`` is meant to be an emulator that was checked
 against the solver; the region in which it is valid enters as the bounds of ``unknowns``.
 
-`fit_regions` fits a model of each region of the limb, to compare with that of the whole limb (the paper's
+`fit_region` fits a model of a region of the limb, to compare with that of the whole limb (the paper's
 table 3).
 """
 
@@ -29,7 +29,7 @@ from ..fit.prediction import ErrorSummary, compute_error_percent, compute_errors
 from ..uncertainty.uncertainty import reduce_covariance
 
 Choice = tuple[int, ...]
-Identify = Callable[[Unknowns], Calibration]
+SiteErrors = dict[str, float | None]  # percent; None where a simulation did not reach the record's end
 
 _MAX_LISTED_CHOICES = 20_000  # choices that are listed before some are drawn
 _CANDIDATES = 600
@@ -193,56 +193,27 @@ def summarise_errors_by_site(folds: Sequence[Fold], sites: int) -> tuple[ErrorSu
     )
 
 
-@dataclass(frozen=True)
-class RegionRecords:
-    """The records of a region.
+def fit_region(
+    identify: Callable[[Unknowns], Calibration],
+    simulate: Simulate,
+    measured: Sequence[MeasuredCurve],
+    unknowns: Unknowns,
+    whole_parameters: Array,
+) -> tuple[Calibration, SiteErrors, SiteErrors]:
+    """Fit a region from the whole limb's parameters (p,); return its own model, its errors and theirs.
 
-    Parameters
-    ----------
-    identify : finds parameters from the records of the region's fitted sites.
-    simulate : returns the force at all of its sites, in the order of ``measured``.
-    """
-
-    identify: Identify
-    simulate: Simulate
-    measured: tuple[MeasuredCurve, ...]
-
-
-@dataclass(frozen=True)
-class RegionFit:
-    """A region's own model, and the errors (percent, by site) of it and of the whole limb's model.
-
-    An error is None if the simulation did not reach the end of the record.
-    """
-
-    calibration: Calibration
-    own_percent: dict[str, float | None]
-    whole_percent: dict[str, float | None]
-
-
-def fit_regions(
-    regions: Mapping[str, RegionRecords], unknowns: Unknowns, whole_parameters: Array
-) -> dict[str, RegionFit]:
-    """Fit the parameters of each region, started from those of the whole limb.
-
-    Parameters
-    ----------
-    unknowns : names and bounds; their start is not used.
-    whole_parameters : (p,) those identified for the whole limb.
+    ``identify`` finds parameters from the records of the region's fitted sites, ``simulate`` returns the
+    force at all of its sites, in the order of ``measured``. The start of the ``unknowns`` is not used.
     """
     start = unknowns.with_start(np.clip(whole_parameters, unknowns.lower, unknowns.upper))
-    fits = {}
-    for name, region in regions.items():
-        whole_percent = compute_site_errors(region.simulate, whole_parameters, region.measured)
-        found = region.identify(start)
-        own_percent = compute_site_errors(region.simulate, found.parameters, region.measured)
-        fits[name] = RegionFit(found, own_percent, whole_percent)
-    return fits
+    whole = compute_site_errors(simulate, whole_parameters, measured)
+    found = identify(start)
+    return found, compute_site_errors(simulate, found.parameters, measured), whole
 
 
 def compute_site_errors(
     simulate: Simulate, parameters: Array, measured: Sequence[MeasuredCurve]
-) -> dict[str, float | None]:
+) -> SiteErrors:
     """Return the force error of each site in percent; None if its simulation is not complete."""
     return {
         site.name: compute_error_percent(response.force_N, site.force_N) if response.completed else None

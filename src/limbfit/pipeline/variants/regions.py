@@ -9,7 +9,7 @@ from typing import Any
 
 from ...arrays import Array
 from ...errors import InputError, StudyError
-from ...identify.checks.crossvalidation import RegionRecords, average_errors, fit_regions
+from ...identify.checks.crossvalidation import average_errors, fit_region
 from ...identify.fit.calibration import Calibration
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import Unknowns
@@ -118,9 +118,9 @@ def _fit_region(
         jobs = [record.own_job(parameters) if apart else record.job(parameters) for record in judged]
         return [to_response(one) for one in cache.run(jobs, context.executor)]
 
-    region = RegionRecords(identify, simulate, tuple(record.measured for record in judged))
-    fit = fit_regions({name: region}, problem.unknowns, whole)[name]
-    found, responses = fit.calibration, list(fit.calibration.responses)
+    measured = [record.measured for record in judged]
+    found, own, of_whole = fit_region(identify, simulate, measured, problem.unknowns, whole)
+    responses = list(found.responses)
     coarser = plan_coarser_meshes(context, records, folder / "coarser")
     correction, spent = correct_answer(problem, simulator, found.parameters, responses, coarser)
     _, known = sample_intervals(problem, simulator, found, correction, spent, moves=False)
@@ -134,10 +134,10 @@ def _fit_region(
         evaluations=found.evaluations,
         converged=found.converged,
         reason=found.reason,
-        own_error_percent=average_errors(fit.own_percent, sites),
-        whole_error_percent=average_errors(fit.whole_percent, sites),
-        own_error_percent_by_site=fit.own_percent,
-        whole_error_percent_by_site=fit.whole_percent,
+        own_error_percent=average_errors(own, sites),
+        whole_error_percent=average_errors(of_whole, sites),
+        own_error_percent_by_site=own,
+        whole_error_percent_by_site=of_whole,
     )
 
 
