@@ -159,17 +159,6 @@ class Robot:
         return self.noise_N * noise
 
 
-def read_emulator(file: Path) -> Emulator:
-    """The emulator of stored runs."""
-    with np.load(file, allow_pickle=False) as stored:
-        ends = np.cumsum(stored["sizes"])[:-1]
-        runs = [
-            [SiteResponse(f, j) for f, j in zip(np.split(force, ends), np.split(jacobian, ends))]
-            for force, jacobian in zip(stored["forces"], stored["jacobians"])
-        ]
-        return Emulator(stored["points"], runs)
-
-
 @dataclass(frozen=True)
 class Smoothed:
     """An emulator whose forces are smoothed, by a matrix (n, n) per site, as their records are."""

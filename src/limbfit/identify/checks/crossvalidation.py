@@ -25,7 +25,7 @@ from ...results.uncertainty import FoldFit
 from ..fit.calibration import Calibration, CalibrationSettings, calibrate
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
 from ..fit.parameters import Grouping, SearchSpace, Unknowns, group_separately
-from ..fit.prediction import ErrorSummary, compute_error_percent, compute_errors_percent, summarise_errors
+from ..fit.prediction import compute_error_percent, compute_errors_percent, summarise_errors
 from ..uncertainty.uncertainty import reduce_covariance
 
 Choice = tuple[int, ...]
@@ -185,12 +185,12 @@ def rank_fold(ranked: Fold, folds: Sequence[Fold]) -> dict[str, float | None]:
     }  # fmt: skip
 
 
-def summarise_errors_by_site(folds: Sequence[Fold], sites: int) -> tuple[ErrorSummary, ...]:
+def summarise_errors_by_site(
+    folds: Sequence[Fold], sites: int
+) -> list[tuple[int, float | None, float | None]]:
     """Summarise the errors of each site over the folds that did not fit it."""
-    return tuple(
-        summarise_errors([fold.errors_percent[i] for fold in folds if i not in fold.fitted])
-        for i in range(sites)
-    )
+    errors = [[fold.errors_percent[i] for fold in folds if i not in fold.fitted] for i in range(sites)]
+    return [summarise_errors(of_site) for of_site in errors]
 
 
 def fit_region(

@@ -55,22 +55,11 @@ def compute_half_width_95(
     return np.asarray(stdtrit(freedom, 0.975) * np.sqrt(variance))
 
 
-@dataclass(frozen=True)
-class ErrorSummary:
-    """Mean and standard deviation (n - 1) of errors in percent; nan where there are too few sites."""
-
-    sites: int
-    mean_percent: float
-    sd_percent: float
-
-
-def summarise_errors(errors_percent: Sequence[float]) -> ErrorSummary:
-    """Summarise the errors of a group of sites."""
+def summarise_errors(errors_percent: Sequence[float]) -> tuple[int, float | None, float | None]:
+    """Return number, mean and standard deviation (n - 1) of errors; None where there are too few."""
     errors = np.asarray(errors_percent, dtype=float)
-    if errors.size == 0:
-        return ErrorSummary(0, np.nan, np.nan)
-    sd = float(errors.std(ddof=1)) if errors.size > 1 else np.nan
-    return ErrorSummary(errors.size, float(errors.mean()), sd)
+    sd = float(errors.std(ddof=1)) if errors.size > 1 else None
+    return errors.size, float(errors.mean()) if errors.size else None, sd
 
 
 def compute_prediction_sd(
@@ -89,7 +78,7 @@ def compute_prediction_sd(
     return np.sqrt(np.einsum("ni,ij,nj->n", scaled, covariance_log, scaled) + noise_N**2)
 
 
-def cover_most_probable(
+def compute_force_range(
     response: SiteResponse, parameters: Array, most_probable: Array
 ) -> tuple[Array, Array]:
     """Return the lower and the higher (n,) of the force at the parameters (p,), and of that at the most
@@ -247,5 +236,5 @@ class PredictionModel:
             own_N = np.hypot(own_N, relaxation_N)
         sd = compute_prediction_sd(response.jacobian, parameters, self.covariance_log, own_N)
         half = compute_half_width_95(sd**2, misfit_N**2, site_N**2, self.known_scale, self.site_freedom)
-        low, high = cover_most_probable(response, parameters, self.most_probable)
+        low, high = compute_force_range(response, parameters, self.most_probable)
         return low + np.minimum(lower_N, 0.0) - half, high + np.maximum(higher_N, 0.0) + half

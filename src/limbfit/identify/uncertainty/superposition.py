@@ -90,9 +90,6 @@ class RelaxationModel:
     def has_tail(self) -> bool:
         return self.spectrum_s is None and self.slope != 0.0
 
-    def has_spectrum(self, tissue: TissueParameters) -> bool:
-        return self.spectrum_s is not None and not tissue.is_given
-
     def terms(self, tissue: TissueParameters, p: Array) -> RelaxationTerms:
         """The relaxation of a tissue; the model's terms come first."""
         own = tissue.own_terms(p)
@@ -155,7 +152,7 @@ class Superposition:
             slopes[:, tissue.moduli] = relaxed[:, :n] * factors[:n]
             slopes[:, tissue.moduli[0]] += relaxed[:, n:] @ factors[n:]
             slopes[:, tissue.others] = relaxed[:, n:] * factors[0]
-            if world.has_spectrum(tissue):
+            if world.spectrum_s is not None and not tissue.is_given:
                 slopes[:, tissue.amplitudes[0]] = (relaxed - elastic) @ factors
                 over_end = terms.amplitudes * terms.times_s / (world.longest_s * p[tissue.times[0]])
                 slopes[:, tissue.times[0]] = np.tensordot(over_end, histories, 1) @ factors

@@ -228,12 +228,12 @@ def _build_result(
                 site=name,
                 region=regions[name],
                 fitted=i in found.own.fitted,
-                left_out_of=summary.sites,
-                mean_percent=None if np.isnan(summary.mean_percent) else summary.mean_percent,
-                sd_percent=None if np.isnan(summary.sd_percent) else summary.sd_percent,
+                left_out_of=count,
+                mean_percent=mean,
+                sd_percent=sd,
                 own_percent=found.own.errors_percent[i],
             )
-            for i, (name, summary) in enumerate(zip(sites, by_site))
+            for i, (name, (count, mean, sd)) in enumerate(zip(sites, by_site))
         ],
         regions=[fold.summarise(sites, names) for fold in found.regions],
         folds=[fold.summarise(sites, names) for fold in found.folds],

@@ -388,7 +388,6 @@ def _compute_means(rows: Sequence[stored.RecordPrediction]) -> dict[str, float |
     found: dict[str, float | None] = {}
     for kind, fitted in (("fitted", True), ("heldout", False)):
         chosen = [(row.site, row.error_percent) for row in rows if row.fitted == fitted]
-        summary = summarise_errors(stored.average_records(chosen))
-        for name, value in (("mean", summary.mean_percent), ("sd", summary.sd_percent)):
-            found[f"{name}_error_{kind}_percent"] = None if np.isnan(value) else value
+        _, mean, sd = summarise_errors(stored.average_records(chosen))
+        found |= {f"mean_error_{kind}_percent": mean, f"sd_error_{kind}_percent": sd}
     return found

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...identify.fit.objective import SiteResponse
-from ...identify.fit.prediction import RelaxationSpread, compute_half_width_95, cover_most_probable
+from ...identify.fit.prediction import RelaxationSpread, compute_force_range, compute_half_width_95
 from ...identify.uncertainty.exploration import Exploration
 from ...identify.uncertainty.uncertainty import (
     DETERMINED,
@@ -265,7 +265,7 @@ def _write_prediction(
         total += sd**2
     estimated = variances["misfit"], variances["site"]
     half = compute_half_width_95(total, *estimated, model.known_scale, model.site_freedom)
-    low, high = cover_most_probable(response, parameters, found.explored.posterior.median)
+    low, high = compute_force_range(response, parameters, found.explored.posterior.median)
     low, high = low + np.minimum(lower, 0.0) - half, high + np.maximum(higher, 0.0) + half
     half_width, low = float(np.mean(high - low)) / 2, np.maximum(low, 0.0)
     write_curves(
