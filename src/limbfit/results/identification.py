@@ -426,10 +426,7 @@ class PredictResult(StoredResult):
 
     def compare_held_out(self) -> tuple[list[float], list[float]]:
         """Errors with one material, and with several, of the held-out sites that both predict."""
-        pairs = [
-            (row.site, row.error_one_material_percent, row.error_percent)
-            for row in self.sites
-            if not row.fitted and None not in (row.error_one_material_percent, row.error_percent)
-        ]
-        one, several = (average_records((pair[0], pair[column]) for pair in pairs) for column in (1, 2))
-        return one, several
+        held = [row for row in self.sites if not row.fitted]
+        known = [row for row in held if None not in (row.error_one_material_percent, row.error_percent)]
+        one = average_records((row.site, row.error_one_material_percent) for row in known)
+        return one, average_records((row.site, row.error_percent) for row in known)

@@ -106,9 +106,9 @@ def list_key_numbers(store: Results) -> tuple[KeyNumber, ...]:
     """The numbers that a reader looks for first."""
     found = []
     if store.predict:
-        for use, words in (("heldout", "held-out"), ("fitted", "fitted")):
-            text = f"mean {store.compared_quantity} error at the {words} sites"
-            found.append(KeyNumber(store.mean_error(use), "%", text))
+        error = f"mean {store.compared_quantity} error at the"
+        found.append(KeyNumber(store.mean_error("heldout"), "%", f"{error} held-out sites"))
+        found.append(KeyNumber(store.mean_error("fitted"), "%", f"{error} fitted sites"))
     for tissue in store.tissues:
         modulus = number(store.stages[-1].parameters[tissue][store.law.moduli[0]])
         found.append(KeyNumber(modulus, "kPa", _label_modulus(store, tissue)))
