@@ -111,23 +111,6 @@ def test_what_is_stored_has_the_same_keys_with_and_without_intervals():
     assert known["settling_interval_mm"][0] >= 0.0
 
 
-def test_intervals_of_a_settling_that_goes_the_other_way_are_the_mirror_s():
-    """A load that pulls the socket off: the interval holds the negative value, and the signs are its own."""
-    spread = spread_of(off=[0.1, 0.0], shift=[-0.1, 0.0], fall=[0.2, 0.0])
-    for value in (50.0, 2.0):
-        (low, high), shares, changes, relaxation = spread.told(value, SLOPES)
-        (lower, higher), others, mirrored, relaxed = spread.told(-value, -SLOPES)
-        assert (lower, higher) == (-high, -low)
-        assert lower <= -value <= higher
-        assert others == shares
-        assert mirrored == {name: -by for name, by in changes.items()}
-        assert relaxed == [-relaxation[0], relaxation[1], -relaxation[2]]
-    found = facts(-2.0, **spread_to_facts(spread, "", "kPa", -2.0, -SLOPES))
-    widen_intervals(found, [(dict.fromkeys(NAMES[:2], 0.1), facts(by)) for by in (-2.0, -4.0)])
-    low, high = found["loads"][0]["settling_interval_mm"]
-    assert low < -2.0 <= high <= 0.0
-
-
 def facts(value: float, **known) -> dict:
     region = {"region": "tibial crest", "mean_kPa": value}
     held = {"regions": [region | known]}
