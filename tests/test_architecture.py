@@ -25,7 +25,7 @@ FLOORS = [
     {"identify", "execution", "traces", "anatomy", "fe", "web"},
     {"mesh", "phases", "autoregressive", "laws", "shapes", "priors"},
     {"extensions", "relaxation", "results"},
-    {"errors", "arrays", "renamed", "_version"},
+    {"errors", "arrays", "folders", "renamed", "_version"},
 ]
 HEIGHT = {room: -level for level, rooms in enumerate(FLOORS) for room in rooms}
 # Floors inside a room, from the top; "" is what stands in the room's own folder.

@@ -25,8 +25,9 @@ from pydicom.uid import UID
 
 from ...arrays import Array
 from ...errors import ImageError, add_location
+from ...folders import list_files
 from ..grid import Volume, check_voxel_count
-from .dicom_headers import SliceHeader, list_files, read_headers, silence_readers
+from .dicom_headers import SliceHeader, read_headers, silence_readers
 
 _PLAIN_WORDS = {"dcm", "dicom", "ima", "im", "img", "image", "i", "slice", "mr", "ct", "pt", "ser", "series"}
 _MAX_COUNT = 9999  # of files; a larger number may be that of a person

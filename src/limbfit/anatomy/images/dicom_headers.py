@@ -47,7 +47,6 @@ _TAGS = [
 ]
 _PREAMBLE = 128  # bytes before "DICM"
 _IMAGE_CLASS = "Image Storage"
-_LEFT = (".DS_Store", "Thumbs.db", "desktop.ini")  # by systems; so are names that begin with ._
 _ENHANCED = ("Enhanced MR Image Storage", "Enhanced CT Image Storage", "Enhanced PET Image Storage")
 
 
@@ -91,13 +90,6 @@ def silence_readers() -> Iterator[None]:
     finally:
         sitk.ProcessObject.SetGlobalWarningDisplay(shown)
         log.disabled = disabled
-
-
-def list_files(folder: Path) -> list[Path]:
-    """The files in a folder and those below it, by name, without what systems leave where folders are
-    looked at."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return [path for path in files if path.name not in _LEFT and not path.name.startswith("._")]
 
 
 def read_headers(path: Path) -> list[SliceHeader] | None:

@@ -16,8 +16,9 @@ from pydicom.errors import InvalidDicomError
 
 from ...arrays import Array, Indices, Mask
 from ...errors import LabelError
+from ...folders import list_files
 from ..grid import Grid, LabelMap, Volume
-from ..images.dicom_headers import find_functional_group, list_files, silence_readers
+from ..images.dicom_headers import find_functional_group, silence_readers
 from .contours import build_labels
 from .labelfiles import flatten, normalise_name
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..._version import __version__
-from ...anatomy.images.dicom_headers import list_files
+from ...folders import list_files
 
 PACKAGE = Path(__file__).parents[2]
 _DEFINITION = re.compile(r"^(?:def |class |async |@)", re.MULTILINE)
