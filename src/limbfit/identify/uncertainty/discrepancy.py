@@ -261,10 +261,9 @@ def estimate_discrepancy(
         known_scale=rows.known_scale(logs),
         criterion=value,
     )
-    if model.site_N:
-        factors = rows.sample_site_factors(logs)
-        found = replace(found, site_factor=float(np.exp(logs[-1])), site_factors=factors)
-    return found
+    if not model.site_N:
+        return found
+    return replace(found, site_factor=float(np.exp(logs[-1])), site_factors=rows.sample_site_factors(logs))
 
 
 def limit_to_mean_square(
@@ -283,11 +282,14 @@ def limit_to_mean_square(
     residual, jacobian = scale * np.concatenate(residuals), scale[:, None] * np.concatenate(jacobians)
     own = block_diag(*(model.own_covariance(i) for i in range(len(residuals))))
     sites = np.concatenate(model.site_deviations)
+    covariance = scale[:, None] * (own + sites @ sites.T) * scale
     directions = np.linalg.qr(jacobian)[0]
-    left = np.eye(len(residual)) - directions @ directions.T
-    covariance = left @ (scale[:, None] * (own + sites @ sites.T) * scale) @ left
-    expected = float(np.trace(covariance))
-    freedom = expected**2 / float(np.sum(covariance**2))
+    along = covariance @ directions
+    within = directions.T @ along
+    # Trace and squares of what is left when the fit has taken these directions.
+    expected = float(np.trace(covariance) - np.trace(within))
+    squares = float(np.sum(covariance**2) - 2.0 * np.sum(along**2) + np.sum(within**2))
+    freedom = expected**2 / squares
     share = float(residual @ residual) / expected * freedom / chi2.ppf(0.025, freedom)
     if share >= 1.0:
         return model
