@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 from numba import njit
 
-from ..arrays import Array
+from ..arrays import Array, Indices
 from .kernel.elements import compute_face_areas
 from .kernel.laws import Laws
 from .kernel.response import add_fibre_stress, elastic_response, kirchhoff_stress, pressures
@@ -92,11 +92,8 @@ def compute_contact_pressure(system: System, laws: Laws, state: State) -> Array:
     N, areas = compute_face_areas(system.element, system.points + state.u, faces, "gauss")
     parts = np.einsum("fqi,qk->fki", areas, N).reshape(-1, 3)
     share = np.stack([np.bincount(faces.ravel(), part, len(pressure)) for part in parts.T], axis=1)
-    to_middles = None
-    if faces.shape[1] == 6:  # of corners the mean over the mid-edge nodes beside
-        corners, beside = faces[:, [0, 0, 1, 1, 2, 2]].ravel(), faces[:, [3, 5, 3, 4, 4, 5]].ravel()
-        means = 1.0 / np.bincount(corners, minlength=len(pressure))[corners]
-        to_middles = sp.csr_matrix((means, (corners, beside)), shape=(len(pressure),) * 2)
+    to_middles = _build_corner_mean(len(pressure), faces) if faces.shape[1] == 6 else None
+    if to_middles is not None:
         force, share = (values + to_middles.T @ values for values in (force, share))
     size = np.linalg.norm(share, axis=1)
     bearing = size > 0.0
@@ -105,6 +102,13 @@ def compute_contact_pressure(system: System, laws: Laws, state: State) -> Array:
         corners = np.unique(faces[:, :3])
         pressure[corners] = (to_middles @ pressure)[corners]
     return pressure
+
+
+def _build_corner_mean(n: int, faces: Indices) -> sp.csr_matrix:
+    """Matrix (n, n): at the corners of quadratic faces (f, 6) the mean over the mid-edge nodes beside."""
+    corners, beside = faces[:, [0, 0, 1, 1, 2, 2]].ravel(), faces[:, [3, 5, 3, 4, 4, 5]].ravel()
+    count = np.bincount(corners, minlength=n)
+    return sp.csr_matrix((1.0 / count[corners], (corners, beside)), shape=(n, n))
 
 
 def average_at_nodes(system: System, values: Array) -> Array:

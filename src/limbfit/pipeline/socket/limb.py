@@ -10,7 +10,7 @@ from typing import Any
 from ...anatomy.frame import Frame, build_limb_frame
 from ...anatomy.meshing.layers import LayerSpec
 from ...anatomy.meshing.liner import build_liner_surface
-from ...anatomy.meshing.meshing import mesh_limb
+from ...anatomy.meshing.meshing import MeshSettings, mesh_limb
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...arrays import Array
 from ...indentation import Direction
@@ -67,20 +67,23 @@ class SocketLimb:
         if not is_meshed(file):
             context.tell(name, 0, 0, "a mesh of the whole limb")
             fine = BELOW_BRIM_MM - float(self.outer.height(brim.points).max())
-            edge_mm, liner_mm = mesh_edge_mm(self.study, brim), self.study.socket.liner.thickness_mm
-            settings = mesh_settings(self.study)
-            settings = replace(
-                settings,
-                element="tet10",
-                layers=(*([LayerSpec(LINER, liner_mm)] if liner_mm else []), *settings.layers),
-                edge_near_mm=edge_mm,
-                edge_far_mm=max(FAR * edge_mm, self.study.mesh.edge_far_mm),  # no pins press there
-                growth=GROWTH,
-                flatness=FLATNESS,
-            )
+            settings = self._choose_mesh_settings(mesh_edge_mm(self.study, brim))
             mesh, facts = mesh_limb(self.outer, settings, max(fine, 0.0), self.depth)
             keep_mesh(mesh, facts, file)
         return read_vtu(file), read_mesh_facts(file)
+
+    def _choose_mesh_settings(self, edge_mm: float) -> MeshSettings:
+        liner_mm, settings = self.study.socket.liner.thickness_mm, mesh_settings(self.study)
+        liner = (LayerSpec(LINER, liner_mm),) if liner_mm else ()
+        return replace(
+            settings,
+            element="tet10",
+            layers=(*liner, *settings.layers),
+            edge_near_mm=edge_mm,
+            edge_far_mm=max(FAR * edge_mm, self.study.mesh.edge_far_mm),  # no pins press there
+            growth=GROWTH,
+            flatness=FLATNESS,
+        )
 
     @property
     def frame(self) -> Frame:
