@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -13,22 +12,13 @@ from limbfit import OgdenQLV
 from limbfit.bench.blocks import build_punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import (
-    Activation,
-    Contractile,
     Fibred,
-    History,
-    Indenter,
-    Motion,
-    RigidBody,
     StepControl,
     solve,
 )
 from limbfit.febio import (
     FebSettings,
-    build_result,
-    find_febio,
     read_feb,
-    run_febio,
     to_problem,
     write_feb,
     write_inp,
@@ -68,33 +58,6 @@ def test_fibres_are_read_back(tmp_path, ground, field):
         steps = StepControl(load_steps=3, unload_steps=2)
 
         assert solve(found, steps, store="none").peak_force > 0.0
-
-
-@pytest.mark.slow
-@pytest.mark.skipif("FEBIO_CMD" not in os.environ, reason="FEBIO_CMD names no FEBio")
-@pytest.mark.parametrize("active", [0.0, 0.01], ids=["at rest", "contracting"])
-def test_febio_itself_runs_fibres_that_relax(tmp_path, active):
-    """A plate on a block whose fibres run otherwise in every cell: as hard as limbfit's."""
-    problem = build_punched_block("hex8", 6)
-    passive = Fibred(GROUND, 0.03, 2.5)
-    plate = Indenter("square", 90.0, 4.0, centre=(0.0, 0.0, 0.2), axis=(0, 0, -1))
-    press = Motion.of([0.0, 1.0], z=[0.0, 4.2])
-    problem = replace(
-        problem,
-        indenter=None,
-        history=History(np.array([0.0, 1.0]), np.zeros(2)),
-        bodies=(RigidBody(plate, problem.mesh.face_sets["skin"], press, name="plate"),),
-        materials={"skin": GROUND, "muscle": Contractile(passive, active) if active else passive},
-        fibres=np.random.default_rng(0).normal(size=(len(problem.mesh.cells), 3)),
-        activation=Activation([0.0, 1.0], [0.0, 1.0]) if active else None,
-    )
-    steps = StepControl(times=(0.5, 1.0), penalty=100.0, hold_penalty=True)
-    write_feb(problem, tmp_path / "model.feb", FebSettings(steps=steps))
-    run = run_febio(find_febio(), tmp_path, 1.0, "forces.txt", time_limit_s=120.0)
-    assert run.verdict.completed, run.verdict.reason
-    assert build_result(problem, run.log, run.verdict).force[-1] == pytest.approx(
-        solve(problem, steps).force[-1], rel=0.03
-    )
 
 
 def mixed(folder, old=ELASTIC, new=MIXED, axis=""):

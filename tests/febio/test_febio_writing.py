@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 
@@ -21,11 +20,9 @@ from limbfit.febio import (
     build_contact,
     build_result,
     build_step_control,
-    find_febio,
     read_feb,
     read_log,
     run_feb,
-    run_febio,
     to_problem,
     turn_to_indenter_frame,
     write_feb,
@@ -368,17 +365,3 @@ def test_calculix_says_no_to_relaxation(tmp_path):
     elastic = {name: OgdenQLV(0.004, 4.0, 0.0, 1.0) for name in ("skin", "muscle")}
     write_inp(block().with_materials(elastic), tmp_path / "m.inp", "calculix", FebSettings())
     assert "*VISCO" not in (tmp_path / "m.inp").read_text()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif("FEBIO_CMD" not in os.environ, reason="FEBIO_CMD names no FEBio")
-@pytest.mark.parametrize("shape", INDENTERS)
-def test_febio_itself_runs_it(tmp_path, shape):
-    problem = block("tet4", shape, divisions=10)
-    write_feb(problem, tmp_path / "model.feb", FebSettings())
-    end = float(problem.history.times[-1])
-    run = run_febio(find_febio(), tmp_path, end, "forces.txt", time_limit_s=600.0)
-    assert run.verdict.completed, run.verdict.reason
-    found = build_result(problem, run.log, run.verdict)
-    mine = run_feb(tmp_path / "model.feb", tmp_path / "out").result
-    np.testing.assert_allclose(mine.force_at(found.times), found.force, atol=0.02 * found.peak_force)

@@ -1,0 +1,169 @@
+"""FEBio itself beside limbfit: what limbfit writes, FEBio runs to its end, with the same forces.
+
+Blocks of few elements, and limbfit at FEBio's own steps with FEBio's integration in time, so that the two
+differ by nothing but contact: FEBio's acts along the skin's normal over the current area, limbfit's along
+the indenter's normal over the area at rest. Under a plate that covers the block this hardly matters, and
+forces are within 0.5 %; a round indenter touches single points at other times, and they are within 1 to 2 %.
+
+Run with ``python -m pytest -m febio``; FEBio is that of ``FEBIO_CMD``, of the path, or beside the repository.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from limbfit import OgdenQLV
+from limbfit.bench.blocks import build_punched_block
+from limbfit.errors import InputError
+from limbfit.fe import (
+    Activation,
+    Contractile,
+    Fibred,
+    History,
+    Indenter,
+    Motion,
+    NeoHookean,
+    Pressure,
+    Problem,
+    Result,
+    RigidBody,
+    RigidSurface,
+    StepControl,
+    isochoric_stretch,
+    solve,
+)
+from limbfit.febio import FebSettings, build_result, find_febio, run_febio, write_feb
+from limbfit.febio.preparation import Preparation
+
+SHARED = Path(__file__).parents[3] / "shared" / "febio" / "febio4"
+pytestmark = pytest.mark.febio
+
+SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, (0.8, 0.3), (0.2, 1.5))
+FIVE = OgdenQLV(0.009, 6.0, (0.5, 0.4, 0.3, 0.2, 0.1), (0.05, 0.2, 1.0, 5.0, 20.0))
+ASKEW = np.array([1.0, -1.0, 0.5])
+FIBRED = Fibred(MUSCLE, 0.012, 2.5)
+TAUT = isochoric_stretch(np.array([0.0, 0.0, 1.0]), 0.93)[0]
+DOWN = (0.0, 0.0, -1.0)
+PLATE = Indenter("square", 90.0, 4.0, (0.0, 0.0, 5.0), DOWN)
+BALL = Indenter("sphere", 40.0, 0.0, (0.0, 0.0, 5.0), DOWN)
+IN_AND_OUT = History(np.array([0.0, 3.0, 6.0]), np.array([0.0, 5.0, 0.0]))
+
+
+@pytest.fixture(scope="session")
+def febio() -> Path:
+    for given in (None, SHARED):
+        try:
+            return find_febio(given)
+        except InputError:
+            assert "FEBIO_CMD" not in os.environ  # which names none that can be run
+    pytest.skip("there is no febio4 on the path, and none beside the repository")
+
+
+def block(divisions: int, **changes: object) -> Problem:
+    given = {"materials": {"skin": SKIN, "muscle": MUSCLE}, "history": IN_AND_OUT, "indenter": PLATE}
+    return replace(build_punched_block("hex8", divisions), **(given | changes))
+
+
+def run_both(program: Path, folder: Path, problem: Problem) -> tuple[Result, Result]:
+    """FEBio's result of a problem, and limbfit's at FEBio's steps, with the contact stiffness of the file."""
+    write_feb(problem, folder / "model.feb", FebSettings())
+    end = Preparation.from_problem(problem).seconds + float(problem.history.times[-1])
+    run = run_febio(program, folder, end, "forces.txt", time_limit_s=300.0)
+    assert run.verdict.completed, run.verdict.reason
+    theirs = build_result(problem, run.log, run.verdict)
+    times = tuple(t for t in theirs.times if t > 0.0)
+    mine = solve(problem, StepControl(times=times, stress="linear", hold_penalty=True), store="none")
+    assert mine.completed, mine.reason
+    return theirs, mine
+
+
+def differ_by(theirs: Result, mine: Result) -> float:
+    """Largest difference of two courses of force, as a share of FEBio's largest force."""
+    return float(np.abs(mine.force_at(theirs.times) - theirs.force).max() / np.abs(theirs.force).max())
+
+
+CYCLES = History(np.array([0.0, 2.0, 6.0, 8.0, 10.0, 12.0]), np.array([0.0, 5.0, 5.0, 1.0, 5.0, 0.0]))
+TENSED = {
+    "materials": {"skin": SKIN, "muscle": Contractile(FIBRED, 0.005)},
+    "fibres": ASKEW,
+    "activation": Activation([0.0, 1.0, 6.0], [0.0, 1.0, 0.4]),
+}
+LAWS: dict[str, dict[str, object]] = {
+    "relaxing in a hold and in cycles": {"history": CYCLES},
+    "five relaxation times": {"materials": {"skin": FIVE, "muscle": MUSCLE}},
+    "elastic": {"materials": {"skin": OgdenQLV(0.009, 6.0, 0.0, 1.0), "muscle": NeoHookean(0.01)}},
+    "fibres": {"materials": {"skin": SKIN, "muscle": FIBRED}, "fibres": ASKEW},
+    "contraction": TENSED,
+    "pre-stretch": {"prestretch": TAUT},
+    "all": TENSED | {"prestretch": TAUT},
+}
+
+
+@pytest.mark.parametrize("case", LAWS)
+def test_tissue_under_a_plate_pushes_as_hard(febio, tmp_path, case):
+    assert differ_by(*run_both(febio, tmp_path, block(4, **LAWS[case]))) < 0.005
+
+
+ROUND = trimesh.creation.icosphere(subdivisions=3, radius=20.0)
+FACETED = RigidSurface(ROUND.vertices - np.array([0.0, 0.0, 20.0]), ROUND.faces)
+INDENTERS = {
+    "square": (Indenter("square", 20.0, 2.0, (0.0, 0.0, 5.0), DOWN), 0.01),
+    "cylinder": (Indenter("cylinder", 30.0, 6.0, (0.0, 0.0, 5.0), DOWN), 0.02),
+    "sphere": (BALL, 0.01),
+    "tilted": (replace(BALL, centre=(1.0, 2.0, 5.0), axis=(0.1, -0.05, -1.0)), 0.02),
+    "stl": (Indenter("stl", centre=(0.0, 0.0, 5.0), axis=DOWN, surface=FACETED), 0.02),
+}
+
+
+@pytest.mark.parametrize("shape", INDENTERS)
+def test_indenters_are_pushed_as_hard(febio, tmp_path, shape):
+    indenter, most = INDENTERS[shape]
+    assert differ_by(*run_both(febio, tmp_path, block(6, indenter=indenter))) < most
+
+
+def test_a_force_goes_as_deep(febio, tmp_path):
+    pressed = History(np.array([0.0, 3.0, 6.0]), force=np.array([0.0, 5.0, 1.0]))
+    theirs, mine = run_both(febio, tmp_path, block(6, indenter=BALL, history=pressed))
+    assert differ_by(theirs, mine) < 0.01
+    depth = np.interp(theirs.times, mine.times, mine.displacement)
+    np.testing.assert_allclose(depth, theirs.displacement, atol=0.01 * theirs.displacement.max())
+
+
+def test_friction_resists_as_hard_where_it_is_pressed_and_dragged(febio, tmp_path):
+    across = np.array([[0.0, 0.0], [0.0, 0.0], [3.0, 0.0]])
+    dragged = History(np.array([0.0, 3.0, 6.0]), np.array([0.0, 5.0, 5.0]), across=across)
+    problem = block(6, indenter=BALL, history=dragged, friction=0.4, sticking="stepwise")
+    assert differ_by(*run_both(febio, tmp_path, problem)) < 0.02
+
+
+def test_a_pressure_beside_the_indenter_counts_as_much(febio, tmp_path):
+    problem = block(6, indenter=BALL)
+    rim = problem.mesh.points[problem.contact_faces][:, :, :2]
+    faces = problem.contact_faces[np.abs(rim).max(axis=(1, 2)) > 25.0]
+    pressed = replace(problem, pressures=(Pressure(faces, [0.0, 3.0, 6.0], [0.0, 0.02, 0.01]),))
+    theirs, mine = run_both(febio, tmp_path, pressed)
+    assert differ_by(theirs, mine) < 0.02
+    assert abs(mine.peak_force - solve(problem, store="none").peak_force) > 0.05 * mine.peak_force
+
+
+@pytest.mark.parametrize("taut", [False, True], ids=["clamped", "clamped and taut"])
+def test_a_clamped_limb_is_touched_later_and_pushes_as_hard(febio, tmp_path, taut):
+    """A pin that presses from the first second on; the indenter touches after it, at 2 s."""
+    pin = Indenter("sphere", 30.0, centre=(18.0, 0.0, 0.3), axis=(0.2, 0.0, -1.0), edge=(0.0, 1.0, 0.0))
+    faces = block(6).contact_faces
+    clamp = RigidBody(pin, faces, Motion.of([0.0, 1.0, 5.0], force={"z": [0.0, 0.5, 0.5]}), name="clamp")
+    later = History(np.array([0.0, 2.0, 4.0, 5.0]), np.array([0.0, 0.0, 4.0, 1.0]))
+    indenter = replace(BALL, centre=(-10.0, 0.0, 1.0))
+    problem = block(6, indenter=indenter, history=later, bodies=(clamp,), touch_down_s=2.0)
+    if taut:
+        problem = replace(problem, prestretch=TAUT)
+    theirs, mine = run_both(febio, tmp_path, problem)
+    late = theirs.times >= 2.0
+    gap = np.abs(mine.force_at(theirs.times) - theirs.force)[late].max()
+    assert gap < 0.02 * theirs.peak_force
