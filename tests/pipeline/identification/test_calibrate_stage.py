@@ -18,7 +18,7 @@ from limbfit.pipeline.engine.context import Context, Progress
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
-from limbfit.pipeline.identification.problem import build_groupings
+from limbfit.pipeline.identification.problem import build_groupings, build_problem
 from limbfit.priors import SOURCE
 from limbfit.study import Study, load_study
 
@@ -216,10 +216,19 @@ def test_groups_of_a_study(tmp_path):
     study = write_study(
         tmp_path, "[calibration]\nfixed = ['skin.m']\ntied = [['skin.c_kPa', 'muscle.c_kPa']]\n"
     )
-    assert build_groupings(study) == ((0, -1, 2, 3, 0, 1, 2, 3), (0, -1, 2, 3, 0, 5, 6, 7))
+    assert build_groupings(study) == ((0, -1, 2, 3, 0, 5, 2, 3), (0, -1, 2, 3, 0, 5, 6, 7))
     ties = ", ".join(f"['skin.{name}', 'muscle.{name}']" for name in ("c_kPa", "m", "gamma", "tau_s"))
     study = write_study(tmp_path, f"[calibration]\ntied = [{ties}]\n")
     assert build_groupings(study) == ((0, 1, 2, 3) * 2,)
+    assert build_problem(study).titles == ("one material",)
+
+
+@pytest.mark.parametrize("known", ["skin", "muscle"])
+def test_a_study_that_fixes_a_whole_tissue_has_one_stage_which_is_not_called_one_material(tmp_path, known):
+    fixed = [f"{known}.{name}" for name in ("c_kPa", "m", "gamma", "tau_s")]
+    problem = build_problem(write_study(tmp_path, f"[calibration]\nfixed = {fixed}\n"))
+    assert [sum(number >= 0 for number in stage) for stage in problem.stages] == [4]
+    assert problem.titles == ("two materials",)
 
 
 @pytest.mark.parametrize(

@@ -49,13 +49,16 @@ def constrain(
 ) -> Grouping:
     """Return ``grouping`` with each set of ``tied`` parameters in one group and the ``fixed`` ones in none.
 
-    Names are known, and ties are of one kind and free, as the study has checked where they are stated.
+    A group has the number of its first parameter, so that groupings are equal where the same parameters move
+    together. Names are known, and ties are of one kind and free, as the study has checked where they are
+    stated.
     """
     found = list(grouping)
     for group in tied:
         members = {found[names.index(name)] for name in group}
         found = [min(members) if number in members else number for number in found]
-    return tuple(FIXED if name in fixed else number for name, number in zip(names, found, strict=True))
+    found = [FIXED if name in fixed else number for name, number in zip(names, found, strict=True)]
+    return tuple(FIXED if number == FIXED else found.index(number) for number in found)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from ...identify.fit.parameters import (
     build_space,
     build_stage_groupings,
     constrain,
+    group_by_kind,
 )
 from ...study import Study
 
@@ -55,12 +56,16 @@ def build_problem(study: Study) -> CalibrationProblem:
     """The problem that a study states."""
     table, tissues = study.calibration, len(study.tissues)
     unknowns, stages = build_unknowns(study), build_groupings(study)
-    several = f"{COUNTS[tissues] if tissues < len(COUNTS) else tissues} materials"
+    one, several = "one material", f"{COUNTS[tissues] if tissues < len(COUNTS) else tissues} materials"
+    if len(stages) == 1:  # what the study fixes or ties leaves nothing to a second one
+        titles = (one if stages[0] == group_by_kind(unknowns.names) else several,)
+    else:
+        titles = (one, several)
     return CalibrationProblem(
         study=study,
         unknowns=unknowns,
         stages=stages,
-        titles=("one material",) if tissues == 1 else ("one material", several),
+        titles=titles,
         settings=CalibrationSettings(
             objective=table.objective,
             relative_tolerance=table.relative_tolerance,

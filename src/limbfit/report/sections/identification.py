@@ -103,7 +103,8 @@ def make_convergence_section(store: Results) -> Section:
 def make_iteration_table(store: Results, stage: SearchStage) -> Table:
     """Every accepted iterate of one identification stage."""
     known = tuple(stage.parameters)
-    tissues = known if stage.name != "one material" else known[:1]
+    alike = all(values == stage.parameters[known[0]] for values in stage.parameters.values())
+    tissues = known[:1] if alike else known  # one material, unless the study fixes a tissue's own value
     name = f"iterations-{stage.name.replace(' ', '-')}"
     return make_table(
         name, stage.iterations, folded=True, words="iterations", stage=stage, tissues=tissues, store=store
