@@ -45,6 +45,11 @@ def test_over_fat_a_skin_has_no_c(study: Path) -> None:
     }
 
 
+def test_a_layer_of_fat_of_which_nothing_is_to_be_known_is_fat_all_the_same(study: Path) -> None:
+    none = 'prior_tissues = { fat = "none" }\n'
+    assert names(with_settings(study, THREE + PEOPLE + none)) == {"skin.m", "muscle.c_kPa", "muscle.m"}
+
+
 def test_the_study_says_what_another_name_means(study: Path) -> None:
     found = with_settings(study, HIDE + PEOPLE + 'prior_tissues = { hide = "skin_fat", muscle = "none" }\n')
     assert names(found) == {"hide.c_kPa", "hide.m"}

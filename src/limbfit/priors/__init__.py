@@ -39,7 +39,7 @@ def of_tissues(
     Parameters
     ----------
     tissues : of the model. One that is called like a tissue of people is that; ``skin`` is skin with its fat
-        where no other layer is fat.
+        where no other tissue is called or stated to be fat.
     stated : which tissue of people another one is, or ``"none"``.
 
     Raises
@@ -58,7 +58,7 @@ def of_tissues(
     strange = [name for name, kind in kinds.items() if kind not in known]
     if strange:
         raise InputError(f"which tissue of people is {strange[0]!r}", remedy=f"state {_list_names()} for it")
-    if "fat" not in kinds.values():
+    if "fat" not in (*tissues, *kinds.values()):  # a layer of fat is one, whatever is known of it
         kinds |= {name: "skin_fat" for name, kind in kinds.items() if kind == "skin" and name not in stated}
     return {
         f"{name}.{key}": (prior["median"], prior["factor"])
