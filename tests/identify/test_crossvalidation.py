@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import comb
 
 import numpy as np
@@ -18,6 +19,7 @@ from limbfit.identify.checks.crossvalidation import (
     summarise_errors_by_site,
 )
 from limbfit.identify.fit.objective import MeasuredCurve
+from limbfit.identify.fit.parameters import constrain, group_separately
 
 SITES = [
     Bars((400 * (1 - h) + 60, 400 * h + 60), (10 + 10 * h, 16 + 8 * h), 3.2 + 3.5 * h)
@@ -93,3 +95,12 @@ def test_regions_have_their_names_and_limits_are_told():
     assert [fold.label for fold in folds] == ["a", "b"]
     tight = PAPER.__class__(PAPER.names, TRUTH * 1.6, TRUTH * 1.5, TRUTH * 3)
     assert "skin.c_kPa" in fit_sites(simulate, records(), tight, (0, 1, 4)).at_limit
+
+
+def test_a_parameter_that_is_given_is_at_no_limit():
+    """Fixed at its lower bound, as who wants no relaxation fixes its amplitude."""
+    unknowns = replace(PAPER, start=np.where(np.arange(8) == 2, PAPER.lower, TRUTH))
+    grouping = constrain(group_separately(PAPER.names), PAPER.names, fixed=["skin.gamma"])
+    data = [MeasuredCurve(f"s{k}", site.force(unknowns.start)) for k, site in enumerate(SITES)]
+    fold = fit_sites(simulate, data, unknowns, (0, 1, 2), grouping=grouping)
+    assert fold.at_limit == ()

@@ -24,7 +24,7 @@ from ...results.identification import average_records
 from ...results.uncertainty import FoldFit
 from ..fit.calibration import Calibration, CalibrationSettings, calibrate
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
-from ..fit.parameters import Grouping, SearchSpace, Unknowns, group_separately
+from ..fit.parameters import FIXED, Grouping, SearchSpace, Unknowns, group_separately
 from ..fit.prediction import compute_error_percent, compute_errors_percent, summarise_errors
 from ..uncertainty.uncertainty import reduce_covariance
 
@@ -145,8 +145,8 @@ def fit_sites(
         stages=(grouping or group_separately(unknowns.names),),
     )
     errors = compute_errors_percent(simulate(found.parameters), measured)
-    is_at_bound = unknowns.is_at_bound(found.parameters)
-    at_limit = tuple(name for name, stuck in zip(unknowns.names, is_at_bound) if stuck)
+    is_stuck = unknowns.is_at_bound(found.parameters) & (np.array(found.stages[-1].grouping) != FIXED)
+    at_limit = tuple(name for name, stuck in zip(unknowns.names, is_stuck) if stuck)
     return Fold(chosen, found.parameters, errors, found.converged, at_limit, label)
 
 

@@ -137,6 +137,16 @@ class SearchSpace:
         """Return z (k,) for logarithms (p,): the mean of each group's members, clipped to the bounds."""
         return np.clip(self.tie.T @ logarithms / self.tie.sum(axis=0), self.lower, self.upper)
 
+    def clip(self, logarithms: Array) -> Array:
+        """Clip logarithms (..., p) of parameters that move to the bounds of their group."""
+        inside = np.clip(logarithms, self.tie @ self.lower, self.tie @ self.upper)
+        return np.where(self.tie.any(axis=1), inside, logarithms)
+
+    @property
+    def bounds_sd(self) -> Array:
+        """Standard deviations (k,) of uniform distributions between the bounds."""
+        return (self.upper - self.lower) / np.sqrt(12.0)
+
     def pull_back(self, jacobian: Array, parameters: Array) -> Array:
         """Return derivatives with respect to z (n, k) from those with respect to the parameters (n, p)."""
         return (jacobian * parameters) @ self.tie

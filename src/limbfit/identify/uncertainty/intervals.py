@@ -21,11 +21,10 @@ from .emulator import Emulator
 from .likelihood import Likelihood
 from .posterior import Posterior, sample_by_importance, sample_posterior
 from .uncertainty import (
-    GIVEN,
     SAMPLED,
     Uncertainty,
     build_combinations,
-    choose_verdict,
+    choose_verdicts,
     compute_correlation,
     compute_principal_axes,
 )
@@ -165,17 +164,15 @@ def pool_linearised_samples(linearised: Uncertainty, posterior: Posterior) -> Un
     drawn = random.multivariate_normal(np.log(linearised.parameters), others, draws, method="eigh")
     of_sites = random.multivariate_normal(zero, linearised.site_covariance, draws, method="eigh")
     drawn += random.choice(model.site_factors, (draws, 1)) / model.site_factor * of_sites
-    drawn = np.clip(drawn, *np.log([linearised.unknowns.lower, linearised.unknowns.upper]))
-    pooled = np.vstack([posterior.samples, np.exp(drawn)])
+    pooled = np.vstack([posterior.samples, np.exp(linearised.space.clip(drawn))])
     return restate_from_samples(linearised, replace(posterior, samples=pooled))
 
 
 def restate_from_samples(known: Uncertainty, posterior: Posterior) -> Uncertainty:
     """Return the uncertainty with what samples of the parameters say in place of its linearisation."""
-    prior_sd = np.log(known.unknowns.upper / known.unknowns.lower) / np.sqrt(12.0)
     covariance, intervals = posterior.covariance, posterior.intervals_95
     factors = np.sqrt(intervals[:, 1] / intervals[:, 0])
-    shares = np.sqrt(np.diag(covariance)) / prior_sd
+    sd, rows = np.sqrt(np.diag(covariance)), np.eye(len(covariance))
     axes = compute_principal_axes(covariance, known.space)
     along = np.log(posterior.samples) @ axes.T
     low, high = np.quantile(along, [0.025, 0.975], axis=0)
@@ -185,16 +182,8 @@ def restate_from_samples(known: Uncertainty, posterior: Posterior) -> Uncertaint
         centre=posterior.median,
         correlation=compute_correlation(covariance),
         intervals_95=intervals,
-        verdicts=tuple(
-            GIVEN if before == GIVEN else choose_verdict(float(factor), float(share))
-            for before, factor, share in zip(known.verdicts, factors, shares)
-        ),
+        verdicts=choose_verdicts(known.space, rows, factors, sd),
         combinations=build_combinations(
-            known.names,
-            axes,
-            (low + high) / 2,
-            (high - low) / 2,
-            along.std(axis=0),
-            np.linalg.norm(axes * prior_sd, axis=1),
+            known.names, known.space, axes, (low + high) / 2, (high - low) / 2, along.std(axis=0)
         ),
     )

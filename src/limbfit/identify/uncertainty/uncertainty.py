@@ -62,10 +62,8 @@ class PriorPrecision:
 
     @classmethod
     def from_unknowns(cls, unknowns: Unknowns, space: SearchSpace) -> PriorPrecision:
-        sd = (space.upper - space.lower) / np.sqrt(12.0)
         rows, target = unknowns.build_prior_rows()
-        own = rows @ space.tie
-        return cls(sd, own, target - rows @ space.fixed_log)
+        return cls(space.bounds_sd, rows @ space.tie, target - rows @ space.fixed_log)
 
     @property
     def bound_precision(self) -> Array:
@@ -214,12 +212,11 @@ class Combination:
     """A product of powers of the parameters, ``exp(weights @ log(parameters))``, and how well it is known.
 
     ``middle_log`` is the middle of the 95 % interval of its logarithm, ``factor_95`` half its width as a
-    factor, ``sd_log`` the logarithm's standard deviation.
+    factor.
     """
 
     weights: Array
     middle_log: float
-    sd_log: float
     factor_95: float
     text: str
     verdict: str
@@ -268,8 +265,8 @@ class Uncertainty:
 
     @property
     def at_bound(self) -> tuple[bool, ...]:
-        """True for each parameter that lies at one of its bounds."""
-        return tuple(map(bool, self.unknowns.is_at_bound(self.parameters)))
+        """True for each parameter that moved and lies at one of its bounds."""
+        return tuple(map(bool, self.unknowns.is_at_bound(self.parameters) & self.space.tie.any(axis=1)))
 
 
 def estimate_uncertainty(
@@ -313,16 +310,12 @@ def estimate_uncertainty(
     share = (settings.force_error_percent / 100) ** 2
     estimate = _LinearisedEstimate.linearise(z, residuals, scaled, curvatures, share, prior, model, space)
 
-    tie, moves = space.tie, np.asarray(space.tie.any(axis=1))
-    middle, (half, sd, freedom) = space.to_logarithms(z), estimate.judge(tie)
-    low = np.maximum(np.exp(middle - half), np.where(moves, unknowns.lower, 0.0))
-    high = np.minimum(np.exp(middle + half), np.where(moves, unknowns.upper, np.inf))
-    prior_sd = np.where(moves, tie @ prior.sd, 1.0)
+    tie, middle = space.tie, space.to_logarithms(z)
+    half, sd, freedom = estimate.judge(tie)
+    low, high = np.exp(space.clip(np.stack([middle - half, middle + half])))
     covariance = tie @ estimate.covariance @ tie.T
     axes = compute_principal_axes(covariance, space)
-    own = axes @ tie
-    half_of_axes, sd_of_axes, _ = estimate.judge(own)
-    prior_sd_of_axes = np.linalg.norm(own * prior.sd, axis=1)
+    half_of_axes, sd_of_axes, _ = estimate.judge(axes @ tie)
     share_of_prior, wider = prior.compute_shares(estimate.best, tie)
     stated = prior.compute_deviations(z)
     return Uncertainty(
@@ -338,13 +331,8 @@ def estimate_uncertainty(
         site_covariance=tie @ estimate.by_sites @ tie.T,
         correlation=compute_correlation(covariance),
         intervals_95=np.stack([low, high], axis=1),
-        verdicts=tuple(
-            choose_verdict(float(factor), float(share)) if free else GIVEN
-            for factor, share, free in zip(np.exp(half), sd / prior_sd, moves)
-        ),
-        combinations=build_combinations(
-            unknowns.names, axes, axes @ middle, half_of_axes, sd_of_axes, prior_sd_of_axes
-        ),
+        verdicts=choose_verdicts(space, np.eye(len(tie)), np.exp(half), sd),
+        combinations=build_combinations(unknowns.names, space, axes, axes @ middle, half_of_axes, sd_of_axes),
         degrees_of_freedom=freedom,
         prior_share=share_of_prior,
         wider_without=wider,
@@ -388,20 +376,30 @@ def choose_verdict(factor: float, share_of_prior: float) -> str:
     return UNDETERMINED
 
 
+def choose_verdicts(space: SearchSpace, rows: Array, factors: Array, sd_log: Array) -> tuple[str, ...]:
+    """Choose the verdicts (m,) on ``rows @ log(parameters)``, rows (m, p); what does not move is given.
+
+    Known of each are half its 95 % interval as a factor, and its standard deviation.
+    """
+    by_bounds = np.linalg.norm(rows @ space.tie * space.bounds_sd, axis=1)
+    return tuple(
+        choose_verdict(factor, sd / most) if most > 0 else GIVEN
+        for factor, sd, most in zip(factors.tolist(), sd_log.tolist(), by_bounds.tolist(), strict=True)
+    )
+
+
 def build_combinations(
-    names: Sequence[str], axes: Array, middle_log: Array, half_log: Array, sd_log: Array, prior_sd: Array
+    names: Sequence[str], space: SearchSpace, axes: Array, middle_log: Array, half_log: Array, sd_log: Array
 ) -> tuple[Combination, ...]:
     """Build combinations with weights ``axes`` (k, p) from what is known of their logarithms, each (k,).
 
-    These are the middle of the 95 % interval, half its width, and the standard deviation with the records and
-    by the bounds alone.
+    These are the middle of the 95 % interval, half its width, and the standard deviation.
     """
-    factors, shares = np.exp(half_log), sd_log / prior_sd
+    factors = np.exp(half_log)
+    verdicts = choose_verdicts(space, axes, factors, sd_log)
     return tuple(
-        Combination(row, middle, sd, factor, format_product(row, names), choose_verdict(factor, share))
-        for row, middle, sd, factor, share in zip(
-            axes, middle_log.tolist(), sd_log.tolist(), factors.tolist(), shares.tolist(), strict=True
-        )
+        Combination(row, middle, factor, format_product(row, names), verdict)
+        for row, middle, factor, verdict in zip(axes, middle_log.tolist(), factors.tolist(), verdicts)
     )
 
 
