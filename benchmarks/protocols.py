@@ -34,9 +34,9 @@ from limbfit.identify.checks.design import (
     DesignTarget,
     NoiseModel,
     RecordOption,
-    compute_bounds_information,
     compute_factors_95,
     compute_information,
+    compute_prior_information,
     plan_records,
 )
 from limbfit.identify.fit.objective import SiteResponse
@@ -161,9 +161,8 @@ def told_of(
 
 def wanted_of(folder: Path, limb: Limb, edge_mm: float | None) -> DesignTarget:
     """All eight parameters, given the study's bounds."""
-    return DesignTarget(
-        compute_bounds_information(build_problem(plan_study(folder, limb, edge_mm)).space), np.eye(8)
-    )
+    problem = build_problem(plan_study(folder, limb, edge_mm))
+    return DesignTarget(compute_prior_information(problem.unknowns, problem.space), np.eye(8))
 
 
 def best_at_truth(

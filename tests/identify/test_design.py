@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -17,21 +18,21 @@ from limbfit.identify.checks.design import (
     RecordOption,
     build_candidate,
     choose_design,
-    compute_bounds_information,
     compute_duration_s,
     compute_efficiency,
     compute_factors_95,
     compute_field_information,
+    compute_prior_information,
     evaluate_design,
     plan_records,
     sample_tissues,
 )
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
-from limbfit.identify.fit.parameters import build_space, constrain, group_separately
+from limbfit.identify.fit.parameters import Prior, build_space, constrain, group_separately
 
 SPACE = build_space(PAPER, group_separately(PAPER.names))
-PRIOR = compute_bounds_information(SPACE)
+PRIOR = compute_prior_information(PAPER, SPACE)
 
 
 def lines(slopes, noise=0.1):
@@ -280,7 +281,7 @@ def test_what_a_study_fixes_is_known_and_what_it_ties_is_one():
         build_candidate(f"s{k}", 4.0, site.respond(TRUTH), TRUTH, NoiseModel(0.05))
         for k, site in enumerate(SITES)
     ]
-    prior = compute_bounds_information(space)
+    prior = compute_prior_information(PAPER, space)
     factors = evaluate_design(candidates, [0, 1], prior).factors_95
     assert factors[1] == pytest.approx(1.0, abs=1e-3)
     assert factors[3] == pytest.approx(factors[7], rel=1e-3)
@@ -302,3 +303,19 @@ def test_sampled_tissues_keep_what_a_study_fixes_and_ties():
     assert np.all(tissues[:, 1] == known.start[1])
     assert tissues[:, 3] == pytest.approx(tissues[:, 7])
     assert len(np.unique(tissues[:, 0])) == 9
+
+
+def test_stated_priors_count_beside_the_data_of_a_design():
+    """skin.m is known within 5 %: no record has to tell it, and its interval is no wider."""
+    known = replace(PAPER, priors=(Prior("skin.m", 6.0, 1.05),))
+    plain, stated = (compute_prior_information(one, SPACE) for one in (PAPER, known))
+    candidates = [
+        build_candidate(f"s{k}", 4.0, site.respond(TRUTH), TRUTH, NoiseModel(0.5))
+        for k, site in enumerate(SITES)
+    ]
+    without, beside = (evaluate_design(candidates, [3], prior).factors_95[1] for prior in (plain, stated))
+    assert without > 2.0
+    assert beside < 1.05**1.97
+    expected = np.zeros((8, 8))
+    expected[1, 1] = np.log(1.05) ** -2
+    assert stated - plain == pytest.approx(expected)

@@ -4,7 +4,8 @@ At given parameters each candidate indentation has a Fisher information on the l
 ``J' S^-1 J``, from the exact derivatives of its force and a noise model. The information of several
 indentations adds up. D-optimal is the choice with the largest determinant of the sum (the smallest volume of
 the joint confidence region), A-optimal the one with the smallest sum of variances (Fedorov 1972; Atkinson and
-Donev 1992). The bounds replace data where there are none.
+Donev 1992). The bounds and the stated priors
+count beside the data.
 
 Records that have to fit into a patient's time are chosen by Bayesian design (`plan_records`). Their
 information is computed at several samples of the parameters, because what a record tells depends on the
@@ -30,7 +31,7 @@ from ...errors import CalibrationError
 from ..fit.objective import SiteResponse
 from ..fit.parameters import SearchSpace, Unknowns
 from ..uncertainty.noise import compute_skin_similarity
-from ..uncertainty.uncertainty import NORMAL_95
+from ..uncertainty.uncertainty import NORMAL_95, PriorPrecision
 
 Criterion = Literal["D", "A"]
 Cost = Callable[[Sequence[int]], float]
@@ -115,14 +116,16 @@ def compute_field_information(
     return np.einsum("abp,abq->pq", rotated / variances[..., None], rotated)
 
 
-def compute_bounds_information(space: SearchSpace) -> Array:
-    """Return the information (p, p) of the bounds, as of a uniform distribution between them.
+def compute_prior_information(unknowns: Unknowns, space: SearchSpace) -> Array:
+    """Return the information (p, p) of the bounds, as of a uniform distribution between them, and of the
+    stated priors.
 
     What does not move in the space is given, and so is the ratio of what moves together.
     """
     mean = space.tie / space.tie.sum(axis=0)
     given = np.eye(len(mean)) - mean @ space.tie.T
-    return mean @ np.diag(12.0 / (space.upper - space.lower) ** 2) @ mean.T + _GIVEN_INFORMATION * given
+    known = PriorPrecision.from_unknowns(unknowns, space).precision
+    return mean @ known @ mean.T + _GIVEN_INFORMATION * given
 
 
 @dataclass(frozen=True)
@@ -381,7 +384,7 @@ def sample_tissues(unknowns: Unknowns, space: SearchSpace, centre: Array, draws:
     A parameter with a prior scatters by the prior's factor, another by half of what its bounds allow. A Latin
     hypercube spreads few samples well.
     """
-    spread = 0.5 * (space.upper - space.lower) / np.sqrt(12.0)
+    spread = 0.5 * space.bounds_sd
     for prior in unknowns.priors:
         spread[space.tie[unknowns.names.index(prior.name)] > 0] = np.log(prior.factor)
     others = qmc.LatinHypercube(len(spread), rng=seed).random(max(draws - 1, 0))
@@ -406,9 +409,7 @@ def plan_records(options: Sequence[RecordOption], budget: Budget, target: Design
 
     Raises `CalibrationError` if no record fits into the time.
     """
-    if not options or all(
-        compute_duration_s(options, [i], budget) > budget.seconds for i in range(len(options))
-    ):
+    if all(compute_duration_s(options, [i], budget) > budget.seconds for i in range(len(options))):
         raise CalibrationError("no record fits into the time")
     draws = len(options[0].information)
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from ...anatomy.sites.sites import measure_tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
-from ...arrays import Array
 from ...errors import InputError, RunError, StudyError
 from ...identify.checks.design import (
     Candidate,
@@ -19,8 +18,8 @@ from ...identify.checks.design import (
     NoiseModel,
     build_candidate,
     choose_design,
-    compute_bounds_information,
     compute_efficiency,
+    compute_prior_information,
     evaluate_design,
 )
 from ...identify.fit.objective import SiteResponse
@@ -148,7 +147,8 @@ def _choose_designs(
     if len({one.site for one in every}) < sites:
         raise RunError(f"only {len(every)} candidates could be simulated: {'; '.join(left_out)}")
     problem = build_problem(study)
-    bounds, prior = problem.unknowns, compute_bounds_information(problem.space)
+    names, prior = problem.unknowns.names, compute_prior_information(problem.unknowns, problem.space)
+    before = np.linalg.slogdet(prior)[1]
     designs = {
         "D-optimal": choose_design(every, sites, prior, "D"),
         "A-optimal": choose_design(every, sites, prior, "A"),
@@ -169,37 +169,32 @@ def _choose_designs(
                 sites=[DesignSite(site=one.site, depth_mm=one.depth_mm) for one in chosen],
                 d_efficiency=compute_efficiency(design, best_d, "D"),
                 a_efficiency=compute_efficiency(design, best_a, "A"),
-                factor_95=dict(zip(bounds.names, design.factors_95.tolist(), strict=True)),
+                factor_95=dict(zip(names, design.factors_95.tolist(), strict=True)),
                 exhaustive=design.exhaustive,
             )
         )
     return {
         "wanted": sites,
         "designs": rows,
-        "verdict": _describe_verdict(designs, bounds.names),
-        "candidates": [_to_row(one, peak, prior) for one, peak in found],
+        "verdict": _describe_verdict(designs, names),
+        "candidates": [
+            DesignCandidate(
+                site=one.site,
+                depth_mm=one.depth_mm,
+                peak_force_N=float(peak),
+                # What it tells alone: bits of information over the bounds and priors.
+                bits=float((np.linalg.slogdet(prior + one.information)[1] - before) / (2 * np.log(2))),
+            )
+            for one, peak in found
+        ],
         "left_out": left_out,
     }
 
 
-def _to_row(one: Candidate, peak: float, prior: Array) -> DesignCandidate:
-    """A candidate, and what it tells alone: bits of information over the bounds."""
-    gain = np.linalg.slogdet(prior + one.information)[1] - np.linalg.slogdet(prior)[1]
-    return DesignCandidate(
-        site=one.site,
-        depth_mm=one.depth_mm,
-        peak_force_N=float(peak),
-        bits=float(gain / (2 * np.log(2))),
-    )
-
-
 def _select_deepest(every: Sequence[Candidate]) -> tuple[int, ...]:
     """The deepest candidate of each site."""
-    best: dict[str, int] = {}
-    for i, one in enumerate(every):
-        if one.site not in best or one.depth_mm > every[best[one.site]].depth_mm:
-            best[one.site] = i
-    return tuple(best.values())
+    by_depth = sorted(enumerate(every), key=lambda pair: pair[1].depth_mm)
+    return tuple(sorted({one.site: i for i, one in by_depth}.values()))
 
 
 def _describe_verdict(designs: dict[str, Design], names: Sequence[str]) -> str:

@@ -21,10 +21,10 @@ from ...identify.checks.design import (
     NoiseModel,
     RecordNoise,
     RecordOption,
-    compute_bounds_information,
     compute_duration_s,
     compute_factors_95,
     compute_information,
+    compute_prior_information,
     plan_records,
     sample_tissues,
 )
@@ -165,7 +165,7 @@ def run_protocol(
         raise RunError(f"no record could be simulated: {'; '.join(left_out)}")
     stiffness = is_modulus(study).astype(np.float64)
     wanted = DesignTarget(
-        compute_bounds_information(space), rows, "A" if criterion == "A" else "D", stiffness
+        compute_prior_information(known, space), rows, "A" if criterion == "A" else "D", stiffness
     )
     off_mm = estimate_surface_error_mm(study, context.store)
     options, blind = ([one.to_option(rest_s, off_mm, which) for one in found] for which in (0, 1))
@@ -228,10 +228,8 @@ def _plan_records(
     """
     study, found, left_out = context.study, [], []
     anatomy = load_anatomy(context.store["surfaces"])
-    deepest: dict[str, float] = {}
-    for one in study.indentations:
-        own = build_model(context, one)
-        deepest[own.site] = max(deepest.get(own.site, 0.0), max(own.knots_mm))
+    models = [build_model(context, one) for one in study.indentations]
+    deepest = {own.site: max(own.knots_mm) for own in sorted(models, key=lambda own: max(own.knots_mm))}
     for site in study.sites:
         usual = deepest[site.name]
         wanted = depths_mm or (usual,)
@@ -339,10 +337,8 @@ def _build_plans(
     """The designed protocol, one slow ramp at every site, as deep as usual, and the best without each
     ingredient."""
     slow, tool = min(one.speed_mm_s for one in found), found[0].indenter
-    most: dict[tuple[str, str], float] = {}
-    for one in found:
-        place = one.site, one.indenter
-        most[place] = max(most.get(place, 0.0), one.depth_mm)
+    by_depth = sorted(found, key=lambda one: one.depth_mm)
+    most = {(one.site, one.indenter): one.depth_mm for one in by_depth}
     kinds: dict[str, Callable[[PlannedRecord], bool]] = {
         DESIGNED: lambda one: True,
         "without holds": lambda one: not one.hold_s,
