@@ -284,6 +284,16 @@ def test_an_interval_takes_the_noise_of_what_is_compared() -> None:
     assert known.find_residual_sd("3-creep", "mm") == (0.0, 0.01)
 
 
+def test_what_is_seen_at_a_site_that_is_not_fitted_has_the_noise_that_is_stated_for_it() -> None:
+    """Fitted are moves of the skin, known to 0.02 mm; its ultrasound is known to 0.3 mm."""
+    of_skin = RecordResiduals.model_construct(unit="mm", compared_noise_sd_N=0.02, misfit_share=0.0)
+    known = PredictionModel(np.zeros((1, 1)), np.ones(1), {"1-surface": of_skin}, 0.0, 1e6)
+    seen = SiteResponse(np.linspace(0.0, 2.0, 5), np.zeros((5, 1)))
+    for name, noise in (("2-muscle", 0.3), ("1-surface", 0.02)):
+        low, high = known.compute_interval_95(seen, np.ones(1), name, "mm", noise_N=0.3)
+        assert high - low == pytest.approx(2 * 1.96 * noise, rel=1e-3)
+
+
 def test_an_interval_covers_the_most_probable_parameters_too() -> None:
     """Force in proportion to the parameter, whose answer is 10 % above the most probable value."""
     sites = {"1": RecordResiduals.model_construct(unit="N", compared_noise_sd_N=0.01, misfit_share=0.0)}

@@ -178,16 +178,16 @@ class PredictionModel:
             None if relaxation is None else RelaxationSpread.from_stored(relaxation.beyond),
         )
 
-    def find_residual_sd(self, site: str, unit: str = "N") -> tuple[float, float]:
+    def find_residual_sd(self, site: str, unit: str = "N", noise_N: float = 0.0) -> tuple[float, float]:
         """Return the noise (N) and the misfit (over the largest force) of a record.
 
-        A record that was not fitted has the median noise of the others of its unit, and the misfit that is
-        expected elsewhere.
+        A record that was not fitted has its own noise ``noise_N``, where that is known, else the median of
+        the others of its unit, and the misfit that is expected elsewhere.
         """
         if site in self.sites:
             return self.sites[site].compared_noise_sd_N, self.sites[site].misfit_share
         noise = [found.compared_noise_sd_N for found in self.sites.values() if found.unit == unit]
-        return float(np.median(noise)) if noise else 0.0, self.misfit_elsewhere
+        return noise_N or (float(np.median(noise)) if noise else 0.0), self.misfit_elsewhere
 
     def find_mesh_error(self, site: str, force_N: Array) -> Array:
         """Return one standard deviation (n,) in N of what the mesh lacks of a record's ``force_N`` (n,).
@@ -220,12 +220,12 @@ class PredictionModel:
         the spread between sites from few sites, so the interval takes Student's quantile. ``site_N`` (n,) is
         one standard deviation of the stiffness that is expected of a site that was not fitted. Beyond the
         longest load in the records, by ``times_s`` (n,), the interval counts what relaxation may do there.
-        ``noise_N`` is taken where no fitted record tells the noise of the unit.
+        ``noise_N`` is the noise of a record that was not fitted, where it is known.
         """
-        known_N, misfit = self.find_residual_sd(name, unit)
+        known_N, misfit = self.find_residual_sd(name, unit, noise_N)
         misfit_N = misfit * find_largest_magnitude(response.force_N)
         site_N = self.site_factor * np.abs(site_N)
-        own_N = np.hypot(np.hypot(known_N or noise_N, misfit_N), site_N)
+        own_N = np.hypot(np.hypot(known_N, misfit_N), site_N)
         lower_N: Array | float = 0.0
         higher_N: Array | float = 0.0
         if self.relaxation is not None and times_s is not None:
