@@ -38,7 +38,7 @@ from limbfit.identify.fit.parameters import Unknowns, build_stage_groupings
 from limbfit.identify.fit.prediction import MAX_FREEDOM, PredictionModel, compute_error_percent
 from limbfit.identify.uncertainty.intervals import EvaluationStore, sample_uncertainty
 from limbfit.identify.uncertainty.noise import compute_depth_slope, estimate_record_noise
-from limbfit.identify.uncertainty.relaxation import GIVES_WAY, assess_relaxation
+from limbfit.identify.uncertainty.relaxation import GIVES_WAY, assess_relaxation, limit_verdicts
 from limbfit.identify.uncertainty.uncertainty import DETERMINED, NORMAL_95, estimate_uncertainty
 from limbfit.results.identification import RecordFit
 
@@ -270,7 +270,7 @@ def run_draw(world: World, seed: int, hold_s: float, after_s: float) -> dict[str
         residuals.known_scale, residuals.site_factor or 1.0, residuals.site_freedom or MAX_FREEDOM,
     )  # fmt: skip
     inside = (known.intervals_95[:, 0] <= truth) & (truth <= known.intervals_95[:, 1])
-    verdicts = relaxation.qualify_verdicts()
+    verdicts = limit_verdicts(known.verdicts, known, relaxation.summarise())
     quality = _judge_fit(fitted, found.responses, best, [one.covariance for one in noise], off)
     row: dict[str, Any] = {
         "named": any(one.verdict for one in quality),

@@ -21,6 +21,7 @@ from limbfit.identify.uncertainty.relaxation import (
     OWN,
     POWER_LAW,
     assess_relaxation,
+    limit_verdicts,
 )
 from limbfit.identify.uncertainty.superposition import (
     RelaxationModel,
@@ -181,7 +182,7 @@ def test_records_of_the_model_prefer_it_and_leave_the_long_term_open(of_model):
     known = of_model.known
     assert of_model.preferred == OWN
     assert known.verdicts[4] == DETERMINED
-    verdicts = of_model.qualify_verdicts()
+    verdicts = limit_verdicts(known.verdicts, known, of_model.summarise())
     assert verdicts[4] == "determined at 1 s and 10 s; its long-term value not"
     assert verdicts[6] == known.verdicts[6]  # gamma
     for time in (1.0, 3600.0):
@@ -194,12 +195,14 @@ def test_a_modulus_that_is_weakly_determined_at_all_times_is_not_called_undeterm
     spread = of_model.spread
     open_log = np.broadcast_to(0.03 * np.eye(len(NAMES)), spread.covariance_log.shape)
     wider = replace(spread, covariance_log=open_log, fall_log=0 * spread.fall_log)
-    assert replace(of_model, spread=wider).qualify_verdicts()[4] == WEAK
+    known, relaxation = of_model.known, replace(of_model, spread=wider).summarise()
+    assert limit_verdicts(known.verdicts, known, relaxation)[4] == WEAK
 
 
 def test_records_of_a_power_law_are_told_and_later_moduli_lie_inside(of_power_law):
     assert of_power_law.preferred == POWER_LAW
-    verdicts = of_power_law.qualify_verdicts()
+    known = of_power_law.known
+    verdicts = limit_verdicts(known.verdicts, known, of_power_law.summarise())
     assert DETERMINED not in (verdicts[2], verdicts[3], verdicts[4], verdicts[6], verdicts[7])
     for time in (1.0, 10.0, 60.0):
         for number, true in enumerate(true_moduli(time)):
@@ -272,3 +275,12 @@ def test_a_limb_that_gives_way_is_named_where_the_records_cannot_tell_it_from_re
     assert GIVES_WAY in found.describe()
     assert found.summarise().tail_weight > 0.5
     assert GIVES_WAY not in of_power_law.describe()
+
+
+def test_moduli_fall_as_a_power_of_time_from_the_longest_load_on_however_long_it_lasts(of_model):
+    """Nothing yet just after the longest load, and more in 16 hours than in ten."""
+    longest = of_model.spread.longest_s
+    for duration_s in (0.9 * longest, 1.001 * longest, 2.0 * longest, 36_000.0, 57_600.0):
+        fall = of_model.spread.interpolate(duration_s)[2]
+        expected = MAX_SLOPE * np.log(max(duration_s / longest, 1.0))
+        assert fall == pytest.approx(np.tile([expected, 0.0, 0.0, 0.0], 2), abs=1e-9)

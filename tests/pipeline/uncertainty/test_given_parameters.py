@@ -29,7 +29,7 @@ from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.problem import build_problem
 from limbfit.pipeline.records.deviations import estimate_site_noise
 from limbfit.pipeline.records.records import load_site_record
-from limbfit.pipeline.uncertainty.result import Found, _write_flat, _write_prediction
+from limbfit.pipeline.uncertainty.result import Found, _summarise_parameters, _write_flat, _write_prediction
 from limbfit.pipeline.uncertainty.uncertainty import _compare_groupings
 from limbfit.results.curves import read_curves
 from limbfit.results.identification import CalibrationResult, PredictResult
@@ -118,7 +118,8 @@ def test_intervals_of_predictions_widen_beyond_the_longest_load_as_those_of_a_ru
     explored = SimpleNamespace(posterior=SimpleNamespace(covariance=no_spread, median=parameters))
     rows, curves = [], []
     for one in (None, relaxation):
-        found = Found(known, explored, None, None, (), one)
+        stated = one and SimpleNamespace(beyond=one)
+        found = Found(known, explored, None, None, (), stated)
         folder = tmp_path / str(len(rows))
         (folder / "predictions").mkdir(parents=True)
         rows.append(_write_prediction(folder, context.study, found, record, response))
@@ -127,6 +128,32 @@ def test_intervals_of_predictions_widen_beyond_the_longest_load_as_those_of_a_ru
     np.testing.assert_array_equal(wide[~later], low[~later])
     np.testing.assert_allclose(wide[later], np.maximum(low[later] - 1.5, 0.0), atol=1e-6)
     assert rows[1].half_width_percent > rows[0].half_width_percent + 5.0
+
+
+def test_verdicts_count_relaxation_beyond_the_records_as_those_of_a_run():
+    data, responses = records(0.01), simulate(TRUTH)
+    known = estimate_uncertainty(TRUTH, responses, data, PAPER, estimate_curve_noise(responses, data))
+    posterior = SimpleNamespace(
+        covariance=1e-4 * np.eye(8),
+        median=TRUTH,
+        intervals_95=TRUTH[:, None] * np.exp([[-0.02, 0.02]]),
+    )
+    explored = SimpleNamespace(
+        posterior=posterior, profiles=(), likelihood=SimpleNamespace(space=known.space)
+    )
+    moduli = [
+        SimpleNamespace(tissue=tissue, time_s=time, interval_95=(5.0, 5.0 * factor))
+        for tissue in ("skin", "muscle")
+        for time, factor in ((1.0, 1.1), (10.0, 1.1), (3600.0, 8.0 if tissue == "skin" else 1.1))
+    ]
+    relaxation = SimpleNamespace(prefers="a power law", moduli=moduli)
+    found = SimpleNamespace(
+        known=known, explored=explored, source_covariance=np.zeros((8, 8)), relaxation=relaxation
+    )
+    verdicts = {row.name: row.verdict for row in _summarise_parameters(found)}
+    assert verdicts["skin.c_kPa"] == "determined at 1 s and 10 s; its long-term value not"
+    assert verdicts["skin.gamma"] == "not determined: another relaxation fits as well"
+    assert verdicts["muscle.c_kPa"] == verdicts["skin.m"] == "determined"
 
 
 def test_an_interval_covers_what_is_most_probable_beside_the_answer(tmp_path):

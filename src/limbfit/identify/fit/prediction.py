@@ -113,10 +113,14 @@ class RelaxationSpread:
     fall_log: Array
 
     def interpolate(self, duration_s: float) -> tuple[Array, Array, Array]:
-        """Return shift (p,), covariance (p, p) and fall (p,) at a duration, from its logarithm."""
-        at = float(np.interp(np.log(duration_s), np.log(self.durations_s), np.arange(len(self.durations_s))))
-        i = min(int(at), len(self.durations_s) - 2)
-        weights = np.array([i + 1 - at, at - i])
+        """Return shift (p,), covariance (p, p) and fall (p,) at a duration, linear in its logarithm.
+
+        They go on so beyond the last duration, as a power of time falls.
+        """
+        logs = np.log(self.durations_s)
+        i = int(np.clip(np.searchsorted(logs, np.log(duration_s)) - 1, 0, len(logs) - 2))
+        at = max((np.log(duration_s) - logs[i]) / (logs[i + 1] - logs[i]), 0.0)
+        weights = np.array([1.0 - at, at])
         shift, fall = weights @ self.shift_log[i : i + 2], weights @ self.fall_log[i : i + 2]
         return shift, np.tensordot(weights, self.covariance_log[i : i + 2], 1), fall
 

@@ -132,29 +132,6 @@ class RelaxationAssessment:
             )
         return found
 
-    def qualify_verdicts(self) -> tuple[str, ...]:
-        """Return the verdicts (p,) on parameters for what relaxation beyond the records leaves of them.
-
-        A modulus is as well determined as `LONG_TERM_S` after a step, amplitudes and times if the records
-        prefer the model's terms to other relaxations.
-        """
-
-        def judge(number: int, duration_s: float) -> str:
-            low, high = self.state_modulus(number, duration_s)[1]
-            return choose_verdict(float(np.sqrt(high / low)), 0.0)
-
-        verdicts = list(self.known.verdicts)
-        for number, tissue in enumerate(self.tissues):
-            for i in (*tissue.amplitudes, *tissue.times):
-                if verdicts[i] in (DETERMINED, WEAK) and self.preferred != OWN:
-                    verdicts[i] = NOT_ALONE
-            modulus = tissue.moduli[0]
-            long_term = judge(number, LONG_TERM_S)
-            if verdicts[modulus] in (DETERMINED, WEAK) and long_term != DETERMINED:
-                times = [f"{time:g} s" for time in STATED_S if judge(number, time) == DETERMINED]
-                verdicts[modulus] = NOT_LONG_TERM.format(" and ".join(times)) if times else long_term
-        return tuple(verdicts)
-
     def summarise(self) -> RelaxationSummary:
         """Return what is stored, with moduli at `STATED_S` and `LONG_TERM_S`."""
         moduli = []
@@ -172,6 +149,32 @@ class RelaxationAssessment:
             prior=RelaxationPrior(slope=(0.0, MAX_SLOPE), source=SOURCE),
             beyond=RelaxationBeyond.model_validate(self.spread),
         )
+
+
+def limit_verdicts(
+    verdicts: Sequence[str], known: Uncertainty, relaxation: RelaxationSummary | None
+) -> tuple[str, ...]:
+    """Return ``verdicts`` (p,) on the ``known`` parameters for what relaxation beyond the records leaves.
+
+    A modulus is as well determined as `LONG_TERM_S` after a step, amplitudes and times if the records prefer
+    the model's terms to other relaxations. Where relaxation was not assessed, verdicts stay.
+    """
+    qualified = list(verdicts)
+    for tissue in find_tissue_parameters(known.names, known.space) if relaxation else ():
+        assert relaxation is not None
+        for i in (*tissue.amplitudes, *tissue.times):
+            if verdicts[i] in (DETERMINED, WEAK) and relaxation.prefers != OWN:
+                qualified[i] = NOT_ALONE
+        after = {
+            one.time_s: choose_verdict(float(np.sqrt(one.interval_95[1] / one.interval_95[0])), 0.0)
+            for one in relaxation.moduli
+            if one.tissue == tissue.name
+        }
+        modulus, long_term = tissue.moduli[0], after[LONG_TERM_S]
+        if verdicts[modulus] in (DETERMINED, WEAK) and long_term != DETERMINED:
+            times = [f"{time:g} s" for time in STATED_S if after[time] == DETERMINED]
+            qualified[modulus] = NOT_LONG_TERM.format(" and ".join(times)) if times else long_term
+    return tuple(qualified)
 
 
 def assess_relaxation(known: Uncertainty, responses: Sequence[SiteResponse]) -> RelaxationAssessment | None:
@@ -193,12 +196,12 @@ def assess_relaxation(known: Uncertainty, responses: Sequence[SiteResponse]) -> 
     weights, evidence = _weigh(fits)
     # The model's own terms keep the answer, whose covariance is counted with it.
     fits[0] = replace(fits[0], z=records.answer, covariance=0 * fits[0].covariance)
-    shifts, covariances = zip(*(records.spread(fits, weights, t) for t in _DURATIONS_S), strict=True)
-    moduli = [i for tissue in tissues for i in tissue.moduli]
-    is_modulus = np.isin(np.arange(len(known.names)), moduli)
-    falls = MAX_SLOPE * np.outer(np.log(np.maximum(_DURATIONS_S / longest, 1.0)), is_modulus)
+    durations = np.unique(np.r_[_DURATIONS_S, longest])  # between these all is linear, but for that corner
+    shifts, covariances = zip(*(records.spread(fits, weights, t) for t in durations), strict=True)
+    is_modulus = np.array([name.endswith("_kPa") for name in known.names])
+    falls = MAX_SLOPE * np.outer(np.log(np.maximum(durations / longest, 1.0)), is_modulus)
     spread = RelaxationSpread(
-        longest, float(weights[0]), _DURATIONS_S, np.array(shifts), np.array(covariances), falls
+        longest, float(weights[0]), durations, np.array(shifts), np.array(covariances), falls
     )
     tails = float(weights[[fit.world.has_tail for fit in fits]].sum())
     return RelaxationAssessment(known, tissues, weights, evidence, tails, spread)

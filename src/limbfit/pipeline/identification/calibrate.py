@@ -13,7 +13,7 @@ from ...identify.fit.calibration import Calibration
 from ...identify.fit.multifidelity import CorrectionRound
 from ...identify.fit.multistart import MultistartResult, describe_starts
 from ...identify.fit.objective import SiteResponse
-from ...identify.uncertainty.relaxation import RelaxationAssessment, assess_relaxation
+from ...identify.uncertainty.relaxation import assess_relaxation, limit_verdicts
 from ...identify.uncertainty.uncertainty import Uncertainty
 from ...indentation import Parameters, Simulation
 from ...laws import FIBRED, FUNG, is_ogden
@@ -55,7 +55,8 @@ def run_calibrate(context: Context, folder: Path) -> None:
     corrections = [_summarise_round(one, found.sites, problem) for one in rounds]
     relaxation = None
     if is_ogden(study.law.name) or study.law.name in (FIBRED, FUNG):
-        relaxation = assess_relaxation(known, found.responses)
+        assessed = assess_relaxation(known, found.responses)
+        relaxation = None if assessed is None else assessed.summarise()
     simulations = simulator.run_answer(found.parameters)
     answers = {one.site: one for one in records.select_forces(simulations)}
     warnings = {site: list(one.warnings) for site, one in answers.items() if one.warnings}
@@ -149,10 +150,10 @@ def _summarise_starts(tried: MultistartResult, study: Study) -> stored.SearchSta
 
 
 def _summarise_uncertainty(
-    known: Uncertainty, study: Study, relaxation: RelaxationAssessment | None
+    known: Uncertainty, study: Study, relaxation: stored.RelaxationSummary | None
 ) -> stored.CalibrationUncertainty:
     """What is stored of the uncertainty; intervals by tissue and name, like the parameters."""
-    verdicts = known.verdicts if relaxation is None else relaxation.qualify_verdicts()
+    verdicts = limit_verdicts(known.verdicts, known, relaxation)
     return stored.CalibrationUncertainty(
         method=known.method,
         intervals_95=group_intervals(known, study),
@@ -166,7 +167,7 @@ def _summarise_uncertainty(
         priors=_summarise_priors(known, study),
         residuals=known.residual_model.summarise(),
         minus_2_log_evidence=known.minus_2_log_evidence,
-        relaxation=None if relaxation is None else relaxation.summarise(),
+        relaxation=relaxation,
     )
 
 

@@ -57,15 +57,13 @@ def build_problem(study: Study) -> CalibrationProblem:
     table, tissues = study.calibration, len(study.tissues)
     unknowns, stages = build_unknowns(study), build_groupings(study)
     one, several = "one material", f"{COUNTS[tissues] if tissues < len(COUNTS) else tissues} materials"
-    if len(stages) == 1:  # what the study fixes or ties leaves nothing to a second one
-        titles = (one if stages[0] == group_by_kind(unknowns.names) else several,)
-    else:
-        titles = (one, several)
+    is_one = stages[-1] == group_by_kind(unknowns.names)
     return CalibrationProblem(
         study=study,
         unknowns=unknowns,
         stages=stages,
-        titles=titles,
+        # What a study fixes or ties may leave nothing to a second stage.
+        titles=(one, several) if len(stages) > 1 else (one if is_one else several,),
         settings=CalibrationSettings(
             objective=table.objective,
             relative_tolerance=table.relative_tolerance,

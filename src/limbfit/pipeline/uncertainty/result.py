@@ -13,21 +13,23 @@ from ...arrays import Array
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.prediction import RelaxationSpread, compute_force_range, compute_half_width_95
 from ...identify.uncertainty.exploration import Exploration
+from ...identify.uncertainty.relaxation import limit_verdicts
 from ...identify.uncertainty.uncertainty import (
     DETERMINED,
     GIVEN,
     NORMAL_95,
     UNDETERMINED,
+    WEAK,
     FitSensitivity,
     Uncertainty,
-    choose_verdict,
+    choose_verdicts,
     compute_correlation,
     compute_principal_axes,
     format_product,
 )
 from ...results import uncertainty as stored
 from ...results.base import ResultPart
-from ...results.identification import CorrelationMatrix
+from ...results.identification import CorrelationMatrix, RelaxationSummary
 from ...study import Study
 from ..engine.storage import write_atomically, write_curves, write_result, write_rows, write_table
 from ..records.deviations import estimate_site_deviation, estimate_site_noise
@@ -35,23 +37,6 @@ from ..records.records import SiteRecord
 from .sources import Change
 
 EMULATOR = "emulator.npz"
-
-
-def write_runs(
-    file: Path, names: Sequence[str], points: Array, responses: Sequence[Sequence[SiteResponse]]
-) -> None:
-    """Parameters (k, p), forces (k, N) and derivatives (k, N, p) of all sites, one after the other."""
-    with write_atomically(file) as stream:
-        np.savez(
-            stream,
-            names=np.array(names),
-            points=np.asarray(points),
-            sizes=np.array([response.force_N.size for response in responses[0]]),
-            forces=np.array([np.concatenate([r.force_N for r in run]) for run in responses]),
-            jacobians=np.array([np.concatenate([r.jacobian for r in run]) for run in responses]),
-        )
-
-
 _DRAWS = 1500  # written
 _SHARES = {name: f"{name}_sd_percent" for name in ("parameters", "sources", "site", "noise", "misfit")}
 _MOST_OFF = 0.5  # of the rise that ends an interval: differences beyond it are told
@@ -66,7 +51,7 @@ class Found:
     evidence: stored.EvidenceComparison | None
     gain: FitSensitivity
     changes: tuple[Change, ...]
-    relaxation: RelaxationSpread | None
+    relaxation: RelaxationSummary | None
 
     @property
     def source_covariance(self) -> Array:
@@ -125,7 +110,17 @@ def write_results(
     _write_flat(folder / "parameters.csv", parameters)
     _write_flat(folder / "sources.csv", content.sources)
     write_rows(folder / "predictions.csv", rows)
-    write_runs(folder / EMULATOR, found.known.names, explored.likelihood.emulator.points, explored.runs)
+    with write_atomically(folder / EMULATOR) as stream:  # all sites, one after the other
+        np.savez(
+            stream,
+            names=np.array(found.known.names),
+            points=emulator.points,  # (k, p)
+            sizes=np.array([response.force_N.size for response in explored.runs[0]]),
+            forces=np.array([np.concatenate([r.force_N for r in run]) for run in explored.runs]),  # (k, N)
+            jacobians=np.array(
+                [np.concatenate([r.jacobian for r in run]) for run in explored.runs]
+            ),  # (k, N, p)
+        )
     draws = posterior.samples[:: max(len(posterior.samples) // _DRAWS, 1)]
     write_curves(folder / "draws.csv", **dict(zip(found.known.names, draws.T)))
     heads = ("parameter", "value", "rise", "extrapolated")
@@ -139,67 +134,57 @@ def write_results(
 
 def _summarise_parameters(found: Found) -> list[stored.ParameterUncertainty]:
     """One row for every parameter: calibrated, its interval by every method, the verdict on all sources."""
-    known, posterior, unknowns = found.known, found.explored.posterior, found.explored.likelihood.unknowns
+    known, posterior, space = found.known, found.explored.posterior, found.explored.likelihood.space
     profiles = {one.name: one for one in found.explored.profiles}
     more = np.sqrt(np.diag(posterior.covariance) + np.diag(found.source_covariance))
     ours = np.sqrt(np.diag(posterior.covariance))
-    rows = []
-    for i, name in enumerate(known.names):
-        median, (low, high) = posterior.median[i], posterior.intervals_95[i]
-        wider = more[i] / max(ours[i], 1e-300)
-        bounds = unknowns.lower[i], unknowns.upper[i]
-        with_sources = (
-            float(max(median * (low / median) ** wider, bounds[0])),
-            float(min(median * (high / median) ** wider, bounds[1])),
+    wider = more / np.maximum(ours, 1e-300)
+    middle, ends = np.log(posterior.median), np.log(posterior.intervals_95.T)
+    with_sources = np.exp(space.clip(middle + wider * (ends - middle))).T
+    factors = np.sqrt(with_sources[:, 1] / with_sources[:, 0])
+    verdicts = choose_verdicts(space, np.eye(len(more)), factors, more)
+    shown = [profiles.get(name) for name in known.names]
+    return [
+        stored.ParameterUncertainty(
+            name=known.names[i],
+            calibrated=float(known.parameters[i]),
+            median=float(posterior.median[i]),
+            linearised_95=known.intervals_95[i].tolist(),
+            posterior_95=posterior.intervals_95[i].tolist(),
+            profile_95=None if profile is None else profile.interval_95,
+            profile_verdict=None if profile is None else profile.verdict,
+            profile_extrapolated=None if profile is None else profile.ends_extrapolated,
+            with_sources_95=with_sources[i].tolist(),
+            verdict=verdict,
         )
-        profile = profiles.get(name)
-        prior_sd = np.log(bounds[1] / bounds[0]) / np.sqrt(12.0)
-        given = known.verdicts[i] == GIVEN
-        factor = np.sqrt(with_sources[1] / with_sources[0])
-        rows.append(
-            stored.ParameterUncertainty(
-                name=name,
-                calibrated=float(known.parameters[i]),
-                median=float(median),
-                linearised_95=known.intervals_95[i].tolist(),
-                posterior_95=(float(low), float(high)),
-                profile_95=None if profile is None else profile.interval_95,
-                profile_verdict=None if profile is None else profile.verdict,
-                profile_extrapolated=None if profile is None else profile.ends_extrapolated,
-                with_sources_95=with_sources,
-                verdict=GIVEN if given else choose_verdict(float(factor), more[i] / prior_sd),
-            )
-        )
-    return rows
+        for i, (profile, verdict) in enumerate(zip(shown, limit_verdicts(verdicts, known, found.relaxation)))
+    ]
 
 
 def _summarise_combinations(found: Found) -> list[stored.ParameterCombination]:
     """The principal axes of the posterior, as its draws, the linearisation and the sources see them."""
-    known, explored = found.known, found.explored
-    logs = np.log(explored.posterior.samples)
-    unknowns, space = explored.likelihood.unknowns, explored.likelihood.space
-    prior_sd = np.log(unknowns.upper / unknowns.lower) / np.sqrt(12.0)
-    rows = []
-    for weights in compute_principal_axes(explored.posterior.covariance, space):
-        drawn = logs @ weights
-        low, high = np.quantile(drawn, [0.025, 0.975])
-        sd = float(drawn.std(ddof=1))
-        linear = float(np.sqrt(weights @ known.covariance @ weights))
-        sources = float(np.sqrt(weights @ found.source_covariance @ weights))
-        factor = float(np.exp((high - low) / 2))
-        total = float(np.hypot(sd, sources))
-        wider = float(factor ** (total / max(sd, 1e-300)))
-        rows.append(
-            stored.ParameterCombination(
-                text=format_product(weights, known.names),
-                weights=weights.tolist(),
-                linearised_factor_95=float(np.exp(min(NORMAL_95 * linear, 50.0))),
-                posterior_factor_95=factor,
-                with_sources_factor_95=wider,
-                verdict=choose_verdict(wider, total / float(np.linalg.norm(weights * prior_sd))),
-            )
+    known, posterior, space = found.known, found.explored.posterior, found.explored.likelihood.space
+    axes = compute_principal_axes(posterior.covariance, space)
+    drawn = np.log(posterior.samples) @ axes.T
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    sd = drawn.std(axis=0, ddof=1)
+    linear, sources = (
+        np.sqrt(np.einsum("kp,pq,kq->k", axes, part, axes))
+        for part in (known.covariance, found.source_covariance)
+    )
+    total, factors = np.hypot(sd, sources), np.exp((high - low) / 2)
+    wider = factors ** (total / np.maximum(sd, 1e-300))
+    return [
+        stored.ParameterCombination(
+            text=format_product(weights, known.names),
+            weights=weights.tolist(),
+            linearised_factor_95=float(np.exp(min(NORMAL_95 * linear[i], 50.0))),
+            posterior_factor_95=float(factors[i]),
+            with_sources_factor_95=float(wider[i]),
+            verdict=verdict,
         )
-    return rows
+        for i, (weights, verdict) in enumerate(zip(axes, choose_verdicts(space, axes, wider, total)))
+    ]
 
 
 def _summarise_source(found: Found, change: Change) -> stored.SourceEffect:
@@ -261,7 +246,8 @@ def _write_prediction(
     total = np.sum(list(variances.values()), axis=0)
     lower, higher = np.zeros((2, len(force)))
     if found.relaxation is not None:
-        lower, higher, sd = found.relaxation.compute_beyond_N(force, scaled, record.times_s)
+        spread = RelaxationSpread.from_stored(found.relaxation.beyond)
+        lower, higher, sd = spread.compute_beyond_N(force, scaled, record.times_s)
         total += sd**2
     estimated = variances["misfit"], variances["site"]
     half = compute_half_width_95(total, *estimated, model.known_scale, model.site_freedom)
@@ -293,7 +279,8 @@ def _describe_verdict(
 ) -> list[str]:
     """The answer in sentences."""
     words = []
-    for word in (DETERMINED, "weakly determined", UNDETERMINED):
+    of_rows = (row.verdict for row in parameters if row.verdict != GIVEN)
+    for word in dict.fromkeys((DETERMINED, WEAK, UNDETERMINED, *of_rows)):
         names = [row.name for row in parameters if row.verdict == word]
         if names:
             words.append(f"{word.capitalize()}: {', '.join(names)}.")

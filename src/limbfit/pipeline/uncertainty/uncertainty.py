@@ -14,7 +14,6 @@ from ...arrays import Array
 from ...identify.fit.multifidelity import MeshCorrection
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import build_space
-from ...identify.fit.prediction import RelaxationSpread
 from ...identify.uncertainty.exploration import Exploration, ExplorationSettings, explore_posterior
 from ...identify.uncertainty.likelihood import Likelihood
 from ...identify.uncertainty.model_comparison import compare_models, fit_alternative
@@ -78,8 +77,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     gain = FitSensitivity.linearise(known, correction.responses)
     changes = simulate_sources(context, folder, cache, records, best) if table.sources else []
     relaxation = calibration.uncertainty.relaxation
-    beyond = None if relaxation is None else RelaxationSpread.from_stored(relaxation.beyond)
-    found = Found(known, explored, evidence, gain, tuple(changes), beyond)
+    found = Found(known, explored, evidence, gain, tuple(changes), relaxation)
     write_results(folder, study, found, _predict_records(context, cache, calibration))
     return {"runs": explored.rounds[-1].runs}
 
