@@ -84,6 +84,10 @@ class OgdenSum(Uncoupled):
         return np.asarray(self.term_slopes[:, :, 0].sum(axis=1) / 2.0)
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
+        """That of `Material`. Raises `ProblemError` for a name that it does not have."""
+        if unknown := sorted(set(values) - set(self.parameter_names)):
+            known = ", ".join(self.parameter_names)
+            raise ProblemError(f"the material has no parameter {unknown[0]!r}", remedy=f"use one of {known}")
         named = dict(zip(self.parameter_names, self.parameters, strict=True)) | dict(values)
         every = tuple(map(float, named.values()))
         elastic = len(self.elastic_parameters)
