@@ -95,6 +95,34 @@ def test_sensitivities_of_a_contracting_muscle_under_a_punch():
         np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max(), err_msg=name)
 
 
+def test_the_force_between_steps_turns_where_contraction_does():
+    """A held punch, and muscle that tenses from 4 to 4.5 s: no spline goes across."""
+    problem = punch(
+        "tet10", 2, 1, history=History(np.array([0.0, 1.0, 10.0]), np.array([0.0, 3.0, 3.0])),
+        fibres=(1.0, 0.0, 0.0), activation=Activation([0.0, 4.0, 4.5, 10.0], [0.0, 0.0, 1.0, 1.0]),
+    )  # fmt: skip
+    tissue = Contractile(Fibred(problem.materials["muscle"], 0.001, 1.0), 0.02)
+    problem = problem.with_materials({**problem.materials, "muscle": tissue})
+    found = solve(problem, StepControl(tolerance=1e-5))
+    fine = solve(problem, StepControl(times=tuple(np.linspace(0.5, 10.0, 20)), tolerance=1e-5))
+    after = fine.times >= 2.0
+    assert np.ptp(fine.force[after]) > 0.2 * fine.peak_force
+    difference = found.force_at(fine.times) - fine.force
+    np.testing.assert_allclose(difference[after], 0.0, atol=0.025 * fine.peak_force)
+
+
+def test_contraction_is_no_strain_energy():
+    """What fibres shorten by themselves strains the ground, and nothing else stores energy."""
+    tissue = Contractile(Fibred(ELASTIC, 0.01, 1.0), 0.01)
+    problem = bar(tissue, held=False)
+    (step,) = iterate(problem, StepControl(times=(1.0,)))
+    system, laws = System(problem), Laws.build([tissue, tissue])
+    active = compute_element_fields(system, laws, step.state).energy
+    assert (active > 1e-4).all()
+    resting = replace(step.state, activation=0.0)
+    np.testing.assert_allclose(active, compute_element_fields(system, laws, resting).energy, rtol=1e-9)
+
+
 def test_what_cannot_be_is_refused():
     with pytest.raises(ProblemError, match=r"active = -1\.0 is negative"):
         Contractile(TISSUE, -1.0)

@@ -136,6 +136,36 @@ def test_a_held_force_creeps_and_its_displacement_has_sensitivities():
     np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max())
 
 
+def test_tissue_that_comes_back_under_no_force_moves_the_indenter_between_steps_too():
+    history = History(np.array([0.0, 1.0, 2.0, 6.0]), force=np.array([0.0, 2.0, 0.0, 0.0]))
+    problem, control = punch("tet10", 2, 1, history=history), replace(CONTROL, tolerance=1e-5)
+    found = solve(problem, control, sensitivities=True)
+    left = found.displacement[found.times == 2.0][0]
+    assert 0.0 < found.displacement[-1] < 0.3 * left
+    np.testing.assert_allclose(found.displacement_at(found.times), found.displacement, rtol=1e-9)
+    between = found.displacement_at(np.linspace(2.0, 6.0, 50))
+    assert ((between > 0.0) & (between < 1.05 * left)).all()
+    slopes = found.response_sensitivity_at(found.times)
+    np.testing.assert_allclose(slopes, found.displacement_sensitivity, rtol=1e-6)
+
+
+def test_a_force_that_acts_from_the_beginning_deforms_tissue_before_it_relaxes():
+    """At time 0 relaxing tissue is as stiff as elastic tissue of its instantaneous modulus."""
+    problem = punch("tet10", 2, 1, history=History(np.array([0.0, 4.0]), force=np.array([1.0, 1.0])))
+    sudden = {
+        name: OgdenQLV(law.c * (1.0 + law.gamma), law.m, 0.0, 1.0, law.kappa_ratio / (1.0 + law.gamma))
+        for name, law in problem.materials.items()
+    }
+    control = replace(CONTROL, tolerance=1e-6)
+    elastic, relaxing = solve(problem.with_materials(sudden), control), solve(problem, control)
+    assert elastic.displacement[0] == pytest.approx(elastic.displacement[-1], rel=1e-5)
+    assert relaxing.displacement[0] == pytest.approx(elastic.displacement[0], rel=1e-5)
+    fine = (*np.geomspace(1e-4, 0.05, 8), *np.linspace(0.1, 4.0, 25))
+    followed = solve(problem, replace(control, times=fine))
+    expected = followed.displacement_at(relaxing.times)
+    np.testing.assert_allclose(relaxing.displacement[:4], expected[:4], atol=5e-3 * expected[-1])
+
+
 def test_a_body_goes_over_from_displacement_to_force():
     """Pressed 3 mm and held, then left with the force that it had at the end: it creeps on from there."""
     problem = punch("tet10", 4, 1)

@@ -108,6 +108,20 @@ def test_taut_skin_is_stiffer_and_no_stretch_is_none():
     assert tense.peak_force > 1.05 * plain.peak_force
 
 
+def test_tissue_that_swells_against_an_indenter_presses_it_from_the_beginning():
+    """It has done so long since: nothing changes while the indenter stays."""
+    still = History(np.array([0.0, 1.0]), np.zeros(2))
+    stretch = isochoric_stretch(UP, 0.9)
+    problem = punch("tet10", 2, 1, history=still, start="as-given", prestretch=stretch)
+    problem = replace(problem, indenter=replace(problem.indenter, centre=(0.0, 0.0, 0.0)))
+    found = solve(problem, StepControl(tolerance=1e-8), sensitivities=True)
+    assert found.force[0] > 0.1
+    np.testing.assert_allclose(found.force, found.force[-1], rtol=1e-5)
+    np.testing.assert_allclose(found.force_at([0.0, 0.01]), found.force[-1], rtol=1e-5)
+    largest = np.abs(found.force_sensitivity[-1]).max()
+    np.testing.assert_allclose(found.force_sensitivity[0], found.force_sensitivity[-1], atol=1e-3 * largest)
+
+
 def test_derivatives_under_a_punch():
     """They follow the equilibrium before, and where the indenter touches."""
     problem, control = taut(1.15), StepControl(load_steps=4, unload_steps=3, tolerance=1e-11)

@@ -209,11 +209,11 @@ def test_steps_that_febio_gets_through_with(tmp_path, shape, parts):
     file, _ = exported(problem, tmp_path)
     control = ET.parse(file).getroot().find("Control")
     size, count = float(control.findtext("step_size")), int(control.findtext("time_steps"))
-    assert size == pytest.approx(problem.history.peak / parts, rel=0.02)
+    assert size == pytest.approx(problem.history.loading_s / parts, rel=0.02)
     assert size * count == pytest.approx(problem.history.times[-1])
     assert control.findtext("time_stepper/aggressiveness") == "1"
     largest = read_feb(file).curves[2].points[:, 1]
-    np.testing.assert_allclose(largest, 4.0 * problem.history.peak / parts, rtol=0.02)
+    np.testing.assert_allclose(largest, 4.0 * problem.history.loading_s / parts, rtol=0.02)
 
 
 @pytest.mark.parametrize("shape", ["square", "sphere"])

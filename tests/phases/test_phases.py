@@ -103,7 +103,7 @@ def test_a_smooth_overshoot_is_part_of_its_hold():
 @pytest.mark.parametrize("end_mm", [3.0, 3.006, 2.994])
 def test_loading_ends_where_the_hold_begins(end_mm):
     history = History(np.array([0.0, 1.0, 31.0, 32.0]), np.array([0.0, 3.0, end_mm, 0.0]))
-    assert history.peak == 1.0
+    assert history.loading_s == 1.0
 
 
 def test_loading_ends_at_the_first_of_equal_cycles():
@@ -115,9 +115,9 @@ def test_loading_ends_at_the_first_of_equal_cycles():
     assert find_loading_end(find_phases(times, displacement)).end_s == 3.0
 
 
-def test_a_history_without_loading_has_its_peak_at_rest():
-    assert History(np.array([0.0, 1.0]), np.array([0.0, -1.0])).peak == 0.0
-    assert History(np.array([0.0, 1.0]), np.array([0.0, 0.0])).peak == 0.0
+def test_a_history_without_loading_is_loaded_to_its_end():
+    assert History(np.array([0.0, 1.0]), np.array([0.0, -1.0])).loading_s == 1.0
+    assert History(np.array([0.0, 1.0]), np.array([0.0, 0.0])).loading_s == 1.0
 
 
 @pytest.mark.parametrize("end_mm", [3.0, 3.006])

@@ -114,14 +114,12 @@ class Relief:
     def _solve_linear_program(self) -> Array:
         """The linear program's depths: unknowns are the depths, the worst gain and the excess."""
         named, others, k = list(self.named), self._others, len(self.named)
-        best = self.best
-        assert best.pressures is not None
-        rest = _log(best.pressures) - self._slopes @ best.depths
+        depths, rest = self.best.depths, self._predict_pressures(np.zeros(k))
         gains = np.column_stack([self._slopes[named], -np.ones(k), np.zeros(k)])
         beyond = np.column_stack([self._slopes[others], np.zeros(len(others)), -np.ones(len(others))])
         cost = np.concatenate([MEAN_WEIGHT * self._slopes[named].mean(axis=0), [1.0, LIMIT_WEIGHT]])
-        low = np.maximum(best.depths - self.trust_mm, MIN_DEPTH_MM)
-        high = np.minimum(best.depths + self.trust_mm, MAX_DEPTH_MM)
+        low = np.maximum(depths - self.trust_mm, MIN_DEPTH_MM)
+        high = np.minimum(depths + self.trust_mm, MAX_DEPTH_MM)
         found = linprog(
             cost,
             A_ub=np.vstack([gains, beyond]),

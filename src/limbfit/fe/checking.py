@@ -108,7 +108,7 @@ def _check_prestretch(problem: Problem) -> None:
     if problem.prestretch is None:
         return
     given, cells = np.asarray(problem.prestretch, dtype=float), len(problem.mesh.cells)
-    if given.shape not in ((3, 3), (cells, 3, 3)):
+    if given.shape not in ((3, 3), (1, 3, 3), (cells, 3, 3)):
         raise ProblemError(
             f"a pre-stretch has shape {given.shape}", remedy=f"give (3, 3), or ({cells}, 3, 3)"
         )

@@ -22,7 +22,7 @@ class ElementFields:
     """Volume averages per element.
 
     ``cauchy (m, 6)`` MPa in the order xx, yy, zz, xy, yz, zx; ``stretches (m, 3)`` principal, falling;
-    ``J (m,)``; ``energy (m,)`` long-term elastic strain energy density, N mm per mm^3.
+    ``J (m,)``; ``energy (m,)`` long-term elastic strain energy density, N mm per mm^3; contraction has none.
     """
 
     cauchy: Array
@@ -34,13 +34,14 @@ class ElementFields:
 def compute_element_fields(system: System, laws: Laws, state: State) -> ElementFields:
     """Fields of a state that kept its memory (``store="peak"``, or a step of `iterate`)."""
     history = _compute_relaxing_stress(system, laws, state)
-    out = np.zeros((len(system.cells), 11))
+    out = np.zeros((2, len(system.cells), 11))
     points, law, numbers, _, _, element, *_ = workspace(0, system.weights.shape[1], laws.numbers.shape[1])
     records = points, law, numbers, element
     mean, every = system.element.mean_dilatation, slice(0, len(system.cells))
-    tables = laws.activate(state.activation, np.ones(len(laws.prony)))
-    _compute_fields(system.elements(every), mean, tables, history, state.u, records, out)
-    return ElementFields(out[:, :6], out[:, 6:9], out[:, 9], out[:, 10])
+    active = laws.activate(state.activation, np.ones(len(laws.prony)))
+    for tables, fields in zip((active, laws.tables), out):
+        _compute_fields(system.elements(every), mean, tables, history, state.u, records, fields)
+    return ElementFields(out[0, :, :6], out[0, :, 6:9], out[0, :, 9], out[1, :, 10])
 
 
 def compute_nodal_forces(system: System, laws: Laws, state: State) -> Array:
@@ -82,11 +83,9 @@ def compute_contact_pressure(system: System, laws: Laws, state: State) -> Array:
     pressure = np.zeros(len(system.points))
     if system.bodies is None:
         return pressure
-    nothing, penalty = np.zeros(0), state.penalty * laws.modulus
-    increment = Increment(
-        state.time, state.displacement, nothing, nothing, penalty, state.drives, state.grips
-    )
-    force = system.contact_force(state.rows, increment)[: system.nodes]
+    penalty = state.penalty * laws.modulus
+    found = system.bodies.evaluate(state.rows, state.drives, penalty, np.inf, state.grips, tangent=False)
+    force = found.residual[: system.nodes]
     faces = np.concatenate([np.asarray(body.faces) for body in system.problem.rigid_bodies])
     faces = faces[np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])]  # each once
     N, areas = compute_face_areas(system.element, system.points + state.u, faces, "gauss")

@@ -89,9 +89,8 @@ class History:
         """The same history, begun so many seconds later."""
         if not seconds:
             return self
-        values = {"displacement" if self.force is None else "force": np.append(self.driver[0], self.driver)}
-        if self.across is not None:
-            values["across"] = np.concatenate([self.across[:1], self.across])
+        stated = {"displacement": self.displacement, "across": self.across, "force": self.force}
+        values = {name: np.concatenate([of[:1], of]) for name, of in stated.items() if of is not None}
         return History(np.append(0.0, self.times + seconds), **values)
 
     @property
@@ -111,15 +110,10 @@ class History:
         return self.times[1:-1][turned]
 
     @property
-    def peak(self) -> float:
-        """End of the loading that first reaches the largest displacement, s; 0 where nothing advances."""
-        loading = find_loading_end(self.phases)
-        return 0.0 if loading is None else loading.end_s
-
-    @property
     def loading_s(self) -> float:
-        """How long the way to the `peak` takes, s; all of it where nothing advances."""
-        return self.peak or float(self.times[-1])
+        """End of the loading that first reaches the largest displacement, s; of all if nothing advances."""
+        loading = find_loading_end(self.phases)
+        return float(self.times[-1]) if loading is None else loading.end_s
 
 
 @dataclass(frozen=True)
@@ -233,6 +227,14 @@ class Problem:
         """A measure that grows evenly while the indenter, or what else drives the problem, changes."""
         return self.moving_s(t) + self.history.travel(t)
 
+    @property
+    def acts_at_once(self) -> bool:
+        """True if a force, pressure, contraction or support acts from time 0 on, before anything moves."""
+        drives = self.drives(0.0)
+        moved = any(one.factor for one in self.supports) and self.history.displacement_at(0.0)
+        loads = moved, self.activation_at(0.0), *(one.at(0.0) for one in self.pressures)
+        return any(loads) or bool(drives.values[drives.forced].any())
+
     def activation_at(self, t: float) -> float:
         """Share of the active stress at time ``t``, s."""
         return 0.0 if self.activation is None else self.activation.at(t)
@@ -246,6 +248,11 @@ class Problem:
         if self.activation is not None:
             knots.append(np.asarray(self.activation.times)[1:])
         return np.unique(np.concatenate([np.zeros(0), *(body.motion.turns for body in self.bodies), *knots]))
+
+    @property
+    def kinks(self) -> NDArray[np.float64]:
+        """Times, s, at which answers may have a kink: a phase of the indenter ends, or something turns."""
+        return np.union1d(self.history.kinks, self.turns)
 
     @property
     def formulation(self) -> Element:

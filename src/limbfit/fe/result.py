@@ -1,9 +1,9 @@
 """What a simulation returns: the force over time, its sensitivities, states and statistics.
 
 Between steps the force is a spline over each phase, in the root of time where steps are dense at its start:
-there the force relaxes, and a spline in time through steps so uneven swings.  Phases end in kinks, and so
-does contact: where it is lost, the spline of the steps before goes on to zero; where it is found again, that
-of the steps after comes from there.
+there the force relaxes, and a spline in time through steps so uneven swings.  Phases end in kinks, what else
+acts on the tissue turns in some, and so does contact: where it is lost, the spline of the steps before goes
+on to zero; where it is found again, that of the steps after comes from there.
 """
 
 from __future__ import annotations
@@ -75,11 +75,6 @@ class Step:
     displacement_sensitivity: Array | None
     state: State
 
-    @property
-    def reaction(self) -> Array:
-        """(3,) force of the indenter along x, y and z of its frame, N."""
-        return self.reactions[0, :3] if len(self.reactions) else np.zeros(3)
-
 
 @dataclass(frozen=True)
 class Result:
@@ -87,7 +82,7 @@ class Result:
 
     Parameters
     ----------
-    times, displacement, force : (n,) s, mm, N (positive when pushing); the first is rest.
+    times, displacement, force : (n,) s, mm, N (positive when pushing); the first is the equilibrium at 0 s.
     force_sensitivity : (n, p) derivative of the force with respect to each parameter (mm, N, s, MPa).
     parameter_names : (region, parameter) per column.
     penetration, contact_area : (n,) mm, mm^2 (reference).
@@ -99,7 +94,7 @@ class Result:
     doubts : the warnings about it, by kind; ``warnings`` are their texts.
     statistics : steps, ``sunk_steps`` (deeper in the skin than allowed), ``unbalanced_steps`` (accepted at
         more than the tolerance), ``unsettled_steps`` (whose friction had not settled), ``penalty_per_mm``
-        (the largest), newton_iterations, factorisations, multigrids (made, one for each matrix), solves,
+        (the largest), newton_iterations, factorisations, solves,
         linear_solver, whether its factors had to be in ``double_precision``, element, unknowns, seconds by
         part.
     """
@@ -143,21 +138,18 @@ class Result:
         The larger of two shares: of the force, N, and of the moment about the pivot, N mm, the latter over
         the stated moment or the force times half the body's width.  0 where nothing is stated.
         """
-        return np.array([self._imbalance(i) for i in range(len(self.times))])
-
-    def _imbalance(self, i: int) -> Array:
-        drives, out = self.problem.drives(float(self.times[i])), np.zeros(self.reactions.shape[1])
-        for j, body in enumerate(self.problem.rigid_bodies):
-            stated = np.where(drives.forced[j], drives.values[j], 0.0)
-            off = np.where(drives.forced[j], self.reactions[i, j] - stated, 0.0)
-            force = float(
-                np.linalg.norm(np.where(drives.forced[j, :3], stated[:3], self.reactions[i, j, :3]))
-            )
-            moment = max(float(np.linalg.norm(stated[3:])), 0.5 * body.shape.width * force)
-            for part, size in ((off[:3], force), (off[3:], moment)):
-                missed = float(np.linalg.norm(part))
-                out[j] = max(out[j], missed / size if missed > 0.0 and size > 0.0 else 0.0)
-        return out
+        drives = [self.problem.drives(float(t)) for t in self.times]
+        forced = np.array([one.forced for one in drives])
+        stated = np.where(forced, [one.values for one in drives], 0.0)
+        missed = np.where(forced, self.reactions - stated, 0.0)
+        force = np.linalg.norm(np.where(forced, stated, self.reactions)[..., :3], axis=-1)
+        widths = np.array([body.shape.width for body in self.problem.rigid_bodies])
+        moment = np.maximum(np.linalg.norm(stated[..., 3:], axis=-1), 0.5 * widths * force)
+        shares = [
+            np.linalg.norm(part, axis=-1) / np.where(size > 0.0, size, np.inf)
+            for part, size in ((missed[..., :3], force), (missed[..., 3:], moment))
+        ]
+        return np.maximum(*shares)
 
     @property
     def peak_force(self) -> float:
@@ -169,23 +161,25 @@ class Result:
         """The kept state with stresses: where loading ends, or as far as the simulation came."""
         return next((state for state in self.states if state.memory is not None), None)
 
-    def _interpolate(self, values: Array | None, t: Array) -> Array:
+    def _interpolate(self, values: Array | None, t: Array, force: Array) -> Array:
         if values is None:
             raise ValueError("the simulation ran without sensitivities")
         at = np.clip(np.asarray(t, dtype=float), self.times[0], self.times[-1])
-        return interpolate(self.times, self.force, self.problem.history.kinks, values, at)
+        return interpolate(self.times, force, self.problem.kinks, values, at)
 
     def force_at(self, t: Array) -> Array:
         """Force (k,) at times ``t (k,)``, N; interpolated between steps, never negative."""
-        return self._interpolate(self.force, t)
+        return self._interpolate(self.force, t, self.force)
 
     def displacement_at(self, t: Array) -> Array:
-        """Displacement (k,) at times ``t (k,)``, mm, between steps as `force_at`."""
-        return self._interpolate(self.displacement, t)
+        """Displacement (k,) at times ``t (k,)``, mm, whether the indenter pushes then or not."""
+        if not self.problem.history.forced:
+            return self.problem.history.at(np.clip(t, self.times[0], self.times[-1]))
+        return self._interpolate(self.displacement, t, np.ones_like(self.force))
 
     def sensitivity_at(self, t: Array) -> Array:
         """Derivative (k, p) of `force_at` with respect to the parameters."""
-        return self._interpolate(self.force_sensitivity, t)
+        return self._interpolate(self.force_sensitivity, t, self.force)
 
     def response_at(self, t: Array) -> Array:
         """What answers to the drive at times ``t (k,)``: force, N, or displacement, mm, under a force."""
@@ -193,15 +187,16 @@ class Result:
 
     def response_sensitivity_at(self, t: Array) -> Array:
         """Derivative (k, p) of `response_at` with respect to the parameters."""
-        forced = self.problem.history.forced
-        return self._interpolate(self.displacement_sensitivity if forced else self.force_sensitivity, t)
+        if not self.problem.history.forced:
+            return self.sensitivity_at(t)
+        return self._interpolate(self.displacement_sensitivity, t, np.ones_like(self.force))
 
 
 def interpolate(times: Array, force: Array, kinks: Array, values: Array, at: Array) -> Array:
     """Values (k, ...) at times ``at (k,)`` of what is ``values (n, ...)`` at the steps, s.
 
     Zero where the ``force (n,)`` between the steps is not positive; for a given force linear in the values.
-    ``kinks``: times where phases begin or end, s.
+    ``kinks``: as `Problem.kinks`, s.
     """
     out = np.zeros((len(at), *values.shape[1:]))
     for first, last in _find_stretches(times, force, kinks):

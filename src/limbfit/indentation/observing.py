@@ -146,7 +146,7 @@ def observe_result(result: Result, model: SiteModel, times_s: Array) -> tuple[Ar
 
     def between(of_states: Array) -> Array:
         """What is (g, s, ...) in the states at the wanted times, (g, n, ...); lengths since touch-down."""
-        kinks, steps = result.problem.history.kinks, result.times[: of_states.shape[1]]
+        kinks, steps = result.problem.kinks, result.times[: of_states.shape[1]]
         column = np.moveaxis(of_states, 1, 0)
         found = np.moveaxis(interpolate(steps, np.ones(len(steps)), kinks, column, at), 0, 1)
         found[since_touch] -= found[since_touch, :1]

@@ -162,8 +162,7 @@ def _estimate_yielding(model: SiteModel, tissues: tuple[str, ...]) -> float:
     the indenter sink in farther, the result says so.  Zero where the reference goes nowhere.
     """
     problem = _build_reference_problem(model, tissues)
-    deepest = problem.history.peak or float(problem.history.times[-1])
-    times = tuple(deepest * np.arange(1, _REFERENCE_STEPS + 1) / _REFERENCE_STEPS)
+    times = tuple(problem.history.loading_s * np.arange(1, _REFERENCE_STEPS + 1) / _REFERENCE_STEPS)
     found = solve(problem, steps=replace(build_steps(model), times=times), store="peak")
     if not found.states:
         return 0.0

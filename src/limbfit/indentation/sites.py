@@ -150,15 +150,13 @@ def build_materials(
     found: dict[str, Material] = {}
     for tissue, values in parameters.items():
         own = stated.in_solver_units(values)
-        if stated.material is not None:
-            found[tissue] = stated.material(**own, kappa_ratio=kappa_ratio)
+        build = FungQLV if law == FUNG else stated.material
+        if build is not None:
+            found[tissue] = build(**own, kappa_ratio=kappa_ratio)
             continue
         if law == POWER:
             times = tuple(choose_relaxation_times(*relaxation_span_s).tolist())
             found[tissue] = OgdenPower(**own, times_s=times, kappa_ratio=kappa_ratio)
-            continue
-        if law == FUNG:
-            found[tissue] = FungQLV(**own, kappa_ratio=kappa_ratio)
             continue
         fibre = {name: own.pop(name) for name in ("k1", "k2") if name in own}
         active = own.pop("active", None)

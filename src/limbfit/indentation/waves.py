@@ -198,8 +198,7 @@ def compute_wave_speeds(result: Result, places: Sequence[WavePlace]) -> tuple[Ar
 
 def _find_turns(result: Result, times: Array) -> Mask:
     """At which times (s,) of its states the solver let the stress go on otherwise than before (`Memory`)."""
-    kinks = np.concatenate([result.problem.history.kinks, result.problem.turns])
-    at_kinks = np.isclose(times[:, None], kinks, rtol=1e-9, atol=0.0).any(axis=1)
+    at_kinks = np.isclose(times[:, None], result.problem.kinks, rtol=1e-9, atol=0.0).any(axis=1)
     pushing = result.force[: len(times)] > 0.0
     met = np.diff(pushing.astype(int), prepend=0) != 0
     touched = np.r_[0.0, times[:-1]] > result.problem.touch_down_s * (1.0 + 1e-9)

@@ -58,9 +58,7 @@ class Solution(Result):
         """Draw force (N) against displacement (mm), on new axes where none are given."""
         axes = axes or new_axes()
         times = np.linspace(0.0, self.times[-1], 400)
-        history = self.problem.history
-        displacement = self.displacement_at(times) if history.forced else history.at(times)
-        axes.plot(displacement, self.force_at(times), label=label or "simulated")
+        axes.plot(self.displacement_at(times), self.force_at(times), label=label or "simulated")
         axes.plot(self.displacement, self.force, ".", color=axes.lines[-1].get_color())
         axes.set(xlabel="displacement, mm", ylabel="force, N")
         return axes

@@ -24,7 +24,6 @@ import numpy as np
 from ...arrays import Array
 from ...phases import MotionPhase
 from ..problem import History, ProblemError
-from .newton import NewtonControl
 
 
 @dataclass(frozen=True)
@@ -75,10 +74,6 @@ class StepControl:
         if not (len(times) and np.isfinite(times).all() and (np.diff([0.0, *times]) > 0.0).all()):
             raise ProblemError("the times of the steps do not grow from 0")
 
-    @property
-    def newton(self) -> NewtonControl:
-        return NewtonControl(tolerance=self.tolerance, max_iterations=self.max_iterations)
-
 
 def schedule_steps(history: History, control: StepControl, turns: Sequence[float] | Array = ()) -> Array:
     """Times (k,) of the steps, s, before any is cut: those stated, or as `grade_steps` places them.
@@ -122,7 +117,7 @@ def grade_steps(history: History, load_steps: int, unload_steps: int) -> Array:
         for phase in row:
             count = round(budget[kind] * phase.duration_s / whole)
             count = max(count, (budget[kind] + 1) // 2)
-            fresh = not times or (kind == "load" and phase.start_mm <= REST_SHARE * travel)
+            fresh = phase.start_mm <= REST_SHARE * travel and (kind == "load" or not times)
             power = FROM_REST if fresh else AFTER_TURN
             part = (np.arange(1, count + 1) / count) ** power
             times.append(phase.start_s + phase.duration_s * part)

@@ -317,7 +317,9 @@ def multiply_symmetric(indptr: Index, indices: Index, data: Array, x: Array, thr
     if columns > 1 and columns % 8 == 1:  # the last one alone: cheaper than seven or more of padding
         parts = (multiply_symmetric(indptr, indices, data, part, threads) for part in (x[:, :-1], x[:, -1:]))
         return np.hstack(list(parts))
-    width = _choose_width(columns)
+    width = columns  # with padding, where that pays: LLVM vectorises loops over 16, eight are written out
+    if columns > 3:
+        width = 8 if columns <= 8 else 16 * ((columns + 15) // 16)
     padded = np.ascontiguousarray(x) if width == columns else np.zeros((n, width))
     if width > columns:
         padded[:, :columns] = x
@@ -334,13 +336,6 @@ def multiply_symmetric(indptr: Index, indices: Index, data: Array, x: Array, thr
         ends = np.searchsorted(indptr, np.linspace(0, len(data), threads + 1)).astype(int)
         y = np.asarray(sum(get_thread_pool(threads).map(product, list(pairwise(ends)))))
     return np.ascontiguousarray(y[:, :columns])
-
-
-def _choose_width(columns: int) -> int:
-    """Columns with padding, where that pays: eight are written out, LLVM vectorises loops over 16."""
-    if columns <= 3:
-        return columns
-    return 8 if columns <= 8 else 16 * ((columns + 15) // 16)
 
 
 @njit(cache=True, nogil=True)

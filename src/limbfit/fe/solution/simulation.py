@@ -18,7 +18,7 @@ from ..problem import Problem
 from ..result import Result, State, Step
 from ..system import Evaluation, Increment, System
 from ..threads import limit_numpy_threads
-from .control import StepControl, StepController, predict_remaining_times, schedule_steps
+from .control import PATIENCE, StepControl, StepController, predict_remaining_times, schedule_steps
 from .coupling import Coupling, couple, renew_increment, solve_coupled
 from .direction import refactor_at
 from .factor import Factor
@@ -30,7 +30,6 @@ from .start import (
     IndenterStart,
     WarmStart,
     build_grips,
-    compute_elastic_residual,
     compute_extrapolation,
     measure_indenter_travel,
 )
@@ -55,6 +54,8 @@ MAX_DEPTH_RATIO = 3.0
 STEEP_PRESSURE = 3.0
 # How long ago tissue was strained before a simulation begins, s: by now it has relaxed.
 PRESTRETCH_AGE_S = 1e9
+# Share of the history in which what acts from its beginning comes on: nothing relaxes meanwhile.
+SUDDEN_SHARE = 1e-9
 
 
 class SteppedRun:
@@ -101,7 +102,7 @@ class SteppedRun:
             rest = self.system.bodies.impose(rest, drives)
         still = np.zeros((*rest.shape, self.laws.count)) if sensitivities else None
         self.rest = self._read_coordinates(rest, drives)
-        self.rested: Array | None = None  # the same where pre-strained tissue is in equilibrium
+        self.onset: Step | None = None  # the equilibrium at time 0, where it is another than that
         start = problem.history.displacement_at(0.0)
         parameters = self.laws.count if sensitivities else 0
         self.grips = build_grips(self.system, parameters, rest, drives)
@@ -118,7 +119,7 @@ class SteppedRun:
         """Yield accepted steps; afterwards ``reason`` says why it stopped early, if it did."""
         begun, pace, why = self.states[-1].time, self.pace, ""
         targets = [t for t in self.planned if t > begun * (1.0 + 1e-9)]
-        if not begun and len(self.system.prestretch) and not self._equilibrate_prestretch():
+        if not begun and not self._equilibrate_onset():
             return
         times, forces = [0.0], [0.0]
         while targets:
@@ -160,16 +161,28 @@ class SteppedRun:
         if any(took) and self.takeover is not None and self.system.bodies is not None:
             self.takeover = self.takeover.update(took, self.system.bodies, step.state, self.laws.modulus)
 
-    def _equilibrate_prestretch(self) -> bool:
-        """True if pre-strained tissue is brought to the equilibrium that it has had long since."""
-        strained = compute_elastic_residual(self.system, self.laws, self.states[0])
-        self.floor = max(self.floor, 1e-2 * strained)  # it may be left without any stress
+    def _equilibrate_onset(self) -> bool:
+        """True if there is equilibrium at time 0.
+
+        Pre-strained tissue has had it long since; under what acts from then on nothing has relaxed yet.
+        """
+        what, takes = "load that acts from the beginning", SUDDEN_SHARE * self.problem.history.times[-1]
+        if len(self.system.prestretch):
+            what, takes = "pre-strained tissue", PRESTRETCH_AGE_S
+            rest = self.states[0]
+            still = self.memory.build_increment(
+                self.system, self.laws, 0.0, takes, rest.displacement, 0.0, rest.drives
+            )
+            strained = self.system.evaluate(rest.rows, self.laws, still, tangent=False).residual
+            self.floor = max(self.floor, 1e-2 * float(np.linalg.norm(strained)))  # no stress may be left
+        elif not self.problem.acts_at_once:
+            return True
         with limit_numpy_threads():
-            found = self._attempt(0.0, self.control.max_iterations, PRESTRETCH_AGE_S)
+            found = self._attempt(0.0, self.pace.usual * PATIENCE, takes)
         if isinstance(found, str):
-            self.reason = f"the pre-strained tissue found no equilibrium: {found}"
+            self.reason = f"the {what} found no equilibrium: {found}"
         else:
-            self.rested = found.coordinates
+            self.onset = found
         self.states = self.states[-1:]
         return not self.reason
 
@@ -195,10 +208,9 @@ class SteppedRun:
                 activation=self.problem.activation_at(t),
                 rims=rims,
             )  # fmt: skip
-            control = replace(
-                self.control.newton, damping=self.damping, max_iterations=patience,
+            control = NewtonControl(
+                self.control.tolerance, patience, self.damping, tangent=self.slope is not None,
                 max_penetration=UNBEARABLE_DEPTH * self.deepest if may_rise else np.inf,
-                tangent=self.slope is not None,
             )  # fmt: skip
             found, increment = self._settle(increment, u, control)
             if found.reason:
@@ -369,8 +381,7 @@ class SteppedRun:
         touched = self.states[-1].time > self.problem.touch_down_s * (1.0 + 1e-9)
         if self.control.stress == "linear" or (met and touched):
             return True
-        kinks = np.concatenate([self.problem.history.kinks, self.problem.turns])
-        return bool(np.isclose(t, kinks, rtol=1e-9, atol=0.0).any())
+        return bool(np.isclose(t, self.problem.kinks, rtol=1e-9, atol=0.0).any())
 
     def _differentiate(
         self, explicit: Explicit, found: Equilibrium, increment: Increment

@@ -21,17 +21,9 @@ from ..kernel.laws import Laws
 from ..memory import Memory
 from ..motion import Drives
 from ..problem import Problem
-from ..result import Result, State
+from ..result import Result
 from ..system import Evaluation, System
 from .coupling import Coupling
-
-
-def compute_elastic_residual(system: System, laws: Laws, state: State) -> float:
-    """Norm of the nodal forces of elastic tissue in a state, N."""
-    still = Memory.rest(system, laws).build_increment(
-        system, laws, 0.0, 1.0, state.displacement, 0.0, state.drives
-    )
-    return float(np.linalg.norm(system.evaluate(state.rows, laws, still, tangent=False).residual))
 
 
 def measure_indenter_travel(system: System, modulus: float) -> float:

@@ -103,6 +103,7 @@ def solve(
     deepest_state: State | None = None
     loading_s = problem.history.loading_s * (1.0 + 1e-9)
     for step in run.run():
+        rows[0] = run.onset or rows[0]
         rows.append(replace(step, state=run.states[0]))
         # What creeps deeper in a hold has relaxed: people mean the end of loading.
         deepest = step.time <= loading_s and (
@@ -180,7 +181,7 @@ def solve_until_onset(problem: Problem, steps: StepControl = StepControl()) -> F
     start, first = run.rest, None
     for step in run.run():
         if first is None:
-            start, first = run.rest if run.rested is None else run.rested, step
+            start, first = run.rest if run.onset is None else run.onset.coordinates, step
         if not run.touch.waits:
             times = np.array([0.0, first.time])
             return FirstStep(run.touch.offset, times, np.array([start, first.coordinates]))
@@ -254,7 +255,6 @@ def _collect_statistics(run: SteppedRun, seconds: float, sunk_steps: int) -> dic
         "penalty_per_mm": run.stiffness,
         "newton_iterations": run.counts["newton_iterations"],
         "factorisations": sum(factor.counts["factorisations"] for factor in used),
-        "multigrids": run.factor.counts["multigrids"],
         "solves": sum(factor.counts["half_solves"] for factor in used) // 2,
         "double_precision": any(factor.counts["double_precision"] for factor in used),
         "linear_solver": run.factor.name,

@@ -148,7 +148,7 @@ def write_site_curve(model: SiteModel, result: Result, file: Path) -> None:
     write_curves(
         file,
         time_s=times,
-        displacement_mm=result.displacement_at(times) if model.forced else model.history.at(times),
+        displacement_mm=result.displacement_at(times + model.waits_s),
         force_N=result.force_at(times + model.waits_s),
     )
 
