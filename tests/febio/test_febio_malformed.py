@@ -78,6 +78,10 @@ CASES = {
     "billions of steps": ("<time_steps>4", "<time_steps>1e12", "1e\\+12 steps"),
     "dynamic": ("STATIC", "DYNAMIC", "DYNAMIC is not supported"),
     "loads": ("</Mesh>", '</Mesh><Loads><nodal_load type="nodal_load"/></Loads>', "load 'nodal_load' is not"),
+    "other units": (
+        'type="solid"/>', 'type="solid"><units>mm-kg-s</units></Module>',
+        r"<units>: 'mm-kg-s' are not supported; scale the input to mm-N-s",
+    ),
     "another module": ('type="solid"', 'type="biphasic"', "biphasic"),
     "another section": ("</Mesh>", "</Mesh><Chemistry/>", "<Chemistry>: this section"),
     "other files": ("<Boundary>", '<Boundary from="/etc/passwd">', "another file"),

@@ -37,6 +37,13 @@ def test_a_feb_becomes_a_problem(tmp_path):
     assert problem.contact_rule == "gauss"
 
 
+def test_a_feb_that_states_limbfits_units_is_read(tmp_path):
+    stated = FEB.replace('type="solid"/>', 'type="solid">\n <units> mm-N-s </units></Module>', 1)
+    np.testing.assert_array_equal(
+        read_feb(written(tmp_path, stated)).geometry.node_ids, [7, 8, 9, 11, 12, 21]
+    )
+
+
 def test_missing_files_are_named(tmp_path):
     for read in (read_feb, read_log):
         with pytest.raises(ProblemError, match="nowhere"):

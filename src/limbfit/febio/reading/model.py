@@ -55,6 +55,7 @@ MIN_RELAXATION_TIMES = 20.0  # longest relaxation times after which no more than
 _OTHER_CONDITIONS = ("rigid", "zero rotation", "zero shell displacement")
 # What none of limbfit's contact rules does; the rest of a contact is how FEBio gets there.
 _UNSUPPORTED_IN_CONTACT = ("tension", "offset", "node_reloc")
+UNITS = "mm-N-s"  # FEBio Studio's name of limbfit's units, in which a file is that names none
 KNOWN_DATA = {
     "node_data": ("x", "y", "z", "ux", "uy", "uz"),
     "element_data": ("x", "y", "z", "sx", "sy", "sz", "sxy", "syz", "sxz", "s1", "s2", "s3", "J"),
@@ -181,8 +182,13 @@ def _read_model(root: XmlNode) -> FebModel:
             raise section[0].error(f"nothing in <{section.tag}> is supported")
         if section.tag not in (*_UNSUPPORTED_SECTIONS, *_KNOWN_SECTIONS):
             raise section.error("this section is not supported")
-        if section.tag == "Module" and section.attributes.get("type", "solid") != "solid":
-            raise section.error(f"module {section.attributes['type']!r} is not supported, only solid")
+        if section.tag == "Module":
+            if section.attributes.get("type", "solid") != "solid":
+                raise section.error(f"module {section.attributes['type']!r} is not supported, only solid")
+            if (units := section.string("units", UNITS)) != UNITS:
+                raise section.child("units").error(
+                    f"{units!r} are not supported", f"scale the input to {UNITS}, pressures in MPa"
+                )
     used = {domain.attributes.get("mat", "") for domain in root.child("MeshDomains")}
     materials, bodies, unread = read_materials(root.child("Material"), used)
     rigid = dict(bodies)
