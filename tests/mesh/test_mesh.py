@@ -104,6 +104,14 @@ def test_check_finds_what_cannot_be_computed_with() -> None:
             check(bad)
 
 
+def test_numbers_of_one_name_are_one_tissue() -> None:
+    names = {1: "muscle", 2: "fat", 4: "muscle"}
+    mesh = Mesh.from_arrays(cube().points, KUHN, [4, 2, 1, 1, 3, 2], names)
+    assert mesh.region_names == ("muscle", "fat", "region 3")
+    assert mesh.regions.tolist() == [0, 1, 0, 0, 2, 1]
+    assert measure_quality(mesh).region_volumes_mm3["muscle"] == pytest.approx(4.0)
+
+
 def test_a_face_of_three_cells_is_refused() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 2], [0, 0, 3]])
     cells = np.array([[0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 2, 5]])

@@ -299,7 +299,9 @@ def _read_tissues(
         return numbers.astype(np.int64), tuple(map(str, kinds))
     if not np.array_equal(kinds, np.round(kinds)):
         raise ProblemError("regions are neither names nor whole numbers")
-    return numbers.astype(np.int64), tuple(names.get(int(k), f"region {int(k)}") for k in kinds)
+    named = [names.get(int(k), f"region {int(k)}") for k in kinds]
+    tissues = tuple(dict.fromkeys(named))  # numbers of one name are one tissue
+    return np.array([tissues.index(name) for name in named])[numbers], tissues
 
 
 def _format_extent(points: Array) -> str:
