@@ -134,6 +134,8 @@ def _measure_above_trimline(
 
 def _interpolate_line(points: Array, limb: LimbProfile) -> PchipInterpolator:
     """Interpolate the height of a closed line (k, 3) over the angle around the limb."""
+    if np.array_equal(points[0], points[-1]):  # some state the end of a closed line, too
+        points = points[:-1]
     angle, station, radius = limb.rays.coordinates(points)
     off = np.abs(radius - limb.at(angle, station))
     if off.max() > MAX_OFF_LIMB_MM:
