@@ -22,12 +22,14 @@ from limbfit.fe.materials import FungQLV
 from limbfit.fe.system import Increment
 from limbfit.indentation.sites import build_materials
 from limbfit.laws import FUNG, LAWS, Parameter, TissueLaw, register_law
+from limbfit.mesh import Mesh
 from limbfit.pipeline.commands.export import check_export
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.partial_results import ResultFiles
 from limbfit.pipeline.socket.limb import SocketLimb
 from limbfit.pipeline.socket.simulation import SocketRun
 from limbfit.socket import Socket
+from small_limb import limb as limb_with_a_bone
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "fe"))
 from blocks import block, check_tangent, punch
@@ -196,10 +198,12 @@ def test_a_socket_knows_it_in_a_process_that_has_read_no_study_and_follows_its_f
     for name in ("skin.stl", "1.csv", "limb.vtu"):
         (tmp_path / name).write_text(name)
     (tmp_path / "study.toml").write_text(GIVEN.replace("yeoh.py", str(file)))
-    study, corners = load_study(tmp_path), np.eye(3)
+    study, corners = load_study(tmp_path), np.eye(3) + [12.0, -80.0, 270.0]  # under the limb
     socket = Socket(corners, np.array([[0, 1, 2]]), corners, np.arange(3))
-    limb = SocketLimb(study, None, None, None, {}, ())
-    run = SocketRun("socket", limb, None, {"skin": TRUTH}, socket, ResultFiles(tmp_path / "runs"))
+    anatomy, mesh = limb_with_a_bone(), Mesh.from_arrays(np.eye(4, 3), [[0, 1, 2, 3]])
+    mesh = replace(mesh, face_sets={"skin": np.array([[0, 1, 2]])})
+    limb = SocketLimb(study, anatomy, anatomy, None, {}, ())
+    run = SocketRun("socket", limb, mesh, {"skin": TRUTH}, socket, ResultFiles(tmp_path / "runs"))
     (tmp_path / "run.pickle").write_bytes(pickle.dumps(run))
     code = "import pickle, sys; print(pickle.load(open(sys.argv[1], 'rb')).laws['skin'].parameters)"
     told = subprocess.run(

@@ -96,12 +96,16 @@ class SocketRun:
     def key(self) -> str:
         """Of all that decides what the socket does to the limb, whose mesh lies above what is kept."""
         assert self.kept is not None
-        study, face = self.limb.study, self.face
+        study, face, fit = self.limb.study, self.face, self.fit
         table = study.socket.model_dump(mode="json", exclude={"design", "worn_s"})
+        # Regions and loads follow from the names of the bones as well, which no mesh and no table holds.
+        loads = [(*load.force, *load.moment, *load.point) for load in fit.loads]
+        regions = {name: mask.tolist() for name, mask in self.faces.items()}
         return compute_digest(
             *(table, study.material.model_dump(mode="json"), self.parameters, self.sensitivities),
             *(compute_file_digest(self.kept.folder.parent / MESH), code_digest(solve_run)),
             *(face.points.tolist(), face.clear.tolist(), compute_extensions_digest(study.extensions)),
+            *(fit.pivot.tolist(), loads, regions),
         )
 
     @property
