@@ -23,7 +23,7 @@ name = "1"
 position = [46.0, -80.0, 290.0]
 depth_mm = 3.0
 [socket]
-trim_mm = 26.0
+trim_mm = 20.0
 edge_mm = 14.0
 distal_clearance_mm = 3.0
 """

@@ -19,7 +19,7 @@ from small_limb import limb, revolved, small_limb
 
 NO_LINER = "[socket.liner]\nthickness_mm = 0.0\n"
 FROM_FILE = 'file = "socket.stl"\n' + NO_LINER
-OF_RECTIFICATION = ("trim_mm = 26.0\n", "distal_clearance_mm = 3.0\n")  # what a file stands in place of
+OF_RECTIFICATION = ("trim_mm = 20.0\n", "distal_clearance_mm = 3.0\n")  # what a file stands in place of
 DEEP = """reduction_percent = 2.0
 [[socket.areas]]
 name = "deep"

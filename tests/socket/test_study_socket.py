@@ -8,15 +8,26 @@ from typing import Any
 
 import numpy as np
 import pytest
-from socket_limbs import round_limb
+from socket_limbs import CUT_NORMAL, round_limb
 
 from limbfit.anatomy.surfaces.surfacefiles import write_surface
+from limbfit.anatomy.surfaces.surfaces import Anatomy
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import StudyError
+from limbfit.mesh import Mesh
 from limbfit.pipeline.commands.check import check_study
 from limbfit.pipeline.commands.fitting import choose_tissues
 from limbfit.pipeline.commands.run import run_experiment
-from limbfit.pipeline.socket.shape import build_regions, build_socket, load_of
+from limbfit.pipeline.engine.partial_results import ResultFiles
+from limbfit.pipeline.socket.limb import SocketLimb
+from limbfit.pipeline.socket.shape import (
+    build_regions,
+    build_socket,
+    find_covered_regions,
+    load_of,
+    trim_of,
+)
+from limbfit.pipeline.socket.simulation import SocketRun
 from limbfit.priors import of_tissues
 from limbfit.socket import Socket
 from limbfit.socket.landmarks import find_knee_centre
@@ -219,3 +230,73 @@ def test_a_table_without_shape_is_a_study_of_its_keys(tmp_path: Path) -> None:
     table: dict[str, Any] = study_of(tmp_path, "[socket]\nfriction = 'sticky'\n").socket.model_dump()
     assert table["friction"] == "sticky"
     assert table["loads"][0]["preset"] == "single stance"
+
+
+def cut_limb(height: float, above: float = 6.0) -> Anatomy:
+    """The round limb cut at a height; its bones stick out of the cut by ``above`` mm, or end below it."""
+    limb = round_limb()
+
+    def cut(surface: Surface, top: float) -> Surface:
+        return Surface(np.minimum(surface.points, [np.inf, np.inf, top]), surface.faces)
+
+    bones = {name: cut(bone, height + above) for name, bone in limb.bones.items()}
+    return Anatomy(cut(limb.skin, height), bones, np.array([0.0, 0.0, height]), CUT_NORMAL)
+
+
+def test_a_shank_that_is_cut_below_the_knee_has_no_knee_centre_and_no_fibular_head(tmp_path: Path) -> None:
+    limb, whole = cut_limb(100.0), cut_limb(100.0, above=-2.0)
+    study = study_of(tmp_path, '[[socket.loads]]\nname = "x"\npreset = "toe-off"\n')
+    stance = study_of(tmp_path, '[[socket.loads]]\nname = "x"\npreset = "single stance"\n')
+    ((point, _),) = trim_of(stance, limb).planes
+    assert point[2] == pytest.approx(70.0)  # 30 mm below the cut; it was 4 mm below it
+    ((point, _),) = trim_of(stance, whole).planes
+    assert point[2] == pytest.approx(88.0)  # 10 mm below the tibia's top
+    socket = build_socket(stance, limb, limb.skin)
+    assert load_of(stance, stance.socket.loads[0], limb, socket)[2][2] < 72.0  # at the brim
+    with pytest.raises(StudyError, match="is not known: the proximal cut goes through the tibia"):
+        load_of(study, study.socket.loads[0], limb, socket)
+    assert load_of(study, study.socket.loads[0], whole, socket)[2] == pytest.approx(find_knee_centre(whole))
+    assert "fibular head" in build_regions(study, whole)
+    regions = build_regions(study, limb)
+    assert "fibular head" not in regions
+    assert {"tibial crest", "distal fibula", "medial middle"} <= regions.keys()
+
+
+def test_what_is_kept_of_a_socket_follows_the_names_of_the_bones(tmp_path: Path) -> None:
+    study, limb = study_of(tmp_path), round_limb()
+    socket, mesh = drawn(study), build_mesh_under(limb.skin)
+    (tmp_path / "limb.vtu").write_text("the same mesh")
+    keys = set()
+    for names in (("tibia", "fibula"), ("shin", "fibula"), ("shin", "splint")):
+        named = replace(limb, bones=dict(zip(names, limb.bones.values(), strict=True)))
+        on = SocketLimb(study, named, named, None, build_regions(study, named), ())
+        keys.add(SocketRun("", on, mesh, {}, socket, ResultFiles(tmp_path / "runs")).key)
+    assert len(keys) == 3
+
+
+def build_mesh_under(skin: Surface) -> Mesh:
+    """A mesh of which only its outer faces are looked at."""
+    cell = np.array([[0, 1, 2, 3]])
+    return Mesh(skin.points, cell, "tet4", np.zeros(1, np.int64), ("skin",), {}, {"skin": skin.faces})
+
+
+def test_a_region_smaller_than_the_faces_of_the_mesh_has_the_nearest_of_them(tmp_path: Path) -> None:
+    text = '[[socket.regions]]\nname = "{}"\nposition = [0, -44, {}]\nradius_mm = 1\n'
+    study = study_of(tmp_path, text.format("sore", 60) + text.format("above the brim", 135))
+    regions, socket, skin = build_regions(study, round_limb()), drawn(study), round_limb().skin
+    angle, height = np.meshgrid(np.radians(np.arange(0.0, 360.0, 16.0)), np.arange(20.0, 150.0, 11.0))
+    middles = np.stack([44.0 * np.cos(angle), 44.0 * np.sin(angle), height], axis=-1).reshape(-1, 3)
+    found = find_covered_regions(middles, skin, regions, socket)
+    far = np.linalg.norm(middles - regions["sore"].position, axis=1)
+    assert np.flatnonzero(found["sore"]).tolist() == [far.argmin()]
+    assert "above the brim" not in found
+
+
+def test_a_trimline_may_end_with_its_first_point(tmp_path: Path) -> None:
+    angle = np.radians(np.arange(0.0, 360.0, 45.0))
+    line = np.column_stack([50.0 * np.cos(angle), 50.0 * np.sin(angle), 100.0 + 5.0 * np.cos(angle)])
+    open_line, closed = (
+        drawn(study_of(tmp_path, f"[socket]\ntrimline = {np.vstack(one).tolist()}\n"))
+        for one in ([line], [line, line[:1]])
+    )
+    np.testing.assert_array_equal(open_line.points, closed.points)

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from ..anatomy.frame import build_limb_frame
-from ..anatomy.surfaces.surfaces import Anatomy
+from ..anatomy.surfaces.surfaces import ON_CUT_MM, Anatomy
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array, Mask
 from ..errors import SurfaceError
@@ -83,13 +83,24 @@ def find_bone(anatomy: Anatomy, name: str) -> Surface | None:
     return next((b for key, b in anatomy.bones.items() if name in key.lower()), None)
 
 
+def find_top(anatomy: Anatomy, name: str) -> float | None:
+    """Find the height of a bone's proximal end over the proximal cut, mm (negative).
+
+    None where no bone has that name, or where the cut goes through it.
+    """
+    bone = find_bone(anatomy, name)
+    top = 0.0 if bone is None else float(anatomy.height(bone.points).max())
+    return top if top < -ON_CUT_MM else None
+
+
 def find_knee_centre(anatomy: Anatomy) -> Array | None:
-    """(3,) LPS mm, the middle of the tibia's top; None where no bone is named tibia."""
-    tibia = find_bone(anatomy, "tibia")
-    if tibia is None:
+    """(3,) LPS mm, the middle of the tibia's top; None where no bone is named tibia, or the cut goes through
+    it.
+    """
+    tibia, highest = find_bone(anatomy, "tibia"), find_top(anatomy, "tibia")
+    if tibia is None or highest is None:
         return None
-    height = anatomy.height(tibia.points)
-    top = tibia.points[height > height.max() - PLATEAU_MM]
+    top = tibia.points[anatomy.height(tibia.points) > highest - PLATEAU_MM]
     return np.asarray((top.min(axis=0) + top.max(axis=0)) / 2)
 
 
@@ -118,22 +129,19 @@ class SkinRegion:
     faces: Mask
 
 
-def build_default_regions(
-    anatomy: Anatomy, directions: Directions, below: float | None = None
-) -> dict[str, SkinRegion]:
+def build_default_regions(anatomy: Anatomy, directions: Directions) -> dict[str, SkinRegion]:
     """Build the regions of a limb by name, where nothing is stated.
 
-    Four sides in three levels between ``below`` and the distal end; over the bones that have these names, the
-    tibial crest, the fibular head, the ends of tibia and fibula and the patellar tendon.
+    Four sides in three levels between the knee centre, or 30 mm below the proximal cut, and the distal end;
+    over the bones that have these names, the tibial crest, the fibular head, the ends of tibia and fibula and
+    the patellar tendon.
 
     Parameters
     ----------
     directions : where anterior and medial are; where medial is not, the sides are ``left`` and ``right``.
-    below : height over the proximal cut (negative, mm) at which the highest level starts, such as the brim's;
-        by default that of the knee centre, or 30 mm below the cut.
     """
     knee = find_knee_centre(anatomy)
-    top = below if below is not None else float(anatomy.height(knee)) if knee is not None else -30.0
+    top = -30.0 if knee is None else float(anatomy.height(knee))
     masks = _select_levels(anatomy, directions, top) | _select_skin_over_bones(anatomy, directions)
     skin, middles = anatomy.skin, anatomy.skin.triangles.mean(axis=1)
     regions = {}
@@ -200,7 +208,8 @@ def _select_skin_over_bones(anatomy: Anatomy, directions: Directions) -> dict[st
         if patella is not None:
             found["patellar tendon"] = _select_tendon(anatomy, directions, patella, tibia)
     if fibula is not None:
-        found["fibular head"] = _select_skin_over_end(anatomy, fibula, distal=False)
+        if find_top(anatomy, "fibula") is not None:
+            found["fibular head"] = _select_skin_over_end(anatomy, fibula, distal=False)
         found["distal fibula"] = _select_skin_over_end(anatomy, fibula, distal=True)
     return found
 

@@ -26,7 +26,6 @@ class StandardLoad:
     proximal, anterior, medial : the force on the socket, in body weights.
     ahead_mm, inside_mm : where the line passes the knee centre, anterior and medial of it; a line through it
         passes the limb's middle where there is no knee.
-    source : where that comes from.
     """
 
     proximal: float
@@ -34,7 +33,6 @@ class StandardLoad:
     medial: float = 0.0
     ahead_mm: float = 0.0
     inside_mm: float = 0.0
-    source: str = ""
 
     def force(self, body_weight: float, directions: Directions) -> Array:
         """(3,) N, LPS, on the socket."""
@@ -52,9 +50,9 @@ class StandardLoad:
 
 
 STANDARD_LOADS: Mapping[str, StandardLoad] = {
-    "double stance": StandardLoad(0.5, source="half of the body weight"),
-    "single stance": StandardLoad(1.0, source="the body weight"),
-    "heel strike": StandardLoad(1.1, 0.2, 0.2, 50.0, 50.0, "Winter 1991; ISO 10328 condition I, rounded"),
-    "mid-stance": StandardLoad(0.8, 0.0, 0.0, 0.0, 40.0, "Winter 1991"),
-    "toe-off": StandardLoad(1.1, -0.1, 0.0, 70.0, 40.0, "Winter 1991; ISO 10328 condition II, rounded"),
+    "double stance": StandardLoad(0.5),
+    "single stance": StandardLoad(1.0),
+    "heel strike": StandardLoad(1.1, 0.2, 0.2, 50.0, 50.0),  # ISO 10328, condition I
+    "mid-stance": StandardLoad(0.8, 0.0, 0.0, 0.0, 40.0),
+    "toe-off": StandardLoad(1.1, -0.1, 0.0, 70.0, 40.0),  # ISO 10328, condition II
 }

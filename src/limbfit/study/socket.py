@@ -113,7 +113,7 @@ class SocketLoadTable(TomlTable):
 class SocketTable(TomlTable):
     """A socket from a file or rectified from the limb; every key has a default.
 
-    ``trim_mm`` is below the top of the tibia, or below the proximal cut by more where no bone is a tibia.
+    ``trim_mm`` is below the top of the tibia, or below the proximal cut by more where no tibia ends below it.
     ``edge_mm`` is the edge length of the limb's mesh where the socket touches, by default by the size of the
     socket; ``face_edge_mm`` the socket's.
     """

@@ -21,9 +21,9 @@ from ...socket.landmarks import (
     SkinRegion,
     build_default_regions,
     build_stated_region,
-    find_bone,
     find_directions,
     find_load_point,
+    find_top,
 )
 from ...socket.loads import STANDARD_LOADS
 from ...socket.targets import Target
@@ -34,7 +34,7 @@ from ...study.socket import SocketLoadTable
 
 LINER = "liner"  # its name among the tissues
 BELOW_KNEE_MM = 10.0  # of the top of the tibia: the brim, where nothing is stated
-BELOW_CUT_MM = 30.0  # of the proximal cut, where no bone is a tibia
+BELOW_CUT_MM = 30.0  # of the proximal cut, where no tibia ends below that
 # Edges of a limb's mesh under a socket whose face is no larger than this; larger ones have as many edges.
 EDGE_MM, FACE_MM2 = 10.0, 8e4
 
@@ -106,10 +106,10 @@ def trim_of(study: Study, anatomy: Anatomy) -> Trim:
     line = np.array(table.trimline) if table.trimline else None
     if planes or line is not None:
         return Trim(planes, line)
-    tibia = find_bone(anatomy, "tibia")
-    below = table.trim_mm if table.trim_mm is not None else (BELOW_CUT_MM if tibia is None else BELOW_KNEE_MM)
-    top = 0.0 if tibia is None else float(anatomy.height(tibia.points).max())  # over the proximal cut, mm
-    return Trim([(anatomy.cut_point + (top - below) * anatomy.cut_normal, anatomy.cut_normal)])
+    top = find_top(anatomy, "tibia")
+    below = BELOW_CUT_MM if top is None else BELOW_KNEE_MM
+    height = (top or 0.0) - (below if table.trim_mm is None else table.trim_mm)
+    return Trim([(anatomy.cut_point + height * anatomy.cut_normal, anatomy.cut_normal)])
 
 
 def build_regions(study: Study, anatomy: Anatomy) -> dict[str, SkinRegion]:
@@ -144,7 +144,7 @@ def load_of(
 
     Raises `StudyError` where the knee centre or the side of the limb must be known and is not.
     """
-    check_load(study, load, anatomy.bones)
+    check_load(study, load, anatomy.bones, find_top(anatomy, "tibia") is None)
     brim = socket.points[socket.brim]
     point = find_load_point(anatomy, brim) if load.point is None else np.array(load.point)
     if load.preset is None:
@@ -155,18 +155,23 @@ def load_of(
         return standard.force(weight, known), standard.moment(weight, known), point
 
 
-def check_load(study: Study, load: SocketLoadTable, bones: Collection[str]) -> None:
+def check_load(
+    study: Study, load: SocketLoadTable, bones: Collection[str], is_tibia_cut: bool = False
+) -> None:
     """That what a preset needs is known of a limb whose bones have these names.
 
-    Raises `StudyError` where the knee centre or the side of the limb must be known and is not.
+    The proximal cut may go through the tibia, so that its top is not there. Raises `StudyError` where the
+    knee centre or the side of the limb must be known and is not.
     """
     if load.preset is None:
         return
     standard, place = STANDARD_LOADS[load.preset], f"socket.loads.{load.name}.preset"
     named = [any(bone in name.lower() for name in bones) for bone in ("tibia", "fibula")]
-    if (standard.ahead_mm or standard.inside_mm) and load.point is None and not named[0]:
+    is_beside = standard.ahead_mm or standard.inside_mm
+    if is_beside and load.point is None and (is_tibia_cut or not named[0]):
+        why = "the proximal cut goes through the tibia" if named[0] else "no bone is named tibia"
         raise StudyError(
-            f"{load.preset!r} passes beside the knee centre, which is not known: no bone is named tibia",
+            f"{load.preset!r} passes beside the knee centre, which is not known: {why}",
             file=study.file,
             place=place,
             remedy='state point, beside which it passes (LPS, mm), or force_N, or take "single stance"',
@@ -209,10 +214,16 @@ def find_covered_regions(
 ) -> dict[str, NDArray[np.bool_]]:
     """Which faces (f,) of an outer surface, with ``middles`` (f, 3) mm, are each region's under a socket.
 
-    A face belongs to a region where the nearest skin does. Regions that no socket reaches are left out.
+    A face belongs to a region where the nearest skin does; a region that is smaller than the faces has the
+    one nearest to its middle. Regions that no socket reaches are left out.
     """
     below, covered = skin.find_nearest(middles)[1], socket.find_covered(middles)
-    masks = {name: region.faces[below] & covered for name, region in regions.items()}
+    masks = {}
+    for name, region in regions.items():
+        inside = region.faces[below]
+        if not inside.any():
+            inside[np.linalg.norm(middles - region.position, axis=1).argmin()] = True
+        masks[name] = inside & covered
     return {name: mask for name, mask in masks.items() if mask.any()}
 
 
