@@ -80,7 +80,7 @@ CASES = {
     "loads": ("</Mesh>", '</Mesh><Loads><nodal_load type="nodal_load"/></Loads>', "load 'nodal_load' is not"),
     "other units": (
         'type="solid"/>', 'type="solid"><units>mm-kg-s</units></Module>',
-        r"<units>: 'mm-kg-s' are not supported; scale the input to mm-N-s",
+        "<Module>: units 'mm-kg-s' are not supported; scale the input to mm-N-s",
     ),
     "another module": ('type="solid"', 'type="biphasic"', "biphasic"),
     "another section": ("</Mesh>", "</Mesh><Chemistry/>", "<Chemistry>: this section"),

@@ -198,7 +198,7 @@ def test_a_socket_knows_it_in_a_process_that_has_read_no_study_and_follows_its_f
     for name in ("skin.stl", "1.csv", "limb.vtu"):
         (tmp_path / name).write_text(name)
     (tmp_path / "study.toml").write_text(GIVEN.replace("yeoh.py", str(file)))
-    study, corners = load_study(tmp_path), np.eye(3) + [12.0, -80.0, 270.0]  # under the limb
+    study, corners = load_study(tmp_path), np.eye(3) + np.array([12.0, -80.0, 270.0])  # beside the limb
     socket = Socket(corners, np.array([[0, 1, 2]]), corners, np.arange(3))
     anatomy, mesh = limb_with_a_bone(), Mesh.from_arrays(np.eye(4, 3), [[0, 1, 2, 3]])
     mesh = replace(mesh, face_sets={"skin": np.array([[0, 1, 2]])})

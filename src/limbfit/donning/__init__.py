@@ -17,7 +17,6 @@ from .outcome import (
     SHEAR_LEVELS,
     DonningResult,
     LoadedState,
-    Patch,
     SocketStep,
     Strains,
     pack,

@@ -7,7 +7,7 @@ motions of their own. Then the history is that of prescribed nodes, and of bodie
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,13 +26,13 @@ from .parts import (
 )
 from .penalty import compute_mean_penalty, find_smallest_depth
 from .reading.geometry import find_boundary_faces, is_closed
-from .reading.materials import Prestrain
 from .reading.model import Contact, FebModel
 from .reading.rigid import (
     FREEDOMS,
     build_motion,
     find_straight_line,
     merge_knots,
+    merge_times,
     restrict_to_rail,
 )
 
@@ -71,7 +71,10 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
     fixed, supports = _build_supports(model, tissue.node_index, driven)
     element = next(iter(model.select_parts(model.materials).values())).element
     friction = 0.0 if placed is None else touching[name][0].friction
-    prestrains = {part: _grow_prestrain(model, one) for part, one in model.prestrains.items()}
+    prestrains = {}  # of a part's cells (m, 3, 3), fully grown
+    for part, one in model.prestrains.items():
+        grown = one.factor * (float(model.curves[one.curve].at(0.0)) if one.curve else 1.0)
+        prestrains[part] = (1.0 - grown) * np.eye(3) + grown * one.gradient
     return Problem(
         mesh=tissue.mesh,
         materials={
@@ -106,13 +109,6 @@ def _fill_cells(tissue: TissueMesh, by_part: Mapping[str, Array], elsewhere: Arr
         if name in by_part:
             found[tissue.mesh.regions == r] = by_part[name]
     return found
-
-
-def _grow_prestrain(model: FebModel, prestrain: Prestrain) -> Array:
-    """Return the pre-strain of a part's cells (m, 3, 3), fully grown."""
-    curve = prestrain.curve
-    grown = prestrain.factor * (float(model.curves[curve].at(0.0)) if curve else 1.0)
-    return np.asarray((1.0 - grown) * np.eye(3) + grown * prestrain.gradient)
 
 
 def _build_activation(model: FebModel) -> Activation | None:
@@ -272,7 +268,7 @@ def group_contacts(model: FebModel) -> dict[str, tuple[Contact, ...]]:
     for contact in model.contacts:
         name = find_touching_body(model, contact)
         found[name] = (*found.get(name, ()), contact)
-        if not contact.acts_like(found[name][0]):
+        if replace(contact, surfaces=found[name][0].surfaces, line=found[name][0].line) != found[name][0]:
             what = f"the contacts of the rigid body {name!r} differ in law, penalty or friction"
             raise ProblemError(what, place=f"line {contact.line}, <contact>", remedy="state them alike")
     return found
@@ -312,7 +308,8 @@ def find_drive(model: FebModel, shaped: bool = False) -> Drive:
         ):
             direction, advance = line
             course = _interpolate_motion(bodies[name], advance, name, 0)
-            times = _merge_times(model, [course, *courses.values()])
+            followers = [course, *courses.values()]
+            times = merge_times([one.knots for one in followers], 0.0, model.end_s)
             base = course.at(times)
             try:
                 return _scale_to_history(model, courses, times, base, name, direction, {})
@@ -320,7 +317,7 @@ def find_drive(model: FebModel, shaped: bool = False) -> Drive:
                 pass
     moving = list(courses.values())
     driven = any(motion.values.any() for motion in bodies.values())
-    times = _merge_times(model, moving)
+    times = merge_times([one.knots for one in moving], 0.0, model.end_s)
     strained = model.contractions or model.prestrains
     if not (moving or driven or model.pressures or strained):
         raise ProblemError("nothing moves: there is no prescribed displacement, no force and no pressure")
@@ -409,13 +406,6 @@ def _interpolate_motion(motion: Motion, values: Array, name: str, line: int) -> 
     return _FollowingCurve(
         lambda t: np.interp(t, times, values), times, f"the motion of the rigid body {name!r}", line
     )
-
-
-def _merge_times(model: FebModel, courses: Sequence[_FollowingCurve]) -> Array:
-    """Return times (k,) from 0 to the end between which everything is linear."""
-    end = model.end_s
-    every = np.unique(np.concatenate([np.zeros(0), *(course.knots for course in courses)]))
-    return np.concatenate([[0.0], every[(every > 0.0) & (every < end * (1.0 - 1e-9))], [end]])
 
 
 def _find_factor(course: _FollowingCurve, times: Array, history: Array) -> float:

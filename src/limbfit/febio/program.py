@@ -44,7 +44,6 @@ class FebioRun:
     verdict: RunVerdict
     log: FebioLog | None
     seconds: float
-    folder: Path
 
 
 def find_febio(program: str | Path | None = None) -> Path:
@@ -97,7 +96,7 @@ def run_febio(
         log = None
         if verdict.completed:
             verdict = replace(verdict, kind="no output", reason=f"FEBio ended normally, but {error}")
-    return FebioRun(verdict, log, seconds, folder)
+    return FebioRun(verdict, log, seconds)
 
 
 def _read_messages(file: Path) -> str:

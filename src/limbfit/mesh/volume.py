@@ -319,7 +319,6 @@ class MeshQuality:
 
     min_dihedral_deg: float
     dihedral_percentiles_deg: Mapping[str, float]
-    max_dihedral_deg: float
     volume_mm3: float
     region_volumes_mm3: Mapping[str, float]
     min_scaled_jacobian: float
@@ -341,7 +340,6 @@ def measure_quality(mesh: Mesh) -> MeshQuality:
     return MeshQuality(
         min_dihedral_deg=float(smallest.min()),
         dihedral_percentiles_deg={f"{q:g}": float(np.percentile(smallest, q)) for q in marks},
-        max_dihedral_deg=float(angles.max()),
         volume_mm3=float(size.sum()),
         region_volumes_mm3={
             name: float(size[mesh.regions == index].sum()) for index, name in enumerate(mesh.region_names)

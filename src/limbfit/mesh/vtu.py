@@ -142,9 +142,7 @@ def _read_sets(grid: vtkUnstructuredGrid, prefix: str) -> dict[str, Indices]:
 def write_pvd(path: str | Path, frames: Sequence[tuple[float, Path]]) -> None:
     """Write a ParaView collection of (time in s, VTU file); the files are named relative to ``path``."""
     folder = Path(path).parent.resolve()
-    lines = []
-    for time, file in frames:
-        name = quoteattr(relpath(file.resolve(), folder))
-        lines.append(f'    <DataSet timestep="{float(time)!r}" part="0" file={name}/>')
+    names = [(float(time), quoteattr(relpath(file.resolve(), folder))) for time, file in frames]
+    lines = [f'    <DataSet timestep="{time!r}" part="0" file={name}/>' for time, name in names]
     head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>'
     Path(path).write_text("\n".join([head, *lines, "  </Collection>\n</VTKFile>\n"]), encoding="utf-8")

@@ -83,25 +83,22 @@ def find_bone(anatomy: Anatomy, name: str) -> Surface | None:
     return next((b for key, b in anatomy.bones.items() if name in key.lower()), None)
 
 
-def find_top(anatomy: Anatomy, name: str) -> float | None:
-    """Find the height of a bone's proximal end over the proximal cut, mm (negative).
+def find_top(anatomy: Anatomy, name: str) -> Array | None:
+    """Find the points (k, 3) of a bone's proximal end, LPS mm.
 
-    None where no bone has that name, or where the cut goes through it.
+    None where no bone has that name, or where the proximal cut goes through it.
     """
     bone = find_bone(anatomy, name)
-    top = 0.0 if bone is None else float(anatomy.height(bone.points).max())
-    return top if top < -ON_CUT_MM else None
+    if bone is None:
+        return None
+    height = anatomy.height(bone.points)
+    return bone.points[height > height.max() - PLATEAU_MM] if height.max() < -ON_CUT_MM else None
 
 
 def find_knee_centre(anatomy: Anatomy) -> Array | None:
-    """(3,) LPS mm, the middle of the tibia's top; None where no bone is named tibia, or the cut goes through
-    it.
-    """
-    tibia, highest = find_bone(anatomy, "tibia"), find_top(anatomy, "tibia")
-    if tibia is None or highest is None:
-        return None
-    top = tibia.points[anatomy.height(tibia.points) > highest - PLATEAU_MM]
-    return np.asarray((top.min(axis=0) + top.max(axis=0)) / 2)
+    """(3,) LPS mm, the middle of the tibia's top; None where that is not known."""
+    top = find_top(anatomy, "tibia")
+    return None if top is None else (top.min(axis=0) + top.max(axis=0)) / 2
 
 
 def find_load_point(anatomy: Anatomy, brim: Array) -> Array:

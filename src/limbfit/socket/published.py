@@ -21,9 +21,8 @@ FINDINGS = tuple(
 
 def select_published_findings(regions: Collection[str]) -> list[PublishedFindings]:
     """The findings over any of the ``regions``, or over the whole limb, as they are stored."""
-    rows = []
-    for finding in FINDINGS:
-        covered = [name for name in finding.regions if name in regions or name == WHOLE]
-        if covered:
-            rows.append(finding.model_copy(update={"regions": covered}))
-    return rows
+    return [
+        finding.model_copy(update={"regions": covered})
+        for finding in FINDINGS
+        if (covered := [name for name in finding.regions if name in regions or name == WHOLE])
+    ]

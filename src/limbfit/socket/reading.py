@@ -19,7 +19,7 @@ from ..anatomy.surfaces.triangles import (
     remove_unused_points,
 )
 from ..arrays import Array, Indices
-from ..errors import SurfaceError
+from ..errors import SurfaceError, add_location
 from .clearance import apply_clearance, refuse_bones
 from .rays import Rays, compute_profile
 from .shape import Socket
@@ -57,12 +57,9 @@ def read_socket(
         For a file that is no surface, is in another unit, has holes or no opening, opens distally, does not
         go around the limb, cuts into a bone or crosses itself: each with the remedy.
     """
-    file = Path(file)
     surface = read_surface(file, space, unit, key="socket.space")
-    try:
+    with add_location(file=file):
         return _build_socket(surface, outer, frame, bones or {})
-    except SurfaceError as error:
-        raise SurfaceError(error.what, file=error.file or file, remedy=error.remedy) from None
 
 
 def _build_socket(surface: Surface, outer: Surface, frame: Frame, bones: Mapping[str, Surface]) -> Socket:

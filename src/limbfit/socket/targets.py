@@ -23,19 +23,12 @@ FULL_DEPTH_MM = 20.0  # of tissue over bone: deeper tissue bears as much
 TISSUE_DEPTH = "tissue depth"
 
 
-@dataclass(frozen=True)
-class Preset:
-    """Shares of the stated pressure: of the limb, and of regions that have another one."""
-
-    limb: float
-    regions: Mapping[str, float] = field(default_factory=dict)
-
-
-# Round figures for what concepts of sockets intend, to begin with; none is measured.
-PRESETS: Mapping[str, Preset] = {
-    "hydrostatic": Preset(1.0),
-    "total surface bearing": Preset(1.0, dict.fromkeys(PROMINENCES, 0.5)),
-    "patellar tendon bearing": Preset(
+# Shares of the stated pressure: of the limb, and of regions that have another one. Round figures for what
+# concepts of sockets intend, to begin with; none is measured.
+PRESETS: Mapping[str, tuple[float, Mapping[str, float]]] = {
+    "hydrostatic": (1.0, {}),
+    "total surface bearing": (1.0, dict.fromkeys(PROMINENCES, 0.5)),
+    "patellar tendon bearing": (
         0.6,
         {"patellar tendon": 2.0, "medial proximal": 1.5, "posterior proximal": 1.5}
         | dict.fromkeys(PROMINENCES, 0.25),
@@ -77,9 +70,9 @@ class Target:
             found = self.pressure_kPa * _compute_depth_share(below, anatomy)
             values: dict[str, float] = {}
         else:
-            preset = PRESETS[self.kind]
-            found = np.full(len(points), self.pressure_kPa * preset.limb)
-            values = {name: share * self.pressure_kPa for name, share in preset.regions.items()}
+            limb, others = PRESETS[self.kind]
+            found = np.full(len(points), self.pressure_kPa * limb)
+            values = {name: share * self.pressure_kPa for name, share in others.items()}
         rest = {name: values[name] for name in values if name in regions and name not in self.regions}
         for name, value in (*rest.items(), *self.regions.items()):  # where they overlap, what is stated wins
             share = build_zone(name, anatomy, regions, 0.0).share(below)

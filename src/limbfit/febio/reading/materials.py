@@ -20,7 +20,7 @@ from ...errors import ProblemError
 from ...fe import Contractile, Fibred, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
 from ...fe.materials import Uncoupled
 from .geometry import Part
-from .timing import LoadCurve
+from .timing import LoadCurve, read_curve_number
 from .tree import XmlNode
 
 ELASTIC = {
@@ -274,7 +274,7 @@ def read_contractions(
         if materials.get(node.attribute("name")) is not None:
             for solid in _walk(node):
                 if solid.attributes.get("type") == ACTIVE:
-                    curve = _read_curve_number(solid.child("activation"), curves)
+                    curve = read_curve_number(solid.child("activation"), curves)
                     found.append(Contraction(node.attribute("name"), curve, solid.line))
     return tuple(found)
 
@@ -283,13 +283,6 @@ def _walk(node: XmlNode) -> Iterator[XmlNode]:
     for child in node:
         yield child
         yield from _walk(child)
-
-
-def _read_curve_number(value: XmlNode, curves: Mapping[int, LoadCurve]) -> int:
-    number = value.attributes.get("lc", "")
-    if number and not (number.isdecimal() and int(number) in curves):
-        raise value.error(f"there is no load curve {number!r}")
-    return int(number or 0)
 
 
 def read_prestrains(
@@ -318,7 +311,7 @@ def read_prestrains(
         gradient = _read_gradient(value, maps, name, len(part.cells))
         if np.abs(np.linalg.det(gradient) - 1.0).max(initial=0.0) > 1e-9:
             raise value.error("changes the volume, which FEBio's pressure does not see and limbfit's does")
-        curve, factor = (0, 1.0) if ramp is None else (_read_curve_number(ramp, curves), ramp.scalar())
+        curve, factor = (0, 1.0) if ramp is None else (read_curve_number(ramp, curves), ramp.scalar())
         found[name] = Prestrain(gradient, curve, factor, prestrain.line)
     return found
 

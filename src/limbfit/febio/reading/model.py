@@ -100,10 +100,6 @@ class Contact:
         """The law by which it sticks, as in `limbfit.Problem`."""
         return "stepwise" if self.rule == "sliding-elastic" else "anchored"
 
-    def acts_like(self, other: Contact) -> bool:
-        """True if both have one law, wherever they act."""
-        return replace(self, surfaces=other.surfaces, line=other.line) == other
-
 
 @dataclass(frozen=True)
 class PressureLoad:
@@ -183,12 +179,11 @@ def _read_model(root: XmlNode) -> FebModel:
         if section.tag not in (*_UNSUPPORTED_SECTIONS, *_KNOWN_SECTIONS):
             raise section.error("this section is not supported")
         if section.tag == "Module":
-            if section.attributes.get("type", "solid") != "solid":
-                raise section.error(f"module {section.attributes['type']!r} is not supported, only solid")
-            if (units := section.string("units", UNITS)) != UNITS:
-                raise section.child("units").error(
-                    f"{units!r} are not supported", f"scale the input to {UNITS}, pressures in MPa"
-                )
+            kind, units = section.attributes.get("type", "solid"), section.string("units", UNITS)
+            if kind != "solid":
+                raise section.error(f"module {kind!r} is not supported, only solid")
+            if units != UNITS:
+                raise section.error(f"units {units!r} are not supported", f"scale the input to {UNITS}")
     used = {domain.attributes.get("mat", "") for domain in root.child("MeshDomains")}
     materials, bodies, unread = read_materials(root.child("Material"), used)
     rigid = dict(bodies)

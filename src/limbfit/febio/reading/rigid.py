@@ -20,7 +20,7 @@ from ...fe import ELEMENTS, Motion
 from ...fe.kernel.elements import compute_reference_gradients
 from .geometry import Geometry, Part, collect_nodes, find_node_set, split_into_triangles
 from .materials import RigidMaterial
-from .timing import ControlPhase, LoadCurve, compute_step_times
+from .timing import ControlPhase, LoadCurve, compute_step_times, read_curve_number
 from .tree import XmlNode
 
 _PRISM = ([0, 1, 2, 5], [0, 1, 5, 4], [0, 4, 5, 3])  # three tetrahedra of a penta6
@@ -204,12 +204,12 @@ def read_drive(condition: XmlNode, letters: str, curves: Mapping[int, LoadCurve]
 
 def read_factor(value: XmlNode, curves: Mapping[int, LoadCurve]) -> tuple[float, int]:
     """Read factor and load curve of a value; 0 and no curve if it is zero."""
-    factor, number = value.scalar(), value.attributes.get("lc", "")
+    factor, number = value.scalar(), read_curve_number(value, curves)
     if factor == 0.0:
         return 0.0, 0
-    if not (number.isdecimal() and int(number) in curves):
-        raise value.error(f"there is no load curve {number!r}" if number else "needs a load curve")
-    return factor, int(number)
+    if not number:
+        raise value.error("needs a load curve")
+    return factor, number
 
 
 def merge_knots(curves: Sequence[LoadCurve], every: Array, start: float, end: float) -> Array:
@@ -218,9 +218,13 @@ def merge_knots(curves: Sequence[LoadCurve], every: Array, start: float, end: fl
     FEBio knows a curve at the ends of its steps only (``every (k,)``): these are the knots of a curve that is
     not linear.
     """
-    corners = [curve.corners for curve in curves]
-    inner = np.unique(np.concatenate([np.zeros(0), *(every if c is None else c for c in corners)]))
-    tiny = 1e-9 * end
+    corners = (curve.corners for curve in curves)
+    return merge_times([every if c is None else c for c in corners], start, end)
+
+
+def merge_times(knots: Sequence[Array], start: float, end: float) -> Array:
+    """Return the times (n,) of all ``knots`` (k,) between ``start`` and ``end``, and these two."""
+    inner, tiny = np.unique(np.concatenate([np.zeros(0), *knots])), 1e-9 * end
     return np.concatenate([[start], inner[(inner > start + tiny) & (inner < end - tiny)], [end]])
 
 

@@ -142,6 +142,14 @@ def read_curves(section: XmlNode | None) -> dict[int, LoadCurve]:
     return curves
 
 
+def read_curve_number(value: XmlNode, curves: Mapping[int, LoadCurve]) -> int:
+    """Read the number of a value's load curve, which must exist; 0 if it has none."""
+    number = value.attributes.get("lc", "")
+    if number and not (number.isdecimal() and int(number) in curves):
+        raise value.error(f"there is no load curve {number!r}")
+    return int(number or 0)
+
+
 def _read_curve(node: XmlNode) -> LoadCurve:
     points = np.array([point.numbers(2) for point in node.child("points")]).reshape(-1, 2)
     if not len(points) or (np.diff(points[:, 0]) <= 0).any():
@@ -248,16 +256,13 @@ def _read_phase(node: XmlNode, curves: Mapping[int, LoadCurve]) -> ControlPhase:
     if stepper is None:
         return ControlPhase(int(steps), size, tolerance=tolerance)
     most = stepper.find("dtmax")
-    must = most.attributes.get("lc") if most is not None else None
-    if must is not None and not (must.isdecimal() and int(must) in curves):
-        assert most is not None
-        raise most.error(f"there is no load controller {must!r}")
+    must = 0 if most is None else read_curve_number(most, curves)
     return ControlPhase(
         int(steps),
         size,
         stepper.number("dtmin", 0.0),
-        size if most is None or must is not None else most.scalar(),
-        None if must is None else int(must),
+        size if most is None or must else most.scalar(),
+        must or None,
         tolerance,
     )
 

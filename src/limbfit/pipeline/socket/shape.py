@@ -108,7 +108,8 @@ def trim_of(study: Study, anatomy: Anatomy) -> Trim:
         return Trim(planes, line)
     top = find_top(anatomy, "tibia")
     below = BELOW_CUT_MM if top is None else BELOW_KNEE_MM
-    height = (top or 0.0) - (below if table.trim_mm is None else table.trim_mm)
+    height = 0.0 if top is None else float(anatomy.height(top).max())
+    height -= below if table.trim_mm is None else table.trim_mm
     return Trim([(anatomy.cut_point + height * anatomy.cut_normal, anatomy.cut_normal)])
 
 
@@ -167,8 +168,7 @@ def check_load(
         return
     standard, place = STANDARD_LOADS[load.preset], f"socket.loads.{load.name}.preset"
     named = [any(bone in name.lower() for name in bones) for bone in ("tibia", "fibula")]
-    is_beside = standard.ahead_mm or standard.inside_mm
-    if is_beside and load.point is None and (is_tibia_cut or not named[0]):
+    if (standard.ahead_mm or standard.inside_mm) and load.point is None and (is_tibia_cut or not named[0]):
         why = "the proximal cut goes through the tibia" if named[0] else "no bone is named tibia"
         raise StudyError(
             f"{load.preset!r} passes beside the knee centre, which is not known: {why}",

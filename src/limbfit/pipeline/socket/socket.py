@@ -20,7 +20,6 @@ from ...indentation import Parameters
 from ...mesh import write_vtu
 from ...results.identification import RecordedExtents, RelaxationBeyond
 from ...results.socket import SocketResult
-from ...socket import Socket
 from ...socket.landmarks import find_bone
 from ...socket.published import select_published_findings
 from ...study import Study
@@ -99,15 +98,24 @@ def run_socket(
         if samples:
             steps = [draw_step(covariance, number) for number in range(samples)]
             simulated = _simulate_samples(context, run, content, steps)
+    table = study.socket
     own = {
         "parameters": parameters,
         "parameters_from": parameters_from,
-        "socket": _describe_shape(limb, socket),
+        "socket": {
+            "source": "rectified" if table.file is None else table.file.name,
+            "reduction_percent": table.reduction_percent if table.file is None else None,
+            "areas": [area.name for area in table.areas],
+            "volume_cm3": socket.volume_mm3 / 1000.0,
+            "deepest_mm": socket.offset(limb.outer.skin).max(),
+            "notes": list(socket.notes),
+            "liner": limb.liner,
+        },
         "mesh": facts,
         # All that was found is of transtibial limbs.
         "published": select_published_findings(run.faces) if find_bone(limb.anatomy, "tibia") else [],
         "samples": simulated,
-        "worn_s": None if relaxation is None else study.socket.worn_s,
+        "worn_s": None if relaxation is None else table.worn_s,
         "outside_text": outside_text,
     }
     result = SocketResult(**content | own)
@@ -177,20 +185,6 @@ def _simulate_samples(
     if found:
         widen_intervals(content, found)
     return {"simulated": len(found), "failed": [reason for reason in reasons if reason]}
-
-
-def _describe_shape(limb: SocketLimb, socket: Socket) -> dict[str, Any]:
-    """What is told of the socket's shape."""
-    table, depth = limb.study.socket, socket.offset(limb.outer.skin)
-    return {
-        "source": "rectified" if table.file is None else table.file.name,
-        "reduction_percent": table.reduction_percent if table.file is None else None,
-        "areas": [area.name for area in table.areas],
-        "volume_cm3": socket.volume_mm3 / 1000.0,
-        "deepest_mm": float(depth.max()),
-        "notes": list(socket.notes),
-        "liner": limb.liner,
-    }
 
 
 def _write_tables(folder: Path, result: SocketResult) -> None:
