@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyvista as pv
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
 
@@ -147,6 +148,20 @@ def test_vtu_shows_fields_regions_and_sets(tmp_path: Path) -> None:
     np.testing.assert_array_equal(vtk_to_numpy(data.GetCellData().GetArray("region")), mesh.regions)
     shown = vtk_to_numpy(data.GetPointData().GetArray("in bottom"))
     np.testing.assert_array_equal(np.flatnonzero(shown), mesh.node_sets["bottom"])
+
+
+@pytest.mark.parametrize(
+    ("given", "names"),
+    [([7, 3], ("region 3", "region 7")), (["skin", "muscle"], ("muscle", "skin"))],
+)
+def test_regions_of_a_foreign_file_are_read(given: list, names: tuple[str, str], tmp_path: Path) -> None:
+    mesh = cube()
+    grid = pv.UnstructuredGrid({10: mesh.cells}, mesh.points)
+    grid["region"] = np.array(given)[np.arange(grid.n_cells) % 2]
+    grid.save(tmp_path / "foreign.vtu")
+    found = read_vtu(tmp_path / "foreign.vtu")
+    assert found.region_names == names
+    assert (found.regions == 1 - np.arange(grid.n_cells) % 2).all()
 
 
 def test_a_file_that_is_no_mesh_is_refused(tmp_path: Path) -> None:

@@ -95,7 +95,8 @@ class Mesh:
         Parameters
         ----------
         regions : (m,) the tissue of each cell, as names or as numbers; none: all are ``tissue``.
-        names : the tissue of each number; by default ``region 1`` for number 1.
+        names : the tissue of each number; by default ``region 1`` for number 1.  Numbers of one name are one
+            tissue.
 
         Raises
         ------
@@ -113,7 +114,7 @@ class Mesh:
             )
         if cells.min() < 0 or cells.max() >= len(points):
             raise ProblemError("cells name nodes that do not exist", remedy="count nodes from 0")
-        numbers, tissues = _read_tissues(regions, len(cells), names or {})
+        numbers, tissues = read_tissues(regions, len(cells), names or {})
         used, inverse = np.unique(cells, return_inverse=True)
         mesh = cls(points[used], inverse.reshape(cells.shape), kinds[width], numbers, tissues)
         turned = cell_volumes(mesh) < 0.0
@@ -154,7 +155,7 @@ class Mesh:
 
     def nodes_where(self, where: Callable[[Array], Mask]) -> Indices:
         """Numbers (k,) of the nodes at which ``where(points)`` holds: ``lambda p: p[:, 2] < -19.9``."""
-        found = np.flatnonzero(where(self.points))
+        found = np.flatnonzero(self._evaluate(where))
         if not len(found):
             raise ProblemError("no node is there", remedy=f"the mesh spans {_format_extent(self.points)}")
         return found
@@ -162,11 +163,19 @@ class Mesh:
     def faces_where(self, where: Callable[[Array], Mask]) -> Indices:
         """Outward boundary faces (k, 3, 6 or 4) at all of whose nodes ``where(points)`` holds."""
         faces = boundary_faces(self)
-        found = faces[np.asarray(where(self.points))[faces].all(axis=1)]
+        found = faces[self._evaluate(where)[faces].all(axis=1)]
         if not len(found):
             raise ProblemError(
                 "no boundary face is there", remedy=f"the mesh spans {_format_extent(self.points)}"
             )
+        return found
+
+    def _evaluate(self, where: Callable[[Array], Mask]) -> Mask:
+        """(n,) whether a condition holds at each node. Raises `ProblemError` where it says something else."""
+        found = np.asarray(where(self.points))
+        if found.shape != (len(self.points),) or found.dtype != bool:
+            what = f"a condition gives {found.dtype} {found.shape}, not true or false for each node"
+            raise ProblemError(what, remedy="compare a coordinate, as in lambda p: p[:, 2] > -0.1")
         return found
 
 
@@ -285,13 +294,17 @@ def _read_cell_array(data: Mapping[str, Any], name: str) -> Any:
     return data[name]
 
 
-def _read_tissues(
+def read_tissues(
     regions: ArrayLike | None, count: int, names: Mapping[int, str]
 ) -> tuple[Indices, tuple[str, ...]]:
-    """The number of each cell's tissue (m,) and the tissues, in the order of their names or numbers."""
+    """The number of each cell's tissue (m,) and the tissues, in the order of their names or numbers. Raises
+    `ProblemError` for regions that are neither, or not one for each of ``count`` cells.
+    """
     if regions is None:
         return np.zeros(count, dtype=np.int64), ("tissue",)
     values = np.asarray(regions)
+    if values.dtype == object:  # names, as a column of pandas has them
+        values = np.asarray(values.tolist())
     if values.shape != (count,):
         raise ProblemError(f"regions have shape {values.shape}, not one for each of {count} cells")
     kinds, numbers = np.unique(values, return_inverse=True)

@@ -16,9 +16,9 @@ from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkFieldData, vtkUnstruc
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader, vtkXMLUnstructuredGridWriter
 
 from ..arrays import Indices
-from ..errors import ProblemError
+from ..errors import ProblemError, add_location
 from .cells import CELLS
-from .volume import Mesh
+from .volume import Mesh, read_tissues
 
 _NODE_SET, _FACE_SET = "node_set:", "face_set:"
 
@@ -90,7 +90,8 @@ def silence_vtk() -> Iterator[None]:
 def read_vtu(path: str | Path) -> Mesh:
     """Read a mesh written by :func:`write_vtu`, or any VTU file of one supported cell type.
 
-    A foreign file without regions becomes one region named ``all``.
+    A foreign file has the regions of its cell array ``region``, names or numbers; without one it is one
+    region named ``all``.
     """
     return grid_to_mesh(read_grid(Path(path)), path)
 
@@ -104,14 +105,20 @@ def grid_to_mesh(grid: vtkUnstructuredGrid, path: str | Path) -> Mesh:
     cell_type = named[int(kinds[0])]
     connectivity = vtk_to_numpy(grid.GetCells().GetConnectivityArray()).astype(np.int64)
     cells = connectivity.reshape(-1, len(CELLS[cell_type].nodes))
-    region = grid.GetCellData().GetArray("region")
-    names = grid.GetFieldData().GetAbstractArray("region_names")
+    regions = _read_array(grid.GetCellData(), "region")
+    names = _read_array(grid.GetFieldData(), "region_names")
+    tissues = ("all",) if names is None else tuple(map(str, names))
+    if regions is None:
+        regions = np.zeros(len(cells))
+    elif names is None:
+        with add_location(file=path):
+            regions, tissues = read_tissues(regions, len(cells), {})
     return Mesh(
         points=vtk_to_numpy(grid.GetPoints().GetData()).astype(np.float64),
         cells=cells,
         cell_type=cell_type,
-        regions=np.zeros(len(cells), np.int64) if region is None else vtk_to_numpy(region).astype(np.int64),
-        region_names=tuple(map(names.GetValue, range(names.GetNumberOfValues()))) if names else ("all",),
+        regions=regions.astype(np.int64),
+        region_names=tissues,
         node_sets=_read_sets(grid, _NODE_SET),
         face_sets=_read_sets(grid, _FACE_SET),
     )
@@ -130,6 +137,14 @@ def read_grid(path: Path) -> vtkUnstructuredGrid:
     if grid is None or grid.GetNumberOfCells() == 0:
         raise ProblemError("not a VTU file with cells", file=path)
     return grid
+
+
+def _read_array(data: vtkFieldData, name: str) -> NDArray | None:
+    """The numbers or texts of an array; None where there is none."""
+    array = data.GetAbstractArray(name)
+    if isinstance(array, vtkStringArray):
+        return np.array([array.GetValue(i) for i in range(array.GetNumberOfValues())])
+    return None if array is None else vtk_to_numpy(array)
 
 
 def _read_sets(grid: vtkUnstructuredGrid, prefix: str) -> dict[str, Indices]:
