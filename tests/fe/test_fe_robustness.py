@@ -299,6 +299,8 @@ BAD: list[tuple[Callable[[Problem], dict], str]] = [
     (lambda p: {"contact_faces": np.zeros((0, 6), dtype=int)}, "contact faces"),
     (lambda p: {"fixed": np.zeros(0, dtype=int)}, "nothing is held in place"),
     (lambda p: {"element": "hex8"}, "no element"),
+    (lambda p: {"supports": (Support(p.fixed, -1),)}, "no component -1; use 0, 1 or 2"),
+    (lambda p: {"indenter": replace(p.indenter, edge=(np.nan, 0.0, 0.0))}, "edge is not three finite"),
     (lambda p: {"materials": {"muscle": SKIN}}, "region 'skin' has no material"),
 ]
 

@@ -27,6 +27,9 @@ def check(problem: Problem) -> None:
             raise ProblemError(f"the {name} are a mask", remedy="give node numbers: numpy.flatnonzero(mask)")
         if value.size and (value.min() < 0 or value.max() >= n):
             raise ProblemError(f"the {name} refer to nodes that the mesh does not have")
+    for support in problem.supports:
+        if support.component not in (0, 1, 2):
+            raise ProblemError(f"a support has no component {support.component!r}", remedy="use 0, 1 or 2")
     _check_fibres(problem)
     _check_prestretch(problem)
     _check_bodies(problem)

@@ -40,7 +40,7 @@ class Motion:
     growth: Array | Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        times, values = np.asarray(self.times, dtype=float), np.asarray(self.values, dtype=float)
+        times, values = np.array(self.times, dtype=float), np.array(self.values, dtype=float)
         if times.ndim != 1 or len(times) < 2 or values.shape != (len(times), 6):
             raise ProblemError("a motion needs two or more times and six values for each")
         steps = np.diff(times)
@@ -53,7 +53,7 @@ class Motion:
         forced = np.asarray(self.forced, dtype=bool)
         if forced.shape not in ((6,), (len(times) - 1, 6)):
             raise ProblemError("a motion says of six coordinates whether they are forced")
-        growth = np.ones(len(times)) if self.growth is None else np.asarray(self.growth, dtype=float)
+        growth = np.ones(len(times)) if self.growth is None else np.array(self.growth, dtype=float)
         if growth.shape != times.shape:
             raise ProblemError("the growth of a motion is not one share for each time")
         if not ((growth >= 0.0) & (growth <= 1.0)).all():
@@ -235,8 +235,10 @@ class RigidBody:
 def read_course(what: str, of: str, times: ArrayLike, values: ArrayLike) -> tuple[Array, Array]:
     """Times (n,) s and values (n,) that are piecewise linear between them. Raises `ProblemError` where there
     are not as many of both, two or more, some are not finite, or times do not grow from 0.
+
+    They are copies: what a caller does to its arrays later must not change a problem.
     """
-    t, v = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
+    t, v = np.array(times, dtype=float), np.array(values, dtype=float)
     if t.ndim != 1 or t.shape != v.shape or len(t) < 2:
         raise ProblemError(f"{what} needs two or more times and as many {of}")
     if not (np.isfinite(t).all() and np.isfinite(v).all()):

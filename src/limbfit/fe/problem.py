@@ -39,7 +39,7 @@ class History:
         driver = "displacement" if self.force is None else "force"
         times, values = read_course(f"a {driver} history", f"{driver}s", self.times, getattr(self, driver))
         if self.across is not None:
-            across = np.asarray(self.across, dtype=float)
+            across = np.array(self.across, dtype=float)
             if across.shape != (len(times), 2) or not np.isfinite(across).all():
                 raise ProblemError("a move across the axis needs two finite numbers for each time")
             object.__setattr__(self, "across", across)
@@ -176,6 +176,10 @@ class Problem:
     prestretch: ArrayLike | None = None
     touch_down_s: float = 0.0
     name: str = field(default="", compare=False)
+
+    def __post_init__(self) -> None:
+        # A dictionary that the caller goes on filling for the next problem must not change this one.
+        object.__setattr__(self, "materials", dict(self.materials))
 
     def with_materials(self, materials: Mapping[str, Material]) -> Problem:
         """The same problem with other materials; a prepared system stays valid."""

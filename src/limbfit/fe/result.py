@@ -14,6 +14,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_interp_spline
 
 from ..arrays import Array
@@ -161,31 +162,32 @@ class Result:
         """The kept state with stresses: where loading ends, or as far as the simulation came."""
         return next((state for state in self.states if state.memory is not None), None)
 
-    def _interpolate(self, values: Array | None, t: Array, force: Array) -> Array:
+    def _interpolate(self, values: Array | None, t: ArrayLike, force: Array) -> Array:
         if values is None:
             raise ValueError("the simulation ran without sensitivities")
         at = np.clip(np.asarray(t, dtype=float), self.times[0], self.times[-1])
-        return interpolate(self.times, force, self.problem.kinks, values, at)
+        found = interpolate(self.times, force, self.problem.kinks, values, at.ravel())
+        return found.reshape(at.shape + values.shape[1:])
 
-    def force_at(self, t: Array) -> Array:
-        """Force (k,) at times ``t (k,)``, N; interpolated between steps, never negative."""
+    def force_at(self, t: ArrayLike) -> Array:
+        """Force (k,) at times ``t (k,)``, or at one time, N; interpolated between steps, never negative."""
         return self._interpolate(self.force, t, self.force)
 
-    def displacement_at(self, t: Array) -> Array:
+    def displacement_at(self, t: ArrayLike) -> Array:
         """Displacement (k,) at times ``t (k,)``, mm, whether the indenter pushes then or not."""
         if not self.problem.history.forced:
             return self.problem.history.at(np.clip(t, self.times[0], self.times[-1]))
         return self._interpolate(self.displacement, t, np.ones_like(self.force))
 
-    def sensitivity_at(self, t: Array) -> Array:
+    def sensitivity_at(self, t: ArrayLike) -> Array:
         """Derivative (k, p) of `force_at` with respect to the parameters."""
         return self._interpolate(self.force_sensitivity, t, self.force)
 
-    def response_at(self, t: Array) -> Array:
+    def response_at(self, t: ArrayLike) -> Array:
         """What answers to the drive at times ``t (k,)``: force, N, or displacement, mm, under a force."""
         return self.displacement_at(t) if self.problem.history.forced else self.force_at(t)
 
-    def response_sensitivity_at(self, t: Array) -> Array:
+    def response_sensitivity_at(self, t: ArrayLike) -> Array:
         """Derivative (k, p) of `response_at` with respect to the parameters."""
         if not self.problem.history.forced:
             return self.sensitivity_at(t)

@@ -168,7 +168,7 @@ class System:
     def _number_unknowns(self, problem: Problem) -> None:
         factors = np.full((self.rows, 3), np.nan)
         for support in problem.supports:
-            factors[np.asarray(support.nodes), support.component] = support.factor
+            factors[np.asarray(support.nodes, dtype=int), support.component] = support.factor
         factors[np.asarray(problem.fixed, dtype=int)] = 0.0
         free = np.isnan(factors)
         forced = [body.motion.free for body in problem.rigid_bodies if body.motion.free.any()]

@@ -140,10 +140,11 @@ class Indenter(RigidShape):
             object.__setattr__(self, "width", self.surface.width)
         size = Size(self.width, self.edge_radius, self.measures, self.surface, self.sharp)
         object.__setattr__(self, "body", SHAPES[self.shape].of(size))
-        for name in ("centre", "axis"):
+        for name in ("centre", "axis", *(["edge"] if self.edge is not None else [])):
             value = np.asarray(getattr(self, name), dtype=float)
             if value.shape != (3,) or not np.isfinite(value).all():
                 raise ProblemError(f"indenter {name} is not three finite numbers")
+            object.__setattr__(self, name, tuple(value.tolist()))  # a copy, which the caller cannot change
         if np.linalg.norm(self.axis) < 1e-12:
             raise ProblemError("indenter axis has no length")
         if np.linalg.norm(np.cross(self.axis, self._edge_direction())) < 1e-9:

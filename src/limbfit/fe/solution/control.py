@@ -65,7 +65,7 @@ class StepControl:
         for name in ("load_steps", "unload_steps", "max_iterations", "most_iterations", "threads"):
             if getattr(self, name) < 1:
                 raise ProblemError(f"{name} = {getattr(self, name)} is less than one")
-        for name in ("tolerance", "penetration"):
+        for name in ("tolerance", "penetration", *(["penalty"] if self.penalty is not None else [])):
             if not getattr(self, name) > 0.0:
                 raise ProblemError(f"{name} = {getattr(self, name)} is not positive")
         if self.stress not in ("quadratic", "linear"):
