@@ -107,11 +107,65 @@ def test_a_gmsh_file_read_by_meshio_keeps_its_named_groups(tmp_path):
         (lambda: Mesh.from_arrays(np.eye(4, 3), [[0, 1, 2, 3]], [1, 2]), "one for each of 1"),
         (lambda: Mesh.from_pyvista(block()).nodes_where(lambda p: p[:, 2] > 5), "z -12 to 0 mm"),
         (lambda: Mesh.from_pyvista(block()).faces_where(lambda p: p[:, 2] == -4.0), "no boundary face"),
+        (lambda: Mesh.from_pyvista(block()).nodes_where(lambda p: np.flatnonzero(p[:, 2] < 0)), "int64"),
+        (lambda: Mesh.from_pyvista(block()).nodes_where(lambda p: p < -11.9), r"\(100, 3\), not true or"),
+        (lambda: Mesh.from_pyvista(block()).faces_where(lambda p: True), "compare a coordinate"),
     ],
 )
 def test_what_is_no_mesh_is_refused_with_a_remedy(make, text):
     with pytest.raises(ProblemError, match=text):
         make()
+
+
+def test_numbers_of_one_name_are_one_tissue():
+    """As two they had the parameters of one name, and a fit took the derivatives of the first alone."""
+    mesh = Mesh.from_pyvista(block(), "tissue")
+    halves = np.where(mesh.regions == 1, 5, np.where(np.arange(len(mesh.cells)) % 2, 2, 9))
+    found = Mesh.from_arrays(mesh.points, mesh.cells, halves, {2: "muscle", 9: "muscle", 5: "skin"})
+    assert found.region_names == ("muscle", "skin")
+    assert (found.regions == mesh.regions).all()
+
+
+def test_tissues_may_be_a_column_of_objects():
+    names = np.array(["skin", "muscle"], dtype=object)[np.arange(48) % 2]
+    mesh = Mesh.from_pyvista(block())
+    assert Mesh.from_arrays(mesh.points, mesh.cells, names).region_names == ("muscle", "skin")
+
+
+def test_a_problem_stays_as_it_was_stated_whatever_becomes_of_what_it_was_given():
+    tissues, depth, place = {"tissue": TISSUE}, np.array([0.0, 2.0, 0.0]), np.zeros(3)
+    mesh, history = Mesh.from_pyvista(block()), History(np.array([0.0, 2.0, 4.0]), depth)
+    problem = replace(problem_of(mesh), materials=tissues, history=history)
+    problem = replace(problem, indenter=replace(problem.indenter, centre=place))
+    tissues["tissue"], place[0] = replace(TISSUE, c=1.0), 5.0
+    depth *= 2.0
+    assert problem.materials["tissue"] is TISSUE
+    assert problem.history.displacement.tolist() == [0.0, 2.0, 0.0]
+    assert tuple(problem.indenter.centre) == (0.0, 0.0, 0.0)
+
+
+def test_what_is_done_to_a_grid_changes_neither_mesh_nor_solution(solution):
+    mesh, deepest, grid = solution.problem.mesh, solution.deepest, solution.to_pyvista()
+    points, regions, moved = mesh.points.copy(), mesh.regions.copy(), deepest.u.copy()
+    grid.points *= 1e-3
+    grid["displacement_mm"][:] = 0.0
+    grid["region"][:] = 0
+    assert (mesh.points == points).all()
+    assert (mesh.regions == regions).all()
+    assert (deepest.u == moved).all()
+
+
+def test_a_grid_that_is_saved_is_read_with_its_tissues(solution, tmp_path):
+    solution.to_pyvista().save(tmp_path / "deepest.vtu")
+    mesh = limbfit.read_vtu(tmp_path / "deepest.vtu")
+    assert mesh.region_names == solution.problem.mesh.region_names
+    assert (mesh.regions == solution.problem.mesh.regions).all()
+
+
+def test_one_time_has_one_force(solution):
+    assert solution.force_at(2.0).shape == ()
+    assert solution.force_at(2.0) == solution.force_at([2.0])[0]
+    assert solution.sensitivity_at(2.0).shape == (8,)
 
 
 def test_a_solution_is_a_result_and_a_grid_of_every_step(solution):
@@ -207,6 +261,46 @@ def test_creep_under_a_force_tells_the_tissue(solution):
     assert fit.parameters["muscle.c"] == pytest.approx(TISSUE.c, rel=0.05)
     assert fit.error_percent[0] < 1.0
     assert fit.plot().get_ylabel() == "displacement, mm"
+
+
+@pytest.mark.parametrize(
+    ("curve", "text"),
+    [
+        ([([1.0, 2.0, 3.0], [0.1, 0.2, 0.3])], "curve 1 is no pair of arrays; give"),
+        (np.ones((5, 2)), "no pair of arrays"),
+        ({"time": [1.0, 2.0], "force": [0.1, 0.2]}, "no pair of arrays"),
+        (([], []), "growing"),
+        (([1.0, 2.0], [0.1, np.nan]), "1 values that are not finite; leave"),
+    ],
+)
+def test_what_is_no_curve_is_refused(solution, curve, text):
+    with pytest.raises(ProblemError, match=text):
+        limbfit.calibrate(solution.problem, curve, {"skin.c": 0.005})
+
+
+def test_a_fit_to_an_indenter_that_never_touches_is_refused(solution):
+    away = replace(solution.problem, history=History([0.0, 2.0, 4.0], [0.0, -2.0, 0.0]))
+    with pytest.raises(ProblemError, match=r"curve 1: .*; displacement and force are positive"):
+        limbfit.calibrate(away, ([1.0, 2.0], [0.1, 0.2]), {"skin.c": 0.005}, steps=STEPS)
+
+
+def test_a_parameter_that_ends_at_its_bound_is_said_to_be_there(solution):
+    """A start in kPa has bounds beyond what MPa the tissue has."""
+    times = np.linspace(0.1, 4.0, 20)
+    fit = limbfit.calibrate(
+        solution.problem, (times, solution.force_at(times)), {"muscle.c": 5.0}, steps=STEPS
+    )
+    assert fit.parameters["muscle.c"] == pytest.approx(0.05)
+    assert fit.table().endswith("; at its bound")
+
+
+def test_problems_of_two_laws_are_fitted_together(solution):
+    one = solution.problem
+    other = one.with_materials({"skin": Ogden(((0.01, 4.0),)), "muscle": TISSUE})
+    times = np.linspace(0.1, 4.0, 20)
+    curves = [(times, limbfit.solve(each, STEPS).force_at(times)) for each in (one, other)]
+    fit = limbfit.calibrate([one, other], curves, {"skin.c": 0.006, "skin.c1": 0.008}, steps=STEPS)
+    assert list(fit.parameters.values()) == pytest.approx([TISSUE.c, 0.01], rel=0.01)
 
 
 @pytest.mark.parametrize(

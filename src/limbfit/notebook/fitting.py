@@ -27,6 +27,7 @@ from .solution import Solution, announce_compilation, new_axes, solve
 
 Curve = tuple[ArrayLike, ArrayLike]  # times (n,) s; force (n,) N, or displacement, mm, under a force
 DEFAULT_BOUND_FACTOR = 100.0  # of default bounds, over the start
+CURVE = "give (times, values), both (n,), times growing"  # what a curve is
 
 
 @dataclass(frozen=True)
@@ -60,16 +61,12 @@ class Fit:
 
     def table(self) -> str:
         """Parameters, 95 % intervals and verdicts as text."""
-        uncertainty = self.uncertainty
+        known = self.uncertainty
+        columns = known.names, known.parameters, known.intervals_95, known.verdicts, known.at_bound
         rows = [("parameter", "value", "95 % interval", "")]
-        for name, value, (low, high), verdict in zip(
-            uncertainty.names,
-            self.parameters.values(),
-            uncertainty.intervals_95,
-            uncertainty.verdicts,
-            strict=True,
-        ):
-            rows.append((name, f"{value:.4g}", f"{low:.4g} to {high:.4g}", verdict))
+        for name, value, (low, high), verdict, stuck in zip(*columns, strict=True):
+            said = verdict + ("; at its bound" if stuck else "")
+            rows.append((name, f"{value:.4g}", f"{low:.4g} to {high:.4g}", said))
         widths = [max(len(row[k]) for row in rows) for k in range(4)]
         return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths)).rstrip() for row in rows)
 
@@ -115,7 +112,8 @@ def calibrate(
     Raises
     ------
     ProblemError
-        For parameters that the problems do not have, and curves that do not fit them.
+        For parameters that the problems do not have, and curves that do not fit them, or at none of whose
+        times the first simulation has a force or a displacement.
     CalibrationError
         Where no simulation completes at the start.
     """
@@ -124,7 +122,9 @@ def calibrate(
     pairs = _pair_curves(given, cases)
     unknowns = _build_unknowns(cases, start, bounds or {})
     announce_compilation()
-    model = _Model(cases, pairs, unknowns.names, steps or StepControl(), listener)
+    control = steps or StepControl()
+    systems = [System(case, control.threads) for case in cases]
+    model = _Model(cases, pairs, unknowns.names, [control] * len(cases), systems, listener)
     measured = _to_measured(pairs)
     result = search(
         model, measured, unknowns, CalibrationSettings(), stages=[group_separately(unknowns.names)]
@@ -151,26 +151,22 @@ def with_parameters(problem: Problem, values: Mapping[str, float]) -> Problem:
     materials = dict(problem.materials)
     for name, value in values.items():
         region, parameter = name.rsplit(".", 1)
-        if region in materials:
+        if region in materials and parameter in materials[region].parameter_names:
             materials[region] = materials[region].with_parameters({parameter: float(value)})
     return problem.with_materials(materials)
 
 
+@dataclass
 class _Model:
     """Responses and derivatives of all problems at the free parameters (p,)."""
 
-    def __init__(
-        self,
-        problems: tuple[Problem, ...],
-        curves: tuple[tuple[Array, Array], ...],
-        names: tuple[str, ...],
-        steps: StepControl,
-        listener: Callable[[str], None] | None,
-    ) -> None:
-        self.problems, self.curves, self.names, self.listener = problems, curves, names, listener
-        self.systems = [System(problem, steps.threads) for problem in problems]
-        self.steps = [steps] * len(problems)
-        self.calls = 0
+    problems: tuple[Problem, ...]
+    curves: tuple[tuple[Array, Array], ...]
+    names: tuple[str, ...]
+    steps: list[StepControl]  # of each problem
+    systems: list[System]
+    listener: Callable[[str], None] | None
+    calls: int = 0
 
     def __call__(self, parameters: Array) -> list[SiteResponse]:
         self.calls += 1
@@ -188,10 +184,15 @@ class _Model:
             penalty = result.statistics["penalty_per_mm"]
             self.steps[number] = replace(self.steps[number], penalty=penalty, hold_penalty=True)
         names = [f"{region}.{parameter}" for region, parameter in result.parameter_names]
-        full = result.response_sensitivity_at(times)
+        response, full = result.response_at(times), result.response_sensitivity_at(times)
+        if self.calls == 1 and result.completed and not response.any():
+            raise ProblemError(
+                f"curve {number + 1}: the simulation does not answer at any of its times",
+                remedy="displacement and force are positive into the tissue",
+            )
         absent = np.zeros(len(times))
         columns = [full[:, names.index(name)] if name in names else absent for name in self.names]
-        answer = result.response_at(times), np.stack(columns, axis=1), result.completed, result.reason
+        answer = response, np.stack(columns, axis=1), result.completed, result.reason
         kinds = list_texts(result.doubts, "slipped", "folded")
         return SiteResponse(*answer, f"curve {number + 1}", result.warnings, *kinds)
 
@@ -201,12 +202,17 @@ def _pair_curves(curves: Sequence[Curve], problems: Sequence[Problem]) -> tuple[
         raise ProblemError(f"{len(curves)} curves for {len(problems)} problems", remedy="give one for each")
     pairs = []
     for number, (curve, problem) in enumerate(zip(curves, problems), start=1):
-        times, force = (np.asarray(values, dtype=float) for values in curve)
+        try:
+            times, force = (np.array(values, dtype=float) for values in curve)
+        except (TypeError, ValueError):  # a table, a dictionary, or the one curve of several problems
+            raise ProblemError(f"curve {number} is no pair of arrays", remedy=CURVE) from None
         end = float(problem.history.times[-1])
-        if times.ndim != 1 or times.shape != force.shape or not (np.diff(times) > 0).all():
+        if times.ndim != 1 or times.shape != force.shape or not (len(times) and (np.diff(times) > 0).all()):
+            raise ProblemError(f"curve {number} has times {times.shape}, values {force.shape}", remedy=CURVE)
+        if not np.isfinite(force).all():
             raise ProblemError(
-                f"curve {number} has times {times.shape} and values {force.shape}",
-                remedy="give (times, values), both (n,), times growing",
+                f"curve {number} has {np.count_nonzero(~np.isfinite(force))} values that are not finite",
+                remedy="leave these points out",
             )
         if times[0] < 0.0 or times[-1] > end * (1.0 + 1e-9):
             raise ProblemError(
@@ -231,7 +237,7 @@ def _build_unknowns(
     values = np.array([float(value) for value in start.values()])
     limits = [
         bounds.get(name, (value / DEFAULT_BOUND_FACTOR, value * DEFAULT_BOUND_FACTOR))
-        for name, value in start.items()
+        for name, value in zip(start, values)
     ]
     low, high = np.array(limits, dtype=float).T
     return Unknowns(tuple(start), values, low, high)

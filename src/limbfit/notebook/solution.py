@@ -33,6 +33,7 @@ class Solution(Result):
 
     def to_pyvista(self, step: int | None = None) -> pv.UnstructuredGrid:
         """The mesh at rest with the fields of a step; ``grid.warp_by_vector("displacement_mm")`` moves it.
+        The grid has arrays of its own: what is changed in it changes neither mesh nor solution.
 
         ``step``: 0 is rest, -1 the last; by default the deepest of the loading. Fields and units are those of
         ``docs/fields.md``: stress, stretch, contact pressure.
@@ -45,13 +46,14 @@ class Solution(Result):
             has = f"there are {len(self.frames)}" if self.frames else "it was solved without frames"
             raise ProblemError(f"no step {step}: {has}", remedy="count from 0, which is rest")
         mesh = self.problem.mesh
-        grid = pv.UnstructuredGrid({mesh.kind.vtk: mesh.cells}, mesh.points)
+        grid = pv.UnstructuredGrid({mesh.kind.vtk: mesh.cells}, mesh.points.copy())
         system = self.system or System(self.problem)
         point_data, cell_data = state_fields(system, self.problem, frame)
         for data, arrays in ((grid.point_data, point_data), (grid.cell_data, cell_data)):
             for name, values in arrays.items():
-                data[name] = values
-        grid.cell_data["region"] = mesh.regions
+                data[name] = np.array(values)
+        grid.cell_data["region"] = mesh.regions.copy()
+        grid.field_data["region_names"] = list(mesh.region_names)  # for `read_vtu`, where it is saved
         return grid
 
     def plot(self, axes: Axes | None = None, label: str = "") -> Axes:
