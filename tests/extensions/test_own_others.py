@@ -58,6 +58,34 @@ def test_a_suffix_belongs_to_one_format():
         register_image_format("NRRD", (".mine",), lambda path: None)
 
 
+@pytest.mark.parametrize("suffixes", [".mine", ("mine",), (".MINE",)])
+def test_what_no_file_can_end_with_is_no_suffix(suffixes):
+    with pytest.raises(InputError, match=r'are no suffixes; give such as \("\.npz",\)'):
+        register_image_format("mine", suffixes, lambda path: None)
+
+
+def test_an_experiment_that_is_in_no_file_is_refused():
+    """As that of a cell of a notebook: its results could not be told from those of another cell."""
+    cell: dict = {}
+    exec(compile("def run(context, folder): pass", "<cell 1>", "exec"), cell)
+    with pytest.raises(InputError, match="in_a_cell: its run is defined in no file"):
+        register_experiment(Experiment("in_a_cell", cell["run"]))
+
+
+@pytest.mark.parametrize("few", [np.array([1.0, 2.0]), range(1, 3), (1, 2)])
+def test_options_may_be_numbers_and_arrays_of_numpy(few, study, monkeypatch):
+    monkeypatch.setattr(EXPERIMENTS, "_added", {})
+
+    def run(context, folder, *, depth_mm=0.0, few=()):
+        (folder / "own.json").write_text(json.dumps({"given": [depth_mm, few]}))
+
+    register_experiment(Experiment("own", run))
+    found = run_experiment(load_study(study), "own", depth_mm=np.float32(3.0), few=few)
+    assert found["given"] == [3.0, [1, 2]]
+    states = {row["stage"]: row["state"] for row in study_status(load_study(study))}
+    assert states["own"] == "done"
+
+
 def named(study: Path, extensions: Path) -> Path:
     """The study with the experiment, and an indenter of its own."""
     for name in ("stiffness.py", "tapered.py"):

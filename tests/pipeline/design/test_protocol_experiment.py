@@ -98,7 +98,7 @@ def test_the_tissues_lie_within_bounds_and_about_what_is_known(found) -> None:
 
 def test_what_cannot_be_planned_is_one_line(found) -> None:
     study, _ = found
-    same = {"depths_mm": (3.0,), "holds_s": (0, 10), "draws": 1}
+    same = {"depths_mm": np.array([3.0]), "holds_s": np.array([0, 10]), "draws": 1}
     with pytest.raises(InputError, match="no record fits into 1 min"):
         limbfit.plan_protocol(study, minutes=1, **same)
     with pytest.raises(InputError, match=r"no parameter is named 'bone\.c_kPa'"):

@@ -110,13 +110,15 @@ def register_image_format(name: str, suffixes: tuple[str, ...], read: Read) -> N
     Raises
     ------
     InputError
-        Where the name or a suffix is taken.
+        Where the name or a suffix is taken, or a suffix is none.
     """
+    if isinstance(suffixes, str) or not all(one.startswith(".") and one == one.lower() for one in suffixes):
+        raise InputError(f"{suffixes!r} are no suffixes", place=name, remedy='give such as (".npz",)')
     for known in IMAGE_FORMATS:
         taken = sorted(set(known.suffixes) & set(suffixes))
         if taken and known.name != name:
             raise InputError(f"images {taken[0]} are {known.name} already", place=name, remedy="rename them")
-    IMAGE_FORMATS.add(name, ImageFormat(name, suffixes, read))
+    IMAGE_FORMATS.add(name, ImageFormat(name, tuple(suffixes), read))
 
 
 def format_of(path: Path, written: bool = False) -> ImageFormat:

@@ -8,10 +8,12 @@ those of the stages and of other experiments, so that a killed one goes on and n
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from inspect import Parameter, signature
+from pathlib import Path
 from typing import Any
 
 from ...errors import InputError
@@ -130,11 +132,14 @@ def register_experiment(experiment: Experiment, section: Maker | None = None) ->
     Raises
     ------
     InputError
-        Where the name is taken, or cannot be that of a folder beside the others.
+        Where the name is taken, or cannot be that of a folder beside the others, or ``run`` is in no file.
     """
     name, others = experiment.name, {*EXPERIMENTS.names} - {experiment.name}
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or any(other.startswith(f"{name}-") for other in others):
         raise InputError(f"no experiment can be named {name!r}", remedy="use small letters and digits")
+    if not Path(inspect.getfile(experiment.run)).is_file():
+        what = "its run is defined in no file, and results could not tell when it changes"
+        raise InputError(what, place=name, remedy="write it to a Python file, and import or name that")
     EXPERIMENTS.add(name, experiment)
     if section is not None:
         SECTIONS.add(name, section)

@@ -130,7 +130,7 @@ def plan_protocol(
         )
     used, origin = choose_parameters(study, parameters)
     times = time_socket_loads(study.socket) if pressures else {}
-    if not holds_s:
+    if not len(holds_s):
         longest = max((one.end_s for one in times.values()), default=0.0)
         holds_s = (0.0, max(_HOLD_S, min(longest, 30.0 * minutes - setup_s - rest_s)))
     return run_experiment(
@@ -140,7 +140,7 @@ def plan_protocol(
         minutes=float(minutes),
         setup_s=float(setup_s),
         rest_s=float(rest_s),
-        speeds_mm_s=[float(v) for v in speeds_mm_s] or _choose_speeds(study, times.values(), depths_mm),
+        speeds_mm_s=[float(v) for v in speeds_mm_s] or _choose_speeds(study, times.values(), list(depths_mm)),
         holds_s=[float(hold) for hold in holds_s],
         depths_mm=[float(depth) for depth in depths_mm],
         determine=[] if pressures else list(determine),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -34,7 +35,7 @@ from ..engine.files import keep_hand_labels
 from ..engine.journal import write_journal
 from ..engine.keys import Keys, Stage, StageKey, describe_causes
 from ..engine.provenance import collect_versions, compute_input_digests, describe_machine, record_settings
-from ..engine.storage import read_json, write_result
+from ..engine.storage import read_json, to_plain, write_result
 from ..engine.store import Store, lock
 from ..identification.calibrate import run_calibrate
 from ..identification.predict import run_predict
@@ -342,7 +343,8 @@ def run_experiment(
         if value is not None and _find_kind(default) not in (-1, _find_kind(value)):
             what = f"option {option} of {name} cannot be {value!r}"
             raise InputError(what, remedy=f"its default is {default!r}")
-    chosen = {**experiment.options, **options}
+    # As its stamp will hold them: a notebook's numbers and arrays may be those of NumPy.
+    chosen = json.loads(json.dumps({**experiment.options, **options}, default=to_plain))
     check_experiment(experiment, study, None, chosen)
     last = [stage.name for stage in STAGES if stage.name in experiment.needs][-1:]
     if last:

@@ -6,7 +6,7 @@ import csv
 import json
 import os
 import uuid
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -36,10 +36,10 @@ def read_json(path: Path) -> Any:
 
 
 def to_plain(value: Any) -> Any:
-    """NumPy scalars and arrays as what JSON knows."""
+    """NumPy scalars and arrays, and collections such as ranges, as what JSON knows."""
     if hasattr(value, "tolist"):
         return value.tolist()
-    return str(value)
+    return list(value) if isinstance(value, Collection) else str(value)
 
 
 @contextmanager
