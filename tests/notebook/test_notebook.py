@@ -294,6 +294,24 @@ def test_a_parameter_that_ends_at_its_bound_is_said_to_be_there(solution):
     assert fit.table().endswith("; at its bound")
 
 
+def test_a_fit_simulates_what_it_fitted(solution):
+    """By default steps and with another penalty the curve was off by more than the error of the fit."""
+    times = np.linspace(0.1, 4.0, 20)
+    noisy = solution.force_at(times) * (1.0 + 0.01 * np.sin(9.0 * times))
+    fit = limbfit.calibrate(solution.problem, (times, noisy), {"muscle.c": 0.002}, steps=STEPS)
+    again, fitted = fit.solve(), fit.responses[0].force_N
+    assert again.force_at(times) == pytest.approx(fitted, abs=1e-4 * fitted.max())
+    assert len(again.times) < len(limbfit.solve(solution.problem).times)
+
+
+def test_fewer_points_than_parameters_have_intervals(solution):
+    times = np.array([0.5, 1.0, 2.0])
+    start = {"muscle.c": 0.004, "muscle.gamma": 0.8, "skin.c": 0.006, "skin.gamma": 1.2}
+    fit = limbfit.calibrate(solution.problem, (times, solution.force_at(times)), start, steps=STEPS)
+    assert np.isfinite(fit.uncertainty.intervals_95).all()
+    assert "determined" not in fit.uncertainty.verdicts
+
+
 def test_problems_of_two_laws_are_fitted_together(solution):
     one = solution.problem
     other = one.with_materials({"skin": Ogden(((0.01, 4.0),)), "muscle": TISSUE})

@@ -34,8 +34,8 @@ CURVE = "give (times, values), both (n,), times growing"  # what a curve is
 class Fit:
     """Fitted parameters, by ``region.parameter``; mm, N, s, MPa.
 
-    ``problems`` have the fitted materials; ``error_percent`` is the mean difference of each curve over its
-    largest force. ``converged`` and ``reason`` say how the search ended.
+    ``problems`` have the fitted materials, and were simulated in ``steps``; ``error_percent`` is the mean
+    difference of each curve over its largest force. ``converged`` and ``reason`` say how the search ended.
     """
 
     parameters: Mapping[str, float]
@@ -47,6 +47,7 @@ class Fit:
     curves: tuple[tuple[Array, Array], ...]
     responses: tuple[SiteResponse, ...]
     unknowns: Unknowns
+    steps: tuple[StepControl, ...]
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
@@ -71,8 +72,8 @@ class Fit:
         return "\n".join("  ".join(c.ljust(w) for c, w in zip(row, widths)).rstrip() for row in rows)
 
     def solve(self, number: int = 0) -> Solution:
-        """Simulate a problem with what was found."""
-        return solve(self.problems[number])
+        """Simulate a problem with what was found, in the steps and with the contact penalty of the fit."""
+        return solve(self.problems[number], self.steps[number])
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Draw the curves as measured (dots) and as fitted (lines) over time."""
@@ -143,6 +144,7 @@ def calibrate(
         curves=pairs,
         responses=tuple(result.responses),
         unknowns=unknowns,
+        steps=tuple(model.steps),
     )
 
 

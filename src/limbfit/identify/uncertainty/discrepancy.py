@@ -280,6 +280,8 @@ def limit_to_mean_square(
     """
     scale = np.concatenate([np.full(len(r), len(r) ** -0.5 / p) for r, p in zip(residuals, model.peaks_N)])
     residual, jacobian = scale * np.concatenate(residuals), scale[:, None] * np.concatenate(jacobians)
+    if len(residual) <= jacobian.shape[1]:  # the fit leaves nothing that could tell
+        return model
     own = block_diag(*(model.own_covariance(i) for i in range(len(residuals))))
     sites = np.concatenate(model.site_deviations)
     covariance = scale[:, None] * (own + sites @ sites.T) * scale
