@@ -115,7 +115,8 @@ def python_in(page: str) -> list[str]:
 def test_python_of_the_pages_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for code in python_in(page):
-        exec(compile(code, page, "exec", dont_inherit=True), {"__name__": "example"})
+        Path("example.py").write_text(code, encoding="utf-8")  # an experiment is in a file
+        exec(compile(code, "example.py", "exec", dont_inherit=True), {"__name__": "example"})
 
 
 def test_the_page_of_commands_is_what_they_say() -> None:
