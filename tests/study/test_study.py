@@ -135,6 +135,15 @@ FAULTS = {
     "infinite": ("edge_near_mm = 3.0", "edge_near_mm = inf", r"mesh\.edge_near_mm: .*finite"),
     "not a number": ("edge_near_mm = 3.0", "edge_near_mm = nan", r"mesh\.edge_near_mm: "),
     "text for number": ("edge_near_mm = 3.0", 'edge_near_mm = "fine"', r"mesh\.edge_near_mm: .*number"),
+    "number in quotes": ("edge_near_mm = 3.0", 'edge_near_mm = "3.0"', r"mesh\.edge_near_mm: .*number"),
+    "truth for number": ("depth_mm = 6.0", "depth_mm = true", r"sites\.2\.depth_mm: .*number"),
+    "number for truth": ("fitted = true", "fitted = 1", r"sites\.1\.fitted: .*boolean"),
+    "text for truth": ("fitted = true", 'fitted = "no"', r"sites\.1\.fitted: .*boolean"),
+    "one record in one bracket": (
+        "[mesh]",
+        '[records]\nsite = "1"\nname = "b"\ntrace = "1.csv"\n[mesh]',
+        r"records: one table, .* two brackets: \[\[records\]\]",
+    ),
     "wrong choice": ("edge_near_mm = 3.0", 'element = "hex20"', r"mesh\.element: .*'tet10' or 'tet10p0'"),
     "no friction": (
         "[mesh]",
@@ -146,13 +155,17 @@ FAULTS = {
         "[indenter]\nfriction = -0.3\n[mesh]",
         r"indenter\.friction: -0\.3 is not",
     ),
-    "short vector": ("[0.0, -50.0, 10.0]", "[0.0, -50.0]", r"sites\.0\.position"),
-    "infinite vector": ("[0.0, -50.0, 10.0]", "[0.0, -50.0, inf]", r"sites\.0\.position\.2: .*finite"),
+    "short vector": ("[0.0, -50.0, 10.0]", "[0.0, -50.0]", r"sites\.1\.position\.3: Field required"),
+    "infinite vector": ("[0.0, -50.0, 10.0]", "[0.0, -50.0, inf]", r"sites\.1\.position\.3: .*finite"),
     "no name": ('name = "one limb"', "", r"study\.name: .*required"),
-    "bad site name": ('name = "2"', 'name = "../2"', r"sites\.1\.name: .*pattern"),
+    "bad site name": (
+        'name = "2"',
+        'name = "../2"',
+        r"sites\.2\.name: '\.\./2' is no name; begin with a letter",
+    ),
     "same site twice": ('name = "2"', 'name = "1"', r"sites: site names must differ; given twice: 1"),
     "two doors": ("[mesh]", '[image]\npath = "mri"\n[mesh]', r"either \[image\] or \[surfaces\]"),
-    "no place": ("position = [0.0, 50.0, 10.0]", "", r"sites\.1: give either position .* or near"),
+    "no place": ("position = [0.0, 50.0, 10.0]", "", r"sites\.2: give either position .* or near"),
     "near without markers": (
         "position = [0.0, 50.0",
         "near = [0.0, 50.0",
@@ -161,12 +174,12 @@ FAULTS = {
     "record and plan": (
         'trace = "1.csv"',
         'trace = "1.csv"\ndepth_mm = 5',
-        r"sites\.0: give either trace .* or depth",
+        r"sites\.1: give either trace .* or depth",
     ),
     "fitted without record": (
         "depth_mm = 6.0",
         "depth_mm = 6.0\nfitted = true",
-        r"sites\.1: a fitted site needs a trace",
+        r"sites\.2: a fitted site needs a trace",
     ),
     "missing record": ('trace = "1.csv"', 'trace = "9.csv"', r"sites\.1\.trace: 9\.csv does not exist"),
     "missing surface": (
@@ -199,6 +212,18 @@ def test_refusals_name_file_key_and_fault(folder: Path, fault: str) -> None:
     text = refusal(write(folder, GOOD.replace(old, new)))
     assert text.startswith(f"{folder / 'study.toml'}: ")
     assert re.search(expected, text), text
+
+
+def test_a_fault_is_at_the_table_that_has_the_name(folder: Path) -> None:
+    """As in every other message; the first table of a list is not number 0, nor the second a site named 1."""
+    text = GOOD.replace("depth_mm = 6.0", "depth_mm = -6.0")
+    assert "study.toml: sites.2.depth_mm: Input should be greater than 0" in refusal(write(folder, text))
+    record = '[[records]]\nsite = "1"\nname = "slow"\ntrace = "1.csv"\nspeed_mm_s = 0\n'
+    assert "study.toml: records.1-slow.speed_mm_s: " in refusal(write(folder, GOOD + record))
+    layers = '[geometry]\nlayers = [{ name = "skin", thickness_mm = 0 }]\n'
+    assert "study.toml: geometry.layers.skin.thickness_mm: " in refusal(write(folder, GOOD + layers))
+    nameless = GOOD.replace('name = "2"\n', "")
+    assert "study.toml: sites.2.name: Field required" in refusal(write(folder, nameless))
 
 
 def test_several_faults_are_counted(folder: Path) -> None:
@@ -260,9 +285,9 @@ def test_a_map_needs_an_image_and_one_thickness(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        ("axis = [0, 0, 0]", r"sites\.0\.axis: a direction of no length"),
-        ("edge = [0, 0, 0]", r"sites\.0\.edge: a direction of no length"),
-        ("axis = [0, 2, 0]\nedge = [0, -1, 0]", r"sites\.0: edge is along axis"),
+        ("axis = [0, 0, 0]", r"sites\.1\.axis: a direction of no length"),
+        ("edge = [0, 0, 0]", r"sites\.1\.edge: a direction of no length"),
+        ("axis = [0, 2, 0]\nedge = [0, -1, 0]", r"sites\.1: edge is along axis"),
     ],
 )
 def test_directions_that_are_none_are_refused(folder: Path, line: str, expected: str) -> None:

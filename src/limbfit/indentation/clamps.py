@@ -42,7 +42,7 @@ def build_clamping_pins(
     normal /= np.linalg.norm(normal)
     middles = points[faces[:, :3]].mean(axis=1) - np.asarray(indenter.centre)
     found: dict[str, Indenter] = {}
-    for degrees, level in zip(clamps.angles, clamps.levels):
+    for degrees, level in zip(clamps.angles, np.broadcast_to(clamps.levels_mm, len(clamps.angles))):
         name = f"clamp at {degrees:.4g} degrees"
         section = middles[np.abs(middles @ normal - level) < clamps.width_mm / 2.0]
         radius = 0.5 * float(np.ptp(section @ inwards)) if len(section) else 0.0

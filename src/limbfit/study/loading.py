@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -42,10 +43,11 @@ def load_study(path: str | Path, *, recorded: bool = True) -> Study:
         for key in ("file", "notes"):  # of a study, but none of its file
             if key in content:
                 raise StudyError("unknown key", place=key, remedy="see docs/study.md for the keys")
-        try:
-            study = Study(**(content | {"file": file, "notes": notes}))
+        try:  # as JSON, of which neither "12" nor true is a number
+            text = json.dumps(content | {"file": str(file), "notes": notes}, default=str)
+            study = Study.model_validate_json(text, strict=True)
         except ValidationError as error:
-            raise _build_study_error(error) from None
+            raise _build_study_error(error, content) from None
         for place, path in study.inputs.items():
             at = study.path(path)
             if (recorded or not place.startswith(("sites.", "records."))) and not at.exists():
@@ -97,11 +99,33 @@ def _load_extensions(content: dict[str, Any], file: Path) -> None:
         load_extensions(file.parent / name for name in named)
 
 
-def _build_study_error(error: ValidationError) -> StudyError:
-    first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"]) or None
-    more = len(error.errors()) - 1
+def _build_study_error(error: ValidationError, content: dict[str, Any]) -> StudyError:
+    found = error.errors()
+    first = next((one for one in found if one["type"] == "value_error"), found[0])  # it says most
+    more = len(found) - 1
+    place, kind, given = _name_place(first["loc"], content), first["type"], first["input"]
     what, remedy = first["msg"].removeprefix("Value error, "), None
-    if first["type"] == "extra_forbidden":
+    if kind == "extra_forbidden":
         what, remedy = "unknown key", "see docs/study.md for the keys"
+    elif kind == "string_pattern_mismatch":
+        what, remedy = f"{given!r} is no name", "begin with a letter; then A to Z, digits or _, up to 30"
+    elif kind == "tuple_type" and isinstance(given, dict):
+        what, remedy = "one table, and not a list of tables", f"write it in two brackets: [[{place}]]"
+    elif kind in ("model_type", "dict_type"):
+        what = "Input should be a table"
     return StudyError(what + (f" (and {more} more)" if more else ""), place=place, remedy=remedy)
+
+
+def _name_place(keys: tuple[int | str, ...], content: Any) -> str | None:
+    """Name the place that ``keys`` lead to, as ``sites.05.weight``; a table without a name by its number."""
+    parts = []
+    for depth, key in enumerate(keys):
+        try:
+            content = content[key]
+        except (LookupError, TypeError):  # a key that is missing, or stands for a type that a value may have
+            content = None
+        part = str(key + 1 if isinstance(key, int) else key)
+        if isinstance(key, int) and isinstance(content, dict) and keys[depth + 1 :] != ("name",):
+            part = "-".join(str(content[name]) for name in ("site", "name") if name in content) or part
+        parts.append(part)
+    return ".".join(part for part in parts if "[" not in part) or None

@@ -10,15 +10,15 @@ from pydantic import Field, field_validator, model_validator
 from ..errors import InputError
 from ..laws import ACTIVE, LAWS, OGDEN
 from ..relaxation import DEFAULT_SPAN_S, choose_relaxation_times
-from .tables import Positive, TomlTable, Vector
+from .tables import Direction, Positive, TomlTable
 
 KAPPA_RATIO = (10.0, 1e4)
 End = Literal["lower", "start", "upper"]
 _ENDS: tuple[End, ...] = ("lower", "start", "upper")
 
 
-class TissueRange(TomlTable):
-    """Start and bounds of one tissue that differ from those of all tissues."""
+class ParameterRange(TomlTable):
+    """Start and bounds of parameters: of all tissues, or of one tissue where they differ from those."""
 
     start: dict[str, Positive] = Field(default={})
     lower: dict[str, Positive] = Field(default={})
@@ -39,7 +39,7 @@ class ActivationTable(TomlTable):
             raise ValueError("time_s does not grow from 0, which is touch-down")
 
 
-class MaterialTable(TomlTable):
+class MaterialTable(ParameterRange):
     """The law of all tissues, and start and bounds of its parameters; those that are not given are the law's.
 
     ``relaxation_span_s``: first and last time of relaxation as a power of time.
@@ -52,11 +52,8 @@ class MaterialTable(TomlTable):
     law: str = OGDEN
     relaxation_span_s: tuple[float, float] = DEFAULT_SPAN_S
     kappa_ratio: float = 100.0
-    start: dict[str, Positive] = Field(default={})
-    lower: dict[str, Positive] = Field(default={})
-    upper: dict[str, Positive] = Field(default={})
-    tissues: dict[str, TissueRange] = Field(default={})
-    fibres: dict[str, Literal["axis", "flow"] | Vector] = Field(default={})
+    tissues: dict[str, ParameterRange] = Field(default={})
+    fibres: dict[str, Literal["axis", "flow"] | Direction] = Field(default={})
     activation: ActivationTable | None = None
     prestretch: dict[str, Annotated[float, Field(ge=0.7, le=1.5)]] = Field(default={})
 
@@ -75,7 +72,7 @@ class MaterialTable(TomlTable):
 
     def of(self, tissue: str, which: End) -> dict[str, float]:
         """Start, lower or upper bound of the parameters of a tissue."""
-        return getattr(self, which) | getattr(self.tissues.get(tissue, TissueRange()), which)
+        return getattr(self, which) | getattr(self.tissues.get(tissue, ParameterRange()), which)
 
     @model_validator(mode="before")
     @classmethod
@@ -92,14 +89,6 @@ class MaterialTable(TomlTable):
         given = {which: content.get(which, {}) for which in _ENDS}
         filled = {which: known[which] | values for which, values in given.items() if isinstance(values, dict)}
         return content | filled
-
-    @field_validator("fibres")
-    @classmethod
-    def _check_directions(cls, fibres: dict[str, Any]) -> dict[str, Any]:
-        for tissue, direction in fibres.items():
-            if not any(direction):
-                raise ValueError(f'{tissue}: a direction of no length; give [x, y, z], "axis" or "flow"')
-        return fibres
 
     @field_validator("relaxation_span_s")
     @classmethod

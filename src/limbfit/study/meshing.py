@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from .tables import Positive, TomlTable
 
@@ -22,24 +22,6 @@ def estimate_cells(edge_near_mm: float, edge_far_mm: float, near_radius_mm: floa
     edge = np.minimum(edge_near_mm + growth * np.maximum(radius - near_radius_mm, 0.0), edge_far_mm)
     volume = np.diff(2.0 / 3.0 * np.pi * radius**3 / _DEPTH_RATIO)
     return float(np.sum(volume * _CELLS_PER_CUBE / ((edge[1:] + edge[:-1]) / 2) ** 3))
-
-
-def _check_cell_count(table: CoarseMeshTable | MeshTable) -> None:
-    """Refuse edge lengths that make more than `MAX_CELLS` cells per site."""
-    far, radius, growth = table.edge_far_mm, table.near_radius_mm, table.growth
-    cells = estimate_cells(table.edge_near_mm, far, radius, growth)
-    if cells <= MAX_CELLS:
-        return
-    counted = f"{cells / 1e9:.2g} billion" if cells > 5e8 else f"{cells / 1e6:.2g} million"
-    where = f"edge_near_mm = {table.edge_near_mm:g} with edge_far_mm = {far:g}"
-    edges = np.geomspace(0.01, 20.0, 400)
-    # The shortest edge that keeps the mesh within the limit; the far edge follows.
-    few = [estimate_cells(e, max(far, e), radius, growth) <= MAX_CELLS for e in edges]
-    finest = np.ceil(100 * edges[np.argmax(few)]) / 100
-    raise ValueError(
-        f"{where} makes about {counted} cells per site, and {MAX_CELLS / 1e6:g} million are the most; give "
-        f"edge_near_mm of {finest:g} or more (edge_far_mm no less), or a smaller near_radius_mm"
-    )
 
 
 def _to_edges(*values: float) -> dict[str, float]:
@@ -90,20 +72,42 @@ def replace_edges(mesh: Any, widths_mm: Sequence[float] = (REFERENCE_WIDTH_MM,))
     return {**suited(fine), "coarse": coarse, **mesh}
 
 
-class CoarseMeshTable(TomlTable):
+class EdgesTable(TomlTable):
+    """The edge lengths of a mesh; the defaults are those of ``mesh.accuracy = "standard"``."""
+
+    edge_near_mm: Positive = _DEFAULT_EDGES["edge_near_mm"]
+    edge_far_mm: Positive = _DEFAULT_EDGES["edge_far_mm"]
+    near_radius_mm: Positive = _DEFAULT_EDGES["near_radius_mm"]
+    growth: Positive = _DEFAULT_EDGES["growth"]
+    flatness: Annotated[float, Field(ge=1, le=2)] = _DEFAULT_EDGES["flatness"]
+
+    def check_keys(self) -> None:
+        """Refuse edge lengths that make more than `MAX_CELLS` cells per site."""
+        far, radius, growth = self.edge_far_mm, self.near_radius_mm, self.growth
+        cells = estimate_cells(self.edge_near_mm, far, radius, growth)
+        if cells <= MAX_CELLS:
+            return
+        counted = f"{cells / 1e9:.2g} billion" if cells > 5e8 else f"{cells / 1e6:.2g} million"
+        where = f"edge_near_mm = {self.edge_near_mm:g} with edge_far_mm = {far:g}"
+        edges = np.geomspace(0.01, 20.0, 400)
+        # The shortest edge that keeps the mesh within the limit; the far edge follows.
+        few = [estimate_cells(e, max(far, e), radius, growth) <= MAX_CELLS for e in edges]
+        finest = np.ceil(100 * edges[np.argmax(few)]) / 100
+        raise ValueError(
+            f"{where} makes about {counted} cells per site, and {MAX_CELLS / 1e6:g} million are the most; "
+            f"give edge_near_mm of {finest:g} or more (edge_far_mm no less), or a smaller near_radius_mm"
+        )
+
+
+class CoarseMeshTable(EdgesTable):
     """The second mesh of each site, on which the identification takes its derivatives: edge lengths."""
 
     edge_near_mm: Positive = 5.5
-    edge_far_mm: Positive = 30.0
     near_radius_mm: Positive = 12.0
     growth: Positive = 0.9
-    flatness: Annotated[float, Field(ge=1, le=2)] = 1.6
-
-    def check_keys(self) -> None:
-        _check_cell_count(self)
 
 
-class MeshTable(TomlTable):
+class MeshTable(EdgesTable):
     """The mesh of each site: element and edge lengths near the indenter and far from it.
 
     ``accuracy`` sets all edge lengths; those that are stated go before it. With ``coarse``, parameters are
@@ -114,22 +118,9 @@ class MeshTable(TomlTable):
     accuracy: Literal["fast", "standard", "fine"] = Field(default="standard", exclude=True)  # edges say it
 
     element: Literal["tet4", "tet10", "tet10p0"] = "tet10p0"
-    edge_near_mm: Positive = _DEFAULT_EDGES["edge_near_mm"]
-    edge_far_mm: Positive = _DEFAULT_EDGES["edge_far_mm"]
-    near_radius_mm: Positive = _DEFAULT_EDGES["near_radius_mm"]
-    growth: Positive = _DEFAULT_EDGES["growth"]
-    flatness: Annotated[float, Field(ge=1, le=2)] = _DEFAULT_EDGES["flatness"]
     engine: Literal["mmg", "netgen"] = "mmg"
     time_limit_s: Positive = 600.0
     coarse: CoarseMeshTable | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _fill_edges(cls, given: Any) -> Any:
-        return replace_edges(given)
-
-    def check_keys(self) -> None:
-        _check_cell_count(self)
 
     def find_accuracy(self, widths_mm: Sequence[float]) -> str | None:
         """Find the ``accuracy`` that has these edges for such indenters; None if the study states others."""

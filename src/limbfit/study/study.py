@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -54,6 +54,13 @@ from .tables import (
 )
 
 
+def _freeze(content: Any) -> Any:
+    """Tuples for lists, however deep: of types that are strict, nothing else is a tuple."""
+    if isinstance(content, Mapping):
+        return {key: _freeze(value) for key, value in content.items()}
+    return tuple(map(_freeze, content)) if isinstance(content, list) else content
+
+
 class Study(TomlTable):
     """A checked study; ``folder`` is where it lives, ``notes`` what its user should know."""
 
@@ -84,7 +91,8 @@ class Study(TomlTable):
     @model_validator(mode="before")
     @classmethod
     def _fill_mesh_edges(cls, content: dict[str, Any]) -> dict[str, Any]:
-        return {**content, "mesh": replace_edges(content.get("mesh", {}), list_indenter_widths(content))}
+        edges = replace_edges(content.get("mesh", {}), list_indenter_widths(content))
+        return {**_freeze(content), "mesh": edges}
 
     @property
     def folder(self) -> Path:
@@ -301,8 +309,8 @@ class Study(TomlTable):
         for other, ending in (name.rsplit("-", 1) for name in names if "-" in name):
             if other in names and ending in STORED_ENDINGS:
                 raise ValueError(f"{other}-{ending} is a file of {other!r} in results; give another name")
-        for number, site in enumerate(self.sites):
-            records, place = self.records_at(site), f"sites.{number}"
+        for site in self.sites:
+            records, place = self.records_at(site), f"sites.{site.name}"
             if site.fitted and not records:
                 raise ValueError(f"{place}: a fitted site needs a trace, or [[records]]")
             if (not records) == (site.depth_mm is None):
@@ -367,7 +375,7 @@ class Study(TomlTable):
                 "the regions out"
             )
         if (self.image is None) == (self.surfaces is None):
-            raise ValueError("give either [image] or [surfaces], not both")
+            raise ValueError("give either [image] or [surfaces]")
         if self.surfaces is not None:
             if any(layer.thickness for layer in self.geometry.layers):
                 raise ValueError('a layer with thickness = "map" needs the fat of an [image], not [surfaces]')

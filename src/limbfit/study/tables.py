@@ -489,11 +489,6 @@ class ClampsTable(TomlTable):
         return self.angles_degrees or usual
 
     @property
-    def levels(self) -> tuple[float, ...]:
-        """Level of each pin, mm."""
-        return self.levels_mm if len(self.levels_mm) > 1 else self.levels_mm * len(self.angles)
-
-    @property
     def begun_s(self) -> float:
         """When the indenter touches, after clamping began, s."""
         return self.clamping_s + self.settling_s

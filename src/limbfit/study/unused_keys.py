@@ -9,7 +9,7 @@ from typing import Any
 from ..errors import StudyError
 from ..laws import ACTIVE, FIBRED, POWER, has_fibres
 from ..shapes import SHAPES
-from .meshing import ACCURACIES, CoarseMeshTable, MeshTable
+from .meshing import ACCURACIES, EdgesTable
 from .study import Study
 
 
@@ -23,9 +23,7 @@ class UnusedKeys:
     remedy: str = "leave it out"
 
 
-def _list_edge_rules(
-    place: str, find: Callable[[Study], MeshTable | CoarseMeshTable | None]
-) -> tuple[UnusedKeys, ...]:
+def _list_edge_rules(place: str, find: Callable[[Study], EdgesTable | None]) -> tuple[UnusedKeys, ...]:
     def find_excess(study: Study) -> float:
         table = find(study)
         return 1.0 if table is None else table.edge_far_mm - table.edge_near_mm

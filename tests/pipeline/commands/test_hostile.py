@@ -199,7 +199,7 @@ def test_names_that_would_leave_the_folder_or_the_line_are_refused(study, monkey
     file = study / "study.toml"
     file.write_text(file.read_text().replace('name = "1"', f'name = "{name}"'))
     err = check(study, monkeypatch, capsys)
-    assert "sites.0.name" in err
+    assert "sites.1.name" in err
     assert "\x1b" not in err
 
 
