@@ -13,9 +13,12 @@ from in_process import Bench
 from limbfit import check_recording, load_study
 from limbfit.acquire import Recorder, check_record, find_ramps, follow_recording, read_recording
 from limbfit.acquire.events import PINS, Sample
+from limbfit.acquire.quality import RecordedRamp
 from limbfit.acquire.recording import COLUMNS
 from limbfit.errors import InputError, TraceError
-from limbfit.traces import find_touch_down, regularise
+from limbfit.pipeline.commands.acquire import write_ramp
+from limbfit.traces import COLUMNS as TRACE_COLUMNS
+from limbfit.traces import Trace, find_touch_down, read_trace, regularise
 
 
 def sample(number: int) -> Sample:
@@ -45,6 +48,19 @@ def test_what_was_written_is_read(written) -> None:
     assert found.number.tolist() == list(range(1, 131))
     assert (found.force_mN == -found.number[:, None]).all()
     assert found.phases() == [("clamp", 60_400, 260_301)]
+
+
+def test_a_ramp_is_written_in_the_units_that_the_names_of_the_columns_state(study) -> None:
+    """Whatever writes the study's other records, ``limbfit acquire`` measures in s, mm and N."""
+    made = read_trace(study / "1.csv")
+    names = ("Time (ms)", "Depth (cm)", "Load (kN)")
+    file = study / "study.toml"
+    stated = "\n".join(f'{key} = "{name}"' for key, name in zip(TRACE_COLUMNS, names))
+    file.write_text(f"{file.read_text()}\n[traces]\n{stated}\n")
+    write_ramp(load_study(study), study / "ramp.csv", RecordedRamp(1, made))
+    read: Trace = read_trace(study / "ramp.csv", names)
+    for key in TRACE_COLUMNS:
+        np.testing.assert_allclose(getattr(read, key), getattr(made, key), rtol=1e-4, atol=1e-4)
 
 
 def test_any_table_reader_reads_the_rows(written) -> None:

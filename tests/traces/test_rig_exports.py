@@ -85,6 +85,20 @@ def test_units_that_are_those_of_limbfit_need_no_remark(tmp_path, truth, unit):
     assert_read(path, truth, ())
 
 
+def test_units_beside_the_names_are_converted_however_they_are_spelled(tmp_path, truth):
+    names = ("Time (MS)", "Extension (CM)", "Load [KN]")
+    path = write(tmp_path / "a.csv", ["\t".join(names), *rows(truth / [[1e-3], [10], [1e3]])])
+    units = ((names[0], "MS to s"), (names[1], "CM to mm"), (names[2], "KN to N"))
+    assert_read(path, truth, tuple(f"column {name!r} is converted from {how}" for name, how in units), names)
+
+
+def test_a_force_that_the_study_names_as_displacement_is_refused(tmp_path, truth):
+    names = ("Time (s)", "Extension (mm)", "Load (N)")
+    path = write(tmp_path / "a.csv", ["\t".join(names), *rows(truth)])
+    with pytest.raises(TraceError, match=r"the unit 'N' of column 'Load \(N\)' is none of mm, "):
+        read_trace(path, (names[0], names[2], names[1]))
+
+
 def clock(seconds, form):
     start = datetime.datetime(2026, 3, 1, 23, 59, 57)
     return [(start + datetime.timedelta(seconds=s)).strftime(form) for s in seconds]
@@ -121,7 +135,7 @@ def test_what_would_need_a_guess_is_refused_and_the_column_option_named(tmp_path
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("unit", ["kg", "g", "lb", "V"])
+@pytest.mark.parametrize("unit", ["kg", "Kg", "KG", "g", "lb", "V", "kPa", "mm", "MN"])
 def test_a_unit_beside_the_name_that_is_no_force_is_refused(tmp_path, truth, unit):
     names = ("Time", "Extension", f"Load [{unit}]")
     path = write(tmp_path / "a.csv", ["\t".join(names), *rows(truth)])

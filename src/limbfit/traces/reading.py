@@ -33,8 +33,9 @@ _UNITS: Mapping[str, Mapping[str, float]] = {  # by the end of a column's key; "
         "lbf": 4.4482216152605,
     },
 }
-# Of a load cell that shows a mass or is not calibrated: in brackets these are units too, and not known ones
-_OTHER_UNITS = ("kg", "g", "t", "lb", "lbs", "oz", "gf", "kp", "V", "mV", "%")
+# Of a load cell that shows a mass or a pressure, or is not calibrated: in brackets these are units too.
+_OTHER_UNITS = ("kg", "g", "t", "lb", "lbs", "oz", "gf", "kp", "V", "mV", "%", "Pa", "kPa", "MPa", "psi")
+_ALL_UNITS = {unit.casefold() for units in (*_UNITS.values(), _OTHER_UNITS) for unit in units}
 _BRACKETED = re.compile(r".*[\[(]\s*(?P<unit>[^\[\]()]+?)\s*[\])]")
 _DAY_S = 86400.0
 _CLOCK = re.compile(
@@ -108,7 +109,7 @@ def _read_column(table: ColumnTable, key: str, name: str, empty: str, notes: lis
         found = [_to_vector(table.vectors[i], name) for i in places]
     else:
         found = [_read_numbers(table.rows, i, name, empty) for i in places]
-    found = [values * _find_factor(table.units[i], key, name, notes) for i, values in zip(places, found)]
+    found = [values * find_factor(key, name, table.units[i], notes) for i, values in zip(places, found)]
     if any(not np.array_equal(values, found[0], equal_nan=True) for values in found):
         raise TraceError(
             f"{len(places)} columns are named {name!r}",
@@ -118,8 +119,8 @@ def _read_column(table: ColumnTable, key: str, name: str, empty: str, notes: lis
     return found[0]
 
 
-def _find_factor(unit: str, key: str, name: str, notes: list[str]) -> float:
-    """Find the factor that converts the values of a column; 1 if no unit is stated.
+def find_factor(key: str, name: str, unit: str, notes: list[str]) -> float:
+    """Find the factor that converts the values of a column to the unit of its key; 1 if none is stated.
 
     Raises `TraceError` for a unit that is not one of the key's quantity, or not that in the column's
     name.
@@ -129,9 +130,10 @@ def _find_factor(unit: str, key: str, name: str, notes: list[str]) -> float:
     below = _BRACKETED.fullmatch(unit)
     units = [below["unit"] if below else unit] if unit else []
     # Other brackets hold other things than units.
-    if beside and (_get_factor(known, beside["unit"]) or beside["unit"] in _OTHER_UNITS):
+    if beside and beside["unit"].casefold() in _ALL_UNITS:
         units.append(beside["unit"])
-    factors = {_get_factor(known, one) for one in units} or {1.0}
+    folded = {one.casefold(): factor for one, factor in known.items()}  # rigs write KN, Sec and MM, too
+    factors = {folded.get(one.casefold(), 0.0) * (one != "MN") for one in units} or {1.0}
     factor = factors.pop()
     if not factor or factors:
         raise TraceError(
@@ -142,12 +144,6 @@ def _find_factor(unit: str, key: str, name: str, notes: list[str]) -> float:
     if factor != 1.0:
         notes.append(f"column {name!r} is converted from {units[0]} to {next(iter(known))}")
     return factor
-
-
-def _get_factor(factors: Mapping[str, float], unit: str) -> float:
-    """The factor of a unit, words in any case; 0 where it is not known."""
-    unit = unit.replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
-    return factors.get(unit, factors.get(unit.lower() if len(unit) > 3 else "", 0.0))
 
 
 def _get_cell(row: Row, place: int, name: str) -> str:

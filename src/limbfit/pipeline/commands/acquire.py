@@ -20,6 +20,8 @@ from ...errors import InputError, TraceError
 from ...results.curves import read_curves
 from ...results.records import TracesResult
 from ...study import Indentation, Record, Study
+from ...traces import COLUMNS
+from ...traces.reading import find_factor
 from ..engine.storage import write_curves, write_json
 from ..engine.store import translate_disk_errors
 
@@ -245,7 +247,7 @@ def _keep(study: Study, one: Indentation, folder: Path, completed: bool) -> dict
     found = acquire.find_ramps(recording)
     with translate_disk_errors(study.folder):
         for ramp in found:
-            _write_ramp(study, folder / f"ramp-{ramp.cycle}.csv", ramp)
+            write_ramp(study, folder / f"ramp-{ramp.cycle}.csv", ramp)
         counted = [ramp for ramp in found if ramp.cycle > study.acquire.precondition]
         if counted and one.trace is not None:
             file = study.path(one.trace)
@@ -253,16 +255,17 @@ def _keep(study: Study, one: Indentation, folder: Path, completed: bool) -> dict
             if file.exists():  # it stays beside the new one
                 until = f"until-{datetime.now(UTC):%Y%m%dT%H%M%S}"
                 file.rename(file.with_name(f"{file.stem}.{until}{file.suffix}"))
-            _write_ramp(study, file, counted[0])
+            write_ramp(study, file, counted[0])
             files["trace"] = str(file)
         # Last: who waits for the verdict finds the trace in its place.
         write_json(folder / VERDICT, verdict | {"trace": str(one.trace) if files["trace"] else None})
     return {"verdict": verdict, "files": files}
 
 
-def _write_ramp(study: Study, file: Path, ramp: acquire.RecordedRamp) -> None:
-    keys = ("time_s", "displacement_mm", "force_N")
-    columns = {getattr(study.traces, key): getattr(ramp.trace, key) for key in keys}
+def write_ramp(study: Study, file: Path, ramp: acquire.RecordedRamp) -> None:
+    """The ramp under the names of ``[traces]``, in the units that these state."""
+    names = {key: getattr(study.traces, key) for key in COLUMNS}
+    columns = {name: getattr(ramp.trace, key) / find_factor(key, name, "", []) for key, name in names.items()}
     work = file.with_name(f".{file.name}.work")
     write_curves(work, **columns)
     work.replace(file)
