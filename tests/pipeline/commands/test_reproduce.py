@@ -40,7 +40,7 @@ def stop(event: Progress) -> None:
     raise StoppedError
 
 
-def test_an_image_goes_with_its_voxels_and_a_study_by_any_name(study, tmp_path):
+def test_an_image_goes_with_its_voxels_and_a_study_by_any_name_into_no_folder_of_another(study, tmp_path):
     """A header of MetaImage, whose voxels lie in a file of their own; and a name with brackets."""
     image = Volume(np.zeros((5, 6, 7), dtype=np.float32), np.ones(3), np.zeros(3), np.eye(3))
     write_volume(study / "scan [1].mhd", image)
@@ -52,8 +52,16 @@ def test_an_image_goes_with_its_voxels_and_a_study_by_any_name(study, tmp_path):
     record = run_record(named).to_plain() | {"stages": {"calibrate": {}, "predict": {}}}
     named.results.mkdir()
     (named.results / "run.json").write_text(json.dumps(record))
-    with pytest.raises(StoppedError):
-        reproduce_study(study / "limb.toml", tmp_path / "again", listener=stop)
+    for _ in ("first", "the attempt goes on"):
+        with pytest.raises(StoppedError):
+            reproduce_study(study / "limb.toml", tmp_path / "again", listener=stop)
+    other = tmp_path / "another"
+    other.mkdir()
+    (other / "study.toml").write_text("of another patient")
+    for taken in (other, other / "study.toml", study):
+        with pytest.raises(InputError, match="holds something else"):
+            reproduce_study(study / "limb.toml", taken, listener=stop)
+    assert (other / "study.toml").read_text() == "of another patient"
     again = load_study(tmp_path / "again")
     assert read_volume(again.path(again.image.path)).size == (7, 6, 5)
     changed = Volume(image.array + 1.0, image.spacing, image.origin, image.direction)

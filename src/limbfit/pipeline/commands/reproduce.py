@@ -119,10 +119,11 @@ def _check_unchanged(study: Study, known: Mapping[str, Any], file: Path) -> None
 
 def _copy_inputs(study: Study, folder: Path) -> None:
     """The study file and what it names below its folder; what lies elsewhere is read where it is."""
-    if folder.exists() and not (folder / "study.toml").is_file() and any(folder.iterdir()):
+    root, begun = study.folder.resolve(), folder / "study.toml"
+    goes_on = begun.is_file() and begun.read_bytes() == study.file.read_bytes() and folder.resolve() != root
+    if not goes_on and folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
         raise InputError("holds something else", file=folder, remedy="give a folder that does not exist")
     folder.mkdir(parents=True, exist_ok=True)
-    root = study.folder.resolve()
     edited = find_hand_labels(study)
     for path in {*study.inputs.values(), Path(study.file.name), *([edited] if edited else [])}:
         source = study.path(path)
