@@ -302,7 +302,8 @@ def test_bad_traces(limbfit, study, change, fragment):
 
 
 def test_bad_usage(limbfit, study):
-    for words in (("run",), ("run", study, "--until", "nonsense"), ("nonsense",)):
+    seeded = [(verb, study.parent / "new", "--seed", -1) for verb in ("phantom", "demo", "crossvalidate")]
+    for words in (("run",), ("run", study, "--until", "nonsense"), ("nonsense",), *seeded):
         code, out, err = limbfit(*words)
         assert code == 2
         assert out == ""

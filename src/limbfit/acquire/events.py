@@ -151,11 +151,6 @@ class Settings(AcquireTable):
         """The pins that hold the limb."""
         return tuple(pin for pin in range(1, PINS + 1) if pin != self.pin and pin not in self.withdrawn)
 
-    @property
-    def cycles(self) -> int:
-        """Ramps in all, those of preconditioning included."""
-        return self.precondition + self.repeats
-
 
 def to_thousandths(value: float) -> int:
     """mm as um, N as mN, s as ms: a thousandth."""

@@ -311,7 +311,7 @@ class Protocol:
             case Phase.DWELL if passed_s >= settings.hold_s:
                 return Phase.UNLOAD
             case Phase.UNLOAD if self._has_arrived(sample, now, self.start_um):
-                if self.cycle == settings.cycles:
+                if self.cycle == settings.precondition + settings.repeats:
                     return Phase.RETRACT
                 return Phase.LOAD if self.cycle < settings.precondition else Phase.PAUSE
             case Phase.RETRACT if self._has_arrived(sample, now, 0):

@@ -94,35 +94,30 @@ def acquire(
         tool = checked.indentation(name).indenter
         if tool is not None:
             print_aside(f"{name} is made with the indenter {tool!r}")
-        rows.append(_acquire_one(checked, name, device, depth, unattended, again))
+        events: SimpleQueue[Event] = SimpleQueue()
+        prioritise()  # before the threads of the display and the keys start
+        shown = draw_session(name) if STDERR.is_terminal else nullcontext(print_phases(name))
+        operated = nullcontext() if unattended else read_keys(events, checked.acquire.key_gap_ms / 1000)
+        with _stop_on_signals(events), operated, shown as listen:
+            row = limbfit.acquire_site(
+                checked,
+                name,
+                address=device,
+                operator=None if unattended else events,
+                stops=events,
+                depth_mm=depth,
+                replace_record=again,
+                listener=listen,
+            )
+        rows.append(row)
         if not as_json:
-            _show(rows[-1])
-        if not rows[-1]["completed"]:
+            _show(row)
+        if not row["completed"]:
             break
     if as_json:
         print_json({"sites": rows})
     if not all(row["completed"] and row["verdict"]["good"] for row in rows):
         raise typer.Exit(1)
-
-
-def _acquire_one(
-    study: limbfit.Study, name: str, device: str, depth: float | None, unattended: bool, again: bool
-) -> dict[str, Any]:
-    events: SimpleQueue[Event] = SimpleQueue()
-    prioritise()  # before the threads of the display and the keys start
-    shown = draw_session(name) if STDERR.is_terminal else nullcontext(print_phases(name))
-    operated = nullcontext() if unattended else read_keys(events, study.acquire.key_gap_ms / 1000)
-    with _stop_on_signals(events), operated, shown as listen:
-        return limbfit.acquire_site(
-            study,
-            name,
-            address=device,
-            operator=None if unattended else events,
-            stops=events,
-            depth_mm=depth,
-            replace_record=again,
-            listener=listen,
-        )
 
 
 @contextmanager

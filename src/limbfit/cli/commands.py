@@ -60,7 +60,7 @@ def call_on_study(study: Path, function: Callable[..., Any], *arguments: Any, **
 
 def demo(
     folder: Annotated[Path, typer.Argument(help="where to put the demo study")] = Path("limbfit-demo"),
-    seed: Annotated[int, typer.Option(help="which synthetic patient")] = 0,
+    seed: Annotated[int, typer.Option(help="which synthetic patient", min=0)] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Make a coarse synthetic patient and identify it: the whole path, from DICOM to report."""
@@ -81,7 +81,7 @@ def phantom(
     detail: Annotated[
         Literal["coarse", "paper"], typer.Option(help="coarse: 6 sites, minutes; paper: 256^3, 18 sites")
     ] = "coarse",
-    seed: Annotated[int, typer.Option(help="which synthetic patient")] = 0,
+    seed: Annotated[int, typer.Option(help="which synthetic patient", min=0)] = 0,
     limb: Annotated[
         Literal["transtibial", "transfemoral"], typer.Option(help="which limb was amputated")
     ] = "transtibial",

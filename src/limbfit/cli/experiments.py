@@ -265,7 +265,7 @@ def crossvalidate(
     study: StudyPath,
     fit: Annotated[int, typer.Option(help="sites to fit; 0: as many as the study fits", min=0)] = 0,
     choices: Annotated[int, typer.Option(help="choices of sites, drawn where there are more", min=1)] = 200,
-    seed: Annotated[int, typer.Option(help="which choices are drawn")] = 0,
+    seed: Annotated[int, typer.Option(help="which choices are drawn", min=0)] = 0,
     runs: Annotated[int, typer.Option(help="simulations of all sites that make the emulator", min=4)] = 12,
     as_json: AsJson = False,
 ) -> None:

@@ -56,7 +56,7 @@ def compare_site(
     program = febio.find_febio(study.febio.program) if febio_log is None else None
     log = None if febio_log is None else febio.read_log(febio_log)
     found = prepare_site(study, name, parameters=parameters, listener=listener)
-    folder, name = found.context.store["compare"], found.name
+    folder, name = found.context.store["compare"], found.model.name
     folder.mkdir(parents=True, exist_ok=True)
     problem = build_site_problem(found)
     found.context.tell("compare", 0, 3, f"site {name}: FEBio")
@@ -117,7 +117,7 @@ def compare_site(
 
 def _solve_matched(found: Indentation, problem: Problem, other: Result) -> Result:
     """limbfit with FEBio's steps, its course of the stress in them and its contact penalty."""
-    found.context.tell("compare", 2, 3, f"site {found.name}: limbfit with FEBio's contact and steps")
+    found.context.tell("compare", 2, 3, f"site {found.model.name}: limbfit with FEBio's contact and steps")
     settings = build_feb_settings(found, "")
     end = float(problem.history.times[-1])
     times = np.minimum(other.times[1:], end)  # a table has nine digits

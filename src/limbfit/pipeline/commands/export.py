@@ -160,7 +160,7 @@ def _write(
     found: Indentation, problem: Problem, to: str, folder: Path, curve: tuple[Array, Array]
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """The files of a site, and what the other solver does otherwise; ``curve``: what its fit compares."""
-    name = found.name
+    name = found.model.name
     settings = build_feb_settings(found, f"{name}-forces.txt")
     if to == "feb":
         febio.write_feb(problem, folder / f"{name}.feb", settings)

@@ -40,11 +40,6 @@ class Indentation:
     parameters: Parameters
     origin: str
 
-    @property
-    def name(self) -> str:
-        """That of the record, or of the site that plans it."""
-        return self.model.name
-
 
 def prepare_site(
     study: Study, name: str, *, parameters: Parameters | None = None, listener: Listener = ignore_progress
@@ -97,7 +92,7 @@ def simulate_site(
     if program is not None and animation:
         raise InputError("FEBio's fields are in its plot file", place="--animation", remedy="leave it out")
     found = prepare_site(study, name, parameters=parameters, listener=listener)
-    context, model, name = found.context, found.model, found.name
+    context, model, name = found.context, found.model, found.model.name
     folder = context.store["simulate"]
     folder.mkdir(exist_ok=True)
     context.tell("simulate", 0, 1, f"site {name}")
@@ -176,7 +171,7 @@ def _compare_with_records(found: Indentation, result: Result, fields: Path | Non
             tested=tested,
         )
     )
-    return {"outside_records": rows, "outside_text": describe_outside({f"site {found.name}": rows})}
+    return {"outside_records": rows, "outside_text": describe_outside({f"site {found.model.name}": rows})}
 
 
 def build_site_problem(found: Indentation) -> Problem:
@@ -187,7 +182,7 @@ def build_site_problem(found: Indentation) -> Problem:
 def build_feb_settings(found: Indentation, force_file: str) -> FebSettings:
     """What is written for FEBio beside the problem."""
     study = found.context.study
-    title = f"{study.study.name}, site {found.name}, parameters: {found.origin}"
+    title = f"{study.study.name}, site {found.model.name}, parameters: {found.origin}"
     return FebSettings(study.febio.penalty, build_first_steps(found.model, study.tissues), force_file, title)
 
 
