@@ -316,6 +316,15 @@ def test_bad_usage(limbfit, study):
     assert "no site is named '99'" in err
 
 
+def test_a_file_where_a_folder_is_wanted_is_one_line(limbfit, study):
+    code, out, err = limbfit("phantom", study / "1.csv" / "new")
+    assert (code, out) == (2, "")
+    lines = [line for line in err.splitlines() if not line.startswith("[")]
+    assert len(lines) == 1
+    assert "1.csv" in lines[0]
+    assert "a file stands where a folder is wanted; give another place" in lines[0]
+
+
 def test_check_tells_what_was_closed(limbfit, study):
     skin = pv.read(study / "skin.stl")
     skin.extract_cells(skin.cell_centers().points[:, 2] < 119.0).extract_surface(

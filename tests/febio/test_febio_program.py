@@ -208,6 +208,11 @@ def test_where_febio_is_looked_for(tmp_path, monkeypatch):
     monkeypatch.setenv("FEBIO_CMD", str(other))
     assert find_febio() == other
     assert find_febio(file) == file
+    monkeypatch.chdir(elsewhere)  # a path of a study is counted from the study's folder
+    assert find_febio(Path("else") / other.name, tmp_path) == other
+    assert find_febio(other.name, tmp_path / "study") == file  # and a name is looked for on the path
+    monkeypatch.setenv("FEBIO_CMD", f"./{other.name}")
+    assert find_febio() == other  # which is run in another folder
     with pytest.raises(InputError, match=r"febio\.program.*not a program that can be run"):
         find_febio(tmp_path / "nowhere")
 

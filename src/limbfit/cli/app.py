@@ -81,6 +81,8 @@ def main() -> None:
         fail(INTERRUPTED, 130)
     except PermissionError as error:
         fail(f"{error.filename}: no permission to read or write it; check its owner and mode", 2)
+    except (FileExistsError, NotADirectoryError) as error:
+        fail(f"{error.filename}: a file stands where a folder is wanted; give another place", 2)
     except BrokenPipeError:
         sys.exit(1)
     except Exception as error:

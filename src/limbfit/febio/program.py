@@ -46,10 +46,11 @@ class FebioRun:
     seconds: float
 
 
-def find_febio(program: str | Path | None = None) -> Path:
-    """Find the FEBio program: the one given, that of ``FEBIO_CMD``, or febio4 or febio on the path. Raises
-    `InputError` if there is none, with how to get it.
+def find_febio(program: str | Path | None = None, folder: Path = Path()) -> Path:
+    """Find the FEBio program: the one given, from ``folder`` or on the path, that of ``FEBIO_CMD``, or febio4
+    or febio on the path. Raises `InputError` if there is none, with how to get it.
     """
+    program = program and (shutil.which(folder / program) or program)
     for name, given in (("febio.program", program), (PROGRAM_VARIABLE, os.environ.get(PROGRAM_VARIABLE))):
         if given:
             found = shutil.which(str(given))
@@ -57,7 +58,7 @@ def find_febio(program: str | Path | None = None) -> Path:
                 raise InputError(
                     "is not a program that can be run", file=given, place=name, remedy=INSTALL_REMEDY
                 )
-            return Path(found)
+            return Path(found).absolute()  # it is run in another folder
     for candidate in filter(None, map(shutil.which, PROGRAM_NAMES)):
         return Path(candidate)
     raise InputError("FEBio is not installed here", remedy=INSTALL_REMEDY)

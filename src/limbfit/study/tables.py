@@ -326,7 +326,7 @@ class CalibrationTable(TomlTable):
     correction_tolerance_percent: Positive = 0.1
 
     def check_keys(self) -> None:
-        if self.answer == "most probable" and self.is_papers:
+        if self.answer == "most probable" and "paper" in (self.objective, self.stopping):
             raise ValueError('answer = "most probable" is not the paper\'s; leave objective and stopping out')
         names = [name for group in self.tied for name in group]
         doubled = [name for name in names if names.count(name) > 1 or name in self.fixed]
@@ -337,11 +337,6 @@ class CalibrationTable(TomlTable):
                 raise ValueError(f"tied = {list(group)}: tie two or more parameters of one kind")
         if (self.prior or self.priors) and self.objective == "paper":
             raise ValueError('objective = "paper" has no place for priors; use "pointwise"')
-
-    @property
-    def is_papers(self) -> bool:
-        """True if any part of the calibration is the paper's method."""
-        return "paper" in (self.objective, self.stopping)
 
 
 class UncertaintyTable(TomlTable):

@@ -53,7 +53,7 @@ def compare_site(
     if study.indentation(name).forced:
         what = f"{name}: a force drives the indenter, and there is none to be compared"
         raise InputError(what, file=study.file, remedy="compare limbfit simulate --solver limbfit and febio")
-    program = febio.find_febio(study.febio.program) if febio_log is None else None
+    program = febio.find_febio(study.febio.program, study.folder) if febio_log is None else None
     log = None if febio_log is None else febio.read_log(febio_log)
     found = prepare_site(study, name, parameters=parameters, listener=listener)
     folder, name = found.context.store["compare"], found.model.name

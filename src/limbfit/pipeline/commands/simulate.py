@@ -88,7 +88,7 @@ def simulate_site(
         stages before.
     """
     by_febio = (solver or study.solver.solver) == "febio"
-    program = find_febio(study.febio.program) if by_febio else None
+    program = find_febio(study.febio.program, study.folder) if by_febio else None
     if program is not None and animation:
         raise InputError("FEBio's fields are in its plot file", place="--animation", remedy="leave it out")
     found = prepare_site(study, name, parameters=parameters, listener=listener)

@@ -86,7 +86,7 @@ def is_moved(study: Study) -> bool:
     if table.answer is not None:
         return table.answer == "most probable"
     more = len(records) > len(study.fitted) or any(record.observed for record in records)
-    return more and not table.is_papers
+    return more and "paper" not in (table.objective, table.stopping)
 
 
 def build_unknowns(study: Study) -> Unknowns:
