@@ -17,7 +17,7 @@ End = Literal["lower", "start", "upper"]
 _ENDS: tuple[End, ...] = ("lower", "start", "upper")
 
 
-class ParameterRange(TomlTable):
+class TissueRange(TomlTable):
     """Start and bounds of parameters: of all tissues, or of one tissue where they differ from those."""
 
     start: dict[str, Positive] = Field(default={})
@@ -39,7 +39,7 @@ class ActivationTable(TomlTable):
             raise ValueError("time_s does not grow from 0, which is touch-down")
 
 
-class MaterialTable(ParameterRange):
+class MaterialTable(TissueRange):
     """The law of all tissues, and start and bounds of its parameters; those that are not given are the law's.
 
     ``relaxation_span_s``: first and last time of relaxation as a power of time.
@@ -52,7 +52,7 @@ class MaterialTable(ParameterRange):
     law: str = OGDEN
     relaxation_span_s: tuple[float, float] = DEFAULT_SPAN_S
     kappa_ratio: float = 100.0
-    tissues: dict[str, ParameterRange] = Field(default={})
+    tissues: dict[str, TissueRange] = Field(default={})
     fibres: dict[str, Literal["axis", "flow"] | Direction] = Field(default={})
     activation: ActivationTable | None = None
     prestretch: dict[str, Annotated[float, Field(ge=0.7, le=1.5)]] = Field(default={})
@@ -72,7 +72,7 @@ class MaterialTable(ParameterRange):
 
     def of(self, tissue: str, which: End) -> dict[str, float]:
         """Start, lower or upper bound of the parameters of a tissue."""
-        return getattr(self, which) | getattr(self.tissues.get(tissue, ParameterRange()), which)
+        return getattr(self, which) | getattr(self.tissues.get(tissue, TissueRange()), which)
 
     @model_validator(mode="before")
     @classmethod

@@ -54,11 +54,11 @@ from .tables import (
 )
 
 
-def _freeze(content: Any) -> Any:
+def _replace_lists(content: Any) -> Any:
     """Tuples for lists, however deep: of types that are strict, nothing else is a tuple."""
     if isinstance(content, Mapping):
-        return {key: _freeze(value) for key, value in content.items()}
-    return tuple(map(_freeze, content)) if isinstance(content, list) else content
+        return {key: _replace_lists(value) for key, value in content.items()}
+    return tuple(map(_replace_lists, content)) if isinstance(content, list) else content
 
 
 class Study(TomlTable):
@@ -92,7 +92,7 @@ class Study(TomlTable):
     @classmethod
     def _fill_mesh_edges(cls, content: dict[str, Any]) -> dict[str, Any]:
         edges = replace_edges(content.get("mesh", {}), list_indenter_widths(content))
-        return {**_freeze(content), "mesh": edges}
+        return {**_replace_lists(content), "mesh": edges}
 
     @property
     def folder(self) -> Path:
