@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import signal
@@ -96,6 +97,16 @@ def test_a_scheduler_or_queue_that_is_not_there_is_one_clear_line():
         DaskExecutor.from_queue("slurmy", 2)
     with pytest.raises(InputError, match="--scheduler: no Dask scheduler answers"):
         DaskExecutor.connect("nonsense://127.0.0.1:1")
+
+
+@pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("address", ["localhost", "tcp://127.0.0.1", "tcp://127.0.0.1:8786/"])
+def test_an_address_without_a_port_is_refused_at_once(address):
+    begun = time.monotonic()
+    with pytest.raises(InputError, match=r"--scheduler: no Dask scheduler answers .* it prints"):
+        DaskExecutor.connect(address)
+    gc.collect()  # the client that Dask leaves behind waited for 40 s and ended with a traceback
+    assert time.monotonic() - begun < 15.0
 
 
 SITES = """[[sites]]

@@ -86,6 +86,8 @@ class DaskExecutor(Executor):
         is not installed, or no scheduler answers.
         """
         try:
+            if not address.rpartition(":")[2].isdigit():  # Dask's half-made client would end after 40 s
+                raise ValueError("no port")
             client = _import_dask("distributed").Client(address, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
             raise InputError(
