@@ -163,6 +163,17 @@ def test_cooks_distance_is_largest_where_the_fit_leans_on_a_bad_record():
     assert max(left, key=lambda entry: entry.standardised).site == "s3"
 
 
+def test_fits_without_a_site_keep_what_is_fixed_and_tied():
+    bars = limb(2)
+    data = [MeasuredCurve(f"s{k}", 1.2 * bar.force(TRUTH)) for k, bar in enumerate(bars)]
+    model = LogLinearModel(TRUTH, [bar.respond(TRUTH) for bar in bars])
+    tie = np.vstack([np.eye(4), np.eye(4)])[:, [0, 2]]  # c and gamma of both tissues, each pair together
+    found = LeaveOutFits(model, data, TRUTH, tie).fit_without(0) / TRUTH
+    assert found[[1, 3, 5, 7]].tolist() == [1.0] * 4
+    assert found[[0, 2]] == pytest.approx(found[[4, 6]], rel=1e-12)
+    assert found[0] > 1.05
+
+
 def test_too_few_sites_cannot_tell_who_is_wrong():
     bars = limb(0)[:3]
     data = [MeasuredCurve(f"s{k}", bar.force(TRUTH) * (9.81 if k else 1)) for k, bar in enumerate(bars)]

@@ -75,10 +75,14 @@ class LeaveOutFits:
     ----------
     simulate : returns all sites of ``measured``, in order; cheap.
     start : the answer (p,), from which the fits start, and which they keep where the data say nothing.
+    tie : (p, k) as `SearchSpace`, which parameters move, and which of them together; None: each by itself.
     """
 
-    def __init__(self, simulate: Simulate, measured: Sequence[MeasuredCurve], start: Array) -> None:
+    def __init__(
+        self, simulate: Simulate, measured: Sequence[MeasuredCurve], start: Array, tie: Array | None = None
+    ) -> None:
         self.simulate, self.measured, self.start = simulate, tuple(measured), start
+        self.tie = np.eye(len(start)) if tie is None else tie
         self.peaks = [site.peak_N for site in measured]
         self._fits: dict[tuple[int, ...], Array] = {}
 
@@ -98,7 +102,7 @@ class LeaveOutFits:
         """Return the same with the force of a record divided by the factor of a unit."""
         measured = list(self.measured)
         measured[i] = replace(measured[i], force_N=measured[i].force_N / factor)
-        return LeaveOutFits(self.simulate, measured, self.start)
+        return LeaveOutFits(self.simulate, measured, self.start, self.tie)
 
     def exchange_records(self, i: int, j: int, exchange: Exchange) -> LeaveOutFits:
         """Return the same with two records in each other's place, their sites driven by each other's."""
@@ -111,12 +115,12 @@ class LeaveOutFits:
             responses[i], responses[j] = moved(parameters)
             return responses
 
-        return LeaveOutFits(respond, measured, self.start)
+        return LeaveOutFits(respond, measured, self.start, self.tie)
 
     def _fit(self, chosen: Sequence[int]) -> Array:
-        z = np.zeros(len(self.start))
+        z = np.zeros(self.tie.shape[1])
         for _ in range(_MAX_STEPS):
-            p = self.start * np.exp(z)
+            p = self.start * np.exp(self.tie @ z)
             responses = self.simulate(p)
             rows = [self._rows(i, responses[i], p) for i in chosen]
             residual = np.concatenate([r for r, _ in rows])
@@ -126,7 +130,7 @@ class LeaveOutFits:
             z = z + np.clip(step, -1.0, 1.0)
             if np.abs(step).max() < 1e-3:
                 break
-        return self.start * np.exp(z)
+        return self.start * np.exp(self.tie @ z)
 
     def _rows(self, i: int, response: SiteResponse, parameters: Array) -> tuple[Array, Array]:
         error_N = _ASSUMED_ERROR_SHARE * self.peaks[i]
@@ -135,7 +139,7 @@ class LeaveOutFits:
         # A record that is many times too strong must not drown the others (Huber's weight).
         size = float(np.sqrt(np.mean(difference**2))) / self.peaks[i]
         weight *= np.sqrt(min(1.0, 5 * _ASSUMED_ERROR_SHARE / max(size, 1e-12)))
-        return difference * weight, response.jacobian * parameters * weight
+        return difference * weight, (response.jacobian * parameters * weight) @ self.tie
 
     def compute_errors(self, parameters: Array) -> Array:
         """Return the root mean square error (n,) of each site over its peak, simulated or measured, the
@@ -182,7 +186,7 @@ class LeaveOutFits:
                     error=error,
                     expected=expected,
                     ratio=float(force @ site.force_N / (force @ force)),
-                    cook=float(np.sum(moved) / (len(self.start) * misfit)),
+                    cook=float(np.sum(moved) / (self.tie.shape[1] * misfit)),
                     standardised=error / expected,
                 )
             )
@@ -360,6 +364,7 @@ def find_outliers(
     exchange: Callable[[LogLinearModel], Exchange],
     exactly: Exchange | None = None,
     neutral: Array | None = None,
+    tie: Array | None = None,
 ) -> OutlierReport:
     """Look for names exchanged, wrong units of force, and sites that do not fit, one after the other.
 
@@ -375,17 +380,18 @@ def find_outliers(
     simulate : returns all sites; called at ``start``, and at ``neutral`` if that is needed.
     exchange : takes the expansion of all sites and returns the approximate exchange of two records.
     exactly : the same by simulation.
+    tie : as `LeaveOutFits`.
     """
     if count_sites(measured) < MIN_SITES:
         return OutlierReport((), ())
     model = LogLinearModel(start, simulate(start))
-    fits = LeaveOutFits(model, measured, start)
+    fits = LeaveOutFits(model, measured, start, tie)
     errors = fits.leave_one_out()
     if neutral is not None and fits.compute_errors(start).max() > MAX_ERROR_SHARE:
         responses = simulate(neutral)
         if not check_responses(responses, measured, len(neutral)):
             model = LogLinearModel(neutral, responses)
-            fits = LeaveOutFits(model, measured, neutral)
+            fits = LeaveOutFits(model, measured, neutral, tie)
     return OutlierReport(errors, _find_warnings(fits, exchange(model), exactly))
 
 

@@ -27,6 +27,7 @@ from ..records.records import RecordSet, SiteRecord, load_records, to_response
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
 from ..simulation.simulations import SimulationCache
+from .problem import build_problem
 
 Loading = tuple[Sequence[Extent], Sequence[stored.OutsideRecords]]
 _MISSING = {
@@ -58,7 +59,8 @@ def run_predict(context: Context, folder: Path) -> None:
         _write_curves(folder, site, band)
         rows.append(_summarise_site(site, _write_observed(folder, study, site, best, known), loading))
     ours = [site.ours for site in sites]
-    warnings = check_records(context, cache, records.own, ours, best, one, records.searched, correction)
+    tie = build_problem(study).space.tie
+    warnings = check_records(context, cache, records.own, ours, best, one, records.searched, correction, tie)
     judged = [(site, band) for site, band in zip(sites, bands, strict=True) if band is not None]
     of_mesh = calibration.uncertainty.residuals.mesh_misfit
     quality = _assess_fits(study, judged, best, known, of_mesh)

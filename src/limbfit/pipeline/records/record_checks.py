@@ -136,6 +136,7 @@ def check_records(
     one: Array,
     searched: Sequence[SiteRecord],
     correction: MeshCorrection | None,
+    tie: Array,
 ) -> dict[str, Any]:
     """Warnings about the records themselves, and about those that the model misses.
 
@@ -148,6 +149,7 @@ def check_records(
     one : the answer with one material.
     searched : the records on the meshes on which parameters are searched.
     correction : brings responses there to those of the study's own meshes; None where they are the same.
+    tie : (p, k) which parameters the study lets move, and which of them together.
     """
     plain = read_record_warnings(context)
     whole = [i for i, response in enumerate(ours) if response.completed]
@@ -186,6 +188,7 @@ def check_records(
         exchange,
         exactly,
         one,
+        tie,
     )
     against = explain_warnings(found.warnings, plain)
     flags = [RecordFlag(**flag.to_dict(), found="in the record") for flag in plain]
