@@ -22,77 +22,44 @@ the same mesh with other materials is quicker with ``warm_start=result`` of a ru
 
 from __future__ import annotations
 
-from ..shapes import RigidSurface
-from .contact.open_surface import OpenSurface
-from .contact.rigid import Indenter
-from .contact.smooth_surface import SmoothSurface
-from .diagnostics import SimulationWarning, list_texts
-from .kernel.elements import ELEMENTS
-from .materials import (
-    ORDER_IN_TIME,
-    VOLUMETRIC_LAWS,
-    Contractile,
-    Fibred,
-    FungQLV,
-    Material,
-    MooneyRivlin,
-    NeoHookean,
-    Ogden,
-    OgdenPower,
-    OgdenQLV,
-)
-from .motion import Activation, Motion, RigidBody
-from .pressure import Pressure
-from .problem import History, Problem, Support, isochoric_stretch
-from .result import Result, State, Step
-from .solution.compiling import are_compiled, compile_kernels
-from .solution.control import StepControl
-from .solution.linear import build_linear_solver
-from .solution.start import compute_tangent_at_rest
-from .solution.stepping import Checkpoints, Snapshot, iterate, solve
-from .system import System
-from .tractions import Tractions, compute_tractions
-
-__all__ = [
-    "ELEMENTS",
-    "ORDER_IN_TIME",
-    "VOLUMETRIC_LAWS",
-    "Activation",
-    "Checkpoints",
-    "Contractile",
-    "Fibred",
-    "FungQLV",
-    "History",
-    "Indenter",
-    "Material",
-    "MooneyRivlin",
-    "Motion",
-    "NeoHookean",
-    "Ogden",
-    "OgdenPower",
-    "OgdenQLV",
-    "OpenSurface",
-    "Pressure",
-    "Problem",
-    "Result",
-    "RigidBody",
-    "RigidSurface",
-    "SimulationWarning",
-    "SmoothSurface",
-    "Snapshot",
-    "State",
-    "Step",
-    "StepControl",
-    "Support",
-    "System",
-    "Tractions",
-    "are_compiled",
-    "build_linear_solver",
-    "compile_kernels",
-    "compute_tangent_at_rest",
-    "compute_tractions",
-    "isochoric_stretch",
-    "iterate",
-    "list_texts",
-    "solve",
-]
+from ..shapes import RigidSurface as RigidSurface
+from .contact.open_surface import OpenSurface as OpenSurface
+from .contact.rigid import Indenter as Indenter
+from .contact.smooth_surface import SmoothSurface as SmoothSurface
+from .diagnostics import SimulationWarning as SimulationWarning
+from .diagnostics import list_texts as list_texts
+from .kernel.elements import ELEMENTS as ELEMENTS
+from .materials import ORDER_IN_TIME as ORDER_IN_TIME
+from .materials import VOLUMETRIC_LAWS as VOLUMETRIC_LAWS
+from .materials import Contractile as Contractile
+from .materials import Fibred as Fibred
+from .materials import FungQLV as FungQLV
+from .materials import Material as Material
+from .materials import MooneyRivlin as MooneyRivlin
+from .materials import NeoHookean as NeoHookean
+from .materials import Ogden as Ogden
+from .materials import OgdenPower as OgdenPower
+from .materials import OgdenQLV as OgdenQLV
+from .motion import Activation as Activation
+from .motion import Motion as Motion
+from .motion import RigidBody as RigidBody
+from .pressure import Pressure as Pressure
+from .problem import History as History
+from .problem import Problem as Problem
+from .problem import Support as Support
+from .problem import isochoric_stretch as isochoric_stretch
+from .result import Result as Result
+from .result import State as State
+from .result import Step as Step
+from .solution.compiling import are_compiled as are_compiled
+from .solution.compiling import compile_kernels as compile_kernels
+from .solution.control import StepControl as StepControl
+from .solution.linear import build_linear_solver as build_linear_solver
+from .solution.start import compute_tangent_at_rest as compute_tangent_at_rest
+from .solution.stepping import Checkpoints as Checkpoints
+from .solution.stepping import Snapshot as Snapshot
+from .solution.stepping import iterate as iterate
+from .solution.stepping import solve as solve
+from .system import System as System
+from .tractions import Tractions as Tractions
+from .tractions import compute_tractions as compute_tractions

@@ -1,53 +1,30 @@
 """FEBio beside limbfit: its inputs read as problems, problems written as its inputs, its runs and logs."""
 
-from .abaqus import write_inp
-from .optimisation import ParameterRange, check_optimisable, turn_to_indenter_frame, write_optimisation
-from .penalty import FacePenalties, compute_mean_penalty
-from .preparation import compute_end_time
-from .problem import build_step_control, to_problem
-from .program import (
-    TIME_TOLERANCE,
-    FebioLog,
-    FebioRun,
-    RunVerdict,
-    build_result,
-    compute_axial_force,
-    find_febio,
-    judge_run,
-    read_log,
-    run_febio,
-)
-from .reading.model import FebModel, read_feb
-from .running import FebRun, run_feb
-from .writing import FebSettings, build_contact, describe_differences, write_feb
-
-__all__ = [
-    "TIME_TOLERANCE",
-    "FacePenalties",
-    "FebModel",
-    "FebRun",
-    "FebSettings",
-    "FebioLog",
-    "FebioRun",
-    "ParameterRange",
-    "RunVerdict",
-    "build_contact",
-    "build_result",
-    "build_step_control",
-    "check_optimisable",
-    "compute_axial_force",
-    "compute_end_time",
-    "compute_mean_penalty",
-    "describe_differences",
-    "find_febio",
-    "judge_run",
-    "read_feb",
-    "read_log",
-    "run_feb",
-    "run_febio",
-    "to_problem",
-    "turn_to_indenter_frame",
-    "write_feb",
-    "write_inp",
-    "write_optimisation",
-]
+from .abaqus import write_inp as write_inp
+from .optimisation import ParameterRange as ParameterRange
+from .optimisation import check_optimisable as check_optimisable
+from .optimisation import turn_to_indenter_frame as turn_to_indenter_frame
+from .optimisation import write_optimisation as write_optimisation
+from .penalty import FacePenalties as FacePenalties
+from .penalty import compute_mean_penalty as compute_mean_penalty
+from .preparation import compute_end_time as compute_end_time
+from .problem import build_step_control as build_step_control
+from .problem import to_problem as to_problem
+from .program import TIME_TOLERANCE as TIME_TOLERANCE
+from .program import FebioLog as FebioLog
+from .program import FebioRun as FebioRun
+from .program import RunVerdict as RunVerdict
+from .program import build_result as build_result
+from .program import compute_axial_force as compute_axial_force
+from .program import find_febio as find_febio
+from .program import judge_run as judge_run
+from .program import read_log as read_log
+from .program import run_febio as run_febio
+from .reading.model import FebModel as FebModel
+from .reading.model import read_feb as read_feb
+from .running import FebRun as FebRun
+from .running import run_feb as run_feb
+from .writing import FebSettings as FebSettings
+from .writing import build_contact as build_contact
+from .writing import describe_differences as describe_differences
+from .writing import write_feb as write_feb

@@ -9,30 +9,20 @@ from __future__ import annotations
 from ..errors import InputError
 from ..extensions import Registry
 from .builtin import Cylinder, Sphere, Square, Stl
-from .facets import Facets, revolved, steps
-from .rigid_surface import RigidSurface
-from .shape import SHARP_EDGE, Measure, Revolution, Shape, Size
+from .facets import Facets as Facets
+from .facets import revolved as revolved
+from .facets import steps as steps
+from .rigid_surface import RigidSurface as RigidSurface
+from .shape import SHARP_EDGE as SHARP_EDGE
+from .shape import Measure as Measure
+from .shape import Revolution as Revolution
+from .shape import Shape as Shape
+from .shape import Size as Size
 
 BUILTIN_SHAPES: tuple[type[Shape], ...] = (Square, Sphere, Cylinder, Stl)
 SHAPES: Registry[type[Shape]] = Registry("indenter shape", {shape.name: shape for shape in BUILTIN_SHAPES})
 # Keys of a study's [indenter], which measures cannot have.
 RESERVED_KEYS = ("shape", "file", "width_mm", "edge_radius_mm", "friction")
-
-__all__ = [
-    "BUILTIN_SHAPES",
-    "RESERVED_KEYS",
-    "SHAPES",
-    "SHARP_EDGE",
-    "Facets",
-    "Measure",
-    "Revolution",
-    "RigidSurface",
-    "Shape",
-    "Size",
-    "register_shape",
-    "revolved",
-    "steps",
-]
 
 
 def register_shape(shape: type[Shape]) -> None:
