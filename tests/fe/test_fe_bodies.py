@@ -192,6 +192,11 @@ def test_a_body_goes_over_from_displacement_to_force():
     np.testing.assert_allclose(again.reactions[:, 0, 2], found.reactions[:, 0, 2], rtol=1e-3, atol=1e-9)
     with pytest.raises(ProblemError, match="leaves open with which force it begins"):
         solve(replace(problem, indenter=None, bodies=(replace(tool, motion=left),), history=history))
+    with pytest.raises(ProblemError, match="no step ends at 3 s, where a body's force is taken over"):
+        solve(
+            replace(problem, indenter=None, bodies=(opened,), history=history),
+            replace(control, times=(1.0, 2.0, 3.2)),
+        )
 
 
 def test_a_force_that_is_taken_over_depends_on_the_parameters():

@@ -43,6 +43,11 @@ def result() -> Result:
     return solve(punch("tet10", 2, 1, depth=3.0), store="all")
 
 
+def test_a_linear_solver_of_no_such_name_is_refused():
+    with pytest.raises(ProblemError, match="unknown linear solver 'mumps'"):
+        solve(punch("hex8", 2), StepControl(linear_solver="mumps"))
+
+
 def test_cases_follow_from_seed_and_number_alone(cases):
     assert cases.draw(0, 17) == cases.draw(0, 17)
     assert cases.draw(0, 17) != cases.draw(1, 17)

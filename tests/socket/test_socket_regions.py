@@ -80,6 +80,14 @@ def test_regions_of_real_limbs(name: str) -> None:
     assert min(areas.values()) > 200.0
 
 
+def test_a_side_that_the_fibula_contradicts_is_refused() -> None:
+    limb = round_limb()
+    found = find_directions(limb)
+    assert np.array_equal(find_directions(limb, "right").medial, found.medial)
+    with pytest.raises(SurfaceError, match=r'a right leg does, but socket.side is "left".*mirrored'):
+        find_directions(limb, "left")
+
+
 def test_without_bones_sides_are_left_and_right() -> None:
     limb = round_limb()
     bare = Anatomy(limb.skin, {}, limb.cut_point, limb.cut_normal)

@@ -57,7 +57,8 @@ def find_directions(anatomy: Anatomy, side: Literal["left", "right"] | None = No
     Raises
     ------
     SurfaceError
-        For a limb that lies along the anterior axis of patient space.
+        For a limb that lies along the anterior axis of patient space, or whose fibula lies on the other side
+        than ``side`` has it.
     """
     proximal = anatomy.cut_normal
     anterior = np.array([0.0, -1.0, 0.0])
@@ -69,13 +70,18 @@ def find_directions(anatomy: Anatomy, side: Literal["left", "right"] | None = No
         )
     anterior /= np.linalg.norm(anterior)
     across = np.cross(proximal, anterior)  # to the patient's left
-    if side is None:
-        tibia, fibula = find_bone(anatomy, "tibia"), find_bone(anatomy, "fibula")
-        if tibia is None or fibula is None:
-            return Directions(proximal, anterior, None)
+    tibia, fibula = find_bone(anatomy, "tibia"), find_bone(anatomy, "fibula")
+    found = side
+    if tibia is not None and fibula is not None:
         distance = float((fibula.points.mean(axis=0) - tibia.points.mean(axis=0)) @ across)
-        return Directions(proximal, anterior, across if distance > 0.0 else -across)
-    return Directions(proximal, anterior, across if side == "left" else -across)
+        found = "left" if distance > 0.0 else "right"
+        if side not in (None, found):
+            raise SurfaceError(
+                f'the fibula lies where that of a {found} leg does, but socket.side is "{side}"',
+                remedy="state the other side, or check the names of the bones, and that no file is mirrored",
+            )
+    lateral = None if found is None else across if found == "left" else -across
+    return Directions(proximal, anterior, lateral)
 
 
 def find_bone(anatomy: Anatomy, name: str) -> Surface | None:

@@ -24,6 +24,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ...arrays import Array
+from ...errors import ProblemError
 from ..threads import get_thread_pool, silence_openmp
 
 Index = NDArray[np.int32]
@@ -297,6 +298,8 @@ def build_linear_solver(
     ``single``: a factor in single precision will do; ``last``: unknowns to be eliminated last.  Only PARDISO
     makes use of them, and of ``threads``.
     """
+    if name not in ("auto", *SOLVERS):
+        raise ProblemError(f"unknown linear solver {name!r}", remedy=f"use one of auto, {', '.join(SOLVERS)}")
     for candidate in SOLVERS if name == "auto" else (name,):
         try:
             return SOLVERS[candidate](indptr, indices, threads, single, last)

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...arrays import Array
+from ...errors import ProblemError
 from ..contact.friction import StickyContact
 from ..kernel.laws import Laws
 from ..memory import Memory, compute_elastic_stresses
@@ -78,6 +79,11 @@ class SteppedRun:
         self.seconds: defaultdict[str, float] = defaultdict(float)
         moduli, threads, last = self.laws.moduli, control.threads, find_touched_unknowns(self.system, problem)
         self.planned = schedule_steps(problem.history, control, problem.turns)
+        opened = [body.motion.times[np.isnan(body.motion.values).any(axis=1)] for body in problem.bodies]
+        for t in (t for times in opened for t in times if not np.isclose(self.planned, t, rtol=1e-9).any()):
+            raise ProblemError(
+                f"no step ends at {t:g} s, where a body's force is taken over", remedy="add it to the times"
+            )
         self.factor = Factor(
             self.system, moduli, control.linear_solver, threads, last=last, steps=len(self.planned)
         )
