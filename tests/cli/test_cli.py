@@ -363,3 +363,18 @@ def test_letters_that_the_output_cannot_show_end_no_command(study):
     )
     assert done.returncode == 0, done.stderr
     assert rb"\u0142ydka" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("design", "--minutes", 5), "--minutes: has no effect without --protocol"),
+        (("design", "--shear-waves", 0.1), "--shear-waves: has no effect without --protocol"),
+        (("design", "--protocol", "--sites", 3), "--sites: has no effect with --protocol"),
+        (("socket", "design", "--simulations", 3), "--simulations: has no effect without --optimise"),
+    ],
+)
+def test_an_option_that_has_no_effect_is_refused(limbfit, study, words, told):
+    code, _, err = limbfit(*words, study)
+    assert code == 2
+    assert told in err

@@ -29,6 +29,7 @@ from rich.table import Table
 
 import limbfit
 
+from ..errors import InputError
 from ..laws import split_key
 
 INTERRUPTED = "interrupted; run the same command again to continue"
@@ -213,6 +214,13 @@ def parse_numbers(text: str, least: float, most: float) -> list[float]:
     except ValueError:
         return []
     return values if all(least <= value <= most for value in values) else []
+
+
+def refuse_idle_options(options: Mapping[str, Any], when: str) -> None:
+    """Refuse options, by name, that are given (not None) where they have no effect."""
+    for name, value in options.items():
+        if value is not None:
+            raise InputError(f"has no effect {when}", place=f"--{name}", remedy="leave it out")
 
 
 def fail(text: str, code: int) -> None:

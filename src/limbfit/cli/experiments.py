@@ -31,6 +31,7 @@ from .console import (
     print_stored,
     print_table,
     print_warning,
+    refuse_idle_options,
 )
 
 
@@ -298,7 +299,9 @@ def show_crossvalidation(found: CrossvalidateResult) -> None:
 
 def design(
     study: StudyPath,
-    sites: Annotated[int, typer.Option(help="how many to choose; 0: as many as the study fits", min=0)] = 0,
+    sites: Annotated[
+        int | None, typer.Option(help="how many to choose; default: as many as the study fits", min=0)
+    ] = None,
     depths: Annotated[
         str | None,
         typer.Option(help="depths in mm to choose from, such as 3,5,7; default: the study's"),
@@ -307,7 +310,9 @@ def design(
     protocol: Annotated[
         bool, typer.Option("--protocol", help="choose the records of a whole session instead")
     ] = False,
-    minutes: Annotated[float, typer.Option(help="with --protocol: length of the session, min", min=1)] = 25.0,
+    minutes: Annotated[
+        float | None, typer.Option(help="with --protocol: length of the session, min; default: 25", min=1)
+    ] = None,
     speeds: Annotated[
         str | None,
         typer.Option(help="with --protocol: speeds in mm/s; default: the study's and five times it"),
@@ -327,7 +332,9 @@ def design(
     criterion: Annotated[
         Literal["D", "A"] | None, typer.Option(help="with --protocol: D or A; default: D, for a socket A")
     ] = None,
-    draws: Annotated[int, typer.Option(help="with --protocol: how many tissues", min=1, max=64)] = 3,
+    draws: Annotated[
+        int | None, typer.Option(help="with --protocol: how many tissues; default: 3", min=1, max=64)
+    ] = None,
     ultrasound: Annotated[
         float | None,
         typer.Option(help="with --protocol: ultrasound reads thicknesses with this deviation, mm", min=1e-3),
@@ -351,20 +358,30 @@ def design(
     several tissues; records.toml has them as a study's [[records]].
     """
     depths_mm = parse_list(depths, "--depths", "give millimetres, such as 3,5,7")
-    options = {"depths_mm": depths_mm, "parameters": parameters}
+    options: dict[str, Any] = {"depths_mm": depths_mm, "parameters": parameters}
+    of_session = {
+        "minutes": minutes,
+        "speeds": speeds,
+        "holds": holds,
+        "determine": determine,
+        "draws": draws,
+    }
+    of_session |= {"criterion": criterion, "ultrasound": ultrasound, "surface": surface}
     if not protocol:
-        result = call_on_study(study, limbfit.design_study, sites=sites, **options)
+        refuse_idle_options(of_session | {"shear-waves": shear_waves}, "without --protocol")
+        result = call_on_study(study, limbfit.design_study, sites=sites or 0, **options)
         print_stored(result, "design", show_design, as_json)
         return
+    refuse_idle_options({"sites": sites}, "with --protocol")
     result = call_on_study(
         study,
         limbfit.plan_protocol,
-        minutes=minutes,
+        minutes=25.0 if minutes is None else minutes,
         speeds_mm_s=parse_list(speeds, "--speeds", "give mm/s, such as 0.96,4.8"),
         holds_s=parse_list(holds, "--holds", "give seconds, such as 0,30", least=0.0),
         determine=determine.split(",") if determine else (),
         criterion=criterion,
-        draws=draws,
+        draws=3 if draws is None else draws,
         ultrasound_sd_mm=ultrasound,
         surface_sd_mm=surface,
         shear_waves_sd_m_s=shear_waves,

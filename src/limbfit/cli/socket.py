@@ -15,7 +15,16 @@ from ..laws import split_key
 from ..results.models import SocketOfModels
 from ..results.socket import SocketDesignResult, SocketLoad, SocketResult
 from .commands import StudyPath, call_on_study
-from .console import AsJson, Column, format_ends, print_line, print_stored, print_table, print_warnings
+from .console import (
+    AsJson,
+    Column,
+    format_ends,
+    print_line,
+    print_stored,
+    print_table,
+    print_warnings,
+    refuse_idle_options,
+)
 from .runs import add_execution_options
 
 
@@ -143,19 +152,25 @@ def design(
         typer.Option(help="regions whose peaks are to be lowered further, separated by commas"),
     ] = "",
     simulations: Annotated[
-        int, typer.Option(help="with --optimise: how many at most, beside those of the two designs", min=1)
-    ] = 6,
+        int | None,
+        typer.Option(
+            help="with --optimise: how many at most, beside those of the two designs; default: 6", min=1
+        ),
+    ] = None,
     parameters: Parameters = None,
     literature: Literature = False,
     as_json: AsJson = False,
 ) -> None:
     """Design a socket from a target pressure, for printing; load it beside a uniformly reduced one."""
     _check_choice(parameters, literature)
+    regions = [name.strip() for name in optimise.split(",") if name.strip()]
+    if not regions:
+        refuse_idle_options({"simulations": simulations}, "without --optimise")
     result = call_on_study(
         study,
         limbfit.design_socket,
-        optimise=[name.strip() for name in optimise.split(",") if name.strip()],
-        simulations=simulations,
+        optimise=regions,
+        simulations=6 if simulations is None else simulations,
         parameters=parameters,
         literature=literature,
     )
