@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +14,8 @@ import pyvista as pv
 from acquiring import ready
 from browsing import launch, open_page, playwright, serve
 from limbfit.cli import main
+from limbfit.errors import InputError
+from limbfit.febio import find_febio
 
 __all__ = ["launch", "open_page", "playwright", "ready", "serve"]
 
@@ -130,3 +134,14 @@ def limbfit(monkeypatch, capsys):
         return code, shown.out, shown.err
 
     return call
+
+
+@pytest.fixture(scope="session")
+def febio() -> Path:
+    """FEBio itself: that of ``FEBIO_CMD``, of the path, or beside the repository."""
+    for given in (None, Path(__file__).parents[2] / "shared" / "febio" / "febio4"):
+        try:
+            return find_febio(given)
+        except InputError:
+            assert "FEBIO_CMD" not in os.environ  # which names none that can be run
+    pytest.skip("there is no febio4 on the path, and none beside the repository")

@@ -116,6 +116,18 @@ def test_a_forward_run_as_febio_has_its_softer_contact():
     assert (own["as_febio"], febio["as_febio"]) == (False, True)
 
 
+@pytest.mark.febio
+@with_reference
+def test_the_ratio_is_that_of_two_times_measured_in_one_run(febio, monkeypatch):
+    monkeypatch.setenv("FEBIO_CMD", str(febio))
+    found = bench_forward(REFERENCE, "block/block_hex8", beside_febio=True, tell=silent)
+    assert found["febio_seconds"] > 0.5
+    assert found["ratio"] == pytest.approx(found["febio_seconds"] / found["seconds"])
+    monkeypatch.setenv("FEBIO_CMD", "no-such-program")
+    with pytest.raises(InputError, match="no-such-program"):
+        bench_forward(REFERENCE, "block/block_hex8", beside_febio=True, tell=silent)
+
+
 @pytest.fixture
 def elsewhere(monkeypatch):
     """A folder name that no machine has above its temporary files."""

@@ -10,7 +10,6 @@ Run with ``python -m pytest -m febio``; FEBio is that of ``FEBIO_CMD``, of the p
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +19,6 @@ import trimesh
 
 from limbfit import OgdenQLV
 from limbfit.bench.blocks import build_punched_block
-from limbfit.errors import InputError
 from limbfit.fe import (
     Activation,
     Contractile,
@@ -38,10 +36,9 @@ from limbfit.fe import (
     isochoric_stretch,
     solve,
 )
-from limbfit.febio import FebSettings, build_result, find_febio, run_febio, write_feb
+from limbfit.febio import FebSettings, build_result, run_febio, write_feb
 from limbfit.febio.preparation import Preparation
 
-SHARED = Path(__file__).parents[3] / "shared" / "febio" / "febio4"
 pytestmark = pytest.mark.febio
 
 SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, (0.8, 0.3), (0.2, 1.5))
@@ -53,16 +50,6 @@ DOWN = (0.0, 0.0, -1.0)
 PLATE = Indenter("square", 90.0, 4.0, (0.0, 0.0, 5.0), DOWN)
 BALL = Indenter("sphere", 40.0, 0.0, (0.0, 0.0, 5.0), DOWN)
 IN_AND_OUT = History(np.array([0.0, 3.0, 6.0]), np.array([0.0, 5.0, 0.0]))
-
-
-@pytest.fixture(scope="session")
-def febio() -> Path:
-    for given in (None, SHARED):
-        try:
-            return find_febio(given)
-        except InputError:
-            assert "FEBIO_CMD" not in os.environ  # which names none that can be run
-    pytest.skip("there is no febio4 on the path, and none beside the repository")
 
 
 def block(divisions: int, **changes: object) -> Problem:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import resource
+import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -12,15 +14,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, RunError
 from ..execution import ProcessExecutor
 from ..fe import Problem, StepControl, solve
+from ..febio import find_febio, read_log, run_febio
 from .blocks import build_punched_block, choose_divisions
 from .parity import PUNCHED, Tell, find_reference, load_case
 
 Answer = TypeVar("Answer")
-# FEBio 4.11 with PARDISO, alone on 2 cores (Intel Xeon, 2.5 GHz), 2 threads.
-FEBIO_SECONDS = {"residuum/posterior_tet10": 144.8, "residuum/posterior_tet4": 10.6}
 CASES = {case.name: case for case in PUNCHED}
 UNKNOWNS = (20_000, 45_000, 80_000)
 # The paper's model of one site: about 150,000 linear tetrahedra.
@@ -35,6 +36,7 @@ def bench_forward(
     element: str = "",
     threads: int = 1,
     as_febio: bool = False,
+    beside_febio: bool = False,
     *,
     tell: Tell,
 ) -> dict[str, Any]:
@@ -47,12 +49,17 @@ def bench_forward(
     element : name in the element table; empty: that of the mesh.
     threads : of assembly and linear algebra.
     as_febio : with the element's quadrature and the contact penalty of the parity table.
+    beside_febio : FEBio itself runs the case afterwards, on as many threads: ``ratio`` is its time over that
+        of the plain simulation.
 
     Raises
     ------
     InputError
-        Where the case is missing or the element does not fit its mesh.
+        Where the case is missing, the element does not fit its mesh, or FEBio is wanted and not there.
+    RunError
+        Where FEBio did not come to its end.
     """
+    program = find_febio() if beside_febio else None
     if case not in CASES:
         raise InputError(f"unknown case {case!r}", remedy=f"use one of {', '.join(CASES)}")
     folder = reference or find_reference(Path.cwd())
@@ -60,12 +67,12 @@ def bench_forward(
     problem = {**named.problem, "element": element} if element else named.problem
     control = {**named.control, "threads": threads}
     posed, stepped, _ = load_case(replace(named, problem=problem, control=control), folder)
-    tell(0, 2, f"{case}, plain")
+    tell(0, 3, f"{case}, plain")
     plain = run_in_fresh_process(solve_timed, threads, posed, stepped, False)
-    tell(1, 2, f"{plain['seconds']:.1f} s plain; with sensitivities")
+    tell(1, 3, f"{plain['seconds']:.1f} s plain; with sensitivities")
     full = run_in_fresh_process(solve_timed, threads, posed, stepped, True)
-    tell(2, 2, f"{full['seconds']:.1f} s with sensitivities")
-    febio = FEBIO_SECONDS.get(case)
+    tell(2, 3, f"{full['seconds']:.1f} s with sensitivities")
+    febio = None if program is None else time_febio(program, folder, case, threads)
     return {
         "case": case,
         **plain,
@@ -78,6 +85,19 @@ def bench_forward(
         "febio_seconds": febio,
         "ratio": None if febio is None else febio / plain["seconds"],
     }
+
+
+def time_febio(program: Path, folder: Path, case: str, threads: int) -> float:
+    """Seconds that FEBio takes for a reference case here and now. Raises `RunError` where it stops early."""
+    file = folder / f"{case}.feb"
+    with tempfile.TemporaryDirectory(prefix="limbfit-bench-") as scratch:
+        shutil.copy(file, Path(scratch) / "model.feb")
+        table = file.with_suffix(".txt")
+        end_s = float(read_log(table).times[-1])
+        run = run_febio(program, Path(scratch), end_s, table.name, threads=threads)
+    if not run.verdict.completed:
+        raise RunError(f"{file}: {run.verdict.reason}")
+    return run.seconds
 
 
 def bench_scaling(

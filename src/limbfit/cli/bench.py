@@ -24,6 +24,10 @@ Reference = Annotated[
     typer.Option(help="folder of FEBio's results; default: shared/reference, here or above"),
 ]
 Threads = Annotated[int, typer.Option(min=1, help="threads of the linear algebra; default: all cores")]
+BesideFebio = Annotated[
+    bool,
+    typer.Option("--beside-febio", help="run FEBio itself afterwards, for the ratio of the times"),
+]
 CORES = count_usable_cores()
 LARGE_UNKNOWNS = (125_000, 200_000, 300_000)
 
@@ -75,10 +79,11 @@ def forward(
     as_febio: Annotated[
         bool, typer.Option("--as-febio", help="with FEBio's quadrature and contact penalty (parity table)")
     ] = False,
+    beside_febio: BesideFebio = False,
     as_json: AsJson = False,
 ) -> None:
-    """Time one simulation, plain and with sensitivities, beside FEBio's time for it."""
-    arguments = (reference, case, element, threads, as_febio)
+    """Time one simulation of a reference case, plain and with sensitivities."""
+    arguments = (reference, case, element, threads, as_febio, beside_febio)
     _bench("forward", limbfit.bench_forward, arguments, show_facts, as_json)
 
 
@@ -126,11 +131,15 @@ def calibrate(
     study: Annotated[
         Path | None, typer.Argument(help="study.toml or its folder; default: the coarse phantom of seed 0")
     ] = None,
+    beside_febio: BesideFebio = False,
     as_json: AsJson = False,
 ) -> None:
-    """Identify a copy of a study from scratch, and time it beside FEBio's loop of finite differences."""
+    """Identify a copy of a study from scratch, and time it.
+
+    With --beside-febio: beside FEBio's loop of finite differences, extrapolated from one run of FEBio.
+    """
     with listen_on_console() as listener:
-        result = limbfit.bench_calibrate(study, listener=listener)
+        result = limbfit.bench_calibrate(study, beside_febio=beside_febio, listener=listener)
     print_result(result, show_facts, as_json)
 
 

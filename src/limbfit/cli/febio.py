@@ -103,6 +103,9 @@ def compare(
             percent = row["difference"]["max_percent"]
             gap = "-" if percent is None else f"{percent:.2f} % of FEBio's peak at most"
             print_line(f"{words}: peak force {row['peak_force_N']:.4g} N, difference {gap}")
+        theirs, ours = (result[key]["seconds"] for key in ("febio", "limbfit"))
+        if theirs:
+            print_line(f"FEBio took {theirs:.1f} s, limbfit {ours:.1f} s: {theirs / ours:.1f} times less")
         print_line(", ".join(result["files"].values()))
     partial = [result[key]["reason"] for key in ("febio", "limbfit", "limbfit_matched")]
     if any(partial):

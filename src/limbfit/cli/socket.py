@@ -152,10 +152,7 @@ def design(
         typer.Option(help="regions whose peaks are to be lowered further, separated by commas"),
     ] = "",
     simulations: Annotated[
-        int | None,
-        typer.Option(
-            help="with --optimise: how many at most, beside those of the two designs; default: 6", min=1
-        ),
+        int | None, typer.Option(help="with --optimise: how many more, at most; default: 6", min=1)
     ] = None,
     parameters: Parameters = None,
     literature: Literature = False,

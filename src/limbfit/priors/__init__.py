@@ -15,8 +15,6 @@ from typing import Any
 
 from ..errors import InputError
 
-__all__ = ["LITERATURE", "POPULATION", "PRIORS", "SOURCE", "TISSUES", "of_tissues"]
-
 POPULATION = Path(__file__).with_name("population.toml")
 SOURCE = "65 people of the MULTIS study (doi 10.18735/S5R97F); m: values of the literature"
 NONE = "none"

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-from .elastic import VOLUMETRIC_LAWS, ElasticLaw, lane_function, mean_exponential
-from .fibred import Contractile, Fibred
-from .hyperelastic import FungQLV, MooneyRivlin, NeoHookean, Ogden, OgdenPower, OgdenQLV
-from .material import LawTable, Material, PronyTerms, Uncoupled
-from .viscoelastic import ORDER_IN_TIME, compute_prony_factors
-
-__all__ = [
-    "ORDER_IN_TIME",
-    "VOLUMETRIC_LAWS",
-    "Contractile",
-    "ElasticLaw",
-    "Fibred",
-    "FungQLV",
-    "LawTable",
-    "Material",
-    "MooneyRivlin",
-    "NeoHookean",
-    "Ogden",
-    "OgdenPower",
-    "OgdenQLV",
-    "PronyTerms",
-    "Uncoupled",
-    "compute_prony_factors",
-    "lane_function",
-    "mean_exponential",
-]
+from .elastic import VOLUMETRIC_LAWS as VOLUMETRIC_LAWS
+from .elastic import ElasticLaw as ElasticLaw
+from .elastic import lane_function as lane_function
+from .elastic import mean_exponential as mean_exponential
+from .fibred import Contractile as Contractile
+from .fibred import Fibred as Fibred
+from .hyperelastic import FungQLV as FungQLV
+from .hyperelastic import MooneyRivlin as MooneyRivlin
+from .hyperelastic import NeoHookean as NeoHookean
+from .hyperelastic import Ogden as Ogden
+from .hyperelastic import OgdenPower as OgdenPower
+from .hyperelastic import OgdenQLV as OgdenQLV
+from .material import LawTable as LawTable
+from .material import Material as Material
+from .material import PronyTerms as PronyTerms
+from .material import Uncoupled as Uncoupled
+from .viscoelastic import ORDER_IN_TIME as ORDER_IN_TIME
+from .viscoelastic import compute_prony_factors as compute_prony_factors

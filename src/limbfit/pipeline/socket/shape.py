@@ -156,9 +156,7 @@ def load_of(
         return standard.force(weight, known), standard.moment(weight, known), point
 
 
-def check_load(
-    study: Study, load: SocketLoadTable, bones: Collection[str], is_tibia_cut: bool = False
-) -> None:
+def check_load(study: Study, load: SocketLoadTable, bones: Collection[str], is_cut: bool = False) -> None:
     """That what a preset needs is known of a limb whose bones have these names.
 
     The proximal cut may go through the tibia, so that its top is not there. Raises `StudyError` where the
@@ -168,7 +166,7 @@ def check_load(
         return
     standard, place = STANDARD_LOADS[load.preset], f"socket.loads.{load.name}.preset"
     named = [any(bone in name.lower() for name in bones) for bone in ("tibia", "fibula")]
-    if (standard.ahead_mm or standard.inside_mm) and load.point is None and (is_tibia_cut or not named[0]):
+    if (standard.ahead_mm or standard.inside_mm) and load.point is None and (is_cut or not named[0]):
         why = "the proximal cut goes through the tibia" if named[0] else "no bone is named tibia"
         raise StudyError(
             f"{load.preset!r} passes beside the knee centre, which is not known: {why}",
