@@ -10,6 +10,7 @@ Run with ``python -m pytest -m febio``; FEBio is that of ``FEBIO_CMD``, of the p
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,9 +37,10 @@ from limbfit.fe import (
     isochoric_stretch,
     solve,
 )
-from limbfit.febio import FebSettings, build_result, run_febio, write_feb
+from limbfit.febio import FebSettings, build_result, read_log, run_febio, write_feb
 from limbfit.febio.preparation import Preparation
 
+REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
 pytestmark = pytest.mark.febio
 
 SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, (0.8, 0.3), (0.2, 1.5))
@@ -154,3 +156,19 @@ def test_a_clamped_limb_is_touched_later_and_pushes_as_hard(febio, tmp_path, tau
     late = theirs.times >= 2.0
     gap = np.abs(mine.force_at(theirs.times) - theirs.force)[late].max()
     assert gap < 0.02 * theirs.peak_force
+
+
+@pytest.mark.skipif(
+    not REFERENCE.is_dir(), reason="the FEBio reference results are not beside the repository"
+)
+@pytest.mark.parametrize("case", ["cube/cube_skin", "cube/cube_lim_par", "block/block_hex8", "socket/tube"])
+def test_febio_gives_again_what_is_stored_of_it(febio, tmp_path, case):
+    """So that what is compared with the stored results is compared with FEBio."""
+    file = REFERENCE / f"{case}.feb"
+    table = file.with_suffix(".txt")
+    stored = read_log(table)
+    shutil.copy(file, tmp_path / "model.feb")
+    run = run_febio(febio, tmp_path, float(stored.times[-1]), table.name, time_limit_s=300.0)
+    assert run.verdict.completed, run.verdict.reason
+    assert run.log is not None
+    np.testing.assert_allclose(run.log.values, stored.values, atol=1e-9 * np.abs(stored.values).max())
