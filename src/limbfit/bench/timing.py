@@ -18,12 +18,12 @@ from ..errors import InputError, RunError
 from ..execution import ProcessExecutor
 from ..fe import Problem, StepControl, solve
 from ..febio import find_febio, read_log, run_febio
+from . import UNKNOWNS
 from .blocks import build_punched_block, choose_divisions
 from .parity import PUNCHED, Tell, find_reference, load_case
 
 Answer = TypeVar("Answer")
 CASES = {case.name: case for case in PUNCHED}
-UNKNOWNS = (20_000, 45_000, 80_000)
 # The paper's model of one site: about 150,000 linear tetrahedra.
 PAPER_ELEMENT, PAPER_DIVISIONS = "tet4", 37
 CONTROL = StepControl()

@@ -11,7 +11,7 @@ from rich.table import Table
 
 import limbfit
 
-from ..bench.timing import UNKNOWNS
+from ..bench import LARGE_UNKNOWNS, UNKNOWNS
 from ..execution import count_usable_cores
 from .console import STDOUT, AsJson, Column, listen_on_console, print_line, print_result, print_table
 
@@ -29,7 +29,6 @@ BesideFebio = Annotated[
     typer.Option("--beside-febio", help="run FEBio itself afterwards, for the ratio of the times"),
 ]
 CORES = count_usable_cores()
-LARGE_UNKNOWNS = (125_000, 200_000, 300_000)
 
 
 def _bench(
