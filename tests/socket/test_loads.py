@@ -35,7 +35,6 @@ def test_directions_of_a_limb_with_its_fibula_on_the_right() -> None:
     np.testing.assert_allclose(known.anterior, [0.0, -1.0, 0.0], atol=1e-12)
     assert known.lateral is not None
     np.testing.assert_allclose(known.lateral, [-1.0, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(find_directions(round_limb(), "left").medial, [-1.0, 0.0, 0.0], atol=1e-12)
     knee = find_knee_centre(round_limb())
     assert knee is not None
     np.testing.assert_allclose(knee, [0.0, -10.0, 119.0], atol=1.5)

@@ -100,10 +100,10 @@ WRONG = {
     "the name of a site": ('name = "3"', 'name = "1-fast"', "a record and a site, have the name '1-fast'"),
     "a name of limbfit": ('name = "slow"', 'name = "raw"', "give another name"),
     "unknown indenter": ('indenter = "ball"', 'indenter = "bal"', "1-ball: no indenter is named 'bal'"),
-    "neither": ("depth_mm = 5.0\n", "", r"sites\.2: give either trace .* \[\[records\]\]\) or depth_mm"),
-    "plan and record": ('site = "2"', 'site = "3"', r"sites\.1: give either trace"),
+    "neither": ("depth_mm = 5.0\n", "", r"sites\.3: give either trace .* \[\[records\]\]\) or depth_mm"),
+    "plan and record": ('site = "2"', 'site = "3"', r"sites\.2: give either trace"),
     "a missing file": ('"d.csv"', '"e.csv"', r"records\.1-ball\.trace: e\.csv does not exist"),
-    "no force": ('indenter = "ball"', 'control = "strength"', "records.2.control: Input should be"),
+    "no force": ('indenter = "ball"', 'control = "strength"', "records.1-ball.control: Input should be"),
     "paper": (
         'indenter = "ball"',
         'control = "force"\n[calibration]\nobjective = "paper"',
