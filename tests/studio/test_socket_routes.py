@@ -123,5 +123,5 @@ def test_a_brim_that_leaves_no_socket_is_refused_and_changes_nothing(page, study
 def test_a_socket_from_a_file_has_no_brim_to_drag(page, study):
     (study / "own.stl").write_text("solid\nendsolid\n")
     file = study / "study.toml"
-    file.write_text(file.read_text().replace("trim_mm = 40.0", 'file = "own.stl"'))
+    file.write_text(file.read_text().replace("trim_mm = 34.0", 'file = "own.stl"'))
     assert page.get("/api/socket/shape").json()["trim"]["points"] == []
