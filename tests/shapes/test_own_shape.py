@@ -11,18 +11,20 @@ import numpy as np
 import pytest
 
 from guide import from_the_guide, identified
+from layered import build_block_site, layered_block
 from limbfit import Indenter, Measure, load_study, register_shape
 from limbfit.bench.blocks import build_punched_block
 from limbfit.errors import InputError, ProblemError, StudyError
 from limbfit.extensions import load_extensions
 from limbfit.fe import StepControl, solve
 from limbfit.febio import FebSettings, read_feb, to_problem, write_feb, write_inp
-from limbfit.indentation import SiteModel
+from limbfit.indentation import SiteModel, simulate
+from limbfit.indentation.simulating import _prepared
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.simulation.simulations import SimulationJob, compute_job_digest
 from limbfit.pipeline.variants.sensitivity import list_other_indenters
 from limbfit.shapes import RESERVED_KEYS, SHAPES, Shape
-from limbfit.study import IndenterTable
+from limbfit.study import IndenterTable, SolverTable
 
 FRAME = {"centre": (0.4, -0.3, 1.0), "axis": (0.05, 0.1, -1.0)}
 
@@ -210,6 +212,25 @@ def test_reports_call_it_by_its_words(shape):
     assert (
         shape.describe(settings) == "tapered indenter of 18.0 mm (edge radius 2.0 mm, taper in degrees 10.0)"
     )
+
+
+def test_a_shape_that_is_edited_between_two_simulations_of_a_session_is_simulated_anew(file, tmp_path):
+    """What a process keeps of a site is that of the file as it was."""
+    text = file.read_text().replace('"tapered"', '"narrowed"')
+    own, mesh = tmp_path / "narrowed.py", layered_block((3.0, 12.0), ("skin", "muscle"), 24.0, 2, 8.0)
+    own.write_text(text)
+    load_extensions([own])
+    steps = SolverTable(load_steps=2, unload_steps=2)
+    model = build_block_site("a", tmp_path / "a.vtu", mesh, 2.0, steps)
+    table = IndenterTable(shape="narrowed", width_mm=24.0, edge_radius_mm=2.0)
+    model = replace(model, indenter=table, extensions=(own,))
+    job = SimulationJob(model, mesh.region_names, 2 * (5.0, 3.0, 1.0, 1.0), (1.0, 2.0), sensitivities=False)
+    before = simulate(job).force_N
+    own.write_text(text.replace("self.width / 2 - self.radius", "self.width / 4 - self.radius"))
+    after = simulate(job).force_N
+    _prepared.clear()
+    assert np.array_equal(simulate(job).force_N, after)
+    assert not np.array_equal(before, after)
 
 
 STATED = """

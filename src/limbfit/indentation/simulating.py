@@ -17,6 +17,7 @@ import psutil
 
 from ..arrays import Array
 from ..execution import count_usable_cores
+from ..extensions import compute_extensions_digest
 from ..fe import Problem, Result, SimulationWarning, StepControl, System, solve
 from ..fields import Animation, write_fields
 from ..laws import LAWS, OGDEN, to_parameters
@@ -117,12 +118,14 @@ class Prepared:
     extension: tuple[float, Extension] | None = None
 
 
-_prepared: OrderedDict[tuple[SiteModel, tuple[str, ...]], Prepared] = OrderedDict()
+# By model, tissues and what the files of its extensions hold: a session may change those between two calls.
+_prepared: OrderedDict[tuple[SiteModel, tuple[str, ...], str], Prepared] = OrderedDict()
 
 
 def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
     """The site's discretisation and contact penalty; sites not used for longest are forgotten."""
-    known = _prepared.get((model, tissues))
+    key = model, tissues, compute_extensions_digest(model.extensions)
+    known = _prepared.get(key)
     if known is None:
         problem = _build_reference_problem(model, tissues)
         control = build_steps(model)
@@ -134,9 +137,10 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
             # Under a stated force too it is driven by its displacement; nothing else moves the limb.
             near = replace(model.bare, knots_N=(), within_mm=within)
             allowed = _MARGIN * control.penetration
-            penalty = max(_estimate_yielding(near, tissues) / allowed, 2000.0 / model.indenter.width_mm)
-        known = _prepared[model, tissues] = Prepared(problem, system, penalty)
-    _prepared.move_to_end((model, tissues))
+            yielding = _estimate_yielding(near, tissues, key[-1])
+            penalty = max(yielding / allowed, 2000.0 / model.indenter.width_mm)
+        known = _prepared[key] = Prepared(problem, system, penalty)
+    _prepared.move_to_end(key)
     most = count_stored_nodes(psutil.virtual_memory().total, count_usable_cores())
     while len(_prepared) > 1 and sum(len(one.problem.mesh.points) for one in _prepared.values()) > most:
         _prepared.popitem(last=False)
@@ -153,7 +157,7 @@ def count_stored_nodes(memory: float, cores: int) -> int:
 
 
 @lru_cache(maxsize=64)
-def _estimate_yielding(model: SiteModel, tissues: tuple[str, ...]) -> float:
+def _estimate_yielding(model: SiteModel, tissues: tuple[str, ...], extensions_digest: str) -> float:
     """Penetration of the indenter into reference tissue over its travel, times the contact penalty (1/mm).
 
     Over the penetration that is allowed it is the penalty, which all simulations of a site hold.  One that
