@@ -130,6 +130,21 @@ def test_what_a_kill_between_renames_has_left_is_put_right(tmp_path):
         assert sorted(p.name for p in tmp_path.iterdir()) == [".holder", ".lock", "mesh", "sites"]
 
 
+def test_a_stage_in_the_place_of_a_link_is_made_again_and_again(tmp_path):
+    """As where someone moved a large stage to another disk, and put a link in its place."""
+    store, elsewhere = Store(tmp_path / "results"), tmp_path / "elsewhere"
+    store.make("mesh", "a", lambda folder: {})
+    store["mesh"].rename(elsewhere)
+    store["mesh"].symlink_to(elsewhere, target_is_directory=True)
+    (elsewhere / "precious").write_text("kept")
+    for key in "bcd":
+        store.make("mesh", key, lambda folder: {})
+        with lock(store.folder):
+            assert store.state("mesh", key).state == "done"
+    assert sorted(path.name for path in store.folder.iterdir()) == [".lock", "mesh"]
+    assert (elsewhere / "precious").read_text() == "kept"
+
+
 def test_a_file_is_readable_by_whom_the_user_lets_read(tmp_path):
     before = os.umask(0o022)
     try:

@@ -139,17 +139,25 @@ class Store:
         for old in self.folder.glob(f"{_OLD}*"):
             place = self.folder / old.name.removeprefix(_OLD)
             if place.exists():
-                shutil.rmtree(old, ignore_errors=True)
+                _remove(old)
             else:
                 old.rename(place)
 
     def _put_in_place(self, work: Path, place: Path) -> None:
         """Renames only: at each moment the old folder, none, or the new one stands there, never a mixture."""
         old = self.folder / f"{_OLD}{place.name}"
-        shutil.rmtree(old, ignore_errors=True)
-        if place.exists():
+        _remove(old)
+        if os.path.lexists(place):
             place.rename(old)
         work.rename(place)
+        _remove(old)
+
+
+def _remove(old: Path) -> None:
+    """Remove a folder; of a link, or a file in its place, itself alone."""
+    if old.is_symlink() or old.is_file():
+        old.unlink()
+    else:
         shutil.rmtree(old, ignore_errors=True)
 
 
