@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import resource
 
 import numpy as np
 import pytest
@@ -68,6 +69,23 @@ def test_an_image_goes_with_its_voxels_and_a_study_by_any_name_into_no_folder_of
     write_volume(study / "scan [1].mhd", changed)
     with pytest.raises(InputError, match=r"has changed since: image\.path"):
         reproduce_study(study / "limb.toml", tmp_path / "other", listener=stop)
+
+
+def test_an_attempt_that_was_ended_while_it_copied_goes_on(study, tmp_path):
+    """As by a disk that is full: the study file is small, and every input is larger than may be written."""
+    record = run_record(load_study(study)).to_plain() | {"stages": {"calibrate": {}, "predict": {}}}
+    (study / "results").mkdir()
+    (study / "results/run.json").write_text(json.dumps(record))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))  # Python ignores the signal
+    try:
+        with pytest.raises(OSError, match="too large"):
+            reproduce_study(study, tmp_path / "again", listener=stop)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with pytest.raises(StoppedError):
+        reproduce_study(study, tmp_path / "again", listener=stop)
+    assert (tmp_path / "again/skin.stl").read_bytes() == (study / "skin.stl").read_bytes()
 
 
 @pytest.mark.slow

@@ -125,7 +125,8 @@ def _copy_inputs(study: Study, folder: Path) -> None:
         raise InputError("holds something else", file=folder, remedy="give a folder that does not exist")
     folder.mkdir(parents=True, exist_ok=True)
     edited = find_hand_labels(study)
-    for path in {*study.inputs.values(), Path(study.file.name), *([edited] if edited else [])}:
+    # The study file first: by it an attempt that was ended while it copied is known.
+    for path in dict.fromkeys([Path(study.file.name), *study.inputs.values(), *filter(None, [edited])]):
         source = study.path(path)
         if path.is_absolute():
             continue
