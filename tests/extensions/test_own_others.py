@@ -131,6 +131,7 @@ def test_names_that_would_hide_results_are_refused(study, monkeypatch):
     for name in ("sensitivity", "a-b", "regions", ""):
         with pytest.raises(InputError, match=r"can be named|exists already"):
             register_experiment(Experiment(name, run))
-    register_experiment(Experiment("mesh", run))
-    with pytest.raises(InputError, match="results/mesh is not for an experiment"):
-        run_experiment(load_study(study), "mesh", listener=print)
+    for name in ("mesh", "log"):
+        register_experiment(Experiment(name, run))
+        with pytest.raises(InputError, match=f"results/{name} is not for an experiment"):
+            run_experiment(load_study(study), name, listener=print)

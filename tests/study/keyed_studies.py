@@ -87,7 +87,7 @@ ACTS: dict[str, tuple[str, Any]] = {
     "mesh.growth": ("mesh", 0.7),
     "mesh.flatness": ("mesh", 1.2),
     "mesh.engine": ("mesh", "netgen"),
-    "mesh.time_limit_s": ("mesh", 60.0),
+    "mesh.time_limit_s": ("calibrate", 60.0),
     "mesh.coarse.edge_near_mm": ("mesh", 7.5),
     "mesh.coarse.edge_far_mm": ("mesh", 25.0),
     "mesh.coarse.near_radius_mm": ("mesh", 15.0),

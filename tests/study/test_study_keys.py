@@ -14,6 +14,7 @@ from keyed_studies import (
     GIVEN,
     IMAGED,
     READ,
+    START,
     before,
     changed,
     decided,
@@ -56,6 +57,47 @@ def test_a_key_of_no_stage_is_read(key: str) -> None:
     read = {node.attr for node in nodes if isinstance(node, ast.Attribute)}
     read |= {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
     assert key.rpartition(".")[2] in read
+
+
+def list_stale(folder: Path, content: Mapping[str, Any], other: Mapping[str, Any]) -> set[str]:
+    """The stages of a study that are others in another study."""
+    then, now = (compute_keys(loaded(folder, one)) for one in (content, other))
+    return {stage for stage in then if then[stage] != now[stage]}
+
+
+@pytest.mark.parametrize(("key", "value"), [("sites.1.region", "calf"), ("sites.1.fitted", True)])
+def test_what_a_site_is_called_or_used_for_is_no_reason_to_mesh_again(
+    folder: Path, key: str, value: Any
+) -> None:
+    stale = list_stale(folder, IMAGED, changed(IMAGED, key, value))
+    assert {"sites", "predict", "report"} <= stale
+    assert "mesh" not in stale
+    assert "mesh" in list_stale(folder, IMAGED, changed(IMAGED, "sites.1.edge", [0.0, 1.0, 1.0]))
+
+
+def test_meshes_that_are_made_are_kept_when_the_mesher_is_given_more_time(folder: Path) -> None:
+    """The remedy that is named where one mesh of many takes too long."""
+    assert list_stale(folder, GIVEN, changed(GIVEN, "mesh.time_limit_s", 1200.0)) == {
+        *("calibrate", "predict", "report")  # which does without a coarser mesh that takes too long
+    }
+
+
+def test_the_order_of_keys_makes_nothing_stale_and_that_of_sites_what_lists_them(folder: Path) -> None:
+    tables: dict[str, Any] = {
+        "indenters": {"ball": {}, "big": {"width_mm": 30.0}},
+        "material": {"tissues": {"skin": {"start": START}, "muscle": {"start": START}}},
+        "calibration": {
+            "prior": {f"{one}.c_kPa": {"median": 5.0, "factor": 2.0} for one in ("skin", "muscle")}
+        },
+    }
+    turned = {
+        key: {name: dict(reversed(part.items())) for name, part in table.items()}
+        for key, table in tables.items()
+    }
+    turned["indenters"] = dict(reversed(tables["indenters"].items()))
+    stated, other = ({**IMAGED, **each} for each in (tables, turned))
+    assert list_stale(folder, stated, other) == set()
+    assert "sites" in list_stale(folder, stated, {**stated, "sites": stated["sites"][::-1]})
 
 
 def test_an_indenter_that_no_fitted_record_names_is_no_reason_to_identify_again(folder: Path) -> None:

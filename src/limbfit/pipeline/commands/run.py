@@ -21,13 +21,7 @@ from ...extensions import load_extensions
 from ...fe import are_compiled, compile_kernels
 from ...results.identification import CalibrationResult, PredictResult
 from ...results.models import ModelsResult
-from ...results.runs import (
-    ExperimentRecord,
-    MachineFacts,
-    RunResult,
-    StageRecord,
-    StudyName,
-)
+from ...results.runs import ExperimentRecord, MachineFacts, RunResult, StageRecord, StudyName
 from ...study import Site, Study, load_study
 from ..engine.context import Context, Listener, Progress, build_executor, ignore_progress
 from ..engine.digests import compute_file_digest
@@ -74,10 +68,9 @@ _WAVES = ("shear_waves", "shear_waves_sd_m_s", "shear_waves_bias_m_s")
 _SEEN = ("ultrasound", "ultrasound_sd_mm", "surface", "surface_sd_mm", "surface_frame", *_WAVES)
 _RECORD = ("trace", "touch_down_s", "peak_s", "control", *_SEEN)
 _NAMED = ("site", "name")
-# How pins press; the mesh depends on how wide they are alone.
-_PRESSING = tuple(
-    f"clamps.{key}" for key in ("force_N", "angles_degrees", "levels_mm", "clamping_s", "settling_s")
-)
+# Of tables of the mesh: how pins press (how wide they are counts), and how long a mesh may take to be made.
+_NO_SHAPE = ("clamps.force_N", "clamps.angles_degrees", "clamps.levels_mm", "clamps.clamping_s")
+_NO_SHAPE += ("clamps.settling_s", "mesh.time_limit_s")
 
 STAGES = (
     Stage("segment", run_segment, (), ("image", "segmentation")),
@@ -85,13 +78,14 @@ STAGES = (
     Stage("sites", run_sites, ("surfaces",), ("indenter", "indenters"), _PLACE, (*_NAMED, "indenter")),
     Stage("traces", run_traces, (), ("traces",), ("name", *_RECORD), (*_NAMED, *_RECORD)),
     Stage(
-        "mesh", run_mesh, ("surfaces", "sites"), ("geometry", "mesh", "clamps"), ("name",), apart=_PRESSING
+        "mesh", run_mesh, ("surfaces", "sites"), ("geometry", "mesh", "clamps"), ("name",), apart=_NO_SHAPE
     ),
     Stage(
         "calibrate",
         run_calibrate,
         ("sites", "traces", "mesh"),
-        ("material", "calibration", "solver", "indenter", "indenters", "clamps"),
+        # It meshes once more, and does without a mesh that takes too long.
+        ("material", "calibration", "solver", "indenter", "indenters", "clamps", "mesh"),
         ("name", "fitted", "weight", "edge", "indenter"),
         (*_NAMED, "indenter"),
     ),
@@ -99,7 +93,7 @@ STAGES = (
     Stage("report", run_report, ("predict",), ("study",), ("name", "region")),
 )
 STAGE_NAMES = tuple(stage.name for stage in STAGES)
-_FOLDERS = frozenset(("compare", "export", "models", "simulate", *STAGE_NAMES))  # of results
+_FOLDERS = frozenset(("compare", "export", "log", "models", "simulate", *STAGE_NAMES))  # of results
 
 
 def list_stages(study: Study) -> tuple[Stage, ...]:
@@ -119,8 +113,10 @@ def compute_keys(study: Study) -> dict[str, str]:
 def _compute_chain(keys: Keys) -> dict[str, StageKey]:
     """See `compute_keys`."""
     fitted = _select_calibration_inputs(keys.study)
+    plain = [site.model_copy(update={"region": "", "fitted": False}) for site in keys.study.sites]
+    unlabelled = keys.study.model_copy(update={"sites": tuple(plain)})
     chain: dict[str, StageKey] = {}
-    below, alone = dict[str, str](), dict[str, str]()
+    below, alone, placed = dict[str, str](), dict[str, str](), dict[str, str]()
     for stage in list_stages(keys.study):
         options: dict[str, Any] = {}
         if stage.name == "report":
@@ -129,7 +125,9 @@ def _compute_chain(keys: Keys) -> dict[str, StageKey]:
             models = keys.study.results / ModelsResult.FILE
             shown += [compute_file_digest(models)] if models.is_file() else []
             options = {"experiments": shown} if shown else {}
-        key = keys.of(stage, below, options)
+        if stage.name == "sites":  # where they are decides their meshes, and not what else is said of them
+            placed = {"sites": keys.of(stage, below, study=unlabelled).digest}
+        key = keys.of(stage, below | placed if stage.name == "mesh" else below, options)
         if "calibrate" not in below:
             key_alone = keys.of(stage, alone, study=fitted)
             alone[stage.name] = key_alone.digest

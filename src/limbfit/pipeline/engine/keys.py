@@ -17,6 +17,7 @@ from .digests import code_parts, compute_digest, compute_file_digest
 from .provenance import list_input_files
 
 _FEW = 4  # causes of one kind that are named
+_BY_NAME = ("indenters.", "material.", "calibration.prior.")  # tables of which the order says nothing
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Stage:
     """A stage: what it stands on, which tables it reads, and which keys of ``[[sites]]`` and ``[[records]]``.
 
     ``run(context, folder)`` does it, and may return facts for its stamp. ``apart`` are keys of its tables,
-    such as ``socket.design``, that it does not read. Its code is that of `digests.find_sources`.
+    such as ``socket.design``, without effect on what it makes. Its code is that of `digests.find_sources`.
     """
 
     name: str
@@ -97,7 +98,8 @@ class Keys:
             code=code_parts(stage.run) | self._code,
             stages={name: below[name] for name in stage.needs if name in below},
         )
-        order = list(read)  # of sites and records: results are in it too
+        # Of sites, records and bones: results are in it too.
+        order = [name for name in read if not name.startswith(_BY_NAME)]
         return StageKey(compute_digest(stage.name, parts.to_plain(), order, *filter(None, [options])), parts)
 
 
@@ -122,7 +124,7 @@ def describe_causes(before: StageParts | None, now: StageParts) -> list[str]:
         found.append(f"limbfit was {then}, is {__version__}")
     elif code:
         found.append(f"code of {_list_few(code)} changed")
-    return found or ["its options changed"]
+    return found or ["its options, or the order of sites, records or bones, changed"]
 
 
 def _list_few(names: list[str]) -> str:
