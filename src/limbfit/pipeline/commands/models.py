@@ -28,7 +28,7 @@ from ...results.curves import read_curves
 from ...results.identification import RecordPrediction
 from ...results.socket import LoadedRegion, SocketResult
 from ...study import Study, load_study
-from ..engine.context import Listener, Progress, ignore_progress
+from ..engine.context import Listener, ignore_progress
 from ..engine.files import find_hand_labels
 from ..engine.storage import write_curves, write_result
 from ..engine.store import Store, lock
@@ -252,10 +252,7 @@ def compare_models(
 
 
 def _name_model(listener: Listener, words: str) -> Listener:
-    def tell(event: Progress) -> None:
-        listener(replace(event, text=f"{words}: {event.text}"))
-
-    return tell
+    return lambda event: listener(replace(event, text=f"{words}: {event.text}"))
 
 
 def _mix_predictions(

@@ -9,12 +9,7 @@ import numpy as np
 
 from ...identify.fit.calibration import Calibration, SearchState, calibrate
 from ...identify.fit.multifidelity import CorrectionRound, CorrectionSettings, calibrate_with_correction
-from ...identify.fit.multistart import (
-    MultistartResult,
-    SearchResult,
-    continue_from_bound,
-    run_multistart,
-)
+from ...identify.fit.multistart import MultistartResult, SearchResult, continue_from_bound, run_multistart
 from ...identify.fit.parameters import Grouping, Unknowns
 from .problem import CalibrationProblem
 from .record_simulator import RecordSimulator

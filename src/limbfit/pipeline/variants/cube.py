@@ -162,7 +162,8 @@ def compress_cube(
         For a compression that is no compression.
     """
     check_compression(compression_percent)
-    times = _build_times()
+    ramp = np.arange(1, STEPS + 1) / STEPS  # even in each ramp, dense at first while the cube is held
+    times = np.concatenate([RAMP_S * ramp, RAMP_S * (1 + ramp), 2 * RAMP_S + HOLD_S * ramp**1.5])
     rows, stresses = [], {}
     own = build_materials(parameters or {}, kappa_ratio, law, relaxation_span_s=relaxation_span_s)
     back = int(np.argmin(np.abs(times - 2 * RAMP_S)))  # at its height again
@@ -263,12 +264,6 @@ def _list_tissues(
             {"tissue": known.name, "law": "sum of Ogden terms"}
             | {key: getattr(known, key) for key in ("kind", "values", "conversion", "source")},
         )
-
-
-def _build_times() -> Array:
-    """Steps (k,) in s: even in each ramp, dense at first while the cube is held."""
-    ramp = np.arange(1, STEPS + 1) / STEPS
-    return np.concatenate([RAMP_S * ramp, RAMP_S * (1 + ramp), 2 * RAMP_S + HOLD_S * ramp**1.5])
 
 
 def compress(material: Material, times: Array, compression_percent: float) -> tuple[Array, float, float]:

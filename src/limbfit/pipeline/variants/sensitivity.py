@@ -19,14 +19,7 @@ from ...errors import InputError
 from ...fe import solve
 from ...fe.kernel.laws import Laws
 from ...fe.observables import compute_element_fields
-from ...indentation import (
-    Parameters,
-    Simulation,
-    SimulationJob,
-    build_problem,
-    build_steps,
-    to_parameters,
-)
+from ...indentation import Parameters, Simulation, SimulationJob, build_problem, build_steps, to_parameters
 from ...mesh import read_vtu
 from ...results import variants as stored
 from ...shapes import BUILTIN_SHAPES, SHAPES

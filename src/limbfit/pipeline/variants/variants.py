@@ -19,12 +19,7 @@ from ..engine.storage import write_curves, write_result, write_rows
 from ..records.deviations import measure_bone_distance_mm
 from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
-from ..simulation.simulations import (
-    CURVE_POINTS,
-    SimulationCache,
-    build_curve_job,
-    open_experiment_cache,
-)
+from ..simulation.simulations import CURVE_POINTS, SimulationCache, build_curve_job, open_experiment_cache
 
 Run = TypeVar("Run", bound=VariantRun)
 
