@@ -118,6 +118,14 @@ def test_a_stage_that_was_complete_when_killed_is_only_put_in_place(tmp_path):
     assert store.state("mesh", "a").state == "done"
 
 
+def test_a_stage_whose_stamp_was_cut_short_before_it_was_put_in_place_is_made_anew(tmp_path):
+    store = Store(tmp_path)
+    store.make("mesh", "a", lambda folder: {"made": 1})
+    store["mesh"].rename(store.work_folder("mesh", "a"))
+    (store.work_folder("mesh", "a") / "stage.json").write_text("")
+    assert store.make("mesh", "a", lambda folder: {"made": 2}).made == 2
+
+
 def test_what_a_kill_between_renames_has_left_is_put_right(tmp_path):
     store = Store(tmp_path)
     for stage in ("mesh", "sites"):

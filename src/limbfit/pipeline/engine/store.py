@@ -92,7 +92,7 @@ class Store:
         work = self.work_folder(stage, key)
         with translate_disk_errors(self.folder):
             work.mkdir(parents=True, exist_ok=True)
-            if not (work / STAMP).is_file():
+            if self.stamp(work.name) is None:  # a power cut may have left a part of it
                 self._take_over_others(stage, work)
                 self._complete(stage, key, work, produce)
             self._put_in_place(work, self[stage])
