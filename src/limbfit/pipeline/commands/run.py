@@ -69,8 +69,8 @@ _SEEN = ("ultrasound", "ultrasound_sd_mm", "surface", "surface_sd_mm", "surface_
 _RECORD = ("trace", "touch_down_s", "peak_s", "control", *_SEEN)
 _NAMED = ("site", "name")
 # Of tables of the mesh: how pins press (how wide they are counts), and how long a mesh may take to be made.
-_NO_SHAPE = ("clamps.force_N", "clamps.angles_degrees", "clamps.levels_mm", "clamps.clamping_s")
-_NO_SHAPE += ("clamps.settling_s", "mesh.time_limit_s")
+_PRESSING = ("force_N", "angles_degrees", "levels_mm", "clamping_s", "settling_s")
+_NO_SHAPE = (*(f"clamps.{key}" for key in _PRESSING), "mesh.time_limit_s")
 
 STAGES = (
     Stage("segment", run_segment, (), ("image", "segmentation")),
