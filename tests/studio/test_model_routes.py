@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from completing import complete
 from limbfit import load_study
 from limbfit.mesh import Mesh, boundary_faces, measure_quality, write_vtu
 from limbfit.results.limb import MeshResult
+from limbfit.studio.editing import set_site
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import AccessGuard
 from limbfit.studio.model_routes import read_anatomy
@@ -110,6 +112,29 @@ def test_a_site_is_moved_named_and_switched(page, study):
     assert page.post("/api/model/sites/heel/remove").status_code == 200
     assert [site.name for site in load_study(study).sites] == ["1"]
     assert "# the first one" in (study / "study.toml").read_text()
+
+
+def test_changes_that_come_at_once_are_all_stored(study):
+    file, regions = study / "study.toml", [f"region {i}" for i in range(12)]
+    file.write_text(
+        file.read_text()
+        + "".join(f'[[sites]]\nname = "s{i}"\nposition = [40, {i}, 60]\ndepth_mm = 4\n' for i in range(12))
+    )
+    with ThreadPoolExecutor(12) as threads:
+        list(threads.map(lambda i: set_site(file, f"s{i}", {"region": regions[i]}), range(12)))
+    assert [load_study(study).site(f"s{i}").region for i in range(12)] == regions
+
+
+def test_a_site_is_added_to_a_list_of_one_line_tables(page, study):
+    file = study / "study.toml"
+    head, first, second = file.read_text().split("[[sites]]\n")
+    rows = [", ".join(row.strip().replace("  # the first one", "").split("\n")) for row in (first, second)]
+    file.write_text("sites = [\n  " + ",\n  ".join(f"{{ {row} }}" for row in rows) + ",\n]  # all\n" + head)
+    (point,) = skin_points(study, 1)
+    site = {"name": "a", "position": point.tolist(), "depth_mm": 5}
+    assert page.post("/api/model/sites", json=site).status_code == 200
+    assert [site.name for site in load_study(study, recorded=False).sites] == ["1", "2", "a"]
+    assert "]  # all" in file.read_text()
 
 
 @pytest.mark.parametrize(

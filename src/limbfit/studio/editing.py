@@ -12,6 +12,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import tomlkit
@@ -22,6 +23,7 @@ from ..errors import StudyError
 from ..study import Record, load_study
 
 POSITION_DIGITS = 2  # of a place in mm
+_LOCK = Lock()  # requests come in threads: each change is made on what the one before it stored
 
 
 @contextmanager
@@ -31,11 +33,17 @@ def edit_study(file: Path) -> Iterator[tomlkit.TOMLDocument]:
     Raises `StudyError` where the file is not TOML, or the study would not be valid; the file is left as it
     was.
     """
-    try:
-        document = tomlkit.parse(file.read_text(encoding="utf-8-sig"))
-    except (TOMLKitError, UnicodeDecodeError) as error:
-        raise StudyError(f"not valid TOML: {error}", file=file) from None
-    yield document
+    with _LOCK:
+        try:
+            document = tomlkit.parse(file.read_text(encoding="utf-8-sig"))
+        except (TOMLKitError, UnicodeDecodeError) as error:
+            raise StudyError(f"not valid TOML: {error}", file=file) from None
+        yield document
+        _store(document, file)
+
+
+def _store(document: tomlkit.TOMLDocument, file: Path) -> None:
+    """Put the document in the place of the study file, where it is a valid study."""
     handle, name = tempfile.mkstemp(prefix=".study-", suffix=".toml", dir=file.parent)
     written = Path(name)
     try:
@@ -81,9 +89,7 @@ def add_site(file: Path, name: str, position: Sequence[float], values: Mapping[s
         sites = document.get("sites")
         if not isinstance(sites, list):
             raise StudyError("the study has no [[sites]] to add to", file=file, place="sites")
-        table = tomlkit.table()
-        _assign(table, {"name": name, "position": position, **values})
-        sites.append(table)
+        _append(sites, {"name": name, "position": position, **values})
 
 
 def remove_site(file: Path, name: str) -> None:
@@ -100,9 +106,7 @@ def set_area(file: Path, name: str, values: Mapping[str, Any]) -> None:
         if area is not None:
             _assign(area, values)
             return
-        area = tomlkit.table() if isinstance(rows, AoT) else tomlkit.inline_table()
-        _assign(area, {"name": name, **values})
-        rows.append(area)
+        _append(rows, {"name": name, **values})
 
 
 def remove_area(file: Path, name: str) -> None:
@@ -138,6 +142,13 @@ def _find_named(rows: Any, name: str) -> Any:
     """The table of a list that has this name; None where there is none, or no list."""
     tables = rows if isinstance(rows, list) else ()
     return next((table for table in tables if str(table.get("name")) == name), None)
+
+
+def _append(rows: Any, values: Mapping[str, Any]) -> None:
+    """Add a table to a list of tables, in the way in which the others of the list are written."""
+    table = tomlkit.table() if isinstance(rows, AoT) else tomlkit.inline_table()
+    _assign(table, values)
+    rows.append(table)
 
 
 def _assign(table: Any, values: Mapping[str, Any]) -> None:
