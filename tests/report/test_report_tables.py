@@ -20,6 +20,10 @@ from limbfit.report.sections.provenance import flatten_settings
         (100.0, "100"),
         (41987.4, "41 987"),
         (3e7, "3.00e+07"),
+        (999.4, "999"),
+        (999.7, "1 000"),
+        (-999.7, "−1 000"),
+        (0.00099999, "0.00100"),
         (math.nan, "–"),
         (math.inf, "∞"),
         (None, "–"),
@@ -27,6 +31,10 @@ from limbfit.report.sections.provenance import flatten_settings
 )
 def test_number(value: float | None, text: str) -> None:
     assert number(value) == text
+
+
+def test_a_number_of_two_digits_that_rounds_to_a_hundred_has_no_exponent() -> None:
+    assert [number(99.4, 2), number(99.96, 2), number(9.96, 2), number(0.0, 2)] == ["99", "100", "10", "0.0"]
 
 
 def test_fixed() -> None:
