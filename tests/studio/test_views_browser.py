@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import pyvista as pv
-from stored_fields import write_stored
+from stored_fields import write_outcome, write_stored
 
 from browsing import WITHOUT_WEBGL, serious_findings, until
 from limbfit import load_study
@@ -125,3 +127,28 @@ def test_without_webgl_the_views_say_so_and_the_rest_works(study, serve, open_pa
     until(lambda: load_study(study).site("1").region == "medial")
     page.keyboard.press("Alt+5")
     until(lambda: "von Mises stress" in page.locator(".player-words").inner_text())
+
+
+def test_the_answer_of_another_law_is_shown_as_it_was(study, serve, open_page):
+    """Until the study is identified anew; the buttons that do so stay, too."""
+    write_outcome(study / "results")
+    stored = study / "results" / "calibrate" / "calibration.json"
+    content = json.loads(stored.read_text())
+    found = content["stages"][-1]["parameters"]
+    for stage in content["stages"]:
+        stage["iterations"][0] |= {"parameters": found, "error_percent": 3.0}
+    content["uncertainty"]["intervals_95"] = {
+        tissue: {key: [value / 2.0, value * 2.0] for key, value in values.items()}
+        for tissue, values in found.items()
+    }
+    stored.write_text(json.dumps(content))
+    layers = '{ name = "skin", thickness_mm = 1.5 }, { name = "fat", thickness_mm = 3.0 }'
+    file = study / "study.toml"
+    file.write_text(file.read_text() + f'[material]\nlaw = "fung"\n[geometry]\nlayers = [{layers}]\n')
+    page = open_page(serve(study) + "#/identification")
+    answer = page.locator("#answer")
+    answer.get_by_text("the last calibration that was completed").wait_for()
+    rows = answer.get_by_role("table", name="Identified parameters").locator("tbody th").all_inner_texts()
+    assert rows == [f"{one} {key}" for one in ("skin", "muscle") for key in ("c (kPa)", "m", "gamma", "tau (s)")]
+    assert page.locator("#parameters .lf-chart").count() == 4
+    assert page.get_by_role("button", name="Run what is missing").is_visible()

@@ -34,7 +34,6 @@ class RunRequest(StrictModel):
 @router.get("")
 def get_identification(folder: Folder) -> dict[str, Any]:
     """The stages and their states, the current or last run, the iterates of the search, and its answer."""
-    study = folder.load()
     stages = list_stages(folder)
     calibration = CalibrationResult.find(folder.results)
     run = find_running(folder)
@@ -46,9 +45,7 @@ def get_identification(folder: Folder) -> dict[str, Any]:
         "starting": find_starting(folder) if run is None else None,
         "last": describe_last_run(folder, run is not None),
         "iterates": _collect_iterates(folder, state, calibration),
-        "parameters": list(study.law.keys),
-        "tissues": list(study.tissues),
-        "sites": [{"site": record.name, "fitted": record.fitted} for record in study.recorded],
+        "sites": [{"site": record.name, "fitted": record.fitted} for record in folder.load().recorded],
         "answer": calibration and _describe_answer(calibration) | {"state": state},
     }
 

@@ -183,7 +183,8 @@ class IdentificationView {
   }
 
   parameters(rows, x) {
-    const { parameters, tissues } = this.found;
+    // Those of the search itself: the study may have another law or other tissues by now.
+    const found = rows.at(-1).parameters, tissues = Object.keys(found), parameters = Object.keys(found[tissues[0]] ?? {});
     if (this.parameterHost.childElementCount !== parameters.length) replace(this.parameterHost, parameters.map(() => el("div", {})));
     parameters.forEach((name, k) => {
       const [symbol, unit] = parted(name);
@@ -237,19 +238,19 @@ class IdentificationView {
   // --- the answer -----------------------------------------------------------------------------------------
 
   results() {
-    const { answer, parameters, tissues } = this.found;
+    const { answer } = this.found;
     if (!answer) {
       replace(this.answer, el("p", {}, "Nothing is identified yet."));
       return;
     }
     if (this.answered === JSON.stringify(answer)) return;
     this.answered = JSON.stringify(answer);
-    const rows = tissues.flatMap((tissue) => parameters.filter((name) => answer.parameters[tissue]).map((name) => {
+    const rows = Object.entries(answer.parameters).flatMap(([tissue, values]) => Object.entries(values).map(([name, value]) => {
       const [low, high] = answer.intervals_95[tissue][name];
       const key = `${tissue}.${name}`;
       const verdict = answer.verdict[key];
       const [symbol, unit] = parted(name);
-      return [`${tissue} ${symbol}${unit ? ` (${unit})` : ""}`, shortNumber(answer.parameters[tissue][name]), `${shortNumber(low)} to ${shortNumber(high)}`,
+      return [`${tissue} ${symbol}${unit ? ` (${unit})` : ""}`, shortNumber(value), `${shortNumber(low)} to ${shortNumber(high)}`,
         el("span", { class: /^not/.test(verdict) ? "bad" : /weak/.test(verdict) ? "doubt" : "good" }, verdict), answer.at_bound[key] ? "at its bound" : ""];
     }));
     const stages = answer.stages.map((stage) => el("li", {}, `${stage.name}: ${stage.converged ? "converged" : "stopped"} after ${stage.evaluations} evaluations, ${stage.reason}`));
