@@ -23,7 +23,7 @@ from limbfit.report.sections.prediction import make_site_table
 from limbfit.report.store import load_store
 from limbfit.report.words import write_words
 from limbfit.results.models import ModelsResult
-from limbfit.results.runs import RunResult, SimulateResult
+from limbfit.results.runs import CompareResult, RunResult, SimulateResult
 from limbfit.results.uncertainty import RegionsResult
 from limbfit.results.variants import StiffnessResult
 
@@ -303,6 +303,27 @@ def test_other_models_are_left_out_once_the_study_was_identified_anew(copy, tmp_
     page = build_report(copy, tmp_path / "out").read_text(encoding="utf-8")
     assert '<section id="models"' not in page
     assert "limbfit uncertainty --models” are left out" in page
+
+
+def test_simulations_with_identified_parameters_are_left_out_once_others_are_identified(copy, tmp_path):
+    calibration = json.loads((copy / "calibrate" / "calibration.json").read_text())
+    identified = calibration["stages"][-1]["parameters"]
+    for model, verb, names in (
+        (SimulateResult, "simulate", ("PT-1", "TI-2")),
+        (CompareResult, "compare", ("PT-1",)),
+    ):
+        (copy / verb).mkdir()
+        for name, origin in zip(names, ("identified", "given"), strict=False):
+            row = complete(model, {"site": name, "parameters_from": origin, "parameters": identified})
+            (copy / verb / f"{name}.json").write_text(json.dumps(row))
+    assert [row.site for row in load_store(copy).simulated] == ["PT-1", "TI-2"]
+    identified["skin"]["c_kPa"] *= 1.001
+    (copy / "calibrate" / "calibration.json").write_text(json.dumps(calibration))
+    store = load_store(copy)
+    assert ([row.site for row in store.simulated], store.compared) == (["TI-2"], ())
+    page = build_report(copy, tmp_path / "out").read_text(encoding="utf-8")
+    for verb in ("simulate", "compare"):
+        assert f"limbfit {verb} --site PT-1” are left out" in page
 
 
 def test_a_report_is_stale_once_other_models_were_weighed(study):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 from fastapi.testclient import TestClient
 from stored_fields import block, fields, write_outcome, write_stored
 
+from completing import complete
+from limbfit.results.runs import SimulateResult
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import AccessGuard
 from limbfit.studio.processes import find_simulating
@@ -40,6 +43,14 @@ def test_what_can_be_played_is_told_with_its_times(page, study):
     curve = study / "results" / "simulate" / "1.csv"
     curve.write_text("time_s,displacement_mm,force_N\n0,0,0\n0.9,5,6\n1.5,1,0\n")
     assert page.get("/api/results/site/1").json()["sources"][0]["deepest"] == 2
+
+
+def test_steps_of_parameters_that_were_identified_before_are_told_as_such(page, study):
+    stored = {"site": "1", "parameters": {"skin": {"c_kPa": 9.0}}, "parameters_from": "identified"}
+    file = study / "results" / "simulate" / "1.json"
+    file.write_text(json.dumps(complete(SimulateResult, stored)))
+    played, _ = page.get("/api/results/site/1").json()["sources"]
+    assert played["parameters_from"] == "identified, before the study was identified anew"
 
 
 @pytest.mark.parametrize("name", [*FIELDS])

@@ -23,7 +23,7 @@ from ..results.identification import (
 from ..results.limb import MeshMeasures, MeshResult, PlacedSite, SegmentResult, SitesResult, SurfacesResult
 from ..results.models import ModelsResult
 from ..results.records import TraceFacts, TracesResult
-from ..results.runs import CompareResult, RunResult, SimulateResult
+from ..results.runs import CompareResult, RunResult, SimulateResult, is_current
 from ..results.socket import SocketResult
 from ..results.study_results import MODELS
 from .formats import format_fixed, format_symbol
@@ -210,6 +210,10 @@ def load_store(results: Path) -> Results:
     if models and not (calibration and models.models[0].parameters == calibration.parameters):
         models = None
         outdated.append("uncertainty --models")
+    simulated, compared = SimulateResult.find_all(results), CompareResult.find_all(results)
+    for verb, rows in (("simulate", simulated), ("compare", compared)):
+        for name in [name for name, row in rows.items() if not is_current(row, calibration)]:
+            outdated.append(f"{verb} --site {rows.pop(name).site}")
     return Results(
         folder=results,
         run=run,
@@ -221,8 +225,8 @@ def load_store(results: Path) -> Results:
         mesh=mesh.sites if mesh else {},
         calibration=calibration,
         predict=PredictResult.find(results),
-        simulated=tuple(SimulateResult.find_all(results).values()),
-        compared=tuple(CompareResult.find_all(results).values()),
+        simulated=tuple(simulated.values()),
+        compared=tuple(compared.values()),
         truth=_read_json(results / "truth.json"),
         experiments={name: _read_experiment(results, name) for name in done},
         outdated=tuple(outdated),

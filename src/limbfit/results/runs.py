@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from pydantic import ConfigDict, Field
 
 from .base import Parameters, ResultPart, StoredResult
-from .identification import OutsideRecords
+from .identification import CalibrationResult, OutsideRecords
 
 
 class StudyName(ResultPart):
@@ -169,3 +169,10 @@ class CompareResult(StoredResult):
     limbfit_matched: LimbfitSimulation = Field(description="limbfit with FEBio's steps and penalty.")
     febio_log: str | None = Field(description="FEBio's table of forces, where it was given.")
     files: CurveFiles = Field(description="Files of the comparison.")
+
+
+def is_current(row: SimulateResult | CompareResult, calibration: CalibrationResult | None) -> bool:
+    """False where it was simulated with identified parameters, and others (or none) are identified now."""
+    if row.parameters_from != "identified":
+        return True
+    return calibration is not None and row.parameters == calibration.parameters

@@ -22,7 +22,7 @@ from ..pipeline.commands.export import export_study
 from ..pipeline.engine.storage import read_json, write_json
 from ..results.curves import read_curves
 from ..results.identification import CalibrationResult, PredictResult
-from ..results.runs import SimulateResult
+from ..results.runs import SimulateResult, is_current
 from ..study import Record
 from ..web.shapes import to_volume_shape
 from . import processes
@@ -244,13 +244,16 @@ def _list_sources(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
     if moments:
         times_s = [time for time, _ in moments]
         simulated = SimulateResult.find(folder.results, site)
+        of = simulated and simulated.parameters_from
+        if simulated and not is_current(simulated, CalibrationResult.find(folder.results)):
+            of = f"{of}, before the study was identified anew"
         sources.append(
             {
                 "source": "simulate",
                 "title": "every step, simulated",
                 "times_s": times_s,
                 "deepest": _find_deepest(folder, site, times_s),
-                "parameters_from": simulated and simulated.parameters_from,
+                "parameters_from": of,
                 "mark": compute_fingerprint(file for _, file in moments),
             }
         )

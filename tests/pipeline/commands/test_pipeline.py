@@ -135,8 +135,12 @@ def test_planned_indentation_is_simulated_without_a_record(coarse):
     file = coarse / "study.toml"
     planned = "depth_mm = 3.0\nposition = [0.0, 40.0, 50.0]"
     file.write_text(file.read_text().replace('trace = "2.csv"\nposition = [0.0, 40.0, 50.0]', planned))
+    steps = coarse / "results/simulate/2.pvd"  # of an animation that was made before
+    steps.parent.mkdir(parents=True)
+    steps.write_text("")
     found = simulate_site(load_study(coarse), "2", parameters=None, listener=quiet)
     assert found["completed"]
+    assert not steps.exists()
     assert found["depth_mm"] == 3.0
     assert found["parameters_from"] == "start of the study"
     assert found["penetration_mm"] <= 0.0101 * 3.0

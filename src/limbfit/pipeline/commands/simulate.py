@@ -97,8 +97,9 @@ def simulate_site(
     folder.mkdir(exist_ok=True)
     context.tell("simulate", 0, 1, f"site {name}")
     played = folder / f"{name}.pvd" if animation else None
+    for kind in ("json", "csv", "vtu", "pvd"):
+        (folder / f"{name}.{kind}").unlink(missing_ok=True)  # that of another simulation
     if program is not None:
-        (folder / f"{name}.vtu").unlink(missing_ok=True)  # that of another simulation
         result, fields = run_febio_site(found, program, folder / f"{name}.febio")
     else:
         fields = folder / f"{name}.vtu"
