@@ -16,6 +16,7 @@ import typer
 from limbfit import __version__
 from limbfit.cli.app import GROUPS, app
 from limbfit.cli.commands import show_summary
+from limbfit.cli.console import print_line, print_table
 
 HEADER = "time_s,displacement_mm,force_N"
 
@@ -352,6 +353,21 @@ def test_a_run_that_ends_with_the_calibration_shows_the_parameters(capsys):
     values = {"c_kPa": 6.5, "m": 7.0, "gamma": 2.5, "tau_s": 0.5}
     show_summary({"parameters": {"skin": values}, "until": "calibrate", "results": "results"}, as_json=False)
     assert "skin, identified" in capsys.readouterr().out
+
+
+def test_a_table_in_a_file_cuts_no_name(capsys):
+    """It was cut at 80 characters, and two parameters of a tissue looked alike."""
+    names = [f"the_deep_compartment_of_the_calf.{name}" for name in ("gamma1", "gamma2")]
+    rows = [{"name": name, "interval": "0.000123 to 12.3", "verdict": "not determined"} for name in names]
+    columns = {"parameter": "name", "95 % by the records": "interval", "with all sources": "interval"}
+    print_table(rows, {**columns, "verdict": "verdict"})
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["parameter", *names]
+
+
+def test_text_that_looks_like_a_symbol_stays_text(capsys):
+    print_line("results in studies:x:2/results")
+    assert capsys.readouterr().out == "results in studies:x:2/results\n"
 
 
 def test_letters_that_the_output_cannot_show_end_no_command(study):

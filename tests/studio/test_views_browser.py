@@ -149,6 +149,8 @@ def test_the_answer_of_another_law_is_shown_as_it_was(study, serve, open_page):
     answer = page.locator("#answer")
     answer.get_by_text("the last calibration that was completed").wait_for()
     rows = answer.get_by_role("table", name="Identified parameters").locator("tbody th").all_inner_texts()
-    assert rows == [f"{one} {key}" for one in ("skin", "muscle") for key in ("c (kPa)", "m", "gamma", "tau (s)")]
+    assert rows == [
+        f"{one} {key}" for one in ("skin", "muscle") for key in ("c (kPa)", "m", "gamma", "tau (s)")
+    ]
     assert page.locator("#parameters .lf-chart").count() == 4
     assert page.get_by_role("button", name="Run what is missing").is_visible()

@@ -35,8 +35,9 @@ from ..laws import split_key
 INTERRUPTED = "interrupted; run the same command again to continue"
 HEARING_TIME_S = 3.0  # for an interrupt to be heard
 CLEARING_TIME_S = 15.0  # for what heard it to end its workers and files
-STDOUT = Console(highlight=False, markup=False)
-STDERR = Console(stderr=True, highlight=False, markup=False)
+STDOUT = Console(highlight=False, markup=False, emoji=False)
+STDERR = Console(stderr=True, highlight=False, markup=False, emoji=False)
+FILE_WIDTH = 10_000  # characters
 Column = str | tuple[str, str] | Callable[[Any], str]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
 
@@ -88,11 +89,15 @@ def print_table(
     """Print rows as a table of columns by their heads, each with what stands below it.
 
     A column is an attribute or key of the rows, one with a format, or a function of the row. A value that is
-    not there is a ``dash``. The cells of ``unwrapped`` columns stay on one line.
+    not there is a ``dash``. The cells of ``unwrapped`` columns stay on one line, as all do in a file or a pipe.
     """
+    if not STDOUT.is_terminal:
+        STDOUT.width = FILE_WIDTH
     table = Table(box=None)
     for head in columns:
-        table.add_column(head, no_wrap=head in unwrapped)
+        table.add_column(
+            head, no_wrap=head in unwrapped, overflow="ellipsis" if head in unwrapped else "fold"
+        )
     for row in rows:
         table.add_row(*(_format_cell(row, column, dash) for column in columns.values()))
     STDOUT.print(table)
