@@ -19,6 +19,7 @@ from stored_results import SITES, write_results
 from limbfit.report import build_report
 from limbfit.report.sections.methods import write_method_parts
 from limbfit.report.store import load_store
+from limbfit.report.words import write_words
 from unpacking import unpack
 
 
@@ -230,6 +231,24 @@ def methods_of(results: Path, **settings: object) -> str:
     store = load_store(results)
     run = store.run.model_copy(update={"settings": {**store.run.settings, **settings}})
     return "\n".join(text for _, text in write_method_parts(replace(store, run=run)))
+
+
+def test_methods_count_one_in_the_singular(results):
+    store = load_store(results)
+    (name, facts), *_ = store.traces.items()
+    held = next(row for row in store.predicted if not row.fitted)
+    stages = [stage.model_copy(update={"evaluations": 1}) for stage in store.stages]
+    found = store.calibration.model_copy(update={"stages": stages})
+    predict = store.predict.model_copy(update={"sites": [held]})
+    segment = store.segment.model_copy(update={"repairs": ["one"]})
+    alone = [store.placed_sites[facts.site].model_copy(update={"fitted": True})]
+    facts = {"traces": {name: facts}, "sites": alone, "predict": predict, "calibration": found}
+    told = "\n".join(text for _, text in write_method_parts(replace(store, segment=segment, **facts)))
+    for words in ("1 repair was made", "1 site has a record of", "1 was fitted (", "at 1 held-out site ("):
+        assert words in told
+    assert "converged after 1 evaluation (" in told
+    words = write_words("end of a stage", stage=stages[0].model_copy(update={"iterations": [None]}))
+    assert "converged after 1 iterate and 1 evaluation; " in words
 
 
 def test_methods_say_what_moved_the_limb_before(results):

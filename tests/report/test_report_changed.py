@@ -16,6 +16,7 @@ from limbfit import compress_cube, load_study
 from limbfit.errors import InputError
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.report import build_report
+from limbfit.report.drawing.interactive import _describe_site
 from limbfit.report.page import Prose
 from limbfit.report.sections.contents import build_summary
 from limbfit.report.sections.other_fits import make_error_table
@@ -222,6 +223,12 @@ def test_only_a_law_with_m_is_compared_at_equal_m(equal_m: float | None) -> None
     assert [" m" in text for text in words] == [equal_m is not None] * 2
 
 
+def describe_sites(results: Path) -> str:
+    """What the picture of the limb says of its sites, as JSON."""
+    store = load_store(results)
+    return json.dumps([_describe_site(store, row) for row in store.sites], separators=(",", ":"))
+
+
 def test_records_under_a_stated_force_have_errors_of_displacement(copy: Path) -> None:
     file = copy / "predict" / "predict.json"
     content = json.loads(file.read_text())
@@ -234,6 +241,7 @@ def test_records_under_a_stated_force_have_errors_of_displacement(copy: Path) ->
     assert "divided by the largest measured displacement" in prediction
     assert "largest force, by phase" not in prediction
     assert "mean absolute displacement difference over the trace" in section_of(text, "method")
+    assert '"compared":"displacement"' in describe_sites(copy)
 
 
 def test_indentations_without_records(copy: Path) -> None:

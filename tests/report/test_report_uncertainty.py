@@ -6,8 +6,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from stored_results import write_results
 
-from limbfit.report.sections.uncertainty import _describe_profile, _draw_profile, draw_profile_figure
+from completing import complete
+from limbfit.report.sections.uncertainty import _draw_profile, draw_profile_figure
 from limbfit.report.store import load_store
+from limbfit.report.words import write_columns
 from limbfit.results.uncertainty import (
     LikelihoodProfile,
     ParameterUncertainty,
@@ -61,11 +63,14 @@ def test_the_figure_of_profiles_says_what_dashes_mean_and_what_the_solver_said(t
 
 def test_the_table_names_the_ends_that_are_extrapolated():
     def describe(verdict: str | None, ends: tuple[bool, bool] | None) -> str:
-        row = ParameterUncertainty.model_construct(profile_verdict=verdict, profile_extrapolated=ends)
-        return _describe_profile(row)
+        stated = {"profile_verdict": verdict, "profile_extrapolated": ends}
+        row = complete(ParameterUncertainty, stated)
+        columns = write_columns("table uncertainty-parameters", row=ParameterUncertainty(**row))
+        return next(text for head, _, text, _ in columns if head == "Profile says")
 
     assert (
         describe("determined on one side", (False, True)) == "determined on one side; high end extrapolated"
     )
     assert describe("determined on one side", (False, False)) == "determined on one side"
+    assert describe("open", (True, True)) == "open; low and high ends extrapolated"
     assert describe(None, None) == "–"

@@ -89,7 +89,7 @@ def print_table(
     """Print rows as a table of columns by their heads, each with what stands below it.
 
     A column is an attribute or key of the rows, one with a format, or a function of the row. A value that is
-    not there is a ``dash``. The cells of ``unwrapped`` columns stay on one line, as all do in a file or a pipe.
+    not there is a ``dash``. Cells of ``unwrapped`` columns stay on one line, in files and pipes all do.
     """
     if not STDOUT.is_terminal:
         STDOUT.width = FILE_WIDTH

@@ -73,9 +73,8 @@ class Results:
 
     @property
     def compared_quantity(self) -> str:
-        """What records compare: ``force``, ``displacement`` where they state the force, or either."""
-        forced = [row.control == "force" for row in self.predicted]
-        return "force" if not any(forced) else "displacement" if all(forced) else "force or displacement"
+        """What the records compare: see `name_compared`."""
+        return name_compared(self.predicted)
 
     def records_of(self, site: str) -> tuple[str, ...]:
         """Names of the records of a site that are stored."""
@@ -183,6 +182,12 @@ class Results:
         """The mesh or fields of a site; of several records' fields the first."""
         files = (self.folder / stage / f"{name}.vtu" for name in (site, *self.records_of(site)))
         return next((file for file in files if file.is_file()), None)
+
+
+def name_compared(rows: Sequence[RecordPrediction]) -> str:
+    """What records compare: ``force``, ``displacement`` where they state the force, or either."""
+    forced = [row.control == "force" for row in rows]
+    return "force" if not any(forced) else "displacement" if all(forced) else "force or displacement"
 
 
 def find_compared_quantity(curves: Curves) -> tuple[str, str]:

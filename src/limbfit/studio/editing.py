@@ -66,7 +66,7 @@ def set_site(file: Path, site: str, values: Mapping[str, Any]) -> None:
     A new place removes ``near``: a site has one of them. Its ``[[records]]`` follow a new name.
     """
     with edit_study(file) as document:
-        _assign(_find_site(document, site, file), values)
+        _assign(_find(document.get("sites", []), site, file, "sites"), values)
         for table in document.get("records", []):
             if table["site"] == site:
                 table["site"] = values.get("name", site)
@@ -95,7 +95,7 @@ def add_site(file: Path, name: str, position: Sequence[float], values: Mapping[s
 def remove_site(file: Path, name: str) -> None:
     """Take a site out of the study; its record stays where it is."""
     with edit_study(file) as document:
-        document["sites"].remove(_find_site(document, name, file))
+        document["sites"].remove(_find(document.get("sites", []), name, file, "sites"))
 
 
 def set_area(file: Path, name: str, values: Mapping[str, Any]) -> None:
@@ -113,10 +113,7 @@ def remove_area(file: Path, name: str) -> None:
     """Take an area out of the study file. Raises `StudyError` where there is none of that name."""
     with edit_study(file) as document:
         rows = document.get("socket", {}).get("areas", [])
-        area = _find_named(rows, name)
-        if area is None:
-            raise StudyError(f"no area is named {name!r}", file=file, place="socket.areas")
-        rows.remove(area)
+        rows.remove(_find(rows, name, file, "socket.areas"))
 
 
 def set_trimline(file: Path, points: Sequence[Sequence[float]] | None) -> None:
@@ -131,11 +128,14 @@ def set_trimline(file: Path, points: Sequence[Sequence[float]] | None) -> None:
             table["trimline"] = rows.multiline(True)
 
 
-def _find_site(document: tomlkit.TOMLDocument, name: str, file: Path) -> Any:
-    site = _find_named(document.get("sites", []), name)
-    if site is None:
-        raise StudyError(f"no site is named {name!r}", file=file, place="sites")
-    return site
+def _find(rows: Any, name: str, file: Path, place: str) -> Any:
+    """The table of this name in the list at ``place``. Raises `StudyError` where there is none."""
+    found = _find_named(rows, name)
+    if found is None:
+        raise StudyError(
+            f"no {place.split('.')[-1].removesuffix('s')} is named {name!r}", file=file, place=place
+        )
+    return found
 
 
 def _find_named(rows: Any, name: str) -> Any:

@@ -34,7 +34,7 @@ class RunRequest(StrictModel):
 @router.get("")
 def get_identification(folder: Folder) -> dict[str, Any]:
     """The stages and their states, the current or last run, the iterates of the search, and its answer."""
-    stages = list_stages(folder)
+    recorded, stages = folder.load().recorded, list_stages(folder)
     calibration = CalibrationResult.find(folder.results)
     run = find_running(folder)
     state = next(row["state"] for row in stages if row["stage"] == "calibrate")
@@ -45,7 +45,7 @@ def get_identification(folder: Folder) -> dict[str, Any]:
         "starting": find_starting(folder) if run is None else None,
         "last": describe_last_run(folder, run is not None),
         "iterates": _collect_iterates(folder, state, calibration),
-        "sites": [{"site": record.name, "fitted": record.fitted} for record in folder.load().recorded],
+        "sites": [{"site": one.name, "fitted": one.fitted, "forced": one.forced} for one in recorded],
         "answer": calibration and _describe_answer(calibration) | {"state": state},
     }
 

@@ -23,7 +23,7 @@ from ...web.arrays import pack
 from ...web.shapes import extract_interface, read_shell, to_shell, to_volume_shape
 from ..formats import format_symbol, get_unit
 from ..page import Interactive
-from ..store import Curves, Json, Results
+from ..store import Curves, Json, Results, name_compared
 from ..words import write_words
 from .pictures import (
     FITTED,
@@ -99,8 +99,8 @@ def _read_layers(store: Results) -> Iterable[tuple[str, Any]]:
 
 def _describe_site(store: Results, row: PlacedSite) -> Json:
     axis = np.asarray(row.axis, dtype=float)
-    known = [one.error_percent for one in store.predicted if one.site == row.site]
-    errors = [error for error in known if error is not None]
+    rows = [one for one in store.predicted if one.site == row.site]
+    errors = [one.error_percent for one in rows if one.error_percent is not None]
     return {
         "name": row.site,
         "region": row.region or "",
@@ -109,6 +109,7 @@ def _describe_site(store: Results, row: PlacedSite) -> Json:
         "axis": (axis / np.linalg.norm(axis)).tolist(),
         "colour": FITTED if row.fitted else HELD_OUT,
         "error_percent": statistics.fmean(errors) if errors else None,
+        "compared": name_compared(rows),
     }
 
 

@@ -7,10 +7,10 @@ from statistics import fmean
 from typing import Any
 
 from ...extensions import Registry
-from ..formats import format_limits, format_symbol, label, number
+from ..formats import label, number
 from ..page import Block, KeyNumber, Note, Page, Section, make_bullets, make_section
 from ..store import Results
-from ..words import make_prose
+from ..words import make_prose, write_words
 from .cube import make_cube_section
 from .design import make_design_section, make_protocol_section
 from .identification import make_convergence_section, make_parameter_section
@@ -42,10 +42,6 @@ _OWN: dict[str, Maker] = {
 SECTIONS = Registry("report section", _OWN)
 
 _RANKS = {"determined": 0, "weakly": 1, "not": 2}
-PRIVACY = (
-    "This report holds no name, date of birth or other identity from the images. It does show the shape of "
-    "a limb and how it responds, which is health data: handle it as the study's consent allows."
-)
 
 
 def make_page(store: Results) -> Page:
@@ -71,14 +67,13 @@ def make_page(store: Results) -> Page:
         make_settings_section(store),
         make_provenance_section(store),
     )
-    version = run.limbfit if run else "of an unknown version"
     return Page(
         title=run.study.name if run else "Unnamed study",
         subtitle=run.study.description if run else "",
         key_numbers=list_key_numbers(store),
         summary=build_summary(store),
         sections=tuple(section for section in sections if section is not None),
-        footer=f"Made by limbfit {version} from stored results. {PRIVACY}",
+        footer=write_words("footer", run=run),
     )
 
 
@@ -90,16 +85,9 @@ def _list_experiment_sections(store: Results) -> tuple[Section, ...]:
         if (one := store.experiments.get(name)) is not None
     ]
     if store.outdated:
-        found.append(make_section("outdated", "Left out", map(_describe_outdated, store.outdated)))
+        notes = (Note(write_words("outdated", experiment=name)) for name in store.outdated)
+        found.append(make_section("outdated", "Left out", notes))
     return tuple(found)
-
-
-def _describe_outdated(name: str) -> Note:
-    verb = name.replace("sensitivity-", "sensitivity --only ").replace("socket_design", "socket design")
-    return Note(
-        f"The stored results of “limbfit {verb}” are left out: they were made from other inputs, settings or "
-        "code. Run it again to see them here."
-    )
 
 
 def list_key_numbers(store: Results) -> tuple[KeyNumber, ...]:
@@ -109,21 +97,16 @@ def list_key_numbers(store: Results) -> tuple[KeyNumber, ...]:
         error = f"mean {store.compared_quantity} error at the"
         found.append(KeyNumber(store.mean_error("heldout"), "%", f"{error} held-out sites"))
         found.append(KeyNumber(store.mean_error("fitted"), "%", f"{error} fitted sites"))
+    first = next(p for p in store.law.parameters if p.key == store.law.moduli[0])
     for tissue in store.tissues:
-        modulus = number(store.stages[-1].parameters[tissue][store.law.moduli[0]])
-        found.append(KeyNumber(modulus, "kPa", _label_modulus(store, tissue)))
+        facts = {"tissue": tissue, "modulus": first, "interval": store.interval(tissue, first.key)}
+        modulus = number(store.stages[-1].parameters[tissue][first.key])
+        found.append(KeyNumber(modulus, "kPa", write_words("modulus", **facts)))
     seconds = [stage.seconds for stage in store.run.stages.values()] if store.run else []
     if seconds:
         size, unit = (1, "s") if sum(seconds) < 120 else (60, "min")
         found.append(KeyNumber(f"{sum(seconds) / size:.0f}", unit, "computing time, all stages"))
     return tuple(found)
-
-
-def _label_modulus(store: Results, tissue: str) -> str:
-    first = next(p for p in store.law.parameters if p.key == store.law.moduli[0])
-    interval = store.interval(tissue, first.key)
-    text = f"{tissue}, {first.words} {format_symbol(first.key)}"
-    return f"{text} ({format_limits(interval)} kPa)" if interval else text
 
 
 def build_summary(store: Results) -> tuple[Block, ...]:

@@ -82,20 +82,14 @@ def _describe_combinations(store: Results) -> tuple[Block | None, ...]:
 
 def make_convergence_section(store: Results) -> Section:
     """How the identification went."""
-    stages = store.stages
-    texts = (
-        f"{stage.name.capitalize()}: {'' if stage.converged else 'not '}converged after "
-        f"{len(stage.iterations)} iterates and {stage.evaluations} evaluations; {stage.reason}."
-        for stage in stages
-    )
     return make_section(
         "convergence",
         "Convergence of the identification",
-        make_bullets(texts),
+        make_bullets(write_words("end of a stage", stage=stage) for stage in store.stages),
         draw_convergence_figure(store),
         draw_convergence_curves(store),
         describe_search(store),
-        (make_iteration_table(store, stage) for stage in stages if stage.iterations),
+        (make_iteration_table(store, stage) for stage in store.stages if stage.iterations),
         otherwise="No identification is stored yet.",
     )
 

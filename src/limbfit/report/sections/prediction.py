@@ -10,7 +10,7 @@ from ..drawing.pictures import draw_field_figure
 from ..formats import NOTHING, format_fixed
 from ..page import Note, Row, Section, Table, make_section
 from ..store import Results
-from ..words import make_prose, make_row, make_table, to_numeric
+from ..words import make_prose, make_row, make_table, to_numeric, write_words
 
 
 def make_fit_section(store: Results) -> Section:
@@ -32,7 +32,6 @@ def make_prediction_section(store: Results) -> Section:
     """Everything about the sites that were not used, and table 2."""
     rows = [row for row in store.predicted if not row.fitted]
     quality = store.predict.fit_quality if store.predict else None
-    unseen = "Every site was fitted, so nothing tests the model on unseen data."
     return make_section(
         "prediction",
         "All sites, held-out sites",
@@ -49,7 +48,7 @@ def make_prediction_section(store: Results) -> Section:
         figures.draw_wave_figure(store, fitted=False),
         figures.draw_skin_figure(store, fitted=False),
         make_observed_table(store),
-        Note(unseen) if store.predicted and not rows else None,
+        Note(write_words("unseen")) if store.predicted and not rows else None,
         otherwise="No predictions are stored yet.",
     )
 
@@ -63,14 +62,13 @@ def make_domain_section(store: Results) -> Section:
         predicted += [(f"socket, {name}", one.outside_records or ()) for name, one in states]
     rows = [(record, row) for record, outside in predicted for row in outside]
     told = (*(store.predict.outside_text if store.predict else ()), *(socket.outside_text if socket else ()))
-    within = "Every prediction lies within what the fitted records did to the tissue."
     return make_section(
         "domain",
         "Where the answer ends",
         make_prose("domain"),
         map(Note, told),
         figures.draw_domain_figure(store),
-        make_table("outside-records", rows) if rows else Note(within),
+        make_table("outside-records", rows) if rows else Note(write_words("within")),
     )
 
 

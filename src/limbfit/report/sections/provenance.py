@@ -5,25 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from ..formats import NOTHING, format_duration, format_fixed
-from ..page import Prose, Section, Table, make_section
+from ..formats import NOTHING, format_duration
+from ..page import Section, Table, make_section
 from ..store import Results
-from ..words import make_row, make_table, to_numeric, write_words
+from ..words import make_prose, make_row, make_table, to_numeric, write_words
 
 
 def make_timing_section(store: Results) -> Section:
     """How long it took, and on what."""
     if store.run is None:
         return make_section("timing", "Computing time", otherwise="No times are stored.")
-    machine, stages = store.run.machine, store.run.stages
+    stages = store.run.stages
     seconds = [stage.seconds for stage in stages.values()]
     total = make_row("Total", to_numeric(format_duration(sum(seconds))), "")
-    memory = "" if machine.memory_GB is None else f"{format_fixed(machine.memory_GB)} GB of memory, "
     return make_section(
         "timing",
         "Computing time",
         make_table("timing", stages.items(), foot=(total,), longest=max([*seconds, 1e-9])),
-        Prose(f"Machine: {machine.cores} cores, {memory}Python {machine.python}."),
+        make_prose("machine", machine=store.run.machine),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ...results.identification import MeshCorrectionRound, RecordPrediction
+from ...results.identification import RecordPrediction
 from ...results.runs import SimulateResult
 from ..drawing.colours import MEASURED, SIMULATED, TRUTH
 from ..drawing.figures import draw_simulated_figure
@@ -12,7 +12,7 @@ from ..drawing.pictures import draw_field_figure
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..page import Bullets, Figure, Note, Section, make_bullets, make_section
 from ..store import Results
-from ..words import make_prose, make_table
+from ..words import make_prose, make_table, write_words
 from .provenance import make_pair_table
 
 
@@ -69,12 +69,12 @@ def make_solver_section(store: Results) -> Section:
         "Objective": found.objective,
         "Forward simulations of the identification": found.forward_runs,
         "Of them with derivatives": found.forward_runs_with_sensitivities,
-        "Corrections of the search by the whole meshes": _describe_corrections(found.corrections),
+        "Corrections of the search by the whole meshes": write_words("corrections", rounds=found.corrections),
         "Starts": found.multistart and found.multistart.summary,
         "Linear solver": found.linear_solver,
         "Element": found.element,
     }
-    known = {key: value for key, value in (facts or {}).items() if value is not None}
+    known = {key: value for key, value in (facts or {}).items() if value not in (None, "")}
     failed = ", ".join(row.record for row in store.predicted if not row.completed)
     return make_section(
         "solver",
@@ -85,14 +85,3 @@ def make_solver_section(store: Results) -> Section:
         make_pair_table("solver-facts", ("Fact", "Value"), known),
         otherwise="No simulations are stored yet.",
     )
-
-
-def _describe_corrections(rounds: Sequence[MeshCorrectionRound]) -> str | None:
-    """How many, and what the last one changed."""
-    if not rounds:
-        return None
-    last = rounds[-1]
-    if last.reason:
-        return f"{len(rounds)}; the last failed: {last.reason}"
-    left = max(change or 0.0 for change in last.change_percent_by_site.values())
-    return f"{len(rounds)}; the last changed no force by more than {left:.2g} % of its largest"

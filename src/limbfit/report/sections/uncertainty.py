@@ -11,11 +11,11 @@ from matplotlib.figure import Figure as Drawing
 from matplotlib.ticker import MaxNLocator
 
 from ...results.models import ModelsResult
-from ...results.uncertainty import LikelihoodProfile, ParameterUncertainty, UncertaintyResult
+from ...results.uncertainty import LikelihoodProfile, UncertaintyResult
 from ..drawing import plots
 from ..drawing.colours import INK, MEASURED, MUTED, SIMULATED, choose_truth_style
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
-from ..formats import NOTHING, format_fixed, label
+from ..formats import format_fixed, label
 from ..page import Bullets, Figure, Note, Prose, Section, Table, make_section
 from ..store import Curves, Results, find_compared_quantity
 from ..words import make_prose, make_table, write_words
@@ -33,7 +33,7 @@ def make_uncertainty_section(store: Results, content: UncertaintyResult) -> Sect
         "What the records determine",
         Bullets(tuple(content.verdict)),
         make_prose("uncertainty", residuals=content.residuals),
-        make_table("uncertainty-parameters", content.parameters, describe_profile=_describe_profile),
+        make_table("uncertainty-parameters", content.parameters),
         make_table("uncertainty-combinations", content.combinations, headed=False),
         draw_profile_figure(store, content),
         draw_pairs_figure(store, content),
@@ -43,16 +43,6 @@ def make_uncertainty_section(store: Results, content: UncertaintyResult) -> Sect
         make_table("uncertainty-predictions", found.sites, marked="fitted", found=found),
         Prose(emulator) if content.emulator.good_enough else Note(emulator),
     )
-
-
-def _describe_profile(row: ParameterUncertainty) -> str:
-    """What a profile says, and which of its ends rest on an emulator beyond its simulations."""
-    if row.profile_verdict is None:
-        return NOTHING
-    low, high = row.profile_extrapolated or (False, False)
-    ends = [word for word, beyond in (("low", low), ("high", high)) if beyond]
-    where = f"; {' and '.join(ends)} end extrapolated" if ends else ""
-    return f"{row.profile_verdict}{where}"
 
 
 @plots.styled

@@ -109,7 +109,7 @@ class Explorer {
     if (!known) this.field.list.value = "";
     this.viewer.setSites(this.facts.sites.map((site) => ({ ...site, filled: site.fitted, chosen: site.name === name })));
     const site = this.facts.sites.find((one) => one.name === name);
-    const error = site.error_percent === null ? "" : ` Force error ${shortNumber(site.error_percent)} %.`;
+    const error = site.error_percent === null ? "" : ` Error of the ${site.compared} ${shortNumber(site.error_percent)} %.`;
     this.words.textContent = `Site ${name}${site.region ? `, ${site.region}` : ""}: ${site.fitted ? "fitted" : "held out"}.${error}` +
       (known ? "" : " No field is stored for it.");
     if (asked && !this.shownField()) this.viewer.view.lookAlong(site.axis);

@@ -167,9 +167,10 @@ class IdentificationView {
 
   convergence() {
     const { rows, of } = this.found.iterates;
-    const last = rows.at(-1);
+    const last = rows.at(-1), forced = this.found.sites.filter((row) => row.fitted).map((row) => row.forced);
+    const quantity = !forced.includes(true) ? "force" : forced.includes(false) ? "force or displacement" : "displacement";
     this.errorNote.textContent = !last ? "No search yet." :
-      `${of === "log" ? "As the log tells it: " : ""}${last.of}, ${rows.length} iterates, mean force error ${last.error_percent.toFixed(2)} % of the largest force.`;
+      `${of === "log" ? "As the log tells it: " : ""}${last.of}, ${rows.length} iterates, mean error ${last.error_percent.toFixed(2)} % of the largest ${quantity}.`;
     if (!last) return;
     const x = rows.map((_, i) => i);
     const sites = Object.keys(last.error_percent_by_site).sort((a, b) => a.localeCompare(b, "en", { numeric: true }));
@@ -177,8 +178,8 @@ class IdentificationView {
     const series = [{ label: "mean of the fitted sites", colour: "--simulated", width: 3, points: true, x, y: rows.map((row) => row.error_percent) },
       ...sites.map((site, i) => ({ label: many ? "" : `site ${site}`, colour: many ? "--muted" : LOOKS[(i + 1) % 4][0], dash: ["dashed", "dotted", "dashdot"][i % 3], width: 1.2,
         x, y: rows.map((row) => row.error_percent_by_site[site]) }))];
-    this.plot("error", this.errorHost, { label: "Force error of the fitted sites over the iterates.", x: { title: "Iterate", unit: "" },
-      y: { title: "Force error", unit: "%", log: true }, series }, 250);
+    this.plot("error", this.errorHost, { label: `Error of the ${quantity} at the fitted sites over the iterates.`, x: { title: "Iterate", unit: "" },
+      y: { title: `Error of the ${quantity}`, unit: "%", log: true }, series }, 250);
     this.parameters(rows, x);
   }
 

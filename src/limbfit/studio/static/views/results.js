@@ -230,7 +230,7 @@ class ResultsView {
     for (const [kind, text] of [["fitted", "mean, fitted"], ["heldout", "mean, held out"]]) {
       rows.push([text, "", "", "", "", mean(means, kind), ...(this.beside ? [mean(this.beside.means, kind)] : [])]);
     }
-    return table(["site", "region", "use", "largest force (N)", "error, one material (%)", "error (%)", ...(this.beside ? [`error, ${this.other} (%)`] : [])], rows, "Force error of each site");
+    return table(["site", "region", "use", "largest force (N)", "error, one material (%)", "error (%)", ...(this.beside ? [`error, ${this.other} (%)`] : [])], rows, "Error of each site, of the largest measured value (of the force, or of the displacement under a stated force)");
   }
 
   parameterTable() {
