@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from queue import SimpleQueue
+
 import numpy as np
 import pytest
 from in_process import FAST, Bench, settings
 
-from limbfit.acquire.events import Abort, Signal
+from limbfit.acquire.events import Abort, Sample, Signal
+from limbfit.acquire.operator import NoOperator
 from limbfit.acquire.protocol import FINAL, TRANSITIONS, Phase
+from limbfit.acquire.safety import Guard, make_session_limits
 from limbfit.acquire.session import PhaseUpdate
 from limbfit.acquire.virtual import Fault
 
@@ -83,10 +87,44 @@ def test_letting_go_halts_at_once_and_a_shallow_search_is_none() -> None:
 def test_the_key_moves_nothing_in_other_phases() -> None:
     bench = Bench()
     bench.until(Phase.CLAMP)
-    for event in (Signal.KEY_DOWN, Signal.KEY_UP, Signal.CONFIRM):
+    for event in (Signal.KEY_DOWN, Signal.KEY_UP):
         bench.session.handle(event, bench.now)
     assert bench.phase is Phase.CLAMP
     assert bench.device.motors.position_mm[0] == 0
+
+
+def test_enter_is_an_emergency_stop_once_the_limb_is_in_place() -> None:
+    bench = Bench()
+    bench.until(Phase.LOAD)
+    bench.session.handle(Signal.CONFIRM, bench.now)
+    assert bench.phase is Phase.STOPPING
+    assert "by a key" in bench.session.protocol.reason
+
+
+def test_a_search_that_nobody_watches_is_not_repeated_where_the_force_ends_it_too_early() -> None:
+    bench, events = Bench(search_force_N=0.6, min_depth_mm=3.0), SimpleQueue()
+    bench.session.listener = NoOperator(events)
+    while not bench.session.protocol.is_over and bench.ms < 10_000:
+        bench.millisecond()
+        while not events.empty():
+            bench.session.handle(events.get(), bench.now)
+    assert bench.phase is Phase.STOPPED
+    assert "acquire.search_force_N before acquire.min_depth_mm" in bench.session.protocol.reason
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_force_over_its_limit_stops_whichever_sign_its_sensor_gives(sign: int) -> None:
+    guard = Guard(make_session_limits(settings(), 60_000, 50_000, 500))
+    strong = Sample(1, 2000, 0, 0, (0,) * 14, (sign * 30_000,) + (0,) * 13, (0,) * 14)
+    wrong = guard.check(strong)
+    assert wrong is not None
+    assert (wrong.code, wrong.pin) == ("force", 1)
+
+
+@pytest.mark.parametrize("key", ["pause_s", "settle_s"])
+def test_a_wait_longer_than_a_phase_may_take_is_refused(key: str) -> None:
+    with pytest.raises(ValueError, match=f"{key} is not below time_limit_s"):
+        settings(**{key: 6.0})
 
 
 def test_the_comfortable_force_ends_the_search_whoever_holds_the_key() -> None:

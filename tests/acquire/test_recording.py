@@ -235,3 +235,19 @@ def test_no_record_is_made_outside_the_studys_folder(study, trace):
     file.write_text(file.read_text().replace("1.csv", trace))
     with pytest.raises(InputError, match=rf"{trace} lies outside the study's folder; nothing is recorded"):
         check_recording(load_study(file, recorded=False), "1", depth_mm=5.0)
+
+
+def test_a_record_that_would_be_text_under_the_name_of_another_format_is_refused_before_it_is_made(study):
+    file = study / "study.toml"
+    file.write_text(file.read_text().replace("1.csv", "1.xlsx"))
+    with pytest.raises(InputError, match=r"written as text, which 1\.xlsx is not; name a file \.csv"):
+        check_recording(load_study(file, recorded=False), "1", depth_mm=5.0)
+
+
+def test_a_ramp_under_names_with_commas_is_read_back(study):
+    made, names = read_trace(study / "1.csv"), ("Time, s", "Way, mm", "Load, N")
+    file = study / "study.toml"
+    stated = "\n".join(f'{key} = "{name}"' for key, name in zip(TRACE_COLUMNS, names))
+    file.write_text(f"{file.read_text()}\n[traces]\n{stated}\n")
+    write_ramp(load_study(file, recorded=False), study / "ramp.csv", RecordedRamp(1, made))
+    assert read_trace(study / "ramp.csv", names).force_N == pytest.approx(made.force_N)

@@ -330,3 +330,14 @@ def test_a_stated_force_that_rises_within_a_sample_is_refused():
     trace = Trace(time, depth, force + 0.02 * random.standard_normal(time.size))
     with pytest.raises(TraceError, match="does not rise where the skin is met; sample it faster"):
         interpret_record(trace, forced=True)
+
+
+@pytest.mark.parametrize("offset_N", [-30.0, 12.0])
+def test_a_stated_force_may_have_an_offset(offset_N):
+    time, random = np.arange(0.0, 13.0, 0.02), np.random.default_rng(0)
+    force = np.interp(time, [3.0, 5.0, 10.0, 12.0], [0.0, 5.0, 5.0, 0.0])
+    depth = np.interp(time, [1.0, 3.0], [0.0, 1.0]) + 2.0 * force**0.6
+    noise = 0.005 * random.standard_normal((2, time.size))
+    plain = interpret_record(Trace(time, depth + noise[0], force + noise[1]), forced=True)
+    offset = interpret_record(Trace(time, depth + noise[0], force + noise[1] + offset_N), forced=True)
+    assert offset.touch_down.time_s == pytest.approx(plain.touch_down.time_s, abs=0.05)

@@ -490,3 +490,40 @@ def test_a_record_of_noise_is_no_contact():
         TraceError, match=r"no contact: the force rises by .* against a noise of .*leave the site"
     ):
         check_trace(Trace(trace.time_s, trace.displacement_mm, 0.03 * rng.standard_normal(trace.time_s.size)))
+
+
+@pytest.mark.parametrize("offset_N", [-50.0, 300.0])
+def test_a_force_is_plausible_by_its_rise_whatever_the_zero_of_its_sensor(offset_N):
+    trace, _ = record(rate=100)
+    check_trace(Trace(trace.time_s, trace.displacement_mm, trace.force_N + offset_N))
+
+
+def test_an_indenter_that_goes_farther_back_than_it_began_has_no_wrong_sign():
+    trace, _ = record(rate=100)
+    time = np.arange(1, 2001) / 100
+    home = Trace(
+        np.r_[trace.time_s, trace.time_s[-1] + time],
+        np.r_[trace.displacement_mm, -time],
+        np.r_[trace.force_N, np.zeros_like(time)],
+    )
+    check_trace(home)
+    with pytest.raises(TraceError, match="the displacement falls"):
+        check_trace(Trace(home.time_s, -home.displacement_mm, home.force_N))
+
+
+@pytest.mark.parametrize(("point", "comma"), [(".", ","), (",", ".")])
+def test_signs_between_thousands_are_refused(tmp_path, truth, point, comma):
+    """1,234 mN beside 0.02 s would be read as 1.234 mN."""
+    table = [f"{t:.3f};{u:.3f};{1000 * f:,.0f}" for t, u, f in truth.T]
+    signs = str.maketrans({".": point, ",": comma})
+    path = write(tmp_path / "a.csv", ["Time;Extension;Load (mN)", *(row.translate(signs) for row in table)])
+    with pytest.raises(
+        TraceError, match=r"has a comma, and .* a point; export numbers with one decimal sign"
+    ):
+        read_trace(path, ("Time", "Extension", "Load (mN)"))
+
+
+def test_names_with_commas_in_a_file_with_semicolons_are_found(tmp_path, truth):
+    names = ("Time, s", "Way, mm", "Load, N")
+    path = write(tmp_path / "a.csv", [";".join(names), *rows(truth, ";")])
+    assert_read(path, truth, (), names)

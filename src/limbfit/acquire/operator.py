@@ -51,11 +51,16 @@ class NoOperator:
 
     def __init__(self, events: SimpleQueue[Event]) -> None:
         self.events = events
+        self._has_searched = False
 
     def __call__(self, update: Update) -> None:
         if not isinstance(update, PhaseUpdate):
             return
         if update.phase == Phase.POSITION:
             self.events.put(Signal.CONFIRM)
+        elif update.phase == Phase.READY and self._has_searched:  # it would end there again, and again
+            reason = "the depth search ended at acquire.search_force_N before acquire.min_depth_mm"
+            self.events.put(Abort(f"{reason}; change one of them"))
         elif update.phase == Phase.READY:
+            self._has_searched = True
             self.events.put(Signal.KEY_DOWN)

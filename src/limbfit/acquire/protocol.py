@@ -154,6 +154,8 @@ class Protocol:
                 return self._transition(self._report_unreachable(why), now)
             case Signal.CONFIRM if self.phase is Phase.POSITION:
                 self._is_confirmed = True
+            case Signal.CONFIRM:  # no longer what is asked for: a key like any other
+                return self._stop("the operator stopped it by a key", now)
             case Signal.KEY_DOWN if self.phase is Phase.READY:
                 return self._transition(Phase.SEARCH, now)
             case Signal.KEY_UP if self.phase is Phase.SEARCH:

@@ -78,7 +78,7 @@ class Guard:
         """Return the first limit that the sample passes, if any."""
         most = self.limits
         # The common case at once; which pin it is matters only where one is over.
-        strong = max(sample.force_mN) > self._lowest_limit_mN or min(sample.force_mN) <= -most.range_mN
+        strong = max(max(sample.force_mN), -min(sample.force_mN)) > self._lowest_limit_mN
         if strong and (wrong := self._check_forces(sample)):
             return wrong
         for pin, (position, far) in enumerate(zip(sample.position_um, most.position_um, strict=True), 1):
@@ -92,7 +92,7 @@ class Guard:
         for pin, (force, most) in enumerate(zip(sample.force_mN, limits.force_mN, strict=True), 1):
             if abs(force) >= limits.range_mN:
                 return Violation("saturated", pin, f"the force sensor of pin {pin} is saturated")
-            if force > most:
+            if abs(force) > most:  # no limb pulls: a sensor that is wired the wrong way round
                 text = f"pin {pin}: {force / 1000:.2f} N is over the limit of {most / 1000:g} N"
                 return Violation("force", pin, text)
         return None

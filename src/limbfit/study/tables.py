@@ -434,6 +434,8 @@ class AcquireTable(TomlTable):
                 raise ValueError(f"{name}_speed_mm_s is over speed_limit_mm_s")
         for low, high, why in (
             ("hold_s", "time_limit_s", ": the hold would end in a stop"),
+            ("pause_s", "time_limit_s", ": the pause would end in a stop"),
+            ("settle_s", "time_limit_s", ": the settling would end in a stop"),
             ("search_force_N", "force_limit_N", ": the search would end in a stop"),
             ("search_depth_mm", "depth_limit_mm", ": the search would end in a stop"),
             ("min_depth_mm", "search_depth_mm", ""),

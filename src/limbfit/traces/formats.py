@@ -20,6 +20,7 @@ from scipy.io import loadmat, whosmat
 from ..errors import TraceError
 from .record import MAX_SAMPLES
 
+BINARY_SUFFIXES = (".mat", ".tdms", ".xlsx", ".xlsm", ".xls")  # of files that are no text
 MAX_PREAMBLE = 1000  # lines before the header
 TIME = "time_s"  # the key of the times
 _END_OF_HEADER = "***End_of_Header***"
@@ -116,20 +117,47 @@ def _split(lines: Sequence[str], delimiter: str, start: int = 0) -> list[Row]:
     return [row for row in rows if any(row[1]) and not row[1][0].startswith("#")]
 
 
-def _find_delimiter(line: str) -> str:
-    return max("\t;,", key=line.count)
+def _find_delimiter(line: str, columns: Names) -> str:
+    """What splits a line into most of the named columns; where none does, what is there most often."""
+
+    def count(delimiter: str) -> tuple[int, int]:
+        cells = {cell for _, row in _split([line], delimiter) for cell in row}
+        return len(cells & set(columns.values())), line.count(delimiter)
+
+    return max("\t;,", key=count)
 
 
 def _read_text(text: str, columns: Names) -> ColumnTable:
     lines = text.splitlines()
-    single = [_split([line], _find_delimiter(line), i) for i, line in enumerate(lines[:MAX_PREAMBLE])]
+    single = [
+        _split([line], _find_delimiter(line, columns), i) for i, line in enumerate(lines[:MAX_PREAMBLE])
+    ]
     header = _find_header([row for rows in single for row in rows], columns)
     number = header[0]
-    delimiter = _find_delimiter(lines[number - 1])
+    delimiter = _find_delimiter(lines[number - 1], columns)
     rows = _split(lines[number:], delimiter, number)
     if delimiter != ",":
+        _check_decimal_signs(rows, [header[1].index(name) for name in columns.values()])
         rows = [(i, [cell.replace(",", ".") for cell in row]) for i, row in rows]
     return _build_table(header, rows, columns, has_preamble=any(single[: number - 1]))
+
+
+def _check_decimal_signs(rows: Sequence[Row], places: Sequence[int]) -> None:
+    """Refuse points beside commas in the named columns: one of the two groups thousands, or both are decimal
+    signs, and nobody knows which.
+    """
+    named = [(i, row[place]) for i, row in rows for place in places if place < len(row)]
+    found = [
+        next(((i, cell) for i, cell in named if sign in cell and ":" not in cell), None) for sign in ".,"
+    ]
+    if None in found:
+        return
+    (_, point), (line, comma) = (one for one in found if one is not None)
+    raise TraceError(
+        f"{comma[:40]!r} has a comma, and {point[:40]!r} a point",
+        place=f"line {line}",
+        remedy="export numbers with one decimal sign, and without a sign between thousands",
+    )
 
 
 def _find_header(rows: Sequence[Row], columns: Names) -> Row:

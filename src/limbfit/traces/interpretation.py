@@ -27,7 +27,7 @@ from .numerics import (
     find_runs,
 )
 from .passivity import find_lag, find_swings
-from .record import Trace, TraceWarning
+from .record import Trace, TraceWarning, measure_start_force
 from .touchdown import TouchDown, compute_deviation_before, find_depth_at, find_touch_down, touch_down_at
 
 _SPIKE_WIDTH = 2  # samples; what lasts longer may have happened
@@ -53,7 +53,7 @@ _CHANCE_SD = 4.0  # standard deviations that the first and the least of all bins
 _SLOPE_SD = 2.0  # standard deviations
 _START_SLOPE = 0.25  # of the mean slope of the way in
 _MIN_START = 8  # samples
-_RISE_SHARE = 0.5  # of the largest force: the rise in which a stated force meets the skin
+_RISE_SHARE = 0.5  # of its rise: the part in which a stated force meets the skin
 _MAX_BINS = 200
 
 
@@ -135,7 +135,8 @@ def _find_touch_down(trace: Trace, line: BrokenLine, touch_down_s: float | None,
         return touch_down_at(trace, touch_down_s)
     if not forced:
         return find_touch_down(trace, line)
-    most = int(np.argmax(trace.force_N >= _RISE_SHARE * trace.force_N.max()))
+    risen = trace.force_N - measure_start_force(trace)
+    most = max(int(np.argmax(risen >= _RISE_SHARE * risen.max())), 2)
     return find_touch_down(Trace(trace.time_s[:most], trace.displacement_mm[:most], trace.force_N[:most]))
 
 

@@ -19,6 +19,7 @@ TRAVEL_RANGE = (0.2, 60.0)
 PEAK_RANGE = (0.05, 200.0)
 _MAX_BINS = 200  # of samples whose mean force is looked at
 _START_SAMPLES, _REST_SHARE = 5, 0.02  # samples at the least that tell the force at the start; of the travel
+_PRESSED_SHARE = 0.5  # of the rise of force: the indenter is in the limb
 
 
 @dataclass(frozen=True)
@@ -82,12 +83,18 @@ def check_trace(trace: Trace, *, columns: tuple[str, str, str] = COLUMNS) -> Non
     _check_units(trace, columns)
 
 
+def measure_start_force(trace: Trace) -> float:
+    """Measure the force before the indenter moves, N: a sensor may have an offset."""
+    travel = np.abs(trace.displacement_mm - np.median(trace.displacement_mm[:_START_SAMPLES]))
+    moving = np.flatnonzero(travel > _REST_SHARE * travel.max())  # before a fast ramp there are few samples
+    at_rest = max(int(moving[0]) if moving.size else 0, _START_SAMPLES)
+    return float(np.median(trace.force_N[:at_rest]))
+
+
 def _check_contact(trace: Trace, columns: tuple[str, str, str]) -> None:
     noise = estimate_noise_level(trace.force_N)
     _, force, _ = average_in_bins(trace.time_s, trace.force_N, _MAX_BINS)
-    travel = np.abs(trace.displacement_mm - np.median(trace.displacement_mm[:_START_SAMPLES]))
-    moving = np.flatnonzero(travel > _REST_SHARE * travel.max())  # before a fast ramp there are few samples
-    start = float(np.median(trace.force_N[: max(int(moving[0]) if moving.size else 0, _START_SAMPLES)]))
+    start = measure_start_force(trace)
     rise, fall = float(force.max()) - start, start - float(force.min())
     if rise <= 5 * noise and fall > 5 * noise and fall > 2 * rise:
         remedy = "pushing must be positive: change the sign"
@@ -100,12 +107,15 @@ def _check_contact(trace: Trace, columns: tuple[str, str, str]) -> None:
 def _check_units(trace: Trace, columns: tuple[str, str, str]) -> None:
     # Single samples that stick out are replaced later, and say nothing of units.
     u, force = (median_filter(one, 5, mode="mirror") for one in (trace.displacement_mm, trace.force_N))
-    start = float(np.median(u[:5]))
-    inward = float(u.max()) - start
-    if inward <= 0.5 * (start - float(u.min())):
+    start = float(np.median(u[:_START_SAMPLES]))
+    force = force - measure_start_force(trace)
+    pressed = float(np.median(u[force >= _PRESSED_SHARE * force.max()]))
+    if pressed < start - _REST_SHARE * float(np.ptp(u)):
         remedy = "displacement into the limb must be positive: change the sign"
         raise TraceError("the displacement falls", place=columns[1], remedy=remedy)
-    _check_range(inward, TRAVEL_RANGE, "travel", "mm", {1e3: "metres", 1e-3: "micrometres"}, columns[1])
+    _check_range(
+        float(u.max()) - start, TRAVEL_RANGE, "travel", "mm", {1e3: "metres", 1e-3: "micrometres"}, columns[1]
+    )
     speed = _compute_typical_speed(trace.time_s, u)
     guesses = {1e3: "milliseconds", 1e6: "microseconds", 1 / 60: "minutes"}
     _check_range(speed, SPEED_RANGE, "speed", "mm/s", guesses, columns[0])

@@ -21,6 +21,7 @@ from ...results.curves import read_curves
 from ...results.records import TracesResult
 from ...study import Indentation, Record, Study
 from ...traces import COLUMNS
+from ...traces.formats import BINARY_SUFFIXES
 from ...traces.reading import find_factor
 from ..engine.storage import write_curves, write_json
 from ..engine.store import translate_disk_errors
@@ -156,6 +157,13 @@ def check_recording(
             remedy='leave out control = "force", or record it elsewhere',
         )
     _check_inside(study, one)
+    if one.trace is not None and one.trace.suffix.lower() in BINARY_SUFFIXES:
+        raise InputError(
+            f"records are written as text, which {one.trace} is not",
+            file=study.file,
+            place=f"{_find_place(one)}.trace",
+            remedy="name a file .csv",
+        )
     return build_device_settings(study, one, depth_mm, unattended)
 
 
@@ -264,8 +272,11 @@ def _keep(study: Study, one: Indentation, folder: Path, completed: bool) -> dict
 
 def write_ramp(study: Study, file: Path, ramp: acquire.RecordedRamp) -> None:
     """The ramp under the names of ``[traces]``, in the units that these state."""
-    names = {key: getattr(study.traces, key) for key in COLUMNS}
-    columns = {name: getattr(ramp.trace, key) / find_factor(key, name, "", []) for key, name in names.items()}
+    columns = {}
+    for key in COLUMNS:
+        name = getattr(study.traces, key)
+        head = '"' + name.replace('"', '""') + '"' if set(name) & set(',"') else name
+        columns[head] = getattr(ramp.trace, key) / find_factor(key, name, "", [])
     work = file.with_name(f".{file.name}.work")
     write_curves(work, **columns)
     work.replace(file)

@@ -34,6 +34,7 @@ from ...results.curves import read_curves
 from ...results.records import LayerRecord, TraceFacts, WaveRecord
 from ...study import Record, Study, Vector
 from ...traces import SurfaceMotion, Thinning, WaveMeans
+from ...traces.numerics import build_linear_interpolation
 from ..engine.files import LAYERS, WAVES
 from ..engine.storage import write_curves
 
@@ -237,7 +238,7 @@ def _build_layer_measurement(
         thinning.compression_mm,
         thinning.time_s,
         np.full(n, number),
-        _build_interpolation(times_s, thinning.time_s),
+        build_linear_interpolation(thinning.time_s, times_s),
         thinning.covariance,
         {"sd": stated.sd_mm, "thickness_mm": stated.thickness_mm, "compared": f"{n} times"},
     )
@@ -261,7 +262,7 @@ def _build_surface_measurement(
         means.moved_mm,
         means.time_s,
         first + 3 * means.point + means.component,
-        means.frames @ _build_interpolation(times_s, motion.time_s),
+        means.frames @ build_linear_interpolation(motion.time_s, times_s),
         np.diag(sd**2 / means.samples),
         facts,
         np.array(points.points)[means.point],
@@ -279,15 +280,10 @@ def _build_wave_measurement(
         means.speed_m_s,
         means.time_s,
         np.full(n, gauge),
-        _build_interpolation(times_s, means.time_s),
+        build_linear_interpolation(means.time_s, times_s),
         means.covariance(sd, bias),
         {"sd": sd, "bias": bias, "compared": f"{n} times"},
     )
-
-
-def _build_interpolation(from_s: Array, to_s: Array) -> Array:
-    """Matrix (n, t) of linear interpolation from times (t,) to times (n,)."""
-    return np.array([np.interp(to_s, from_s, row) for row in np.eye(len(from_s))]).T
 
 
 @dataclass(frozen=True)
