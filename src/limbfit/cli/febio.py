@@ -10,15 +10,7 @@ import typer
 import limbfit
 
 from .commands import Parameters, StudyPath, call_on_study
-from .console import (
-    AsJson,
-    fail,
-    listen_on_console,
-    print_aside,
-    print_json,
-    print_line,
-    print_warnings,
-)
+from .console import AsJson, fail, listen_on_console, print_aside, print_json, print_line, print_warnings
 
 
 def febio(

@@ -14,15 +14,7 @@ import limbfit
 
 from ..execution import QUEUES, Placement, place_jobs
 from .commands import StudyPath, list_stage_names
-from .console import (
-    AsJson,
-    Column,
-    listen_on_console,
-    print_aside,
-    print_json,
-    print_line,
-    print_table,
-)
+from .console import AsJson, Column, listen_on_console, print_aside, print_json, print_line, print_table
 
 _OPTIONS = {
     "workers": Annotated[

@@ -16,14 +16,7 @@ import numpy as np
 from ..arrays import Array, Indices
 from ..errors import ProblemError
 from ..fe import Activation, History, Indenter, Motion, Pressure, Problem, StepControl, Support
-from .parts import (
-    TissueMesh,
-    build_indenter,
-    build_rigid_body,
-    build_tissue,
-    find_touched_faces,
-    is_hollow,
-)
+from .parts import TissueMesh, build_indenter, build_rigid_body, build_tissue, find_touched_faces, is_hollow
 from .penalty import compute_mean_penalty, find_smallest_depth
 from .reading.geometry import find_boundary_faces, is_closed
 from .reading.model import Contact, FebModel

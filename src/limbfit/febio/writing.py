@@ -28,13 +28,7 @@ from ..errors import ProblemError
 from ..fe import Indenter, Motion, Problem, StepControl
 from ..fe.solution.control import schedule_steps
 from ..mesh import Mesh
-from .conditions import (
-    FIXED_SET,
-    FRAME_BODY,
-    CurveList,
-    find_step_ends,
-    list_conditions,
-)
+from .conditions import FIXED_SET, FRAME_BODY, CurveList, find_step_ends, list_conditions
 from .meshes import (
     FRONT,
     INDENTER,

@@ -13,13 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array
-from ...mesh.cells import (
-    QUAD_CORNERS,
-    ShapeFunctions,
-    linear_simplex,
-    linear_tensor,
-    quadratic_simplex,
-)
+from ...mesh.cells import QUAD_CORNERS, ShapeFunctions, linear_simplex, linear_tensor, quadratic_simplex
 
 
 @dataclass(frozen=True)

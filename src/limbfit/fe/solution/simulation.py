@@ -27,13 +27,7 @@ from .linear import prefers_multigrid
 from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, compute_reaction_scale, equilibrate
 from .sensitivity import Explicit, ForceTakeover, MemoryDerivative
 from .springs import find_touched_unknowns
-from .start import (
-    IndenterStart,
-    WarmStart,
-    build_grips,
-    compute_extrapolation,
-    measure_indenter_travel,
-)
+from .start import IndenterStart, WarmStart, build_grips, compute_extrapolation, measure_indenter_travel
 
 # Penetration over the allowed one that a few more iterations will not mend; how often a penalty is raised.
 UNBEARABLE_DEPTH, MAX_RAISES = 1.2, 5

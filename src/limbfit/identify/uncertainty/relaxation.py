@@ -28,14 +28,7 @@ from ..fit.objective import SiteResponse
 from ..fit.prediction import RelaxationSpread
 from .discrepancy import ResidualModel, estimate_discrepancy
 from .superposition import RelaxationModel, Superposition, TissueParameters, find_tissue_parameters
-from .uncertainty import (
-    DETERMINED,
-    NORMAL_95,
-    WEAK,
-    PriorPrecision,
-    Uncertainty,
-    choose_verdict,
-)
+from .uncertainty import DETERMINED, NORMAL_95, WEAK, PriorPrecision, Uncertainty, choose_verdict
 
 # Slopes of log G over log t. Muscle: 0.25 in vivo (Klatt et al. 2010); six pieces ex vivo (Iaquinta 2023,
 # perineal_indentation): 0.13 to 0.16 before 1 s, 0.18 to 0.22 from 3 to 10 s.

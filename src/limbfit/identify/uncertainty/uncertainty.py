@@ -30,12 +30,7 @@ from ..fit.calibration import CalibrationSettings
 from ..fit.objective import MeasuredCurve, SiteResponse
 from ..fit.parameters import Grouping, SearchSpace, Unknowns, build_space, group_separately
 from ..fit.prediction import combine_freedom
-from .discrepancy import (
-    ResidualModel,
-    estimate_discrepancy,
-    estimate_mesh_misfit,
-    limit_to_mean_square,
-)
+from .discrepancy import ResidualModel, estimate_discrepancy, estimate_mesh_misfit, limit_to_mean_square
 from .noise import SiteNoise
 
 DETERMINED, WEAK, UNDETERMINED = "determined", "weakly determined", "not determined by these data"
