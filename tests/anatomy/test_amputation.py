@@ -49,6 +49,20 @@ def test_bones_end_at_the_plane_and_the_pad_beyond(plane, stump):
     assert -PAD <= height[stump.limb].min() < -PAD + 2.5
 
 
+def test_the_pad_is_muscle_even_where_the_lowest_label_is_fat(leg, plane):
+    """As in a file of 3D Slicer with the segments muscle and fat, which keep the values 7 and 6."""
+    names = {2: "tibia", 3: "fibula", 6: "fat", 7: "muscle"}
+    stump = amputate_limb(leg.with_array(np.where(leg.array == 1, 7, leg.array), names), *plane, PAD)
+    pad = stump.limb & (stump.compute_heights(*plane) < 0)
+    assert set(np.unique(stump.array[pad])) == {7}
+
+
+def test_where_proximal_is_may_be_stated_for_a_leg_that_is_held_up(leg, plane):
+    point, normal = plane
+    stump = amputate_limb(leg, point, -normal, PAD, -normal)
+    assert stump.compute_heights(point, normal)[stump.limb].max() == pytest.approx(PAD, abs=2.5)
+
+
 def test_the_end_is_rounded(plane, stump):
     """Sections shrink distally, ever faster."""
     height = stump.compute_heights(*plane)

@@ -75,6 +75,12 @@ def test_the_cut_of_a_closed_skin_is_the_flat_end_that_bones_reach_out_of(whole)
     assert notes[0].startswith("skin: the proximal cut is its flat end at (12.0, -80.0, 300.0) mm")
 
 
+def test_a_cut_that_the_skin_does_not_reach_is_refused_before_it_is_meshed(whole):
+    cut = (whole.cut_point + 20.0 * whole.cut_normal, whole.cut_normal)
+    with pytest.raises(SurfaceError, match=r"geometry\.proximal_cut: the skin ends 20\.0 mm below"):
+        build_closed_anatomy(whole.skin, whole.bones, cut)
+
+
 def segment_along_x(length: float) -> tuple[Surface, Surface]:
     """The proximal part of a limb along x, flat at both ends, and its bone, whose tip is 70 mm below."""
     upright = limb()

@@ -276,6 +276,17 @@ def test_a_given_cut_is_kept(leg):
         build_anatomy(leg, 5.0, (point + 500 * normal, normal))
 
 
+def test_a_bone_that_the_cut_leaves_in_two_pieces_is_refused():
+    """Of a femur that is cut through its condyles one would be soft tissue."""
+    z, y, x = 4.0 * (np.indices((36, 28, 28)) - np.array([0.0, 13.5, 13.5])[:, None, None, None])
+    limb, two = np.hypot(x, y) < 46.0, np.hypot(np.abs(x) - 18.0, y) < 12.0
+    shaft = (np.abs(x) < 30.0) & (np.abs(y) < 12.0) & (z > 80.0)
+    array = np.where(limb, 1, 0) + np.where((two & (z > 40.0)) | shaft, 3, 0)
+    labels = LabelMap(array, [4.0] * 3, [0.0, 0.0, 0.0], np.eye(3))
+    with pytest.raises(LabelError, match=r"'femur' is cut into pieces of 12 and 12 cm3; .*or move the cut"):
+        build_anatomy(labels, 6.0, ([54.0, 54.0, 70.0], [0.0, 0.0, 1.0]))
+
+
 def test_a_cut_without_a_direction_is_refused(anatomy):
     with pytest.raises(SurfaceError, match="normal of the plane is zero"):
         replace(anatomy, cut_normal=[0, 0, 0])

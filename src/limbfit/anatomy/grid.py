@@ -277,11 +277,11 @@ class LabelMap(Grid):
 
     @property
     def soft_value(self) -> int:
-        """The label value of soft tissue; of several kinds the lowest."""
+        """The label value of soft tissue; of several kinds the lowest, fat and skin last."""
         soft = [value for value, name in sorted(self.names.items()) if name in SOFT_NAMES]
         if not soft:
             raise LabelError("the label map names no soft tissue", remedy=f"name one label {SOFT_TISSUE!r}")
-        return soft[0]
+        return min(soft, key=lambda value: (self.names[value] in ("skin", FAT), value))
 
     def mask(self, name: str) -> Mask:
         """Voxels of one name."""

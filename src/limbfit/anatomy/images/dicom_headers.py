@@ -103,31 +103,21 @@ def read_headers(path: Path) -> list[SliceHeader] | None:
             if "Segmentation" in _find_class_name(tags):  # beside its image, not one of its series
                 return []
             if "Rows" not in tags or "Columns" not in tags:
-                if _is_image_class(tags):
+                kind = tags.file_meta.get("MediaStorageSOPClassUID") or tags.get("SOPClassUID")
+                if kind is None or kind.name.endswith(_IMAGE_CLASS):  # one that has them, or cut short before
                     raise damaged
                 return []
             return _read_slices(tags, path)
     except InvalidDicomError:
-        if _is_torn(path):
+        head = path.read_bytes()[: _PREAMBLE + 4] if path.stat().st_size < 10_000 else b"?"
+        is_zero = len(head) < _PREAMBLE + 4 and not any(head)
+        if is_zero or path.suffix.lower() in (".dcm", ".ima"):  # the beginning of one, or all zeros
             raise damaged from None
         return None
     except ImageError:
         raise
     except Exception:  # pydicom raises whatever a damaged value makes it raise, with the value in the text
         raise damaged from None
-
-
-def _is_torn(path: Path) -> bool:
-    """True if a file that is not DICOM looks like the beginning of one, or is all zeros."""
-    head = path.read_bytes()[: _PREAMBLE + 4] if path.stat().st_size < 10_000 else b"?"
-    is_zero = len(head) < _PREAMBLE + 4 and not any(head)
-    return is_zero or path.suffix.lower() in (".dcm", ".ima")
-
-
-def _is_image_class(tags: FileDataset) -> bool:
-    """True if a file without rows and columns is of a class that has them, or ends before its class."""
-    kind = tags.file_meta.get("MediaStorageSOPClassUID") or tags.get("SOPClassUID")
-    return kind is None or kind.name.endswith(_IMAGE_CLASS)
 
 
 def _find_class_name(tags: FileDataset) -> str:
@@ -167,9 +157,12 @@ def _read_slice(
     """One slice; ``read`` gives the value of a tag in the functional group of a name."""
     slope = _to_number(read("PixelValueTransformationSequence", "RescaleSlope"))
     intercept = _to_number(read("PixelValueTransformationSequence", "RescaleIntercept"))
+    uid = str(tags.get("SeriesInstanceUID", ""))
+    if re.fullmatch(r"[0-9.]{0,64}", uid) is None:  # someone typed into it, and it will be shown
+        uid = "x" + hashlib.sha256(uid.encode()).hexdigest()[:12]
     return SliceHeader(
         path=path,
-        series_uid=_redact_uid(str(tags.get("SeriesInstanceUID", ""))),
+        series_uid=uid,
         series_number=str(tags.get("SeriesNumber", "") or ""),
         modality=str(tags.get("Modality", "")),
         rows=int(tags.Rows),
@@ -185,12 +178,6 @@ def _read_slice(
         frame=frame,
         rescale=(1.0 if slope is None else slope, 0.0 if intercept is None else intercept),
     )
-
-
-def _redact_uid(uid: str) -> str:
-    """The UID as it will be shown; one that is not digits and dots (someone typed into it) as a digest."""
-    is_uid = re.fullmatch(r"[0-9.]{0,64}", uid) is not None
-    return uid if is_uid else "x" + hashlib.sha256(uid.encode()).hexdigest()[:12]
 
 
 def find_functional_group(groups: tuple[Dataset, Dataset], name: str) -> Dataset:

@@ -22,17 +22,12 @@ _PR_SET_PDEATHSIG = 1  # of <linux/prctl.h>
 
 def main() -> None:
     """From the task file to the mesh file, by the engine that the command line names."""
-    _end_with_parent()
+    if sys.platform == "linux":  # a mesher would not hear of a killed run, and keep a core until it is done
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     engine, source, target = sys.argv[1:]
     with np.load(source) as stored:
         mesh = {"mmg": remesh_with_mmg, "netgen": remesh_with_netgen}[engine](dict(stored))
     np.savez(target, allow_pickle=False, **mesh)
-
-
-def _end_with_parent() -> None:
-    """On Linux: a mesher would not hear of a killed run, and keep a core until it is done."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def remesh_with_mmg(task: Arrays) -> Arrays:

@@ -110,7 +110,8 @@ def cut(
     """
     values = compute_in_band(field, grid.points, LONGEST_EDGE * grid.spacing, grid.spacing, slack)
     chosen = grid.tets if region is None else grid.tets[grid.regions == region]
-    edges = _find_crossed_edges(chosen, values)
+    ends = np.sort(chosen[:, TET_EDGES].reshape(-1, 2), axis=1)
+    edges = _select_unique_edges(ends[values[ends[:, 0]] * values[ends[:, 1]] < 0], len(values))
     t = _find_roots(grid.points, edges, values, field)
     grid, snapped = _snap_vertices(grid, edges, t, bit)
     values = np.where(snapped, 0.0, values)
@@ -149,12 +150,6 @@ def compute_in_band(field: Field, points: Array, band: float, spacing: float, sl
         open_ = open_[np.abs(values[open_]) <= band + slack + np.sqrt(0.75) * cell]
     values[open_] = field(points[open_])[0]
     return values
-
-
-def _find_crossed_edges(tets: Indices, values: Array) -> Indices:
-    """Unique edges (k, 2), smaller node first and sorted, whose ends differ strictly in sign."""
-    ends = np.sort(tets[:, TET_EDGES].reshape(-1, 2), axis=1)
-    return _select_unique_edges(ends[values[ends[:, 0]] * values[ends[:, 1]] < 0], len(values))
 
 
 def _select_unique_edges(edges: Indices, count: int) -> Indices:

@@ -26,7 +26,7 @@ from ...arrays import Array
 from ...errors import SurfaceError
 from ...results.limb import BoneLoss, SkinLoss
 from ..frame import Frame, build_limb_frame
-from ..surfaces.surfaces import Anatomy
+from ..surfaces.surfaces import END_TOLERANCE_MM, Anatomy, check_cut
 from ..surfaces.thickness import SLOPE, limit_slope, transfer_values
 from ..surfaces.triangles import Surface, find_open_edges, from_pyvista
 
@@ -34,7 +34,6 @@ Level = tuple[Array, Array]  # a signed function at points and its gradient ther
 
 PROLONGATION_MM = 40.0
 SEAM_MM = 3.0  # below the cut, where surfaces are prolonged from
-END_TOLERANCE_MM = 0.5  # a surface that ends this close to the cut is meant to be cut there
 NORMAL_WITHIN_MM = 1e-3  # of a surface, where its normal stands for the gradient of the distance
 TRIM_SAMPLES = 60_000
 MIN_LAYER_SHARE = 1 / 3  # of the layers' thickness, below which ``thin-skin`` trims bone instead
@@ -168,14 +167,9 @@ def build_limb_fields(
     SurfaceError
         When the skin does not reach the cut plane, or the fat's depth is needed and not given.
     """
+    check_cut(anatomy)
     frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     skin = Surface(frame.to_limb(anatomy.skin.points), anatomy.skin.faces)
-    top = skin.points[:, 2].max()
-    if top < -END_TOLERANCE_MM:
-        raise SurfaceError(
-            f"the skin ends {-top:.1f} mm below the proximal cut plane",
-            remedy="move the plane or check its normal",
-        )
     bones, regions = (_prolong_bodies(bodies, frame) for bodies in (anatomy.bones, anatomy.regions))
     long = prolong_surface(skin)
     depths = _compute_layer_depths(layers, skin, long, fat_depth_mm)

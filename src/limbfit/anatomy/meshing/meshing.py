@@ -246,7 +246,12 @@ def _mesh_base(
     start = time.perf_counter()
     fields = base.fields
     task = _build_task(base.grid, size, settings)
-    core = _snap_nodes(_adapt_core(task, fields, settings), fields)
+    try:
+        core = ENGINES[settings.engine](task, settings.time_limit_s)
+    except MesherError as error:  # as a rule where its input is flattest
+        where = describe_narrowest_gap(task.points, task.tets, fields)
+        raise MeshingError(f"{error}; its input is flattest {where}") from None
+    core = _snap_nodes(core, fields)
     names = (*(layer.name for layer in settings.layers), *fields.regions, settings.core)
     mesh, stack = extrude_layers(core, fields, names)
     mesh = smooth_elements(mesh, fields, stack)
@@ -273,15 +278,6 @@ def _mesh_base(
         repairs=repairs,
     )
     return mesh.with_points(fields.frame.to_patient(mesh.points)), measures
-
-
-def _adapt_core(task: VolumeTask, fields: LimbFields, settings: MeshSettings) -> VolumeMesh:
-    """The core, graded; a mesher that fails does so, as a rule, where its input is flattest."""
-    try:
-        return ENGINES[settings.engine](task, settings.time_limit_s)
-    except MesherError as error:
-        where = describe_narrowest_gap(task.points, task.tets, fields)
-        raise MeshingError(f"{error}; its input is flattest {where}") from None
 
 
 def _check_usable(mesh: Mesh, fields: LimbFields) -> None:

@@ -33,7 +33,11 @@ _MARGIN_MM = 4.0  # of empty voxels beside and below the limb
 
 
 def amputate_limb(
-    labels: LabelMap, plane_point: ArrayLike, plane_normal: ArrayLike, pad_mm: float = 15.0
+    labels: LabelMap,
+    plane_point: ArrayLike,
+    plane_normal: ArrayLike,
+    pad_mm: float = 15.0,
+    proximal: Array | None = None,
 ) -> LabelMap:
     """The leg cut at a plane, with a rounded pad of soft tissue over the cut bones.
 
@@ -43,6 +47,7 @@ def amputate_limb(
     plane_point, plane_normal : LPS mm; the normal points proximally, to what is kept.
     pad_mm : soft tissue distal of the bones, on the limb's middle; towards the outline it thins as a
         quarter ellipse.
+    proximal : (3,) LPS, where proximal is; by default as :func:`find_proximal_end` finds it.
 
     Returns
     -------
@@ -59,14 +64,18 @@ def amputate_limb(
     point, normal = normalise_plane(plane_point, plane_normal)
     if pad_mm <= 0:
         raise LabelError(f"the pad of soft tissue must be thicker than {pad_mm} mm")
-    _check_direction(labels, normal)
-    labels = _divide_slices(labels)
+    _check_direction(labels, normal, proximal)
+    for axis in range(3):
+        parts = int(np.ceil(labels.spacing[axis] / _THICKEST_MM))
+        if parts > 1:
+            labels = _divide_along(labels, axis, parts)
     height = labels.compute_heights(point, normal)
     section = _cut_section(labels, point, normal)
     _check_bones(labels, height)
     array = np.where(height >= 0, labels.array, 0).astype(np.uint8)
     near = np.nonzero((height < 0) & (height > -pad_mm))
-    depth = section.depth_at(labels.index_to_point(np.column_stack(near[::-1])))
+    place = (labels.index_to_point(np.column_stack(near[::-1])) - section.corner) @ section.axes / _STEP_MM
+    depth = map_coordinates(section.depth, place.T, order=1, mode="constant", cval=0.0)
     share = np.clip(depth / min(float(section.depth.max()), _ROUNDING * pad_mm), 0, 1)
     end = pad_mm * np.sqrt(1 - (1 - share) ** 2)  # a quarter ellipse, upright at the outline
     kept = -height[near] < end
@@ -75,16 +84,8 @@ def amputate_limb(
     return labels.with_array(array)
 
 
-def _divide_slices(labels: LabelMap) -> LabelMap:
-    """Thick slices divided, the shape of each label interpolated (Raya and Udupa 1990)."""
-    for axis in range(3):
-        parts = int(np.ceil(labels.spacing[axis] / _THICKEST_MM))
-        if parts > 1:
-            labels = _divide_along(labels, axis, parts)
-    return labels
-
-
 def _divide_along(labels: LabelMap, axis: int, parts: int) -> LabelMap:
+    """Thick slices divided, the shape of each label interpolated (Raya and Udupa 1990)."""
     count = labels.size[axis]
     place = (np.arange(count * parts) + 0.5) / parts - 0.5
     spacing, start = labels.spacing.copy(), np.zeros(3)
@@ -114,9 +115,9 @@ def _interpolate_along(field: NDArray[np.float32], place: Array, axis: int) -> N
     return below + part * (above - below)
 
 
-def _check_direction(labels: LabelMap, normal: Array) -> None:
+def _check_direction(labels: LabelMap, normal: Array, proximal: Array | None) -> None:
     """Refuse a normal that points distally, or that is not along the limb at all."""
-    along = float(find_proximal_end(labels.limb, labels).direction(labels) @ normal)
+    along = float(find_proximal_end(labels.limb, labels, normal=proximal).direction(labels) @ normal)
     angle = float(np.degrees(np.arccos(np.clip(along, -1, 1))))
     if angle > 180 - _MOST_OBLIQUE_DEG:
         raise LabelError(
@@ -150,11 +151,6 @@ class _Section:
     axes: Array
     depth: Array
     whole: bool
-
-    def depth_at(self, points: Array) -> Array:
-        """Depth of points (n, 3) projected onto the plane."""
-        place = (points - self.corner) @ self.axes / _STEP_MM
-        return map_coordinates(self.depth, place.T, order=1, mode="constant", cval=0.0)
 
 
 def _cut_section(labels: LabelMap, point: Array, normal: Array) -> _Section:
@@ -209,9 +205,8 @@ def amputate_anatomy(
     LabelError
         For a plane that misses the limb, lies along it, points distally or cuts no bone off.
     """
-    labels = amputate_limb(
-        voxelise_anatomy(anatomy, pad_mm + _MARGIN_MM), plane_point, plane_normal, pad_mm=pad_mm
-    )
+    voxels = voxelise_anatomy(anatomy, pad_mm + _MARGIN_MM)
+    labels = amputate_limb(voxels, plane_point, plane_normal, pad_mm, anatomy.cut_normal)
     return build_anatomy(labels, edge_mm, (anatomy.cut_point, anatomy.cut_normal))
 
 

@@ -35,17 +35,11 @@ def find_bright_fat(levels: Field, limb: Mask, bones: Mask, depth: Field, spacin
     sees less of is darker, fat and muscle alike, and N4 leaves some of that.
     """
     rind = limb & ~bones & (depth < _RIND_MM)
-    return np.asarray(
-        limb & (_average_in_limb(levels, limb, spacing) > _compute_half_way_level(levels, rind, spacing))
-    )
-
-
-def _average_in_limb(levels: Field, limb: Mask, spacing: Array) -> Field:
-    """The mean of the neighbourhood inside the limb."""
     sigma = _NOISE_MM / spacing[::-1]
     weight = gaussian_filter(limb.astype(np.float32), sigma, mode="nearest")
     total = gaussian_filter(np.where(limb, levels, 0).astype(np.float32), sigma, mode="nearest")
-    return np.asarray(total / np.maximum(weight, 1e-3))
+    mean = total / np.maximum(weight, 1e-3)  # of the neighbourhood inside the limb
+    return np.asarray(limb & (mean > _compute_half_way_level(levels, rind, spacing)))
 
 
 def _compute_half_way_level(levels: Field, rind: Mask, spacing: Array) -> Field:

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pyvista as pv
 from numpy.typing import ArrayLike
+from scipy.ndimage import label as connected
 
 from ...arrays import Array, Indices, Mask
 from ...errors import InputError, LabelError, SurfaceError, add_location
@@ -26,6 +27,7 @@ from .surfacefiles import read_surface, write_surface
 from .triangles import Surface, check_closed, find_bodies, find_half_edges, from_pyvista
 
 ON_CUT_MM = 0.1  # nearer to the proximal cut, a point lies on it: flat ends of files are flat to half of that
+END_TOLERANCE_MM = 0.5  # a surface that ends this close to the cut is meant to be cut there
 _CUT_INSIDE_MM = 2.0  # of the image's proximal end
 _STICK_OUT_MM = 6.0  # of the bones beyond the cut
 _SKIN_TOLERANCE_MM = 0.05  # how far a bone may lie outside the skin: rounding of files
@@ -76,6 +78,7 @@ def build_anatomy(
     labels: LabelMap,
     edge_mm: float = 3.0,
     proximal_cut: tuple[ArrayLike, ArrayLike] | None = None,
+    proximal: Array | None = None,
 ) -> Anatomy:
     """Smooth closed surfaces of a label map.
 
@@ -85,18 +88,22 @@ def build_anatomy(
     edge_mm : edge length of the triangles.
     proximal_cut : point and proximal normal (LPS mm) of the cut; by default 2 mm inside the limb's proximal
         end, across the image axis along which it is longest.
+    proximal : (3,) LPS, where proximal is, if there is no such cut: of a short stump its shape does not say.
 
     Raises
     ------
     LabelError
-        For a map without a limb, or a limb that the image's side cuts off.
+        For a map without a limb, a limb that the image's side cuts off, or a bone or region that a cut
+        leaves in several pieces.
     SurfaceError
         For a cut that misses the limb.
     """
     labels = labels.align_with_lps()
     if proximal_cut is None:
-        end = find_proximal_end(labels.limb, labels)
-        point, normal = _choose_default_cut(labels, end)
+        end = find_proximal_end(labels.limb, labels, normal=proximal)
+        index = (np.array(labels.size) - 1) / 2  # a little inside the outer face of the last layer
+        index[end.axis] = end.layer + end.side * (0.5 - _CUT_INSIDE_MM / labels.spacing[end.axis])
+        point, normal = labels.index_to_point(index), end.direction(labels)
     else:
         point, normal = normalise_plane(*proximal_cut)
         end = find_proximal_end(labels.limb, labels, normal=normal)
@@ -122,18 +129,20 @@ def _build_anatomy(
     labels: LabelMap, end: ProximalEnd, edge_mm: float, point: Array, normal: Array
 ) -> Anatomy:
     extended = _extend_labels(labels, end, _STICK_OUT_MM + _CUT_INSIDE_MM + 2 * edge_mm)
-    distal = labels.compute_heights(point, normal) < 0
-    _check_sides(labels.limb & distal, end)
+    heights = extended.compute_heights(point, normal)
+    distal = heights < 0
+    _check_sides(extended.limb & distal, end)
     skin = cut_and_cap(extract_fine_surface(extended, None, edge_mm), point, normal, edge_mm)
-    beyond = extended.compute_heights(point + _STICK_OUT_MM * normal, normal) > 0
-    reach = extended.with_array(np.where(beyond, 0, extended.array))
+    reach = extended.with_array(np.where(heights > _STICK_OUT_MM, 0, extended.array))
     bones = {}
     for name in labels.bone_names:
-        if (labels.mask(name) & distal).sum() * labels.voxel_mm3 >= _STUMP_MM3:
+        if (extended.mask(name) & distal).sum() * labels.voxel_mm3 >= _STUMP_MM3:
+            _check_pieces(reach, name, distal)
             bones[name] = extract_surface(reach, name, edge_mm)
     regions = {}
     for label, name in labels.regions.items():
-        if not (labels.mask(label) & distal).any():
+        _check_pieces(reach, label, distal)
+        if not (extended.mask(label) & distal).any():
             raise LabelError(
                 f"nothing of {label!r} is left in the limb",
                 place=f"geometry.regions.{name}",
@@ -143,11 +152,15 @@ def _build_anatomy(
     return Anatomy(skin, bones, point, normal, regions)
 
 
-def _choose_default_cut(labels: LabelMap, end: ProximalEnd) -> tuple[Array, Array]:
-    """A little inside the outer face of the last layer."""
-    index = (np.array(labels.size) - 1) / 2
-    index[end.axis] = end.layer + end.side * (0.5 - _CUT_INSIDE_MM / labels.spacing[end.axis])
-    return labels.index_to_point(index), end.direction(labels)
+def _check_pieces(labels: LabelMap, name: str, distal: Mask) -> None:
+    """Refuse a label of which a cut leaves notable pieces, as condyles: all but one would be lost."""
+    parts = connected(labels.mask(name))[0]
+    volumes = np.bincount(parts[distal])[1:] * labels.voxel_mm3
+    if (volumes >= _STUMP_MM3).sum() > 1:
+        raise LabelError(
+            f"{name!r} is cut into pieces of {' and '.join(f'{v / 1000:.2g}' for v in volumes)} cm3",
+            remedy="give each piece a label of its own (segmentation.labels), or move the cut",
+        )
 
 
 def _extend_labels(labels: LabelMap, end: ProximalEnd, length_mm: float) -> LabelMap:
@@ -211,11 +224,12 @@ def _find_rim(surface: Surface, point: Array, normal: Array) -> Indices:
 
 def check_anatomy(anatomy: Anatomy, files: Mapping[str, Path] | None = None) -> None:
     """Refuse an anatomy that cannot be meshed. Raises `SurfaceError` for a surface that :func:`check_closed`
-    refuses, a bone or region outside the skin (beyond the cut is allowed), or a region that reaches into a
-    bone.
+    refuses, a skin that ends below the cut, a bone or region outside the skin (beyond the cut is allowed), or
+    a region that reaches into a bone.
     """
     files = files or {}
     check_closed(anatomy.skin, "skin", files.get("skin"))
+    check_cut(anatomy)
     for name, bone in anatomy.bones.items():
         check_closed(bone, name, files.get(name))
         with add_location(file=files.get(name)):
@@ -224,6 +238,17 @@ def check_anatomy(anatomy: Anatomy, files: Mapping[str, Path] | None = None) -> 
         check_closed(region, name, files.get(name), smallest_mm=0.0)
         with add_location(file=files.get(name), place=f"geometry.regions.{name}"):
             _check_region(anatomy, region)
+
+
+def check_cut(anatomy: Anatomy) -> None:
+    """Refuse a proximal cut that the skin does not reach. Raises `SurfaceError`."""
+    top = float(anatomy.height(anatomy.skin.points).max())
+    if top < -END_TOLERANCE_MM:
+        raise SurfaceError(
+            f"the skin ends {-top:.1f} mm below the proximal cut plane",
+            place="geometry.proximal_cut",
+            remedy="move the plane or check its normal",
+        )
 
 
 def _check_region(anatomy: Anatomy, region: Surface) -> None:

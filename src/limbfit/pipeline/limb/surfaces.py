@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...anatomy.frame import find_proximal_end
 from ...anatomy.imaging import read_labels
 from ...anatomy.labels.labelfiles import normalise_name
 from ...anatomy.segmentation.amputation import amputate_anatomy, amputate_limb
@@ -38,13 +39,17 @@ def _build_imaged_anatomy(context: Context, folder: Path) -> tuple[Anatomy, tupl
     with name_file_in_errors(find_labelled_file(study)):
         labels = read_labels(context.store["segment"] / "labels.seg.nrrd")
         labels = labels.with_regions(list_labelled_regions(study))
+    proximal = None if cut is None else np.array(cut.normal)
     if plane is not None:
-        labels = amputate_limb(labels, plane.point, plane.normal, pad_mm=geometry.amputation_pad_mm)
+        proximal = find_proximal_end(labels.limb, labels, normal=proximal).direction(labels)
+        with name_file_in_errors(study.file, "geometry.amputation"):
+            labels = amputate_limb(labels, plane.point, plane.normal, geometry.amputation_pad_mm, proximal)
     with name_file_in_errors(find_labelled_file(study)):
         anatomy = build_anatomy(
             labels,
             edge_mm=geometry.surface_edge_mm,
-            proximal_cut=None if cut is None else (np.array(cut.point), np.array(cut.normal)),
+            proximal_cut=None if cut is None else (cut.point, cut.normal),
+            proximal=proximal,
         )
     anatomy, files, notes = _add_given_regions(study, anatomy)
     with name_file_in_errors(find_labelled_file(study)):
@@ -83,9 +88,10 @@ def read_given_anatomy(study: Study) -> tuple[Anatomy, tuple[str, ...]]:
     files = {name: study.path(path) for name, path in {"skin": tables.skin, **tables.bones}.items()}
     surfaces = {name: read_surface(path, tables.coordinates, tables.unit) for name, path in files.items()}
     skin, cut = surfaces.pop("skin"), geometry.proximal_cut
-    anatomy, notes = build_closed_anatomy(
-        skin, surfaces, None if cut is None else (cut.point, cut.normal), files
-    )
+    with name_file_in_errors(study.file):
+        anatomy, notes = build_closed_anatomy(
+            skin, surfaces, None if cut is None else (cut.point, cut.normal), files
+        )
     if geometry.regions:
         anatomy, region_files, told = _add_given_regions(study, anatomy)
         notes += told
@@ -93,7 +99,7 @@ def read_given_anatomy(study: Study) -> tuple[Anatomy, tuple[str, ...]]:
     if geometry.amputation is None:
         return anatomy, notes
     plane, pad = geometry.amputation, geometry.amputation_pad_mm
-    with name_file_in_errors(files["skin"]):
+    with name_file_in_errors(study.file, "geometry.amputation"):
         stump = amputate_anatomy(anatomy, plane.point, plane.normal, pad, geometry.surface_edge_mm)
         check_anatomy(stump)
     return stump, notes
