@@ -14,6 +14,7 @@ from runpy import run_path
 import pytest
 
 import limbfit
+from limbfit.pipeline.commands.experiments import EXPERIMENTS
 from limbfit.study import Study
 
 ROOT = Path(__file__).parents[1]
@@ -114,6 +115,7 @@ def python_in(page: str) -> list[str]:
 @pytest.mark.parametrize("page", [f"docs/{page.name}" for page in PAGES if page.parent.name == "docs"])
 def test_python_of_the_pages_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(EXPERIMENTS, "_added", {})  # no other test has this file
     for code in python_in(page):
         Path("example.py").write_text(code, encoding="utf-8")  # an experiment is in a file
         exec(compile(code, "example.py", "exec", dont_inherit=True), {"__name__": "example"})
