@@ -177,4 +177,4 @@ def test_a_process_with_little_memory_forgets_the_site_that_was_not_used_for_lon
     monkeypatch.setattr(simulating, "count_stored_nodes", lambda memory, cores: 1)
     for model in (site, other):
         assert simulate(job(model, sensitivities=False)).completed
-    assert [model.name for model, _ in simulating._prepared] == ["other"]
+    assert [model.name for model, *_ in simulating._prepared] == ["other"]

@@ -164,13 +164,15 @@ def _find_header(rows: Sequence[Row], columns: Names) -> Row:
     """The first row that holds all names.
 
     Raises `TraceError` if none does. It shows the row that holds the most of them; where none holds any,
-    the first row that is as wide as the numbers.
+    the first row that is as wide as the numbers, if there are some.
     """
     if not rows:
         raise TraceError("the file is empty")
     likely = max(rows, key=lambda row: sum(name in row[1] for name in columns.values()))
     if not set(columns.values()) & set(likely[1]):
-        width = next((len(row) for _, row in rows if sum(map(is_number, row)) > 1), len(likely[1]))
+        width = next((len(row) for _, row in rows if sum(map(is_number, row)) > 1), None)
+        if width is None:  # what it holds is not shown: it may be another's file
+            raise TraceError("no table: it has none of the columns, and no row of numbers")
         likely = next((row for row in rows if len(row[1]) == width), likely)
     _check_names(likely[1], columns)
     return likely

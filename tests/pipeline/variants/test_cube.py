@@ -10,7 +10,7 @@ from scipy.integrate import quad
 
 from limbfit import compress_cube
 from limbfit.errors import InputError
-from limbfit.pipeline.variants.cube import KPA, PUBLISHED, _build_times, compress
+from limbfit.pipeline.variants.cube import KPA, PUBLISHED, compress
 
 SKIN = {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.5}
 MUSCLE = {"c_kPa": 4.0, "m": 4.0, "gamma": 3.0, "tau_s": 0.3}
@@ -56,7 +56,7 @@ def test_stress_is_that_of_the_closed_form(tissue):
     """Nearly incompressible: kappa ten thousand times the shear modulus."""
     material = tissue.material(((2.0, 0.5),))
     stiff = type(material)(material.terms, material.prony, kappa_ratio=1e5)
-    times = _build_times()
+    times = np.linspace(0.0, 2.0, 81)[1:]
     stress, least, most = compress(stiff, times, 20.0)
     gamma, tau = material.prony[0] if material.prony else (0.0, 1.0)
     wanted = [exact_stress(tissue.terms, gamma, tau, 0.2, t) for t in (0.25, 0.5, 0.75, 1.0, 1.5)]
