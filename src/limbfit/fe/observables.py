@@ -34,14 +34,16 @@ class ElementFields:
 def compute_element_fields(system: System, laws: Laws, state: State) -> ElementFields:
     """Fields of a state that kept its memory (``store="peak"``, or a step of `iterate`)."""
     history = _compute_relaxing_stress(system, laws, state)
-    out = np.zeros((2, len(system.cells), 11))
+    # Contraction has no strain energy: where there is some, the energy is that of a second pass without it.
+    passes = [laws.activate(state.activation, np.ones(len(laws.prony)))]
+    passes += [laws.tables] if state.activation else []
+    out = np.zeros((len(passes), len(system.cells), 11))
     points, law, numbers, _, _, element, *_ = workspace(0, system.weights.shape[1], laws.numbers.shape[1])
     records = points, law, numbers, element
     mean, every = system.element.mean_dilatation, slice(0, len(system.cells))
-    active = laws.activate(state.activation, np.ones(len(laws.prony)))
-    for tables, fields in zip((active, laws.tables), out):
+    for tables, fields in zip(passes, out):
         _compute_fields(system.elements(every), mean, tables, history, state.u, records, fields)
-    return ElementFields(out[0, :, :6], out[0, :, 6:9], out[0, :, 9], out[1, :, 10])
+    return ElementFields(out[0, :, :6], out[0, :, 6:9], out[0, :, 9], out[-1, :, 10])
 
 
 def compute_nodal_forces(system: System, laws: Laws, state: State) -> Array:

@@ -22,6 +22,7 @@ from ...errors import InputError, LabelError, SurfaceError, add_location
 from ...results.limb import SurfaceMeasures, SurfacesResult
 from ..frame import ProximalEnd, find_proximal_end, select_layer
 from ..grid import LabelMap
+from ..morphology import find_box
 from .extraction import extract_fine_surface, extract_surface, remesh
 from .surfacefiles import read_surface, write_surface
 from .triangles import Surface, check_closed, find_bodies, find_half_edges, from_pyvista
@@ -141,21 +142,22 @@ def _build_anatomy(
             bones[name] = extract_surface(reach, name, edge_mm)
     regions = {}
     for label, name in labels.regions.items():
-        _check_pieces(reach, label, distal)
         if not (extended.mask(label) & distal).any():
             raise LabelError(
                 f"nothing of {label!r} is left in the limb",
                 place=f"geometry.regions.{name}",
                 remedy="leave the region out or move the cut",
             )
+        _check_pieces(reach, label, distal)
         regions[name] = extract_surface(reach, label, edge_mm)
     return Anatomy(skin, bones, point, normal, regions)
 
 
 def _check_pieces(labels: LabelMap, name: str, distal: Mask) -> None:
     """Refuse a label of which a cut leaves notable pieces, as condyles: all but one would be lost."""
-    parts = connected(labels.mask(name))[0]
-    volumes = np.bincount(parts[distal])[1:] * labels.voxel_mm3
+    mask = labels.mask(name)
+    box = find_box(mask)  # in a fine image a bone fills little of it
+    volumes = np.bincount(connected(mask[box])[0][distal[box]])[1:] * labels.voxel_mm3
     if (volumes >= _STUMP_MM3).sum() > 1:
         raise LabelError(
             f"{name!r} is cut into pieces of {' and '.join(f'{v / 1000:.2g}' for v in volumes)} cm3",
