@@ -364,11 +364,14 @@ def design(
         "speeds": speeds,
         "holds": holds,
         "determine": determine,
+        "criterion": criterion,
         "draws": draws,
+        "ultrasound": ultrasound,
+        "surface": surface,
+        "shear-waves": shear_waves,
     }
-    of_session |= {"criterion": criterion, "ultrasound": ultrasound, "surface": surface}
     if not protocol:
-        refuse_idle_options(of_session | {"shear-waves": shear_waves}, "without --protocol")
+        refuse_idle_options(of_session, "without --protocol")
         result = call_on_study(study, limbfit.design_study, sites=sites or 0, **options)
         print_stored(result, "design", show_design, as_json)
         return

@@ -172,8 +172,12 @@ def _find_crossings(mesh: Mesh, origin: Array, axis: Array) -> list[_Crossing]:
     crossings.sort(key=lambda c: c.along_mm)
     distinct: list[_Crossing] = []
     for crossing in crossings:
-        before = distinct[-1:]
-        if not any(crossing.along_mm - b.along_mm < _SAME_MM and crossing.below == b.below for b in before):
+        previous = distinct[-1] if distinct else None
+        if (
+            previous is None
+            or crossing.along_mm - previous.along_mm >= _SAME_MM
+            or crossing.below != previous.below
+        ):
             distinct.append(crossing)
     return distinct
 

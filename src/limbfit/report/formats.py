@@ -17,9 +17,8 @@ def number(value: Any, digits: int = 3) -> str:
         return NOTHING
     if value in (float("inf"), float("-inf")):
         return "∞" if value > 0 else "−∞"
-    value = (
-        float(f"{value:.{digits - 1}e}") if abs(value) < 10**digits else value
-    )  # it may reach another decade
+    if abs(value) < 10**digits:
+        value = float(f"{value:.{digits - 1}e}")  # rounded first: it may reach another decade
     if value == 0 or 1e-3 <= abs(value) < 1e5:
         text = f"{value:#.{digits}g}" if abs(value) < 10**digits else f"{value:,.0f}".replace(",", " ")
         return text.rstrip(".").replace("-", "−")

@@ -73,11 +73,7 @@ class SteppedRun:
         self.seconds: defaultdict[str, float] = defaultdict(float)
         moduli, threads, last = self.laws.moduli, control.threads, find_touched_unknowns(self.system, problem)
         self.planned = schedule_steps(problem.history, control, problem.turns)
-        opened = [body.motion.times[np.isnan(body.motion.values).any(axis=1)] for body in problem.bodies]
-        for t in (t for times in opened for t in times if not np.isclose(self.planned, t, rtol=1e-9).any()):
-            raise ProblemError(
-                f"no step ends at {t:g} s, where a body's force is taken over", remedy="add it to the times"
-            )
+        _check_takeovers(problem, self.planned)
         self.factor = Factor(
             self.system, moduli, control.linear_solver, threads, last=last, steps=len(self.planned)
         )
@@ -419,3 +415,12 @@ class SteppedRun:
         if self.problem.history.forced:  # the force is what is stated
             return du, np.zeros(laws.count)
         return du, at.force * d_penalty + d_reaction + d_force
+
+
+def _check_takeovers(problem: Problem, planned: Array) -> None:
+    """Refuse steps (k,), s, that skip the time at which a body's force is taken over."""
+    for body in problem.bodies:
+        for t in body.motion.times[np.isnan(body.motion.values).any(axis=1)]:
+            if not np.isclose(planned, t, rtol=1e-9).any():
+                what = f"no step ends at {t:g} s, where a body's force is taken over"
+                raise ProblemError(what, remedy="add it to the times")

@@ -4,8 +4,7 @@ At given parameters each candidate indentation has a Fisher information on the l
 ``J' S^-1 J``, from the exact derivatives of its force and a noise model. The information of several
 indentations adds up. D-optimal is the choice with the largest determinant of the sum (the smallest volume of
 the joint confidence region), A-optimal the one with the smallest sum of variances (Fedorov 1972; Atkinson and
-Donev 1992). The bounds and the stated priors
-count beside the data.
+Donev 1992). The bounds and the stated priors count beside the data.
 
 Records that have to fit into a patient's time are chosen by Bayesian design (`plan_records`). Their
 information is computed at several samples of the parameters, because what a record tells depends on the

@@ -193,8 +193,11 @@ def _choose_designs(
 
 def _select_deepest(every: Sequence[Candidate]) -> tuple[int, ...]:
     """The deepest candidate of each site."""
-    by_depth = sorted(enumerate(every), key=lambda pair: pair[1].depth_mm)
-    return tuple(sorted({one.site: i for i, one in by_depth}.values()))
+    best: dict[str, int] = {}
+    for i, one in enumerate(every):
+        if one.site not in best or one.depth_mm > every[best[one.site]].depth_mm:
+            best[one.site] = i
+    return tuple(best.values())
 
 
 def _describe_verdict(designs: dict[str, Design], names: Sequence[str]) -> str:

@@ -228,8 +228,10 @@ def _plan_records(
     """
     study, found, left_out = context.study, [], []
     anatomy = load_anatomy(context.store["surfaces"])
-    models = [build_model(context, one) for one in study.indentations]
-    deepest = {own.site: max(own.knots_mm) for own in sorted(models, key=lambda own: max(own.knots_mm))}
+    deepest: dict[str, float] = {}
+    for one in study.indentations:
+        own = build_model(context, one)
+        deepest[own.site] = max(deepest.get(own.site, 0.0), max(own.knots_mm))
     for site in study.sites:
         usual = deepest[site.name]
         wanted = depths_mm or (usual,)
@@ -337,8 +339,10 @@ def _build_plans(
     """The designed protocol, one slow ramp at every site, as deep as usual, and the best without each
     ingredient."""
     slow, tool = min(one.speed_mm_s for one in found), found[0].indenter
-    by_depth = sorted(found, key=lambda one: one.depth_mm)
-    most = {(one.site, one.indenter): one.depth_mm for one in by_depth}
+    most: dict[tuple[str, str], float] = {}
+    for one in found:
+        place = one.site, one.indenter
+        most[place] = max(most.get(place, 0.0), one.depth_mm)
     kinds: dict[str, Callable[[PlannedRecord], bool]] = {
         DESIGNED: lambda one: True,
         "without holds": lambda one: not one.hold_s,
