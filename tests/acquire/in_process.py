@@ -5,6 +5,9 @@ What must never happen is checked on every millisecond of the device (`Bench.mil
 
 from __future__ import annotations
 
+from copy import deepcopy
+from functools import cache
+
 import numpy as np
 
 from acquiring import indentation
@@ -163,3 +166,24 @@ class Bench:
             assert "release" in self.session.protocol.reason  # what is left to do
         if self.phase is not Phase.DONE:
             assert self.session.protocol.reason
+
+
+@cache
+def _course() -> dict[Phase, Bench]:
+    """A session whose ramps are held, as it was when it first came to each of its phases."""
+    bench, found = Bench(hold_s=0.2), {}
+    while not bench.session.protocol.is_over:
+        found.setdefault(bench.phase, deepcopy(bench))
+        before = bench.phase
+        while bench.phase is before:
+            bench.millisecond()
+            if bench.phase is before:
+                bench.operate()
+    return found
+
+
+def session_in(phase: Phase, *faults: Fault) -> Bench:
+    """A session that has just come to a phase, with a device that will have those faults."""
+    bench = deepcopy(_course()[phase])
+    bench.device.faults.faults = faults
+    return bench

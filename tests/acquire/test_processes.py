@@ -8,14 +8,15 @@ import pty
 import random
 import re
 import select
-import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from queue import SimpleQueue
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -152,11 +153,11 @@ def kill_the_device(ready, samples: int) -> None:
 
 
 def test_a_killed_host_leaves_a_readable_record_and_a_retracted_device(ready) -> None:
-    kill_the_host(ready, 2500)
+    kill_the_host(ready, 600)
 
 
 def test_a_killed_device_ends_the_session_with_a_reason(ready) -> None:
-    kill_the_device(ready, 2500)
+    kill_the_device(ready, 600)
 
 
 @pytest.mark.slow
@@ -169,7 +170,7 @@ def test_both_ends_killed_at_random_moments(ready, end, seed: int) -> None:
 def test_termination_retracts(ready) -> None:
     with fitsocket(ready, "--speed", SPEED) as (address, _):
         host = start("acquire", ready, "--device", address, "--unattended", "--site", "1", "--depth", 4.0)
-        file = wait_for_record(ready, 1500, host)
+        file = wait_for_record(ready, 600, host)
         host.send_signal(signal.SIGTERM)
         _, err = host.communicate(timeout=60)
     assert host.returncode == 1
@@ -179,14 +180,12 @@ def test_termination_retracts(ready) -> None:
 
 def test_faults_on_demand_stop_the_session(ready, tmp_path) -> None:
     faults = tmp_path / "faults.toml"
-    faults.write_text(
-        '[[faults]]\nkind = "limb"\nphase = "load"\nat_s = 0.5\npin = 4\nvalue = -6\nduration_s = 0.3\n'
-    )
+    faults.write_text('[[faults]]\nkind = "button"\nphase = "clamp"\nat_s = 0.2\nduration_s = 0.5\n')
     with fitsocket(ready, "--speed", SPEED, "--faults", faults) as (address, _):
         code, found, err = acquire(ready, address, "--unattended", "--depth", 4.0)
     assert code == 1
     (row,) = found["sites"]  # the second site is not begun
-    assert "the limb has moved" in row["reason"], err
+    assert "button" in row["reason"], err
     assert row["phase"] == "stopped"
 
 
@@ -269,13 +268,6 @@ def test_the_operator_s_keys_in_a_terminal(ready) -> None:
     assert 1.0 < depth < 15.0
 
 
-def test_without_a_terminal_an_operator_is_asked_for(ready) -> None:
-    process = start("acquire", ready, stdin=subprocess.DEVNULL)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 2
-    assert "--unattended" in err
-
-
 def test_the_server_binds_to_loopback_and_takes_one_host(ready) -> None:
     with fitsocket(ready) as (address, process):
         host, port = re.fullmatch(r"tcp://(127\.0\.0\.1):(\d+)", address).groups()
@@ -314,29 +306,37 @@ def identity(model: str) -> bytes:
     ],
     ids=["ansi", "endless", "control", "long", "space", "spoilt"],
 )
-def test_a_hostile_device_gets_one_clean_line(ready, answer: bytes) -> None:
+def test_a_hostile_device_gets_one_clean_line(ready, limbfit, answer: bytes) -> None:
     listener = socket.create_server(("127.0.0.1", 0))
     address = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
-    host = start("acquire", ready, "--device", address, "--unattended", "--site", "1", "--depth", 3.0)
-    connection, _ = listener.accept()
-    connection.sendall(answer)
-    _, err = host.communicate(timeout=60)
-    assert host.returncode == 1
+
+    def answer_once() -> None:
+        connection, _ = listener.accept()
+        with connection, suppress(OSError):  # the host hangs up on a device that talks too much
+            connection.sendall(answer)
+            connection.recv(100)
+
+    device = Thread(target=answer_once)
+    device.start()
+    code, _, err = limbfit(
+        "acquire", ready, "--device", address, "--unattended", "--site", "1", "--depth", 3.0
+    )
+    listener.close()
+    device.join()
+    assert code == 1
     assert err.startswith("error: no greeting from the device")
     assert len(err.splitlines()) == 1
     assert err.strip().isprintable()
     assert not list(ready.glob("acquired/*"))
-    connection.close()
-    listener.close()
 
 
-def test_nothing_is_written_outside_the_study(ready) -> None:
+def test_nothing_is_written_outside_the_study(ready, limbfit) -> None:
     file = ready / "study.toml"
     file.write_text(file.read_text().replace('trace = "1.csv"', 'trace = "../1.csv"'))
-    code, _, err = acquire(ready, "tcp://127.0.0.1:1", "--unattended", "--site", "1", "--depth", 3.0)
+    words = ("--device", "tcp://127.0.0.1:1", "--unattended", "--site", "1", "--depth", 3.0)
+    code, _, err = limbfit("acquire", ready, *words)
     assert code == 2
     assert "outside the study's folder" in err
-    shutil.rmtree(ready / "results")
 
 
 @pytest.mark.parametrize(
@@ -348,11 +348,9 @@ def test_nothing_is_written_outside_the_study(ready) -> None:
         ("", "faults"),
     ],
 )
-def test_bad_fault_files_are_refused(ready, tmp_path, content: str, said: str) -> None:
+def test_bad_fault_files_are_refused(ready, limbfit, tmp_path, content: str, said: str) -> None:
     file = tmp_path / "faults.toml"
     file.write_text(content)
-    process = start("virtual-fitsocket", ready, "--port", 0, "--faults", file)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 2
+    code, _, err = limbfit("virtual-fitsocket", ready, "--port", 0, "--faults", file)
+    assert code == 2
     assert said in err
-    assert "Traceback" not in err

@@ -6,7 +6,7 @@ from queue import SimpleQueue
 
 import numpy as np
 import pytest
-from in_process import FAST, Bench, settings
+from in_process import FAST, Bench, session_in, settings
 
 from limbfit.acquire.events import Abort, Sample, Signal
 from limbfit.acquire.operator import NoOperator
@@ -85,8 +85,7 @@ def test_letting_go_halts_at_once_and_a_shallow_search_is_none() -> None:
 
 
 def test_the_key_moves_nothing_in_other_phases() -> None:
-    bench = Bench()
-    bench.until(Phase.CLAMP)
+    bench = session_in(Phase.CLAMP)
     for event in (Signal.KEY_DOWN, Signal.KEY_UP):
         bench.session.handle(event, bench.now)
     assert bench.phase is Phase.CLAMP
@@ -94,8 +93,7 @@ def test_the_key_moves_nothing_in_other_phases() -> None:
 
 
 def test_enter_is_an_emergency_stop_once_the_limb_is_in_place() -> None:
-    bench = Bench()
-    bench.until(Phase.LOAD)
+    bench = session_in(Phase.LOAD)
     bench.session.handle(Signal.CONFIRM, bench.now)
     assert bench.phase is Phase.STOPPING
     assert "by a key" in bench.session.protocol.reason
@@ -150,7 +148,7 @@ FAULTS = {
 @pytest.mark.parametrize("kind", FAULTS)
 def test_each_fault_ends_retracted_with_its_reason(kind: str) -> None:
     fault, _ = FAULTS[kind]
-    bench = Bench(faults=(fault,), depth_mm=3.0)
+    bench = session_in(Phase(fault.phase), fault)
     bench.until()
     bench.settle()
     bench.check_end()
@@ -162,14 +160,14 @@ def test_each_fault_ends_retracted_with_its_reason(kind: str) -> None:
 @pytest.mark.parametrize("ms", [2, 10])
 def test_a_short_disturbance_is_outlived(ms: int) -> None:
     fault = Fault(kind="lost", phase="load", at_s=0.1, duration_s=ms / 1000)
-    bench = Bench(faults=(fault,))
+    bench = session_in(Phase.LOAD, fault)
     bench.until()
     assert bench.phase is Phase.DONE
     assert bench.session.lost == pytest.approx(ms / 2, abs=1)
 
 
 def test_a_pin_that_stays_stuck_is_reported() -> None:
-    bench = Bench(faults=(Fault(kind="stuck", phase="load", at_s=0.1, pin=1),))
+    bench = session_in(Phase.LOAD, Fault(kind="stuck", phase="load", at_s=0.1, pin=1))
     bench.until()
     assert bench.phase is Phase.UNREACHABLE
     assert bench.session.unreachable == (1,)
@@ -181,8 +179,7 @@ def test_a_pin_that_stays_stuck_is_reported() -> None:
 
 
 def test_a_device_that_falls_silent_after_a_stop_is_reported() -> None:
-    bench = Bench()
-    bench.until(Phase.LOAD)
+    bench = session_in(Phase.LOAD)
     bench.session.handle(Abort("for the test"), bench.now)
     for _ in range(5100):
         bench.millisecond(device=False)
@@ -192,8 +189,7 @@ def test_a_device_that_falls_silent_after_a_stop_is_reported() -> None:
 
 @pytest.mark.parametrize("phase", [p for p in Phase if p not in FINAL | {Phase.IDLE, Phase.STOPPING}])
 def test_an_abort_in_any_phase_retracts(phase: Phase) -> None:
-    bench = Bench(hold_s=0.2)
-    bench.until(phase)
+    bench = session_in(phase)
     bench.session.handle(Abort("for the test"), bench.now)
     bench.settle()
     bench.check_end()
@@ -210,8 +206,7 @@ def test_an_operator_who_does_not_come_is_not_waited_for_forever() -> None:
 
 
 def test_a_host_that_hangs_is_noticed_by_the_device() -> None:
-    bench = Bench()
-    bench.until(Phase.LOAD)
+    bench = session_in(Phase.LOAD)
     for _ in range(25):
         bench.millisecond(host=False)
     assert bench.device.stopped == "watchdog"

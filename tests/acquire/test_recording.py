@@ -178,12 +178,12 @@ def checks(recording) -> dict[str, bool | None]:
 
 def test_a_good_session_is_called_good_and_its_ramps_are_kept_with_their_holds(tmp_path) -> None:
     bench, recording = session(
-        tmp_path, repeats=2, precondition=1, ramp_speed_mm_s=1.4, hold_s=1.0, pause_s=3.0, settle_s=0.5
+        tmp_path, repeats=1, precondition=1, ramp_speed_mm_s=2.5, hold_s=0.6, pause_s=2.0, settle_s=0.5
     )
     verdict = check_record(recording)
     assert verdict.is_good, verdict
     found = find_ramps(recording)
-    assert [ramp.cycle for ramp in found] == [1, 2, 3]
+    assert [ramp.cycle for ramp in found] == [1, 2]
     protocol = bench.session.protocol
     depth = (protocol.depth_um - protocol.start_um) / 1000
     for ramp in found:
@@ -193,7 +193,7 @@ def test_a_good_session_is_called_good_and_its_ramps_are_kept_with_their_holds(t
     curve = regularise(found[1].trace, find_touch_down(found[1].trace))
     assert [phase.kind for phase in curve.phases] == ["load", "hold", "unload"]
     hold = curve.phases[1]
-    assert hold.duration_s == pytest.approx(1.0, abs=0.15)
+    assert hold.duration_s == pytest.approx(0.6, abs=0.1)
     inside = (curve.time_s > hold.start_s + 0.1) & (curve.time_s < hold.end_s - 0.1)
     assert np.diff(curve.force_N[inside])[[0, -1]].max() < 0.0  # it relaxes
 

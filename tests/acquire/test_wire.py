@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from in_process import Bench, connect, device
+from in_process import Bench, connect, device, session_in
 
 from limbfit.acquire.events import PINS, Fence, Hold, Move, Sample, Stop
 from limbfit.acquire.line_protocol import (
@@ -164,8 +164,7 @@ def hostile(bench: Bench) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("kind", ["malformed", "checksum", "replayed", "oversized", "unknown"])
 def test_the_device_acts_on_none_of_them(kind: str) -> None:
-    bench = Bench()
-    bench.until(Phase.READY)
+    bench = session_in(Phase.READY)
     motors, refused = bench.device.motors, bench.device.refused
     before = getattr(refused, kind)
     line = hostile(bench)[kind]
