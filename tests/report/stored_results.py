@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -48,12 +49,6 @@ def leave_unarranged(monkeypatch: pytest.MonkeyPatch) -> None:
         drawn(canvas, *args, **options)
 
     monkeypatch.setattr(FigureCanvasSVG, "print_svg", print_svg)
-
-
-def remove_geometry(results: Path) -> None:
-    """Take away the meshes and surfaces, which only pictures need."""
-    for file in (*results.rglob("*.vtu"), *results.rglob("*.stl")):
-        file.unlink()
 
 
 def radius(z: np.ndarray) -> np.ndarray:
@@ -109,11 +104,13 @@ def add_fat(folder: Path) -> Path:
     return folder
 
 
-def write_results(folder: Path, *, sites: tuple = SITES, name: str = "Phantom 7 (coarse)") -> Path:
-    """Every artefact of a finished study below ``folder``."""
+def write_results(
+    folder: Path, *, sites: tuple = SITES, name: str = "Phantom 7 (coarse)", geometry: bool = True
+) -> Path:
+    """Every artefact of a finished study below ``folder``; without the geometry, which only pictures need."""
     _json(folder / "run.json", _run(sites, name))
     _json(folder / "truth.json", {"parameters": TRUTH})
-    _surfaces(folder / "surfaces")
+    _surfaces(folder / "surfaces", geometry)
     volumes = {"muscle": 902.4, "tibia": 118.0, "fibula": 17.3, "skin": 151.2}
     _json(folder / "segment" / "segment.json", {"volumes_cm3": volumes, "method": "bias-corrected threshold"})
     _json(folder / "sites" / "sites.json", {"sites": [_site(i, row) for i, row in enumerate(sites)]})
@@ -121,6 +118,8 @@ def write_results(folder: Path, *, sites: tuple = SITES, name: str = "Phantom 7 
     _meshes(folder, sites)
     _json(folder / "calibrate" / "calibration.json", _calibration(sites))
     _predict(folder / "predict", sites)
+    if geometry:
+        _write_meshes(folder, sites)
     return folder
 
 
@@ -163,8 +162,22 @@ def _run(sites: tuple, name: str) -> dict:
     }
 
 
-def _surfaces(folder: Path) -> None:
+def _surfaces(folder: Path, geometry: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
+    if geometry:
+        _bodies(folder)
+    _json(
+        folder / "surfaces.json",
+        {
+            "cut_point": [0, 0, 60],
+            "cut_normal": [0, 0, 1],
+            "skin": {"volume_mm3": 1153100.0},
+            "bones": {"tibia": {"volume_mm3": 117200.0}},
+        },
+    )
+
+
+def _bodies(folder: Path) -> None:
     z, angle = np.meshgrid(np.linspace(-129.5, 60, 80), np.linspace(0, 2 * np.pi, 90), indexing="ij")
     r = radius(z)
     wall = pv.StructuredGrid(r * np.cos(angle), r * np.sin(angle), z).extract_surface(
@@ -175,15 +188,6 @@ def _surfaces(folder: Path) -> None:
         middle = (*centre, (low + 60) / 2)
         bone = pv.Cylinder(center=middle, direction=(0, 0, 1), radius=size, height=60 - low, resolution=40)
         bone.triangulate().save(folder / f"bone-{name}.stl")
-    _json(
-        folder / "surfaces.json",
-        {
-            "cut_point": [0, 0, 60],
-            "cut_normal": [0, 0, 1],
-            "skin": {"volume_mm3": 1153100.0},
-            "bones": {"tibia": {"volume_mm3": 117200.0}},
-        },
-    )
 
 
 def _site(index: int, row: tuple) -> dict:
@@ -274,12 +278,8 @@ def _limb_mesh() -> Mesh:
 
 
 def _meshes(folder: Path, sites: tuple) -> None:
-    (folder / "mesh").mkdir(parents=True, exist_ok=True)
-    (folder / "predict").mkdir(parents=True, exist_ok=True)
-    mesh = _limb_mesh()
     facts = {}
     for i, row in enumerate(sites):
-        write_vtu(mesh, folder / "mesh" / f"{row[0]}.vtu")
         facts[row[0]] = {
             "nodes": 61234 + i,
             "cells": 41987,
@@ -291,9 +291,17 @@ def _meshes(folder: Path, sites: tuple) -> None:
             "warnings": ["the layer is thin at the tibial crest"] if i == 1 else [],
             "seconds": 15.2,
         }
+    _json(folder / "mesh" / "mesh.json", {"sites": facts})
+
+
+def _write_meshes(folder: Path, sites: tuple) -> None:
+    mesh = _limb_mesh()
+    write_vtu(mesh, folder / "mesh" / f"{sites[0][0]}.vtu")
+    for i, row in enumerate(sites):
+        if i:
+            shutil.copy(folder / "mesh" / f"{sites[0][0]}.vtu", folder / "mesh" / f"{row[0]}.vtu")
         if row[2]:
             _peak_fields(mesh, skin_point(row[3], row[4]), _depth(i), folder / "predict" / f"{row[0]}.vtu")
-    _json(folder / "mesh" / "mesh.json", {"sites": facts})
 
 
 def _peak_fields(mesh: Mesh, site: np.ndarray, depth: float, file: Path) -> None:

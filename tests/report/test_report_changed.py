@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from page_outline import Outline, section_of, without_scripts
-from stored_results import SITES, add_fat, leave_unarranged, remove_geometry, write_results
+from stored_results import SITES, add_fat, leave_unarranged, write_results
 
 from completing import complete
 from limbfit import compress_cube, load_study
@@ -34,9 +34,7 @@ SKIN = {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.5}
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    written = write_results(tmp_path_factory.mktemp("study") / "results", sites=FEW)
-    remove_geometry(written)
-    return written
+    return write_results(tmp_path_factory.mktemp("study") / "results", sites=FEW, geometry=False)
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ def compared(folder, peak=3.0, reason=""):
 
 @pytest.mark.slow
 def test_the_comparison_is_shown_where_there_is_one(tmp_path):
-    write_results(tmp_path / "results")
+    write_results(tmp_path / "results", geometry=False)
     plain = build_report(tmp_path / "results", tmp_path / "plain").read_text()
     assert "Comparison with FEBio" not in plain
     compared(tmp_path / "results" / "compare", reason="FEBio was <killed>")

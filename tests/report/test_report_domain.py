@@ -26,7 +26,7 @@ def loading(ramp_s: float, end_s: float, skin: float, muscle: float) -> list[Ext
 @pytest.fixture(scope="module")
 def store(tmp_path_factory) -> Results:
     """Records of ramps; a load of a socket that lasts an hour and shears the skin more."""
-    found = load_store(write_results(tmp_path_factory.mktemp("study") / "results"))
+    found = load_store(write_results(tmp_path_factory.mktemp("study") / "results", geometry=False))
     own = [
         loading(7.0 + 0.1 * i, 14.0 + 0.2 * i, 0.24 - 0.01 * i, 0.2 + 0.01 * i)
         for i in range(len(found.predicted))

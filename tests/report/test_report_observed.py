@@ -55,7 +55,7 @@ WAVE = {
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
     """A study with a surface at a fitted site, ultrasound and shear waves at a held-out one."""
-    folder = write_results(tmp_path / "results")
+    folder = write_results(tmp_path / "results", geometry=False)
     file = folder / "predict" / "predict.json"
     content = json.loads(file.read_text())
     for row in content["sites"]:
@@ -118,6 +118,6 @@ def test_each_has_a_row_with_what_was_left_out(results: Path) -> None:
 
 
 def test_a_study_of_forces_alone_shows_nothing_of_it(tmp_path: Path) -> None:
-    store = load_store(write_results(tmp_path / "results"))
+    store = load_store(write_results(tmp_path / "results", geometry=False))
     assert make_observed_table(store) is None
     assert draw_skin_figure(store, fitted=True) is None

@@ -22,7 +22,7 @@ from limbfit.results.identification import CalibrationResult
 
 @pytest.fixture
 def results(tmp_path: Path) -> Path:
-    return write_results(tmp_path / "results")
+    return write_results(tmp_path / "results", geometry=False)
 
 
 def add_priors(results: Path) -> None:

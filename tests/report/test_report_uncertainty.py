@@ -53,7 +53,7 @@ def test_extrapolated_parts_of_a_profile_are_dashed():
 
 
 def test_the_figure_of_profiles_says_what_dashes_mean_and_what_the_solver_said(tmp_path):
-    store = load_store(write_results(tmp_path))
+    store = load_store(write_results(tmp_path, geometry=False))
     figure = draw_profile_figure(
         store, UncertaintyResult.model_construct(profiles={"skin.m": PROFILE}, checks=CHECKS)
     )

@@ -21,7 +21,7 @@ from limbfit.report import build_report
 from limbfit.results.identification import CalibrationResult
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "report"))
-from stored_results import leave_unarranged, remove_geometry, write_results
+from stored_results import leave_unarranged, write_results
 
 FOLD = SimulationWarning("folded", "7 elements are inside out at a node at 9.1 mm", 7, 9.1, 1.0)
 DOUBT = FOLD.text
@@ -43,8 +43,7 @@ def test_the_command_line_names_the_site(capsys):
 
 
 def test_the_report_shows_them_and_counts_those_of_the_search(tmp_path, monkeypatch):
-    results = write_results(tmp_path / "results")
-    remove_geometry(results)
+    results = write_results(tmp_path / "results", geometry=False)
     leave_unarranged(monkeypatch)
     file = results / "predict" / "predict.json"
     predicted = json.loads(file.read_text())
