@@ -11,7 +11,7 @@ from limbfit.phases import find_boundaries
 from limbfit.traces import Trace, find_touch_down, read_trace, regularise, touch_down_at
 
 
-@pytest.mark.parametrize("p", [1.0, 1.3, 1.5, 2.0])
+@pytest.mark.parametrize("p", [1.0, 1.5, 2.0])
 @pytest.mark.parametrize("slack", [0.0, 0.4, 2.0])
 def test_touch_down_is_found_under_noise(p, slack):
     for seed in range(3):
@@ -44,7 +44,7 @@ def test_more_noise_means_more_uncertainty_and_no_bias():
 
 
 @needs_openlimb
-@pytest.mark.parametrize("site", ["1", "2", "3", "4", "5", "6"])
+@pytest.mark.parametrize("site", ["1", "4", "6"])
 def test_touch_down_of_foreign_records(site):
     """Between FEBio's last point without force and the first with more than 10 mN, to 0.1 mm."""
     trace = read_trace(OPENLIMB / "traces" / f"site-{site}.csv")

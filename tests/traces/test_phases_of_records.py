@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -36,14 +37,20 @@ PROTOCOLS = {
 }
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
-def test_every_phase_of_a_record_is_found_and_smoothed_by_itself(name):
-    corners_s, corners_mm, expected = PROTOCOLS[name]
-    trace, truth = path_record(corners_s, corners_mm)
+@cache
+def follow(name: str):
+    """The record of a protocol: its touch-down, its curve, and the true force over time."""
+    trace, truth = path_record(*PROTOCOLS[name][:2])
     check_trace(trace)
     touch = find_touch_down(trace)
+    return touch, regularise(trace, touch), truth
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_every_phase_of_a_record_is_found_and_smoothed_by_itself(name):
+    corners_s, _, expected = PROTOCOLS[name]
+    touch, curve, truth = follow(name)
     assert touch.displacement_mm == pytest.approx(0.4, abs=0.1)
-    curve = regularise(trace, touch)
     assert [phase.kind for phase in curve.phases] == expected.split()
     ends = find_boundaries(curve.phases)[1:-1] + touch.time_s
     assert ends == pytest.approx(corners_s[1:-1], abs=0.01)
@@ -55,9 +62,7 @@ def test_every_phase_of_a_record_is_found_and_smoothed_by_itself(name):
 
 
 def test_cycles_that_leave_the_skin_have_no_force_between():
-    trace, _ = path_record(*PROTOCOLS["three cycles"][:2])
-    touch = find_touch_down(trace)
-    curve = regularise(trace, touch)
+    touch, curve, _ = follow("three cycles")
     assert curve.knots_mm[2] == pytest.approx(-touch.displacement_mm, abs=0.01)
     away = np.abs(curve.time_s + touch.time_s - 10.0) < 0.3
     assert curve.force_N[away].max() < 0.03
@@ -65,8 +70,7 @@ def test_cycles_that_leave_the_skin_have_no_force_between():
 
 
 def test_a_long_hold_takes_no_points_of_comparison_from_the_ramps():
-    trace, _ = path_record(*PROTOCOLS["long hold"][:2])
-    even = regularise(trace, find_touch_down(trace)).resample(81)
+    even = follow("long hold")[1].resample(81)
     counts = [
         int(((even.time_s > phase.start_s) & (even.time_s <= phase.end_s)).sum()) for phase in even.phases
     ]
@@ -91,8 +95,7 @@ def test_the_start_of_a_relaxation_is_smoothed_alike_in_record_and_simulation():
 
 
 def test_the_response_of_the_smoothing_follows_every_phase():
-    trace, _ = path_record(*PROTOCOLS["cycles in contact"][:2])
-    curve = regularise(trace, find_touch_down(trace))
+    _, curve, _ = follow("cycles in contact")
     times = curve.resample(81).time_s
     matrix = curve.curve.compute_response(times)
     force = np.interp(times, curve.knots_s, curve.knots_mm)
@@ -108,7 +111,7 @@ def test_a_stated_peak_is_that_of_the_first_cycle():
 
 
 def test_a_displacement_that_wanders_is_refused():
-    time = np.arange(0, 40, 0.01)
+    time = np.arange(0, 40, 0.04)
     wander = np.abs(0.2 * np.cumsum(np.random.default_rng(1).standard_normal(time.size)))
     with pytest.raises(TraceError, match=r"displacement: the displacement wanders: 40 .* cut out the part"):
         regularise(Trace(time, wander, wander), TouchDown(0.0, 0.0, 0.1, 1.0, 0.0, True))
@@ -147,9 +150,7 @@ def test_its_sign_is_still_looked_at():
 
 
 @needs_relaxation
-@pytest.mark.parametrize(
-    "name", ["230403-FF1A", "230403-FF1b", "230403-RDG1A", "230411-RDG1A", "230411-RDG1B", "230411-RDG1C"]
-)
+@pytest.mark.parametrize("name", ["230403-FF1A", "230403-RDG1A", "230411-RDG1C"])
 def test_real_ramp_and_hold_records(name):
     trace = read_trace(RELAXATION / f"{name}.csv")
     touch = find_touch_down(trace)
