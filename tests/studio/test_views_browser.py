@@ -129,6 +129,7 @@ def test_without_webgl_the_views_say_so_and_the_rest_works(study, serve, open_pa
     until(lambda: "von Mises stress" in page.locator(".player-words").inner_text())
 
 
+@pytest.mark.slow
 def test_the_answer_of_another_law_is_shown_as_it_was(study, serve, open_page):
     """Until the study is identified anew; the buttons that do so stay, too."""
     write_outcome(study / "results")
