@@ -90,7 +90,7 @@ def test_the_shell_completes_verbs_and_options(typed, word, offered):
     assert done.stdout.split() == offered
 
 
-def test_check_as_json(limbfit, study):
+def test_check_as_json(limbfit, commands_unasked, study):
     code, out, _ = limbfit("check", study, "--json")
     found = json.loads(out)
     assert code == 0
@@ -111,7 +111,7 @@ hold_s = 3600.0
 """
 
 
-def test_check_says_what_goes_beyond_the_fitted_records(limbfit, study):
+def test_check_says_what_goes_beyond_the_fitted_records(limbfit, commands_unasked, study):
     """A site a quarter around the limb, one that is planned deep and fast, and a load of an hour."""
     file = study / "study.toml"
     file.write_text(file.read_text() + PLANNED)
@@ -188,18 +188,13 @@ def test_surfaces_are_shown(limbfit, study):
     least = np.linalg.norm(skin[:, None] - bone, axis=-1).min()
     assert found["thinnest_mm"]["tibia"]["tissue_mm"] == pytest.approx(least, abs=0.3)
     assert min(picture_size(found["picture"])) > 400
-    code, out, _ = limbfit("surfaces", study)
-    assert code == 0
-    assert "2 closed bodies" in out
-    assert found["picture"] in out
 
 
 def test_sites_are_shown(limbfit, study):
-    code, out, _ = limbfit("sites", study, "--json")
-    found = json.loads(out)
+    code, out, _ = limbfit("sites", study)
     assert code == 0
-    assert [site["site"] for site in found["sites"]] == ["1", "2"]
-    assert min(picture_size(found["picture"])) > 400
+    assert min(picture_size(study / "results" / "sites" / "sites.png")) > 400
+    assert "sites.png" in out
     assert not (study / "results/traces").exists()
 
 
@@ -326,7 +321,7 @@ def test_a_file_where_a_folder_is_wanted_is_one_line(limbfit, study):
     assert "a file stands where a folder is wanted; give another place" in lines[0]
 
 
-def test_check_tells_what_was_closed(limbfit, study):
+def test_check_tells_what_was_closed(limbfit, commands_unasked, study):
     skin = pv.read(study / "skin.stl")
     skin.extract_cells(skin.cell_centers().points[:, 2] < 119.0).extract_surface(
         algorithm="dataset_surface"
@@ -336,7 +331,7 @@ def test_check_tells_what_was_closed(limbfit, study):
     assert "skin: open at one end, cut flat" in " ".join(out.split())
 
 
-def test_an_amputation_shortens_given_surfaces(limbfit, study):
+def test_an_amputation_shortens_given_surfaces(limbfit, commands_unasked, study):
     _, whole, _ = limbfit("check", study)
     bones = 'bones = { tibia = "tibia.stl" }'
     edit(study, bones, bones + "\n[geometry]\namputation = { point = [0, 0, 30] }")
