@@ -11,6 +11,7 @@ from bars import NAMES, PAPER, SITES, TRUTH, Counted, records, simulate
 
 from limbfit.errors import CalibrationError
 from limbfit.identify.fit.calibration import Calibration, CalibrationSettings, calibrate
+from limbfit.identify.fit.multifidelity import SearchResult
 from limbfit.identify.fit.multistart import (
     combine_searches,
     continue_from_bound,
@@ -238,10 +239,10 @@ def test_a_smaller_error_is_the_answer_and_its_way_follows_the_first(bounded):
 
 def test_a_second_search_that_fails_leaves_the_answer_and_is_told(bounded):
     def search(unknowns, stages):
-        return calibrate(Counted(forbidden=lambda p: True), records(), unknowns, stages=stages), ()
+        return SearchResult(calibrate(Counted(forbidden=lambda p: True), records(), unknowns, stages=stages))
 
     said = []
-    first = bounded, ()
+    first = SearchResult(bounded)
     assert continue_from_bound(first, LOW, build_stage_groupings(NAMES), search, said.append) is first
     assert said[0] == "skin.gamma at a bound: searched again from inside"
     assert said[1].startswith("warning: skin.gamma at a bound: searched again from inside, which fails: ")

@@ -14,9 +14,9 @@ from bars import PAPER, SITES, TRUTH, coarsened, plain, records, simulate
 from limbfit.errors import CalibrationError
 from limbfit.identify.fit.calibration import CalibrationSettings, calibrate
 from limbfit.identify.fit.multifidelity import (
-    CorrectedCalibration,
     CorrectionSettings,
     MeshCorrection,
+    SearchResult,
     calibrate_with_correction,
 )
 from limbfit.identify.fit.objective import SiteResponse
@@ -33,7 +33,7 @@ def counting(function, calls):
 
 
 @pytest.fixture(scope="module")
-def corrected() -> CorrectedCalibration:
+def corrected() -> SearchResult:
     return calibrate_with_correction(coarsened, plain, records(0.03), PAPER)
 
 

@@ -86,7 +86,7 @@ def build_candidate(
     whole.
     """
     if not response.completed:
-        raise CalibrationError(f"{site}, {depth_mm:g} mm: {response.reason or 'simulation failed'}")
+        raise CalibrationError(f"{site}, {depth_mm:g} mm: {response.fault}")
     return Candidate(site, depth_mm, compute_information(response, parameters, noise))
 
 

@@ -94,7 +94,8 @@ class MeshCorrection:
 def _correct_response(
     response: SiteResponse, coarse: SiteResponse, fine: SiteResponse, scale: float | None, reason: str
 ) -> SiteResponse:
-    reason = reason or ("" if response.completed else f"{COARSE_MESH}: {_describe_failure(response)}")
+    if not response.completed:
+        reason = reason or f"{COARSE_MESH}: {response.fault}"
     if scale is None or reason:
         nothing = np.full_like(response.force_N, np.nan), np.full_like(response.jacobian, np.nan)
         return SiteResponse(*nothing, False, reason, response.site)
@@ -109,15 +110,8 @@ def _correct_response(
 
 def _find_fault(response: SiteResponse, where: str) -> str:
     """Return why a response cannot be an anchor, or an empty text."""
-    if not response.completed:
-        return f"{where}: {_describe_failure(response)}"
-    if not (np.all(np.isfinite(response.force_N)) and np.all(np.isfinite(response.jacobian))):
-        return f"{where}: the simulated force is not finite"
-    return "" if np.any(response.force_N) else f"{where}: there is no force"
-
-
-def _describe_failure(response: SiteResponse) -> str:
-    return response.reason or "simulation failed"
+    fault = response.fault or ("" if np.any(response.force_N) else "there is no force")
+    return fault and f"{where}: {fault}"
 
 
 def _check_same_sites(responses: Sequence[SiteResponse], expected: Sequence[SiteResponse]) -> None:
@@ -186,11 +180,11 @@ class _CorrectedModel:
 
 
 @dataclass(frozen=True)
-class CorrectedCalibration:
-    """A calibration whose forces are the fine ones, and the corrections that led to it."""
+class SearchResult:
+    """A calibration whose forces are the fine ones, and the corrections that led to it, if there were any."""
 
     calibration: Calibration
-    rounds: tuple[CorrectionRound, ...]
+    rounds: tuple[CorrectionRound, ...] = ()
 
 
 def calibrate_with_correction(
@@ -203,7 +197,7 @@ def calibrate_with_correction(
     *,
     stages: Sequence[Grouping] = (),
     on_iterate: Callable[[SearchState], None] | None = None,
-) -> CorrectedCalibration:
+) -> SearchResult:
     """Calibrate as :func:`calibrate` does, on corrected coarse simulations.
 
     Parameters
@@ -255,7 +249,7 @@ class _CorrectionLoop:
     fidelity: CorrectionSettings
     stages: tuple[Grouping, ...]
     on_iterate: Callable[[SearchState], None] | None
-    state: SearchState | None = None
+    state: SearchState = field(init=False)  # there is none before the first search
     history: tuple[Iterate, ...] = ()
     ended: tuple[StageResult, ...] = ()
     rounds: tuple[CorrectionRound, ...] = ()
@@ -270,8 +264,8 @@ class _CorrectionLoop:
     def run_stage(self) -> None:
         """Run one stage to its end, corrected until coarse and fine forces agree on it."""
         stage, reason = len(self.ended), "the corrections have not settled"
-        before = 0 if self.state is None else self.state.evaluations
         last = len(self.history)
+        before = self.state.evaluations if last else 0
         settled, is_last = False, stage == len(self.stages) - 1
         best: tuple[SearchState, MeshCorrection] | None = None
         least = np.inf  # the cost of the fine forces there
@@ -288,21 +282,19 @@ class _CorrectionLoop:
                 reason = f"the correction fails: {reached.reason}"
                 break
             if self._cost() < least:
-                assert self.state is not None
                 assert self.model.correction is not None
                 best, least = (self.state, self.model.correction), self._cost()
             if settled and not (is_last and loose):
                 break
         if best is not None and least < self._cost():
             self._restore(*best)
-        assert self.state is not None
-        end, converged = self.history[-1], inner.converged and settled
+        end = self.history[-1]
         result = replace(
             inner,
             cost=end.cost,
             iterations=len(self.history) - last - 1,
             evaluations=self.state.evaluations - before,
-            converged=converged,
+            converged=inner.converged and settled,
             reason=inner.reason if settled else f"{reason} ({inner.reason})",
         )
         self.ended = (*self.ended, result)
@@ -310,13 +302,14 @@ class _CorrectionLoop:
 
     def _search(self, stage: int, loose: float) -> StageResult:
         """Find the optimum of the model with the present correction, from where the search ended before."""
-        start = self.state
+        start = self.state if self.history else None
+        known = len(start.history) if start else 0
 
         def keep(state: SearchState) -> None:
-            fresh = state.history[len(() if start is None else start.history) :]
             self.state = state
             if self.on_iterate:
-                self.on_iterate(replace(state, history=(*self.history, *fresh), stages=self.ended))
+                whole = (*self.history, *state.history[known:])
+                self.on_iterate(replace(state, history=whole, stages=self.ended))
 
         found = calibrate(
             self.model,
@@ -327,21 +320,19 @@ class _CorrectionLoop:
             on_iterate=keep,
             state=start,
         )
-        self.history += found.history[len(() if start is None else start.history) :]
+        self.history += found.history[known:]
         return found.stages[stage]
 
     def _cost(self) -> float:
         return self.history[-1].cost
 
     def _restore(self, best: SearchState, correction: MeshCorrection) -> None:
-        assert self.state is not None
         self.model.correction = correction
         here = replace(best.history[-1], evaluations=self.state.evaluations)
         self.history = (*self.history, here)
         self.state = replace(best, history=(here,))
 
     def _step_half_way_back(self, stage: int, best: SearchState) -> None:
-        assert self.state is not None
         z = 0.5 * (np.array(self.state.z) + np.array(best.z))
         parameters = build_space(self.unknowns, self.stages[stage]).expand(z)
         here = replace(self.history[-1], parameters=tuple(parameters.tolist()))
@@ -350,14 +341,12 @@ class _CorrectionLoop:
 
     def _correct(self, stage: int) -> CorrectionRound:
         """Anchor the model at an optimum, and evaluate the iterate there with the fine forces."""
-        assert self.state is not None
         found = self._anchor(stage, np.array(self.history[-1].parameters))
         if not found.reason:
             anchored = replace(self.state, radius=FIRST_RADIUS, stages=self.ended)
             here = evaluate_state(
                 self.model, self.measured, self.unknowns, self.settings, self.stages, anchored
             )
-            here = replace(here, evaluations=self.state.evaluations, failures=self.history[-1].failures)
             self.history = (*self.history, here)
             self.state = replace(anchored, history=(here,))
         return found
@@ -386,9 +375,8 @@ class _CorrectionLoop:
             self.model.correction = correction
         return found
 
-    def build_result(self) -> CorrectedCalibration:
+    def build_result(self) -> SearchResult:
         parameters = np.array(self.history[-1].parameters)
-        assert self.state is not None
         calibration = Calibration(
             names=self.unknowns.names,
             sites=tuple(site.name for site in self.measured),
@@ -399,4 +387,4 @@ class _CorrectionLoop:
             settings=self.settings,
             responses=tuple(self.model(parameters)),
         )
-        return CorrectedCalibration(calibration, self.rounds)
+        return SearchResult(calibration, self.rounds)

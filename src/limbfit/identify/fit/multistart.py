@@ -10,14 +10,13 @@ import numpy as np
 from ...arrays import Array
 from ...errors import CalibrationError
 from .calibration import Calibration
-from .multifidelity import CorrectionRound
+from .multifidelity import SearchResult
 from .parameters import FIXED, Grouping, Unknowns, build_space, group_by_kind
 
 _SAME_COST = 0.01  # relative: half a per cent of the error
 # Relative, of every parameter: searches that stop on their last step end so far apart
 _SAME_PARAMETERS = 0.01
 _SAME_FIT = 1e-4  # rms force error per site, of its largest: fits closer than this are alike, however exact
-SearchResult = tuple[Calibration, tuple[CorrectionRound, ...]]
 Search = Callable[[Unknowns, Sequence[Grouping]], SearchResult]
 MIN_IMPROVEMENT = 0.01  # relative fall of the squared error: less is the same optimum
 
@@ -142,24 +141,24 @@ def continue_from_bound(
 
     Parameters
     ----------
-    result : the calibration from ``start`` by ``search``, with its corrections. It is returned as it is if
+    result : of ``search`` from ``start``. It is returned as it is if
         nothing ended at a bound, or if the second search fails.
     report : called with a sentence when the second search begins, and when it fails.
     """
-    calibration, rounds = result
-    inside = find_start_inside(calibration, start, stages[-1])
+    inside = find_start_inside(result.calibration, start, stages[-1])
     if inside is None:
         return result
     names, again = inside
     message = f"{', '.join(names)} at a bound: searched again from inside"
     report(message)
     try:
-        second, second_rounds = search(again, stages[-1:])
+        second = search(again, stages[-1:])
     except CalibrationError as error:
         report(f"warning: {message}, which fails: {error}")
         return result
-    second_rounds = tuple(replace(one, stage=len(stages) - 1) for one in second_rounds)
-    return combine_searches(calibration, second, names), (*rounds, *second_rounds)
+    further_rounds = (replace(one, stage=len(stages) - 1) for one in second.rounds)
+    calibration = combine_searches(result.calibration, second.calibration, names)
+    return SearchResult(calibration, (*result.rounds, *further_rounds))
 
 
 def find_start_inside(

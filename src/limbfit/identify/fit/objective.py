@@ -108,6 +108,14 @@ class SiteResponse:
     slipped: str = ""
     folded: str = ""
 
+    @property
+    def fault(self) -> str:
+        """Why it cannot be used, or an empty text."""
+        if not self.completed:
+            return self.reason or "simulation failed"
+        is_finite = np.isfinite(self.force_N).all() and np.isfinite(self.jacobian).all()
+        return "" if is_finite else "the simulated force is not finite"
+
 
 Simulate = Callable[[Array], Sequence[SiteResponse]]
 
@@ -123,13 +131,11 @@ def check_responses(
     if len(responses) != len(measured):
         raise CalibrationError(f"{len(responses)} responses for {len(measured)} sites")
     for response, site in zip(responses, measured):
-        if not response.completed:
-            return f"{site.name}: {response.reason or 'simulation failed'}"
-        n = site.force_N.size
-        if response.force_N.shape != (n,) or response.jacobian.shape != (n, parameters):
+        shapes, n = (response.force_N.shape, response.jacobian.shape), site.force_N.size
+        if response.completed and shapes != ((n,), (n, parameters)):
             raise CalibrationError(f"{site.name}: the simulated force has the wrong shape")
-        if not (np.all(np.isfinite(response.force_N)) and np.all(np.isfinite(response.jacobian))):
-            return f"{site.name}: the simulated force is not finite"
+        if response.fault:
+            return f"{site.name}: {response.fault}"
     return ""
 
 

@@ -25,9 +25,9 @@ def compute_error_percent(simulated_N: Array, measured_N: Array) -> float:
 
 
 def compute_errors_percent(
-    responses: Sequence[SiteResponse], measured: Sequence[MeasuredCurve]
+    responses: Sequence[SiteResponse], measured: Sequence[MeasuredCurve | SiteResponse]
 ) -> tuple[float, ...]:
-    """Return the error of each record in percent."""
+    """Return the error of each record in percent, of what was measured or of another simulation."""
     pairs = zip(responses, measured, strict=True)
     return tuple(compute_error_percent(response.force_N, site.force_N) for response, site in pairs)
 

@@ -18,7 +18,6 @@ import numpy as np
 from ...arrays import Array
 from ...errors import CalibrationError
 from ..fit.objective import SiteResponse, find_largest_magnitude
-from ..fit.prediction import compute_error_percent
 
 _LENGTHS = (1.0, 2.0, 4.0, 8.0)  # of the kernel, in half-widths of the points
 _NUGGETS = (1e-9, 1e-7, 1e-5)  # variance that the solver's own tolerances add, over that of the kernel
@@ -53,13 +52,7 @@ class Emulator:
         CalibrationError
             If fewer than two complete runs are left.
         """
-        whole = [
-            i
-            for i, run in enumerate(responses)
-            if all(
-                r.completed and np.isfinite(r.force_N).all() and np.isfinite(r.jacobian).all() for r in run
-            )
-        ]
+        whole = [i for i, run in enumerate(responses) if not any(response.fault for response in run)]
         if len(whole) < 2:
             raise CalibrationError(f"an emulator needs two complete simulations, has {len(whole)}")
         runs = [responses[i] for i in whole]
@@ -149,11 +142,6 @@ class Emulator:
     def is_inside(self, parameters: Array, margin: float = 0.1) -> bool:
         """True if the parameters (p,) lie in the box of the points, widened by a share of its width."""
         return bool(np.all(np.abs(self._to_unit(np.asarray(parameters))) <= 1 + 2 * margin + _ROUNDING_SHARE))
-
-    def compute_errors_percent(self, parameters: Array, responses: Sequence[SiteResponse]) -> Array:
-        """Return the error (sites,) of the emulated force at a simulation of the solver, in percent."""
-        pairs = zip(self(parameters), responses, strict=True)
-        return np.array([compute_error_percent(ours.force_N, run.force_N) for ours, run in pairs])
 
     def _to_unit(self, parameters: Array) -> Array:
         return (np.log(parameters) - self._centre) / self._width

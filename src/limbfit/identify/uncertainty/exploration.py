@@ -18,6 +18,7 @@ from ...arrays import Array
 from ...results.uncertainty import EmulatorRound, ProfileCheck
 from ..fit.objective import SiteResponse
 from ..fit.parameters import SearchSpace
+from ..fit.prediction import compute_errors_percent
 from .emulator import Emulator
 from .likelihood import Likelihood, Optimum, Profile, check_profile_ends, compute_profile
 from .posterior import Posterior, sample_posterior
@@ -98,7 +99,7 @@ def explore_posterior(
         design, found = _simulate_complete(simulate, design, report)
         spent += count
         pairs = zip(design, found, strict=True)
-        errors = [emulator.compute_errors_percent(*pair) for pair in pairs] if emulator else []
+        errors = [compute_errors_percent(emulator(point), run) for point, run in pairs] if emulator else []
         known, runs = known + design, runs + found
         emulator = Emulator(np.array(known), runs)
         likelihood = Likelihood(emulator, linearised.measured, model, linearised.unknowns, space)
@@ -177,7 +178,9 @@ def _thin(samples: Array, count: int) -> Array:
     return samples[:: max(len(samples) // count, 1)]
 
 
-def _assess_emulator(emulator: Emulator, samples: Array, new_errors: Sequence[Array]) -> EmulatorRound:
+def _assess_emulator(
+    emulator: Emulator, samples: Array, new_errors: Sequence[Sequence[float]]
+) -> EmulatorRound:
     """Assess the emulator over samples (m, p); ``new_errors`` (sites,) are those at runs it did not know."""
     asked = _thin(samples, _CHECKED_SAMPLES)
     stated = np.array([emulator.expected_error_percent(p) for p in asked])

@@ -8,8 +8,13 @@ from functools import partial
 import numpy as np
 
 from ...identify.fit.calibration import Calibration, SearchState, calibrate
-from ...identify.fit.multifidelity import CorrectionRound, CorrectionSettings, calibrate_with_correction
-from ...identify.fit.multistart import MultistartResult, SearchResult, continue_from_bound, run_multistart
+from ...identify.fit.multifidelity import (
+    CorrectionRound,
+    CorrectionSettings,
+    SearchResult,
+    calibrate_with_correction,
+)
+from ...identify.fit.multistart import MultistartResult, continue_from_bound, run_multistart
 from ...identify.fit.parameters import Grouping, Unknowns
 from .problem import CalibrationProblem
 from .record_simulator import RecordSimulator
@@ -24,8 +29,9 @@ def search_from_starts(
     def run(number: int, start: Unknowns) -> Calibration:
         if number:
             simulator.report(f"start {number + 1} of {table.starts}")
-        answer, corrections[number] = search_parameters(problem, simulator, start, problem.stages)
-        return answer
+        found = search_parameters(problem, simulator, start, problem.stages)
+        corrections[number] = found.rounds
+        return found.calibration
 
     starts = run_multistart(run, problem.unknowns, table.starts, table.seed, problem.stages[0])
     return starts, corrections[starts.number]
@@ -83,10 +89,9 @@ def _search_once(
         found = calibrate(
             simulator.search, records.measured, start, problem.settings, stages=stages, on_iterate=report
         )
-        return found, ()
-    corrected = calibrate_with_correction(
+        return SearchResult(found)
+    return calibrate_with_correction(
         simulator.search, simulator.check, records.measured, start, problem.settings,
         CorrectionSettings(table.corrections, table.correction_tolerance_percent),
         stages=stages, on_iterate=report,
     )  # fmt: skip
-    return corrected.calibration, corrected.rounds

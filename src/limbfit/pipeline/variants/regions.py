@@ -111,7 +111,7 @@ def _fit_region(
     sites = {record.name: record.site.name for record in judged}
 
     def identify(start: Unknowns) -> Calibration:
-        return search_parameters(problem, simulator, start, problem.stages[-1:])[0]
+        return search_parameters(problem, simulator, start, problem.stages[-1:]).calibration
 
     def simulate(parameters: Array) -> list[SiteResponse]:
         apart = study.is_searched_apart
