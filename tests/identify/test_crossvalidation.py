@@ -89,10 +89,10 @@ def test_the_standing_of_a_choice_is_its_rank():
     assert best["median_percent"] == pytest.approx(np.median([f.mean_heldout for f in folds]))
 
 
-def test_regions_have_their_names_and_limits_are_told():
+def test_regions_are_left_out_and_limits_are_told():
     choices = list_choices_without_regions(["a", "a", "b", "b", "b"])
-    folds = cross_validate(simulate, records(), near(), choices)
-    assert [fold.label for fold in folds] == ["a", "b"]
+    folds = cross_validate(simulate, records(), near(), list(choices.values()))
+    assert [fold.heldout for fold in folds] == [(0, 1), (2, 3, 4)]
     tight = PAPER.__class__(PAPER.names, TRUTH * 1.6, TRUTH * 1.5, TRUTH * 3)
     assert "skin.c_kPa" in fit_sites(simulate, records(), tight, (0, 1, 4)).at_limit
 

@@ -42,7 +42,7 @@ _WIDENING = 2.0  # than the fit's own covariance: fewer records, or others, tell
 class Fold:
     """One fit: ``fitted`` are indices of sites; ``errors_percent`` are those of all sites, in order.
 
-    ``at_limit`` names the parameters that ended on a bound.
+    ``at_limit`` names the parameters that ended on a bound, and ``label`` a region that was left out.
     """
 
     fitted: Choice
@@ -121,7 +121,6 @@ def fit_sites(
     unknowns: Unknowns,
     chosen: Choice,
     settings: CalibrationSettings | None = None,
-    label: str = "",
     grouping: Grouping | None = None,
 ) -> Fold:
     """Fit the ``chosen`` sites, and predict all of them.
@@ -133,12 +132,12 @@ def fit_sites(
     grouping : parameters that move together, as in the study's last stage; by default each by itself.
     """
 
-    def of_chosen(parameters: Array) -> list[SiteResponse]:
+    def simulate_chosen(parameters: Array) -> list[SiteResponse]:
         responses = simulate(parameters)
         return [responses[i] for i in chosen]
 
     found = calibrate(
-        of_chosen,
+        simulate_chosen,
         [measured[i] for i in chosen],
         unknowns,
         settings or CalibrationSettings(),
@@ -147,24 +146,23 @@ def fit_sites(
     errors = compute_errors_percent(simulate(found.parameters), measured)
     is_stuck = unknowns.is_at_bound(found.parameters) & (np.array(found.stages[-1].grouping) != FIXED)
     at_limit = tuple(name for name, stuck in zip(unknowns.names, is_stuck) if stuck)
-    return Fold(chosen, found.parameters, errors, found.converged, at_limit, label)
+    return Fold(chosen, found.parameters, errors, found.converged, at_limit)
 
 
 def cross_validate(
     simulate: Simulate,
     measured: Sequence[MeasuredCurve],
     unknowns: Unknowns,
-    choices: Sequence[Choice] | Mapping[str, Choice],
+    choices: Sequence[Choice],
     settings: CalibrationSettings | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     grouping: Grouping | None = None,
 ) -> tuple[Fold, ...]:
-    """Fit every choice (with its label if ``choices`` have names) and predict the other sites."""
-    pairs = list(choices.items()) if isinstance(choices, Mapping) else [("", choice) for choice in choices]
+    """Fit every choice and predict the other sites."""
     folds = []
-    for i, (label, choice) in enumerate(pairs):
-        folds.append(fit_sites(simulate, measured, unknowns, tuple(choice), settings, label, grouping))
-        progress(i + 1, len(pairs))
+    for i, choice in enumerate(choices):
+        folds.append(fit_sites(simulate, measured, unknowns, choice, settings, grouping))
+        progress(i + 1, len(choices))
     return tuple(folds)
 
 
@@ -205,9 +203,8 @@ def fit_region(
     ``identify`` finds parameters from the records of the region's fitted sites, ``simulate`` returns the
     force at all of its sites, in the order of ``measured``. The start of the ``unknowns`` is not used.
     """
-    start = unknowns.with_start(np.clip(whole_parameters, unknowns.lower, unknowns.upper))
     whole = compute_site_errors(simulate, whole_parameters, measured)
-    found = identify(start)
+    found = identify(unknowns.with_start(whole_parameters))
     return found, compute_site_errors(simulate, found.parameters, measured), whole
 
 

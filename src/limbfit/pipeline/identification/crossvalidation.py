@@ -157,16 +157,16 @@ def _fit_choices(
         context.tell("crossvalidate", done, total, f"{done} of {total} choices fitted")
 
     def fit(
-        choices: Mapping[str, Choice], told: Callable[[int, int], None] = lambda done, total: None
+        choices: Sequence[Choice], progress: Callable[[int, int], None] = lambda done, total: None
     ) -> tuple[Fold, ...]:
-        records = {label: expand_to_records(choice, groups) for label, choice in choices.items()}
-        folds = cross_validate(emulator, measured, unknowns, records, settings, told, problem.stages[-1])
-        pairs = zip(folds, choices.values(), strict=True)
+        records = [expand_to_records(choice, groups) for choice in choices]
+        folds = cross_validate(emulator, measured, unknowns, records, settings, progress, problem.stages[-1])
+        pairs = zip(folds, choices, strict=True)
         return tuple(average_by_site(fold, choice, groups) for fold, choice in pairs)
 
-    (alone,) = fit({"": own})
-    numbered = fit({str(i): choice for i, choice in enumerate(chosen)}, tell)
-    return _Fits(alone, tuple(replace(fold, label="") for fold in numbered), fit(regions))
+    (alone,), others = fit([own]), fit(chosen, tell)
+    without = zip(regions, fit(list(regions.values())), strict=True)
+    return _Fits(alone, others, tuple(replace(fold, label=region) for region, fold in without))
 
 
 def _check_folds(
