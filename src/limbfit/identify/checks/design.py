@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations, product
 from math import comb, prod
 from typing import Literal
@@ -200,7 +201,8 @@ def choose_design(
     for _ in range(_RESTARTS):
         picked = rng.choice(len(groups), size, replace=False)
         starts.append([int(rng.choice(groups[g])) for g in picked])
-    end = min((_improve_by_exchange(groups, start, cost) for start in starts), key=cost)
+    exchange = partial(_list_exchanges, groups)
+    end = min((_improve(start, exchange, cost, 1e-12) for start in starts), key=cost)
     return replace(evaluate_design(candidates, sorted(end), prior), exhaustive=False)
 
 
@@ -212,20 +214,27 @@ def _choose_greedily(groups: Sequence[Sequence[int]], size: int, cost: Cost) -> 
     return chosen
 
 
-def _improve_by_exchange(groups: Sequence[Sequence[int]], start: Sequence[int], cost: Cost) -> list[int]:
-    """Return the choice after the best exchange of one candidate, repeated until no exchange helps."""
-    chosen, least = list(start), cost(start)
+def _list_exchanges(groups: Sequence[Sequence[int]], chosen: list[int]) -> list[list[int]]:
+    """Return the choices that have another candidate in place of one of the ``chosen``."""
+    found = []
+    for at in range(len(chosen)):
+        rest = chosen[:at] + chosen[at + 1 :]
+        free = [i for group in groups if not set(group) & set(rest) for i in group if i not in chosen]
+        found += [[*rest, i] for i in free]
+    return found
+
+
+def _improve(
+    start: list[int], list_others: Callable[[list[int]], list[list[int]]], cost: Cost, tolerance: float
+) -> list[int]:
+    """Take the best of the choices that ``list_others`` makes of one, until it is better by no more than a
+    share of the cost."""
+    chosen = start
     while True:
-        trials = []
-        for at in range(len(chosen)):
-            rest = chosen[:at] + chosen[at + 1 :]
-            free = [i for group in groups if not set(group) & set(rest) for i in group if i not in chosen]
-            trials += [[*rest, i] for i in free]
-        best = min(trials, key=cost, default=chosen)
-        now = cost(best)
-        if not now < least - 1e-12 * abs(least):
+        best, least = min(list_others(chosen), key=cost, default=chosen), cost(chosen)
+        if not cost(best) < least - tolerance * abs(least):
             return chosen
-        chosen, least = best, now
+        chosen = best
 
 
 @dataclass(frozen=True)
@@ -415,8 +424,18 @@ def plan_records(options: Sequence[RecordOption], budget: Budget, target: Design
     def cost(chosen: Sequence[int]) -> float:
         return target.compute_cost(target.compute_covariances(options, chosen, draws))
 
+    def list_refilled(chosen: list[int]) -> list[list[int]]:
+        """Leave each record out in turn, and fill the time again."""
+        found = []
+        for out in chosen:
+            rest = [i for i in chosen if i != out]
+            endless = replace(options[out], seconds=float("inf"))  # so that it is not chosen again
+            others = [endless if i == out else option for i, option in enumerate(options)]
+            found += [_fill_budget(rest, others, budget, cost, by_time=by_time) for by_time in (True, False)]
+        return found
+
     starts = [_fill_budget([], options, budget, cost, by_time=by_time) for by_time in (True, False)]
-    best = min((_improve_plan(start, options, budget, cost) for start in starts), key=cost)
+    best = min((_improve(start, list_refilled, cost, 1e-9) for start in starts), key=cost)
     return tuple(sorted(best))
 
 
@@ -437,22 +456,3 @@ def _fill_budget(
         if best < 0:
             return filled
         filled.append(best)
-
-
-def _improve_plan(
-    start: Sequence[int], options: Sequence[RecordOption], budget: Budget, cost: Cost
-) -> list[int]:
-    """Leave one record out and fill the time again, as long as that is better."""
-    found, least = list(start), cost(start)
-    while True:
-        trials = []
-        for out in found:
-            rest = [i for i in found if i != out]
-            endless = replace(options[out], seconds=float("inf"))  # so that it is not chosen again
-            others = [endless if i == out else option for i, option in enumerate(options)]
-            trials += [_fill_budget(rest, others, budget, cost, by_time=by_time) for by_time in (True, False)]
-        best = min(trials, key=cost, default=found)
-        now = cost(best)
-        if not now < least - 1e-9 * abs(least):
-            return found
-        found, least = best, now
