@@ -24,7 +24,7 @@ SECTOR_DEG = 45.0  # around a fitted site, as seen along the limb: a quarter of 
 _PROBABILITIES = np.linspace(0.0, 1.0, 401)
 # How far a prediction may go beyond the records. Relaxation changes with the logarithm of time: half as long
 # again is little. A site tells of tissue around it.
-_FACTOR, _FACTORS, _ALLOWED = 1.1, {TIME: 1.5, ANGLE: 1.0}, {LEVEL: 20.0}
+_FACTOR, _FACTORS, _ALLOWED = 1.1, {TIME: 1.5, ANGLE: 1.0, LEVEL: 1.0}, {LEVEL: 20.0}
 _TWO_SIDED = (TIME, LEVEL)
 _MOST_TOLD = 3  # quantities in one sentence
 
@@ -59,8 +59,6 @@ class Extent:
     def is_within(self, tested: Extent) -> bool:
         """True if it goes no farther beyond the ``tested`` extent than is allowed."""
         factor, more = _FACTORS.get(self.quantity, _FACTOR), _ALLOWED.get(self.quantity, 0.0)
-        if self.quantity == LEVEL:
-            factor = 1.0
         above = self.high > factor * tested.high + more
         below = self.quantity in _TWO_SIDED and self.low < tested.low / factor - more
         return not (above or below)
@@ -186,8 +184,8 @@ def _describe_row(row: OutsideRecords) -> str:
     if row.quantity == LEVEL:
         end, tested = (most, high) if most - high > low - least else (least, low)
         return f"{LEVEL} {end:.0f}{unit} (the fitted sites end at {tested:.0f})"
-    part = f", over {100.0 * row.share:.0f} % of the volume" if "strain" in row.quantity else ""
-    part = "" if row.quantity == RATE else part
+    is_strain = row.quantity in (SHEAR, COMPRESSION)
+    part = f", over {100.0 * row.share:.0f} % of the volume" if is_strain else ""
     return f"{row.quantity}{of} {_format(most, 2)}{unit} (records: {_format(high, 2)}{part})"
 
 

@@ -73,19 +73,21 @@ def assess_fit(
     alike = float(centred[1:] @ centred[:-1] / max(centred @ centred, 1e-300))
     phases = _assess_phases(times_s, depth_mm, residual_N, refitted, peak_N, covariance)
     share = None if inside is None else float(np.mean(inside))
-    times_noise, p = float(np.sqrt(np.mean(white**2))), _test_autocorrelation(white)
-    found = RecordFit(
+    p = _test_autocorrelation(white)
+    if fitted:
+        verdict = _describe_fitted(record, phases, p, compared)
+    else:
+        verdict = _describe_held_out(record, phases, share, compared)
+    return RecordFit(
         record=record,
         fitted=fitted,
-        times_noise=times_noise,
+        times_noise=float(np.sqrt(np.mean(white**2))),
         autocorrelation=alike,
         ljung_box_p=p,
         inside_95=share,
         phases=phases,
-        verdict="",
+        verdict=verdict,
     )
-    verdict = _describe_fitted(found, compared) if fitted else _describe_held_out(found, compared)
-    return found.model_copy(update={"verdict": verdict})
 
 
 def summarise_fit(records: Sequence[RecordFit]) -> str:
@@ -157,23 +159,22 @@ def _is_clear(phase: PhaseFit) -> bool:
     return phase.times_noise >= _MIN_TIMES_NOISE and phase.error_percent >= 100 * _MIN_SHARE
 
 
-def _describe_fitted(found: RecordFit, compared: str) -> str:
-    clear = [phase for phase in found.phases if _is_clear(phase)]
-    if not clear or found.ljung_box_p > _CLEAR_P:
+def _describe_fitted(record: str, phases: Sequence[PhaseFit], ljung_box_p: float, compared: str) -> str:
+    clear = [phase for phase in phases if _is_clear(phase)]
+    if not clear or ljung_box_p > _CLEAR_P:
         return ""
     worst = max(clear, key=lambda phase: phase.error_percent)
     return (
-        f"the model cannot follow the {worst.phase} at {found.record}: {worst.error_percent:.2g} % of the "
+        f"the model cannot follow the {worst.phase} at {record}: {worst.error_percent:.2g} % of the "
         f"largest {compared}, {worst.times_noise:.2g} times what noise, touch-down, mesh and site explain"
     )
 
 
-def _describe_held_out(found: RecordFit, compared: str) -> str:
-    inside = found.inside_95
-    if inside is None or inside >= _FEW_INSIDE or not any(map(_is_clear, found.phases)):
+def _describe_held_out(record: str, phases: Sequence[PhaseFit], inside: float | None, compared: str) -> str:
+    if inside is None or inside >= _FEW_INSIDE or not any(map(_is_clear, phases)):
         return ""
-    worst = max(found.phases, key=lambda phase: phase.error_percent)
+    worst = max(phases, key=lambda phase: phase.error_percent)
     return (
-        f"{found.record} is not predicted: {100 * inside:.0f} % of its points lie in the 95 % band, "
+        f"{record} is not predicted: {100 * inside:.0f} % of its points lie in the 95 % band, "
         f"and the {worst.phase} is off by {worst.error_percent:.2g} % of the largest {compared}"
     )
