@@ -54,16 +54,15 @@ class LogLinearModel:
 
     def __call__(self, parameters: Array) -> list[SiteResponse]:
         step = np.log(parameters / self.parameters)
-        return [self._moved(response, step, parameters) for response in self.responses]
+        return [self._extrapolate(response, step, parameters) for response in self.responses]
 
-    def _moved(self, response: SiteResponse, step: Array, parameters: Array) -> SiteResponse:
+    def _extrapolate(self, response: SiteResponse, step: Array, parameters: Array) -> SiteResponse:
         force, scaled = response.force_N, response.jacobian * self.parameters
         small = force < 0.05 * force.max()
         rate = scaled / np.where(small, 1.0, force)[:, None]
         grown = np.exp(np.clip(rate @ step, -5.0, 5.0))
-        moved = np.where(small, force + scaled @ step, force * grown)
         slope = np.where(small[:, None], scaled, scaled * grown[:, None])
-        return SiteResponse(moved, slope / parameters)
+        return SiteResponse(np.where(small, force + scaled @ step, force * grown), slope / parameters)
 
 
 class LeaveOutFits:
@@ -147,13 +146,11 @@ class LeaveOutFits:
 
         So a record that is too weak by a factor counts as much as one that is too strong by it.
         """
-        triples = zip(self.simulate(parameters), self.measured, self.peaks)
-        return np.array(
-            [
-                np.sqrt(np.mean((r.force_N - m.force_N) ** 2)) / max(peak, r.force_N.max())
-                for r, m, peak in triples
-            ]
-        )
+        errors = []
+        for response, site, peak in zip(self.simulate(parameters), self.measured, self.peaks):
+            error_N = np.sqrt(np.mean((response.force_N - site.force_N) ** 2))
+            errors.append(error_N / max(peak, response.force_N.max()))
+        return np.array(errors)
 
     def compute_expected_error(self, *left_out: int) -> float:
         """Return the root mean square error of sites predicted without themselves and ``left_out``."""
@@ -174,11 +171,9 @@ class LeaveOutFits:
         found = []
         for i, site in enumerate(self.measured):
             parameters = self.fit_without(i)
-            force = self.simulate(parameters)[i].force_N
-            moved = [
-                np.mean((r.force_N - w) ** 2) / peak**2
-                for r, w, peak in zip(self.simulate(parameters), whole, self.peaks)
-            ]
+            forces = [r.force_N for r in self.simulate(parameters)]
+            force = forces[i]
+            moved = [np.mean((f - w) ** 2) / peak**2 for f, w, peak in zip(forces, whole, self.peaks)]
             error, expected = float(self.compute_errors(parameters)[i]), self.compute_expected_error(i)
             found.append(
                 LeftOutRecord(
@@ -223,11 +218,8 @@ def find_misfitting_sites(sites: LeaveOutFits) -> tuple[tuple[LeftOutRecord, ...
     best = int(np.argmax([single.standardised for single in singles]))
     alone = singles[best].standardised if singles[best].error > MAX_ERROR_SHARE else 0.0
     pair, together = _find_worst_pair(sites, singles)
-    if (
-        together > MAX_STANDARDISED_ERROR
-        and together > 1.5 * alone
-        and count_sites(sites.measured) > MIN_SITES
-    ):
+    is_pair = together > max(MAX_STANDARDISED_ERROR, 1.5 * alone)
+    if is_pair and count_sites(sites.measured) > MIN_SITES:
         return singles, pair
     return singles, (best,) if alone > MAX_STANDARDISED_ERROR else ()
 

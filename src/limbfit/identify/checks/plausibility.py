@@ -243,29 +243,27 @@ def _compare_records(facts: Sequence[RecordFacts]) -> Iterator[RecordWarning]:
 
 def _explain_odd_record(f: RecordFacts, shift: Array, sd: Array) -> Iterator[RecordWarning]:
     """Explain what is odd about a record: a unit that explains it all, or an unexplained stiffness."""
-    null = float(((shift / sd) ** 2).sum())
     if np.abs(shift / sd).max() < _MAX_STANDARDISED:
         return
-    name, best = "", null
+    chi2 = {"": float(((shift / sd) ** 2).sum())}
     for unit, (force, travel, time) in UNITS.items():
         expected = np.log([force / travel, travel / time, time, travel])
-        chi2 = float((((shift - expected) / sd) ** 2).sum())
-        if chi2 < best:
-            name, best = unit, chi2
+        chi2[unit] = float((((shift - expected) / sd) ** 2).sum())
+    name = min(chi2, key=lambda unit: chi2[unit])
     numbers = {
         "modulus_kPa": f.modulus_kPa,
         "modulus_ratio": float(np.exp(shift[0])),
         "speed_ratio": float(np.exp(shift[1])),
         "time_step_ratio": float(np.exp(shift[2])),
         "depth_ratio": float(np.exp(shift[3])),
-        "chi2": null,
-        "chi2_explained": best,
+        "chi2": chi2[""],
+        "chi2_explained": chi2[name],
     }
     what = (
         f"against the other sites its apparent modulus is {np.exp(shift[0]):.2g} times, its speed "
         f"{np.exp(shift[1]):.2g} times, its depth {np.exp(shift[3]):.2g} times"
     )
-    if name and best < _MAX_CHI2_EXPLAINED and null - best > _MIN_CHI2_DROP:
+    if chi2[name] < _MAX_CHI2_EXPLAINED and chi2[""] - chi2[name] > _MIN_CHI2_DROP:
         yield RecordWarning((f.site,), "unit", what, numbers, name, "convert the column to s, mm and N")
     elif abs(shift[0] / sd[0]) >= _MAX_STANDARDISED:  # a protocol of its own is no fault
         cause = "a swapped name, another place or another limb"
@@ -284,20 +282,17 @@ def _find_exchange(facts: Sequence[RecordFacts], z: Array) -> RecordWarning | No
         moduli = np.log([f.modulus_kPa for f in rows])
         return float(np.abs(moduli - np.median(moduli)).sum())
 
-    before = scatter(facts)
-    found: tuple[float, int, int] | None = None
+    before, exchanged = scatter(facts), []
     for i, j in combinations(range(len(facts)), 2):
         if z[i] * z[j] > 0 or np.hypot(z[i], z[j]) < _MIN_PAIR_DEVIATION or min(abs(z[i]), abs(z[j])) < 2.0:
             continue
         rows = list(facts)
         rows[i] = replace(facts[i], thickness_mm=facts[j].thickness_mm)
         rows[j] = replace(facts[j], thickness_mm=facts[i].thickness_mm)
-        after = scatter(rows)
-        if found is None or after < found[0]:
-            found = (after, i, j)
-    if found is None or found[0] > 0.5 * before:
+        exchanged.append((scatter(rows), i, j))
+    after, i, j = min(exchanged, default=(np.inf, 0, 0))
+    if after > 0.5 * before:
         return None
-    after, i, j = found
     one, two = facts[i], facts[j]
     what = (
         f"for tissue of {one.thickness_mm:.0f} and {two.thickness_mm:.0f} mm their apparent moduli are "
