@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .arrays import Array
 
-_MOST_CORRELATED = 0.999
+MAX_LAG = 0.999  # correlation of neighbours beyond which no covariance can be made of it
 
 
 def compute_block_covariance(sd: float, lag: float, samples: NDArray[np.int64]) -> Array:
@@ -32,9 +32,4 @@ def estimate_lag_one(residual: Array) -> float:
     """Correlation of neighbours in a residual (n,) of mean zero; none where it is negative."""
     squares = float(residual @ residual)
     lag = float(residual[1:] @ residual[:-1]) / squares if squares > 0 else 0.0
-    return clip_lag(lag)
-
-
-def clip_lag(lag: float) -> float:
-    """A correlation of neighbours that a covariance can be made of."""
-    return float(np.clip(lag, 0.0, _MOST_CORRELATED))
+    return float(np.clip(lag, 0.0, MAX_LAG))

@@ -9,7 +9,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 from scipy.optimize import minimize_scalar
 
 from ..arrays import Array, Indices, Mask
-from ..autoregressive import clip_lag
+from ..autoregressive import MAX_LAG
 
 _GAP_STEPS = 10.0  # usual steps in time
 _REPEATED_SHARE = 0.75  # of the samples: so many have a value that another one has too
@@ -105,7 +105,7 @@ def estimate_noise(*parts: Array) -> SampleNoise:
     n = sum(map(len, rows))
     found = minimize_scalar(
         lambda log: _compute_restricted_likelihood(rows, 1.0 - np.exp(log))[0],
-        bounds=(np.log(1.0 - clip_lag(1.0)), 0.0),
+        bounds=(np.log(1.0 - MAX_LAG), 0.0),
         method="bounded",
         options={"xatol": 0.02},
     )
