@@ -13,6 +13,7 @@ from ..errors import ProblemError
 from .facets import ARC, FLAT, STEEPEST_DEG, Facets, build_quadrilaterals, revolved, steps
 from .rigid_surface import Body, RigidSurface, surface_distance
 from .shape import Array, Distance, Revolution, Shape, Size
+from .triangles import compute_triangle_normals
 
 SPHERE_STEEPEST_DEG = 75.0  # of a face; what is steeper touches no skin
 
@@ -177,10 +178,8 @@ class Stl(Shape):
         """The surface as it is, its edges sharp."""
         used, faces = np.unique(self.surface.faces, return_inverse=True)
         points, faces = self.surface.points[used], faces.reshape(-1, 3)
-        a, b, c = (points[faces[:, i]] for i in range(3))
-        normals = np.cross(b - a, c - a)
-        steep = np.cos(np.radians(STEEPEST_DEG))
-        front = faces[normals[:, 2] > steep * np.linalg.norm(normals, axis=1)]
+        normals, _ = compute_triangle_normals(points[faces])
+        front = faces[normals[:, 2] > np.cos(np.radians(STEEPEST_DEG))]
         if not len(front):
             raise ProblemError("no face of the indenter's surface looks along its axis")
         return Facets(points, front, rounding=0.0, closed=faces)
