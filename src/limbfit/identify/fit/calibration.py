@@ -334,10 +334,9 @@ class _Search:
 
     def _advance(self, state: SearchState, step: SearchStep) -> SearchState:
         """Return the state after an accepted step, which closes the stage if it was its last."""
-        history = state.history
-        if tuple(step.point.z.tolist()) != state.z:
+        z, history, stages = tuple(step.point.z.tolist()), state.history, state.stages
+        if z != state.z:
             history = (*history, self.build_iterate(state.stage, step.point))
-        stages = state.stages
         if step.reason:
             failed = self.failure and not step.converged
             result = StageResult(
@@ -350,9 +349,7 @@ class _Search:
                 reason=f"{step.reason} ({self.failure})" if failed else step.reason,
             )
             stages = (*stages, result)
-        z = tuple(step.point.z.tolist())
-        evaluations, folds = self.evaluations, self.fold_refusals
-        return SearchState(state.stage, z, step.radius, evaluations, history, stages, folds)
+        return SearchState(state.stage, z, step.radius, self.evaluations, history, stages, self.fold_refusals)
 
     def _begin_stage(self, state: SearchState, logarithms: Array) -> tuple[SearchState, SearchPoint]:
         """Take the same parameters into the next stage, with the ratios of the tissues' own starts.
@@ -389,9 +386,8 @@ class _Search:
             (cost, failures), (now, failed) = track[-1 - _VALLEY_STEPS :][0], track[-1]
             # Small steps after failures tell of the failures, not of the data.
             if len(track) > _VALLEY_STEPS and now > least * cost and failed == failures:
-                steps = f"{_VALLEY_STEPS} steps"
-                return f"{steps} hardly lowered the error: the data do not separate the parameters"
-
+                why = "hardly lowered the error: the data do not separate the parameters"
+                return f"{_VALLEY_STEPS} steps {why}"
             return ""
 
         return stop

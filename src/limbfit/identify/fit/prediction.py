@@ -230,14 +230,13 @@ class PredictionModel:
         misfit_N = misfit * find_largest_magnitude(response.force_N)
         site_N = self.site_factor * np.abs(site_N)
         own_N = np.hypot(np.hypot(known_N, misfit_N), site_N)
-        lower_N: Array | float = 0.0
-        higher_N: Array | float = 0.0
+        lower_N, higher_N, relaxation_N = np.zeros((3, len(response.force_N)))
         if self.relaxation is not None and times_s is not None:
             slopes = response.jacobian * parameters
             lower_N, higher_N, relaxation_N = self.relaxation.compute_beyond_N(
                 response.force_N, slopes, times_s
             )
-            own_N = np.hypot(own_N, relaxation_N)
+        own_N = np.hypot(own_N, relaxation_N)
         sd = compute_prediction_sd(response.jacobian, parameters, self.covariance_log, own_N)
         half = compute_half_width_95(sd**2, misfit_N**2, site_N**2, self.known_scale, self.site_freedom)
         low, high = compute_force_range(response, parameters, self.most_probable)
