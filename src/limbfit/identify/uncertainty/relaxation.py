@@ -61,9 +61,9 @@ _IN_CONTACT = 0.01  # of the largest force
 
 @dataclass(frozen=True)
 class _Fit:
-    """A world fitted to the records: z (k,), covariance (k, k), and minus twice the log evidence."""
+    """A relaxation fitted to the records: z (k,), covariance (k, k), and minus twice the log evidence."""
 
-    world: RelaxationModel
+    relaxation: RelaxationModel
     z: Array
     covariance: Array
     criterion: float
@@ -73,8 +73,8 @@ class _Fit:
 class RelaxationAssessment:
     """Which relaxations fit the records at the ``known`` answer, and what they leave open.
 
-    ``weights`` (w,) of the fitted worlds, the model's own terms first. ``evidence`` is twice the logarithm of
-    how much more probable the records are with a power law than with the model's own terms.
+    ``weights`` (w,) of the fitted relaxations, the model's own terms first. ``evidence`` is twice the
+    logarithm of how much more probable the records are with a power law than with the model's own terms.
     ``tail_weight`` is the part of the weights that fits with a tail have. ``spread`` is what they leave open
     of each tissue's modulus at any time.
     """
@@ -183,9 +183,9 @@ def assess_relaxation(known: Uncertainty, responses: Sequence[SiteResponse]) -> 
     records = _ForceRecords(known, [responses[i] for i in chosen], chosen, tissues)
     longest = records.longest_s
     times = np.geomspace(_SHORTEST * records.shortest_ramp_s, _LONGEST * longest, _SPECTRUM_TIMES)
-    worlds = [RelaxationModel(), *(RelaxationModel(slope, longest) for slope in _TAIL_SLOPES)]
-    worlds += [RelaxationModel(slope, longest, times) for slope in _SPECTRUM_SLOPES]
-    fits = [records.fit(world) for world in worlds]
+    relaxations = [RelaxationModel(), *(RelaxationModel(slope, longest) for slope in _TAIL_SLOPES)]
+    relaxations += [RelaxationModel(slope, longest, times) for slope in _SPECTRUM_SLOPES]
+    fits = [records.fit(relaxation) for relaxation in relaxations]
     weights, evidence = _weigh(fits)
     # The model's own terms keep the answer, whose covariance is counted with it.
     fits[0] = replace(fits[0], z=records.answer, covariance=0 * fits[0].covariance)
@@ -196,12 +196,13 @@ def assess_relaxation(known: Uncertainty, responses: Sequence[SiteResponse]) -> 
     spread = RelaxationSpread(
         longest, float(weights[0]), durations, np.array(shifts), np.array(covariances), falls
     )
-    tails = float(weights[[fit.world.has_tail for fit in fits]].sum())
+    tails = float(weights[[fit.relaxation.has_tail for fit in fits]].sum())
     return RelaxationAssessment(known, tissues, weights, evidence, tails, spread)
 
 
 def _weigh(fits: Sequence[_Fit]) -> tuple[Array, float]:
-    """Return the weight (w,) of each world, the model's own terms first, and the evidence for a power law."""
+    """Return the weights (w,) of the relaxations, the model's own terms first, and the evidence for a power
+    law."""
     half = -0.5 * np.array([fit.criterion for fit in fits])
     evidence = float(2 * (logsumexp(half[1:]) - np.log(len(half) - 1) - half[0]))
     own = max(float(expit(-evidence / 2)), MIN_OWN_WEIGHT)
@@ -229,16 +230,16 @@ class _ForceRecords:
         self.shortest_ramp_s = min(float(times[int(np.argmax(r.force_N))] - times[0]) for times, r in pairs)
         self.longest_s = max(_find_longest_load(times, r.force_N) for times, r in pairs)
 
-    def fit(self, world: RelaxationModel) -> _Fit:
-        """Fit a world, first with alike weights, then by what its own residuals say of its misfit."""
-        start = self.answer if world.spectrum_s is None else self._guess(world)
-        z, _ = self._solve(world, start, self._alike(), _MAX_FIT_STEPS)
-        found = estimate_discrepancy(self.model, *self._linearise(world, z), self.prior.precision)
+    def fit(self, relaxation: RelaxationModel) -> _Fit:
+        """Fit a relaxation, first with equal errors everywhere, then by what its residuals say of misfit."""
+        start = self.answer if relaxation.spectrum_s is None else self._guess_start(relaxation)
+        z, _ = self._solve(relaxation, start, self._assume_equal_errors(), _MAX_FIT_STEPS)
+        found = estimate_discrepancy(self.model, *self._linearise(relaxation, z), self.prior.precision)
         stated = self.prior.compute_deviations(z)
-        z, covariance = self._solve(world, z, found, _FURTHER_FIT_STEPS)
-        return _Fit(world, z, covariance, found.criterion + float(stated @ stated))
+        z, covariance = self._solve(relaxation, z, found, _FURTHER_FIT_STEPS)
+        return _Fit(relaxation, z, covariance, found.criterion + float(stated @ stated))
 
-    def _alike(self) -> ResidualModel:
+    def _assume_equal_errors(self) -> ResidualModel:
         """The residuals' covariance if the model were off by as much of the largest force everywhere."""
         noise = [
             replace(one, covariance=(_ALIKE * peak) ** 2 * np.eye(len(one.times_s)))
@@ -248,12 +249,12 @@ class _ForceRecords:
         return replace(self.model, noise=tuple(noise), misfit=off, correlation=1.0, mesh_N=(), site_N=())
 
     def _solve(
-        self, world: RelaxationModel, z: Array, model: ResidualModel, steps: int
+        self, relaxation: RelaxationModel, z: Array, model: ResidualModel, steps: int
     ) -> tuple[Array, Array]:
         """Generalised least squares from z (k,) on; the answer and its covariance (k, k)."""
         prior = self.prior
         for _ in range(steps):
-            residuals, scaled = self._linearise(world, z)
+            residuals, scaled = self._linearise(relaxation, z)
             precision, weighted = prior.weigh(scaled, model)
             slope = prior.bound_precision @ (z - self.answer) + prior.rows.T @ prior.compute_deviations(z)
             slope = slope + sum(W.T @ r for r, W in zip(residuals, weighted))
@@ -263,17 +264,18 @@ class _ForceRecords:
                 break
         return z, np.asarray(np.linalg.inv(precision))
 
-    def _guess(self, world: RelaxationModel) -> Array:
-        """Start of a spectrum's fit: forces are linear in a modulus, and in that times an amplitude."""
+    def _guess_start(self, relaxation: RelaxationModel) -> Array:
+        """Guess the start of a spectrum's fit: forces are linear in a modulus, and in that times an amplitude."""
         p = self.parameters.copy()
-        relaxing = [tissue for tissue in self.tissues if not tissue.is_given]
-        p[[i for tissue in relaxing for i in (tissue.amplitudes[0], tissue.times[0])]] = 1.0
+        for tissue in self.tissues:
+            if not tissue.is_given:
+                p[[tissue.amplitudes[0], tissue.times[0]]] = 1.0
         rows = []
         for one, curve in zip(self.superpositions, self.measured, strict=True):
-            slopes, parts = one.respond(world, p).jacobian * p, []
+            slopes, parts = one.respond(relaxation, p).jacobian * p, []
             for tissue in self.tissues:
-                relaxing = slopes[:, tissue.amplitudes].sum(axis=1)
-                parts += [slopes[:, tissue.moduli].sum(axis=1) - relaxing, relaxing]
+                of_terms = slopes[:, tissue.amplitudes].sum(axis=1)
+                parts += [slopes[:, tissue.moduli].sum(axis=1) - of_terms, of_terms]
             rows.append(np.column_stack([*parts, curve.force_N]) / curve.peak_N)
         table = np.vstack(rows)
         shares = np.maximum(nnls(table[:, :-1], table[:, -1])[0].reshape(-1, 2), _DIFFERENCE)
@@ -283,10 +285,9 @@ class _ForceRecords:
                 p[tissue.amplitudes[0]] = amplitude / modulus
         return self.space.reduce(np.log(p))
 
-    def _linearise(self, world: RelaxationModel, z: Array) -> tuple[list[Array], list[Array]]:
-        """Residuals (n,) and derivatives (n, k) of each record."""
+    def _linearise(self, relaxation: RelaxationModel, z: Array) -> tuple[list[Array], list[Array]]:
         p = self.space.expand(z)
-        found = [one.respond(world, p) for one in self.superpositions]
+        found = [one.respond(relaxation, p) for one in self.superpositions]
         residuals = [r.force_N - one.force_N for r, one in zip(found, self.measured, strict=True)]
         return residuals, [self.space.pull_back(r.jacobian, p) for r in found]
 
@@ -298,12 +299,12 @@ class _ForceRecords:
         within, own = min(duration_s, self.longest_s), RelaxationModel()
         shares, changes, inner = [], [], []
         for fit, weight in zip(fits, weights, strict=True):
-            worlds = (fit.world, own) if fit.world.has_tail else (fit.world,)
-            for world in worlds:
-                at = self._elastic_log(world, fit.z, within)
-                steps = _DIFFERENCE * np.eye(len(fit.z))
-                D = np.array([self._elastic_log(world, fit.z + s, within) - at for s in steps]) / _DIFFERENCE
-                shares.append(weight / len(worlds))
+            relaxations = (fit.relaxation, own) if fit.relaxation.has_tail else (fit.relaxation,)
+            for relaxation in relaxations:
+                at = self._elastic_log(relaxation, fit.z, within)
+                points = fit.z + _DIFFERENCE * np.eye(len(fit.z))
+                D = np.array([self._elastic_log(relaxation, z, within) - at for z in points]) / _DIFFERENCE
+                shares.append(weight / len(relaxations))
                 changes.append(at)
                 inner.append(D.T @ fit.covariance @ D)
         change = np.array(changes) - self._elastic_log(own, self.answer, duration_s)
@@ -311,14 +312,14 @@ class _ForceRecords:
         apart = change - mean
         return mean, np.einsum("w,wi,wj->ij", shares, apart, apart) + np.tensordot(shares, inner, 1)
 
-    def _elastic_log(self, world: RelaxationModel, z: Array, duration_s: float) -> Array:
+    def _elastic_log(self, relaxation: RelaxationModel, z: Array, duration_s: float) -> Array:
         """Logarithms (p,) of moduli so long after a step and of other elastic parameters; 0 of the rest."""
         p = self.space.expand(z)
         found = np.zeros(len(p))
         for tissue in self.tissues:
             elastic = [*tissue.moduli, *tissue.others]
             found[elastic] = np.log(p[elastic])
-            found[list(tissue.moduli)] += np.log(world.terms(tissue, p).at(duration_s))
+            found[list(tissue.moduli)] += np.log(relaxation.terms(tissue, p).at(duration_s))
         return found
 
 

@@ -138,12 +138,12 @@ class Superposition:
             for one in tissues
         ]
 
-    def respond(self, world: RelaxationModel, p: Array) -> SiteResponse:
-        """Force (n,) and derivatives (n, p) in a world at parameters p."""
+    def respond(self, relaxation: RelaxationModel, p: Array) -> SiteResponse:
+        """Force (n,) and derivatives (n, p) with a relaxation at parameters p."""
         change = np.log(p / self.parameters)
         total, slopes = np.zeros(len(self.times_s)), np.zeros((len(self.times_s), len(p)))
         for elastic, tissue in zip(self.elastic, self.tissues, strict=True):
-            terms, n = world.terms(tissue, p), len(tissue.moduli)
+            terms, n = relaxation.terms(tissue, p), len(tissue.moduli)
             histories = _convolve(elastic, self.times_s, terms.times_s)
             relaxed = terms.constant * elastic + np.tensordot(terms.amplitudes, histories, 1)
             factors = np.r_[np.exp(change[list(tissue.moduli)]), change[list(tissue.others)]]
@@ -152,9 +152,9 @@ class Superposition:
             slopes[:, tissue.moduli] = relaxed[:, :n] * factors[:n]
             slopes[:, tissue.moduli[0]] += relaxed[:, n:] @ factors[n:]
             slopes[:, tissue.others] = relaxed[:, n:] * factors[0]
-            if world.spectrum_s is not None and not tissue.is_given:
+            if relaxation.spectrum_s is not None and not tissue.is_given:
                 slopes[:, tissue.amplitudes[0]] = (relaxed - elastic) @ factors
-                over_end = terms.amplitudes * terms.times_s / (world.longest_s * p[tissue.times[0]])
+                over_end = terms.amplitudes * terms.times_s / (relaxation.longest_s * p[tissue.times[0]])
                 slopes[:, tissue.times[0]] = np.tensordot(over_end, histories, 1) @ factors
                 continue
             for k, (amplitude, time) in enumerate(zip(tissue.amplitudes, tissue.times, strict=True)):
