@@ -24,7 +24,7 @@ FIBRED = "ogden-fibres"  # the law whose tissues may have fibres
 ACTIVE = "ogden-active"  # the law whose fibres may pull by themselves
 POWER = "ogden-power"  # the law that relaxes as a power of time
 FUNG = "fung"  # the law that stiffens exponentially
-MOST_RELAXATIONS = 6  # terms, as FEBio
+MAX_RELAXATION_TERMS = 6  # terms, as FEBio
 
 
 @dataclass(frozen=True)
@@ -98,14 +98,7 @@ class TissueLaw:
 
     def record(self) -> dict[str, Any]:
         """As it is stored beside results."""
-        times = {"relaxation_times_s": list(self.relaxation_times_s)} if self.relaxation_times_s else {}
-        return {
-            "name": self.name,
-            "words": self.words,
-            "energy": self.energy,
-            "parameters": [asdict(parameter) for parameter in self.parameters],
-            **times,
-        }
+        return {key: value for key, value in asdict(self).items() if key != "material" and value != ()}
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any]) -> TissueLaw:
@@ -200,7 +193,7 @@ _ACTIVE = TissueLaw(
 )
 
 FIBRE_KEYS = tuple(parameter.key for parameter in (*_FIBRES, _TENSION))
-_OGDEN_LAWS = {law.name: law for law in (_PLAIN, *map(_build_ogden, range(2, MOST_RELAXATIONS + 1)))}
+_OGDEN_LAWS = {law.name: law for law in (_PLAIN, *map(_build_ogden, range(2, MAX_RELAXATION_TERMS + 1)))}
 LAWS = Registry("tissue law", _OGDEN_LAWS | {law.name: law for law in (_POWER, _FUNG, _FIBRED, _ACTIVE)})
 
 

@@ -10,7 +10,7 @@ from guide import identified
 from limbfit.errors import StudyError
 from limbfit.fe import OgdenQLV
 from limbfit.indentation import build_materials
-from limbfit.laws import LAWS, MOST_RELAXATIONS, TissueLaw, is_ogden
+from limbfit.laws import LAWS, MAX_RELAXATION_TERMS, TissueLaw, is_ogden
 from limbfit.report.formats import format_symbol, get_unit
 from limbfit.study import load_study
 
@@ -41,7 +41,7 @@ def study_of(folder, law="ogden-prony2", more=""):
     return load_study(folder)
 
 
-@pytest.mark.parametrize("terms", range(1, MOST_RELAXATIONS + 1))
+@pytest.mark.parametrize("terms", range(1, MAX_RELAXATION_TERMS + 1))
 def test_terms_share_out_the_times_and_the_amplitude_of_one(terms):
     law, one = LAWS["ogden" if terms == 1 else f"ogden-prony{terms}"], LAWS["ogden"]
     assert is_ogden(law.name)
