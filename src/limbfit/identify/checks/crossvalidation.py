@@ -249,5 +249,4 @@ def spread_points(centre: Array, covariance_log: Array, space: SearchSpace, coun
     for _ in range(count):
         found.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(unit - unit[found[-1]], axis=1))
-    points = np.clip(middle + (unit[found] * sd) @ axes.T, space.lower, space.upper)
-    return np.array([space.expand(point) for point in points])
+    return space.expand(np.clip(middle + (unit[found] * sd) @ axes.T, space.lower, space.upper))

@@ -397,7 +397,7 @@ def sample_tissues(unknowns: Unknowns, space: SearchSpace, centre: Array, draws:
         spread[space.tie[unknowns.names.index(prior.name)] > 0] = np.log(prior.factor)
     others = qmc.LatinHypercube(len(spread), rng=seed).random(max(draws - 1, 0))
     scattered = space.reduce(np.log(centre)) + spread * norm.ppf(np.clip(others, 0.05, 0.95))
-    return np.vstack([centre, *map(space.expand, np.clip(scattered, space.lower, space.upper))])
+    return np.vstack([centre, space.expand(np.clip(scattered, space.lower, space.upper))])
 
 
 def compute_factors_95(covariances: Array) -> Array:

@@ -19,14 +19,14 @@ from ...results.identification import OutsideRecords, RecordedExtents
 SHEAR, COMPRESSION, RATE = "shear strain", "compressive strain", "shear strain rate"
 TIME, PRESSURE, DEPTH = "time", "pressure", "depth over thickness"
 LEVEL, ANGLE = "level along the limb", "angle to the nearest fitted site"
-RARE = 0.01  # of the volume, or area: what strains or presses more than this share does is the largest
+TAIL_SHARE = 0.01  # of the volume, or area: what strains or presses more than this share does is the largest
 SECTOR_DEG = 45.0  # around a fitted site, as seen along the limb: a quarter of the limb
 _PROBABILITIES = np.linspace(0.0, 1.0, 401)
 # How far a prediction may go beyond the records. Relaxation changes with the logarithm of time: half as long
 # again is little. A site tells of tissue around it.
 _FACTOR, _FACTORS, _ALLOWED = 1.1, {TIME: 1.5, ANGLE: 1.0, LEVEL: 1.0}, {LEVEL: 20.0}
 _TWO_SIDED = (TIME, LEVEL)
-_MOST_TOLD = 3  # quantities in one sentence
+_MAX_LISTED = 3  # quantities in one sentence
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Extent:
         cumulative = np.cumsum(weights[order])
         places = np.searchsorted(cumulative, _PROBABILITIES * cumulative[-1])
         quantiles = values[order][np.minimum(places, len(values) - 1)]
-        low, high = (float(np.interp(p, _PROBABILITIES, quantiles)) for p in (RARE, 1.0 - RARE))
+        low, high = (float(np.interp(p, _PROBABILITIES, quantiles)) for p in (TAIL_SHARE, 1.0 - TAIL_SHARE))
         return cls(quantity, unit, low if quantity in _TWO_SIDED else 0.0, high, tissue, quantiles)
 
     def is_within(self, tested: Extent) -> bool:
@@ -162,19 +162,19 @@ def _compute_excess(row: OutsideRecords) -> float:
 
 def _describe_times(rows: Sequence[OutsideRecords]) -> str:
     (low, high), (ramp, end) = rows[0].records, rows[0].prediction
-    factor, told = _FACTORS[TIME], []
+    factor, parts = _FACTORS[TIME], []
     if ramp * factor < low:
-        told.append(f"comes on in {_format(ramp)} s (the records' shortest ramp takes {_format(low)} s)")
+        parts.append(f"comes on in {_format(ramp)} s (the records' shortest ramp takes {_format(low)} s)")
     if end > factor * high:
-        told.append(f"lasts {_format(end)} s (the records last {_format(high)} s)")
-    return f"{' and '.join(told)}: no record tells how tissue relaxes at such times"
+        parts.append(f"lasts {_format(end)} s (the records last {_format(high)} s)")
+    return f"{' and '.join(parts)}: no record tells how tissue relaxes at such times"
 
 
 def _describe_others(rows: Sequence[OutsideRecords]) -> str:
     first = sorted(rows, key=_compute_excess, reverse=True)
-    told = [_describe_row(row) for row in first[:_MOST_TOLD]]
-    more = f", and {len(first) - _MOST_TOLD} more" if len(first) > _MOST_TOLD else ""
-    return f"goes beyond the records: {'; '.join(told)}{more}"
+    parts = [_describe_row(row) for row in first[:_MAX_LISTED]]
+    more = f", and {len(first) - _MAX_LISTED} more" if len(first) > _MAX_LISTED else ""
+    return f"goes beyond the records: {'; '.join(parts)}{more}"
 
 
 def _describe_row(row: OutsideRecords) -> str:

@@ -126,11 +126,11 @@ class SearchSpace:
     fixed_values: Array
 
     def to_logarithms(self, z: Array) -> Array:
-        """Return the logarithms (p,) of the full parameters at z (k,)."""
-        return self.fixed_log + self.tie @ z
+        """Return the logarithms (..., p) of the full parameters at z (..., k)."""
+        return self.fixed_log + z @ self.tie.T
 
     def expand(self, z: Array) -> Array:
-        """Return the full parameters (p,) at z (k,)."""
+        """Return the full parameters (..., p) at z (..., k)."""
         return np.where(self.tie.any(axis=1), np.exp(self.to_logarithms(z)), self.fixed_values)
 
     def reduce(self, logarithms: Array) -> Array:

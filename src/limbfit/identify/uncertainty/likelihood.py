@@ -77,8 +77,8 @@ class Likelihood:
         return bool(self._spectrum.values.max(initial=0.0) > 1e-6)
 
     def to_parameters(self, z: Array) -> Array:
-        """Return the full parameters (m, p) at z (m, k)."""
-        return np.exp(self.space.fixed_log + np.atleast_2d(z) @ self.space.tie.T)
+        """Return the full parameters (..., p) at z (..., k)."""
+        return np.exp(self.space.to_logarithms(z))
 
     def compute_minus_2_log(self, z: Array, factor: Array | float = 1.0) -> Array:
         """Return minus twice the log-likelihood (m,) at z (m, k), with the misfit ``factor`` (m,) times as
@@ -86,7 +86,8 @@ class Likelihood:
 
         It is infinite outside the bounds.
         """
-        z, parameters = np.atleast_2d(z), self.to_parameters(z)
+        z = np.atleast_2d(z)
+        parameters = self.to_parameters(z)
         squares = np.atleast_1d(factor)[:, None] ** 2
         if self.counts_emulator:
             forces, sd_N = self.emulator.predict_forces_and_sd(parameters)
@@ -124,7 +125,7 @@ class Likelihood:
 
     def linearise(self, z: Array, factor: float = 1.0) -> SearchPoint | None:
         """Return residuals of unit variance and their derivatives at z (k,), for least squares."""
-        parameters = self.to_parameters(z)[0]
+        parameters = self.to_parameters(z)
         responses = self.emulator(parameters)
         forces = np.concatenate([response.force_N for response in responses])
         slopes = np.concatenate([self.space.pull_back(r.jacobian, parameters) for r in responses])
@@ -159,7 +160,7 @@ class Likelihood:
             )
             for step in steps:
                 z[free] = step.point.z
-        return Optimum(z, self.to_parameters(z)[0], float(self.compute_minus_2_log(z, factor)[0]))
+        return Optimum(z, self.to_parameters(z), float(self.compute_minus_2_log(z, factor)[0]))
 
     def find_best(self, starts: Sequence[Array]) -> Optimum:
         """Return the most probable of the optima from several full parameters (p,)."""

@@ -125,7 +125,6 @@ def _split_states(likelihood: Likelihood, states: Array) -> tuple[Array, Array]:
 
 
 def _compute_log_probability(likelihood: Likelihood, states: Array) -> Array:
-    """Return the log-probability (m,) of states."""
     z, factor = _split_states(likelihood, states)
     found = -0.5 * likelihood.compute_minus_2_log(z, factor)
     return np.where((factor > MISFIT_FACTOR_BOUNDS[0]) & (factor < MISFIT_FACTOR_BOUNDS[1]), found, -np.inf)
