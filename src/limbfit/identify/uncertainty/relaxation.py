@@ -265,7 +265,7 @@ class _ForceRecords:
         return z, np.asarray(np.linalg.inv(precision))
 
     def _guess_start(self, relaxation: RelaxationModel) -> Array:
-        """Guess the start of a spectrum's fit: forces are linear in a modulus, and in that times an amplitude."""
+        """Guess a spectrum's start: forces are linear in a modulus, and in that times an amplitude."""
         p = self.parameters.copy()
         for tissue in self.tissues:
             if not tissue.is_given:
