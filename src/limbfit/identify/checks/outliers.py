@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import combinations
 from typing import Literal
 
@@ -26,7 +27,8 @@ from ..fit.objective import MeasuredCurve, Simulate, SiteResponse, check_respons
 from .plausibility import UNITS, RecordWarning
 
 History = tuple[Array, Array]
-Exchange = Callable[[Array, int, int], tuple[SiteResponse, SiteResponse]]
+Exchanged = tuple[SiteResponse, SiteResponse]  # the responses of two sites, each to the other's record
+Exchange = Callable[[int, int], Exchanged]
 
 _UNIT_TOLERANCE = 0.25  # of the logarithm of a unit's factor: how near the force ratio must come
 _MAX_CORRECTIONS = 3  # corrections that are looked for
@@ -103,9 +105,9 @@ class LeaveOutFits:
         measured[i] = replace(measured[i], force_N=measured[i].force_N / factor)
         return LeaveOutFits(self.simulate, measured, self.start, self.tie)
 
-    def exchange_records(self, i: int, j: int, exchange: Exchange) -> LeaveOutFits:
-        """Return the same with two records in each other's place, their sites driven by each other's."""
-        measured, moved = list(self.measured), LogLinearModel(self.start, exchange(self.start, i, j))
+    def exchange_records(self, i: int, j: int, exchanged: Exchanged) -> LeaveOutFits:
+        """Return the same with two records in each other's place, and the responses to these at the start."""
+        measured, moved = list(self.measured), LogLinearModel(self.start, exchanged)
         measured[i] = replace(self.measured[j], site=self.measured[i].site_name)
         measured[j] = replace(self.measured[i], site=self.measured[j].site_name)
 
@@ -292,25 +294,25 @@ def _match_times(history: History, other_history: History) -> Array:
 
 
 def find_best_correction(
-    fits: LeaveOutFits, exchange: Exchange, exactly: Exchange | None = None
+    fits: LeaveOutFits, approximate: Exchange, simulate: Exchange
 ) -> RecordCorrection | None:
     """Find the one change of names or of a unit that lowers the misfit of all sites most, if it is
     convincing.
 
     Parameters
     ----------
-    exchange : takes parameters (p,) and two sites, and returns the response of each to the other's record, at
-        the times of the record; it may be an approximation (``approximate_response``).
-    exactly : the same by simulation, asked for the few exchanges that may matter, and then decisive; an
+    approximate : approximates the responses of two sites, each to the other's record, at the start of the
+        fits (``approximate_response``).
+    simulate : simulates the same. It is asked for the few exchanges that may matter, and then decisive; an
         exchange whose simulation fails is not considered.
     """
     before = fits.compute_errors(fits.fit_without())
     if before.max() <= MAX_ERROR_SHARE / 2:
         return None  # nothing to explain
 
-    def swap(pair: tuple[int, ...], exchange: Exchange) -> RecordCorrection:
+    def swap(pair: tuple[int, ...], exchanged: Exchanged) -> RecordCorrection:
         i, j = pair
-        swapped = fits.exchange_records(i, j, exchange)
+        swapped = fits.exchange_records(i, j, exchanged)
         return _build_correction("swap", pair, "swapped site names", before, swapped)
 
     worst = sorted(find_worst_sites(fits, before))
@@ -320,12 +322,10 @@ def find_best_correction(
         for unit, factor in FORCE_UNITS.items()
         if fits.measured[i].unit == "N"
     ]
-    swaps = [swap(pair, exchange) for pair in list_pairs(fits.measured, worst)]
-    if exactly is not None:
-        likely = sorted((s for s in swaps if s.gain > MIN_GAIN / 2), key=lambda s: -s.gain)
-        pairs = [s.sites for s in likely[:_MAX_SIMULATED_EXCHANGES]]
-        pairs = [pair for pair in pairs if all(r.completed for r in exactly(fits.start, *pair))]
-        swaps = [swap(pair, exactly) for pair in pairs]
+    swaps = [swap(pair, approximate(*pair)) for pair in list_pairs(fits.measured, worst)]
+    likely = sorted((s for s in swaps if s.gain > MIN_GAIN / 2), key=lambda s: -s.gain)
+    simulated = [(s.sites, simulate(*s.sites)) for s in likely[:_MAX_SIMULATED_EXCHANGES]]
+    swaps = [swap(pair, exchanged) for pair, exchanged in simulated if all(r.completed for r in exchanged)]
     convincing = [correction for correction in (*units, *swaps) if correction.is_convincing]
     return max(convincing, key=lambda correction: correction.gain, default=None)
 
@@ -353,9 +353,9 @@ def find_outliers(
     simulate: Simulate,
     measured: Sequence[MeasuredCurve],
     start: Array,
-    exchange: Callable[[LogLinearModel], Exchange],
-    exactly: Exchange | None = None,
-    neutral: Array | None = None,
+    histories: Sequence[History],
+    simulate_exchange: Callable[[Array, int, int], Exchanged],
+    neutral: Array,
     tie: Array | None = None,
 ) -> OutlierReport:
     """Look for names exchanged, wrong units of force, and sites that do not fit, one after the other.
@@ -370,8 +370,8 @@ def find_outliers(
     Parameters
     ----------
     simulate : returns all sites; called at ``start``, and at ``neutral`` if that is needed.
-    exchange : takes the expansion of all sites and returns the approximate exchange of two records.
-    exactly : the same by simulation.
+    histories : times (n,) s and depths (n,) mm of each record.
+    simulate_exchange : simulates two sites with parameters (p,), each with the other's record.
     tie : as `LeaveOutFits`.
     """
     if count_sites(measured) < MIN_SITES:
@@ -379,20 +379,27 @@ def find_outliers(
     model = LogLinearModel(start, simulate(start))
     fits = LeaveOutFits(model, measured, start, tie)
     errors = fits.leave_one_out()
-    if neutral is not None and fits.compute_errors(start).max() > MAX_ERROR_SHARE:
+    if fits.compute_errors(start).max() > MAX_ERROR_SHARE:
         responses = simulate(neutral)
         if not check_responses(responses, measured, len(neutral)):
             model = LogLinearModel(neutral, responses)
             fits = LeaveOutFits(model, measured, neutral, tie)
-    return OutlierReport(errors, _find_warnings(fits, exchange(model), exactly))
+
+    def approximate(i: int, j: int) -> Exchanged:
+        one, two = histories[i], histories[j]
+        responses = model.responses
+        return approximate_response(responses[i], one, two), approximate_response(responses[j], two, one)
+
+    warnings = _find_warnings(fits, approximate, partial(simulate_exchange, model.parameters))
+    return OutlierReport(errors, warnings)
 
 
 def _find_warnings(
-    fits: LeaveOutFits, exchange: Exchange, exactly: Exchange | None
+    fits: LeaveOutFits, approximate: Exchange, simulate: Exchange
 ) -> tuple[RecordWarning, ...]:
     warnings, measured = [], fits.measured
     for _ in range(_MAX_CORRECTIONS):
-        correction = find_best_correction(fits, exchange, exactly)
+        correction = find_best_correction(fits, approximate, simulate)
         if correction is None:
             break
         fits = correction.fits

@@ -14,7 +14,7 @@ import numpy as np
 from ...anatomy.sites.sites import compute_indenter_axis, measure_tissue_under
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...arrays import Array
-from ...identify.checks.outliers import Exchange, LogLinearModel, approximate_response, find_outliers
+from ...identify.checks.outliers import find_outliers
 from ...identify.checks.plausibility import RecordFacts, RecordWarning, check_plausibility, explain_warnings
 from ...identify.fit.multifidelity import MeshCorrection
 from ...identify.fit.objective import SiteResponse
@@ -164,29 +164,19 @@ def check_records(
         failed.extend(f"site {r.site}, one material: {r.reason}" for r in found if not r.completed)
         return found
 
-    def exactly(parameters: Array, i: int, j: int) -> tuple[SiteResponse, SiteResponse]:
+    def simulate_exchange(parameters: Array, i: int, j: int) -> tuple[SiteResponse, SiteResponse]:
         jobs = [_build_driven_job(searched[a], searched[b], parameters) for a, b in ((i, j), (j, i))]
         one, two = _run(context, cache, jobs)
         pairs = ((one, two), (two, one))
         failed.extend(f"site {a.site}, record of {b.site}: {a.reason}" for a, b in pairs if not a.completed)
         return one, two
 
-    def exchange(first: LogLinearModel) -> Exchange:
-        """From the expansion of all sites to about what two answer to each other's record."""
-
-        def pair(parameters: Array, i: int, j: int) -> tuple[SiteResponse, SiteResponse]:
-            histories = [(records[k].times_s, records[k].displacement_mm) for k in (i, j)]
-            one, two = first.responses[i], first.responses[j]
-            return approximate_response(one, *histories), approximate_response(two, *histories[::-1])
-
-        return pair
-
     found = find_outliers(
         simulate,
         [replace(record.measured, weight=1.0 / record.record.of_site) for record in records],
         best,
-        exchange,
-        exactly,
+        [(record.times_s, record.displacement_mm) for record in records],
+        simulate_exchange,
         one,
         tie,
     )
