@@ -24,6 +24,7 @@ import numpy as np
 from .material import LawTable, Material, Uncoupled, check_not_negative, check_positive
 
 
+@dataclass(frozen=True)
 class _Extension(Material):
     """A `Material` that is another one, its first field, with parameters of its own, the other fields.
 
@@ -32,11 +33,11 @@ class _Extension(Material):
 
     @property
     def _base(self) -> Material:
-        return cast("Material", getattr(self, fields(cast("Any", self))[0].name))
+        return cast("Material", getattr(self, fields(self)[0].name))
 
     @property
     def _own_names(self) -> tuple[str, ...]:
-        return tuple(field.name for field in fields(cast("Any", self))[1:])
+        return tuple(field.name for field in fields(self)[1:])
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -57,11 +58,10 @@ class _Extension(Material):
         return *self._base.instantaneous_modulus_gradient, *(0.0 for _ in self._own_names)
 
     def with_parameters(self, values: Mapping[str, float]) -> Self:
-        own: dict[str, Any] = {name: values[name] for name in self._own_names if name in values}
-        own[fields(cast("Any", self))[0].name] = self._base.with_parameters(
-            {name: value for name, value in values.items() if name not in own}
-        )
-        return cast("Self", replace(cast("Any", self), **own))
+        changes: dict[str, Any] = {name: values[name] for name in self._own_names if name in values}
+        of_base = {name: value for name, value in values.items() if name not in changes}
+        changes[fields(self)[0].name] = self._base.with_parameters(of_base)
+        return replace(self, **changes)
 
 
 @dataclass(frozen=True)
