@@ -77,8 +77,8 @@ def test_a_record_in_another_unit_is_named(unit, seed):
 def test_swapped_names_of_thin_and_thick_sites_are_found(seed):
     facts = study(seed)
     thin, thick = facts[1], facts[2]
-    facts[1] = replace(thick, site="s1", thickness_mm=thin.thickness_mm)
-    facts[2] = replace(thin, site="s2", thickness_mm=thick.thickness_mm)
+    facts[1] = replace(thick, record="s1", thickness_mm=thin.thickness_mm)
+    facts[2] = replace(thin, record="s2", thickness_mm=thick.thickness_mm)
     swaps = [flag for flag in check_plausibility(facts) if flag.kind == "swap"]
     assert [flag.sites for flag in swaps] == [("s1", "s2")]
     assert swaps[0].evidence["scatter_exchanged"] < 0.5 * swaps[0].evidence["scatter"]

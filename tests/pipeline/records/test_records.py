@@ -186,10 +186,10 @@ def test_what_is_a_site_s_own_moves_its_records_together() -> None:
 
 def test_records_of_one_site_may_differ() -> None:
     """Another speed or indenter is another stiffness; one wrong axis is told of once."""
-    one = RecordFacts("1", 5.0, 5.0, 1.0, 0.01, 11.0, 20.0, 40.0, position_mm=(0.0, 0.0, 0.0), place="1")
-    facts = [one, replace(one, site="1-fast", peak_N=8.0)]
+    one = RecordFacts("1", 5.0, 5.0, 1.0, 0.01, 11.0, 20.0, 40.0, position_mm=(0.0, 0.0, 0.0), site="1")
+    facts = [one, replace(one, record="1-fast", peak_N=8.0)]
     assert [(flag.sites, flag.kind) for flag in check_plausibility(facts)] == [(("1",), "axis")]
-    apart = [replace(one, place="") for one in facts]
+    apart = [replace(one, site="") for one in facts]
     assert {flag.kind for flag in check_plausibility(apart)} == {"axis", "place"}
 
 

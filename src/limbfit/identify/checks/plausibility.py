@@ -100,14 +100,14 @@ def explain_warnings(
 class RecordFacts:
     """A record and its site in numbers; what is not known (yet) is None.
 
-    ``site`` is the record's name, and ``place`` the name of the site if it has several records.
+    ``record`` is its name, and ``site`` that of the site if it has several records.
     ``position_mm`` (LPS) is where that is on the skin, ``step_s`` the time between samples, ``radius_mm``
     that of a circle of the punch's area, ``thickness_mm`` the soft tissue under the indenter along its axis,
     ``axis_deg`` the angle between that axis and the skin's inward normal, ``hint_mm`` how far its marker is
     from where the study says the site is.
     """
 
-    site: str
+    record: str
     peak_N: float
     depth_mm: float
     speed_mm_s: float
@@ -118,12 +118,12 @@ class RecordFacts:
     off_skin_mm: float | None = None
     hint_mm: float | None = None
     position_mm: tuple[float, float, float] | None = None
-    place: str = ""
+    site: str = ""
 
     @property
     def site_name(self) -> str:
         """The name that all records of one site share."""
-        return self.place or self.site
+        return self.site or self.record
 
     @property
     def modulus_kPa(self) -> float:
@@ -159,7 +159,7 @@ def _check_places(facts: Sequence[RecordFacts]) -> Iterator[RecordWarning]:
         if share > MAX_DEPTH_SHARE:
             what = f"it goes {f.depth_mm:.1f} mm deep where the soft tissue is {f.thickness_mm:.1f} mm thick"
             cause = "another place, another limb, or a wrong unit of displacement"
-            yield RecordWarning((f.site,), "depth", what, {"depth_share": share}, cause, "check the record")
+            yield RecordWarning((f.record,), "depth", what, {"depth_share": share}, cause, "check the record")
         if f.site_name in seen_sites:
             continue
         seen_sites.add(f.site_name)
@@ -193,7 +193,7 @@ def _check_shared_places(facts: Sequence[RecordFacts]) -> Iterator[RecordWarning
         )
         numbers = {"apart_mm": apart, "modulus_ratio": ratio}
         remedy = "give each site its own place"
-        sites = one.site, two.site
+        sites = one.record, two.record
         yield RecordWarning(sites, "place", what, numbers, "a position given twice", remedy)
 
 
@@ -237,7 +237,7 @@ def _compare_records(facts: Sequence[RecordFacts]) -> Iterator[RecordWarning]:
     if swapped is not None:
         yield swapped
     for f, shift, sd in zip(facts, away, spread):
-        if swapped is None or f.site not in swapped.sites:
+        if swapped is None or f.record not in swapped.sites:
             yield from _explain_odd_record(f, shift, sd)
 
 
@@ -264,11 +264,11 @@ def _explain_odd_record(f: RecordFacts, shift: Array, sd: Array) -> Iterator[Rec
         f"{np.exp(shift[1]):.2g} times, its depth {np.exp(shift[3]):.2g} times"
     )
     if chi2[name] < _MAX_CHI2_EXPLAINED and chi2[""] - chi2[name] > _MIN_CHI2_DROP:
-        yield RecordWarning((f.site,), "unit", what, numbers, name, "convert the column to s, mm and N")
+        yield RecordWarning((f.record,), "unit", what, numbers, name, "convert the column to s, mm and N")
     elif abs(shift[0] / sd[0]) >= _MAX_STANDARDISED:  # a protocol of its own is no fault
         cause = "a swapped name, another place or another limb"
         remedy = "check which site this record belongs to"
-        yield RecordWarning((f.site,), "stiffness", what, numbers, cause, remedy)
+        yield RecordWarning((f.record,), "stiffness", what, numbers, cause, remedy)
 
 
 def _find_exchange(facts: Sequence[RecordFacts], z: Array) -> RecordWarning | None:
@@ -300,4 +300,4 @@ def _find_exchange(facts: Sequence[RecordFacts], z: Array) -> RecordWarning | No
     )
     numbers = {"scatter": before, "scatter_exchanged": after}
     remedy = "exchange the traces of the two sites, or their names"
-    return RecordWarning((one.site, two.site), "swap", what, numbers, "swapped site names", remedy)
+    return RecordWarning((one.record, two.record), "swap", what, numbers, "swapped site names", remedy)

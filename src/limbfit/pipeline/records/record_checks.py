@@ -101,8 +101,8 @@ def _collect_facts(
             "hint_mm": None if row.marker is None else row.marker.distance_to_hint_mm,
         }
     return RecordFacts(
-        site=stated.name,
-        place=stated.site.name,
+        record=stated.name,
+        site=stated.site.name,
         peak_N=record.peak_force_N,
         depth_mm=record.depth_mm,
         speed_mm_s=abs(record.speed_load_mm_s),
