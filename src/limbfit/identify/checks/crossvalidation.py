@@ -140,7 +140,7 @@ def fit_sites(
         simulate_chosen,
         [measured[i] for i in chosen],
         unknowns,
-        settings or CalibrationSettings(),
+        settings,
         stages=(grouping or group_separately(unknowns.names),),
     )
     errors = compute_errors_percent(simulate(found.parameters), measured)

@@ -410,7 +410,7 @@ def _find_warnings(
     return (*warnings, *(warn_of_outlier(singles[i], measured[i].unit) for i in others))
 
 
-def warn_of_outlier(error: LeftOutRecord, unit: str = "N") -> RecordWarning:
+def warn_of_outlier(error: LeftOutRecord, unit: str) -> RecordWarning:
     """Build the warning about a site that does not fit, with the unit that its force ratio is near.
 
     ``unit`` is that of what is compared; for a depth, another unit was found before.
