@@ -283,7 +283,7 @@ def mean_limb() -> tuple[Anatomy, BaseMesh]:
 
 
 @pytest.mark.skipif(not OPENLIMB.is_dir(), reason="the shared mean limb is not beside the repository")
-@pytest.mark.parametrize("name", ["1", "4"])
+@pytest.mark.parametrize("name", ["1", pytest.param("4", marks=pytest.mark.slow)])
 def test_real_mean_limb(mean_limb: tuple[Anatomy, BaseMesh], name: str) -> None:
     site = json.loads((OPENLIMB / "sites.json").read_text(encoding="utf-8"))["sites"][name]
     place = np.array(site["position"]), np.array(site["axis"])

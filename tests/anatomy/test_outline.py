@@ -113,7 +113,7 @@ def test_a_limb_without_supports_is_left_as_it_is(inside, images):
     assert np.array_equal(remove_supports(inside, images["UTE"]), inside)
 
 
-@pytest.mark.parametrize("contrast", CONTRASTS)
+@pytest.mark.parametrize("contrast", ["UTE", "CT", pytest.param("T1", marks=pytest.mark.slow)])
 def test_every_contrast_gives_limb_bones_and_fat(images, inside, limb, points, contrast):
     labels = segment(images[contrast])
     assert dice(labels.limb, inside) > 0.99

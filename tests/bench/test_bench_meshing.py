@@ -8,8 +8,9 @@ import pytest
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings
 from limbfit.anatomy.surfaces.surfaces import Anatomy
-from limbfit.bench.meshing import bench_meshing, draw_random_sites, make_phantom_limb
+from limbfit.bench.meshing import bench_meshing, draw_random_sites
 from limbfit.errors import InputError
+from small_limb import limb
 
 COARSE = MeshSettings(edge_near_mm=6.0, edge_far_mm=24.0, near_radius_mm=8.0, growth=0.9, flatness=1.6)
 
@@ -20,7 +21,7 @@ def silent(done: int, total: int, text: str) -> None:
 
 @pytest.fixture(scope="module")
 def anatomy() -> Anatomy:
-    return make_phantom_limb(0, "coarse")
+    return limb()
 
 
 def test_sites_lie_on_the_skin_and_look_in(anatomy: Anatomy) -> None:

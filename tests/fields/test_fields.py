@@ -28,11 +28,11 @@ def played(problem, folder, **control):
     return result, [pv.read(file) for _, file in animation.frames]
 
 
-@pytest.fixture(scope="module", params=["hex8", "tet10"])
+@pytest.fixture(scope="module", params=[("hex8", 12), ("tet10", 10)], ids=["hex8", "tet10"])
 def elastic(request, tmp_path_factory):
     """A long-term elastic block under a flat round punch that covers several faces."""
     problem = replace(
-        build_punched_block(request.param, 12),
+        build_punched_block(*request.param),
         materials=ELASTIC,
         indenter=Indenter("cylinder", 30.0, 6.0, (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
     )

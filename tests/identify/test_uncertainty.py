@@ -92,7 +92,7 @@ def test_intervals_cover_the_truth_where_the_model_is_wrong():
     assert 0.90 < shares.mean() < 0.99
 
 
-@pytest.mark.parametrize("stiffer", [0.02, 0.06])
+@pytest.mark.parametrize("stiffer", [0.02, pytest.param(0.06, marks=pytest.mark.slow)])
 def test_intervals_cover_the_truth_where_sites_are_of_other_stiffness(stiffer):
     """Stiffness that scatters from site to site by as much as expected, or three times as much."""
     shares = coverage(

@@ -77,7 +77,7 @@ def test_speeds_in_a_compressed_cube(element: str) -> None:
 
 def site(folder: Path) -> SiteModel:
     steps = SolverTable(load_steps=4, unload_steps=3, penalty_per_mm=400.0)
-    mesh = build_layered_block("tet10", 6)
+    mesh = build_layered_block("tet10", 4)
     mesh = replace(mesh, node_sets={"fixed_bottom": mesh.node_sets["bottom"]})
     model = build_block_site("a", folder / "a.vtu", mesh, 4.0, steps)
     return replace(model, waves=place_waves_under(model, mesh, [("skin", None), ("muscle", 20.0)]))

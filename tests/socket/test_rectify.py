@@ -233,7 +233,7 @@ def test_a_folded_limb_is_refused() -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["mean", "limb-1", *(pytest.param(n, marks=pytest.mark.slow) for n in ("limb-4", "limb-5", "limb-8"))],
+    ["mean", *(pytest.param(f"limb-{n}", marks=pytest.mark.slow) for n in (1, 4, 5, 8))],
 )
 @pytest.mark.skipif(not FILES["mean"].is_file(), reason="shared/data is not here")
 def test_real_limbs(name: str) -> None:

@@ -122,7 +122,7 @@ def test_thinner_tissue_under_an_indenter_has_faster_waves(tmp_path: Path) -> No
     assert off == pytest.approx(0.5 * LEAST_SHARE * speeds + (speeds - 4.0) * GIVEN_MM / thickness)
 
 
-@pytest.mark.parametrize("lag", [0.0, 0.98])
+@pytest.mark.parametrize("lag", [pytest.param(0.0, marks=pytest.mark.slow), 0.98])
 def test_slow_noise_of_a_record_is_not_taken_for_the_force(tmp_path: Path, lag: float) -> None:
     """At 0.98 the smoothing removes a fifth of it only."""
     found = context(tmp_path)
