@@ -55,6 +55,7 @@ def test_steps_follow_the_thickness_and_change_by_one_at_most() -> None:
     assert choose_even_steps(thickness, np.full(4, 100.0), edges, 8).tolist() == [1, 1, 1, 1]
 
 
+@pytest.mark.slow
 def test_three_layers_are_as_thick_as_asked() -> None:
     anatomy = limb()
     position, axis = site_of(anatomy, np.array([0, 1.0, 0]), -35.0)

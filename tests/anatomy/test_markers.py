@@ -66,6 +66,7 @@ def test_markers_of_a_second_image_of_a_moved_limb() -> None:
     assert not errors or max(errors) > 2.0
 
 
+@pytest.mark.slow
 def test_motion_of_a_limb() -> None:
     limb, moved, plain, marked = scans(1)
     motion = register_limb(plain, marked, mask_of(plain))
@@ -100,6 +101,7 @@ def test_another_limb_is_no_motion() -> None:
         register_limb(plain, plain.with_array(noise), mask_of(plain))
 
 
+@pytest.mark.slow
 def test_markers_of_one_image_alone_are_found_and_taken_off() -> None:
     """The skin under them comes back within the thickness of a line, elsewhere it stays as it was."""
     _, moved, _, marked = scans(1)

@@ -104,6 +104,7 @@ def test_the_force_of_the_part_is_nearly_in_proportion_to_the_whole_one(site):
     assert (np.linalg.norm(factor * near.jacobian - whole.jacobian, axis=0) < 0.06 * size).all()
 
 
+@pytest.mark.slow
 def test_first_guesses_of_the_part_save_iterations_and_change_no_force(site):
     simulating._prepared.clear()
     rest = simulate(job(site, sensitivities=False))
@@ -113,6 +114,7 @@ def test_first_guesses_of_the_part_save_iterations_and_change_no_force(site):
     assert nested.facts["newton_iterations"] < rest.facts["newton_iterations"]
 
 
+@pytest.mark.slow
 def test_first_guesses_of_the_part_serve_a_law_with_other_parameters(site):
     """Two relaxation terms, of which one does nothing, are the law of one."""
     start = tuple(1.2 * to_vector(TRUTH, TISSUES))

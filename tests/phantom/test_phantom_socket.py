@@ -18,6 +18,7 @@ from limbfit.socket import read_socket
 from limbfit.study import load_study
 
 
+@pytest.mark.slow
 def test_a_socket_beside_the_patient(tmp_path: Path) -> None:
     def simulate(function, jobs):
         assert list(tmp_path.glob(".study-*/socket/socket.stl"))  # made before anything is simulated

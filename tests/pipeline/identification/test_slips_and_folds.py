@@ -56,6 +56,7 @@ def test_the_solver_s_own_folds_and_slips_reach_the_search(block):
     assert "elements are inside out" in doubtful.folded
 
 
+@pytest.mark.slow
 def test_a_search_that_starts_where_the_tissue_slips_leaves_it_and_does_not_return(block):
     measured = [MeasuredCurve("a", block(TRUTH)[0].force_N)]
     names = tuple(f"{tissue}.{name}" for tissue in TISSUES for name in ("c_kPa", "m", "gamma", "tau_s"))

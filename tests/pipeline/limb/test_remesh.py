@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
+
 from conftest import COARSE
 from limbfit import load_study, run_study
 from limbfit.execution import SerialExecutor
@@ -14,6 +16,7 @@ from limbfit.pipeline.limb.remesh import mesh_models, mesh_where_possible
 from limbfit.pipeline.records.records import load_site_record
 
 
+@pytest.mark.slow
 def test_a_site_without_such_a_mesh_is_left_out_and_named(study):
     """The others keep theirs: here one was made, and no time is left for the other."""
     with (study / "study.toml").open("a") as stream:

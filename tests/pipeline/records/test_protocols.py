@@ -80,7 +80,7 @@ def write_record(file: Path, knots_s, knots_mm, force, slack_mm=0.36, slack_s=0.
     )
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", ["cycles", pytest.param("held", marks=pytest.mark.slow)])
 def test_a_protocol_goes_from_its_record_to_residuals_and_report(tmp_path, name):
     knots_s, knots_mm, words = PROTOCOLS[name]
     (tmp_path / "study.toml").write_text(TEXT + SITE.format(name=name), encoding="utf-8")

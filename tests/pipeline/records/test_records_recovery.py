@@ -152,6 +152,7 @@ def test_further_records_narrow_every_interval(tmp_path: Path, no_own_record: No
     assert (widths[1] < widths[0]).all()
 
 
+@pytest.mark.slow
 def test_depths_under_a_force_follow_the_parameters(tmp_path: Path, no_own_record: None) -> None:
     """The derivatives that a creep is fitted with, in the units of the study, beside differences."""
     text = STUDY.replace("load_steps = 10", "load_steps = 3").replace("unload_steps = 10", "unload_steps = 3")

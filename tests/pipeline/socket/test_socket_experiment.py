@@ -107,6 +107,7 @@ def test_tissue_relaxes_while_the_socket_is_held(found):
     assert (np.diff([row["mean_kPa"] for row in held]) < 0.0).all()
 
 
+@pytest.mark.slow
 def test_it_is_not_done_twice_and_the_report_shows_it(found, folder, limbfit):
     file = folder / "results" / "socket" / "socket.json"
     before = file.stat().st_mtime_ns

@@ -67,6 +67,7 @@ def test_thin_and_thick_sites_are_chosen_unless_named(context):
         choose_sites(context, ["no such site"])
 
 
+@pytest.mark.slow
 def test_force_grows_with_c_of_each_tissue(context, tmp_path):
     run_stiffness(context, tmp_path, sites=["1"])
     found = runs(tmp_path, "sensitivity-c", "1")
