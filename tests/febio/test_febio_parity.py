@@ -39,6 +39,7 @@ from limbfit.fe import (
 )
 from limbfit.febio import FebSettings, build_result, read_log, run_febio, write_feb
 from limbfit.febio.preparation import Preparation
+from limbfit.mesh import Mesh
 
 REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
 pytestmark = pytest.mark.febio
@@ -54,9 +55,17 @@ BALL = Indenter("sphere", 40.0, 0.0, (0.0, 0.0, 5.0), DOWN)
 IN_AND_OUT = History(np.array([0.0, 3.0, 6.0]), np.array([0.0, 5.0, 0.0]))
 
 
-def block(divisions: int, **changes: object) -> Problem:
+def block(divisions: int, element: str = "hex8", **changes: object) -> Problem:
     given = {"materials": {"skin": SKIN, "muscle": MUSCLE}, "history": IN_AND_OUT, "indenter": PLATE}
-    return replace(build_punched_block("hex8", divisions), **(given | changes))
+    return replace(build_punched_block(element, divisions), **(given | changes))
+
+
+def with_tendon(mesh: Mesh) -> Mesh:
+    """A quarter of the muscle is another tissue, from the bottom to the skin."""
+    x, y, _ = mesh.points[mesh.corners].mean(axis=1).T
+    muscle = mesh.regions == mesh.region_names.index("muscle")
+    regions = np.where(muscle & (x > 0.0) & (y > 0.0), len(mesh.region_names), mesh.regions)
+    return replace(mesh, regions=regions, region_names=(*mesh.region_names, "tendon"))
 
 
 def run_both(program: Path, folder: Path, problem: Problem) -> tuple[Result, Result]:
@@ -92,6 +101,22 @@ LAWS: dict[str, dict[str, object]] = {
     "pre-stretch": {"prestretch": TAUT},
     "all": TENSED | {"prestretch": TAUT},
 }
+
+
+@pytest.mark.parametrize("element", ["tet10", "tet10p0"])
+def test_tetrahedra_push_as_hard(febio, tmp_path, element):
+    assert differ_by(*run_both(febio, tmp_path, block(4, element))) < 0.01
+
+
+def test_a_tendon_in_the_muscle_counts_as_much(febio, tmp_path):
+    problem, stiff = block(4), OgdenQLV(0.03, 6.0, 2.0, 0.5)
+    problem = replace(
+        problem, mesh=with_tendon(problem.mesh), materials=dict(problem.materials) | {"tendon": stiff}
+    )
+    theirs, mine = run_both(febio, tmp_path, problem)
+    assert differ_by(theirs, mine) < 0.005
+    without, _ = run_both(febio, tmp_path, block(4))
+    assert theirs.force.max() > 1.2 * without.force.max()
 
 
 @pytest.mark.parametrize("case", LAWS)
