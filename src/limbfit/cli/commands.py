@@ -63,7 +63,10 @@ def demo(
     seed: Annotated[int, typer.Option(help="which synthetic patient", min=0)] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Make a coarse synthetic patient and identify it: the whole path, from DICOM to report."""
+    """Identify a coarse synthetic patient: the whole path, from DICOM to report.
+
+    The patient of seed 0 comes with limbfit; those of other seeds are made first.
+    """
     start = perf_counter()
     with listen_on_console() as listener:
         summary = limbfit.run_demo(folder, seed=seed, listener=listener)

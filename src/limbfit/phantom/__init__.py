@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from .build import draw_true_parameters, make_phantom
+from .build import draw_true_parameters, make_phantom, unpack_patient
 from .geometry import LIMBS, Limb, make_limb
 from .sites import TrueSite, build_true_sites

@@ -18,8 +18,10 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from importlib import resources
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -65,6 +67,7 @@ FAT_BASE = {"c_kPa": 2.2, "m": 4.0, "gamma": 1.2, "tau_s": 0.9}
 TENDON_KPA = 30.0
 PARAMETER_SPREAD = 0.15
 KAPPA_RATIO = 100.0
+PACKED = "patient.zip"
 
 
 def draw_true_parameters(seed: int, fat: bool = False, tendon: bool = False) -> Parameters:
@@ -155,6 +158,29 @@ def make_phantom(
         text = _format_study(indented, detail, seed, patient, measurements, socket)
         (work / "study.toml").write_text(text, encoding="utf-8")
         (work / "truth.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
+    return truth
+
+
+def unpack_patient(folder: str | Path) -> dict[str, Any]:
+    """Unpack what :func:`make_phantom` makes by default, which comes with limbfit, into ``folder``.
+
+    Returns
+    -------
+    dict
+        What ``truth.json`` holds.
+
+    Raises
+    ------
+    InputError
+        For a folder that is not empty.
+    """
+    with (
+        _open_hidden_folder(Path(folder)) as work,
+        resources.files(__package__).joinpath(PACKED).open("rb") as packed,
+        ZipFile(packed) as archive,
+    ):
+        archive.extractall(work)
+        truth: dict[str, Any] = json.loads((work / "truth.json").read_text(encoding="utf-8"))
     return truth
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from ...errors import InputError
 from ...execution import make_executor
-from ...phantom.build import make_phantom
+from ...phantom.build import make_phantom, unpack_patient
 from ...phantom.forces import simulate_true_force
 from ...study import load_study
 from ..engine.context import Listener, Progress, ignore_progress
@@ -50,6 +50,8 @@ def make_phantom_study(
 def run_demo(folder: str | Path, *, seed: int = 0, listener: Listener = ignore_progress) -> dict[str, Any]:
     """A coarse synthetic patient identified from its DICOM images and records; goes on where it was stopped.
 
+    The patient of seed 0 comes with limbfit; those of other seeds are made first.
+
     Returns
     -------
     dict
@@ -63,7 +65,11 @@ def run_demo(folder: str | Path, *, seed: int = 0, listener: Listener = ignore_p
     folder = Path(folder)
     truth_file = folder / "truth.json"
     if not truth_file.is_file():
-        make_phantom_study(folder, detail="coarse", seed=seed, listener=listener)
+        if seed == 0:
+            unpack_patient(folder)
+            listener(Progress("phantom: the patient of seed 0, which comes with limbfit", 1, 1))
+        else:
+            make_phantom_study(folder, detail="coarse", seed=seed, listener=listener)
     truth = read_json(truth_file)
     if truth["seed"] != seed or truth["detail"] != "coarse":
         raise InputError(
