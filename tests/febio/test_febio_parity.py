@@ -10,7 +10,9 @@ Run with ``python -m pytest -m febio``; FEBio is that of ``FEBIO_CMD``, of the p
 
 from __future__ import annotations
 
+import re
 import shutil
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,6 +40,7 @@ from limbfit.fe import (
     solve,
 )
 from limbfit.febio import FebSettings, build_result, read_log, run_febio, write_feb
+from limbfit.febio.optimisation import ParameterRange, turn_to_indenter_frame, write_optimisation
 from limbfit.febio.preparation import Preparation
 from limbfit.mesh import Mesh
 
@@ -186,6 +189,33 @@ def test_a_clamped_limb_is_touched_later_and_pushes_as_hard(febio, tmp_path, tau
 @pytest.mark.skipif(
     not REFERENCE.is_dir(), reason="the FEBio reference results are not beside the repository"
 )
+def test_febios_own_fit_ends_at_the_relaxation_that_made_the_force(febio, tmp_path):
+    """Without the ties of c, m and the bulk modulus: they need LEVMAR, which not every FEBio is built with."""
+    true, start = OgdenQLV(0.004, 4.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, 1.6, 0.6)
+    problem = turn_to_indenter_frame(block(2, materials={"skin": SKIN, "muscle": true}))
+    theirs, _ = run_both(febio, tmp_path, problem)
+    values = {"c": start.c, "m": start.m, "gamma": start.gamma, "tau": start.tau}
+    bounds = ({name: factor * value for name, value in values.items()} for factor in (0.2, 5.0))
+    file, model = tmp_path / "optimize.feb", tmp_path / "model.feb"
+    write_feb(problem.with_materials({"skin": SKIN, "muscle": start}), model, FebSettings())
+    write_optimisation(file, {"muscle": ParameterRange(values, *bounds, 100.0)}, theirs.times, theirs.force)
+    text = re.sub("<Constraints>.*</Constraints>", "", file.read_text(), flags=re.DOTALL)
+    text = re.sub(r"<param name=.*\.(elastic\.\w+|k)\">.*</param>\n", "", text)
+    file.write_text(text.replace("constrained levmar", "levmar"))
+    done = subprocess.run(
+        [febio, "-i", model, "-s", file],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert "N O R M A L" in done.stdout, done.stdout[-500:]
+    found = dict(re.findall(r"'muscle'\)\.(\w1) = (\S+)", done.stdout.partition("Optimal parameters")[2]))
+    assert float(found["g1"]) == pytest.approx(2.0, rel=0.01)
+    assert float(found["t1"]) == pytest.approx(0.5, rel=0.01)
+
+
 @pytest.mark.parametrize("case", ["cube/cube_skin", "cube/cube_lim_par", "block/block_hex8", "socket/tube"])
 def test_febio_gives_again_what_is_stored_of_it(febio, tmp_path, case):
     """So that what is compared with the stored results is compared with FEBio."""
