@@ -190,7 +190,7 @@ def test_a_clamped_limb_is_touched_later_and_pushes_as_hard(febio, tmp_path, tau
     not REFERENCE.is_dir(), reason="the FEBio reference results are not beside the repository"
 )
 def test_febios_own_fit_ends_at_the_relaxation_that_made_the_force(febio, tmp_path):
-    """Without the ties of c, m and the bulk modulus: they need LEVMAR, which not every FEBio is built with."""
+    """Without the ties of c, m and the bulk modulus: not every FEBio has LEVMAR, which they need."""
     true, start = OgdenQLV(0.004, 4.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, 1.6, 0.6)
     problem = turn_to_indenter_frame(block(2, materials={"skin": SKIN, "muscle": true}))
     theirs, _ = run_both(febio, tmp_path, problem)
