@@ -40,6 +40,7 @@ from limbfit.fe import (
     solve,
 )
 from limbfit.febio import FebSettings, build_result, read_log, run_febio, write_feb
+from limbfit.febio.abaqus import write_inp
 from limbfit.febio.optimisation import ParameterRange, turn_to_indenter_frame, write_optimisation
 from limbfit.febio.preparation import Preparation
 from limbfit.mesh import Mesh
@@ -214,6 +215,22 @@ def test_febios_own_fit_ends_at_the_relaxation_that_made_the_force(febio, tmp_pa
     found = dict(re.findall(r"'muscle'\)\.(\w1) = (\S+)", done.stdout.partition("Optimal parameters")[2]))
     assert float(found["g1"]) == pytest.approx(2.0, rel=0.01)
     assert float(found["t1"]) == pytest.approx(0.5, rel=0.01)
+
+
+def test_calculix_pushes_as_hard_into_elastic_tissue(tmp_path):
+    """Ten-node tetrahedra of both, without relaxation, which CalculiX has not."""
+    if shutil.which("ccx") is None:
+        pytest.skip("there is no CalculiX (ccx) on the path")
+    elastic = {"skin": OgdenQLV(0.009, 6.0, 0.0, 1.0), "muscle": OgdenQLV(0.004, 4.0, 0.0, 1.0)}
+    pressed = History(np.array([0.0, 1.0]), np.array([0.0, 5.0]))
+    problem = block(4, "tet10", materials=elastic, history=pressed)
+    write_inp(problem, tmp_path / "m.inp", "calculix", FebSettings())
+    done = subprocess.run(["ccx", "-i", "m"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-500:]
+    forces = re.findall(r"forces .* time +(\S+)\s+\d+ +\S+ +\S+ +(\S+)", (tmp_path / "m.dat").read_text())
+    times, theirs = np.array(forces, dtype=float).T
+    mine = solve(problem, StepControl(times=tuple(times)), store="none")
+    assert np.abs(mine.force_at(times) + theirs).max() < 0.01 * mine.force.max()
 
 
 @pytest.mark.parametrize("case", ["cube/cube_skin", "cube/cube_lim_par", "block/block_hex8", "socket/tube"])

@@ -301,7 +301,7 @@ def test_abaqus(tmp_path):
     values = [float(v) for v in lines[at + 1].split(",")]
     np.testing.assert_allclose(values, [skin.c / 2, skin.m, skin.c / 2, -skin.m, 2 / (100 * skin.c), 0])
     g, _, tau = (float(v) for v in lines[at + 3].split(","))
-    assert (g, tau) == (skin.gamma / (1 + skin.gamma), skin.tau)
+    assert (g, tau) == pytest.approx((skin.gamma / (1 + skin.gamma), skin.tau), rel=1e-11)
     sides = lines[lines.index("*SURFACE, NAME=contact_patch, TYPE=ELEMENT") + 1 :]
     assert sum("S" in line for line in sides[: len(problem.contact_faces)]) == len(problem.contact_faces)
 
@@ -363,5 +363,19 @@ def test_calculix_says_no_to_relaxation(tmp_path):
     with pytest.raises(ProblemError, match=r"relaxes, which CalculiX cannot.*gamma is 0"):
         write_inp(block(), tmp_path / "m.inp", "calculix", FebSettings())
     elastic = {name: OgdenQLV(0.004, 4.0, 0.0, 1.0) for name in ("skin", "muscle")}
-    write_inp(block().with_materials(elastic), tmp_path / "m.inp", "calculix", FebSettings())
+    write_inp(block("tet10").with_materials(elastic), tmp_path / "m.inp", "calculix", FebSettings())
     assert "*VISCO" not in (tmp_path / "m.inp").read_text()
+    with pytest.raises(ProblemError, match=r"hexahedra lock.*quadratic tetrahedra"):
+        write_inp(block("hex8").with_materials(elastic), tmp_path / "m.inp", "calculix", FebSettings())
+
+
+@pytest.mark.parametrize("program", ["abaqus", "calculix"])
+def test_no_number_is_longer_than_the_20_characters_that_a_field_may_have(tmp_path, program):
+    """As a round indenter's points next to nothing are in full, for which CalculiX stops."""
+    ball = Indenter("sphere", 40.0, 0.0, (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
+    elastic = {name: OgdenQLV(1e-3 / 3.0, 4.0 / 7.0, 0.0, 1.0) for name in ("skin", "muscle")}
+    problem = replace(block("tet10"), indenter=ball).with_materials(elastic)
+    write_inp(problem, tmp_path / "m.inp", program, FebSettings())
+    fields = [field.strip() for line in (tmp_path / "m.inp").read_text().split("\n")
+              if not line.startswith("*") for field in line.split(",")]  # fmt: skip
+    assert max(map(len, fields)) <= 20

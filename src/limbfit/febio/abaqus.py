@@ -42,6 +42,11 @@ def write_inp(problem: Problem, path: str | Path, program: str, settings: FebSet
     check_simple_indentation(problem, program.capitalize())
     for name in problem.mesh.region_names:
         _check_material(name, problem.materials[name], program)
+    if program == "calculix" and problem.mesh.cell_type == "hex8":
+        raise ProblemError(
+            "CalculiX's hexahedra lock in nearly incompressible tissue: twice the force",
+            remedy="give a mesh of quadratic tetrahedra",
+        )
     system = System(problem)
     assert system.indenter is not None
     tool = build_indenter_mesh(system.indenter)
@@ -86,10 +91,13 @@ def _describe_file(
     whole = Mesh(tool.points, tool.cells, "hex8", np.zeros(len(tool.cells), np.int64), (INDENTER,))
     laws = [problem.materials[name] for name in mesh.region_names]
     seconds = [phase.duration_s for phase in history.phases]
+    first = 16.0 if program == "calculix" else 64.0  # parts of the shortest phase
     return {
         "title": " ".join(settings.title.split()),
         "program": program,
         "is_stiffer": is_stiffer,
+        # The other kind of CalculiX does not converge under a block's first contact.
+        "contact": "NODE TO SURFACE" if program == "calculix" else "SURFACE TO SURFACE",
         "points": np.vstack([mesh.points, tool.points, np.asarray(indenter.centre)]),
         "parts": parts,
         "node_sets": {
@@ -109,7 +117,7 @@ def _describe_file(
         "fixed_set": FIXED_SET,
         "is_relaxing": any(g for law in laws for g, _ in law.table().prony),
         # One for each phase, whose end is met: first increment, whole, smallest and largest one, s.
-        "steps": [(min(seconds) / 64.0, t, t * 1e-8, t / 16.0) for t in seconds],
+        "steps": [(min(seconds) / first, t, t * 1e-8, t / 16.0) for t in seconds],
         "axis": indenter.frame[2].tolist(),
     }
 

@@ -13,9 +13,14 @@ from ..arrays import Array
 from ..errors import RunError
 
 
-def format_row(values: Iterable[float], separator: str = ",") -> str:
+def format_row(values: Iterable[float]) -> str:
     """Write numbers with commas, so that they are read back exactly."""
-    return separator.join(repr(float(value)) for value in values)
+    return ",".join(repr(float(value)) for value in values)
+
+
+def format_fields(values: Iterable[float]) -> str:
+    """Write numbers with commas, each in the 20 characters that Abaqus and CalculiX take at most."""
+    return ", ".join(f"{float(value):.12g}" for value in values)
 
 
 def format_ids(nodes: Iterable[int]) -> str:
@@ -44,8 +49,8 @@ def write_template(path: str | Path, template: str, **content: Any) -> None:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    filters = {"row": format_row, "ids": format_ids, "wrap": wrap_numbers, "across": find_across}
-    environment.filters |= filters
+    environment.filters |= {"row": format_row, "fields": format_fields, "ids": format_ids}
+    environment.filters |= {"wrap": wrap_numbers, "across": find_across}
     text = environment.get_template(template).render(content)
     try:
         Path(path).write_text(text, encoding="utf-8")
