@@ -12,7 +12,6 @@ from ..pipeline.commands.run import STAGE_NAMES
 from ..pipeline.simulation.simulations import find_newest_simulation
 from ..results.curves import read_curves
 from ..results.identification import CalibrationResult
-from ..study import Record
 from .folder import StudyFolder
 from .processes import find_running, find_starting, start_run, stop_run
 from .study_routes import Folder, StrictModel, list_stage_states, list_stages
@@ -64,9 +63,8 @@ def get_curves(folder: Folder, name: str) -> dict[str, Any]:
     measured = folder.results / "traces" / f"{site.name}.csv"
     if live is not None and measured.is_file():
         curves = {key: values.tolist() for key, values in read_curves(measured).items()}
-        forced = isinstance(site, Record) and site.forced
-        what, unit, old = ("displacement", "mm", "displacement_mm") if forced else ("force", "N", "force_N")
-        curves[f"{what}_measured_{unit}"] = curves.pop(old)
+        what, unit = ("displacement", "mm") if site.forced else ("force", "N")
+        curves[f"{what}_measured_{unit}"] = curves.pop(f"{what}_{unit}")
         curves[f"{what}_simulated_{unit}"] = live
         return {"site": site.name, "of": "the newest simulation of the search", **curves}
     if stored.is_file():

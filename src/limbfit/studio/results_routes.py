@@ -23,7 +23,6 @@ from ..pipeline.engine.storage import read_json, write_json
 from ..results.curves import read_curves
 from ..results.identification import CalibrationResult, PredictResult
 from ..results.runs import SimulateResult, is_current
-from ..study import Record
 from ..web.shapes import to_volume_shape
 from . import processes
 from .folder import StudyFolder, compute_fingerprint
@@ -327,8 +326,7 @@ def _list_downloads(folder: StudyFolder) -> list[dict[str, str]]:
 def _list_site_downloads(folder: StudyFolder, site: str) -> list[dict[str, str]]:
     """The same for one site: curves, fields, the FEBio input where it was written."""
     indentation = folder.load().indentation(site)
-    name = indentation.name
-    place = indentation.site.name if isinstance(indentation, Record) else name
+    name, place = indentation.name, indentation.site.name
     files = [
         (f"predict/{name}.csv", "predicted curves (CSV)"),
         (f"traces/{name}.csv", "regularised record (CSV)"),

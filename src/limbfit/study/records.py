@@ -74,6 +74,16 @@ class Site(_RecordKeys):
     axis: Direction | None = None
     edge: Direction | None = None
 
+    @property
+    def site(self) -> Site:
+        """The site itself: like a record, an indentation that it plans has a site and a key."""
+        return self
+
+    @property
+    def key(self) -> str:
+        """Where the study file states it."""
+        return f"sites.{self.name}"
+
     def check_keys(self) -> None:
         super().check_keys()
         if (self.position is None) == (self.near is None):
@@ -96,6 +106,16 @@ class RecordTable(_RecordKeys):
     depth_mm: Positive | None = None
     speed_mm_s: Positive | None = None
     hold_s: Annotated[float, Field(ge=0)] | None = None
+
+    @property
+    def full_name(self) -> str:
+        """Its name among all records and sites."""
+        return f"{self.site}-{self.name}"
+
+    @property
+    def key(self) -> str:
+        """Where the study file states it."""
+        return f"records.{self.full_name}"
 
 
 class Record(_RecordKeys):
@@ -150,15 +170,13 @@ Indentation = Record | Site  # a site is one where it plans an indentation
 
 def list_records(site: Site, tables: tuple[RecordTable, ...]) -> tuple[Record, ...]:
     """List the records of a site: its own, then those of the study's tables that name it."""
-    stated: dict[str, dict[str, Any]] = {}
+    stated: list[dict[str, Any]] = []
     if site.trace is not None:  # the site's depth and speed plan an indentation without a record
         own = {field: getattr(site, field) for field in _RecordKeys.model_fields}
-        stated[site.name] = {**own, "key": f"sites.{site.name}"}
+        stated.append({**own, "key": site.key})
     for table in tables:
         if table.site == site.name:
-            name = f"{site.name}-{table.name}"
-            stated[name] = {**dict(table), "name": name, "key": f"records.{name}"}
+            stated.append({**dict(table), "name": table.full_name, "key": table.key})
     return tuple(
-        Record.model_construct(**{**values, "site": site, "of_site": len(stated)})
-        for values in stated.values()
+        Record.model_construct(**{**values, "site": site, "of_site": len(stated)}) for values in stated
     )

@@ -301,7 +301,7 @@ class Study(TomlTable):
                 raise ValueError(
                     f"records.{table.name}: no site is named {table.site!r}; they are {', '.join(names)}"
                 )
-        names += [f"{table.site}-{table.name}" for table in self.records]
+        names += [table.full_name for table in self.records]
         if doubled := find_repeated(names):
             raise ValueError(
                 f"two records, or a record and a site, have the name {doubled[0]!r}; name one anew"
@@ -310,12 +310,12 @@ class Study(TomlTable):
             if other in names and ending in STORED_ENDINGS:
                 raise ValueError(f"{other}-{ending} is a file of {other!r} in results; give another name")
         for site in self.sites:
-            records, place = self.records_at(site), f"sites.{site.name}"
+            records = self.records_at(site)
             if site.fitted and not records:
-                raise ValueError(f"{place}: a fitted site needs a trace, or [[records]]")
+                raise ValueError(f"{site.key}: a fitted site needs a trace, or [[records]]")
             if (not records) == (site.depth_mm is None):
                 raise ValueError(
-                    f"{place}: give either trace (a record; several: [[records]]) or depth_mm (an "
+                    f"{site.key}: give either trace (a record; several: [[records]]) or depth_mm (an "
                     "indentation to be simulated)"
                 )
 
@@ -339,12 +339,11 @@ class Study(TomlTable):
                 raise ValueError(f"material.{key}: {one.name} has {seen}, which sees no {what}; leave it out")
 
     def _check_indenters(self) -> None:
-        named = [(f"sites.{site.name}", site.indenter) for site in self.sites]
-        named += [(f"records.{table.site}-{table.name}", table.indenter) for table in self.records]
-        for place, name in named:
-            if name is not None and name not in self.indenters:
+        for one in (*self.sites, *self.records):
+            if one.indenter is not None and one.indenter not in self.indenters:
                 known = ", ".join(self.indenters) or "none"
-                raise ValueError(f"{place}: no indenter is named {name!r}; those of [indenters] are {known}")
+                what = f"{one.key}: no indenter is named {one.indenter!r}"
+                raise ValueError(f"{what}; those of [indenters] are {known}")
 
     def _check_material(self) -> None:
         layers = [layer.name for layer in self.geometry.model_layers]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -259,29 +259,35 @@ def check_unused_keys(study: Study, content: Mapping[str, Any]) -> None:
     StudyError
         With the key, why it has no effect and what to do.
     """
+    for key, why, remedy in _find_unused_keys(study, content):
+        raise StudyError(f"without effect: {why}", place=key, remedy=remedy)
+
+
+def _find_unused_keys(study: Study, content: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """Each unused key with why it has no effect and what to do."""
     for rule in UNUSED_KEYS:
         for key in rule.keys:
             if _is_stated(content, key) and rule.when(study):
-                raise _build_unused_key_error(key, rule.why, rule.remedy)
+                yield key, rule.why, rule.remedy
     for name, indenter in study.all_indenters.items():
         place = "indenter.edge_radius_mm" if name is None else f"indenters.{name}.edge_radius_mm"
         if _is_stated(content, place) and not SHAPES[indenter.shape].has_edge:
-            raise _build_unused_key_error(place, "the indenter has no edge to round", "leave it out")
+            yield place, "the indenter has no edge to round", "leave it out"
     edges = ACCURACIES["standard"][0].keys() | ({"coarse"} if study.mesh.coarse is not None else set())
     if "accuracy" in (mesh := content.get("mesh", {})) and edges <= mesh.keys():
-        why = "all edge lengths are stated"
-        raise _build_unused_key_error("mesh.accuracy", why, "leave it or them out")
+        yield "mesh.accuracy", "all edge lengths are stated", "leave it or them out"
     for name in sorted(study.calibration.prior.keys() & set(study.fixed)):
-        why, place = "the parameter stays at its start", f"calibration.prior.{name}"
-        raise _build_unused_key_error(place, why, "leave it out, or let the parameter move")
-    tables: list[tuple[str, Any, tuple[UnusedKeys, ...]]]
-    tables = [(f"sites.{one.name}", one, UNUSED_SITE_KEYS) for one in study.sites]
-    tables += [(f"records.{one.site}-{one.name}", one, UNUSED_RECORD_KEYS) for one in study.records]
-    for (place, table, rules), stated in zip(tables, (*content["sites"], *content.get("records", ()))):
-        for rule in rules:
-            for key in rule.keys:
-                if key in stated and rule.when(study, table):
-                    raise _build_unused_key_error(f"{place}.{key}", rule.why, rule.remedy)
+        why = "the parameter stays at its start"
+        yield f"calibration.prior.{name}", why, "leave it out, or let the parameter move"
+    for tables, stated_tables, rules in (
+        (study.sites, content["sites"], UNUSED_SITE_KEYS),
+        (study.records, content.get("records", ()), UNUSED_RECORD_KEYS),
+    ):
+        for table, stated in zip(tables, stated_tables, strict=True):
+            for rule in rules:
+                for key in rule.keys:
+                    if key in stated and rule.when(study, table):
+                        yield f"{table.key}.{key}", rule.why, rule.remedy
 
 
 def _is_stated(content: Mapping[str, Any], key: str) -> bool:
@@ -293,7 +299,3 @@ def _is_stated(content: Mapping[str, Any], key: str) -> bool:
     if rest:
         return isinstance(value, Mapping) and _is_stated(value, rest)
     return value != {}
-
-
-def _build_unused_key_error(key: str, why: str, remedy: str) -> StudyError:
-    return StudyError(f"without effect: {why}", place=key, remedy=remedy)

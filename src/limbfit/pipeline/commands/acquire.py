@@ -73,7 +73,6 @@ def acquire_site(
         Where the device does not answer, or the record cannot be written.
     """
     one = study.indentation(name)
-    site = one.site if isinstance(one, Record) else one
     settings = check_recording(
         study, name, depth_mm=depth_mm, unattended=operator is None, replace_record=replace_record
     )
@@ -86,7 +85,7 @@ def acquire_site(
             identity = asdict(device.identity)
             del identity["nonce"]
             head = {
-                "site": site.name,
+                "site": one.site.name,
                 "record": one.name,
                 "indenter": one.indenter,
                 "begun": datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -110,13 +109,13 @@ def acquire_site(
             listener(update)
 
     try:
-        session = acquire.Session(settings, device, site=site.name, recorder=recorder, listener=tell)
+        session = acquire.Session(settings, device, site=one.site.name, recorder=recorder, listener=tell)
         ending = acquire.run_session(session, events)
     finally:
         recorder.close()
     found = {
         "name": one.name,
-        "site": site.name,
+        "site": one.site.name,
         "completed": ending.is_completed,
         "phase": str(ending.phase),
         "reason": ending.reason,
@@ -147,13 +146,13 @@ def check_recording(
     one = study.indentation(name)
     if study.is_recorded(one) and not replace_record:
         remedy = "give --again to record it once more; the old record is kept"
-        place = f"{_find_place(one)}.trace"
+        place = f"{one.key}.trace"
         raise InputError(f"{one.trace} exists", file=study.file, place=place, remedy=remedy)
-    if isinstance(one, Record) and one.forced:
+    if one.forced:
         raise InputError(
             "the device drives by displacement, and this record is made under force",
             file=study.file,
-            place=f"{_find_place(one)}.trace",
+            place=f"{one.key}.trace",
             remedy='leave out control = "force", or record it elsewhere',
         )
     _check_inside(study, one)
@@ -161,7 +160,7 @@ def check_recording(
         raise InputError(
             f"records are written as text, which {one.trace} is not",
             file=study.file,
-            place=f"{_find_place(one)}.trace",
+            place=f"{one.key}.trace",
             remedy="name a file .csv",
         )
     return build_device_settings(study, one, depth_mm, unattended)
@@ -192,11 +191,6 @@ def judge_recording(file: Path) -> dict[str, Any]:
     }
 
 
-def _find_place(one: Indentation) -> str:
-    """Where the study states the record."""
-    return one.key if isinstance(one, Record) else f"sites.{one.name}"
-
-
 def _check_inside(study: Study, one: Indentation) -> None:
     """Nothing outside the study's folder is written."""
     root = study.folder.resolve()
@@ -210,7 +204,7 @@ def _check_inside(study: Study, one: Indentation) -> None:
             raise InputError(
                 f"{target} lies outside the study's folder",
                 file=study.file,
-                place=f"{_find_place(one)}.trace",
+                place=f"{one.key}.trace",
                 remedy="nothing is recorded there; name a place inside",
             )
 
@@ -225,14 +219,14 @@ def build_device_settings(
         settings = acquire.Settings(**(study.acquire.model_dump() | stated))
     except ValidationError as error:
         what = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
-        raise InputError(what, file=study.file, place=_find_place(one)) from None
+        raise InputError(what, file=study.file, place=one.key) from None
     if depth_mm is None and (unattended or isinstance(one, Record)):
         depth_mm = one.depth_mm
     if depth_mm is None and unattended:
         traces = TracesResult.find(study.results)
         if traces is None or one.name not in traces.sites:
             remedy = "give --depth, or state its depth_mm"
-            raise InputError("the depth is not known", file=study.file, place=_find_place(one), remedy=remedy)
+            raise InputError("the depth is not known", file=study.file, place=one.key, remedy=remedy)
         depth_mm = traces.sites[one.name].depth_mm
     if depth_mm is None:
         return settings
@@ -307,7 +301,7 @@ def read_surrogates(study: Study) -> dict[str, Surrogate]:
     found: dict[str, Surrogate] = {}
     columns = (("predict", "force_simulated_N"), ("simulate", "force_N"))
     for one in study.indentations:
-        site = one.site.name if isinstance(one, Record) else one.name
+        site = one.site.name
         for (folder, column), name in product(columns, dict.fromkeys((one.name, site))):
             file = study.results / folder / f"{name}.csv"
             if site not in found and file.is_file() and (folder == "simulate" or column in read_curves(file)):

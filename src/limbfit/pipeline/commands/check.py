@@ -160,19 +160,18 @@ def _describe_outside(
     axis = None if limb is None else LimbAxis(limb.anatomy)
 
     def describe(one: Record | Site, tested: RecordedRange | None = None) -> list[Extent]:
-        site = one.site if isinstance(one, Record) else one
         facts = records.get(one.name)
         if facts is None:  # an indentation that the site plans, in and out
-            assert site.depth_mm is not None
-            ramp = site.depth_mm / site.speed_mm_s
-            history = LoadHistory.from_knots((0.0, ramp, 2 * ramp), (0.0, site.depth_mm, 0.0))
+            assert one.site.depth_mm is not None
+            ramp = one.site.depth_mm / one.site.speed_mm_s
+            history = LoadHistory.from_knots((0.0, ramp, 2 * ramp), (0.0, one.site.depth_mm, 0.0))
         else:
             history = LoadHistory.from_knots(facts.knots_s, facts.knots_N or facts.knots_mm)
         return describe_indentation(
             history,
-            facts.depth_mm if facts else float(site.depth_mm or 0.0),
+            facts.depth_mm if facts else float(one.site.depth_mm or 0.0),
             study.indenter_of(one),
-            None if limb is None else limb.place(site),
+            None if limb is None else limb.place(one.site),
             axis,
             force_N=facts.peak_force_N if facts else None,
             tested=tested,

@@ -16,7 +16,7 @@ from ...mesh import read_vtu
 from ...results.identification import RecordedExtents
 from ...results.runs import SimulateResult
 from ...study import Indentation as Planned
-from ...study import Record, Study
+from ...study import Study
 from ..engine.context import Context, Listener, ignore_progress
 from ..engine.storage import write_curves, write_result
 from ..engine.store import Store
@@ -159,13 +159,12 @@ def _compare_with_records(found: Indentation, result: Result, fields: Path | Non
     if stored is None:
         return {"outside_records": None, "outside_text": []}
     tested, limb = RecordedRange.from_stored(stored), LimbGeometry.stored(found.context.store)
-    site = found.stated.site if isinstance(found.stated, Record) else found.stated
     rows = tested.find_outside(
         describe_indentation(
             LoadHistory.from_knots(model.knots_s, model.knots_N or model.knots_mm),
             float(result.displacement.max()),
             model.indenter,
-            limb.place(site),
+            limb.place(found.stated.site),
             LimbAxis(limb.anatomy),
             force_N=result.peak_force,
             strains=read_strain_extents(fields) if fields is not None and fields.is_file() else (),

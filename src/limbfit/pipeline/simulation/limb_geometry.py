@@ -14,7 +14,7 @@ from ...arrays import Array
 from ...indentation import Direction, SiteModel, build_clamping_pins, read_indenter, to_vector3
 from ...mesh import read_vtu
 from ...results.limb import PlacedSite
-from ...study import Indentation, IndenterTable, Record, Site, Study, Vector
+from ...study import Indentation, IndenterTable, Site, Study, Vector
 from ..engine.context import Context
 from ..engine.digests import compute_file_digest
 from ..engine.files import name_file_in_errors
@@ -72,7 +72,7 @@ def build_site_model(
     Raises `ProblemError` where the study's clamps do not meet the limb there.
     """
     study: Study = context.study
-    site = one.site if isinstance(one, Record) else one
+    site = one.site
     placed = {row.site: row for row in context.results.sites.sites}[site.name]
     mesh, indenter = context.store["mesh"] / f"{site.name}.vtu", study.indenter_of(one)
     clamped: dict[str, Any] = {}

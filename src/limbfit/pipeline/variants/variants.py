@@ -13,7 +13,7 @@ from ...errors import InputError
 from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
 from ...results.base import StoredResult
 from ...results.variants import VariantRun, VariedSite
-from ...study import Indentation, Record, Study
+from ...study import Indentation, Study
 from ..engine.context import Context
 from ..engine.storage import write_curves, write_result, write_rows
 from ..records.deviations import measure_bone_distance_mm
@@ -60,7 +60,7 @@ def check_variants(study: Study, limb: LimbGeometry | None, options: Mapping[str
 def _select_driven(study: Study, names: Sequence[str]) -> list[Indentation]:
     """The named indentations, or all, under a stated displacement."""
     chosen = [study.indentation(name) for name in names] or list(study.indentations)
-    driven = [one for one in chosen if not (isinstance(one, Record) and one.forced)]
+    driven = [one for one in chosen if not one.forced]
     if not driven or (names and len(driven) < len(chosen)):
         raise InputError(
             'this compares forces, and a record with control = "force" has none to compare',
