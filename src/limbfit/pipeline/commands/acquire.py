@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from ... import acquire
 from ..._version import __version__
 from ...acquire.virtual import Fault, Serving, Surrogate, VirtualFitSocket, VirtualLimb, fit_surrogate, serve
-from ...errors import InputError, TraceError
+from ...errors import InputError, TraceError, add_location
 from ...results.curves import read_curves
 from ...results.records import TracesResult
 from ...study import Indentation, Record, Study
@@ -144,25 +144,23 @@ def check_recording(
         For what can be known to be wrong before the device is asked.
     """
     one = study.indentation(name)
-    if study.is_recorded(one) and not replace_record:
-        remedy = "give --again to record it once more; the old record is kept"
-        place = f"{one.key}.trace"
-        raise InputError(f"{one.trace} exists", file=study.file, place=place, remedy=remedy)
-    if one.forced:
-        raise InputError(
-            "the device drives by displacement, and this record is made under force",
-            file=study.file,
-            place=f"{one.key}.trace",
-            remedy='leave out control = "force", or record it elsewhere',
-        )
-    _check_inside(study, one)
-    if one.trace is not None and one.trace.suffix.lower() in BINARY_SUFFIXES:
-        raise InputError(
-            f"records are written as text, which {one.trace} is not",
-            file=study.file,
-            place=f"{one.key}.trace",
-            remedy="name a file .csv",
-        )
+    with add_location(file=study.file, place=f"{one.key}.trace"):
+        if study.is_recorded(one) and not replace_record:
+            remedy = "give --again to record it once more; the old record is kept"
+            raise InputError(f"{one.trace} exists", remedy=remedy)
+        if one.forced:
+            what = "the device drives by displacement, and this record is made under force"
+            raise InputError(what, remedy='leave out control = "force", or record it elsewhere')
+        for target in filter(None, (Path(FOLDER) / one.name, one.trace)):
+            if not study.path(target).resolve().is_relative_to(study.folder.resolve()):
+                what = f"{target} lies outside the study's folder"
+                raise InputError(what, remedy="nothing is recorded there; name a place inside")
+        if one.trace is not None and one.trace.suffix.lower() in BINARY_SUFFIXES:
+            what = f"records are written as text, which {one.trace} is not"
+            raise InputError(what, remedy="name a file .csv")
+    folder = study.folder / FOLDER
+    if folder.exists() and not folder.is_dir():
+        raise InputError("is a file, where records are kept", file=folder, remedy="move it away")
     return build_device_settings(study, one, depth_mm, unattended)
 
 
@@ -189,24 +187,6 @@ def judge_recording(file: Path) -> dict[str, Any]:
         "phases": [phase for phase, _, _ in recording.phases()],
         "verdict": verdict,
     }
-
-
-def _check_inside(study: Study, one: Indentation) -> None:
-    """Nothing outside the study's folder is written."""
-    root = study.folder.resolve()
-    targets = [Path(FOLDER) / one.name, *([] if one.trace is None else [one.trace])]
-    if (study.folder / FOLDER).exists() and not (study.folder / FOLDER).is_dir():
-        raise InputError(
-            "is a file, where records are kept", file=study.folder / FOLDER, remedy="move it away"
-        )
-    for target in targets:
-        if not study.path(target).resolve().is_relative_to(root):
-            raise InputError(
-                f"{target} lies outside the study's folder",
-                file=study.file,
-                place=f"{one.key}.trace",
-                remedy="nothing is recorded there; name a place inside",
-            )
 
 
 def build_device_settings(
