@@ -46,6 +46,11 @@ class Finding:
     remedy: str = ""
 
 
+def _judge(check: str, is_good: bool, found: str, remedy: str, otherwise: str = "failed") -> Finding:
+    """``ok``, or the state ``otherwise`` with its remedy."""
+    return Finding(check, "ok", found) if is_good else Finding(check, otherwise, found, remedy)
+
+
 def diagnose(folder: Path = Path(".")) -> dict[str, Any]:
     """Check the installation and the machine; ``folder`` is where studies would lie.
 
@@ -76,21 +81,16 @@ def _check_machine() -> Iterator[Finding]:
     required = [line for line in metadata.requires("limbfit") or [] if ";" not in line]  # whatever extras
     names = [re.split("[>=~<]", line)[0].strip() for line in required]
     missing = [name for name in names if _find_version(name) is None]
-    if missing:
-        yield Finding("libraries", "failed", f"missing: {', '.join(missing)}", "pip install limbfit")
-    else:
-        yield Finding("libraries", "ok", "all there")
+    found = f"missing: {', '.join(missing)}" if missing else "all there"
+    yield _judge("libraries", not missing, found, "pip install limbfit")
     usable, there = count_usable_cores(), os.cpu_count() or 1
     set_here = [f"{name}={os.environ[name]}" for name in THREAD_VARIABLES if name in os.environ]
     yield Finding("cores", "ok", f"{usable} of {there} may be used: {usable} workers of one thread each")
     yield Finding("threads", "ok", ", ".join(set_here) or "not set here; workers get one each")
     free = psutil.virtual_memory().available / 1e9
     found = f"{free:.1f} GB free, {free / usable:.1f} GB for each of {usable} workers"
-    state, remedy = "ok", ""
-    if free < NEEDED_GB:
-        state = "warning"
-        remedy = f"a site at the paper's size wants {NEEDED_GB:g} GB; use fewer workers (--workers 1)"
-    yield Finding("memory", state, found, remedy)
+    remedy = f"a site at the paper's size wants {NEEDED_GB:g} GB; use fewer workers (--workers 1)"
+    yield _judge("memory", free >= NEEDED_GB, found, remedy, otherwise="warning")
 
 
 def _find_version(distribution: str) -> str | None:
@@ -115,12 +115,9 @@ def _check_solvers() -> Iterator[Finding]:
         yield Finding("sparse solvers", "failed", "none works", "pip install pypardiso, or limbfit[cholmod]")
         return
     slow = prefers_multigrid()
-    yield Finding(
-        "sparse solvers",
-        "warning" if slow else "ok",
-        f"{'multigrid' if slow else working[0]} is used; working: {', '.join(working)}",
-        "a faster one: pip install pypardiso (x86-64), or limbfit[cholmod]" if slow else "",
-    )
+    found = f"{'multigrid' if slow else working[0]} is used; working: {', '.join(working)}"
+    remedy = "a faster one: pip install pypardiso (x86-64), or limbfit[cholmod]"
+    yield _judge("sparse solvers", not slow, found, remedy, otherwise="warning")
 
 
 def _check_meshers() -> Iterator[Finding]:
@@ -162,9 +159,9 @@ def _check_writing(folder: Path) -> Iterator[Finding]:
         yield Finding("write access", "failed", f"{folder}: {why}", "work in a folder that can be written")
         return
     free = shutil.disk_usage(folder).free / 1e9
-    state = "ok" if free >= FREE_GB else "warning"
-    remedy = "" if state == "ok" else f"a study's results take up to {FREE_GB:g} GB; free some space"
-    yield Finding("write access", state, f"{folder}: {free:.1f} GB free", remedy)
+    found = f"{folder}: {free:.1f} GB free"
+    remedy = f"a study's results take up to {FREE_GB:g} GB; free some space"
+    yield _judge("write access", free >= FREE_GB, found, remedy, otherwise="warning")
 
 
 def _check_self_test() -> Iterator[Finding]:
@@ -183,9 +180,7 @@ def judge_self_test(found: float, wanted: float, seconds: float) -> Finding:
     """A right stress is ``ok`` however long it took: a busy machine compiles for a minute."""
     off = abs(found / wanted - 1.0)
     text = f"stress of a cube {off:.1e} off its closed form, {seconds:.1f} s (the first run compiles)"
-    if off <= 1e-3:
-        return Finding("self-test", "ok", text)
-    return Finding("self-test", "failed", text, _SELF_TEST_REMEDY)
+    return _judge("self-test", off <= 1e-3, text, _SELF_TEST_REMEDY)
 
 
 def compress_test_cube(strain: float) -> tuple[float, float]:
