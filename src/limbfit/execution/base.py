@@ -131,8 +131,10 @@ class Executor(ABC):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the workers; nothing to do where there are none."""
-        return None
+        self.end(at_once=error is not None)
+
+    def end(self, at_once: bool) -> None:  # noqa: B027
+        """End the workers, ``at_once`` in the middle of their jobs; nothing to do where there are none."""
 
 
 def count_usable_cores() -> int:

@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
-from types import TracebackType
 from typing import Any, Self
 
 from ..errors import InputError, RunError
@@ -207,9 +206,7 @@ class DaskExecutor(Executor):
         except (distributed.CancelledError, distributed.comm.CommClosedError) as error:
             raise RunError(_SCHEDULER_GONE) from error
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def end(self, at_once: bool) -> None:
         for one in (self._client, self._cluster):
             with suppress(Exception):  # nothing more is wanted of either, and there may be no cluster
                 one.close(timeout=2)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequenc
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from types import ModuleType, TracebackType
+from types import ModuleType
 from typing import Any
 
 import psutil
@@ -131,12 +131,10 @@ class ProcessExecutor(Executor):
             worker.dismiss(at_once=True)
             worker.end(time.monotonic() + GRACE_S)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def end(self, at_once: bool) -> None:
         staff, self._seats = [worker for worker in self._seats if worker], [None] * self.workers
         for worker in staff:
-            worker.dismiss(at_once=error is not None)
+            worker.dismiss(at_once)
         until = time.monotonic() + GRACE_S  # for all of them together
         for worker in staff:
             worker.end(until)
