@@ -15,7 +15,7 @@ from vtkmodules.vtkCommonCore import vtkCommand
 from vtkmodules.vtkIOGeometry import vtkSTLReader
 
 from ..arrays import Array, Indices
-from ..errors import ProblemError, SurfaceError
+from ..errors import ProblemError, SurfaceError, add_location
 from ..extensions import load_extensions
 from ..fe import (
     Activation,
@@ -227,11 +227,8 @@ def read_indenter(table: IndenterTable, position: Vector, axis: Vector, edge: Ve
     """
     file, surface = table.file, None
     if file is not None:
-        points, faces = _read_stl(file)
-        try:
-            surface = RigidSurface(points, faces)
-        except ProblemError as error:
-            raise ProblemError(error.what, file=file, remedy=error.remedy) from None
+        with add_location(file=file):
+            surface = RigidSurface(*_read_stl(file))
     return Indenter(
         shape=table.shape,
         width=table.width_mm,
@@ -261,7 +258,7 @@ def _read_stl(file: Path) -> tuple[Array, Indices]:
     reader.Update()
     found = reader.GetOutput()
     if not found.GetNumberOfPolys():
-        raise SurfaceError("holds no triangles", file=file, remedy="export the surface as STL again")
+        raise SurfaceError("holds no triangles", remedy="export the surface as STL again")
     faces = vtk_to_numpy(found.GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
     a, b, c = faces.T
     return vtk_to_numpy(found.GetPoints().GetData()), faces[(a != b) & (b != c) & (c != a)]

@@ -84,6 +84,13 @@ class Site(_RecordKeys):
         """Where the study file states it."""
         return f"sites.{self.name}"
 
+    @property
+    def planned_knots(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Times, s, and depths, mm, of the indentation that it plans: in and out."""
+        assert self.depth_mm is not None
+        ramp = self.depth_mm / self.speed_mm_s
+        return (0.0, ramp, 2 * ramp), (0.0, self.depth_mm, 0.0)
+
     def check_keys(self) -> None:
         super().check_keys()
         if (self.position is None) == (self.near is None):

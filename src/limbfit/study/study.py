@@ -339,7 +339,8 @@ class Study(TomlTable):
                 raise ValueError(f"material.{key}: {one.name} has {seen}, which sees no {what}; leave it out")
 
     def _check_indenters(self) -> None:
-        for one in (*self.sites, *self.records):
+        tables: list[Site | RecordTable] = [*self.sites, *self.records]
+        for one in tables:
             if one.indenter is not None and one.indenter not in self.indenters:
                 known = ", ".join(self.indenters) or "none"
                 what = f"{one.key}: no indenter is named {one.indenter!r}"

@@ -10,6 +10,7 @@ from ..errors import StudyError
 from ..laws import ACTIVE, FIBRED, POWER, has_fibres
 from ..shapes import SHAPES
 from .meshing import ACCURACIES, EdgesTable
+from .records import RecordTable, Site
 from .study import Study
 
 
@@ -279,15 +280,12 @@ def _find_unused_keys(study: Study, content: Mapping[str, Any]) -> Iterator[tupl
     for name in sorted(study.calibration.prior.keys() & set(study.fixed)):
         why = "the parameter stays at its start"
         yield f"calibration.prior.{name}", why, "leave it out, or let the parameter move"
-    for tables, stated_tables, rules in (
-        (study.sites, content["sites"], UNUSED_SITE_KEYS),
-        (study.records, content.get("records", ()), UNUSED_RECORD_KEYS),
-    ):
-        for table, stated in zip(tables, stated_tables, strict=True):
-            for rule in rules:
-                for key in rule.keys:
-                    if key in stated and rule.when(study, table):
-                        yield f"{table.key}.{key}", rule.why, rule.remedy
+    tables: list[Site | RecordTable] = [*study.sites, *study.records]
+    for table, stated in zip(tables, (*content["sites"], *content.get("records", ())), strict=True):
+        for rule in UNUSED_SITE_KEYS if isinstance(table, Site) else UNUSED_RECORD_KEYS:
+            for key in rule.keys:
+                if key in stated and rule.when(study, table):
+                    yield f"{table.key}.{key}", rule.why, rule.remedy
 
 
 def _is_stated(content: Mapping[str, Any], key: str) -> bool:

@@ -14,7 +14,7 @@ from ...identify.checks.domain import Extent, RecordedRange, describe_outside
 from ...indentation import read_indenter
 from ...results.identification import OutsideRecords
 from ...results.records import TraceFacts
-from ...study import Record, Site, Study
+from ...study import Indentation, Study
 from ...traces import SurfaceMotion
 from ..engine.context import Listener, Progress, ignore_progress
 from ..engine.store import Store
@@ -51,70 +51,35 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
     InputError
         For an image, label map, surface, site or record that cannot be used.
     """
-    facts = list(study.notes)
     listener(Progress("check", 0, 2, "geometry"))
-    given, notes = read_given_anatomy(study) if study.surfaces is not None else (None, ())
-    told, bones = _describe_image(study) if given is None else ([*notes, *_describe_surfaces(given)], None)
-    facts += told
-    store, limb = Store(study.results), None
-    if given is not None:
-        places = {site.name: place_site(site, study, given, None) for site in study.sites}
-        limb = LimbGeometry(given, places)
-    elif store.stamp("sites") and store.state("sites", compute_keys(study)["sites"]).state == "done":
-        limb = LimbGeometry.stored(store)
-    placed, anatomy = (limb.places, limb.anatomy) if limb is not None else ({}, None)
-    for name, table in study.used_indenters.items():
-        if table.file is not None:
-            here = table.model_copy(update={"file": study.path(table.file)})
-            width = read_indenter(here, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
-            facts.append(f"indenter{'' if name is None else ' ' + name}: {table.file}, {width:.1f} mm wide")
+    limb, bones, geometry_facts = _read_geometry(study)
+    facts = [*study.notes, *geometry_facts, *_describe_indenters(study)]
     listener(Progress("check", 1, 2, "records"))
     records: dict[str, TraceFacts] = {}
-    seen: dict[str, SecondaryMeasurement] = {}
-    steps: dict[str, float] = {}
+    secondary: dict[str, SecondaryMeasurement] = {}
+    steps_s: dict[str, float] = {}
     for one in study.recorded:
         trace, smooth, record = read_record(study, one)
         records[one.name] = record
-        seen[one.name] = read_observed(study, one, trace, record.touch_down_s, smooth)
-        steps[one.name] = float(np.median(np.diff(trace.time_s)))
-        facts.append(
-            f"site {one.name}: peak force {record.peak_force_N:.2f} N at {record.depth_mm:.2f} mm, "
-            f"touch-down after {record.touch_down_mm:.2f} +- {record.touch_down_uncertainty_mm:.2f} "
-            f"mm; {record.phases_in_words}"
-            + ("" if record.speed_unload_mm_s is not None else "; loading only, no unloading")
-        )
-    number = len(study.records_at(*study.fitted))
-    facts.append(
-        f"{len(study.fitted)} of {len(study.sites)} sites are fitted"
-        + (f", with {number} records" if number > len(study.fitted) else "")
-    )
-    if study.priors:
-        known = (f"{name} {p.median:g}, factor {p.factor:g}" for name, p in study.priors.items())
-        facts.append(f"lognormal priors (median, one standard deviation): {'; '.join(known)}")
-    facts += _describe_surface_motion(study, {name: beside.motion for name, beside in seen.items()}, limb)
-    for name, beside in seen.items():
-        for place, means in beside.waves:
-            speeds = f"{means.speed_m_s.min():.2f} to {means.speed_m_s.max():.2f} m/s"
-            readings = int(means.samples.sum())
-            facts.append(f"site {name}: shear waves at {place.name}, {speeds} in {readings} readings")
-    if records and not placed:
+        secondary[one.name] = read_observed(study, one, trace, record.touch_down_s, smooth)
+        steps_s[one.name] = float(np.median(np.diff(trace.time_s)))
+        facts.append(_describe_record(one.name, record))
+    facts += _describe_fit(study)
+    motions = {name: measured.motion for name, measured in secondary.items()}
+    facts += _describe_surface_motion(study, motions, limb)
+    facts += _describe_waves(secondary)
+    if records and limb is None:
         facts.append(
             "the sites are not placed yet: stiffness is compared without the thickness of the tissue "
             "(limbfit run --until sites, then check again)"
         )
+    anatomy = None if limb is None else limb.anatomy
     if "socket" in study.model_fields_set:
         facts += _describe_socket(study, anatomy, bones)
-    if study.clamps is not None:
-        pins = study.clamps
-        said = f"clamps: {len(pins.angles)} pins of {pins.force_N:g} N, {pins.begun_s:g} s before touch-down"
-        if limb is None:
-            facts.append(f"{said}; they are placed after limbfit run --until sites")
-        else:
-            held = [f"{count} at site {name}" for name, count in limb.clamping_pins(study).items()]
-            facts.append(f"{said}; {', '.join(held)} meet the skin")
+    facts += _describe_clamps(study, limb)
     refused = list_refused_commands(study, limb)
     facts += [f"cannot run: limbfit {', '.join(row['commands'])}: {row['why']}" for row in refused]
-    flags = record_flags(study, records, steps, placed, anatomy)
+    flags = record_flags(study, records, steps_s, {} if limb is None else limb.places, anatomy)
     outside = _describe_outside(study, records, limb)
     listener(Progress("check", 2, 2))
     return {
@@ -126,6 +91,67 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
         "outside_records": {name: [row.to_plain() for row in rows] for name, rows in outside.items()},
         "outside_text": describe_outside(outside),
     }
+
+
+def _read_geometry(study: Study) -> tuple[LimbGeometry | None, tuple[str, ...] | None, list[str]]:
+    """The limb where its sites are known, the bones of a given label map, and facts."""
+    if study.surfaces is not None:
+        anatomy, notes = read_given_anatomy(study)
+        facts = [*notes, *_describe_surfaces(anatomy)]
+        places = {site.name: place_site(site, study, anatomy, None) for site in study.sites}
+        return LimbGeometry(anatomy, places), None, facts
+    facts, bones = _describe_image(study)
+    store = Store(study.results)
+    are_placed = store.stamp("sites") and store.state("sites", compute_keys(study)["sites"]).state == "done"
+    return LimbGeometry.stored(store) if are_placed else None, bones, facts
+
+
+def _describe_indenters(study: Study) -> Iterator[str]:
+    for name, table in study.used_indenters.items():
+        if table.file is not None:
+            here = table.model_copy(update={"file": study.path(table.file)})
+            width = read_indenter(here, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
+            yield f"indenter{'' if name is None else ' ' + name}: {table.file}, {width:.1f} mm wide"
+
+
+def _describe_record(name: str, record: TraceFacts) -> str:
+    return (
+        f"site {name}: peak force {record.peak_force_N:.2f} N at {record.depth_mm:.2f} mm, "
+        f"touch-down after {record.touch_down_mm:.2f} +- {record.touch_down_uncertainty_mm:.2f} "
+        f"mm; {record.phases_in_words}"
+        + ("" if record.speed_unload_mm_s is not None else "; loading only, no unloading")
+    )
+
+
+def _describe_fit(study: Study) -> Iterator[str]:
+    """How many sites and records are fitted, and with which priors."""
+    number = len(study.records_at(*study.fitted))
+    more = f", with {number} records" if number > len(study.fitted) else ""
+    yield f"{len(study.fitted)} of {len(study.sites)} sites are fitted{more}"
+    if study.priors:
+        priors = (f"{name} {p.median:g}, factor {p.factor:g}" for name, p in study.priors.items())
+        yield f"lognormal priors (median, one standard deviation): {'; '.join(priors)}"
+
+
+def _describe_waves(secondary: Mapping[str, SecondaryMeasurement]) -> Iterator[str]:
+    for name, measured in secondary.items():
+        for place, means in measured.waves:
+            speeds = f"{means.speed_m_s.min():.2f} to {means.speed_m_s.max():.2f} m/s"
+            readings = int(means.samples.sum())
+            yield f"site {name}: shear waves at {place.name}, {speeds} in {readings} readings"
+
+
+def _describe_clamps(study: Study, limb: LimbGeometry | None) -> Iterator[str]:
+    """How the pins press, and where the limb is known how many meet it at each site."""
+    pins = study.clamps
+    if pins is None:
+        return
+    said = f"clamps: {len(pins.angles)} pins of {pins.force_N:g} N, {pins.begun_s:g} s before touch-down"
+    if limb is None:
+        yield f"{said}; they are placed after limbfit run --until sites"
+    else:
+        met = [f"{count} at site {name}" for name, count in limb.clamping_pins(study).items()]
+        yield f"{said}; {', '.join(met)} meet the skin"
 
 
 def list_refused_commands(study: Study, limb: LimbGeometry | None) -> list[dict[str, Any]]:
@@ -159,23 +185,17 @@ def _describe_outside(
     """
     axis = None if limb is None else LimbAxis(limb.anatomy)
 
-    def describe(one: Record | Site, tested: RecordedRange | None = None) -> list[Extent]:
+    def describe(one: Indentation, tested: RecordedRange | None = None) -> list[Extent]:
         facts = records.get(one.name)
-        if facts is None:  # an indentation that the site plans, in and out
-            assert one.site.depth_mm is not None
-            ramp = one.site.depth_mm / one.site.speed_mm_s
-            history = LoadHistory.from_knots((0.0, ramp, 2 * ramp), (0.0, one.site.depth_mm, 0.0))
-        else:
+        if facts is not None:
             history = LoadHistory.from_knots(facts.knots_s, facts.knots_N or facts.knots_mm)
-        return describe_indentation(
-            history,
-            facts.depth_mm if facts else float(one.site.depth_mm or 0.0),
-            study.indenter_of(one),
-            None if limb is None else limb.place(one.site),
-            axis,
-            force_N=facts.peak_force_N if facts else None,
-            tested=tested,
-        )
+            depth_mm, force_N = facts.depth_mm, facts.peak_force_N
+        else:
+            history = LoadHistory.from_knots(*one.site.planned_knots)
+            depth_mm, force_N = max(one.site.planned_knots[1]), None
+        place = None if limb is None else limb.place(one.site)
+        indenter = study.indenter_of(one)
+        return describe_indentation(history, depth_mm, indenter, place, axis, force_N=force_N, tested=tested)
 
     fitted = study.records_at(*study.fitted)
     if not fitted:
@@ -185,7 +205,7 @@ def _describe_outside(
     tested = RecordedRange.from_records(map(describe, fitted), angles)
     held = [record for record in study.recorded if not record.site.fitted]
     planned = [site for site in study.sites if site.depth_mm is not None and not study.records_at(site)]
-    others: list[Record | Site] = [*held, *planned]
+    others: list[Indentation] = [*held, *planned]
     found = {f"site {one.name}": tested.find_outside(describe(one, tested)) for one in others}
     if "socket" in study.model_fields_set:
         for name, history in time_socket_loads(study.socket).items():

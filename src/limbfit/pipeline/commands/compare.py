@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from ... import febio
 from ...arrays import Array
-from ...errors import InputError, ProblemError
+from ...errors import InputError, add_location
 from ...fe import Problem, Result, System, solve
 from ...fe.solution.control import schedule_steps
 from ...indentation import Parameters, build_first_steps
@@ -20,7 +20,7 @@ from ...results.runs import CompareResult, CurveDifference, CurveFiles, FebioSim
 from ...study import Study
 from ..engine.context import Listener, ignore_progress
 from ..engine.storage import write_curves, write_result
-from .simulate import Indentation, build_feb_settings, build_site_problem, prepare_site, run_febio_site
+from .simulate import PreparedIndentation, prepare_site, run_febio_site
 
 FREE = 1.0  # penetration over the depth: FEBio's punch sinks in as far as its penalty lets it
 
@@ -55,28 +55,22 @@ def compare_site(
         raise InputError(what, file=study.file, remedy="compare limbfit simulate --solver limbfit and febio")
     program = febio.find_febio(study.febio.program, study.folder) if febio_log is None else None
     log = None if febio_log is None else febio.read_log(febio_log)
-    found = prepare_site(study, name, parameters=parameters, listener=listener)
-    folder, name = found.context.store["compare"], found.model.name
+    prepared = prepare_site(study, name, parameters=parameters, listener=listener)
+    folder, name = prepared.context.store["compare"], prepared.model.name
     folder.mkdir(parents=True, exist_ok=True)
-    problem = build_site_problem(found)
-    found.context.tell("compare", 0, 3, f"site {name}: FEBio")
+    problem = prepared.build_problem()
+    prepared.context.tell("compare", 0, 3, f"site {name}: FEBio")
     if program is not None:
-        other, _ = run_febio_site(found, program, folder / f"{name}.febio")
+        other, _ = run_febio_site(prepared, program, folder / f"{name}.febio")
     else:
+        assert febio_log is not None
         assert log is not None
-        reached, end = float(log.times[-1]), febio.compute_end_time(problem)
-        complete = reached > end * (1.0 - febio.TIME_TOLERANCE)
-        reason = "" if complete else f"the table ends at {reached:.4g} s of {end:.4g} s"
-        verdict = febio.RunVerdict("normal" if complete else "partial", reason, reached, "")
-        try:
-            other = febio.build_result(problem, log, verdict)
-        except ProblemError as error:
-            raise ProblemError(error.what, file=febio_log, remedy=error.remedy) from None
-    found.context.tell("compare", 1, 3, f"site {name}: limbfit")
-    first = build_first_steps(found.model, found.context.study.tissues)
+        other = _build_logged_result(problem, log, febio_log)
+    prepared.context.tell("compare", 1, 3, f"site {name}: limbfit")
+    first = build_first_steps(prepared.model, prepared.study.tissues)
     runs = {"limbfit": solve(problem, first, store="none")}  # as `limbfit simulate` does
-    runs["limbfit_matched"] = _solve_matched(found, problem, other)
-    found.context.tell("compare", 3, 3, f"site {name}")
+    runs["limbfit_matched"] = _solve_matched(prepared, problem, other)
+    prepared.context.tell("compare", 3, 3, f"site {name}")
     files = CurveFiles(csv=str(folder / f"{name}.csv"), png=str(folder / f"{name}.png"))
     times = _select_common_times(other, min(runs.values(), key=lambda run: run.times[-1]))
     curves = {key: run.force_at(times) for key, run in runs.items()}
@@ -91,14 +85,14 @@ def compare_site(
     _draw(Path(files.png), name, times, febio_N, curves)
     content = CompareResult(
         site=name,
-        parameters=found.parameters,
-        parameters_from=found.origin,
+        parameters=prepared.parameters,
+        parameters_from=prepared.origin,
         element=other.statistics["element"],
         unknowns=runs["limbfit"].statistics["unknowns"],
         febio=FebioSimulation(
             **_summarise_solver(other),
             version=other.statistics["linear_solver"],
-            penalty=found.context.study.febio.penalty,
+            penalty=prepared.study.febio.penalty,
         ),
         **{
             key: LimbfitSimulation(
@@ -115,10 +109,21 @@ def compare_site(
     return content.to_plain()
 
 
-def _solve_matched(found: Indentation, problem: Problem, other: Result) -> Result:
+def _build_logged_result(problem: Problem, log: febio.FebioLog, file: str | Path) -> Result:
+    """FEBio's result from the table in a ``file``; partial where that ends before the problem does."""
+    reached, end = float(log.times[-1]), febio.compute_end_time(problem)
+    complete = reached > end * (1.0 - febio.TIME_TOLERANCE)
+    reason = "" if complete else f"the table ends at {reached:.4g} s of {end:.4g} s"
+    verdict = febio.RunVerdict("normal" if complete else "partial", reason, reached, "")
+    with add_location(file=file):
+        return febio.build_result(problem, log, verdict)
+
+
+def _solve_matched(prepared: PreparedIndentation, problem: Problem, other: Result) -> Result:
     """limbfit with FEBio's steps, its course of the stress in them and its contact penalty."""
-    found.context.tell("compare", 2, 3, f"site {found.model.name}: limbfit with FEBio's contact and steps")
-    settings = build_feb_settings(found, "")
+    name = prepared.model.name
+    prepared.context.tell("compare", 2, 3, f"site {name}: limbfit with FEBio's contact and steps")
+    settings = prepared.build_feb_settings("")
     end = float(problem.history.times[-1])
     times = np.minimum(other.times[1:], end)  # a table has nine digits
     if not len(times):  # FEBio got nowhere: all the way then

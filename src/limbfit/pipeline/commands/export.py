@@ -19,13 +19,13 @@ from ...fe import ELEMENTS, Problem
 from ...indentation import Parameters, SiteModel, build_problem
 from ...laws import OGDEN, is_ogden
 from ...mesh import write_vtu
-from ...study import Indentation as Planned
-from ...study import Record, Study
+from ...study import Indentation, Record, Study
 from ..engine.context import Context, Listener, ignore_progress
 from ..engine.files import name_file_in_errors
 from ..engine.store import Store
 from ..records.records import load_site_record
-from .simulate import Indentation, build_feb_settings, build_site_problem, choose_parameters, prepare_site
+from ..simulation.limb_geometry import list_material_fields
+from .simulate import PreparedIndentation, choose_parameters, prepare_site
 
 FITTED = "febio-optimize"
 FORMATS = ("feb", FITTED, "inp", "calculix")
@@ -62,20 +62,20 @@ def export_study(
     folder = study.results / "export" if output is None else Path(output)
     rows = []
     for one in chosen:
-        found = prepare_site(study, one.name, parameters=parameters, listener=listener)
+        prepared = prepare_site(study, one.name, parameters=parameters, listener=listener)
         folder.mkdir(parents=True, exist_ok=True)
         curve = _NO_CURVE
         if to == FITTED:
-            assert isinstance(found.stated, Record)
-            record = load_site_record(found.context, found.stated)
-            inside = (record.times_s >= 0.0) & (record.times_s <= found.model.knots_s[-1])
+            assert isinstance(prepared.stated, Record)
+            record = load_site_record(prepared.context, prepared.stated)
+            inside = (record.times_s >= 0.0) & (record.times_s <= prepared.model.knots_s[-1])
             curve = record.times_s[inside], record.force_N[inside]
-        files, notes = _write(found, build_site_problem(found), to, folder, curve)
+        files, notes = _write(prepared, prepared.build_problem(), to, folder, curve)
         rows.append(
             {
                 "site": one.name,
-                "parameters": found.parameters,
-                "parameters_from": found.origin,
+                "parameters": prepared.parameters,
+                "parameters_from": prepared.origin,
                 "files": [str(file) for file in files],
                 "notes": list(notes),
             }
@@ -85,7 +85,7 @@ def export_study(
 
 def check_export(
     study: Study, to: str, *, site: str | None = None, parameters: Parameters | None = None
-) -> Sequence[Planned]:
+) -> Sequence[Indentation]:
     """The indentations to be written, each of which has been written on a small block in the limb's place.
 
     Raises `InputError` as `export_study`, before anything is meshed.
@@ -115,13 +115,13 @@ def check_export(
             if study.clamps is not None:
                 later = problem.history.delay(study.clamps.begun_s)
                 problem = replace(problem, history=later, touch_down_s=study.clamps.begun_s)
-            found = Indentation(context, one, model, used, origin)
+            prepared = PreparedIndentation(context, one, model, used, origin)
             with name_file_in_errors(study.file, about=f"{one.name}: "):
-                _write(found, problem, to, Path(folder), _NO_CURVE)
+                _write(prepared, problem, to, Path(folder), _NO_CURVE)
     return chosen
 
 
-def _build_block_model(study: Study, one: Planned, file: Path) -> SiteModel:
+def _build_block_model(study: Study, one: Indentation, file: Path) -> SiteModel:
     """An indentation in the middle of that block's top, without pins.
 
     Its penalty is any: that of a site is found by solving, and nobody reads what is written of the block.
@@ -133,17 +133,12 @@ def _build_block_model(study: Study, one: Planned, file: Path) -> SiteModel:
         model,
         knots_N=(0.0, 1.0, 0.0) if one.forced else (),
         indenter=study.indenter_of(one),
-        kappa_ratio=study.material.kappa_ratio,
-        law=study.material.law,
-        relaxation_span_s=study.material.relaxation_span_s,
         fibres=tuple((tissue, along) for tissue in study.fibres),
-        extensions=study.extensions,
-        course=study.material.course,
-        prestretch=tuple(sorted(study.material.prestretch.items())),
+        **list_material_fields(study),
     )
 
 
-def _select_chosen(study: Study, to: str, site: str | None) -> Sequence[Planned]:
+def _select_chosen(study: Study, to: str, site: str | None) -> Sequence[Indentation]:
     if site is not None:
         one = study.indentation(site)
         if to == FITTED and not isinstance(one, Record):
@@ -157,16 +152,16 @@ def _select_chosen(study: Study, to: str, site: str | None) -> Sequence[Planned]
 
 
 def _write(
-    found: Indentation, problem: Problem, to: str, folder: Path, curve: tuple[Array, Array]
+    prepared: PreparedIndentation, problem: Problem, to: str, folder: Path, curve: tuple[Array, Array]
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """The files of a site, and what the other solver does otherwise; ``curve``: what its fit compares."""
-    name = found.model.name
-    settings = build_feb_settings(found, f"{name}-forces.txt")
+    name = prepared.model.name
+    settings = prepared.build_feb_settings(f"{name}-forces.txt")
     if to == "feb":
         febio.write_feb(problem, folder / f"{name}.feb", settings)
         return (folder / f"{name}.feb",), febio.describe_differences(problem, settings)
     if to == FITTED:
-        law = found.context.study.material.law
+        law = prepared.study.material.law
         if not is_ogden(law):
             what = f'FEBio\'s fit is written for "{OGDEN}", whatever its relaxation terms, not for "{law}"'
             raise InputError(what, remedy="identify with limbfit")
@@ -176,8 +171,8 @@ def _write(
         settings = replace(settings, penalty=None)
         turned = febio.turn_to_indenter_frame(problem)
         febio.write_feb(turned, model, settings)
-        ranges = _build_ranges(found, problem.mesh.region_names)
-        iterations = found.context.study.calibration.max_iterations
+        ranges = _build_ranges(prepared, problem.mesh.region_names)
+        iterations = prepared.study.calibration.max_iterations
         febio.write_optimisation(control, ranges, *curve, iterations=iterations)
         return (control, model), febio.describe_differences(turned, settings)
     program = "abaqus" if to == "inp" else to
@@ -185,12 +180,12 @@ def _write(
     return (folder / f"{name}.inp",), ()
 
 
-def _build_ranges(found: Indentation, tissues: Sequence[str]) -> dict[str, febio.ParameterRange]:
+def _build_ranges(prepared: PreparedIndentation, tissues: Sequence[str]) -> dict[str, febio.ParameterRange]:
     """Start and bounds of the tissues, in the solver's units."""
-    study = found.context.study
+    study = prepared.study
     ranges = {}
     for tissue in tissues:
-        start = found.parameters[tissue]
+        start = prepared.parameters[tissue]
         lower, upper = (study.material.of(tissue, bound) for bound in ("lower", "upper"))
         for key, value in start.items():
             if not lower[key] <= value <= upper[key]:

@@ -15,8 +15,7 @@ from ...indentation import Parameters, SiteModel, build_first_steps, build_probl
 from ...mesh import read_vtu
 from ...results.identification import RecordedExtents
 from ...results.runs import SimulateResult
-from ...study import Indentation as Planned
-from ...study import Study
+from ...study import Indentation, Study
 from ..engine.context import Context, Listener, ignore_progress
 from ..engine.storage import write_curves, write_result
 from ..engine.store import Store
@@ -31,19 +30,34 @@ FEB_NAME, FORCES = "model.feb", "forces.txt"
 
 
 @dataclass(frozen=True)
-class Indentation:
+class PreparedIndentation:
     """An indentation of a study, ready to be simulated: ``origin`` says where the parameters are from."""
 
     context: Context
-    stated: Planned
+    stated: Indentation
     model: SiteModel
     parameters: Parameters
     origin: str
 
+    @property
+    def study(self) -> Study:
+        return self.context.study
+
+    def build_problem(self) -> Problem:
+        """The problem that `simulate_site` solves."""
+        return build_problem(self.model, read_vtu(self.model.mesh), self.parameters)
+
+    def build_feb_settings(self, force_file: str) -> FebSettings:
+        """What is written for FEBio beside the problem."""
+        study, name = self.study, self.model.name
+        title = f"{study.study.name}, site {name}, parameters: {self.origin}"
+        steps = build_first_steps(self.model, study.tissues)
+        return FebSettings(study.febio.penalty, steps, force_file, title)
+
 
 def prepare_site(
     study: Study, name: str, *, parameters: Parameters | None = None, listener: Listener = ignore_progress
-) -> Indentation:
+) -> PreparedIndentation:
     """A site as recorded, or as the study plans it; meshes are made where missing.
 
     Raises `InputError` for a site that the study does not have, identified parameters that are stale, or any
@@ -55,11 +69,10 @@ def prepare_site(
     parameters : per tissue; by default the identified ones, or the study's start where none were identified.
     """
     stated = study.indentation(name)
-    store = Store(study.results)
     used, origin = choose_parameters(study, parameters)
     run_study(study, until="mesh", listener=listener)
-    context = Context(study, store, SerialExecutor(), listener)
-    return Indentation(context, stated, build_model(context, stated), used, origin)
+    context = Context(study, Store(study.results), SerialExecutor(), listener)
+    return PreparedIndentation(context, stated, build_model(context, stated), used, origin)
 
 
 def simulate_site(
@@ -91,26 +104,23 @@ def simulate_site(
     program = find_febio(study.febio.program, study.folder) if by_febio else None
     if program is not None and animation:
         raise InputError("FEBio's fields are in its plot file", place="--animation", remedy="leave it out")
-    found = prepare_site(study, name, parameters=parameters, listener=listener)
-    context, model, name = found.context, found.model, found.model.name
+    prepared = prepare_site(study, name, parameters=parameters, listener=listener)
+    context, model, name = prepared.context, prepared.model, prepared.model.name
     folder = context.store["simulate"]
     folder.mkdir(exist_ok=True)
-    context.tell("simulate", 0, 1, f"site {name}")
-    played = folder / f"{name}.pvd" if animation else None
     for kind in ("json", "csv", "vtu", "pvd"):
         (folder / f"{name}.{kind}").unlink(missing_ok=True)  # that of another simulation
+    curve = folder / f"{name}.csv"
+    played = folder / f"{name}.pvd" if animation else None
+    context.tell("simulate", 0, 1, f"site {name}")
     if program is not None:
-        result, fields = run_febio_site(found, program, folder / f"{name}.febio")
+        result, fields = run_febio_site(prepared, program, folder / f"{name}.febio")
     else:
         fields = folder / f"{name}.vtu"
-        result = simulate_fields(model, found.parameters, fields, played)
+        result = simulate_fields(model, prepared.parameters, fields, played)
     context.tell("simulate", 1, 1, f"site {name}")
-    write_site_curve(model, result, folder / f"{name}.csv")
-    files = {
-        "curve": folder / f"{name}.csv",
-        "fields": fields if fields.is_file() and (by_febio or result.states) else None,
-        "animation": played,
-    }
+    write_site_curve(model, result, curve)
+    files = {"curve": curve, "fields": fields if fields.is_file() else None, "animation": played}
     # A path may tell who the patient is: what is stored names the files as they lie beside it.
     beside: dict[str, Any] = {
         kind: file and file.relative_to(folder).as_posix() for kind, file in files.items()
@@ -118,8 +128,8 @@ def simulate_site(
     stored = SimulateResult(
         site=name,
         solver="limbfit" if program is None else result.statistics["linear_solver"],
-        parameters=found.parameters,
-        parameters_from=found.origin,
+        parameters=prepared.parameters,
+        parameters_from=prepared.origin,
         peak_force_N=result.peak_force,
         depth_mm=float(result.displacement.max()),
         # FEBio says nothing of its penetration.
@@ -129,7 +139,7 @@ def simulate_site(
         warnings=result.warnings,
         element=result.statistics["element"],
         unknowns=result.statistics["unknowns"],
-        **_compare_with_records(found, result, None if program else fields),
+        **_compare_with_records(prepared, result, None if program else fields),
         **beside,
     )
     write_result(folder / f"{name}.json", stored)
@@ -149,48 +159,38 @@ def write_site_curve(model: SiteModel, result: Result, file: Path) -> None:
     )
 
 
-def _compare_with_records(found: Indentation, result: Result, fields: Path | None) -> dict[str, Any]:
+def _compare_with_records(
+    prepared: PreparedIndentation, result: Result, fields: Path | None
+) -> dict[str, Any]:
     """What of an indentation no fitted record did, and in words; None where that is not known.
 
     ``fields`` at its deepest point; without them strains are not compared.
     """
-    study, model = found.context.study, found.model
-    stored = read_recorded_range(study) if found.origin == IDENTIFIED else None
+    model = prepared.model
+    stored = read_recorded_range(prepared.study) if prepared.origin == IDENTIFIED else None
     if stored is None:
         return {"outside_records": None, "outside_text": []}
-    tested, limb = RecordedRange.from_stored(stored), LimbGeometry.stored(found.context.store)
+    tested, limb = RecordedRange.from_stored(stored), LimbGeometry.stored(prepared.context.store)
     rows = tested.find_outside(
         describe_indentation(
             LoadHistory.from_knots(model.knots_s, model.knots_N or model.knots_mm),
             float(result.displacement.max()),
             model.indenter,
-            limb.place(found.stated.site),
+            limb.place(prepared.stated.site),
             LimbAxis(limb.anatomy),
             force_N=result.peak_force,
             strains=read_strain_extents(fields) if fields is not None and fields.is_file() else (),
             tested=tested,
         )
     )
-    return {"outside_records": rows, "outside_text": describe_outside({f"site {found.model.name}": rows})}
+    return {"outside_records": rows, "outside_text": describe_outside({f"site {prepared.model.name}": rows})}
 
 
-def build_site_problem(found: Indentation) -> Problem:
-    """The site's problem, as `simulate_site` solves it."""
-    return build_problem(found.model, read_vtu(found.model.mesh), found.parameters)
-
-
-def build_feb_settings(found: Indentation, force_file: str) -> FebSettings:
-    """What is written for FEBio beside the problem."""
-    study = found.context.study
-    title = f"{study.study.name}, site {found.model.name}, parameters: {found.origin}"
-    return FebSettings(study.febio.penalty, build_first_steps(found.model, study.tissues), force_file, title)
-
-
-def run_febio_site(found: Indentation, program: Path, folder: Path) -> tuple[Result, Path]:
+def run_febio_site(prepared: PreparedIndentation, program: Path, folder: Path) -> tuple[Result, Path]:
     """The site solved by FEBio in ``folder``, and its plot file; a failure is a result with its reason."""
-    problem, options = build_site_problem(found), found.context.study.febio
+    problem, options = prepared.build_problem(), prepared.study.febio
     folder.mkdir(parents=True, exist_ok=True)
-    write_feb(problem, folder / FEB_NAME, build_feb_settings(found, FORCES))
+    write_feb(problem, folder / FEB_NAME, prepared.build_feb_settings(FORCES))
     end = compute_end_time(problem)
     run = run_febio(program, folder, end, FORCES, threads=options.threads, time_limit_s=options.time_limit_s)
     return build_result(problem, run.log, run.verdict, run.seconds), folder / "model.xplt"

@@ -220,9 +220,7 @@ def build_model(context: Context, one: Indentation) -> SiteModel:
     """An indentation as it was recorded, from touch-down on, or as the study plans it."""
     if isinstance(one, Record):
         return load_site_record(context, one).model
-    assert one.depth_mm is not None
-    ramp = one.depth_mm / one.speed_mm_s  # in and out
-    return build_site_model(context, one, (0.0, ramp, 2 * ramp), (0.0, one.depth_mm, 0.0))
+    return build_site_model(context, one, *one.planned_knots)
 
 
 def estimate_surface_error_mm(study: Study, store: Store) -> float:

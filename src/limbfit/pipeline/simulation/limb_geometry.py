@@ -92,19 +92,27 @@ def build_site_model(
         edge=site.edge,
         indenter=indenter,
         indenter_digest="" if indenter.file is None else compute_file_digest(indenter.file),
-        kappa_ratio=study.material.kappa_ratio,
         steps=study.solver,
         element=study.mesh.element,
-        law=study.material.law,
-        relaxation_span_s=study.material.relaxation_span_s,
-        extensions=study.extensions,
         layers=tuple(layers),
-        course=study.material.course,
-        prestretch=tuple(sorted(study.material.prestretch.items())),
+        **list_material_fields(study),
         **clamped,
     )
     _check_pins(study, model)
     return model
+
+
+def list_material_fields(study: Study) -> dict[str, Any]:
+    """What the study says of all tissues, as fields of a `SiteModel`: all but the directions of fibres."""
+    table = study.material
+    return {
+        "kappa_ratio": table.kappa_ratio,
+        "law": table.law,
+        "relaxation_span_s": table.relaxation_span_s,
+        "course": table.course,
+        "prestretch": tuple(sorted(table.prestretch.items())),
+        "extensions": study.extensions,
+    }
 
 
 def coarsen_model(context: Context, model: SiteModel) -> SiteModel:
