@@ -346,7 +346,7 @@ def test_an_amputation_shortens_given_surfaces(limbfit, commands_unasked, study)
 def test_a_run_that_ends_with_the_calibration_shows_the_parameters(capsys):
     """There are no predictions yet; it ended in an internal error."""
     values = {"c_kPa": 6.5, "m": 7.0, "gamma": 2.5, "tau_s": 0.5}
-    show_summary({"parameters": {"skin": values}, "until": "calibrate", "results": "results"}, as_json=False)
+    show_summary({"parameters": {"skin": values}, "until": "calibrate", "results": "results"})
     assert "skin, identified" in capsys.readouterr().out
 
 

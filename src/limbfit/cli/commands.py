@@ -19,8 +19,8 @@ from ..study import Study
 from .console import (
     AsJson,
     Column,
+    build_parameter_columns,
     fail,
-    format_parameter_heads,
     format_use,
     listen_on_console,
     parse_numbers,
@@ -71,7 +71,7 @@ def demo(
     with listen_on_console() as listener:
         summary = limbfit.run_demo(folder, seed=seed, listener=listener)
     summary["seconds"] = round(perf_counter() - start, 1)
-    show_summary(summary, as_json)
+    print_result(summary, show_summary, as_json)
     if not as_json:
         print_line(
             f"next: limbfit studio {folder} shows it all in a browser; limbfit uncertainty {folder} finds "
@@ -130,11 +130,11 @@ def series(
     as_json: AsJson = False,
 ) -> None:
     """List the DICOM series of a folder, to choose one by its UID (image.series in study.toml)."""
-    result = limbfit.describe_series(folder)
-    if as_json:
-        print_json({"series": result})
-        return
-    for row in result:
+    print_result({"series": limbfit.describe_series(folder)}, show_series, as_json)
+
+
+def show_series(result: dict[str, Any]) -> None:
+    for row in result["series"]:
         number = f"series {row['number']}: " if row["number"] else ""
         size = f"{row['slices']} slices of {row['rows']} x {row['columns']}"
         step = " x ".join(f"{s:.4g}" for s in row["spacing_mm"]) + " mm, whole" if row["whole"] else ""
@@ -144,10 +144,10 @@ def series(
 
 def check(study: StudyPath, as_json: AsJson = False) -> None:
     """Read every input of a study and report what is wrong, before anything runs."""
-    findings = call_on_study(study, limbfit.check_study)
-    if as_json:
-        print_json(findings)
-        return
+    print_result(call_on_study(study, limbfit.check_study), show_findings, as_json)
+
+
+def show_findings(findings: dict[str, Any]) -> None:
     for line in findings["facts"]:
         print_line(line)
     print_warnings(flag["text"] for flag in findings["flags"])
@@ -180,7 +180,7 @@ def run(
     began = perf_counter()
     summary = call_on_study(study, limbfit.run_study, until=until, start=start, force=force or ())
     summary["seconds"] = round(perf_counter() - began, 1)
-    show_summary(summary, as_json)
+    print_result(summary, show_summary, as_json)
 
 
 def status(study: StudyPath, as_json: AsJson = False) -> None:
@@ -236,7 +236,7 @@ def simulate(
 
 def report(study: StudyPath, as_json: AsJson = False) -> None:
     """Make the report again from stored results; nothing is solved."""
-    show_summary(call_on_study(study, limbfit.report_study), as_json)
+    print_result(call_on_study(study, limbfit.report_study), show_summary, as_json)
 
 
 def parse_parameters(text: str | None, study: Study) -> dict[str, dict[str, float]] | None:
@@ -254,10 +254,7 @@ def parse_parameters(text: str | None, study: Study) -> dict[str, dict[str, floa
     return study.by_tissue(values)
 
 
-def show_summary(summary: dict[str, Any], as_json: bool) -> None:
-    if as_json:
-        print_json(summary)
-        return
+def show_summary(summary: dict[str, Any]) -> None:
     if "parameters" in summary:
         show_parameters(summary)
     elif "until" in summary:
@@ -286,9 +283,7 @@ def show_parameters(summary: dict[str, Any]) -> None:
         for kind, tissues in (("identified", summary["parameters"]), ("truth", summary.get("truth", {})))
         for tissue, values in tissues.items()
     ]
-    columns: dict[str, Column] = {"tissue": "tissue"}
-    columns |= {head: (key, ".3g") for head, key in zip(format_parameter_heads(keys), keys)}
-    print_table(rows, columns)
+    print_table(rows, {"tissue": "tissue", **build_parameter_columns(keys)})
     for text in summary.get("relaxation", {}).get("words", ()):
         print_line(f"relaxation: {text}")
 

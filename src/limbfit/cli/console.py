@@ -201,10 +201,10 @@ def prompt_interrupt() -> Iterator[None]:
         writer.close()  # which ends the watch
 
 
-def format_parameter_heads(keys: Iterable[str]) -> list[str]:
-    """Parameters as heads of columns: ``tau_s`` is ``tau (s)``."""
-    split = [split_key(key) for key in keys]
-    return [f"{name} ({unit})" if unit else name for name, unit in split]
+def build_parameter_columns(keys: Iterable[str]) -> dict[str, Column]:
+    """A column for each parameter; the head of ``tau_s`` is ``tau (s)``."""
+    split = {key: split_key(key) for key in keys}
+    return {f"{name} ({unit})" if unit else name: (key, ".3g") for key, (name, unit) in split.items()}
 
 
 def format_ends(interval: Sequence[float] | None, form: str = ".3g") -> str:

@@ -21,8 +21,8 @@ from .commands import Parameters, StudyPath, call_on_study
 from .console import (
     AsJson,
     Column,
+    build_parameter_columns,
     format_ends,
-    format_parameter_heads,
     format_use,
     listen_on_console,
     parse_numbers,
@@ -103,9 +103,14 @@ def show_regions(found: RegionsResult) -> None:
             rows.append(head | values | {"tissue": tissue})
             head = {"region": "", "sites": ""}
     keys = list(next(iter(whole.parameters.values())))
-    columns: dict[str, Column] = {"region": "region", "sites": "sites", "tissue": "tissue"}
-    columns |= {head: (key, ".3g") for head, key in zip(format_parameter_heads(keys), keys)}
-    columns |= {"error (%)": ("own", ".2f"), "whole (%)": ("whole", ".2f")}
+    columns: dict[str, Column] = {
+        "region": "region",
+        "sites": "sites",
+        "tissue": "tissue",
+        **build_parameter_columns(keys),
+        "error (%)": ("own", ".2f"),
+        "whole (%)": ("whole", ".2f"),
+    }
     print_table(rows, columns, dash="")
     _show_left_out(found.left_out)
 
