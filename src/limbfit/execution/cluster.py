@@ -77,7 +77,7 @@ class DaskExecutor(Executor):
     ) -> None:
         self._client, self._cluster, self.limits = client, cluster, limits
         self._requested = workers
-        self._home: dict[str, str] = {}
+        self._worker_of_key: dict[str, str] = {}
 
     @classmethod
     def connect(cls, address: str, limits: Limits = NO_LIMITS) -> Self:
@@ -191,9 +191,9 @@ class DaskExecutor(Executor):
         """Where jobs of a key went before, if that worker lives; else the next worker in turn."""
         if key is None or not present:
             return None
-        if self._home.get(key) not in present:
-            self._home[key] = present[len(self._home) % len(present)]
-        return [self._home[key]]
+        if self._worker_of_key.get(key) not in present:
+            self._worker_of_key[key] = present[len(self._worker_of_key) % len(present)]
+        return [self._worker_of_key[key]]
 
     def _result(self, future: Any, contained: bool) -> Any:
         distributed = _import_dask("distributed")

@@ -23,7 +23,7 @@ from .base import NO_LIMITS, SAFE_PATH, THREAD_VARIABLES, Batch, Executor, Limit
 
 MAX_TRIES = 2
 _POLL_S = 0.25  # between two looks at what jobs take
-_DEATH = "a worker process died: out of memory, killed or crashed"
+_WORKER_DIED = "a worker process died: out of memory, killed or crashed"
 
 
 class ProcessExecutor(Executor):
@@ -38,7 +38,7 @@ class ProcessExecutor(Executor):
             raise ValueError("workers and threads must be at least 1")
         self.threads, self.limits = threads, limits
         self._seats: list[Worker | None] = [None] * workers
-        self._home: dict[str, int] = {}
+        self._seat_of_key: dict[str, int] = {}
         self._mapping = False
 
     @property
@@ -94,7 +94,7 @@ class ProcessExecutor(Executor):
             if not free:
                 return
             key = keys[job]
-            seat = free[0] if key is None else self._home.setdefault(key, free[0])
+            seat = free[0] if key is None else self._seat_of_key.setdefault(key, free[0])
             if seat in free:
                 waiting.remove(job)
                 yield seat, job
@@ -113,7 +113,7 @@ class ProcessExecutor(Executor):
                 continue
             if outcome is None:
                 self._replace(seat)
-            yield seat, outcome or _DEATH
+            yield seat, outcome or _WORKER_DIED
         for line, seat in lines.items():
             if line not in ready and (excess := self._get_worker(seat).find_exceeded_limit(limits)):
                 self._replace(seat)

@@ -26,7 +26,7 @@ from ..study import Vector
 
 Direction = Vector | Literal["flow"]
 DISTAL_MM = 10.0  # of the bone's far end, along the limb, that fibres run to
-_SOLVED = 1e-8  # residual of the potential
+_POTENTIAL_TOLERANCE = 1e-8  # residual of the potential
 
 
 def build_fibre_field(fibres: Iterable[tuple[str, Direction]], mesh: Mesh) -> Array | None:
@@ -94,7 +94,7 @@ def _solve_potential(
     free, out = ~(start | end), end.astype(float)
     inner, right = K[free][:, free], -(K[free] @ out)
     M = sp.diags(1.0 / inner.diagonal())
-    out[free], failed = spla.cg(inner, right, rtol=_SOLVED, maxiter=20 * count, M=M)
+    out[free], failed = spla.cg(inner, right, rtol=_POTENTIAL_TOLERANCE, maxiter=20 * count, M=M)
     if failed:
         raise ProblemError("the potential of the fibres' flow was not found", remedy="state a direction")
     return out

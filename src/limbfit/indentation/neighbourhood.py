@@ -20,8 +20,8 @@ from ..mesh import Mesh
 
 # Of the cut, what lies this straight below the indenter is held, for deep tissue hangs on bone; the sides may
 # move. Held or free altogether, the factor to the whole force would be 0.69 or 2.3 (docs/convergence.md).
-_BELOW = np.cos(np.radians(32.0))
-_TRUSTED = 0.6  # share of the radius within which the part's displacements are those of the whole
+_MIN_COSINE_BELOW = np.cos(np.radians(32.0))
+_TRUSTED_SHARE = 0.6  # share of the radius within which the part's displacements are those of the whole
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def cut_neighbourhood(mesh: Mesh, centre: Array, radius_mm: float) -> Neighbourh
 def find_fixed_cut_nodes(part: Neighbourhood, centre: Array, axis: Array) -> Indices:
     """Nodes of the cut to be held: those below the indenter, which advances along ``axis``."""
     offset = part.mesh.points[part.cut] - centre
-    return part.cut[offset @ axis > _BELOW * np.linalg.norm(offset, axis=1)]
+    return part.cut[offset @ axis > _MIN_COSINE_BELOW * np.linalg.norm(offset, axis=1)]
 
 
 class Extension:
@@ -80,7 +80,7 @@ class Extension:
     def __init__(self, system: System, part: Neighbourhood, centre: Array, radius_mm: float) -> None:
         self._system, self._part = system, part
         held = np.zeros(len(system.points), dtype=bool)
-        held[part.nodes] = np.linalg.norm(part.mesh.points - centre, axis=1) < _TRUSTED * radius_mm
+        held[part.nodes] = np.linalg.norm(part.mesh.points - centre, axis=1) < _TRUSTED_SHARE * radius_mm
         given = np.repeat(held, 3)[system.free]
         self._given, self._rest = np.flatnonzero(given), np.flatnonzero(~given)
         self._solver = None

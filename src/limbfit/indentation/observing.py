@@ -25,7 +25,7 @@ from .waves import WavePlace, compute_wave_speeds, to_vector3
 
 OFF_SKIN_MM = 5.0  # a point farther from the skin than this is not on it
 RINGS_MM, DIRECTIONS = (3.0, 8.0, 15.0), 8
-MOST_ASIDE = 0.25  # of a ring's radius: where the skin ends its nearest point is elsewhere
+MAX_OFFSET_SHARE = 0.25  # of a ring's radius: where the skin ends its nearest point is elsewhere
 
 
 def _build_layer_gauges(model: SiteModel, mesh: Mesh) -> tuple[Gauge, ...]:
@@ -72,7 +72,7 @@ def choose_points_around(mesh: Mesh, indenter: Indenter) -> Array:
     flat = np.stack([np.outer(radii, np.cos(turns)), np.outer(radii, np.sin(turns))], axis=-1).reshape(-1, 2)
     found = find_skin_points(mesh, np.asarray(indenter.centre) + flat @ indenter.frame[:2])
     local = (found.points - indenter.centre) @ indenter.frame.T
-    there = np.linalg.norm(local[:, :2] - flat, axis=1) < MOST_ASIDE * np.linalg.norm(flat, axis=1)
+    there = np.linalg.norm(local[:, :2] - flat, axis=1) < MAX_OFFSET_SHARE * np.linalg.norm(flat, axis=1)
     return found.points[there]
 
 

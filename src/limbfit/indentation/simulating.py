@@ -90,14 +90,14 @@ class Simulation:
 
 # Nodes of the sites that a process keeps, four of the largest usual ones, and the bytes that each costs;
 # processes on all cores keep no more than a share of the machine's memory.
-_KEPT_NODES, _BYTES, _SHARE = 200_000, 25_000, 0.5
+_MAX_NODES, _BYTES_PER_NODE, _MEMORY_SHARE = 200_000, 25_000, 0.5
 # The tissue that sets a site's contact penalty, whatever law the site's own have.
-_REFERENCE = {"c_kPa": 5.0, "m": 5.0, "gamma": 1.0, "tau_s": 1.0}
+_REFERENCE_TISSUE = {"c_kPa": 5.0, "m": 5.0, "gamma": 1.0, "tau_s": 1.0}
 # To the deepest point; from the indenter's edge.  With 4 steps and 20 mm more the penalty of the demo's six
 # sites is the same within 0.3 %, for twice the time.
-_REFERENCE_STEPS, _REFERENCE_MM = 3, 35.0
+_REFERENCE_STEPS, _REFERENCE_RADIUS_MM = 3, 35.0
 # Of the penetration that is allowed: three of 24 tissues drawn over the bounds then go beyond it.
-_MARGIN = 0.5
+_PENETRATION_MARGIN = 0.5
 
 
 @dataclass
@@ -131,12 +131,12 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
         control = build_steps(model)
         penalty, system = control.penalty, System(problem, control.threads)
         if penalty is None:
-            within = _REFERENCE_MM + model.indenter.width_mm / 2.0
+            within = _REFERENCE_RADIUS_MM + model.indenter.width_mm / 2.0
             if model.within_mm is not None:
                 within = min(within, model.within_mm)
             # Under a stated force too it is driven by its displacement; nothing else moves the limb.
             near = replace(model.bare, knots_N=(), within_mm=within)
-            allowed = _MARGIN * control.penetration
+            allowed = _PENETRATION_MARGIN * control.penetration
             yielding = _estimate_yielding(near, tissues, key[-1])
             penalty = max(yielding / allowed, 2000.0 / model.indenter.width_mm)
         known = _prepared[key] = Prepared(problem, system, penalty)
@@ -148,12 +148,13 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
 
 
 def _build_reference_problem(model: SiteModel, tissues: tuple[str, ...]) -> Problem:
-    return build_problem(replace(model, law=OGDEN), read_vtu(model.mesh), dict.fromkeys(tissues, _REFERENCE))
+    parameters = dict.fromkeys(tissues, _REFERENCE_TISSUE)
+    return build_problem(replace(model, law=OGDEN), read_vtu(model.mesh), parameters)
 
 
 def count_stored_nodes(memory: float, cores: int) -> int:
     """Nodes of the sites that a process keeps on a machine with so many bytes and cores."""
-    return min(_KEPT_NODES, int(_SHARE * memory / (cores * _BYTES)))
+    return min(_MAX_NODES, int(_MEMORY_SHARE * memory / (cores * _BYTES_PER_NODE)))
 
 
 @lru_cache(maxsize=64)

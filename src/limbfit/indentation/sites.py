@@ -44,7 +44,7 @@ from .waves import WavePlace
 RISE_S, REST_S = 2.0, 5.0  # muscle tenses, and rests tensed, before the indenter touches
 # Of the solver's tolerance: it is one of the reactions of all pins, of which the test pin's is a small part.
 CLAMPED_TOLERANCE_SHARE = 0.1
-ROUGHLY = 3.0  # a percent of penetration costs half a percent of force (docs/contact.md)
+PENETRATION_FACTOR = 3.0  # a percent of penetration costs half a percent of force (docs/contact.md)
 
 
 @dataclass(frozen=True)
@@ -267,13 +267,13 @@ def _read_stl(file: Path) -> tuple[Array, Indices]:
 def build_steps(model: SiteModel) -> StepControl:
     """How the solver steps through a site's history, before it adapts.
 
-    On a part of its mesh the indenter may sink in `ROUGHLY` times as far: its forces are corrected by those
-    of the whole.
+    On a part of its mesh the indenter may sink in `PENETRATION_FACTOR` times as far: its forces are corrected
+    by those of the whole.
     """
     table = model.steps
     control = StepControl(load_steps=table.load_steps, unload_steps=table.unload_steps)
     if model.within_mm is not None:
-        control = replace(control, penetration=ROUGHLY * control.penetration)
+        control = replace(control, penetration=PENETRATION_FACTOR * control.penetration)
     if model.clamps is not None:
         control = replace(control, tolerance=CLAMPED_TOLERANCE_SHARE * control.tolerance)
     if table.penalty_per_mm is None:

@@ -39,8 +39,8 @@ DISC_RADIUS_MM, DISC_HALF_MM = 2.0, 1.0
 _RINGS, _LAYERS = 2, 4
 _ON_TISSUE_MM = 0.1  # a point of the disc may be moved by so much into the tissue
 OFF_TISSUE_MM = 3.0  # farther from a tissue than that a place is not in it
-_STEP = 1e-4  # of a parameter
-_LEAST = 1e-12  # MPa: a tissue that carries no wave
+_DERIVATIVE_STEP = 1e-4  # of a parameter
+_MIN_MODULUS = 1e-12  # MPa: a tissue that carries no wave
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class _Regions:
             tension = np.einsum("mr,mr->m", _build_contraction(N, N), stress)
             values = (stiffness + tension) / np.linalg.det(F)
             found.append(np.bincount(self.place, values) / np.bincount(self.place))
-        return 1e3 * np.sqrt(np.maximum(np.array(found).T, _LEAST) / DENSITY)
+        return 1e3 * np.sqrt(np.maximum(np.array(found).T, _MIN_MODULUS) / DENSITY)
 
 
 def _build_contraction(a: Array, b: Array) -> Array:
@@ -186,7 +186,7 @@ def compute_wave_speeds(result: Result, places: Sequence[WavePlace]) -> tuple[Ar
     for p, ((region, name), value) in enumerate(
         zip(problem.parameter_names, problem.parameters, strict=True)
     ):
-        step = _STEP * (abs(value) or 1.0)
+        step = _DERIVATIVE_STEP * (abs(value) or 1.0)
         own = problem.materials[region]
         less, more = (
             after({**problem.materials, region: own.with_parameters({name: value + change})}, p, change)

@@ -173,13 +173,13 @@ class _Model:
     def __call__(self, parameters: Array) -> list[SiteResponse]:
         self.calls += 1
         values = dict(zip(self.names, parameters, strict=True))
-        answers = [self._one(k, values) for k in range(len(self.problems))]
+        answers = [self._simulate(k, values) for k in range(len(self.problems))]
         if self.listener is not None:
             values_text = ", ".join(f"{name} {value:.4g}" for name, value in values.items())
             self.listener(f"simulation {self.calls}: {values_text}")
         return answers
 
-    def _one(self, number: int, values: Mapping[str, float]) -> SiteResponse:
+    def _simulate(self, number: int, values: Mapping[str, float]) -> SiteResponse:
         problem, (times, _) = with_parameters(self.problems[number], values), self.curves[number]
         result = simulate(problem, self.steps[number], sensitivities=True, system=self.systems[number])
         if not self.steps[number].hold_penalty and result.completed:

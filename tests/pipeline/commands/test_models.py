@@ -15,7 +15,7 @@ from limbfit.identify.uncertainty.model_comparison import compute_mixture_interv
 from limbfit.laws import FUNG, LAWS
 from limbfit.pipeline.commands.models import (
     MODELS,
-    OWN,
+    OWN_MODEL,
     _mix_predictions,
     _mix_pressures,
     _share_stages,
@@ -155,7 +155,7 @@ def test_the_interval_of_a_mixture_holds_95_percent_of_it():
         ]
         np.testing.assert_allclose(below, [0.025, 0.975], atol=1e-9)
     assert (low[1], high[1]) == pytest.approx(norm.interval(0.95, 1.0, 2.0))
-    assert OWN not in MODELS
+    assert OWN_MODEL not in MODELS
 
 
 STORED = Path(__file__).parents[2] / "results" / "stored"  # of real runs
@@ -193,7 +193,10 @@ def test_pressures_of_models_are_mixed_and_read_back(tmp_path):
     region, mixed = own.donning.regions[0], loads[0].regions[0]
     assert mixed.mean_kPa == [region.mean_kPa] * 2
     assert mixed.interval_kPa == pytest.approx(region.interval_kPa or 2 * (region.mean_kPa,), abs=1e-6)
-    weights = [ModelWeight(model=OWN, words="", weight=0.3), ModelWeight(model=FUNG, words="", weight=0.7)]
+    weights = [
+        ModelWeight(model=OWN_MODEL, words="", weight=0.3),
+        ModelWeight(model=FUNG, words="", weight=0.7),
+    ]
     content = SocketOfModels(models=weights, loads=loads)
     (tmp_path / "models").mkdir()
     write_result(tmp_path / SocketOfModels.FILE, content)

@@ -12,7 +12,7 @@ from layered import build_block_site, layered_block
 from limbfit.bench.blocks import SPEED
 from limbfit.errors import StudyError
 from limbfit.indentation import SimulationJob, simulate
-from limbfit.indentation.sites import ROUGHLY
+from limbfit.indentation.sites import PENETRATION_FACTOR
 from limbfit.pipeline.engine.provenance import record_settings
 from limbfit.pipeline.identification.problem import is_moved
 from limbfit.pipeline.limb.mesh import build_coarse_settings, mesh_settings
@@ -156,6 +156,6 @@ def test_contact_is_as_stiff_as_the_site_needs(tmp_path: Path) -> None:
         assert "sunk" not in [doubt.kind for doubt in found[name].doubts]
     own, rough = (found[name].facts["penalty_per_mm"] for name in ("whole", "part"))
     assert own > 100.0  # 2000 over the width of 20 mm: thin tissue needs more
-    assert max(100.0, own / ROUGHLY) == pytest.approx(rough)
+    assert max(100.0, own / PENETRATION_FACTOR) == pytest.approx(rough)
     assert found["whole"].penetration_mm == pytest.approx(0.005 * depth, rel=0.15)
     assert found["part"].force_N == pytest.approx(found["whole"].force_N, rel=0.03)

@@ -125,7 +125,7 @@ def acquire_site(
         "refused": asdict(device.refused),
         "depth_mm": (ending.depth_um - ending.touch_um) / 1000 if ending.is_completed else None,
     }
-    return found | _keep(study, one, folder, ending.is_completed)
+    return found | _store_ramps(study, one, folder, ending.is_completed)
 
 
 def check_recording(
@@ -219,7 +219,7 @@ def build_device_settings(
     return settings.model_copy(update={"search_depth_mm": depth_mm})
 
 
-def _keep(study: Study, one: Indentation, folder: Path, completed: bool) -> dict[str, Any]:
+def _store_ramps(study: Study, one: Indentation, folder: Path, completed: bool) -> dict[str, Any]:
     """Verdict and ramps beside the record; the first ramp that counts into the study."""
     files: dict[str, Any] = {"record": str(folder / RECORD), "trace": None}
     if not completed:

@@ -18,7 +18,7 @@ from .run import run_study
 
 # A site of the paper's kind, of 20,922 nodes, and how often the paper's search improved its parameters.
 FEBIO_CASE, FEBIO_ITERATIONS = "residuum/posterior_tet10", 10
-_AFRESH = ("calibrate", "predict", "report")
+_STAGES_DONE_ANEW = ("calibrate", "predict", "report")
 
 
 def bench_calibrate(
@@ -88,4 +88,4 @@ def _select_left_out(folder: str, names: list[str]) -> set[str]:
     """Results that stand on the meshes, locks and unfinished work."""
     if Path(folder).name != "results":
         return set()
-    return {name for name in names if name in _AFRESH or name.startswith(".")}
+    return {name for name in names if name in _STAGES_DONE_ANEW or name.startswith(".")}

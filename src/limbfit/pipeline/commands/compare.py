@@ -22,7 +22,7 @@ from ..engine.context import Listener, ignore_progress
 from ..engine.storage import write_curves, write_result
 from .simulate import PreparedIndentation, prepare_site, run_febio_site
 
-FREE = 1.0  # penetration over the depth: FEBio's punch sinks in as far as its penalty lets it
+MAX_PENETRATION = 1.0  # penetration over the depth: FEBio's punch sinks in as far as its penalty lets it
 
 
 def compare_site(
@@ -130,10 +130,11 @@ def _solve_matched(prepared: PreparedIndentation, problem: Problem, other: Resul
         times = schedule_steps(problem.history, settings.steps)
     contact = febio.build_contact(problem, settings)
     penalty = febio.compute_mean_penalty(contact, problem, float(times[0]))
-    steps = replace(settings.steps, times=tuple(times), penalty=penalty, penetration=FREE, stress="linear")
+    control = replace(settings.steps, times=tuple(times), stress="linear")
+    control = replace(control, penalty=penalty, penetration=MAX_PENETRATION)
     system = System(problem)
     weights = febio.FacePenalties(system, (contact,) * len(problem.rigid_bodies), times)
-    return solve(problem, steps, store="none", on_step=weights.update_after, system=system)
+    return solve(problem, control, store="none", on_step=weights.update_after, system=system)
 
 
 def _select_common_times(other: Result, mine: Result) -> Array:

@@ -36,7 +36,7 @@ from .fitting import fit_socket
 from .run import compute_keys, run_study
 
 FOLDER = "models"
-OWN = "the study's own"
+OWN_MODEL = "the study's own"
 TWO_TERMS = "ogden-prony2"
 _LAYER_MM, _MIN_LAYER_MM, _FRICTION = 1.0, 0.5, 0.4
 MIN_SOCKET_WEIGHT = 0.01  # of a model whose socket is simulated
@@ -259,7 +259,7 @@ def _mix_predictions(
     study: Study, derived: Mapping[str, Study], left_out: Mapping[str, str]
 ) -> stored.ModelsResult:
     """Weights of the models, and for each record the interval of the study's own and of all."""
-    stores = {OWN: Store(study.results), **{name: Store(one.results) for name, one in derived.items()}}
+    stores = {OWN_MODEL: Store(study.results), **{name: Store(one.results) for name, one in derived.items()}}
     calibrations = [store.results.calibration for store in stores.values()]
     evidence = [one.uncertainty.minus_2_log_evidence for one in calibrations]
     weights = weigh_models(evidence)
@@ -298,7 +298,7 @@ def _mix_record(
     head = next(key for key in curves[0] if "_measured_" in key)
     name, unit = head.split("_measured_")
     measured = curves[0][head]
-    by_model = {f"{name}_{'own' if key == OWN else key}_{unit}": one for key, one in zip(stores, means)}
+    by_model = {f"{name}_{'own' if key == OWN_MODEL else key}_{unit}": one for key, one in zip(stores, means)}
     band = {f"{name}_low_{unit}": mixed[0], f"{name}_high_{unit}": mixed[1]}
     times = {"time_s": curves[0]["time_s"]}
     write_curves(folder / f"{row.record}.csv", **times, **{head: measured}, **band, **by_model)
@@ -336,13 +336,13 @@ def fit_socket_of_models(study: Study, *, listener: Listener = ignore_progress) 
         raise InputError(
             "no other models were compared", file=study.file, remedy="limbfit uncertainty --models all"
         )
-    names = [one.model for one in compared.models if one.model != OWN]
+    names = [one.model for one in compared.models if one.model != OWN_MODEL]
     compare_models(study, names, listener=listener)  # anew where the study has changed
     compared = stored.ModelsResult.read(study.results)
     chosen = [one for one in compared.models if one.weight >= MIN_SOCKET_WEIGHT]
     sockets = []
     for one in chosen:
-        of_model = study if one.model == OWN else load_study(study.results / FOLDER / one.model)
+        of_model = study if one.model == OWN_MODEL else load_study(study.results / FOLDER / one.model)
         fit_socket(of_model, listener=_name_model(listener, f"socket, {one.words}"))
         sockets.append(SocketResult.read(of_model.results))
     weights = np.array([one.weight for one in chosen])

@@ -23,7 +23,7 @@ from .simulate import choose_parameters
 
 _SENSOR_N, _MISFIT = 0.05, 0.02  # where no calibration tells: noise, and the model's error over the peak
 _HOLD_S = 30.0
-_FASTER = 5.0  # the second speed that a protocol may have, over the first
+_SPEED_FACTOR = 5.0  # the second speed that a protocol may have, over the first
 _CORRELATION = 0.95  # of the model's error between neighbouring points of comparison
 
 
@@ -168,7 +168,7 @@ def _choose_speeds(study: Study, loads: Iterable[LoadHistory], depths_mm: Sequen
         stated += [facts.depth_mm for facts in store.results.traces.sites.values()]
     deepest = max(depths_mm or stated, default=0.0)
     fast = max((deepest / one.ramp_s for one in loads), default=0.0)
-    return [slow, min(max(_FASTER * slow, fast), limit)]
+    return [slow, min(max(_SPEED_FACTOR * slow, fast), limit)]
 
 
 def _read_socket_pressures(study: Study) -> dict[str, list[float]]:

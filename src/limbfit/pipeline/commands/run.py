@@ -256,7 +256,7 @@ def select_stages_to_redo(
 
 
 _KINDS = (bool, Real, str, Mapping, Collection)  # of options: a switch is no number, a text no list
-_FIGURES = ("mean_error_fitted_percent", "mean_error_heldout_percent", "report")
+_BATCH_KEYS = ("mean_error_fitted_percent", "mean_error_heldout_percent", "report")
 
 
 def run_batch(
@@ -295,7 +295,7 @@ def run_batch(
             row: dict[str, Any] = {"study": str(path), "state": "done", "error": None}
             try:
                 summary = run_study(load_study(path), until=until, listener=listener)
-                row |= {key: summary.get(key) for key in _FIGURES}
+                row |= {key: summary.get(key) for key in _BATCH_KEYS}
             except LimbfitError as error:
                 row |= {"state": "failed", "error": str(error)}
             except Exception as error:  # one study's bad luck must not cost the others

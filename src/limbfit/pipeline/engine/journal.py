@@ -22,7 +22,7 @@ from .context import Listener, Progress
 from .store import translate_disk_errors
 
 FOLDER = "log"
-KEPT = 50  # logs of a study; older ones go
+MAX_LOGS = 50  # logs of a study; older ones go
 _PATH = re.compile(r"(?<![\w.<])(?:[A-Za-z]:)?[/\\](?!\s)(?:[^/\\:;,'\"]+[/\\])+[^\s:;,'\"]*")
 
 
@@ -32,7 +32,7 @@ def write_journal(study: Study, what: str, listener: Listener) -> Iterator[Liste
     folder, start = study.results / FOLDER, perf_counter()
     with translate_disk_errors(study.results):
         folder.mkdir(parents=True, exist_ok=True)
-        for old in sorted(folder.glob("*.jsonl"))[: -KEPT + 1]:
+        for old in sorted(folder.glob("*.jsonl"))[: -MAX_LOGS + 1]:
             old.unlink()
         file = folder / f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}.jsonl"
         stream = file.open("x", encoding="utf-8")

@@ -16,7 +16,7 @@ from ...study import Study
 from .digests import code_parts, compute_digest, compute_file_digest
 from .provenance import list_input_files
 
-_FEW = 4  # causes of one kind that are named
+_MAX_NAMED = 4  # causes of one kind that are named
 _BY_NAME = ("indenters.", "material.", "calibration.prior.")  # tables of which the order says nothing
 
 
@@ -128,7 +128,8 @@ def describe_causes(before: StageParts | None, now: StageParts) -> list[str]:
 
 
 def _list_few(names: list[str]) -> str:
-    return ", ".join(names[:_FEW]) + (f" and {len(names) - _FEW} more" if len(names) > _FEW else "")
+    more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
+    return ", ".join(names[:_MAX_NAMED]) + more
 
 
 def _find_different(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

@@ -27,7 +27,7 @@ from .storage import DRAFT, read_json, write_json, write_result
 
 STAMP = "stage.json"
 LOCK, HOLDER = ".lock", ".holder"
-_PATIENCE_S = 0.5  # for one who only asks whether a study is held
+_LOCK_TIMEOUT_S = 0.5  # for one who only asks whether a study is held
 RUNS = "runs"  # a stage's kept simulations
 COARSE = "coarse"  # folder of the coarse meshes, in that of the mesh stage
 EARLIER = ".earlier"  # those of attempts with other inputs, while the stage is not complete
@@ -194,7 +194,7 @@ def lock(folder: Path) -> Iterator[None]:
     """
     if folder.is_symlink():
         raise RunError(f"{folder}: is a link, and nothing outside the study is written; make it a folder")
-    own = FileLock(folder / LOCK, timeout=_PATIENCE_S)
+    own = FileLock(folder / LOCK, timeout=_LOCK_TIMEOUT_S)
     with translate_disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try:

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 # one direction there, so a difference tells how large the error may be and nothing can be extrapolated.
 MESH_ORDERS: Mapping[str, float | None] = {"tet4": 1.3, "tet10": 1.0, "tet10p0": None}
 MEASURED_ORDERS = (0.3, 6.0)  # in which an order that three meshes show is believed
-_MOST = 5.0  # times a difference: two edges that are nearly the same tell no limit
+_MAX_ERROR_FACTOR = 5.0  # times a difference: two edges that are nearly the same tell no limit
 
 
 def estimate_coarse_error(order: float | None, ratio: float) -> float:
@@ -20,12 +20,12 @@ def estimate_coarse_error(order: float | None, ratio: float) -> float:
 
     ``limit - coarser`` is this times ``finer - coarser``; where there is no order, the difference itself.
     """
-    return 1.0 if order is None else min(1.0 / (1.0 - ratio**-order), _MOST)
+    return 1.0 if order is None else min(1.0 / (1.0 - ratio**-order), _MAX_ERROR_FACTOR)
 
 
 def estimate_fine_error(order: float | None, ratio: float) -> float:
     """The same of the finer of the two."""
-    return 1.0 if order is None else min(1.0 / max(ratio**order - 1.0, 1e-9), _MOST)
+    return 1.0 if order is None else min(1.0 / max(ratio**order - 1.0, 1e-9), _MAX_ERROR_FACTOR)
 
 
 @dataclass(frozen=True)
