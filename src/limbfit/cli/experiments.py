@@ -302,6 +302,11 @@ def show_crossvalidation(found: CrossvalidateResult) -> None:
         print_line(f"the emulator at {len(checks)} of the fits, against the solver: within {largest:.2f} %")
 
 
+def _session_option(help: str, **limits: float) -> Any:
+    """An option of ``design --protocol``; None where it is not given."""
+    return typer.Option(help=f"with --protocol: {help}", **limits)
+
+
 def design(
     study: StudyPath,
     sites: Annotated[
@@ -316,44 +321,32 @@ def design(
         bool, typer.Option("--protocol", help="choose the records of a whole session instead")
     ] = False,
     minutes: Annotated[
-        float | None, typer.Option(help="with --protocol: length of the session, min; default: 25", min=1)
+        float | None, _session_option("length of the session, min; default: 25", min=1)
     ] = None,
     speeds: Annotated[
-        str | None,
-        typer.Option(help="with --protocol: speeds in mm/s; default: the study's and five times it"),
+        str | None, _session_option("speeds in mm/s; default: the study's and five times it")
     ] = None,
     holds: Annotated[
         str | None,
-        typer.Option(
-            help="with --protocol: holds in s, 0 for none; default: 0,30, for a socket as long as its loads"
-        ),
+        _session_option("holds in s, 0 for none; default: 0,30, for a socket as long as its loads"),
     ] = None,
     determine: Annotated[
         str | None,
-        typer.Option(
-            help="with --protocol: parameters such as muscle.c_kPa, or socket (pressures); default: all"
-        ),
+        _session_option("parameters such as muscle.c_kPa, or socket (pressures); default: all"),
     ] = None,
     criterion: Annotated[
-        Literal["D", "A"] | None, typer.Option(help="with --protocol: D or A; default: D, for a socket A")
+        Literal["D", "A"] | None, _session_option("D or A; default: D, for a socket A")
     ] = None,
-    draws: Annotated[
-        int | None, typer.Option(help="with --protocol: how many tissues; default: 3", min=1, max=64)
-    ] = None,
+    draws: Annotated[int | None, _session_option("how many tissues; default: 3", min=1, max=64)] = None,
     ultrasound: Annotated[
-        float | None,
-        typer.Option(help="with --protocol: ultrasound reads thicknesses with this deviation, mm", min=1e-3),
+        float | None, _session_option("ultrasound reads thicknesses with this deviation, mm", min=1e-3)
     ] = None,
     surface: Annotated[
-        float | None,
-        typer.Option(help="with --protocol: cameras read the skin with this deviation, mm", min=1e-3),
+        float | None, _session_option("cameras read the skin with this deviation, mm", min=1e-3)
     ] = None,
     shear_waves: Annotated[
         float | None,
-        typer.Option(
-            help="with --protocol: elastography reads shear-wave speeds with this deviation, m/s",
-            min=1e-3,
-        ),
+        _session_option("elastography reads shear-wave speeds with this deviation, m/s", min=1e-3),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
