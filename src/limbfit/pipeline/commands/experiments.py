@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from inspect import Parameter, signature
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,23 @@ class Experiment(Stage):
             stated = signature(self.run).parameters.values()
             defaults = {one.name: one.default for one in stated if one.default is not Parameter.empty}
             object.__setattr__(self, "options", defaults)
+
+    def check_options(self, given: Mapping[str, Any]) -> None:
+        """Refuse options that the experiment does not have, or of another kind than their default."""
+        unknown = ", ".join(sorted(given.keys() - self.options.keys()))
+        if unknown:
+            raise InputError(f"{self.name} has no option {unknown}")
+        for option, value in given.items():
+            default = self.options[option]
+            if value is not None and _find_kind(default) not in (None, _find_kind(value)):
+                what = f"option {option} of {self.name} cannot be {value!r}"
+                raise InputError(what, remedy=f"its default is {default!r}")
+
+
+def _find_kind(value: Any) -> type | None:
+    """Which kind of option a value is; None for no kind."""
+    kinds = (bool, Real, str, Mapping, Collection)  # a switch is no number, a text no list
+    return next((kind for kind in kinds if isinstance(value, kind)), None)
 
 
 IDENTIFIED = "identified"  # where parameters are from

@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
-from numbers import Real
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -255,7 +254,6 @@ def select_stages_to_redo(
     return {*force, *(names[names.index(start) :] if start is not None else ())}
 
 
-_KINDS = (bool, Real, str, Mapping, Collection)  # of options: a switch is no number, a text no list
 _BATCH_KEYS = ("mean_error_fitted_percent", "mean_error_heldout_percent", "report")
 
 
@@ -333,14 +331,7 @@ def run_experiment(
     experiment = EXPERIMENTS[name]
     if name in _FOLDERS:
         raise InputError(f"results/{name} is not for an experiment", remedy="give it another name")
-    unknown = ", ".join(sorted(set(options) - set(experiment.options)))
-    if unknown:
-        raise InputError(f"{name} has no option {unknown}")
-    for option, value in options.items():
-        default = experiment.options[option]
-        if value is not None and _find_kind(default) not in (-1, _find_kind(value)):
-            what = f"option {option} of {name} cannot be {value!r}"
-            raise InputError(what, remedy=f"its default is {default!r}")
+    experiment.check_options(options)
     # As its stamp will hold them: a notebook's numbers and arrays may be those of NumPy.
     chosen = json.loads(json.dumps({**experiment.options, **options}, default=to_plain))
     check_experiment(experiment, study, None, chosen)
@@ -362,11 +353,6 @@ def run_experiment(
             _do(context, experiment, key, chosen)
         folder = context.store[name]
     return read_json(folder / f"{name}.json") | {"folder": str(folder)}
-
-
-def _find_kind(value: Any) -> int:
-    """Which of `_KINDS` the value of an option is; -1 for none of them."""
-    return next((i for i, kind in enumerate(_KINDS) if isinstance(value, kind)), -1)
 
 
 @contextmanager
