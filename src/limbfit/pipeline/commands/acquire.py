@@ -78,24 +78,7 @@ def acquire_site(
     )
     device = acquire.LineDevice(acquire.connect(address))
     try:
-        with translate_disk_errors(study.folder):
-            stamp = f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"[:-3]
-            folder = study.folder / FOLDER / one.name / stamp
-            folder.mkdir(parents=True)
-            identity = asdict(device.identity)
-            del identity["nonce"]
-            head = {
-                "site": one.site.name,
-                "record": one.name,
-                "indenter": one.indenter,
-                "begun": datetime.now(UTC).isoformat(timespec="milliseconds"),
-                "limbfit": __version__,
-                "unattended": operator is None,
-                "priority": acquire.prioritise(),
-                "device": identity,
-                "settings": settings.model_dump(),
-            }
-            recorder = acquire.Recorder(folder / RECORD, head)
+        folder, recorder = _begin_record(study, one, device, settings, unattended=operator is None)
     except BaseException:
         device.close()
         raise
@@ -126,6 +109,30 @@ def acquire_site(
         "depth_mm": (ending.depth_um - ending.touch_um) / 1000 if ending.is_completed else None,
     }
     return found | _store_ramps(study, one, folder, ending.is_completed)
+
+
+def _begin_record(
+    study: Study, one: Indentation, device: acquire.LineDevice, settings: acquire.Settings, unattended: bool
+) -> tuple[Path, acquire.Recorder]:
+    """A new folder of the indentation, and in it the record with how it is made as its head."""
+    with translate_disk_errors(study.folder):
+        stamp = f"{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"[:-3]
+        folder = study.folder / FOLDER / one.name / stamp
+        folder.mkdir(parents=True)
+        identity = asdict(device.identity)
+        del identity["nonce"]
+        head = {
+            "site": one.site.name,
+            "record": one.name,
+            "indenter": one.indenter,
+            "begun": datetime.now(UTC).isoformat(timespec="milliseconds"),
+            "limbfit": __version__,
+            "unattended": unattended,
+            "priority": acquire.prioritise(),
+            "device": identity,
+            "settings": settings.model_dump(),
+        }
+        return folder, acquire.Recorder(folder / RECORD, head)
 
 
 def check_recording(
