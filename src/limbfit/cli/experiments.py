@@ -302,7 +302,7 @@ def show_crossvalidation(found: CrossvalidateResult) -> None:
         print_line(f"the emulator at {len(checks)} of the fits, against the solver: within {largest:.2f} %")
 
 
-def _session_option(help: str, **limits: float) -> Any:
+def _session_option(help: str, **limits: Any) -> Any:
     """An option of ``design --protocol``; None where it is not given."""
     return typer.Option(help=f"with --protocol: {help}", **limits)
 

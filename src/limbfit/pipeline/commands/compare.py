@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,52 +54,43 @@ def compare_site(
     if study.indentation(name).forced:
         what = f"{name}: a force drives the indenter, and there is none to be compared"
         raise InputError(what, file=study.file, remedy="compare limbfit simulate --solver limbfit and febio")
-    program = febio.find_febio(study.febio.program, study.folder) if febio_log is None else None
-    log = None if febio_log is None else febio.read_log(febio_log)
+    source: Path | febio.FebioLog
+    if febio_log is None:
+        source = febio.find_febio(study.febio.program, study.folder)
+    else:
+        source = febio.read_log(febio_log)
     prepared = prepare_site(study, name, parameters=parameters, listener=listener)
     folder, name = prepared.context.store["compare"], prepared.model.name
     folder.mkdir(parents=True, exist_ok=True)
     problem = prepared.build_problem()
     prepared.context.tell("compare", 0, 3, f"site {name}: FEBio")
-    if program is not None:
-        other, _ = run_febio_site(prepared, program, folder / f"{name}.febio")
-    else:
-        assert febio_log is not None
-        assert log is not None
-        other = _build_logged_result(problem, log, febio_log)
+    with add_location(file=febio_log):
+        by_febio = _solve_by_febio(prepared, problem, source, folder / f"{name}.febio")
     prepared.context.tell("compare", 1, 3, f"site {name}: limbfit")
-    first = build_first_steps(prepared.model, prepared.study.tissues)
-    runs = {"limbfit": solve(problem, first, store="none")}  # as `limbfit simulate` does
-    runs["limbfit_matched"] = _solve_matched(prepared, problem, other)
+    steps = build_first_steps(prepared.model, prepared.study.tissues)
+    runs = {
+        "limbfit": solve(problem, steps, store="none"),  # as `limbfit simulate` does
+        "limbfit_matched": _solve_matched(prepared, problem, by_febio),
+    }
     prepared.context.tell("compare", 3, 3, f"site {name}")
     files = CurveFiles(csv=str(folder / f"{name}.csv"), png=str(folder / f"{name}.png"))
-    times = _select_common_times(other, min(runs.values(), key=lambda run: run.times[-1]))
-    curves = {key: run.force_at(times) for key, run in runs.items()}
-    febio_N = other.force[: len(times)]
-    write_curves(
-        Path(files.csv),
-        time_s=times,
-        displacement_mm=other.displacement[: len(times)],
-        febio_N=febio_N,
-        **{f"{key}_N": force for key, force in curves.items()},
-    )
-    _draw(Path(files.png), name, times, febio_N, curves)
+    _store_curves(name, by_febio, runs, files)
     content = CompareResult(
         site=name,
         parameters=prepared.parameters,
         parameters_from=prepared.origin,
-        element=other.statistics["element"],
+        element=by_febio.statistics["element"],
         unknowns=runs["limbfit"].statistics["unknowns"],
         febio=FebioSimulation(
-            **_summarise_solver(other),
-            version=other.statistics["linear_solver"],
+            **_summarise_solver(by_febio),
+            version=by_febio.statistics["linear_solver"],
             penalty=prepared.study.febio.penalty,
         ),
         **{
             key: LimbfitSimulation(
                 **_summarise_solver(run),
                 penetration_mm=float(run.penetration.max(initial=0.0)),
-                difference=difference(other, run),
+                difference=compute_difference(by_febio, run),
             )
             for key, run in runs.items()
         },
@@ -109,23 +101,30 @@ def compare_site(
     return content.to_plain()
 
 
-def _build_logged_result(problem: Problem, log: febio.FebioLog, file: str | Path) -> Result:
-    """FEBio's result from the table in a ``file``; partial where that ends before the problem does."""
-    reached, end = float(log.times[-1]), febio.compute_end_time(problem)
+def _solve_by_febio(
+    prepared: PreparedIndentation, problem: Problem, source: Path | febio.FebioLog, folder: Path
+) -> Result:
+    """FEBio's result: of its program, run in a ``folder``, or of a table that it wrote.
+
+    It is partial where the table ends before the problem does.
+    """
+    if isinstance(source, Path):
+        result, _ = run_febio_site(prepared, source, folder)
+        return result
+    reached, end = float(source.times[-1]), febio.compute_end_time(problem)
     complete = reached > end * (1.0 - febio.TIME_TOLERANCE)
     reason = "" if complete else f"the table ends at {reached:.4g} s of {end:.4g} s"
     verdict = febio.RunVerdict("normal" if complete else "partial", reason, reached, "")
-    with add_location(file=file):
-        return febio.build_result(problem, log, verdict)
+    return febio.build_result(problem, source, verdict)
 
 
-def _solve_matched(prepared: PreparedIndentation, problem: Problem, other: Result) -> Result:
+def _solve_matched(prepared: PreparedIndentation, problem: Problem, by_febio: Result) -> Result:
     """limbfit with FEBio's steps, its course of the stress in them and its contact penalty."""
     name = prepared.model.name
     prepared.context.tell("compare", 2, 3, f"site {name}: limbfit with FEBio's contact and steps")
     settings = prepared.build_feb_settings("")
     end = float(problem.history.times[-1])
-    times = np.minimum(other.times[1:], end)  # a table has nine digits
+    times = np.minimum(by_febio.times[1:], end)  # a table has nine digits
     if not len(times):  # FEBio got nowhere: all the way then
         times = schedule_steps(problem.history, settings.steps)
     contact = febio.build_contact(problem, settings)
@@ -137,22 +136,38 @@ def _solve_matched(prepared: PreparedIndentation, problem: Problem, other: Resul
     return solve(problem, control, store="none", on_step=weights.update_after, system=system)
 
 
-def _select_common_times(other: Result, mine: Result) -> Array:
+def _store_curves(name: str, by_febio: Result, runs: Mapping[str, Result], files: CurveFiles) -> None:
+    """All curves as a table and a picture, as far as every simulation went."""
+    times = _select_common_times(by_febio, min(runs.values(), key=lambda run: run.times[-1]))
+    curves = {key: run.force_at(times) for key, run in runs.items()}
+    febio_N = by_febio.force[: len(times)]
+    write_curves(
+        Path(files.csv),
+        time_s=times,
+        displacement_mm=by_febio.displacement[: len(times)],
+        febio_N=febio_N,
+        **{f"{key}_N": force for key, force in curves.items()},
+    )
+    _draw(Path(files.png), name, times, febio_N, curves)
+
+
+def _select_common_times(by_febio: Result, by_limbfit: Result) -> Array:
     """FEBio's own times, as far as both went."""
-    return other.times[other.times <= mine.times[-1] * (1.0 + 1e-9)]
+    return by_febio.times[by_febio.times <= by_limbfit.times[-1] * (1.0 + 1e-9)]
 
 
-def difference(other: Result, mine: Result) -> CurveDifference:
+def compute_difference(by_febio: Result, by_limbfit: Result) -> CurveDifference:
     """limbfit less FEBio at FEBio's own times, in percent of FEBio's largest force."""
-    times = _select_common_times(other, mine)
-    peak = float(other.force[: len(times)].max(initial=0.0))
+    times = _select_common_times(by_febio, by_limbfit)
+    febio_N, limbfit_N = by_febio.force[: len(times)], by_limbfit.force_at(times)
+    peak = float(febio_N.max(initial=0.0))
     if peak <= 0.0:
         return CurveDifference(max_percent=None, mean_percent=None, peak_percent=None)
-    gap = mine.force_at(times) - other.force[: len(times)]
+    gap = np.abs(limbfit_N - febio_N)
     return CurveDifference(
-        max_percent=100.0 * float(np.abs(gap).max()) / peak,
-        mean_percent=100.0 * float(np.abs(gap).mean()) / peak,
-        peak_percent=100.0 * (float(mine.force_at(times).max()) - peak) / peak,
+        max_percent=100.0 * float(gap.max()) / peak,
+        mean_percent=100.0 * float(gap.mean()) / peak,
+        peak_percent=100.0 * (float(limbfit_N.max()) - peak) / peak,
     )
 
 
@@ -166,15 +181,15 @@ def _summarise_solver(run: Result) -> dict[str, Any]:
     }
 
 
-def _draw(file: Path, name: str, times: Array, febio: Array, curves: dict[str, Array]) -> None:
+def _draw(file: Path, name: str, times: Array, febio_N: Array, curves: dict[str, Array]) -> None:
     words = {"limbfit": "limbfit", "limbfit_matched": "limbfit, FEBio's contact penalty"}
     with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
         drawing = Figure(figsize=(9.6, 3.2), layout="constrained", dpi=150)
         left, right = drawing.subplots(1, 2)
-        left.plot(times, febio, "o", ms=3.5, mfc="none", color="0.3", label="FEBio")
+        left.plot(times, febio_N, "o", ms=3.5, mfc="none", color="0.3", label="FEBio")
         for (key, force), style in zip(curves.items(), ("-", "--")):
             left.plot(times, force, style, label=words[key])
-            right.plot(times, 100.0 * (force - febio) / max(febio.max(initial=0.0), 1e-12), style)
+            right.plot(times, 100.0 * (force - febio_N) / max(febio_N.max(initial=0.0), 1e-12), style)
         left.set(xlabel="Time (s)", ylabel="Force (N)", title=f"Site {name}")
         right.set(xlabel="Time (s)", ylabel="Difference (% of FEBio's peak)")
         left.legend(frameon=False)
