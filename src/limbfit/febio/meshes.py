@@ -39,9 +39,11 @@ class RigidMesh:
     front: Indices
 
 
-def has_round_edges(indenter: Indenter) -> bool:
-    """True if the rigid mesh is round enough for FEBio's contact; the edges of a surface are sharp."""
-    return indenter.body.facets().rounding >= MIN_EDGE_ROUNDING * indenter.width
+def has_round_edges(problem: Problem) -> bool:
+    """True if all indenters are round enough for FEBio's contact; the edges of a surface are sharp."""
+    shapes = [body.shape for body in problem.rigid_bodies]
+    indenters = [shape for shape in shapes if isinstance(shape, Indenter)]
+    return all(one.body.facets().rounding >= MIN_EDGE_ROUNDING * one.width for one in indenters)
 
 
 def build_indenter_mesh(indenter: Indenter) -> RigidMesh:

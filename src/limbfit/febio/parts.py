@@ -16,6 +16,7 @@ from ..shapes import SHARP_EDGE
 from .penalty import find_smallest_depth
 from .reading.geometry import (
     build_part_error,
+    collect_nodes,
     find_boundary_faces,
     is_closed,
     split_convexly,
@@ -61,7 +62,7 @@ def is_hollow(model: FebModel, name: str, contacts: Sequence[Contact]) -> bool:
 
 def _find_front(model: FebModel, name: str, contacts: Sequence[Contact]) -> Indices:
     """Return the triangles (m, 3) of a rigid body's faces that touch, in the numbers of the model's nodes."""
-    own = np.concatenate([part.cells.ravel() for part in model.select_body_parts(name)])
+    own = collect_nodes(model.geometry.select_parts([name]).values())
     sides = [model.geometry.surfaces[side] for contact in contacts for side in contact.surfaces]
     return split_into_triangles(_merge_faces([side for side in sides if np.isin(side, own).all()]))
 
@@ -73,7 +74,8 @@ def build_indenter(
 
     Its sharp edges are rounded by no more than the depth of the elements that it touches (``depth``, mm).
     """
-    faces = split_convexly(model.geometry.points, find_boundary_faces(model.select_body_parts(name)))
+    parts = model.geometry.select_parts([name]).values()
+    faces = split_convexly(model.geometry.points, find_boundary_faces(parts))
     used, faces = np.unique(faces, return_inverse=True)
     frame = Indenter("sphere", axis=axis, edge=edge).frame
     points = model.geometry.points[used] @ frame.T
@@ -100,7 +102,7 @@ def build_rigid_body(
     front = _find_front(model, name, contacts)
     smooth = is_hollow(model, name, contacts)
     shape: Indenter | OpenSurface | SmoothSurface
-    if is_closed(find_boundary_faces(model.select_body_parts(name))) and not smooth:
+    if is_closed(find_boundary_faces(model.geometry.select_parts([name]).values())) and not smooth:
         a, b, c = (model.geometry.points[front[:, i]] for i in range(3))
         towards = np.cross(b - a, c - a).sum(axis=0)
         main = int(np.abs(towards).argmax())
@@ -142,7 +144,7 @@ def _build_wall(
 
 def _name_part(model: FebModel, name: str, error: ProblemError) -> ProblemError:
     """Return the error of a surface, with the part that it is made of."""
-    part_name, part = next(iter(model.select_parts({name: None}).items()))
+    part_name, part = next(iter(model.geometry.select_parts([name]).items()))
     return build_part_error(part, part_name, error.what)
 
 
@@ -170,7 +172,7 @@ def build_tissue(model: FebModel) -> TissueMesh:
 
     Raises `ProblemError` if there is none, if their elements differ, or if one is inverted.
     """
-    parts = model.select_parts(model.materials)
+    parts = model.geometry.select_parts(model.materials)
     if not parts:
         raise ProblemError("no part is made of a deformable material")
     first = next(iter(parts.values()))

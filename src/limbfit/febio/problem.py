@@ -18,7 +18,7 @@ from ..errors import ProblemError
 from ..fe import Activation, History, Indenter, Motion, Pressure, Problem, StepControl, Support
 from .parts import TissueMesh, build_indenter, build_rigid_body, build_tissue, find_touched_faces, is_hollow
 from .penalty import compute_mean_penalty, find_smallest_depth
-from .reading.geometry import find_boundary_faces, is_closed
+from .reading.geometry import collect_nodes, find_boundary_faces, is_closed
 from .reading.model import Contact, FebModel
 from .reading.rigid import (
     FREEDOMS,
@@ -62,7 +62,7 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
     elif indenter is not None and touching:
         raise ProblemError("no single rigid body goes straight into the tissue, to stand for an indenter")
     fixed, supports = _build_supports(model, tissue.node_index, driven)
-    element = next(iter(model.select_parts(model.materials).values())).element
+    element = next(iter(model.geometry.select_parts(model.materials).values())).element
     friction = 0.0 if placed is None else touching[name][0].friction
     prestrains = {}  # of a part's cells (m, 3, 3), fully grown
     for part, one in model.prestrains.items():
@@ -136,7 +136,7 @@ def _choose_contact_rule(model: FebModel, tissue: TissueMesh) -> str:
 def _place_indenter(model: FebModel, axis: Array, name: str, indenter: Indenter) -> Indenter:
     """Put an indenter where the foremost point of a rigid body is."""
     centre = model.rigid[name].centre
-    nodes = np.concatenate(find_boundary_faces(model.select_body_parts(name)))
+    nodes = np.concatenate(find_boundary_faces(model.geometry.select_parts([name]).values()))
     foremost = float(((model.geometry.points[nodes] - centre) @ axis).max())
     return replace(indenter, centre=centre + foremost * axis, axis=axis)
 
@@ -271,8 +271,7 @@ def find_touching_body(model: FebModel, contact: Contact) -> str:
     """Find the rigid body that one of the surfaces in contact lies on."""
     surfaces = [model.geometry.surfaces[name] for name in contact.surfaces]
     for name in model.rigid:
-        parts = model.select_body_parts(name)
-        nodes = np.concatenate([np.zeros(0, np.int64), *(part.cells.ravel() for part in parts)])
+        nodes = collect_nodes(model.geometry.select_parts([name]).values())
         if any(np.isin(surface, nodes).all() for surface in surfaces):
             return name
     place = f"line {contact.line}, <contact>"
@@ -295,7 +294,7 @@ def find_drive(model: FebModel, shaped: bool = False) -> Drive:
     if len(bodies) == 1:
         (name,) = bodies
         line = find_straight_line(bodies[name])
-        around = find_boundary_faces(model.select_body_parts(name))
+        around = find_boundary_faces(model.geometry.select_parts([name]).values())
         if line is not None and (
             shaped or (is_closed(around) and not is_hollow(model, name, touching[name]))
         ):
@@ -344,7 +343,7 @@ def _read_body_motions(model: FebModel) -> dict[str, Motion]:
     """Return the motions of all rigid bodies that have parts, checked for what they carry."""
     found, touching, rails = {}, group_contacts(model), {rail.body: rail for rail in model.rails}
     for name, body in model.rigid.items():
-        if not model.select_body_parts(name) and name not in model.carried_nodes:
+        if not model.geometry.select_parts([name]) and name not in model.carried_nodes:
             continue
         motion = build_motion(name, model.conditions, model.curves, model.phases)
         if name in rails:

@@ -19,7 +19,7 @@ from ..fe.observables import ElementFields, compute_element_fields, compute_noda
 from .parts import build_tissue
 from .penalty import FacePenalties
 from .problem import build_step_control, find_drive, group_contacts, has_penalty, to_problem
-from .reading.model import FebModel, Request, read_feb
+from .reading.model import KNOWN_DATA, FebModel, Request, read_feb
 
 _CAUCHY = ("sx", "sy", "sz", "sxy", "syz", "sxz")
 
@@ -156,7 +156,7 @@ class LogTables:
     def _compute_displacement(self, step: Step | None) -> Array:
         """Return the displacement (n, 3) of all nodes of the file, mm; nodes of no element stay."""
         u = np.zeros_like(self.model.geometry.points)
-        for part in self.model.select_parts(self.model.rigid).values():
+        for part in self.model.geometry.select_parts(self.model.rigid).values():
             move, turn = self._compute_pose(part.material, step)
             nodes, centre = np.unique(part.cells), self.model.rigid[part.material].centre
             arms = self.model.geometry.points[nodes] - centre
@@ -171,7 +171,7 @@ class LogTables:
         """Return FEBio's numbers of the items, and a column per name."""
         geometry = self.model.geometry
         if request.kind == "node_data":
-            found = dict(zip(("x", "y", "z", "ux", "uy", "uz"), np.hstack([geometry.points + u, u]).T))
+            found = dict(zip(KNOWN_DATA["node_data"], np.hstack([geometry.points + u, u]).T))
             numbers = geometry.node_ids
         elif request.kind == "element_data":
             found = self._compute_element_columns(geometry.points + u, fields)
@@ -202,7 +202,7 @@ class LogTables:
         They are the place of its centre of mass, mm, its rotation vector, rad, the force, N, and the moment
         about that place, N mm.
         """
-        names = ("x", "y", "z", "thx", "thy", "thz", "Fx", "Fy", "Fz", "Mx", "My", "Mz")
+        names = KNOWN_DATA["rigid_body_data"]
         rows = np.zeros((len(self.model.rigid), len(names)))
         for i, (name, body) in enumerate(self.model.rigid.items()):
             move, turn = self._compute_pose(name, step)

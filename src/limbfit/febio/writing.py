@@ -25,7 +25,7 @@ from markupsafe import Markup
 
 from ..arrays import Array
 from ..errors import ProblemError
-from ..fe import Indenter, Motion, Problem, StepControl
+from ..fe import Motion, Problem, StepControl
 from ..fe.solution.control import schedule_steps
 from ..mesh import Mesh
 from .conditions import FIXED_SET, FRAME_BODY, CurveList, find_step_ends, list_conditions
@@ -90,10 +90,7 @@ def write_feb(problem: Problem, path: str | Path, settings: FebSettings | None =
 
 
 def _check_bodies(problem: Problem) -> list[FebBody]:
-    """Return the rigid bodies of a problem that FEBio can be given.
-
-    Raises `ProblemError` if FEBio cannot be given the problem.
-    """
+    """Return the rigid bodies of a problem; raise `ProblemError` if FEBio cannot be given it."""
     check_element(problem, "FEBio")
     _find_prestrains(problem)
     if problem.touch_down_s and any(support.factor for support in problem.supports):
@@ -163,8 +160,7 @@ def describe_differences(problem: Problem, settings: FebSettings) -> tuple[str, 
             "sticking: FEBio anchors what sticks anew in every step, so that it slips on in time; "
             'limbfit does so with sticking = "stepwise"'
         )
-    shapes = [body.shape for body in problem.rigid_bodies]
-    if not all(has_round_edges(shape) for shape in shapes if isinstance(shape, Indenter)):
+    if not has_round_edges(problem):
         lines.append(
             "edge: FEBio's contact gets through with edges rounded by 2 mm, or a twentieth of the width; "
             "under one as sharp as this it may stop before the end"
@@ -267,15 +263,14 @@ def _describe_file(
 def _find_must_points(problem: Problem, settings: FebSettings) -> Array:
     """Return the times (k,) that FEBio must meet and the largest step up to each, s."""
     preparation = Preparation.from_problem(problem)
-    own = preparation.seconds + schedule_steps(problem.history, settings.steps, problem.turns)
-    times, largest = np.append(0.0, own), np.full(len(own) + 1, _compute_largest_step(problem))
+    largest = _compute_largest_step(problem)
+    points = [(0.0, largest)]
     if preparation.settling_s:
-        rest = preparation.settling_s - PRESTRAIN_S
-        settling = [PRESTRAIN_S, preparation.settling_s] if rest else [PRESTRAIN_S]
-        times = np.concatenate([[0.0], settling, own])
-        largest = np.concatenate([[PRESTRAIN_S / 10.0], [PRESTRAIN_S / 10.0, rest / 10.0][: len(settling)],
-                                  largest[1:]])  # fmt: skip
-    return np.column_stack([times, largest])
+        points = [(0.0, PRESTRAIN_S / 10.0), (PRESTRAIN_S, PRESTRAIN_S / 10.0)]
+        if rest := preparation.settling_s - PRESTRAIN_S:
+            points.append((preparation.settling_s, rest / 10.0))
+    own = preparation.seconds + schedule_steps(problem.history, settings.steps, problem.turns)
+    return np.array([*points, *((float(time), largest) for time in own)])
 
 
 def _describe_materials(problem: Problem, curves: CurveList, settled: float) -> Iterator[dict[str, Any]]:
@@ -314,9 +309,7 @@ def _compute_largest_step(problem: Problem) -> float:
     for body in problem.bodies:
         ends = [*body.motion.turns, body.motion.times[-1]]
         ways += [float(ends[0])] if body.motion.values.any() else []
-    shapes = [body.shape for body in problem.rigid_bodies]
-    round_enough = all(has_round_edges(shape) for shape in shapes if isinstance(shape, Indenter))
-    return min(ways, default=float(problem.history.times[-1])) / (16.0 if round_enough else 32.0)
+    return min(ways, default=float(problem.history.times[-1])) / (16.0 if has_round_edges(problem) else 32.0)
 
 
 def _divide_evenly(span: float, size: float) -> float:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ...arrays import Array, Indices
 from ...errors import ProblemError
+from ...mesh import TET_FACES
+from ...mesh.cells import CELLS
 from .tree import XmlNode
 
 CELL_NODES = {"tet4": 4, "tet10": 10, "hex8": 8, "penta6": 6, "tri3": 3, "tri6": 6, "quad4": 4}
@@ -61,6 +63,10 @@ class Geometry:
     pairs: Mapping[str, tuple[str, str]]
     blocks: Mapping[str, Indices]
     part_lists: Mapping[str, tuple[str, ...]]
+
+    def select_parts(self, materials: Container[str]) -> dict[str, Part]:
+        """Return the parts made of any of these materials, by name."""
+        return {name: part for name, part in self.parts.items() if part.material in materials}
 
 
 def read_geometry(root: XmlNode, materials: Iterable[str]) -> Geometry:
@@ -274,11 +280,10 @@ def is_closed(faces: Iterable[Indices]) -> bool:
     return bool(edges) and set(edges.values()) == {2}
 
 
-_TET = ([0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2])
-_FACES: dict[str, tuple[list[int], ...]] = {
-    "tet4": _TET,
-    "tet10": _TET,
-    "hex8": ([0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]),
+_FACES: dict[str, Iterable[Sequence[int]]] = {
+    "tet4": TET_FACES.tolist(),
+    "tet10": TET_FACES.tolist(),
+    "hex8": CELLS["hex8"].faces.tolist(),
     "penta6": ([0, 2, 1], [3, 4, 5], [0, 1, 4, 3], [1, 2, 5, 4], [2, 0, 3, 5]),
     "tri3": ([0, 1, 2],),
     "tri6": ([0, 1, 2],),

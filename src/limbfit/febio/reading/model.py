@@ -18,7 +18,7 @@ import numpy as np
 from ...arrays import Array, Indices
 from ...errors import ProblemError, add_location
 from ...fe import Material
-from .geometry import Geometry, Part, find_node_set, read_geometry
+from .geometry import Geometry, find_node_set, read_geometry
 from .materials import (
     Contraction,
     Prestrain,
@@ -150,14 +150,6 @@ class FebModel:
         """Times (k,) s of FEBio's steps."""
         return compute_step_times(self.phases, self.curves)
 
-    def select_body_parts(self, body: str) -> list[Part]:
-        """Return the parts of a rigid body."""
-        return [part for part in self.geometry.parts.values() if part.material == body]
-
-    def select_parts(self, materials: Mapping[str, object]) -> dict[str, Part]:
-        """Return the parts made of any of these materials."""
-        return {name: part for name, part in self.geometry.parts.items() if part.material in materials}
-
 
 def read_feb(path: str | Path) -> FebModel:
     """Read a FEBio 3 or 4 input. Raises `ProblemError` if the file is missing, is not XML, or holds what
@@ -190,7 +182,7 @@ def _read_model(root: XmlNode) -> FebModel:
     geometry = read_geometry(root, (*materials, *rigid))
     for name, body in bodies.items():
         if np.isnan(body.centre).any():
-            parts = [part for part in geometry.parts.values() if part.material == name]
+            parts = geometry.select_parts([name]).values()
             rigid[name] = replace(body, centre=compute_centre_of_mass(geometry.points, parts))
     curves = read_curves(root.find("LoadData"))
     boundary = root.find("Boundary")

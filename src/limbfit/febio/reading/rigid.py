@@ -75,12 +75,10 @@ def find_carried_nodes(
     soft, bodies : names of the deformable and of the rigid materials.
     conditions : rigid body and ``<bc type="rigid">`` of every set that is tied.
     """
-    parts = geometry.parts.values()
-    owned = {
-        name: collect_nodes(part for part in parts if part.material == name) for name in (*soft, *bodies)
-    }
-    tissue = np.unique(np.concatenate([np.zeros(0, np.int64), *(owned[name] for name in soft)]))
-    found = {name: np.intersect1d(owned[name], tissue) for name in bodies}
+    tissue = collect_nodes(geometry.select_parts(soft).values())
+    found = {}
+    for name in bodies:
+        found[name] = np.intersect1d(collect_nodes(geometry.select_parts([name]).values()), tissue)
     for name, condition in conditions:
         nodes = find_node_set(geometry, condition.attribute("node_set"), condition)
         found[name] = np.union1d(found[name], np.intersect1d(nodes, tissue))
