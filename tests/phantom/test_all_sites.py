@@ -9,13 +9,7 @@ import pytest
 
 from limbfit.anatomy.surfaces.surfaces import save_anatomy
 from limbfit.phantom.build import draw_true_parameters
-from limbfit.phantom.forces import (
-    DISCRETISATIONS,
-    ForceJob,
-    TruthMeshJob,
-    mesh_true_site,
-    simulate_true_force,
-)
+from limbfit.phantom.forces import DISCRETISATIONS, ForceJob, mesh_true_site, simulate_true_force
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.record import SecondaryMeasurements
 from limbfit.phantom.sites import build_true_sites
@@ -38,7 +32,7 @@ def test_site_is_simulated_to_its_end(phantom, name):
     folder, sites = phantom
     site = sites[name]
     made = DISCRETISATIONS["coarse"]
-    mesh = mesh_true_site(TruthMeshJob(site, folder, made.mesh, made.within_mm))
+    mesh = mesh_true_site(site, folder, made.mesh, made.within_mm)
     found = simulate_true_force(ForceJob(site, mesh, made.steps(site.thickness), draw_true_parameters(0)))
     peak = int(np.argmax(found.force))
     assert 2.0 < found.force[peak] < 20.0
@@ -53,7 +47,7 @@ def test_a_site_shows_what_is_asked_for_and_no_more(tmp_path):
     save_anatomy(tmp_path, build_true_anatomy(limb, 8.0))
     site = next(site for site in build_true_sites(limb, 0) if site.name == "05")
     edges = replace(made.mesh, edge_near_mm=8.0, edge_far_mm=30.0, growth=0.9)
-    mesh = mesh_true_site(TruthMeshJob(site, tmp_path, edges, 32.0))
+    mesh = mesh_true_site(site, tmp_path, edges, 32.0)
     steps = replace(made.steps(site.thickness), load_steps=3, unload_steps=2)
     job = ForceJob(site, mesh, steps, draw_true_parameters(0))
     plain, found = (

@@ -18,6 +18,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -32,14 +33,7 @@ from ..anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from ..arrays import Array
 from ..errors import InputError
 from ..indentation import Parameters
-from .forces import (
-    ForceJob,
-    TrueForce,
-    TruthMeshJob,
-    choose_discretisation,
-    mesh_true_site,
-    simulate_true_force,
-)
+from .forces import ForceJob, TrueForce, choose_discretisation, mesh_true_site, simulate_true_force
 from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, make_limb
 from .mri import DETAIL_GRIDS, LABELS_FILE, TENDON_LABEL, build_true_labels, make_grid, write_series
 from .record import SecondaryMeasurements, record, write_surface, write_ultrasound, write_waves
@@ -242,12 +236,12 @@ def _write_traces(
     save_anatomy(truth, anatomy)
     made = choose_discretisation(detail, limb.kind)
     settings = replace(made.mesh, layers=limb.layers)
-    mesh_jobs = [TruthMeshJob(site, truth, settings, made.within_mm) for site in indented]
-    jobs = []
-    tell("meshes", 0, len(mesh_jobs))
-    for site, mesh in zip(indented, mapping(mesh_true_site, mesh_jobs), strict=True):
-        jobs.append(ForceJob(site, mesh, made.steps(site.thickness), parameters, measurements))
-        tell("meshes", len(jobs), len(mesh_jobs))
+    mesh = partial(mesh_true_site, folder=truth, settings=settings, within_mm=made.within_mm)
+    jobs: list[ForceJob] = []
+    tell("meshes", 0, len(indented))
+    for site, site_mesh in zip(indented, mapping(mesh, indented), strict=True):
+        jobs.append(ForceJob(site, site_mesh, made.steps(site.thickness), parameters, measurements))
+        tell("meshes", len(jobs), len(indented))
     tell("forces", 0, len(jobs))
     facts = []
     for i, (site, found) in enumerate(zip(indented, mapping(simulate_true_force, jobs), strict=True)):

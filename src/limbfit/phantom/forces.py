@@ -82,16 +82,6 @@ def choose_discretisation(detail: str, kind: str) -> Discretisation:
 
 
 @dataclass(frozen=True)
-class TruthMeshJob:
-    """A site to be meshed, and where its anatomy is stored."""
-
-    site: TrueSite
-    anatomy: Path
-    settings: MeshSettings
-    within_mm: float | None
-
-
-@dataclass(frozen=True)
 class ForceJob:
     """One indentation to be simulated: its site, mesh, steps, and the tissues' parameters."""
 
@@ -127,11 +117,11 @@ def _build_base(folder: Path, settings: MeshSettings) -> tuple[Anatomy, BaseMesh
     return anatomy, build_base_mesh(anatomy, settings)
 
 
-def mesh_true_site(job: TruthMeshJob) -> Mesh:
-    """Mesh one site, and keep the tissue that its force depends on."""
-    anatomy, base = _build_base(job.anatomy, job.settings)
-    mesh, _ = mesh_site(anatomy, job.site.position, job.site.axis, job.settings, base)
-    return mesh if job.within_mm is None else cut_neighbourhood(mesh, job.site.position, job.within_mm).mesh
+def mesh_true_site(site: TrueSite, folder: Path, settings: MeshSettings, within_mm: float | None) -> Mesh:
+    """Mesh one site of the anatomy in ``folder``, and keep the tissue that its force depends on."""
+    anatomy, base = _build_base(folder, settings)
+    mesh, _ = mesh_site(anatomy, site.position, site.axis, settings, base)
+    return mesh if within_mm is None else cut_neighbourhood(mesh, site.position, within_mm).mesh
 
 
 def simulate_true_force(job: ForceJob) -> TrueForce:

@@ -98,10 +98,7 @@ def compute_surface_point(shape: LimbShape, angle: Array, z: Array, inset: Array
 
 def extrude_section(section: Array, z: Array, low: float, high: float, rounding: float) -> Array:
     """A prism from ``low`` to ``high`` over a section's field, its edges rounded."""
-    a = section + rounding
-    b = np.maximum(z - high, low - z) + rounding
-    outside = np.hypot(np.maximum(a, 0), np.maximum(b, 0))
-    return np.minimum(np.maximum(a, b), 0) + outside - rounding
+    return intersect_fields(section, np.maximum(z - high, low - z), rounding)
 
 
 def compute_triangle_distance(x: Array, y: Array, corners: tuple[Array, Array, Array]) -> Array:
@@ -126,6 +123,13 @@ def compute_ellipsoid_distance(
     k0 = np.linalg.norm(scaled, axis=-1)
     k1 = np.linalg.norm(scaled / np.array(axes, points.dtype), axis=-1)
     return k0 * (k0 - 1) / np.maximum(k1, 1e-6)
+
+
+def intersect_fields(a: Array, b: Array, rounding: float) -> Array:
+    """Field of what two bodies share, with rounded edges."""
+    a, b = a + rounding, b + rounding
+    outside = np.hypot(np.maximum(a, 0), np.maximum(b, 0))
+    return np.minimum(np.maximum(a, b), 0) + outside - rounding
 
 
 def join_fields(a: Array, b: Array, blend: float) -> Array:
@@ -240,8 +244,7 @@ def compute_tendon_field(shape: Shank, points: Array) -> Array:
     above = z - shape.joint
     depth = 9.5 + 5.5 * compute_smoothstep((above - 2) / 16) + 4.5 * compute_smoothstep((-14 - above) / 24)
     across = y + shape.section_radius(0 * z, z) - depth
-    a, b = np.abs(x) - TENDON_MM[0] / 2 + 2.5, np.abs(across) - TENDON_MM[1] / 2 + 2.5
-    section = np.minimum(np.maximum(a, b), 0) + np.hypot(np.maximum(a, 0), np.maximum(b, 0)) - 2.5
+    section = intersect_fields(np.abs(x) - TENDON_MM[0] / 2, np.abs(across) - TENDON_MM[1] / 2, 2.5)
     return extrude_section(section, z, shape.joint - 40, shape.joint + 17, 2.0)
 
 

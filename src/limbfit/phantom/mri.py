@@ -26,7 +26,7 @@ from scipy.special import ndtr
 from ..anatomy.grid import DEFAULT_NAMES
 from ..anatomy.imaging import LabelMap
 from .geometry import Limb, build_rotation
-from .limb_shapes import PROXIMAL_CUT_MM
+from .limb_shapes import PROXIMAL_CUT_MM, intersect_fields
 
 FAT, MUSCLE, MARROW, CORTEX, TENDON, MARKER = 1.0, 0.5, 0.8, 0.12, 0.3, 1.15
 MARKER_DIAMETER_MM, MARKER_HEIGHT_MM = 9.0, 5.0
@@ -108,10 +108,9 @@ class SkinMarker:
         offset = points - self.position.astype(points.dtype)
         height = offset @ self.outward.astype(points.dtype)
         radial = np.sqrt(np.maximum((offset * offset).sum(-1) - height**2, 0))
-        rounding, base = 1.5, 2.0
-        a = radial - MARKER_DIAMETER_MM / 2 + rounding
-        b = np.abs(height - (MARKER_HEIGHT_MM - base) / 2) - (MARKER_HEIGHT_MM + base) / 2 + rounding
-        return np.minimum(np.maximum(a, b), 0) + np.hypot(np.maximum(a, 0), np.maximum(b, 0)) - rounding
+        base = 2.0
+        along = np.abs(height - (MARKER_HEIGHT_MM - base) / 2) - (MARKER_HEIGHT_MM + base) / 2
+        return intersect_fields(radial - MARKER_DIAMETER_MM / 2, along, rounding=1.5)
 
 
 def _compute_occupancy(

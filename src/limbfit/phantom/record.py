@@ -122,12 +122,11 @@ def write_ultrasound(
     """
     time = np.arange(0.0, made.time[-1], 1 / ULTRASOUND_HZ)
     since = time - made.touch_s
-    columns = [time]
-    for thickness, compression in layers.values():
+    columns = {"time_s": time}
+    for tissue, (thickness, compression) in layers.items():
         clean = thickness - np.where(since > 0.0, compression(np.maximum(since, 0.0)), 0.0)
-        columns.append(clean + ULTRASOUND_NOISE_MM * random.standard_normal(time.size))
-    header = ",".join(["time_s", *(f"{tissue}_mm" for tissue in layers)])
-    np.savetxt(path, np.column_stack(columns), fmt="%.3f", delimiter=",", header=header, comments="")
+        columns[f"{tissue}_mm"] = clean + ULTRASOUND_NOISE_MM * random.standard_normal(time.size)
+    _write_table(path, columns)
 
 
 def write_surface(
@@ -148,9 +147,10 @@ def write_surface(
     since = time - made.touch_s
     moved = np.where(since > 0.0, moves(np.maximum(since, 0.0)), 0.0)
     moved = moved + SURFACE_NOISE_MM * random.standard_normal(moved.shape)
-    frames = [np.column_stack([np.full(len(points), t), points, moved[..., i]]) for i, t in enumerate(time)]
-    header = "time_s,x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm"
-    np.savetxt(path, np.concatenate(frames), fmt="%.3f", delimiter=",", header=header, comments="")
+    columns = {"time_s": np.repeat(time, len(points))}
+    columns |= dict(zip(("x_mm", "y_mm", "z_mm"), np.tile(points, (len(time), 1)).T))
+    columns |= dict(zip(("ux_mm", "uy_mm", "uz_mm"), moved.transpose(1, 2, 0).reshape(3, -1)))
+    _write_table(path, columns)
 
 
 def write_waves(
@@ -169,9 +169,13 @@ def write_waves(
     """
     time = np.arange(0.0, made.time[-1], 1 / WAVES_HZ)
     since = np.maximum(time - made.touch_s, 0.0)
-    columns = [time]
-    for speed in speeds.values():
+    columns = {"time_s": time}
+    for tissue, speed in speeds.items():
         off = WAVES_BIAS_M_S * random.standard_normal() + WAVES_NOISE_M_S * random.standard_normal(time.size)
-        columns.append(speed(since) + off)
-    header = ",".join(["time_s", *(f"{tissue}_m_s" for tissue in speeds)])
-    np.savetxt(path, np.column_stack(columns), fmt="%.3f", delimiter=",", header=header, comments="")
+        columns[f"{tissue}_m_s"] = speed(since) + off
+    _write_table(path, columns)
+
+
+def _write_table(path: Path, columns: Mapping[str, Array]) -> None:
+    table = np.column_stack(list(columns.values()))
+    np.savetxt(path, table, fmt="%.3f", delimiter=",", header=",".join(columns), comments="")
