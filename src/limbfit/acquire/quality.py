@@ -95,8 +95,9 @@ def check_record(recording: Recording) -> Verdict:
         *_check_curves(counted, float(recording.head["settings"]["ramp_speed_mm_s"])),
         _check_drift(recording),
         _check_saturation(recording),
+        _check_losses(recording),
     ]
-    return Verdict((*checks, _check_losses(recording)))
+    return Verdict(tuple(checks))
 
 
 def _check_curves(counted: list[RecordedRamp], speed_mm_s: float) -> list[Check]:

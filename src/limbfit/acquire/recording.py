@@ -30,7 +30,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from ..arrays import Indices
-from ..errors import RunError, TraceError
+from ..errors import RunError, TraceError, add_location
 from .events import PINS, Sample
 
 FIRST_LINE = "#limbfit-recording 1"
@@ -150,14 +150,15 @@ def read_recording(file: str | Path) -> Recording:
     record, or its first block is damaged.
     """
     path = Path(file)
-    if not path.is_file():
-        raise TraceError("no such record", file=path)
-    if path.stat().st_size > MAX_BYTES:
-        raise TraceError(f"larger than {MAX_BYTES:g} bytes", file=path)
-    data = path.read_bytes()
-    blocks = _read_first_block(data, path)
-    whole = _read_whole_blocks(data, blocks)
-    return _parse_content(blocks.content + whole.content, len(data) - whole.end, path)
+    with add_location(file=path):
+        if not path.is_file():
+            raise TraceError("no such record")
+        if path.stat().st_size > MAX_BYTES:
+            raise TraceError(f"larger than {MAX_BYTES:g} bytes")
+        data = path.read_bytes()
+        blocks = _read_first_block(data)
+        whole = _read_whole_blocks(data, blocks)
+        return _parse_content(blocks.content + whole.content, len(data) - whole.end)
 
 
 def follow_recording(file: str | Path, offset: int = 0, *, every: int = 1) -> tuple[Recording, int]:
@@ -178,21 +179,21 @@ def follow_recording(file: str | Path, offset: int = 0, *, every: int = 1) -> tu
         Where it is no record, no block ends at the offset, or what follows is damaged, not only unfinished.
     """
     path = Path(file)
-    if not path.is_file():
-        raise TraceError("no such record", file=path)
-    with path.open("rb") as stream:
-        first = _read_first_block(stream.read(_HEAD_BYTES), path)
-        before = _read_block_before(stream, offset, path) if offset else first
-        stream.seek(before.end)
-        data = stream.read(FOLLOWED_BYTES)
-    found = _read_whole_blocks(data, replace(before, content=b"", end=0))
-    if found.is_damaged or (not found.content and len(data) == FOLLOWED_BYTES):
-        remedy = "limbfit recording says what can be read of it"
-        place = f"byte {before.end + found.end}"
-        raise TraceError("this part is damaged", file=path, place=place, remedy=remedy)
-    # The first block holds the head alone.
-    recording = _parse_content(first.content + found.content, len(data) - found.end, path, every)
-    return recording, before.end + found.end
+    with add_location(file=path):
+        if not path.is_file():
+            raise TraceError("no such record")
+        with path.open("rb") as stream:
+            first = _read_first_block(stream.read(_HEAD_BYTES))
+            before = _read_block_before(stream, offset) if offset else first
+            stream.seek(before.end)
+            data = stream.read(FOLLOWED_BYTES)
+        found = _read_whole_blocks(data, replace(before, content=b"", end=0))
+        end = before.end + found.end
+        if found.is_damaged or (not found.content and len(data) == FOLLOWED_BYTES):
+            remedy = "limbfit recording says what can be read of it"
+            raise TraceError("this part is damaged", place=f"byte {end}", remedy=remedy)
+        # The first block holds the head alone.
+        return _parse_content(first.content + found.content, len(data) - found.end, every), end
 
 
 @dataclass(frozen=True)
@@ -206,23 +207,23 @@ class _WholeBlocks:
     is_damaged: bool = False  # what follows is closed, and yet not whole
 
 
-def _read_first_block(data: bytes, path: Path) -> _WholeBlocks:
+def _read_first_block(data: bytes) -> _WholeBlocks:
     """The block that holds the head."""
     if not data.startswith(FIRST_LINE.encode()):
-        raise TraceError("not a record of limbfit acquire", file=path, place="line 1")
+        raise TraceError("not a record of limbfit acquire", place="line 1")
     first = _read_whole_blocks(data, _WholeBlocks(b"", 0, 0, 0), most=1)
     if not first.content:
-        raise TraceError("its first block is damaged", file=path, remedy="nothing can be read from it")
+        raise TraceError("its first block is damaged", remedy="nothing can be read from it")
     return first
 
 
-def _read_block_before(stream: BinaryIO, offset: int, path: Path) -> _WholeBlocks:
+def _read_block_before(stream: BinaryIO, offset: int) -> _WholeBlocks:
     """What the closing line of the block that ends at an offset says."""
     stream.seek(max(offset - _CLOSING_BYTES, 0))
     line = stream.read(min(offset, _CLOSING_BYTES))
     closing = _CLOSING.fullmatch(line, line.rfind(b"\n", 0, -1) + 1)
     if closing is None:
-        raise TraceError("no block ends here", file=path, place=f"byte {offset}", remedy="read it anew")
+        raise TraceError("no block ends here", place=f"byte {offset}", remedy="read it anew")
     return _WholeBlocks(b"", offset, int(closing[3], 16), int(closing[1]) + 1)
 
 
@@ -242,7 +243,7 @@ def _read_whole_blocks(data: bytes, before: _WholeBlocks, most: int = sys.maxsiz
     return _WholeBlocks(b"".join(parts), at, crc, before.next + len(parts), is_damaged)
 
 
-def _parse_content(content: bytes, lost_bytes: int, path: Path, every: int = 1) -> Recording:
+def _parse_content(content: bytes, lost_bytes: int, every: int = 1) -> Recording:
     """Head, events and each ``every``-th sample of whole blocks."""
     head: dict[str, Any] = {}
     events, rows = [], []
@@ -257,23 +258,23 @@ def _parse_content(content: bytes, lost_bytes: int, path: Path, every: int = 1) 
         for event in events:
             event["at_us"], event["event"] = int(event["at_us"]), str(event["event"])
     except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
-        raise TraceError("it has a line that no record holds", file=path) from None
+        raise TraceError("it has a line that no record holds") from None
     if not isinstance(head, dict):
-        raise TraceError("its head is not a table", file=path)
-    table = _read_table(rows[every - 1 :: every], path)
+        raise TraceError("its head is not a table")
+    table = _read_table(rows[every - 1 :: every])
     host_us, device_us, number, flags, moving = table[:, : len(_NAMES)].T
     position, force, capacitance = np.split(table[:, len(_NAMES) :], 3, axis=1)
     series = host_us, device_us, number, flags, moving, position, force, capacitance
     return Recording(head, tuple(events), *series, lost_bytes)
 
 
-def _read_table(rows: list[str], path: Path) -> Indices:
+def _read_table(rows: list[str]) -> Indices:
     if not rows:
         return np.zeros((0, len(COLUMNS)), dtype=np.int64)
     try:
         table = np.loadtxt(io.StringIO("\n".join(rows)), delimiter=",", dtype=np.int64, ndmin=2)
     except (ValueError, OverflowError):
-        raise TraceError("its rows are not integers in columns", file=path) from None
+        raise TraceError("its rows are not integers in columns") from None
     if table.shape[1] != len(COLUMNS):
-        raise TraceError(f"{table.shape[1]} columns instead of {len(COLUMNS)}", file=path)
+        raise TraceError(f"{table.shape[1]} columns instead of {len(COLUMNS)}")
     return table

@@ -116,14 +116,13 @@ class Guard:
     def _check_frozen_sensors(self, sample: Sample) -> Violation | None:
         """Find a sensor that repeats itself: a live one is noisy."""
         if self._last_forces:
-            max_unchanged_samples = self._unchanged_samples
+            unchanged = self._unchanged_samples
             for k, (now, then) in enumerate(zip(sample.force_mN, self._last_forces, strict=True)):
-                max_unchanged_samples[k] = max_unchanged_samples[k] + 1 if now == then else 0
-                if max_unchanged_samples[k] >= self.limits.max_unchanged_samples:
+                unchanged[k] = unchanged[k] + 1 if now == then else 0
+                if unchanged[k] >= self.limits.max_unchanged_samples:
                     self._last_forces = sample.force_mN
-                    return Violation(
-                        "dead", k + 1, f"the force sensor of pin {k + 1} is dead: it repeats itself"
-                    )
+                    text = f"the force sensor of pin {k + 1} is dead: it repeats itself"
+                    return Violation("dead", k + 1, text)
         self._last_forces = sample.force_mN
         return None
 
