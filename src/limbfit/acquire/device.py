@@ -184,7 +184,7 @@ class LineDevice:
         self._decoder = wire.Decoder(wire.DEVICE_LINE, numbered=False)
         self._pending: dict[int, _PendingCommand] = {}
         self.identity = self._greet()
-        self._answer_time_s = PACED_ANSWER_S if self.identity.clock == "paced" else ANSWER_S
+        self._answer_time_s = PACED_ANSWER_S if self.identity.is_paced else ANSWER_S
 
     @property
     def refused(self) -> wire.Refusals:

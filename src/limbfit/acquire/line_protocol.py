@@ -242,6 +242,10 @@ class Identity(Message):
     serial: Word
     calibrated: Word
 
+    @property
+    def is_paced(self) -> bool:
+        return self.clock == "paced"
+
 
 @dataclass(frozen=True, slots=True)
 class Accepted(Message):

@@ -113,7 +113,6 @@ class Session:
         self.protocol = Protocol(settings, device.identity)
         self.samples = self.lost = 0
         self.unreachable: tuple[int, ...] = ()
-        self._paced = device.identity.clock == "paced"
         self._site = site
         self._last_sample: Sample | None = None
         self._smallest_lead_s = float("inf")  # the least of arrival minus device time
@@ -169,7 +168,11 @@ class Session:
     def tick(self, now: float) -> None:
         """Check the watchdog, and repeat commands that went unanswered."""
         protocol = self.protocol
-        if not self._paced and protocol.phase is not Phase.STOPPING and not protocol.is_over:
+        if (
+            not self.device.identity.is_paced
+            and protocol.phase is not Phase.STOPPING
+            and not protocol.is_over
+        ):
             silent = now - self._last_fresh_s
             if silent * 1000 > self.settings.watchdog_ms:
                 self.handle(Abort(f"no fresh sample for {silent * 1000:.0f} ms"), now)
@@ -287,7 +290,7 @@ def run_session(session: Session, operator: SimpleQueue[Event]) -> Protocol:
 
 
 def _run_loop(session: Session, operator: SimpleQueue[Event]) -> None:
-    device, paced = session.device, session._paced
+    device, paced = session.device, session.device.identity.is_paced
     now = 0.0 if paced else time.monotonic()
     heard = time.monotonic()
     origin: float | None = None  # a paced device may have been running for long

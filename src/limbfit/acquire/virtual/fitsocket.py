@@ -131,19 +131,18 @@ class VirtualFitSocket:
             return b""
         if self.is_home and not self.faults.on("button"):
             self.stopped, self._given_up = "", False
-        sensors = self.sensors
         identity = wire.Identity(
-            wire.VERSION,
-            secrets.token_hex(8),
-            PINS,
-            RATE_HZ,
-            round(1000 * STROKE_MM),
-            sensors.range_mN,
-            sensors.touch_fF,
-            self.clock,
-            "VirtualFitSocket",
-            self._serial,
-            "2000-01-01",
+            version=wire.VERSION,
+            nonce=secrets.token_hex(8),
+            pins=PINS,
+            rate_hz=RATE_HZ,
+            stroke_um=round(1000 * STROKE_MM),
+            range_mN=self.sensors.range_mN,
+            touch_fF=self.sensors.touch_fF,
+            clock=self.clock,
+            model="VirtualFitSocket",
+            serial=self._serial,
+            calibrated="2000-01-01",
         )
         line = wire.Encoder(first=0).encode(identity.body)[1]
         salt = wire.derive_salt(hello.nonce, identity.nonce)
