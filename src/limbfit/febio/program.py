@@ -79,17 +79,17 @@ def run_febio(
     RunError
         If the program cannot be started, or the folder cannot be written.
     """
-    words = folder / OUTPUT
+    output = folder / OUTPUT
     try:
         for left in (table, OUTPUT, LOG, "model.xplt"):
             (folder / left).unlink(missing_ok=True)
         started = time.perf_counter()
-        with words.open("wb") as stream:
+        with output.open("wb") as stream:
             code, timed_out = _run_process(program, folder, stream, threads, time_limit_s)
     except OSError as error:
         raise RunError(f"{program}: {error.strerror or error}") from error
     seconds = time.perf_counter() - started
-    messages = _read_messages(words)
+    messages = _read_messages(output)
     verdict = judge_run(messages, code, end_s, timed_out=timed_out, limit_s=time_limit_s)
     try:
         log = read_log(folder / table)
@@ -102,12 +102,12 @@ def run_febio(
 
 def _read_messages(file: Path) -> str:
     """Read FEBio's messages; of very long ones the first part (its version) and the last (its end)."""
-    with file.open("rb") as said:
-        found = said.read(_MAX_MESSAGE_BYTES)
+    with file.open("rb") as stream:
+        found = stream.read(_MAX_MESSAGE_BYTES)
         left = file.stat().st_size - len(found)
         if left > 0:
-            said.seek(-min(left, _MAX_MESSAGE_BYTES), os.SEEK_END)
-            found += b"\n" + said.read()
+            stream.seek(-min(left, _MAX_MESSAGE_BYTES), os.SEEK_END)
+            found += b"\n" + stream.read()
     return found.decode("utf-8", "replace")
 
 

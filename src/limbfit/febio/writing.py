@@ -114,7 +114,7 @@ def build_contact(problem: Problem, settings: FebSettings) -> Contact:
     penalty, automatic = settings.penalty, settings.penalty is not None
     if penalty is None:
         penalty = compute_explicit_penalty(problem, settings.steps)
-    return Contact("sliding-elastic", (PATCH, FRONT), penalty, automatic, False, 0)
+    return Contact("sliding-elastic", (PATCH, FRONT), penalty, automatic, augmented=False, line=0)
 
 
 def describe_differences(problem: Problem, settings: FebSettings) -> tuple[str, ...]:
@@ -207,12 +207,7 @@ def _describe_file(
     curves, settled = CurveList(), Preparation.from_problem(problem).settling_s
     ends = find_step_ends([body.motion for body in bodies], float(prepared.history.times[-1]), settled)
     rigid = [list_conditions(body.name, body.motion, ends, curves) for body in bodies]
-    steps: list[dict[str, Any]] = []
-    for k, (begin, end) in enumerate(pairwise([0.0, *ends])):
-        largest = PRESTRAIN_S / 10.0 if end <= settled else _compute_largest_step(problem)
-        size = _divide_evenly(end - begin, 0.25 * largest)  # of the first steps, s, which FEBio enlarges
-        conditions = [one for body in rigid for one in body[k]]
-        steps.append({"count": round((end - begin) / size), "size": size, "conditions": conditions})
+    steps = list(_describe_steps(problem, ends, settled, rigid))
     meshes = {body.name: body.tool for body in bodies}
     centres = {body.name: body.centre for body in bodies}
     everywhere = steps[0]["conditions"] if len(steps) == 1 else []
@@ -258,6 +253,17 @@ def _describe_file(
         "gradient": GRADIENT,
         "curves": curves,
     }
+
+
+def _describe_steps(
+    problem: Problem, ends: list[float], settled: float, rigid: list[list[list[dict[str, Any]]]]
+) -> Iterator[dict[str, Any]]:
+    """Describe the steps of the analysis; ``rigid`` are the conditions of each body in every step."""
+    for k, (begin, end) in enumerate(pairwise([0.0, *ends])):
+        largest = PRESTRAIN_S / 10.0 if end <= settled else _compute_largest_step(problem)
+        size = _divide_evenly(end - begin, 0.25 * largest)  # of the first steps, s, which FEBio enlarges
+        conditions = [one for body in rigid for one in body[k]]
+        yield {"count": round((end - begin) / size), "size": size, "conditions": conditions}
 
 
 def _find_must_points(problem: Problem, settings: FebSettings) -> Array:

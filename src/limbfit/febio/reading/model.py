@@ -189,22 +189,22 @@ def _read_model(root: XmlNode) -> FebModel:
     tied_sets = [(find_body(bc, rigid), bc) for bc in boundary or () if bc.attributes.get("type") == "rigid"]
     requests, notes = read_requests(root.find("Output"), geometry)
     model = FebModel(
-        geometry,
-        materials,
-        rigid,
-        tuple(_read_node_motions(boundary, geometry, curves)),
-        read_conditions(root, rigid, curves),
-        find_carried_nodes(geometry, materials, rigid, tied_sets),
-        tuple(_read_contact(node, geometry) for node in root.find("Contact") or ()),
-        tuple(_read_pressures(root.find("Loads"), geometry, curves)),
-        curves,
-        read_phases(root, curves),
-        requests,
-        (*unread, *notes),
-        read_fibres(root, materials, geometry.parts),
-        read_rails(root, rigid),
-        read_contractions(root.child("Material"), materials, curves),
-        read_prestrains(root, materials, curves, geometry.parts),
+        geometry=geometry,
+        materials=materials,
+        rigid=rigid,
+        motions=tuple(_read_node_motions(boundary, geometry, curves)),
+        conditions=read_conditions(root, rigid, curves),
+        carried_nodes=find_carried_nodes(geometry, materials, rigid, tied_sets),
+        contacts=tuple(_read_contact(node, geometry) for node in root.find("Contact") or ()),
+        pressures=tuple(_read_pressures(root.find("Loads"), geometry, curves)),
+        curves=curves,
+        phases=read_phases(root, curves),
+        requests=requests,
+        notes=(*unread, *notes),
+        fibres=read_fibres(root, materials, geometry.parts),
+        rails=read_rails(root, rigid),
+        contractions=read_contractions(root.child("Material"), materials, curves),
+        prestrains=read_prestrains(root, materials, curves, geometry.parts),
     )
     return _drop_settling(model)
 

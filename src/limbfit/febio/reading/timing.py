@@ -260,10 +260,10 @@ def _read_phase(node: XmlNode, curves: Mapping[int, LoadCurve]) -> ControlPhase:
     return ControlPhase(
         int(steps),
         size,
-        stepper.number("dtmin", 0.0),
-        size if most is None or must else most.scalar(),
-        must or None,
-        tolerance,
+        min_step_s=stepper.number("dtmin", 0.0),
+        max_step_s=size if most is None or must else most.scalar(),
+        must_curve=must or None,
+        tolerance=tolerance,
     )
 
 
