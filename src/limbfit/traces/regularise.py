@@ -176,16 +176,15 @@ class SmoothCurve:
     ) -> None:
         self._corners = select_sampled_corners(find_boundaries(phases), time)
         holds = [(phase.start_s, phase.end_s) for phase in phases if phase.kind == "hold"]
-        self._clocks = []
+        self._clocks: list[_PhaseClock] = []
+        self._bins: list[tuple[Array, Array, Array]] = []
         for start, end in pairwise(self._corners):
             is_hold = any(begin < (start + end) / 2 < stop for begin, stop in holds)
-            self._clocks.append(_PhaseClock(start, end, DENSER if is_hold else 1.0))
-        parts = [(time >= clock.start_s) & (time <= clock.end_s) for clock in self._clocks]
-        self._bins = [
-            average_in_bins(clock(time[part]), force[part], _MAX_BINS, clock.power if enough else 1.0)
-            for clock, part in zip(self._clocks, parts)
-            for enough in [part.sum() >= _MIN_CROWDED]
-        ]
+            clock = _PhaseClock(start, end, DENSER if is_hold else 1.0)
+            part = (time >= start) & (time <= end)
+            power = clock.power if part.sum() >= _MIN_CROWDED else 1.0
+            self._clocks.append(clock)
+            self._bins.append(average_in_bins(clock(time[part]), force[part], _MAX_BINS, power))
         given = [(smoothing, smoothing)] * len(self._bins)
         self._splines, self._penalties = self._fit_splines([averages for _, averages, _ in self._bins], given)
 

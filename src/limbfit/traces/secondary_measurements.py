@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..arrays import Array, Indices, Mask
+from ..arrays import Array, Indices
 from ..errors import TraceError, add_location
 from .formats import TIME
 from .reading import read_columns
@@ -249,10 +249,6 @@ class SurfaceMotion:
         """The largest component of all."""
         return float(np.nanmax(np.abs(self.moved_mm)))
 
-    def frames(self, which: Mask) -> SurfaceMotion:
-        """Some of the frames (f,)."""
-        return SurfaceMotion(self.points, self.time_s[which], self.moved_mm[which])
-
     def average(self, points: Indices) -> SurfaceMeans:
         """Means over at most `MAX_SURFACE_TIMES` spans of time, each of the frames that show the point."""
         spans = np.array_split(np.arange(len(self.time_s)), min(len(self.time_s), MAX_SURFACE_TIMES))
@@ -368,10 +364,11 @@ def select_frames_in_contact(
             f"{record_s[1]:g} s",
             remedy="give times of the record's own clock",
         )
-    found = motion.frames((motion.time_s > touch_down_s) & (motion.time_s <= end_s))
-    if not np.isfinite(found.moved_mm).any():
+    inside = (motion.time_s > touch_down_s) & (motion.time_s <= end_s)
+    moved = motion.moved_mm[inside]
+    if not np.isfinite(moved).any():
         raise TraceError(
             f"no displacement while the indenter presses ({touch_down_s:.2f} to {end_s:.2f} s)",
             remedy="give some at times between, on the record's own clock",
         )
-    return SurfaceMotion(found.points, found.time_s - touch_down_s, found.moved_mm)
+    return SurfaceMotion(motion.points, motion.time_s[inside] - touch_down_s, moved)
