@@ -91,7 +91,7 @@ def _describe_file(
     whole = Mesh(tool.points, tool.cells, "hex8", np.zeros(len(tool.cells), np.int64), (INDENTER,))
     laws = [problem.materials[name] for name in mesh.region_names]
     seconds = [phase.duration_s for phase in history.phases]
-    first = 16.0 if program == "calculix" else 64.0  # parts of the shortest phase
+    shortest = min(seconds) / (16.0 if program == "calculix" else 64.0)
     return {
         "title": " ".join(settings.title.split()),
         "program": program,
@@ -117,7 +117,7 @@ def _describe_file(
         "fixed_set": FIXED_SET,
         "is_relaxing": any(g for law in laws for g, _ in law.table().prony),
         # One for each phase, whose end is met: first increment, whole, smallest and largest one, s.
-        "steps": [(min(seconds) / first, t, t * 1e-8, t / 16.0) for t in seconds],
+        "steps": [(shortest, t, t * 1e-8, t / 16.0) for t in seconds],
         "axis": indenter.frame[2].tolist(),
     }
 
