@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from limbfit.fe import (
 )
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.motion import Drives
+from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.system import Evaluation, Increment
 from limbfit.mesh import TET10_EDGES, TET_FACES, Mesh
 from limbfit.mesh.boxes import HEX, SIX_TETS, build_boxes
@@ -92,13 +94,16 @@ def graded(half: float, inner: float, n_inner: int, n_outer: int) -> NDArray:
     return np.concatenate([-out[::-1], np.linspace(-inner, inner, n_inner + 1), out])
 
 
+COARSE_Z, FINE_Z = (-30.0, -11.0, -3.0, 0.0), (-30.0, -19.5, -9.0, -6.0, -3.0, 0.0)
+
+
 def punch(
-    cell_type: str = "tet10", n: int = 6, outer: int = 2, depth: float = 6.0, speed: float = 0.96, **changes
-) -> Problem:
-    """A two-layer block of 60 x 60 x 30 mm under a square punch of 20 mm."""
+    cell_type: str = "tet10", n: int = 6, outer: int = 2, depth: float = 6.0, speed: float = 0.96,
+    z: tuple[float, ...] = COARSE_Z, **changes,
+) -> Problem:  # fmt: skip
+    """A two-layer block of 60 x 60 x 30 mm under a square punch of 20 mm; elements between heights ``z``."""
     lines = graded(30.0, 11.0, n, outer)
-    z = np.concatenate([np.linspace(-30.0, -9.0, 3), np.array([-6.0, -3.0, 0.0])])
-    mesh = block(cell_type, lines, lines, z, layer=3.0)
+    mesh = block(cell_type, lines, lines, np.array(z), layer=3.0)
     history = History(np.array([0.0, depth / speed, 2 * depth / speed]), np.array([0.0, depth, 0.0]))
     values = {
         "mesh": mesh,
@@ -188,18 +193,35 @@ def drive(advance: float, x: float = 0.0, y: float = 0.0) -> Drives:
     return Drives(np.array([[x, y, advance, 0.0, 0.0, 0.0]]), np.zeros((1, 6), dtype=bool), np.ones(1))
 
 
-def slope_and_difference(centre: Result, control: StepControl) -> tuple[np.ndarray, np.ndarray]:
-    """Change of a punch's force along one direction of all eight parameters: by its sensitivities, and by
-    central differences about ``centre``, which kept all states."""
+def check_derivatives(
+    system: System, at: Callable[[NDArray], Evaluation], u: NDArray, d: NDArray, rel: float = 1e-4
+) -> tuple[Evaluation, tuple[NDArray, NDArray]]:
+    """Energy, force on the indenter and residual at ``u`` (n, 3) change along ``d`` (n, 3) as residual,
+    advance and tangent say; also returns the tangent times ``d`` and the change of the residual."""
+    h = 1e-6
+    here, ahead, back = at(u), at(u + h * d), at(u - h * d)
+    assert (ahead.energy - back.energy) / (2 * h) == pytest.approx((here.residual * d).sum(), rel=1e-5)
+    assert (ahead.force - back.force) / (2 * h) == pytest.approx(-(here.advance * d).sum(), rel=1e-4)
+    K_d = multiply_symmetric(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
+    change = ((ahead.residual - back.residual) / (2 * h)).reshape(-1, 1)[system.free]
+    np.testing.assert_allclose(K_d, change, atol=rel * np.abs(change).max())
+    return here, (K_d, change)
+
+
+def slope_and_difference(
+    centre: Result, control: StepControl, response: str = "force"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Change of a punch's force (or displacement) along one direction of all eight parameters: by its
+    sensitivities, and by central differences about ``centre``, which kept all states."""
     problem = centre.problem
     change = 1e-4 * problem.parameters * np.random.default_rng(3).uniform(-1, 1, 8)
 
-    def force(sign: int) -> np.ndarray:
+    def respond(sign: int) -> np.ndarray:
         values = (problem.parameters + sign * change).reshape(2, 4)
         changed = {name: OgdenQLV(*row) for name, row in zip(("skin", "muscle"), values)}
-        return solve(problem.with_materials(changed), control, warm_start=centre).force
+        return getattr(solve(problem.with_materials(changed), control, warm_start=centre), response)
 
-    return centre.force_sensitivity @ change, 0.5 * (force(1) - force(-1))
+    return getattr(centre, f"{response}_sensitivity") @ change, 0.5 * (respond(1) - respond(-1))
 
 
 def parameter_slope(

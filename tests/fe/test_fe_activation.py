@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import block, check_tangent, parameter_slope, punch
+from blocks import FINE_Z, block, check_tangent, parameter_slope, punch
 from scipy.optimize import brentq
 from test_fe_fibres import ASKEW, GROUND, LINES, TISSUE, bent, body
 
@@ -81,16 +81,16 @@ def test_sensitivities_of_a_contracting_muscle_under_a_punch():
     """It tenses while it is pressed; forces by the active stress, the fibres and the ground."""
     muscle = Contractile(TISSUE, 0.006)
     problem = punch(
-        "tet10", 2, 1, materials={"skin": GROUND, "muscle": muscle}, fibres=ASKEW,
+        "tet10", 2, 1, 4.0, materials={"skin": GROUND, "muscle": muscle}, fibres=ASKEW,
         activation=Activation([0.0, 4.0, 9.0], [0.0, 1.0, 0.5]),
     )  # fmt: skip
-    control = StepControl(load_steps=4, unload_steps=3, tolerance=1e-11)
+    control = StepControl(load_steps=3, unload_steps=2, tolerance=1e-10)
     centre = solve(problem, control, sensitivities=True, store="all")
     assert centre.completed, centre.reason
     assert list(centre.parameter_names)[-1] == ("muscle", "active")
     passive = solve(replace(problem, materials={"skin": GROUND, "muscle": TISSUE}), control)
     assert np.abs(centre.force - passive.force_at(centre.times)).max() > 0.02 * passive.force.max()
-    for name in ("active", "k1", "c"):
+    for name in ("active", "c"):
         slope, difference = parameter_slope(centre, control, "muscle", name)
         np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max(), err_msg=name)
 
@@ -98,13 +98,15 @@ def test_sensitivities_of_a_contracting_muscle_under_a_punch():
 def test_the_force_between_steps_turns_where_contraction_does():
     """A held punch, and muscle that tenses from 4 to 4.5 s: no spline goes across."""
     problem = punch(
-        "tet10", 2, 1, history=History(np.array([0.0, 1.0, 10.0]), np.array([0.0, 3.0, 3.0])),
+        "tet10", 2, 1, z=FINE_Z, history=History(np.array([0.0, 1.0, 10.0]), np.array([0.0, 3.0, 3.0])),
         fibres=(1.0, 0.0, 0.0), activation=Activation([0.0, 4.0, 4.5, 10.0], [0.0, 0.0, 1.0, 1.0]),
     )  # fmt: skip
     tissue = Contractile(Fibred(problem.materials["muscle"], 0.001, 1.0), 0.02)
     problem = problem.with_materials({**problem.materials, "muscle": tissue})
     found = solve(problem, StepControl(tolerance=1e-5))
-    fine = solve(problem, StepControl(times=tuple(np.linspace(0.5, 10.0, 20)), tolerance=1e-5))
+    fine = solve(
+        problem, StepControl(times=(0.5, 1.0, 2.0, 3.0, 4.0, 4.5, 5.0, 6.0, 7.0, 8.5, 10.0), tolerance=1e-5)
+    )
     after = fine.times >= 2.0
     assert np.ptp(fine.force[after]) > 0.2 * fine.peak_force
     difference = found.force_at(fine.times) - fine.force

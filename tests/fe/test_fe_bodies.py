@@ -6,7 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import MUSCLE, SKIN, block, parameter_slope, press_fit, punch, quarter_tube, sector
+from blocks import (
+    MUSCLE,
+    SKIN,
+    block,
+    check_derivatives,
+    parameter_slope,
+    press_fit,
+    punch,
+    quarter_tube,
+    sector,
+    slope_and_difference,
+)
 from scipy.spatial.transform import Rotation
 
 from limbfit.errors import ProblemError
@@ -29,7 +40,6 @@ from limbfit.fe.contact.tool import Pose
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.motion import Drives
 from limbfit.fe.solution.control import schedule_steps
-from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.system import Increment
 
 TOOL = Indenter("square", 20.0, 3.0, centre=(0.3, -0.4, 2.0), axis=(0.1, 0.05, -1.0))
@@ -60,14 +70,13 @@ def test_derivatives_of_a_pose_are_differences(turned):
         np.testing.assert_allclose(pose(w).bends[k], (ahead.slopes - back.slopes) / (2 * h), atol=1e-9)
 
 
-@pytest.mark.parametrize("mu", [0.0, 0.3])
-@pytest.mark.parametrize("turned", [0.0, 0.15])
+@pytest.mark.parametrize(("mu", "turned"), [(0.0, 0.0), (0.3, 0.15)])
 def test_forces_and_stiffness_of_a_free_body_are_derivatives_of_its_energy(mu, turned):
     """All six coordinates unknown: residual, tangent and the border of the matrix, moved and turned."""
     body = RigidBody(TOOL, punch("tet10", 4, 1).contact_faces, FREE, mu, pivot=(3.0, 2.0, 12.0))
     problem = punch("tet10", 4, 1, indenter=None, bodies=(body,))
     system, laws = System(problem), Laws.build([SKIN, MUSCLE])
-    rest, rng, h = np.zeros((*system.weights.shape, 6)), np.random.default_rng(1), 1e-6
+    rest, rng = np.zeros((*system.weights.shape, 6)), np.random.default_rng(1)
     u = np.zeros((system.rows, 3))
     u[: system.nodes] = 0.01 * rng.normal(size=(system.nodes, 3)) * ~system.supported[: system.nodes]
     u[system.nodes :] = [[0.2, -0.1, 3.6], [0.6 * turned, -0.4 * turned, turned]]
@@ -86,13 +95,8 @@ def test_forces_and_stiffness_of_a_free_body_are_derivatives_of_its_energy(mu, t
     def at(u):
         return system.evaluate(u, laws, Increment(0.0, 0.0, np.zeros(2), rest, 0.5, drives, grips))
 
-    here, ahead, back = at(u), at(u + h * d), at(u - h * d)
+    here, (K_d, change) = check_derivatives(system, at, u, d)
     assert here.contact_area > 10.0
-    assert (ahead.energy - back.energy) / (2 * h) == pytest.approx((here.residual * d).sum(), rel=1e-5)
-    assert (ahead.force - back.force) / (2 * h) == pytest.approx(-(here.advance * d).sum(), rel=1e-4)
-    K_d = multiply_symmetric(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
-    change = ((ahead.residual - back.residual) / (2 * h)).reshape(-1, 1)[system.free]
-    np.testing.assert_allclose(K_d, change, atol=1e-4 * np.abs(change).max())
     border = np.abs(change[-6:]).max()
     np.testing.assert_allclose(K_d[-6:], change[-6:], atol=1e-5 * border)
 
@@ -106,7 +110,7 @@ def test_force_control_gives_back_the_displacement():
 
     Both with stresses that are linear in a step: a quadratic course begins anew where what drives turns.
     """
-    problem = punch("tet10", 4, 1, history=History(TIMES, np.array([0.0, 4.0, 4.0])))
+    problem = punch("tet10", 2, 1, history=History(TIMES, np.array([0.0, 4.0, 4.0])))
     linear = replace(CONTROL, stress="linear")
     driven = solve(problem, linear)
     history = History(driven.times, force=driven.force)
@@ -118,21 +122,13 @@ def test_force_control_gives_back_the_displacement():
 
 
 def test_a_held_force_creeps_and_its_displacement_has_sensitivities():
-    problem = punch("tet10", 4, 1, history=History(TIMES, force=np.array([0.0, 2.0, 2.0])))
+    problem = punch("tet10", 2, 1, history=History(TIMES, force=np.array([0.0, 2.0, 2.0])))
     centre = solve(problem, CONTROL, sensitivities=True, store="all")
     loaded = centre.times >= 2.0 - 1e-9
     assert (np.diff(centre.displacement[loaded]) > 0.0).all()
     assert centre.displacement[-1] > 1.05 * centre.displacement[loaded][0]
     np.testing.assert_allclose(centre.force[loaded], 2.0, rtol=1e-6)
-    change = 1e-4 * problem.parameters * np.random.default_rng(3).uniform(-1, 1, 8)
-
-    def displacement(sign):
-        values = (problem.parameters + sign * change).reshape(2, 4)
-        changed = {name: OgdenQLV(*row) for name, row in zip(("skin", "muscle"), values)}
-        return solve(problem.with_materials(changed), CONTROL, warm_start=centre).displacement
-
-    slope = centre.displacement_sensitivity @ change
-    difference = 0.5 * (displacement(1) - displacement(-1))
+    slope, difference = slope_and_difference(centre, CONTROL, "displacement")
     np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max())
 
 
@@ -168,7 +164,7 @@ def test_a_force_that_acts_from_the_beginning_deforms_tissue_before_it_relaxes()
 
 def test_a_body_goes_over_from_displacement_to_force():
     """Pressed 3 mm and held, then left with the force that it had at the end: it creeps on from there."""
-    problem = punch("tet10", 4, 1)
+    problem = punch("tet10", 2, 1)
     pressed = Motion.of([0.0, 1.0, 3.0], z=[0.0, 3.0, 3.0])
     tool = RigidBody(problem.indenter.moved(1.0), problem.contact_faces, pressed)
     control = replace(CONTROL, times=(0.25, 0.5, 0.75, 1.0, 2.0, 3.0), tolerance=1e-8)
@@ -201,30 +197,28 @@ def test_a_body_goes_over_from_displacement_to_force():
 
 def test_a_force_that_is_taken_over_depends_on_the_parameters():
     """Of a stiffer block: what held the tool was larger, and the force begins with that."""
-    problem = punch("tet10", 3, 1)
+    problem = punch("tet4", 2, 1)
     pressed = Motion.of([0.0, 1.0, 2.0], z=[0.0, 3.0, 3.0])
     left = Motion.of([0.0, 1.0, 1.5], force={"z": [np.nan, 0.5, 0.5]})
     tool = RigidBody(problem.indenter.moved(1.0), problem.contact_faces, pressed.then(left), 0.4)
     problem = replace(problem, indenter=None, bodies=(tool,), history=History([0.0, 3.5], [0.0, 0.0]))
-    control = replace(CONTROL, times=(0.5, 1.0, 1.5, 2.0, 2.3, 2.7, 3.0, 3.5), tolerance=1e-9, penalty=20.0)
+    control = replace(CONTROL, times=(0.5, 1.0, 2.0, 2.5, 3.0, 3.5), penalty=20.0)
     centre = solve(problem, control, sensitivities=True, store="all")
     slopes = np.array([state.bodies[0, 2] for state in centre.states])
-    for i, (region, name) in enumerate(problem.parameter_names):
-        if (region, name) not in (("muscle", "c"), ("skin", "tau")):
-            continue
-        ways = []
+    for region, name in (("muscle", "c"), ("skin", "tau")):
+        law, ways = problem.materials[region], []
         for sign in (1.0, -1.0):
-            law = problem.materials[region]
             other = replace(law, **{name: getattr(law, name) * (1.0 + 1e-3 * sign)})
-            ways.append(solve(problem.with_materials({**problem.materials, region: other}), control))
-        step = 2e-3 * problem.parameters[i]
-        difference = (ways[0].coordinates[:, 0, 2] - ways[1].coordinates[:, 0, 2]) / step
-        np.testing.assert_allclose(slopes[:, i], difference[1:], atol=1e-3 * np.abs(difference).max())
+            changed = problem.with_materials({**problem.materials, region: other})
+            ways.append(solve(changed, control, warm_start=centre).coordinates[1:, 0, 2])
+        difference = (ways[0] - ways[1]) / (2e-3 * getattr(law, name))
+        slope = slopes[:, list(problem.parameter_names).index((region, name))]
+        np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max())
 
 
 def test_the_force_of_a_body_that_turned_with_friction_has_derivatives():
     """Along the axis at its start, whereto its anchors turn with it."""
-    problem = punch("tet10", 3, 1)
+    problem = punch("tet10", 2, 1)
     ball = Indenter("sphere", 20.0, centre=(0.0, 0.0, 0.05), axis=(0, 0, -1))
     motion = Motion.of(
         [0.0, 1.0, 2.0], z=[0.0, 2.5, 2.5], x=[0, 0, 1.5], turn_x=[0, 0, 0.5], turn_y=[0, 0, 0.4]
@@ -258,7 +252,7 @@ def test_steps_go_on_for_what_moves_when_the_indenter_has_left():
 
 def test_a_free_plate_lies_down_on_what_is_askew():
     """A plate pressed by a force and free to turn rests without moment, turned towards the softer side."""
-    problem = punch("tet10", 4, 1)
+    problem = punch("tet10", 2, 1)
     motion = Motion.of([0.0, 1.0, 2.0], force={"z": [0.0, 2.0, 2.0], "turn_x": 0.0, "turn_y": 0.0})
     plate = RigidBody(
         Indenter("square", 20.0, centre=(22.0, 0.0, 0.0), axis=(0, 0, -1)), problem.contact_faces, motion
@@ -300,7 +294,7 @@ def test_two_bodies_are_each_other_s_mirror():
 
 def test_a_rotation_of_everything_changes_nothing():
     """Block, supports and tool turned together: the same forces."""
-    problem = punch("tet10", 3, 1, history=History(TIMES, np.array([0.0, 3.0, 3.0])))
+    problem = punch("tet4", 2, 1, history=History(TIMES, np.array([0.0, 3.0, 3.0])))
     plain = solve(problem, CONTROL)
     turn = Rotation.from_rotvec([0.4, -0.8, 1.1])
     tool = problem.indenter
@@ -371,8 +365,8 @@ def test_a_bar_under_a_held_force_creeps_as_the_closed_form():
         mesh, {"skin": law, "muscle": law}, np.zeros(0, int), mesh.face_sets["top"], plate,
         History(times, force=np.array([0.0, force, force])), supports=planes,
     )  # fmt: skip
-    creeping = seconds + (times[-1] - seconds) * (np.arange(1, 41) / 40) ** 2
-    steps = (*np.linspace(0.0, seconds, 6)[1:], *creeping)
+    creeping = seconds + (times[-1] - seconds) * (np.arange(1, 17) / 16) ** 2
+    steps = (*np.linspace(0.0, seconds, 4)[1:], *creeping)
     found = solve(problem, StepControl(times=steps, penalty=1e6, hold_penalty=True, tolerance=1e-8))
     assert found.completed, found.reason
 
@@ -402,23 +396,17 @@ def test_distances_from_an_open_surface_are_those_of_its_triangles():
     """Behind the wall, where contact is: gradient and hessian by differences; nothing beyond the brim."""
     surface = ring(20.0, 21.0, 24, 10.0)
     rng, h = np.random.default_rng(0), 1e-6
-    angle, height = rng.uniform(0.05, 1.5, 400), rng.uniform(-9.5, 9.5, 400)
+    angle, height = rng.uniform(0.05, 1.5, 60), rng.uniform(-9.5, 9.5, 60)
     wall = np.where(height < 0.0, 20.0, 20.0 + height / 10.0)
     for off in (-0.8, 0.5):  # in the cavity, and in the wall
         radius = wall + off
         points = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
         values, slopes, bends = surface.local_distance(points)
         np.testing.assert_allclose(values, -off, atol=0.06)
-        differences = [
-            (surface.local_distance(points + d)[0] - surface.local_distance(points - d)[0]) / (2 * h)
-            for d in h * np.eye(3)
-        ]
-        np.testing.assert_allclose(np.transpose(differences), slopes, atol=1e-4)
-        turned = [
-            (surface.local_distance(points + d)[1] - surface.local_distance(points - d)[1]) / (2 * h)
-            for d in h * np.eye(3)
-        ]
-        np.testing.assert_allclose(np.moveaxis(turned, 0, 2), bends, atol=1e-3)
+        for i, d in enumerate(h * np.eye(3)):
+            ahead, back = surface.local_distance(points + d), surface.local_distance(points - d)
+            np.testing.assert_allclose((ahead[0] - back[0]) / (2 * h), slopes[:, i], atol=1e-4)
+            np.testing.assert_allclose((ahead[1] - back[1]) / (2 * h), bends[..., i], atol=1e-3)
     beyond = np.array([[21.5 * np.cos(0.7), 21.5 * np.sin(0.7), 14.0]])
     assert np.isinf(surface.signed_distance(beyond)).all()
 

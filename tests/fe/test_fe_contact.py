@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from blocks import MUSCLE, SKIN, block, drive, punch
+from blocks import MUSCLE, SKIN, block, check_derivatives, drive, punch
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, OgdenQLV, Problem, StepControl, System, solve
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.system import Increment
 
-SHAPES = [("square", 0.0), ("square", 2.0), ("sphere", 0.0), ("cylinder", 0.0), ("cylinder", 2.0)]
 
-
-@pytest.mark.parametrize("rule", ["nodes", "gauss"])
-@pytest.mark.parametrize("cell_type", ["tet4", "tet10", "hex8"])
-@pytest.mark.parametrize(("shape", "radius"), SHAPES)
-def test_contact_force_and_stiffness_are_derivatives_of_its_energy(cell_type, rule, shape, radius):
-    tool = Indenter(shape, 20.0, max(radius, 1.0), centre=(0.3, -0.4, 2.0), axis=(0.1, 0.05, -1.0))
+@pytest.mark.parametrize(
+    ("shape", "radius", "cell_type", "rule"),
+    [
+        ("square", 1.0, "tet10", "gauss"), ("square", 2.0, "tet10", "nodes"),
+        ("square", 2.0, "tet4", "nodes"), ("square", 2.0, "tet4", "gauss"),
+        ("square", 2.0, "hex8", "nodes"), ("square", 2.0, "hex8", "gauss"), ("sphere", 0.0, "tet10", "gauss"),
+        ("cylinder", 1.0, "hex8", "nodes"), ("cylinder", 2.0, "tet10", "gauss"),
+    ],
+)  # fmt: skip
+def test_contact_force_and_stiffness_are_derivatives_of_its_energy(shape, radius, cell_type, rule):
+    tool = Indenter(shape, 20.0, radius, centre=(0.3, -0.4, 2.0), axis=(0.1, 0.05, -1.0))
     problem = punch(cell_type, 4, 1, indenter=tool, contact_rule=rule, start="as-given")
     system, laws = System(problem), Laws.build([SKIN, MUSCLE])
     rest = np.zeros((*system.weights.shape, 6))
@@ -30,16 +33,10 @@ def test_contact_force_and_stiffness_are_derivatives_of_its_energy(cell_type, ru
     rng, h = np.random.default_rng(1), 1e-6
     u = 0.01 * rng.normal(size=system.points.shape) * ~system.supported
     d = rng.normal(size=u.shape) * ~system.supported
-    here = at(u, 2.6)
+    here, _ = check_derivatives(system, lambda u: at(u, 2.6), u, d)
     assert here.contact_area > 0
-    ahead, back = at(u + h * d, 2.6), at(u - h * d, 2.6)
-    assert (ahead.energy - back.energy) / (2 * h) == pytest.approx((here.residual * d).sum(), rel=1e-5)
-    assert (ahead.force - back.force) / (2 * h) == pytest.approx(-(here.advance * d).sum(), rel=1e-4)
     deeper, shallower = at(u, 2.6 + h), at(u, 2.6 - h)
     assert (deeper.energy - shallower.energy) / (2 * h) == pytest.approx(here.force, rel=1e-5)
-    K_d = multiply_symmetric(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
-    change = ((ahead.residual - back.residual) / (2 * h)).reshape(-1, 1)[system.free]
-    np.testing.assert_allclose(K_d, change, atol=1e-4 * np.abs(change).max())
 
 
 def test_indenter_beside_the_faces_is_refused():
@@ -49,7 +46,7 @@ def test_indenter_beside_the_faces_is_refused():
 
 @pytest.mark.parametrize("cell_type", ["tet4", "tet10", "hex8"])
 def test_punch_stays_out_and_comes_back_to_rest(cell_type):
-    result = solve(punch(cell_type, 4, 1))
+    result = solve(punch(cell_type, 2, 1))
     assert result.completed, result.reason
     assert result.penetration.max() <= 0.01 * 6.0
     assert (result.force >= 0).all()
@@ -61,9 +58,9 @@ def test_punch_stays_out_and_comes_back_to_rest(cell_type):
     ("c", "m", "gamma", "tau"),
     [
         (4.7e-5, 20.0, 10.0, 0.01),
-        (0.047, 2.0, 0.01, 10.0),
+        pytest.param(0.047, 2.0, 0.01, 10.0, marks=pytest.mark.slow),
         (0.047, 20.0, 10.0, 10.0),
-        (4.7e-5, 2.0, 10.0, 10.0),
+        pytest.param(4.7e-5, 2.0, 10.0, 10.0, marks=pytest.mark.slow),
     ],
 )
 def test_corners_of_the_parameter_bounds(c, m, gamma, tau):
@@ -72,10 +69,10 @@ def test_corners_of_the_parameter_bounds(c, m, gamma, tau):
     assert result.completed, result.reason
 
 
-@pytest.mark.parametrize("shape", ["square", "sphere", "cylinder"])
+@pytest.mark.parametrize("shape", ["square", "sphere"])
 def test_thin_tissue_over_bone(shape):
     """4 mm of tissue pushed in by 2.4 mm by a sharp, tilted tool."""
-    lines = np.linspace(-20.0, 20.0, 9)
+    lines = np.linspace(-20.0, 20.0, 7)
     mesh = block("tet10", lines, lines, np.array([-4.0, -2.0, 0.0]), layer=2.0)
     tool = Indenter(shape, 20.0, 0.0, centre=(0, 0, 1), axis=(0.05, 0.1, -1.0))
     history = History(np.array([0.0, 2.5, 5.0]), np.array([0.0, 2.4, 0.0]))

@@ -121,12 +121,12 @@ def bending(X: np.ndarray) -> np.ndarray:
     return 0.05 * np.column_stack([np.sin(2 * y + z), np.sin(2 * z + x), np.sin(2 * x + y)])
 
 
-@pytest.mark.parametrize(("name", "order"), [("tet4", 1), ("tet10", 2), ("tet10p0", 1), ("hex8", 1)])
+@pytest.mark.parametrize(("name", "order"), [("tet4", 1), ("tet10", 2), ("hex8", 1)])
 def test_interpolated_energy_converges(name, order):
     """The energy of an interpolated smooth field converges at twice the order of its gradient."""
     law = Laws.build([TISSUE, TISSUE])
     energies = []
-    for n in (2, 4, 8, 16):
+    for n in (2, 4, 8) if order == 2 else (4, 8, 16):
         lines = np.linspace(0.0, 1.0, n + 1)
         system = System(body(name, lines=lines, jitter=0.0))
         rest = Increment(0.0, 0.0, np.ones(2), np.zeros((*system.weights.shape, 6)), 1.0)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import MUSCLE, SKIN, block, drive, punch, slope_and_difference
+from blocks import FINE_Z, MUSCLE, SKIN, block, check_derivatives, drive, punch, slope_and_difference
 
 from limbfit.errors import ProblemError
 from limbfit.fe import (
@@ -23,7 +23,6 @@ from limbfit.fe import (
 from limbfit.fe.contact.friction import Coulomb
 from limbfit.fe.contact.tool import Tool
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.solution.simulation import SteppedRun
 from limbfit.fe.system import Increment
 
@@ -59,25 +58,18 @@ class Dragged:
         return self.system.evaluate(u, self.laws, self.increment(advance, grip or self.grip))
 
 
-@pytest.mark.parametrize("rule", ["nodes", "gauss"])
-@pytest.mark.parametrize("shape", ["sphere", "square"])
+@pytest.mark.parametrize(("rule", "shape"), [("nodes", "sphere"), ("gauss", "square")])
 def test_forces_and_stiffness_of_friction_are_derivatives_of_its_energy(rule, shape):
     one = Dragged(rule, shape)
-    system, u, h = one.system, one.u, 1e-6
-    d = one.field(1.0)
-    here, ahead, back = one.at(u), one.at(u + h * d), one.at(u - h * d)
+    u, h = one.u, 1e-6
+    here, _ = check_derivatives(one.system, one.at, u, one.field(1.0))
     free = one.at(u, grip=replace(one.grip, held=np.zeros_like(one.grip.held)))
     assert np.abs(here.residual - free.residual).max() > 0.01 * np.abs(free.residual).max()
-    assert (ahead.energy - back.energy) / (2 * h) == pytest.approx((here.residual * d).sum(), rel=1e-5)
-    assert (ahead.force - back.force) / (2 * h) == pytest.approx(-(here.advance * d).sum(), rel=1e-4)
     rise = (one.at(u, 3.3 + h).energy - one.at(u, 3.3 - h).energy) / (2 * h)
     assert rise == pytest.approx(here.force, rel=1e-5)
-    K_d = multiply_symmetric(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
-    change = ((ahead.residual - back.residual) / (2 * h)).reshape(-1, 1)[system.free]
-    np.testing.assert_allclose(K_d, change, atol=1e-4 * np.abs(change).max())
 
 
-@pytest.mark.parametrize("mu", [0.05, 0.3, 30.0])
+@pytest.mark.parametrize("mu", [0.05, 30.0])
 def test_coupling_is_what_a_step_holds_constant(mu):
     """Contact forces with planes and bounds renewed at every displacement: springs and coupling together."""
     one = Dragged("gauss", mu=mu)
@@ -115,7 +107,7 @@ PRESS_AND_DRAG = History(
 DRAG_TIMES = tuple(np.concatenate([np.linspace(0.25, 1.0, 4), np.linspace(1.2, 3.0, 10)]))
 
 
-@pytest.mark.parametrize("mu", [0.1, 0.3, 0.5])  # with 0.8 a block this soft rolls before it slips
+@pytest.mark.parametrize("mu", [0.1, 0.5])  # with 0.8 a block this soft rolls before it slips
 def test_at_full_slip_the_friction_is_mu_times_the_normal_force(mu):
     result = solve(dragged_block(mu, PRESS_AND_DRAG), StepControl(times=DRAG_TIMES))
     assert result.completed, result.reason
@@ -127,12 +119,12 @@ def test_at_full_slip_the_friction_is_mu_times_the_normal_force(mu):
 
 
 def test_what_sticks_does_not_creep():
-    """Half of what it takes to slip, held for 40 steps: the force across stays as it is."""
+    """Half of what it takes to slip, held for 16 steps: the force across stays as it is."""
     history = History(
         np.array([0.0, 1.0, 2.0, 100.0]), np.array([0.0, 1.0, 1.0, 1.0]),
         np.array([[0.0, 0.0], [0.0, 0.0], [0.4, 0.0], [0.4, 0.0]]),
     )  # fmt: skip
-    times = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, *np.linspace(4.0, 100.0, 40))
+    times = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, *np.linspace(10.0, 100.0, 16))
     result = solve(dragged_block(0.8, history), StepControl(times=times))
     assert result.completed, result.reason
     held = result.times >= 2.0
@@ -162,7 +154,7 @@ def test_stepwise_sticking_slips_on_by_a_like_share_in_every_step():
 def test_friction_lies_between_frictionless_and_sticky():
     """Without friction and with a very large coefficient it is what those two are."""
     tool = Indenter("sphere", 40.0, centre=(0.0, 0.0, 1.0))
-    problem = punch("tet10", 2, 1, indenter=tool, depth=4.0)
+    problem = punch("tet4", 2, 1, indenter=tool, depth=4.0)
     control = StepControl(load_steps=3, unload_steps=3)
     free, none, some, much, stuck = (
         solve(replace(problem, friction=friction), control).force
@@ -174,16 +166,16 @@ def test_friction_lies_between_frictionless_and_sticky():
     np.testing.assert_array_equal(solve(replace(problem, friction=0.0), control).force, free)
 
 
-@pytest.mark.parametrize(("shape", "mu"), [("square", 0.5), ("sphere", 0.1)])
+@pytest.mark.parametrize(("shape", "mu", "element"), [("square", 0.5, "tet4"), ("sphere", 0.1, "tet10")])
 @pytest.mark.parametrize("sticking", ["anchored", pytest.param("stepwise", marks=pytest.mark.slow)])
-def test_sensitivities_with_friction_equal_central_differences(shape, mu, sticking):
+def test_sensitivities_with_friction_equal_central_differences(shape, mu, element, sticking):
     """Along one direction in the space of all eight parameters, pressing, dragging and letting go."""
     tight = StepControl(load_steps=3, unload_steps=2, tolerance=1e-9)
     tool = Indenter(shape, 30.0, 2.0 * (shape == "square"), axis=(0.05, 0.02, -1.0), centre=(0, 0, 3.0))
     times = np.array([0.0, 4.0, 6.0, 10.0])
     across = np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 0.5], [1.0, 0.5]])
     history = History(times, np.array([0.0, 4.0, 4.0, 0.0]), across)
-    problem = punch("tet10", 2, 1, indenter=tool, friction=mu, sticking=sticking, history=history)
+    problem = punch(element, 2, 1, indenter=tool, friction=mu, sticking=sticking, history=history)
     centre = solve(problem, tight, sensitivities=True, store="all")
     assert centre.completed
     assert not centre.doubts
@@ -191,13 +183,10 @@ def test_sensitivities_with_friction_equal_central_differences(shape, mu, sticki
     np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max())
 
 
-@pytest.mark.parametrize("friction", ["rough", -0.1, float("nan"), float("inf"), True])
-def test_friction_that_is_none_is_refused(friction):
-    with pytest.raises(ProblemError, match="unknown friction"):
-        solve(punch("tet4", 2, 1, friction=friction))
-
-
-def test_a_law_of_sticking_that_is_none_is_refused():
+def test_friction_that_is_none_is_refused():
+    for friction in ("rough", -0.1, float("nan"), float("inf"), True):
+        with pytest.raises(ProblemError, match="unknown friction"):
+            solve(punch("tet4", 2, 1, friction=friction))
     with pytest.raises(ProblemError, match="unknown law of sticking 'glued'"):
         solve(punch("tet4", 2, 1, friction=0.3, sticking="glued"))
 
@@ -246,9 +235,9 @@ def test_partial_slip_of_a_ball_is_that_of_cattaneo_and_mindlin():
     np.testing.assert_allclose(Q, expected, atol=0.03 * mu * P)
 
 
-@pytest.mark.parametrize("most", [20, 40])
-def test_iterations_that_lead_nowhere_count_and_a_step_keeps_to_the_bound(most):
+def test_iterations_that_lead_nowhere_count_and_a_step_keeps_to_the_bound():
     """A tolerance that rounding never meets: friction's own search fails again and again in one step."""
+    most = 20
     across = np.array([[0.0, 0.0], [0.0, 0.0], [6.0, 0.0]])
     history = History(np.array([0.0, 1.0, 2.0]), np.array([0.0, 4.0, 4.0]), across)
     problem = replace(punch("tet10", 2, 1), history=history, friction=0.5)
@@ -257,26 +246,18 @@ def test_iterations_that_lead_nowhere_count_and_a_step_keeps_to_the_bound(most):
     assert found.statistics["newton_iterations"] <= most
 
 
-def soft_skin(n: int, mu: float) -> Problem:
-    """A skin so soft that it slips within a ten-thousandth of a mm."""
-    laws = {"skin": OgdenQLV(1e-4, 10.0, 0.2, 1.0), "muscle": OgdenQLV(4.5e-3, 11.0, 0.05, 0.3)}
-    return replace(punch("tet10", n, 1, depth=2.0, friction=mu), materials=laws)
-
-
 def test_points_that_stick_slip_and_turn_round_are_found_in_few_iterations():
-    """With the second derivative alone it takes 217 iterations."""
-    result = solve(soft_skin(2, 0.3))
-    assert result.completed, result.reason
-    assert not result.doubts
-    assert result.statistics["newton_iterations"] <= 150
+    """On a skin so soft that it slips within a ten-thousandth of a mm.
 
-
-def test_friction_that_follows_the_displacement_is_found_though_the_residual_rises_first():
-    """Where every step had to lower the residual, 27 iterations led nowhere."""
-    run = SteppedRun(soft_skin(2, 0.3), StepControl(), False, None)
-    steps = list(run.run())
+    With the second derivative alone it takes 217 iterations, and where every step has to lower the residual,
+    which rises first, 27 lead nowhere.
+    """
+    laws = {"skin": OgdenQLV(1e-4, 10.0, 0.2, 1.0), "muscle": OgdenQLV(4.5e-3, 11.0, 0.05, 0.3)}
+    problem = punch("tet10", 2, 1, 2.0, z=FINE_Z, friction=0.3, materials=laws)
+    run = SteppedRun(problem, StepControl(), False, None)
+    assert len(list(run.run())) == 18
     assert not run.reason
-    assert len(steps) == 18
+    assert run.counts["newton_iterations"] <= 150
     assert run.counts["vain_iterations"] <= 9
 
 

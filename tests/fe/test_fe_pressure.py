@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import MUSCLE, SKIN, block, boundary, punch, sector
+from blocks import MUSCLE, SKIN, block, boundary, punch, sector, slope_and_difference
 from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
@@ -142,24 +142,15 @@ def test_a_pressed_block_turned_is_the_same():
 
 def test_derivatives_of_the_force_beside_a_pressure_with_a_free_rim():
     """An indenter on a half-pressed surface: its force by sensitivities and by central differences."""
-    problem = punch("tet10", 4, 1, history=History(np.array([0.0, 2.0]), np.array([0.0, 2.0])))
+    problem = punch("tet10", 2, 1, history=History(np.array([0.0, 2.0]), np.array([0.0, 2.0])))
     middle = problem.mesh.points[problem.contact_faces].mean(axis=1)
     pressed = problem.contact_faces[middle[:, 0] > 0.0]
     problem = replace(problem, pressures=(Pressure(pressed, [0.0, 2.0], [0.0, 0.004]),))
-    control = StepControl(times=(0.5, 1.0, 1.5, 2.0), tolerance=1e-9, penalty=200.0, hold_penalty=True)
+    control = StepControl(times=(0.7, 1.4, 2.0), tolerance=1e-9, penalty=200.0, hold_penalty=True)
     centre = solve(problem, control, sensitivities=True, store="all")
     assert centre.completed, centre.reason
-    change = 1e-4 * problem.parameters * np.random.default_rng(3).uniform(-1, 1, 8)
-
-    def force(sign: int) -> np.ndarray:
-        values = (problem.parameters + sign * change).reshape(2, 4)
-        changed = {name: OgdenQLV(*row) for name, row in zip(("skin", "muscle"), values)}
-        return solve(problem.with_materials(changed), control, warm_start=centre).force
-
-    difference = 0.5 * (force(1) - force(-1))
-    np.testing.assert_allclose(
-        centre.force_sensitivity @ change, difference, atol=1e-3 * np.abs(difference).max()
-    )
+    slope, difference = slope_and_difference(centre, control)
+    np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max())
 
 
 def test_a_pressure_that_stays_is_stepped_to_where_it_is_reached_and_leaves_no_force_at_free_nodes():

@@ -9,18 +9,18 @@ from blocks import parameter_slope, punch, slope_and_difference
 from limbfit.fe import Indenter, Ogden, StepControl, solve
 from limbfit.fe.solution import sensitivity, simulation
 
-TIGHT = StepControl(load_steps=4, unload_steps=4, tolerance=1e-10)
+TIGHT = StepControl(load_steps=3, unload_steps=3, tolerance=1e-10)
 
 
 def test_sensitivities_equal_central_differences():
-    centre = solve(punch("tet10", 2, 1), TIGHT, sensitivities=True, store="all")
+    centre = solve(punch("tet4", 2, 1), TIGHT, sensitivities=True, store="all")
     for region, name in centre.parameter_names:
         slope, difference = parameter_slope(centre, TIGHT, region, name)
         error = np.abs(difference - slope).max()
         assert error <= 1e-4 * np.abs(difference).max(), (region, name)
 
 
-@pytest.mark.parametrize(("cell_type", "element"), [("tet4", ""), ("hex8", ""), ("tet10", "tet10p0")])
+@pytest.mark.parametrize(("cell_type", "element"), [("hex8", ""), ("tet10", ""), ("tet10", "tet10p0")])
 def test_sensitivities_of_other_elements_equal_central_differences(cell_type, element):
     """Along one direction of all eight parameters."""
     centre = solve(punch(cell_type, 2, 1, element=element), TIGHT, sensitivities=True, store="all")

@@ -11,7 +11,7 @@ from limbfit.fe.solution import simulation
 
 def rounded(mu: float) -> Problem:
     tool = Indenter("square", 20.0, 2.0, axis=(0, 0, -1), centre=(0.0, 0.0, 1.0))
-    return punch("tet10", 3, 1, friction=mu, indenter=tool)
+    return punch("tet10", 2, 1, friction=mu, indenter=tool)
 
 
 def test_renewals_ask_for_equilibrium_no_better_than_needed(monkeypatch):

@@ -89,9 +89,9 @@ def test_a_smooth_surface_fades_past_its_brim_and_beyond_its_reach():
 
 
 def test_a_surface_grows_from_its_clear_shape_to_the_final_one():
-    x = on_cup(31.0, 200)
+    x = on_cup(31.0, 60)
     angle = np.arctan2(x[:, 1], x[:, 0])
-    clear = SmoothSurface.of(CUP[0] * [1.15, 1.1, 1.0] - [0.0, 0.0, 3.0], CUP[1], spacing=1.0)
+    clear = SmoothSurface.of(CUP[0] * [1.15, 1.1, 1.0] - [0.0, 0.0, 3.0], CUP[1], spacing=1.5)
     np.testing.assert_allclose(ROUND.grown(0.0).signed_distance(x), clear.signed_distance(x), atol=0.05)
     half, slopes, _ = ROUND.grown(0.5).local_distance(x)
     ends = [ROUND.grown(share).signed_distance(x) for share in (0.0, 1.0)]
@@ -136,15 +136,14 @@ def pipe(radius: float, length: float, n: int = 480) -> tuple[np.ndarray, np.nda
     return points, np.array([t for a, b in corners for t in ((a, a + n + 1, b), (b, a + n + 1, b + n + 1))])
 
 
-@pytest.mark.parametrize("mu", [0.0, 0.2])
-def test_a_press_fit_by_growth_is_lames_and_comes_off_by_its_friction(mu):
+def test_a_press_fit_by_growth_is_lames_and_comes_off_by_its_friction():
     """A rigid pipe grows onto a tube: the pressure of plane strain, small strain; then the pull mu p A."""
-    inner, outer, n, overlap = 10.0, 20.0, 24, 0.04
+    inner, outer, n, overlap, mu = 10.0, 20.0, 24, 0.04, 0.2
     law = NeoHookean(0.01, kappa_ratio=20.0)
     mesh = sector(np.linspace(inner, outer, 13), n)
     height = float(mesh.points[:, 2].max())
-    final, faces = pipe(outer - overlap, 4.0 * height)
-    clear = pipe(outer + 0.02, 4.0 * height)[0]
+    final, faces = pipe(outer - overlap, 2.0 * height)
+    clear = pipe(outer + 0.02, 2.0 * height)[0]
     shape = SmoothSurface.of(final, faces, clear=clear, spacing=0.5, reach=2.0)
     growth = Motion.of([0.0, 1.0], growth=[0.0, 1.0])
     body = RigidBody(shape, mesh.face_sets["outside"], growth.then(Motion.of([0.0, 1.0], z=[0.0, 0.5])), mu)
@@ -156,12 +155,12 @@ def test_a_press_fit_by_growth_is_lames_and_comes_off_by_its_friction(mu):
     pressure = press_fit(law, inner, outer, overlap)
     radial, axial = -found.reactions[-1, 0, 0], found.reactions[-1, 0, 2]
     assert radial == pytest.approx(pressure * outer * height, rel=0.01)
-    assert axial == pytest.approx(mu * np.pi / 2 * radial, rel=0.01, abs=1e-6 * radial)
+    assert axial == pytest.approx(mu * np.pi / 2 * radial, rel=0.01)
 
 
-@pytest.mark.parametrize("mu", [0.0, 0.3])
-def test_sensitivities_through_growth_equal_central_differences(mu):
-    """A cone grows onto a tube by 1 mm, and is pulled: displacements and axial force by the parameters."""
+def test_sensitivities_through_growth_equal_central_differences():
+    """A cone grows onto a tube by 1 mm, and is pulled with friction: displacements and axial force by the
+    parameters."""
     law = OgdenQLV(0.01, 4.0, 1.5, 0.4)
     mesh = sector(np.linspace(10.0, 20.0, 4), 6)
     height = float(mesh.points[:, 2].max())
@@ -169,7 +168,7 @@ def test_sensitivities_through_growth_equal_central_differences(mu):
     final = wide * [0.95, 0.95, 1.0] * (1.0 + 0.002 * wide[:, 2:]) ** [1.0, 1.0, 0.0]
     shape = SmoothSurface.of(final, faces, clear=wide, reach=4.0)
     motion = Motion.of([0.0, 1.0], growth=[0.0, 1.0]).then(Motion.of([0.0, 1.0], z=[0.0, 0.3]))
-    body = RigidBody(shape, mesh.face_sets["outside"], motion, mu)
+    body = RigidBody(shape, mesh.face_sets["outside"], motion, 0.3)
     problem = quarter_tube(mesh, law, body)
     control = StepControl(
         times=(0.4, 0.7, 1.0, 1.4, 2.0), penalty=100.0, hold_penalty=True, penetration=1.0, tolerance=1e-9

@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import MUSCLE, SKIN, block, drive, punch, slope_and_difference, symmetry
+from blocks import MUSCLE, SKIN, block, check_derivatives, drive, punch, slope_and_difference, symmetry
 
 from limbfit.fe import History, Indenter, NeoHookean, Problem, StepControl, System, iterate, solve
 from limbfit.fe.contact.friction import Anchors
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.system import Increment
 
 
@@ -32,14 +31,9 @@ def test_forces_and_stiffness_of_anchors_are_derivatives_of_their_energy(rule):
         )
 
     u = u + 0.1 * d
-    here, ahead, back = at(u, 1.7), at(u + h * d, 1.7), at(u - h * d, 1.7)
-    assert (ahead.energy - back.energy) / (2 * h) == pytest.approx((here.residual * d).sum(), rel=1e-5)
-    assert (ahead.force - back.force) / (2 * h) == pytest.approx(-(here.advance * d).sum(), rel=1e-4)
+    here, _ = check_derivatives(system, lambda u: at(u, 1.7), u, d)
     rise = (at(u, 1.7 + h).energy - at(u, 1.7 - h).energy) / (2 * h)
     assert rise == pytest.approx(here.force, rel=1e-5)
-    K_d = multiply_symmetric(system.indptr, system.indices, here.data, d.reshape(-1, 1)[system.free])
-    change = ((ahead.residual - back.residual) / (2 * h)).reshape(-1, 1)[system.free]
-    np.testing.assert_allclose(K_d, change, atol=1e-4 * np.abs(change).max())
 
 
 def test_anchors_neither_push_nor_pull_along_the_normal():
@@ -59,11 +53,11 @@ def test_anchors_neither_push_nor_pull_along_the_normal():
 def slip_and_force(friction: str) -> tuple[float, np.ndarray]:
     """How far pressed points move across the axis of a ball from step to step, mm at most; the forces."""
     tool = Indenter("sphere", 40.0, centre=(0.0, 0.0, 1.0))
-    problem = punch("tet10", 4, 1, friction=friction, indenter=tool, contact_rule="nodes")
+    problem = punch("tet10", 2, 1, friction=friction, indenter=tool, contact_rule="nodes")
     system = System(problem)
     nodes = system.bodies.first.surface.faces[:, 0]
     slip, forces, pressed, u = 0.0, [], np.zeros(len(nodes), dtype=bool), np.zeros_like(system.points)
-    for step in iterate(problem, StepControl(load_steps=6, unload_steps=5)):
+    for step in iterate(problem, StepControl(load_steps=5, unload_steps=4)):
         gaps = system.bodies.tools(step.state.u, step.state.drives)[0].gaps[:, 0]
         now = gaps < -0.1 * step.penetration
         moved = np.linalg.norm((step.state.u - u)[nodes, :2], axis=1)
@@ -81,12 +75,12 @@ def test_what_touches_does_not_slip_and_lets_go_at_the_end():
     assert stuck[-1] == 0.0
 
 
-@pytest.mark.parametrize("shape", ["square", "sphere"])
-def test_sensitivities_of_sticky_contact_equal_central_differences(shape):
+@pytest.mark.parametrize(("shape", "element"), [("square", "tet4"), ("sphere", "tet10")])
+def test_sensitivities_of_sticky_contact_equal_central_differences(shape, element):
     """Along one direction in the space of all eight parameters."""
     tight = StepControl(load_steps=3, unload_steps=2, tolerance=1e-10)
     tool = Indenter(shape, 30.0, 2.0 * (shape == "square"), axis=(0.05, 0.02, -1.0), centre=(0, 0, 3.0))
-    problem = punch("tet10", 2, 1, indenter=tool, friction="sticky")
+    problem = punch(element, 2, 1, indenter=tool, friction="sticky")
     centre = solve(problem, tight, sensitivities=True, store="all")
     assert centre.completed
     slope, difference = slope_and_difference(centre, tight)
@@ -110,7 +104,7 @@ def stiffening(nu: float) -> float:
     return stuck.peak_force / free.peak_force
 
 
-@pytest.mark.parametrize("nu", [0.0, 0.25, 0.4995])
+@pytest.mark.parametrize("nu", [0.0, 0.4995])
 def test_sticking_stiffens_a_flat_punch_as_in_theory(nu):
     """Spence (1968): ``F_stuck / F_free = (1 - nu) ln(3 - 4 nu) / (1 - 2 nu)``, 1.099 at 0 and 1 at 1/2."""
     theory = (1.0 - nu) * np.log(3.0 - 4.0 * nu) / (1.0 - 2.0 * nu)

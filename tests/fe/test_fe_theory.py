@@ -20,7 +20,7 @@ NONE = np.zeros(0, dtype=int)
 NO_FACES = np.zeros((0, 3), dtype=int)
 
 
-@pytest.mark.parametrize("law", SAMPLES.values(), ids=SAMPLES)
+@pytest.mark.parametrize("law", [SAMPLES["two times"], SAMPLES["elastic"]], ids=["two times", "elastic"])
 def test_uniaxial_compression_with_relaxation(law):
     """Sides free: 30 % in 0.5 s, held, half released; incompressible: ``lambda^2 S_a - S_l/lambda``."""
     law = replace(law, kappa_ratio=1e5)
@@ -229,9 +229,7 @@ def relative_errors(element: str, n: int, body: HalfSpace) -> np.ndarray:
     return np.array([found / size for found, size in norms])
 
 
-@pytest.mark.parametrize(
-    ("element", "l2", "h1"), [("tet10", 3, 2), ("tet10g8", 3, 2), ("tet4", 2, 1), ("hex8", 2, 1)]
-)
+@pytest.mark.parametrize(("element", "l2", "h1"), [("tet10", 3, 2), ("tet4", 2, 1), ("hex8", 2, 1)])
 def test_convergence_order(element, l2, h1):
     """Slope of the errors over three meshes, with a pressure that varies."""
     sizes = np.array([3, 4, 6])
@@ -255,7 +253,7 @@ def bonded(element: str, n: int, kappa_ratio: float) -> float:
         mesh, {"skin": law, "muscle": law}, NONE, NO_FACES, None, ramp,
         supports=(*symmetry(mesh), *plates), element=element,
     )  # fmt: skip
-    *_, step = iterate(problem, StepControl(times=(0.25, 0.5, 0.75, 1.0), tolerance=1e-6))
+    *_, step = iterate(problem, StepControl(times=(0.5, 1.0), tolerance=1e-6))
     system, rest = System(problem), Increment(1.0, 1.0, np.ones(2), 0.0, 1.0)
     rest = replace(rest, history=np.zeros((*system.weights.shape, 6)))
     at = system.evaluate(step.state.u, Laws.build([law, law]), rest)
@@ -263,7 +261,7 @@ def bonded(element: str, n: int, kappa_ratio: float) -> float:
 
 
 # tet10 with n = 4 (13,000 unknowns), by kappa/mu; some 3 % above its limit: the bonded edges are singular.
-BONDED_N = {1e2: 4 * 1.26589, 1e3: 4 * 1.29414, 1e4: 4 * 1.30172}
+BONDED_N = {1e2: 4 * 1.26589, 1e4: 4 * 1.30172}
 
 
 def test_default_element_does_not_lock():
@@ -272,4 +270,4 @@ def test_default_element_does_not_lock():
     excess = np.array([[bonded(e, n, k) / BONDED_N[k] - 1 for k in BONDED_N] for e, n in same_nodes])
     assert (np.abs(excess[0]) < 0.035).all(), excess
     assert np.ptp(excess[0]) < 0.01, excess
-    assert (excess[1] > [0.15, 0.8, 4.0]).all(), excess
+    assert (excess[1] > [0.15, 4.0]).all(), excess

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from blocks import punch
+from blocks import FINE_Z, punch
 
 from limbfit.fe import History, StepControl, solve
 from limbfit.fe.materials import compute_prony_factors
@@ -30,54 +31,46 @@ USUAL = StepControl(load_steps=STUDY.load_steps, unload_steps=STUDY.unload_steps
 FEWER = StepControl(load_steps=6, unload_steps=8)
 
 
-@pytest.mark.parametrize("tau", [0.1, 0.2, 0.32, 1.0, 3.0])
-@pytest.mark.parametrize("name", ["ramp", "hold"])
-def test_the_curve_is_within_its_goal(name, tau):
+@cache
+def exact(name, tau, parts=300):
+    return solve_reference_layer(HISTORIES[name], parts, prony=((3.0, tau),))
+
+
+@pytest.mark.parametrize(
+    ("name", "tau", "control"),
+    [
+        *[("ramp", tau, control) for tau in (0.1, 0.32, 3.0) for control in (USUAL, FEWER)],
+        *[("hold", 0.32, USUAL), ("hold", 0.32, FEWER), ("cycles", 0.1, USUAL), ("two rates", 0.1, USUAL)],
+    ],
+)
+def test_the_curve_is_within_its_goal(name, tau, control):
     """0.3 % rms and 1 % at worst of the peak, read between the steps too."""
-    layer = {"prony": ((3.0, tau),)}
-    exact = solve_reference_layer(HISTORIES[name], **layer)
-    for control in (USUAL, FEWER):
-        rms, worst = compute_curve_error(solve_layer(HISTORIES[name], control, **layer), exact)
-        assert rms < 0.3
-        assert worst < 1.0
-
-
-@pytest.mark.parametrize("tau", [0.1, 0.32])
-@pytest.mark.parametrize("name", ["cycles", "two rates"])
-def test_cycles_and_rates_are_within_the_goal(name, tau):
-    layer = {"prony": ((3.0, tau),)}
-    rms, worst = compute_curve_error(
-        solve_layer(HISTORIES[name], USUAL, **layer), solve_reference_layer(HISTORIES[name], **layer)
-    )
+    rms, worst = compute_curve_error(solve_layer(HISTORIES[name], control, ((3.0, tau),)), exact(name, tau))
     assert rms < 0.3
     assert worst < 1.0
 
 
-@pytest.mark.parametrize("tau", [0.4, 0.5, 1.0, 1.6, 3.0])
+@pytest.mark.parametrize("tau", [0.4, 1.6])
 def test_slow_tissue_that_has_not_come_back_is_met_on_the_way(tau):
     """At a time that no step foresees: the curve goes to zero there, not at the step before it."""
-    layer = {"prony": ((3.0, tau),)}
-    exact = solve_reference_layer(HISTORIES["cycles"], **layer)
-    rms, worst = compute_curve_error(solve_layer(HISTORIES["cycles"], USUAL, **layer), exact)
+    found = solve_layer(HISTORIES["cycles"], USUAL, ((3.0, tau),))
+    rms, worst = compute_curve_error(found, exact("cycles", tau))
     assert rms < 0.3
     assert worst < 1.8
 
 
 @pytest.mark.parametrize(("control", "most"), [(USUAL, 18), (FEWER, 14)])
-@pytest.mark.parametrize("tau", [0.1, 0.32, 1.0, 3.0])
+@pytest.mark.parametrize("tau", [0.1, 3.0])
 def test_a_ramp_takes_no_more_steps_than_stated(control, most, tau):
     found = solve_layer(HISTORIES["ramp"], control, ((3.0, tau),))
     assert len(found.times) - 1 <= control.load_steps + control.unload_steps == most
 
 
-@pytest.mark.parametrize("tau", [0.1, 0.32, 1.0])
+@pytest.mark.parametrize("tau", [0.1, 1.0])
 @pytest.mark.parametrize("detail", DISCRETISATIONS)
 def test_the_phantoms_truth_has_a_tenth_of_the_goals_error(detail, tau):
-    layer = {"prony": ((3.0, tau),)}
-    exact = solve_reference_layer(HISTORIES["ramp"], parts=1500, **layer)
-    rms, worst = compute_curve_error(
-        solve_layer(HISTORIES["ramp"], DISCRETISATIONS[detail].steps(20.0), **layer), exact
-    )
+    found = solve_layer(HISTORIES["ramp"], DISCRETISATIONS[detail].steps(20.0), ((3.0, tau),))
+    rms, worst = compute_curve_error(found, exact("ramp", tau, 1000))
     assert rms < 0.03
     assert worst < 0.1
 
@@ -88,15 +81,14 @@ def test_order_of_convergence(stress, order):
     history = History(np.array([0.0, 4.0]), np.array([0.0, 1.0]))
     layer = {"prony": ((2.0, 0.5), (1.0, 3.0)), "power": 3.0}
     ends = []
-    for n in (20, 40, 80, 1600):
+    for n in (20, 40, 80, 800):
         times = tuple(4.0 * np.arange(1, n + 1) / n)
         ends.append(solve_layer(history, StepControl(times=times, stress=stress), **layer).force[-1])
     errors = np.abs(np.array(ends[:-1]) - ends[-1])
     assert np.log2(errors[1] / errors[2]) == pytest.approx(order, abs=0.2)
 
 
-@pytest.mark.parametrize("x", [1e-4, 0.019, 0.021, 0.5, 4.0])
-@pytest.mark.parametrize("q", [0.4, 1.0, 3.0])
+@pytest.mark.parametrize(("x", "q"), [(1e-4, 0.4), (0.019, 1.0), (0.021, 1.0), (0.5, 3.0), (4.0, 0.4)])
 def test_the_history_of_a_quadratic_stress_is_exact(x, q):
     """Against the integral, and derivatives against differences."""
     tau = 0.32
@@ -116,7 +108,7 @@ def test_the_history_of_a_quadratic_stress_is_exact(x, q):
 
 def test_a_step_before_the_end_of_contact_does_not_move_with_the_parameters():
     places = set()
-    for g in np.linspace(2.9, 3.1, 9):
+    for g in np.linspace(2.9, 3.1, 5):
         places |= set(solve_layer(HISTORIES["ramp"], USUAL, ((g, 1.0),)).times.round(9))
     planned = set(grade_steps(HISTORIES["ramp"], USUAL.load_steps, USUAL.unload_steps).round(9))
     assert 1 <= len(places - planned - {0.0}) <= 2
@@ -130,8 +122,8 @@ def test_only_what_unloads_foresees_the_end_of_contact():
 
 
 def test_a_block_is_within_the_goal_with_fewer_steps():
-    problem = punch("tet4", 2, 1)
-    fine = solve(problem, StepControl(load_steps=40, unload_steps=50), store="none")
+    problem = punch("tet4", 2, 1, z=FINE_Z)
+    fine = solve(problem, StepControl(load_steps=24, unload_steps=30), store="none")
     found = solve(problem, FEWER, store="none")
     t = np.linspace(0.0, problem.history.times[-1], 400)
     error = 100.0 * (found.force_at(t) - fine.force_at(t)) / fine.peak_force
