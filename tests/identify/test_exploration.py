@@ -62,7 +62,7 @@ def test_failed_runs_do_not_stop_an_exploration():
         runs[-1][0] = SiteResponse(bad.force_N, bad.jacobian, False, "stopped")
         return runs
 
-    settings = ExplorationSettings(runs=8, batch=8, steps=200, checked=0)
+    settings = ExplorationSettings(runs=8, batch=8, steps=100, checked=0)
     earlier = [np.array(i.parameters) for i in found.history]
     done = explore_posterior(flaky, known, earlier, settings)
     assert len(done.runs) == len(earlier) + 8 - 2
@@ -126,15 +126,20 @@ def test_combinations_of_bent_draws_are_as_wide_as_the_bend():
 
 @pytest.fixture(scope="module")
 def vague():
-    """Records that leave some parameters open, and what is found with few runs."""
+    """Records that leave some parameters open, and what is found with few runs; one end of the narrowest
+    profile cannot be simulated."""
     _, found, known = calibrated(noise=0.5)
 
-    def many(points):
-        return [simulate(p) for p in points]
+    def failing(points):
+        runs = [list(simulate(p)) for p in points]
+        if len(points) == 5:  # the optimum and the ends of two profiles
+            end = runs[2][0]
+            runs[2][0] = SiteResponse(end.force_N, end.jacobian, False, "stopped")
+        return runs
 
     earlier = [np.array(i.parameters) for i in found.history]
-    settings = ExplorationSettings(runs=8, batch=8, steps=200, checked=1)
-    return explore_posterior(many, known, earlier, settings)
+    settings = ExplorationSettings(runs=8, batch=8, steps=100, checked=1)
+    return explore_posterior(failing, known, earlier, settings)
 
 
 def test_profiles_say_where_they_are_extrapolated(vague):
@@ -163,19 +168,6 @@ def test_the_solver_is_asked_at_the_ends_of_the_widest_profile_too(vague):
     assert None not in checks["widest"].solved
 
 
-def test_an_end_that_cannot_be_simulated_is_told():
-    _, found, known = calibrated(noise=0.5)
-
-    def failing(points):
-        runs = [list(simulate(p)) for p in points]
-        if len(points) == 5:  # the optimum and the ends of two profiles
-            last = runs[-1][0]
-            runs[-1][0] = SiteResponse(last.force_N, last.jacobian, False, "stopped")
-        return runs
-
-    earlier = [np.array(i.parameters) for i in found.history]
-    settings = ExplorationSettings(runs=8, batch=8, steps=200, checked=1)
-    done = explore_posterior(failing, known, earlier, settings)
-    widest = next(check for check in done.checks if check.why == "widest")
-    assert widest.solved[1] is None
-    assert widest.solved[0] is not None
+def test_an_end_that_cannot_be_simulated_is_told(vague):
+    narrowest = next(check for check in vague.checks if check.why == "narrowest")
+    assert [end is None for end in narrowest.solved] == [False, True]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ TIME = np.linspace(-1.0, 1.0, POINTS)
 X = np.stack([np.ones(POINTS), 0.06 * TIME, TIME**2], axis=1)
 BENT = Unknowns(("t.c_kPa", "t.m", "t.gamma"), np.ones(3), np.full(3, 0.05), np.full(3, 20.0))
 BENT_TRUTH = np.array([1.2, 1.3, 0.9])
+SEPARATE = group_separately(NAMES)
 
 
 class Valley:
@@ -62,20 +64,19 @@ def test_on_a_bent_valley_the_stated_intervals_hold_the_truth():
     assert found.further <= 10
 
 
-def near_the_truth(noise=0.03, grouping=None):
-    data, kept = records(noise, seed=4), EvaluationStore()
-    grouping = grouping or group_separately(NAMES)
-    found = calibrate(storing(kept, simulate), data, PAPER.with_start(TRUTH), stages=(grouping,))
-    bounds = PAPER.with_start(TRUTH)
-    known = estimate_uncertainty(
-        found.parameters,
-        found.responses,
-        data,
-        bounds,
-        estimate_curve_noise(found.responses, data),
-        grouping=grouping,
-    )
-    return data, kept, known
+@cache
+def estimate_near_the_truth(grouping):
+    data, kept, bounds = records(0.03, seed=4), EvaluationStore(), PAPER.with_start(TRUTH)
+    found = calibrate(storing(kept, simulate), data, bounds, stages=(grouping,))
+    noise = estimate_curve_noise(found.responses, data)
+    arguments = (found.parameters, found.responses, data, bounds, noise)
+    return data, kept, estimate_uncertainty(*arguments, grouping=grouping)
+
+
+def near_the_truth(grouping=SEPARATE):
+    """Records, the simulations that a calibration made of them, and what is known after it."""
+    data, kept, known = estimate_near_the_truth(grouping)
+    return data, EvaluationStore([*kept.points], [*kept.responses]), known
 
 
 def test_further_simulations_are_few_and_asked_for_again_alike():

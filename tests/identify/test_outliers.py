@@ -99,14 +99,14 @@ def test_a_curve_driven_by_another_record_is_close_to_its_simulation():
         assert np.abs(about.force_N - true).mean() < 0.12 * true.max()
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_clean_studies_have_no_warning(seed):
     assert study(seed).warnings == ()
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("site", [1, 5])
-@pytest.mark.parametrize("factor", [9.81, 4.448])
+@pytest.mark.parametrize(
+    ("seed", "site", "factor"), [(0, 1, 9.81), (1, 5, 9.81), (2, 1, 4.448), (0, 5, 4.448)]
+)
 def test_a_force_in_another_unit_is_named(seed, site, factor):
     warnings = study(seed, ("force", site, factor)).warnings
     assert [(warning.sites, warning.kind) for warning in warnings] == [((f"s{site}",), "unit")]
@@ -130,7 +130,7 @@ def test_swapped_names_are_found_whoever_was_fitted(pair):
     assert caught
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_site_of_other_tissue_is_warned_of_with_the_evidence(seed):
     """Among six sites its record may also be explained by an exchange: there is a warning either way."""
     warnings = study(seed, ("stiff", 4)).warnings

@@ -9,7 +9,7 @@ import pytest
 from bars import NAMES, PAPER, SITES, TRUTH, Bars
 
 from limbfit.bench.blocks import build_punched_block
-from limbfit.fe import History, OgdenQLV, solve
+from limbfit.fe import History, OgdenQLV, StepControl, solve
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import build_space, group_separately
@@ -150,7 +150,8 @@ def test_superposition_holds_for_the_solver():
             tissue: OgdenQLV(1e-3 * c, *own)
             for tissue, (c, *own) in zip(("skin", "muscle"), values.reshape(2, 4))
         }
-        return solve(replace(block, history=history, materials=laws), sensitivities=sensitivities)
+        pressed = replace(block, history=history, materials=laws)
+        return solve(pressed, StepControl(load_steps=6, unload_steps=6), sensitivities=sensitivities)
 
     one, true = press(p, True), press(other, False).force_at(times)
     slopes = one.sensitivity_at(times) * np.array([1e-3, 1, 1, 1] * 2)
@@ -222,6 +223,7 @@ def test_a_hold_of_a_minute_narrows_what_is_open_after_it(of_model):
         assert np.log(high_held / low_held) < 0.6 * np.log(high / low)
 
 
+@pytest.mark.slow
 def test_a_hold_tells_a_power_law_of_time():
     found = assess_power_law(60.0)
     assert found.preferred == POWER_LAW
