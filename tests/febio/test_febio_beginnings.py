@@ -42,9 +42,9 @@ from limbfit.febio.preparation import Preparation
 SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, (0.8, 0.3), (0.2, 1.5))
 TENSED = Contractile(Fibred(MUSCLE, 0.012, 2.5), 0.01)
 ASKEW = np.array([1.0, -1.0, 0.5])
-TIMES = (0.5, 1.0, 1.5, 2.0, 3.0)
+TIMES = (0.5, 1.0, 2.0, 3.0)
 EXACT = StepControl(
-    times=TIMES, stress="linear", penalty=20.0, penetration=1.0, hold_penalty=True, tolerance=1e-10
+    times=TIMES, stress="linear", penalty=20.0, penetration=1.0, hold_penalty=True, tolerance=1e-9
 )
 UP = np.array([0.0, 0.0, 1.0])
 TAUT = isochoric_stretch(UP, 0.9)[0]
@@ -101,10 +101,8 @@ def field(problem):
 TENSES = {"materials": {"skin": SKIN, "muscle": TENSED}, "fibres": ASKEW,
           "activation": Activation([0.0, 0.7, 2.0], [0.0, 1.0, 0.4])}  # fmt: skip
 CASES = {
-    "contraction": TENSES,
     "elastic contraction": TENSES | {"materials": {"skin": SKIN, "muscle": STILL}},
     "pre-stretch": {"prestretch": TAUT},
-    "field": {"prestretch": field(block())},
     "all": TENSES | {"prestretch": field(block())},
 }  # fmt: skip
 
@@ -133,7 +131,7 @@ def test_a_contraction_alone_is_written(tmp_path):
     )
 
 
-@pytest.mark.parametrize("axis", [(0.0, 0.0, -1.0), (0.3, 0.1, -1.0), (-0.2, 0.4, -1.0)])
+@pytest.mark.parametrize("axis", [(0.0, 0.0, -1.0), (0.3, 0.1, -1.0)])
 def test_bodies_under_force_go_along_their_own_axis(tmp_path, axis):
     """Two, of which at most one could be turned to the axes of space."""
     force = Motion.of([0.0, 1.0, 3.0], force={"z": [0.0, 0.8, 0.5]})
@@ -147,7 +145,7 @@ def test_bodies_under_force_go_along_their_own_axis(tmp_path, axis):
     np.testing.assert_allclose(theirs[0], mine[0], atol=1e-5 * np.abs(mine).max())
     np.testing.assert_allclose(theirs[1:], mine[1:], atol=1e-6 * np.abs(mine).max())
     along = np.einsum("bj,nbj->nb", [b.shape.frame[2] for b in bodies], mine)
-    np.testing.assert_allclose(along[3], 0.65, rtol=1e-6)
+    np.testing.assert_allclose(along[2], 0.65, rtol=1e-6)
     if len(model.rails) == 2:
         assert np.abs(mine - along[..., None] * [b.shape.frame[2] for b in bodies]).max() > 0.01
 
@@ -160,11 +158,9 @@ PRESSED = Motion.of([0.0, 1.0, 5.0], force={"z": [0.0, 0.5, 0.5]})
 CLAMP = ball((0.2, 0.0, -1.0), 18.0, PRESSED, "clamp")
 TENSED_EARLY = TENSES | {"activation": Activation([0.0, 1.0], [0.0, 1.0])}
 LATER = {
-    "clamped": {"bodies": (CLAMP,), "touch_down_s": HELD_S},
     "tensed": TENSED_EARLY | {"touch_down_s": HELD_S},
     "taut": {"prestretch": TAUT, "history": History(COURSE.times[1:] - HELD_S, COURSE.driver[1:])},
-    "taut and clamped": {"prestretch": TAUT, "touch_down_s": HELD_S,
-                         "bodies": (CLAMP,)},
+    "taut and clamped": {"prestretch": TAUT, "touch_down_s": HELD_S, "bodies": (CLAMP,)},
 }  # fmt: skip
 
 
@@ -193,6 +189,9 @@ def test_tables_and_results_tell_the_time_of_each(tmp_path):
     """FEBio's time in its own tables, that of the problem in its result, whose way is from touch-down."""
     problem = block(indenter=PUNCH, history=COURSE, **LATER["taut and clamped"])
     back(problem, tmp_path, LATE)
+    text = (tmp_path / "model.feb").read_text()
+    for words in ("<!-- pre-strain: grows in 1 s", "<!-- touch-down: where limbfit", "<!-- guides: bodies"):
+        assert text.count(words) == 1
     begun = Preparation.from_problem(problem).seconds
     run = run_feb(tmp_path / "model.feb", tmp_path / "out", times=LATE.times, penalty=20.0, penetration=1.0)
     assert run.result.completed, run.result.reason
@@ -207,14 +206,6 @@ def test_tables_and_results_tell_the_time_of_each(tmp_path):
     assert found.peak_force > 0.5
     early = replace(log, times=log.times[:1], values=log.values[:1])
     assert build_result(problem, early, RunVerdict("partial", "stopped", 0.1, "4.11")).times.tolist() == [0.0]
-
-
-def test_what_limbfit_writes_says_what_it_does(tmp_path):
-    problem = block(indenter=PUNCH, history=COURSE, **LATER["taut and clamped"])
-    back(problem, tmp_path, LATE)
-    text = (tmp_path / "model.feb").read_text()
-    for words in ("<!-- pre-strain: grows in 1 s", "<!-- touch-down: where limbfit", "<!-- guides: bodies"):
-        assert text.count(words) == 1
 
 
 def stepping(text):
@@ -260,7 +251,7 @@ HOLDS = '<rigid_bc type="rigid_fixed"><rb>clamp</rb><Rx_dof>1</Rx_dof></rigid_bc
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_limbfit_has_not_is_refused_with_its_line(tmp_path, case):
     change, words = REFUSED[case]
-    problem = block(bodies=LATER["clamped"]["bodies"], history=COURSE, prestretch=TAUT)
+    problem = block(bodies=(CLAMP,), history=COURSE, prestretch=TAUT)
     write_feb(problem, tmp_path / "model.feb", FebSettings(steps=LATE))
     text = change((tmp_path / "model.feb").read_text())
     with pytest.raises(ProblemError, match=rf"(?s)line \d+.*{words}|{words}"):

@@ -41,14 +41,14 @@ SIDE = np.array([[x, y, 0.2] for x in (-8.0, 0.0, 8.0) for y in (-8.0, 8.0)])
 SHEET = OpenSurface(SIDE, np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]]))
 
 
-def block(**changes):
-    problem = build_punched_block("hex8", 6)
+def block(divisions=4, **changes):
+    problem = build_punched_block("hex8", divisions)
     soft = {name: NeoHookean(0.006, kappa_ratio=100.0) for name in ("skin", "muscle")}
     return replace(problem.with_materials(soft), indenter=None, history=END, **changes)
 
 
 def sheet(motion, **changes):
-    faces = build_punched_block("hex8", 6).mesh.face_sets["skin"]
+    faces = build_punched_block("hex8", 4).mesh.face_sets["skin"]
     return RigidBody(SHEET, faces, motion, 0.3, pivot=(1.0, 2.0, 4.0), name="sheet", **changes)
 
 
@@ -69,8 +69,10 @@ MOTIONS = {
 
 @pytest.mark.parametrize("case", MOTIONS)
 def test_a_body_is_read_back_as_it_was(tmp_path, case):
-    """An open sheet with friction, beside a pressure: every number, and hence the forces; with FEBio's law
-    of sticking, in the place of which the forces are taken with limbfit's."""
+    """An open sheet with friction, beside a pressure: every number, and hence the forces (of two of them).
+
+    It comes back with FEBio's law of sticking, in the place of which the forces are taken with limbfit's.
+    """
     problem = block(bodies=(sheet(MOTIONS[case]),))
     problem = replace(
         problem,
@@ -92,6 +94,8 @@ def test_a_body_is_read_back_as_it_was(tmp_path, case):
     (pressed,) = found.pressures
     np.testing.assert_array_equal(pressed.faces, problem.pressures[0].faces)
     assert [pressed.at(t) for t in (0.7, 1.8)] == pytest.approx([7e-4 / 1.5, 4e-4])
+    if case not in ("turned", "pressed"):
+        return
     alike = replace(found, bodies=(replace(theirs, sticking="anchored"),))
     runs = [solve(one, STEPS, store="none") for one in (problem, alike)]
     assert runs[0].completed, runs[0].reason
@@ -103,12 +107,12 @@ def test_a_body_is_read_back_as_it_was(tmp_path, case):
 
 def test_several_bodies_push_as_hard_when_read_back(tmp_path):
     """A punch under a force, and a ball with friction that is dragged: their facets are all that differs."""
-    faces = block().contact_faces
+    faces = block(6).contact_faces
     down = History(np.array([0.0, 1.0, 2.0]), force=np.array([0.0, 1.5, 1.0]))
     punch = Indenter("square", 12.0, 2.0, (-10.0, 0.0, 0.3), (0.0, 0.0, -1.0), edge=(1.0, 0.0, 0.0))
     ball = Indenter("sphere", 16.0, centre=(14.0, 0.0, 0.3), axis=(0.0, 0.0, -1.0), edge=(1.0, 0.0, 0.0))
     dragged = RigidBody(ball, faces, Motion.of(TIMES, x=[0.0, 0.0, 1.0], z=[0.0, 2.0, 2.0]), 0.4, name="ball")
-    problem = replace(block(bodies=(dragged,)), indenter=punch, history=down, start="as-given")
+    problem = replace(block(6, bodies=(dragged,)), indenter=punch, history=down, start="as-given")
     found = back(problem, tmp_path)
     assert [body.name for body in found.rigid_bodies] == ["indenter", "ball"]
     assert [body.friction for body in found.rigid_bodies] == ["frictionless", 0.4]
@@ -155,7 +159,7 @@ def test_moments_are_about_the_centre_of_mass(tmp_path):
         body = replace(sheet(MOTIONS["moved"]), pivot=pivot)
         write_feb(block(bodies=(body,)), tmp_path / "model.feb", FebSettings())
         text = (tmp_path / "model.feb").read_text().replace("Fx;Fy;Fz;x;y;z", "Fx;Fy;Fz;Mx;My;Mz")
-        run_feb(written(tmp_path, text, "asked.feb"), tmp_path / "out", times=STEPS.times)
+        run_feb(written(tmp_path, text, "asked.feb"), tmp_path / "out", times=(1.0, 2.0))
         tables.append(read_log(tmp_path / "out" / "forces.txt").values[-1, 0])
     np.testing.assert_allclose(tables[1][:3], tables[0][:3], rtol=1e-9)
     arm = np.array([4.0, -3.0, 3.0])  # from the second centre to the first

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import re
-import resource
-import subprocess
-import sys
 import tracemalloc
 
 import pytest
@@ -111,14 +108,19 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("name", HOSTILE)
-def test_entities_are_never_read(tmp_path, name):
+def refuse_in(file, said):
+    """Bytes of memory in which a file is refused."""
     tracemalloc.start()
-    with pytest.raises(ProblemError, match="document type"):
-        read_feb(written(tmp_path, HOSTILE[name]))
+    with pytest.raises(ProblemError, match=said):
+        read_feb(file)
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert most < 5e6
+    return most
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_entities_are_never_read(tmp_path, name):
+    assert refuse_in(written(tmp_path, HOSTILE[name]), "document type") < 5e6
 
 
 def test_a_file_of_gigabytes_is_not_read(tmp_path):
@@ -130,18 +132,9 @@ def test_a_file_of_gigabytes_is_not_read(tmp_path):
 
 
 def test_memory_stays_in_proportion(tmp_path):
-    """A million empty elements in a process that may have four gigabytes of addresses."""
-    file = tmp_path / "many.feb"
-    file.write_text("<febio_spec version='4.0'>" + "<a/>" * 10**6 + "</febio_spec>")
-    code = f"from limbfit.febio import read_feb; read_feb({str(file)!r})"
-    limit = 4 * 2**30
-
-    def less() -> None:
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-
-    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, preexec_fn=less)
-    assert "ProblemError" in shown.stderr
-    assert "<a>: this section is not supported" in shown.stderr
+    """A hundred thousand empty elements take no more than four kilobytes each."""
+    text = "<febio_spec version='4.0'>" + "<a/>" * 10**5 + "</febio_spec>"
+    assert refuse_in(written(tmp_path, text), "<a>: this section is not supported") < 4e8
 
 
 def test_tables_stay_in_their_folder(tmp_path):

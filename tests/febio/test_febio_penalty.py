@@ -55,8 +55,16 @@ def modulus_as_febio(normal, mu, kappa):
     return 1.0 / (v @ np.linalg.inv(tangent) @ v)
 
 
-@pytest.mark.parametrize("axis", [(0, 0, 1), (1, 1, 0), (1, 1, 1), (0.7, -0.2, 0.4)])
-@pytest.mark.parametrize("element", ["hex8", "tet4", "tet10"])
+@pytest.mark.parametrize(
+    ("element", "axis"),
+    [
+        ("hex8", (0, 0, 1)),
+        ("hex8", (1, 1, 0)),
+        ("hex8", (0.7, -0.2, 0.4)),
+        ("tet4", (1, 1, 1)),
+        ("tet10", (1, 1, 0)),
+    ],
+)
 def test_the_automatic_penalty_depends_on_the_normal(element, axis):
     problem = turned(element, axis)
     dt = 1e-9  # of the instant

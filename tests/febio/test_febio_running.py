@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -160,19 +158,19 @@ def test_tables_are_not_written_over(tmp_path):
     assert file.read_text().startswith("<?xml")
 
 
-def test_command(tmp_path):
+def test_command(tmp_path, limbfit):
     file = written(tmp_path, CUBE)
-    command = [sys.executable, "-m", "limbfit", "febio", str(file), "--output", str(tmp_path / "o"), "--json"]
-    shown = subprocess.run(command, capture_output=True, text=True)
-    assert shown.returncode == 0, shown.stderr
-    found = json.loads(shown.stdout)
+    command = ("febio", file, "--output", tmp_path / "o", "--json")
+    code, shown, said = limbfit(*command)
+    assert code == 0, said
+    found = json.loads(shown)
     assert found["completed"]
     assert found["steps"] == 4
     assert found["peak_force_N"] is None
     file.write_text(CUBE.replace("incomp neo-Hookean", "Arruda-Boyce"))
-    shown = subprocess.run(command, capture_output=True, text=True)
-    assert shown.returncode == 2
-    assert shown.stderr.strip().split("\n")[-1].startswith(f"error: {file}: line 5, <material>: ")
+    code, _, said = limbfit(*command)
+    assert code == 2
+    assert said.strip().split("\n")[-1].startswith(f"error: {file}: line 5, <material>: ")
 
 
 TABLES = """<Output><logfile>

@@ -99,7 +99,7 @@ def test_friction_is_read_back(tmp_path):
     assert to_problem(read_feb(plain)).friction == "frictionless"
 
 
-@pytest.mark.parametrize("shape", ["square", "cylinder", "sphere"])
+@pytest.mark.parametrize("shape", ["square", "sphere"])
 def test_the_front_is_read_back_without_valleys(tmp_path, shape):
     """Faces of four corners that are warped bulge: in a valley contact has no smooth energy."""
     file, _ = exported(block("tet4", shape), tmp_path)
@@ -132,7 +132,7 @@ def test_the_indenter_is_where_it_touches(tmp_path, shape):
     assert np.abs(gap).max() < (0.1 if shape in ("sphere", "stl") else 0.05)
 
 
-@pytest.mark.parametrize("shape", INDENTERS)
+@pytest.mark.parametrize("shape", ["square", "stl"])
 def test_structure(tmp_path, shape):
     """Numbers from 1 without gaps, faces outward, rigid elements upright, names that exist."""
     problem = block("tet10", shape)
@@ -200,9 +200,7 @@ def test_another_reader_understands_it(tmp_path):
     assert len(curve.points.points) == len(problem.history.times)
 
 
-@pytest.mark.parametrize(
-    ("shape", "parts"), [("square", 64), ("cylinder", 64), ("sphere", 64), ("sharp", 128), ("stl", 128)]
-)
+@pytest.mark.parametrize(("shape", "parts"), [("square", 64), ("sphere", 64), ("sharp", 128), ("stl", 128)])
 def test_steps_that_febio_gets_through_with(tmp_path, shape, parts):
     """Half as large under a sharp edge; a step that fails is halved, not shortened by a ninth."""
     problem = block("tet4", shape)
@@ -216,11 +214,10 @@ def test_steps_that_febio_gets_through_with(tmp_path, shape, parts):
     np.testing.assert_allclose(largest, 4.0 * problem.history.loading_s / parts, rtol=0.02)
 
 
-@pytest.mark.parametrize("shape", ["square", "sphere"])
-def test_it_pushes_as_hard(tmp_path, shape):
+def test_it_pushes_as_hard(tmp_path):
     """Solved from the file, with the same penalty, the facets are all that differs."""
     ramp = History(np.array([0.0, 2.0, 3.0]), np.array([0.0, 2.0, 1.0]))
-    problem = replace(block("tet4", shape, divisions=8), history=ramp)
+    problem = replace(block("tet4", "sphere", divisions=8), history=ramp)
     file, _ = exported(problem, tmp_path)
     same = {"times": (1.0, 2.0, 3.0), "stress": "linear", "penalty": 20.0, "penetration": 1.0}
     direct = solve(problem, StepControl(**same), store="none")
@@ -247,7 +244,7 @@ def test_what_febio_has_not_is_refused(tmp_path):
 
 
 def test_in_the_frame_of_the_indenter(tmp_path):
-    problem = block("tet4", "sharp", divisions=6)
+    problem = block("tet4", "sharp")
     steps = StepControl(load_steps=3, unload_steps=2)
     turned = turn_to_indenter_frame(problem)
     np.testing.assert_allclose(turned.indenter.frame, np.eye(3), atol=1e-14)

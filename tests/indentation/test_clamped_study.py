@@ -23,7 +23,7 @@ from limbfit.pipeline.simulation.simulations import compute_job_digest
 from limbfit.study import Study, load_study
 from small_limb import small_limb
 
-COARSE = "\n[mesh]\nedge_near_mm = 6.0\nelement = 'tet10'\n[solver]\nload_steps = 3\nunload_steps = 3\n"
+COARSE = "\n[mesh]\nedge_near_mm = 8.0\nelement = 'tet10'\n[solver]\nload_steps = 3\nunload_steps = 3\n"
 GENTLE = COARSE + "[clamps]\nforce_N = 4.0\n"
 
 

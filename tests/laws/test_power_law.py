@@ -103,13 +103,10 @@ def test_force_of_a_study_follows_its_law_by_its_derivatives(tmp_path):
     assert compute_job_digest(job) != compute_job_digest(other)
     found = simulate(job)
     assert found.completed, found.reason
-    for j, name in enumerate(names):
-        if name in ("gamma", "slope"):
-            h = 1e-4 * flat[j]
-            ends = [flat + sign * h * np.eye(len(flat))[j] for sign in (1, -1)]
-            forces = [simulate(replace(job, parameters=tuple(end))).force_N for end in ends]
-            difference = (forces[0] - forces[1]) / (2 * h)
-            np.testing.assert_allclose(found.jacobian[:, j], difference, atol=2e-3 * np.abs(difference).max())
+    step = np.where(np.isin(names, ("gamma", "slope")), 1e-4 * flat, 0.0)
+    forces = [simulate(replace(job, parameters=tuple(end))).force_N for end in (flat + step, flat - step)]
+    change = (forces[0] - forces[1]) / 2.0
+    np.testing.assert_allclose(found.jacobian @ step, change, atol=2e-3 * np.abs(change).max())
 
 
 @pytest.mark.parametrize(

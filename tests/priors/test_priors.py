@@ -91,7 +91,7 @@ def test_what_people_cannot_say_is_refused_in_one_line(study: Path, more: str, w
     assert "\n" not in str(caught.value)
 
 
-def test_check_tells_the_priors(study: Path) -> None:
+def test_check_tells_the_priors(commands_unasked: None, study: Path) -> None:
     facts = check_study(with_settings(study, PEOPLE), listener=lambda event: None)["facts"]
     (told,) = (fact for fact in facts if "priors" in fact)
     known = PRIORS["muscle"]["c_kPa"]
