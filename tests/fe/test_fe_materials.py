@@ -169,9 +169,10 @@ def affine(law, direction, times, history) -> list[np.ndarray]:
     return [compute_element_fields(system, laws, s.state).cauchy[0] for s in steps]
 
 
-@every_law
-def test_relaxation_equals_the_integrated_convolution(law):
+@pytest.mark.parametrize("name", ["paper", "power", "ogden", "elastic"])
+def test_relaxation_equals_the_integrated_convolution(name):
     """Loading, hold and partial unloading, two stretches equal; second order in the step."""
+    law = SAMPLES[name]
     direction = np.array([0.12, 0.12, -0.3])
     history = History(np.array([0.0, 0.5, 1.0, 1.5]), np.array([0.0, 1.0, 1.0, 0.4]))
     fine = np.linspace(0.0, 1.5, 3001)
@@ -208,7 +209,7 @@ def test_a_held_strain_relaxes_as_the_closed_form(law):
     np.testing.assert_allclose((found[:, 2] - found[:, 0])[-len(t) :], expected, rtol=1e-3)
 
 
-@every_law
+@pytest.mark.parametrize("law", [SAMPLES[name] for name in ("power", "ogden", "mooney-rivlin")])
 def test_a_simulation_has_the_sensitivities_of_its_law(law):
     """Along one direction of all parameters of the law."""
     problem = punch("tet4", 2, 1, materials={"skin": law, "muscle": SAMPLES["paper"]})

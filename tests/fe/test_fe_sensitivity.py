@@ -20,7 +20,7 @@ def test_sensitivities_equal_central_differences():
         assert error <= 1e-4 * np.abs(difference).max(), (region, name)
 
 
-@pytest.mark.parametrize(("cell_type", "element"), [("hex8", ""), ("tet10", ""), ("tet10", "tet10p0")])
+@pytest.mark.parametrize(("cell_type", "element"), [("hex8", ""), ("tet10", "tet10p0")])
 def test_sensitivities_of_other_elements_equal_central_differences(cell_type, element):
     """Along one direction of all eight parameters."""
     centre = solve(punch(cell_type, 2, 1, element=element), TIGHT, sensitivities=True, store="all")

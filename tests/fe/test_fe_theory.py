@@ -158,7 +158,8 @@ PUNCH = {
 }
 
 
-@pytest.mark.parametrize("grid", ["quick", pytest.param("fine", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("grid", ["quick", "fine"])
 def test_flat_circular_punch(grid):
     """A cylinder of 20 mm, edge rounding 0.2 mm: ``F = 2 a E* d`` with the radius a of its flat face."""
     radii, depths, tolerance = PUNCH[grid]

@@ -107,7 +107,9 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param("elastic contraction", marks=pytest.mark.slow), "pre-stretch", "all"]
+)
 def test_it_pushes_as_hard_when_read_back(tmp_path, case):
     problem = block(bodies=(ball(),), **CASES[case])
     found, model = back(problem, tmp_path)

@@ -148,6 +148,7 @@ def test_what_differs_is_said_in_the_file(tmp_path):
     assert any("may stop before the end" in line for line in describe_differences(sharp, FebSettings()))
 
 
+@pytest.mark.slow
 def test_a_written_model_is_as_stiff_as_its_own(tmp_path):
     """Read back and solved as FEBio would, with its steps and its penalty: within 1.5 % of the peak."""
     problem = build_punched_block("tet4", 8)

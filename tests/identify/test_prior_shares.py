@@ -94,9 +94,14 @@ def test_priors_of_people_narrow_what_records_leave_open_and_let_stand_what_they
     assert with_people.wider_without == pytest.approx(np.sqrt(variances[0] / variances[1]), rel=1e-6)
     low, high = with_people.intervals_95.T
     assert np.all((low < TRUTH) & (high > TRUTH))
-    # The width of an open parameter hangs on the noise: 0.5 to 1.2 times that without, one draw by another.
-    narrowed = [half_widths(with_people)[skin] / half_widths(without)[skin]]
-    for seed in (1, 2):
+    assert (half_widths(with_people)[skin] < 0.85 * half_widths(without)[skin]).all()
+
+
+@pytest.mark.slow
+def test_priors_of_people_narrow_what_records_leave_open_on_average_over_noise():
+    """The width of an open parameter hangs on it: 0.5 to 1.2 times that without, one draw by another."""
+    skin, narrowed = [NAMES.index("skin.c_kPa"), NAMES.index("skin.m")], []
+    for seed in (0, 1, 2):
         both = [told(unknowns, seed)[1] for unknowns in (replace(PAPER, priors=PEOPLE), PAPER)]
         narrowed.append(half_widths(both[0])[skin] / half_widths(both[1])[skin])
     assert np.exp(np.log(narrowed).mean(axis=0)).max() < 0.85

@@ -68,6 +68,7 @@ def smooth_misfit(rng, n, length=0.2, size=0.05):
     return size * L @ rng.standard_normal(n) + 0.004 * rng.standard_normal(n)
 
 
+@pytest.mark.slow
 def test_intervals_cover_the_truth_under_white_noise():
     shares = coverage(lambda rng, n: 0.03 * rng.standard_normal(n))
     assert np.all((shares > 0.90) & (shares < 0.99)), shares

@@ -13,7 +13,7 @@ from test_study_docs import KEYS
 
 from limbfit.extensions import load_extensions
 from limbfit.pipeline.commands.experiments import EXPERIMENTS
-from limbfit.pipeline.commands.run import compute_keys
+from limbfit.pipeline.commands.run import STAGES, compute_keys
 from limbfit.pipeline.engine.keys import Keys
 from limbfit.study import Study, load_study
 
@@ -285,6 +285,18 @@ def decided(study: Study) -> dict[str, str]:
     known, stages = Keys(study), compute_keys(study)
     more = [e for e in EXPERIMENTS if e.name in ("uncertainty", "design")]
     return stages | {e.name: known.of(e, stages, e.options).digest for e in more}
+
+
+def decide(study: Study, name: str) -> str:
+    """The key of one stage, without those below it where it reads the whole study, or of an experiment."""
+    if name not in ("segment", "surfaces", "traces", "mesh"):
+        return decided(study)[name]
+    return Keys(study).of(next(stage for stage in STAGES if stage.name == name), {}).digest
+
+
+@cache
+def decide_before(folder: Path, imaged: bool, name: str) -> str:
+    return decide(loaded(folder, IMAGED if imaged else GIVEN), name)
 
 
 @cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from keyed_studies import (
     START,
     before,
     changed,
+    decide,
+    decide_before,
     decided,
     loaded,
     prepare,
@@ -35,28 +38,27 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return prepare(tmp_path_factory.mktemp("study"))
 
 
-@pytest.mark.parametrize("key", ACTS)
-def test_a_key_of_an_imaged_study_acts(folder: Path, key: str) -> None:
-    stage, value = ACTS[key]
-    content = changed(IMAGED, key, value)
-    assert decided(loaded(folder, content))[stage] != before(folder, True)[stage]
+@pytest.mark.parametrize(
+    ("imaged", "key"), [(True, key) for key in ACTS] + [(False, key) for key in ACTS_ON_SURFACES]
+)
+def test_a_key_of_an_imaged_study_or_of_given_surfaces_acts(folder: Path, imaged: bool, key: str) -> None:
+    stage, value = (ACTS if imaged else ACTS_ON_SURFACES)[key]
+    was = decide_before(folder, imaged, stage)
+    assert decide(loaded(folder, changed(IMAGED if imaged else GIVEN, key, value)), stage) != was
 
 
-@pytest.mark.parametrize("key", ACTS_ON_SURFACES)
-def test_a_key_of_given_surfaces_acts(folder: Path, key: str) -> None:
-    stage, value = ACTS_ON_SURFACES[key]
-    assert decided(loaded(folder, changed(GIVEN, key, value)))[stage] != before(folder, False)[stage]
+@cache
+def list_read(place: Path) -> set[str]:
+    """Attributes and words of a file, or of all files of a folder."""
+    files = sorted(place.rglob("*.py")) if place.is_dir() else [place]
+    nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))]
+    read = {node.attr for node in nodes if isinstance(node, ast.Attribute)}
+    return read | {n.value for n in nodes if isinstance(n, ast.Constant) and isinstance(n.value, str)}
 
 
 @pytest.mark.parametrize("key", READ)
 def test_a_key_of_no_stage_is_read(key: str) -> None:
-    place = Path(limbfit.__file__).parent / READ[key]
-    files = sorted(place.rglob("*.py")) if place.is_dir() else [place]
-    trees = [ast.parse(file.read_text(encoding="utf-8")) for file in files]
-    nodes = [node for tree in trees for node in ast.walk(tree)]
-    read = {node.attr for node in nodes if isinstance(node, ast.Attribute)}
-    read |= {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
-    assert key.rpartition(".")[2] in read
+    assert key.rpartition(".")[2] in list_read(Path(limbfit.__file__).parent / READ[key])
 
 
 def list_stale(folder: Path, content: Mapping[str, Any], other: Mapping[str, Any]) -> set[str]:
