@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import pyvista as pv
 from blocks import punch
-from numpy.typing import NDArray
 
 from limbfit.errors import ProblemError
 from limbfit.fe import Indenter, Problem, RigidSurface, StepControl, System, solve
@@ -53,21 +52,16 @@ TOOLS = {
 }
 
 
-def evaluated(tool: Indenter, points: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Distances, gradients and hessians at local points."""
-    return tool.local_distance(points)
-
-
 @pytest.mark.parametrize("name", TOOLS)
 def test_distance_derivatives(name):
     tool, h = TOOLS[name], 1e-6
     radius = tool.body.radius
     points = np.random.default_rng(0).uniform([-13, -13, -6], [13, 13, 2], (400, 3))
-    values, slopes, bends = evaluated(tool, points)
+    values, slopes, bends = tool.local_distance(points)
     keep = values > -0.9 * radius  # deeper, the way out is through the front: a jump
     np.testing.assert_allclose(np.linalg.norm(slopes, axis=1), 1.0, atol=1e-12)
     for i, step in enumerate(h * np.eye(3)):
-        ahead, back = evaluated(tool, points + step), evaluated(tool, points - step)
+        ahead, back = tool.local_distance(points + step), tool.local_distance(points - step)
         change, bend = (ahead[0] - back[0]) / (2 * h), (ahead[1] - back[1]) / (2 * h)
         np.testing.assert_allclose(change[keep], slopes[keep, i], atol=1e-5)
         smooth = keep & (np.abs(ahead[1] - back[1]).max(axis=1) < 1e-4)  # no edge of a zone within the step
@@ -79,21 +73,23 @@ def test_distance_derivatives(name):
 def test_box_of_triangles_is_the_square(radius):
     points = np.random.default_rng(1).uniform([-14, -14, -12], [14, 14, 3], (2000, 3))
     points = np.vstack([points, [[0, 0, -0.1], [1, 1, -3], [10, 10, 0], [9.9, 9.9, -0.1], [-10, 10, -0.05]]])
-    mine = evaluated(Indenter("stl", edge_radius=radius, surface=box()), points)
-    theirs = evaluated(Indenter("square", 20.0, radius), points)
+    mine = Indenter("stl", edge_radius=radius, surface=box()).local_distance(points)
+    theirs = Indenter("square", 20.0, radius).local_distance(points)
     for found, wanted in zip(mine, theirs):
         np.testing.assert_allclose(found, wanted, atol=1e-9)
 
 
 def test_deep_points_go_back_out_of_the_front():
-    values, slopes, _ = evaluated(Indenter("stl", surface=box()), np.array([[9.0, 0.0, -6.0], [0, -9.7, -4]]))
+    deep = np.array([[9.0, 0.0, -6.0], [0, -9.7, -4]])
+    values, slopes, _ = Indenter("stl", surface=box()).local_distance(deep)
     np.testing.assert_allclose(values, [-6.0, -4.0])
     np.testing.assert_allclose(slopes, [[0, 0, 1], [0, 0, 1]], atol=1e-12)
 
 
 def test_fine_ball_is_the_sphere():
     points = np.random.default_rng(2).uniform([-9, -9, -9], [9, 9, 2], (500, 3))
-    mine, theirs = evaluated(Indenter("stl", surface=ball()), points), evaluated(Indenter("sphere"), points)
+    mine = Indenter("stl", surface=ball()).local_distance(points)
+    theirs = Indenter("sphere").local_distance(points)
     near = (np.abs(theirs[0]) < 2.0) & (points[:, 2] > -8.0)
     assert near.sum() > 50
     np.testing.assert_allclose(mine[0][near], theirs[0][near], atol=0.02)
@@ -104,7 +100,7 @@ def test_surface_is_put_with_its_foremost_point_at_the_origin_and_outwards():
     points, faces = box().points + np.array([0, 0, 7.0]), BOX_FACES[:, ::-1]
     surface = RigidSurface(points, faces)
     assert surface.points[:, 2].max() == 0.0
-    values = evaluated(Indenter("stl", surface=surface), np.array([[0.0, 0, 1.0], [0, 0, -1.0]]))[0]
+    values = Indenter("stl", surface=surface).local_distance(np.array([[0.0, 0, 1.0], [0, 0, -1.0]]))[0]
     np.testing.assert_allclose(values, [1.0, -1.0])
 
 

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from blocks import drive, punch
 
 from limbfit.bench.blocks import build_punched_block
-from limbfit.fe import StepControl, Support, System, solve
+from limbfit.fe import Problem, StepControl, Support, System, solve
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.memory import Memory
 from limbfit.fe.solution.factor import Factor
@@ -78,14 +78,19 @@ def test_halves_of_solutions_make_the_whole_and_those_among_the_last_unknowns_ar
         assert np.abs(np.delete(W, wanted, axis=0)).max() == 0.0
 
 
-def test_springs_under_the_indenter_and_beside_it_are_taken_in_exactly():
-    problem = build_punched_block("tet10", 6)
+def at_rest(problem: Problem, advance: float = 0.0) -> tuple[System, Laws, np.ndarray]:
+    """The undeformed system, its laws and its tangent under an indenter that has gone ``advance`` mm."""
     system = System(problem)
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
     increment = Memory.rest(system, laws).build_increment(
-        system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus, drive(0.0)
+        system, laws, 0.1, 0.1, advance, 100.0 * laws.modulus, drive(advance)
     )
-    data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
+    return system, laws, system.evaluate(np.zeros_like(system.points), laws, increment).tangent
+
+
+def test_springs_under_the_indenter_and_beside_it_are_taken_in_exactly():
+    problem = build_punched_block("tet10", 6)
+    system, laws, data = at_rest(problem)
     bodies, stiff = system.bodies, 50.0 * laws.modulus
     last = find_touched_unknowns(system, problem)
     factor = Factor(system, laws.moduli, last=last)
@@ -144,13 +149,7 @@ def test_symmetric_product(columns):
 
 def test_a_tangent_with_negative_eigenvalues_is_solved_all_the_same():
     """As at an unstable equilibrium, where conjugate gradients end early."""
-    problem = punch("tet10", 4, 1)
-    system = System(problem)
-    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    increment = Memory.rest(system, laws).build_increment(
-        system, laws, 0.3, 0.3, 0.1, 100.0 * laws.modulus, drive(0.1)
-    )
-    data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
+    system, laws, data = at_rest(punch("tet10", 4, 1), 0.1)
     factor = Factor(system, laws.moduli)
     factor.factorise(data)
     data[system.indptr[:40]] *= -1.0
@@ -171,13 +170,7 @@ def test_a_deep_first_step_does_not_cost_the_single_precision():
 
 def iterations(divisions: int) -> int:
     """Of conjugate gradients with multigrid, to a thousandth, on a block at rest."""
-    problem = build_punched_block("tet10", divisions)
-    system = System(problem)
-    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    increment = Memory.rest(system, laws).build_increment(
-        system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus, drive(0.0)
-    )
-    data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
+    system, laws, data = at_rest(build_punched_block("tet10", divisions))
     factor = Factor(system, laws.moduli, "multigrid")
     factor.factorise(data)
     b = system.bodies.spread_forces(np.ones((system.bodies.first.surface.areas.size, 3, 1)))
@@ -196,15 +189,10 @@ def test_iterations_with_multigrid_do_not_grow_with_the_mesh():
 def test_multigrid_is_symmetric_and_positive():
     """Or conjugate gradients would not do; also with single components held."""
     problem = build_punched_block("tet10", 5)
-    n = len(problem.mesh.points)
     sides = np.flatnonzero(problem.mesh.points[:, 0] <= -30.0)
-    system = System(replace(problem, supports=(Support(sides, 0),)))
-    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    increment = Memory.rest(system, laws).build_increment(
-        system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus, drive(0.0)
-    )
+    system, _, data = at_rest(replace(problem, supports=(Support(sides, 0),)))
     multigrid = Multigrid(system)
-    multigrid.factorise(system.evaluate(np.zeros((n, 3)), laws, increment).tangent)
+    multigrid.factorise(data)
     v, w = np.random.default_rng(0).standard_normal((2, system.unknowns))
     assert v @ multigrid.solve(w) == pytest.approx(w @ multigrid.solve(v), rel=1e-4)
     assert v @ multigrid.solve(v) > 0.0
@@ -214,11 +202,7 @@ def test_where_multigrid_does_not_converge_a_factor_takes_over():
     """As with a bulk modulus a million times the shear modulus."""
     problem = build_punched_block("tet10", 4)
     stiff = {name: replace(m, kappa_ratio=1e6) for name, m in problem.materials.items()}
-    system, laws = System(problem), Laws.build([stiff[name] for name in problem.mesh.region_names])
-    increment = Memory.rest(system, laws).build_increment(
-        system, laws, 0.1, 0.1, 0.0, 100.0 * laws.modulus, drive(0.0)
-    )
-    data = system.evaluate(np.zeros_like(system.points), laws, increment).tangent
+    system, laws, data = at_rest(problem.with_materials(stiff))
     factor = Factor(system, laws.moduli, "multigrid")
     factor.factorise(data)
     b = np.random.default_rng(0).standard_normal((system.unknowns, 1))

@@ -9,7 +9,6 @@ import pytest
 from blocks import MUSCLE, SKIN, block, boundary, punch, sector, slope_and_difference
 from scipy.integrate import quad
 from scipy.optimize import brentq
-from scipy.spatial.transform import Rotation
 
 from limbfit.errors import ProblemError
 from limbfit.fe import (
@@ -124,20 +123,6 @@ def test_inflation_of_a_tube_is_the_closed_form(law):
     radius = np.linalg.norm((mesh.points + found.states[-1].u)[inner, :2], axis=1)
     assert expected > 1.2 * a
     np.testing.assert_allclose(radius - a, expected - a, rtol=0.005)
-
-
-def test_a_pressed_block_turned_is_the_same():
-    problem = punch("tet10", 3, 1, indenter=None, history=STILL)
-    pressures = (Pressure(problem.contact_faces[:20], [0.0, 1.0], [0.0, 0.003]),)
-    plain = replace(problem, pressures=pressures)
-    turn = Rotation.from_rotvec([0.4, -0.8, 1.1])
-    turned = replace(plain, mesh=replace(plain.mesh, points=turn.apply(plain.mesh.points)))
-    steps = StepControl(times=(0.5, 1.0), tolerance=1e-8)
-    first, second = (solve(one, steps, store="all") for one in (plain, turned))
-    assert first.completed, first.reason
-    size = np.abs(first.states[-1].u).max()
-    assert size > 0.3
-    np.testing.assert_allclose(second.states[-1].u, turn.apply(first.states[-1].u), atol=1e-5 * size)
 
 
 def test_derivatives_of_the_force_beside_a_pressure_with_a_free_rim():

@@ -173,13 +173,6 @@ def test_flat_circular_punch(grid):
     assert reaction(problem, 2e3) == pytest.approx(expected, rel=tolerance)
 
 
-def test_round_edge_of_the_punch_formula_ends_in_hertz():
-    """Without a flat face the arc is a sphere: ``4/3 E sqrt(R) d^1.5`` for small depths."""
-    contact, force = rounded_punch(1.0, 1e-3, 1e-9, 50.0)
-    assert contact == pytest.approx(np.sqrt(50.0 * 1e-3), rel=1e-3)
-    assert force == pytest.approx(4 / 3 * np.sqrt(50.0) * 1e-3**1.5, rel=1e-3)
-
-
 def papkovich(X: np.ndarray, nu: float) -> tuple[np.ndarray, np.ndarray]:
     """``u = (3 - 4 nu) b e_z - z grad b`` with ``b = a sin(2x) sin(2y) exp(sqrt(8) z)``, and ``grad u``.
 

@@ -7,7 +7,6 @@ import pytest
 from bars import (
     BARS,
     PAPER,
-    SITES,
     TRUE_THREE,
     TRUTH,
     Bars,
@@ -27,14 +26,6 @@ from limbfit.identify.fit.parameters import FIXED, Unknowns, build_space, group_
 @pytest.fixture(scope="module")
 def noisy() -> Calibration:
     return calibrate(simulate, records(0.03), PAPER)
-
-
-def test_complex_step_derivatives_agree_with_differences():
-    response = SITES[0].respond(TRUTH)
-    for k, row in enumerate(np.eye(8)):
-        h = 1e-5 * TRUTH[k]
-        central = (SITES[0].force(TRUTH + h * row) - SITES[0].force(TRUTH - h * row)) / (2 * h)
-        assert response.jacobian[:, k] == pytest.approx(central, rel=1e-5, abs=1e-9)
 
 
 def test_truth_is_found_from_the_papers_start_in_few_evaluations():

@@ -11,7 +11,7 @@ import pytest
 from limbfit.errors import ProblemError, StudyError
 from limbfit.execution import SerialExecutor
 from limbfit.febio import read_feb, to_problem
-from limbfit.indentation import SimulationJob, simulate
+from limbfit.indentation import SimulationJob, SiteModel, simulate
 from limbfit.pipeline.commands.check import check_study
 from limbfit.pipeline.commands.export import export_study
 from limbfit.pipeline.commands.run import compute_keys, run_study
@@ -20,7 +20,7 @@ from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.limb.mesh import build_coarse_settings, mesh_settings
 from limbfit.pipeline.records.records import build_model
 from limbfit.pipeline.simulation.simulations import compute_job_digest
-from limbfit.study import Study, load_study
+from limbfit.study import ClampsTable, Study, load_study
 from small_limb import small_limb
 
 COARSE = "\n[mesh]\nedge_near_mm = 8.0\nelement = 'tet10'\n[solver]\nload_steps = 3\nunload_steps = 3\n"
@@ -112,27 +112,33 @@ def test_a_clamped_site_goes_to_febio(context, tmp_path):
     assert ways[2] - ways[1] == pytest.approx(3.0)
 
 
-def test_they_are_among_what_decides_a_kept_simulation(context):
-    model = build_model(context, context.study.sites[0])
-    clamps = model.clamps
-    assert clamps is not None
-    others = [None, clamps.model_copy(update={"force_N": 5.0})]
-    jobs = [
-        SimulationJob(replace(model, clamps=one), ("muscle",), (1.0,), (0.0,)) for one in (clamps, *others)
-    ]
+def test_they_are_among_what_decides_a_kept_simulation():
+    model = SiteModel("1", Path("1.vtu"), "", (0, 0, 0), (0, 0, -1), (0, 1), (0, 1))
+    clamps = (None, ClampsTable(force_N=4.0), ClampsTable(force_N=5.0))
+    jobs = [SimulationJob(replace(model, clamps=one), ("muscle",), (1.0,), (0.0,)) for one in clamps]
     assert len({compute_job_digest(job) for job in jobs}) == 3
 
 
-def test_the_check_says_how_many_hold_the_limb(commands_unasked, context, tmp_path):
-    facts = check_study(context.study)["facts"]
+def test_the_check_says_how_many_hold_the_limb(commands_unasked, tmp_path):
+    facts = check_study(study_of(tmp_path, GENTLE))["facts"]
     assert "clamps: 11 pins of 4 N, 7 s before touch-down; 11 at site 1 meet the skin" in facts
+
+
+@pytest.mark.parametrize(
+    ("stated", "what"),
+    [
+        ("angles_degrees = [10.0]", "the clamp at 10 degrees would lie on the test pin"),
+        ("levels_mm = [300.0]", "no clamping pin meets the skin; give clamps.angles_degrees"),
+    ],
+)
+def test_the_check_refuses_pins_with_the_study_s_file(commands_unasked, tmp_path, stated, what):
     with pytest.raises(ProblemError) as caught:
-        check_study(study_of(tmp_path, COARSE + "[clamps]\nangles_degrees = [10.0]\n"))
-    told = str(caught.value)
-    assert "study.toml: clamps: site 1: the clamp at 10 degrees would lie on the test pin" in told
-    assert "\n" not in told
+        check_study(study_of(tmp_path, f"{COARSE}[clamps]\n{stated}\n"))
+    assert f"study.toml: clamps: site 1: {what}" in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_pins_that_miss_are_refused_with_the_study_s_file(context):
     clamps = context.study.clamps
     assert clamps is not None
