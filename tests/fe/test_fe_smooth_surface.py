@@ -136,6 +136,7 @@ def pipe(radius: float, length: float, n: int = 480) -> tuple[np.ndarray, np.nda
     return points, np.array([t for a, b in corners for t in ((a, a + n + 1, b), (b, a + n + 1, b + n + 1))])
 
 
+@pytest.mark.slow
 def test_a_press_fit_by_growth_is_lames_and_comes_off_by_its_friction():
     """A rigid pipe grows onto a tube: the pressure of plane strain, small strain; then the pull mu p A."""
     inner, outer, n, overlap, mu = 10.0, 20.0, 24, 0.04, 0.2
