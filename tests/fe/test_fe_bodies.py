@@ -348,6 +348,7 @@ def test_an_open_surface_has_one_side():
         OpenSurface(good.points[:5], good.faces)
 
 
+@pytest.mark.slow
 def test_a_bar_under_a_held_force_creeps_as_the_closed_form():
     """Small strain, one Prony term: 1/E creeps as a standard linear solid in shear over a constant bulk."""
     mu, gamma, tau, seconds = 0.01, 2.0, 0.5, 0.05

@@ -69,7 +69,7 @@ def test_corners_of_the_parameter_bounds(c, m, gamma, tau):
     assert result.completed, result.reason
 
 
-@pytest.mark.parametrize("shape", ["square", "sphere"])
+@pytest.mark.parametrize("shape", ["square", pytest.param("sphere", marks=pytest.mark.slow)])
 def test_thin_tissue_over_bone(shape):
     """4 mm of tissue pushed in by 2.4 mm by a sharp, tilted tool."""
     lines = np.linspace(-20.0, 20.0, 7)

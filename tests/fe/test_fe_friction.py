@@ -166,7 +166,10 @@ def test_friction_lies_between_frictionless_and_sticky():
     np.testing.assert_array_equal(solve(replace(problem, friction=0.0), control).force, free)
 
 
-@pytest.mark.parametrize(("shape", "mu", "element"), [("square", 0.5, "tet4"), ("sphere", 0.1, "tet10")])
+@pytest.mark.parametrize(
+    ("shape", "mu", "element"),
+    [pytest.param("square", 0.5, "tet4", marks=pytest.mark.slow), ("sphere", 0.1, "tet10")],
+)
 @pytest.mark.parametrize("sticking", ["anchored", pytest.param("stepwise", marks=pytest.mark.slow)])
 def test_sensitivities_with_friction_equal_central_differences(shape, mu, element, sticking):
     """Along one direction in the space of all eight parameters, pressing, dragging and letting go."""

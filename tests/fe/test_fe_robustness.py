@@ -81,7 +81,9 @@ def test_travel_ends_at_the_bone(cases, site):
     assert gap < 1e-4 or depth == pytest.approx(cases.FARTHEST_MM)
 
 
-@pytest.mark.parametrize(("skin", "muscle", "depth"), [(SOFT, STIFF, 1.5), (STIFF, SOFT, 4.0)])
+@pytest.mark.parametrize(
+    ("skin", "muscle", "depth"), [pytest.param(SOFT, STIFF, 1.5, marks=pytest.mark.slow), (STIFF, SOFT, 4.0)]
+)
 def test_opposite_corners_of_the_bounds(skin, muscle, depth):
     """A thousandfold contrast of the moduli; soft skin gives way by half of its thickness.
 

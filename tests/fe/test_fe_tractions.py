@@ -14,7 +14,9 @@ from limbfit.fe.observables import compute_contact_pressure, compute_nodal_force
 from limbfit.fe.tractions import compute_tractions
 
 
-@pytest.mark.parametrize(("friction", "n", "z"), [(0.3, 3, COARSE_Z), ("sticky", 4, FINE_Z)])
+@pytest.mark.parametrize(
+    ("friction", "n", "z"), [(0.3, 3, COARSE_Z), pytest.param("sticky", 4, FINE_Z, marks=pytest.mark.slow)]
+)
 def test_tractions_balance_the_forces_and_moments_that_are_stated(friction, n, z):
     """A ball pressed and dragged by forces, its turns free but one: at every step, and on the supports."""
     ball = Indenter("sphere", 24.0, centre=(1.0, 2.0, 0.3), axis=(0.1, 0.0, -1.0))

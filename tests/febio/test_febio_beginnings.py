@@ -166,7 +166,7 @@ LATER = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", LATER)
+@pytest.mark.parametrize("case", [pytest.param("tensed", marks=pytest.mark.slow), "taut", "taut and clamped"])
 def test_an_indenter_touches_where_limbfit_has_found_it(tmp_path, case):
     """With its own shape in the place of its facets: FEBio's indenter comes from afar, and pushes as hard."""
     problem = block(indenter=PUNCH, **{"history": COURSE, **LATER[case]})
