@@ -16,7 +16,7 @@ from limbfit.anatomy.surfaces.surfaces import load_anatomy
 from limbfit.errors import InputError, SiteError
 from limbfit.laws import LAWS
 from limbfit.phantom import draw_true_parameters, make_limb, make_phantom
-from limbfit.phantom.forces import TrueForce, mesh_true_site, simulate_true_force
+from limbfit.phantom.forces import TrueForce, simulate_true_force
 from limbfit.phantom.sites import DETAIL_SITES, FITTED
 from limbfit.study import load_study
 from limbfit.traces import read_surface_motion
@@ -28,7 +28,7 @@ def cubic_law(function, jobs):
     Where cameras are wanted two points follow the indenter by a half and a tenth.
     """
     for job in jobs:
-        if function is mesh_true_site:
+        if function is not simulate_true_force:
             yield None
             continue
         ramp = job.site.ramp
@@ -121,7 +121,8 @@ def test_a_limb_with_fat_has_three_tissues_and_is_the_same_otherwise(tmp_path, m
     assert truth["parameters"]["muscle"] == plain["parameters"]["muscle"]
     assert truth["parameters"]["fat"]["c_kPa"] < truth["parameters"]["muscle"]["c_kPa"]
     assert jobs[simulate_true_force][0].parameters == truth["parameters"]
-    meshed = jobs[mesh_true_site][0].settings.layers
+    (mesh,) = jobs.keys() - {simulate_true_force}
+    meshed = mesh.keywords["settings"].layers
     assert [layer.name for layer in meshed] == ["skin", "fat"]
     assert [layer.thickness_mm for layer in meshed] == [layer.thickness_mm for layer in study.geometry.layers]
 

@@ -17,7 +17,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -62,6 +62,20 @@ TENDON_KPA = 30.0
 PARAMETER_SPREAD = 0.15
 KAPPA_RATIO = 100.0
 PACKED = "patient.zip"
+
+
+@dataclass(frozen=True)
+class _Patient:
+    """The patient of a seed: ``marked`` sites carry a marker, ``indented`` ones have a record, too."""
+
+    seed: int
+    detail: str
+    limb: Limb
+    marked: tuple[TrueSite, ...]
+    indented: tuple[TrueSite, ...]
+    parameters: Parameters
+    measurements: SecondaryMeasurements
+    has_socket: bool
 
 
 def draw_true_parameters(seed: int, fat: bool = False, tendon: bool = False) -> Parameters:
@@ -135,22 +149,26 @@ def make_phantom(
     tell = progress or (lambda text, done, total: None)
     if detail not in DETAIL_GRIDS:
         raise InputError(f"unknown detail {detail!r}", remedy=f"use one of {', '.join(DETAIL_GRIDS)}")
-    patient = make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER, tendon, limb)
-    measurements = SecondaryMeasurements(ultrasound, surface, shear_waves)
-    parameters = draw_true_parameters(seed, fat, tendon)
-    everywhere = build_true_sites(patient, seed)
-    indented = select_sites(everywhere, DETAIL_SITES[detail] if sites is None else sites)
+    made_limb = make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER, tendon, limb)
+    marked = build_true_sites(made_limb, seed)
+    patient = _Patient(
+        seed=seed,
+        detail=detail,
+        limb=made_limb,
+        marked=marked,
+        indented=select_sites(marked, DETAIL_SITES[detail] if sites is None else sites),
+        parameters=draw_true_parameters(seed, fat, tendon),
+        measurements=SecondaryMeasurements(ultrasound, surface, shear_waves),
+        has_socket=socket,
+    )
     with _open_hidden_folder(folder) as work:
-        truth = _truth_to_dict(patient, everywhere, detail, seed, parameters)
-        anatomy = build_true_anatomy(patient)
+        truth = _truth_to_dict(patient)
+        anatomy = build_true_anatomy(made_limb)
         if socket:
-            truth["socket"] = write_socket(work, patient, anatomy)
-        _write_images(work, patient, everywhere, detail, seed, tell)
-        truth["sites"] = _write_traces(
-            work, patient, anatomy, indented, detail, seed, parameters, mapping, tell, measurements
-        )
-        text = _format_study(indented, detail, seed, patient, measurements, socket)
-        (work / "study.toml").write_text(text, encoding="utf-8")
+            truth["socket"] = write_socket(work, made_limb, anatomy)
+        _write_images(work, patient, tell)
+        truth["sites"] = _write_traces(work, patient, anatomy, mapping, tell)
+        (work / "study.toml").write_text(_format_study(patient), encoding="utf-8")
         (work / "truth.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
     return truth
 
@@ -196,20 +214,20 @@ def _open_hidden_folder(folder: Path) -> Iterator[Path]:
         raise
 
 
-def _write_images(
-    work: Path, limb: Limb, everywhere: Sequence[TrueSite], detail: str, seed: int, tell: Listener
-) -> None:
-    grid = make_grid(limb, detail, seed)
+def _write_images(work: Path, patient: _Patient, tell: Listener) -> None:
+    limb, seed = patient.limb, patient.seed
+    grid = make_grid(limb, patient.detail, seed)
     if limb.has_tendon:
         (work / LABELS_FILE.parent).mkdir()
         write_labels(work / LABELS_FILE, build_true_labels(limb, grid))
-    series = (("plain", (), "UTE residuum"), ("markers", build_markers(everywhere), "UTE residuum, markers"))
-    for number, (name, markers, description) in enumerate(series, start=1):
+    markers = build_markers(patient.marked)
+    series = (("plain", (), "UTE residuum"), ("markers", markers, "UTE residuum, markers"))
+    for number, (name, shown, description) in enumerate(series, start=1):
         write_series(
             work / "mri" / name,
             limb,
             grid,
-            markers,
+            shown,
             seed=seed,
             number=number,
             description=description,
@@ -218,34 +236,26 @@ def _write_images(
 
 
 def _write_traces(
-    work: Path,
-    limb: Limb,
-    anatomy: Anatomy,
-    indented: Sequence[TrueSite],
-    detail: str,
-    seed: int,
-    parameters: Parameters,
-    mapping: Mapping,
-    tell: Listener,
-    measurements: SecondaryMeasurements,
+    work: Path, patient: _Patient, anatomy: Anatomy, mapping: Mapping, tell: Listener
 ) -> list[dict[str, Any]]:
     """Simulate and record every site; return what is true of each, for ``truth.json``."""
     truth, traces = work / "truth", work / "traces"
     truth.mkdir()
     traces.mkdir()
     save_anatomy(truth, anatomy)
-    made = choose_discretisation(detail, limb.kind)
-    settings = replace(made.mesh, layers=limb.layers)
+    made, indented = choose_discretisation(patient.detail, patient.limb.kind), patient.indented
+    settings = replace(made.mesh, layers=patient.limb.layers)
     mesh = partial(mesh_true_site, folder=truth, settings=settings, within_mm=made.within_mm)
     jobs: list[ForceJob] = []
     tell("meshes", 0, len(indented))
     for site, site_mesh in zip(indented, mapping(mesh, indented), strict=True):
-        jobs.append(ForceJob(site, site_mesh, made.steps(site.thickness), parameters, measurements))
+        steps = made.steps(site.thickness)
+        jobs.append(ForceJob(site, site_mesh, steps, patient.parameters, patient.measurements))
         tell("meshes", len(jobs), len(indented))
     tell("forces", 0, len(jobs))
     facts = []
     for i, (site, found) in enumerate(zip(indented, mapping(simulate_true_force, jobs), strict=True)):
-        facts.append(_record_site(traces, site, found, seed))
+        facts.append(_record_site(traces, site, found, patient.seed))
         tell("forces", i + 1, len(jobs))
     return facts
 
@@ -297,14 +307,13 @@ def _site_to_dict(site: TrueSite) -> dict[str, Any]:
     }
 
 
-def _truth_to_dict(
-    limb: Limb, everywhere: Sequence[TrueSite], detail: str, seed: int, parameters: Parameters
-) -> dict[str, Any]:
-    made = choose_discretisation(detail, limb.kind)
+def _truth_to_dict(patient: _Patient) -> dict[str, Any]:
+    limb = patient.limb
+    made = choose_discretisation(patient.detail, limb.kind)
     return {
-        "seed": seed,
-        "detail": detail,
-        "parameters": parameters,
+        "seed": patient.seed,
+        "detail": patient.detail,
+        "parameters": patient.parameters,
         "kappa_ratio": KAPPA_RATIO,
         "indenter_mm": INDENTER_MM,
         "limb": {
@@ -313,7 +322,7 @@ def _truth_to_dict(
             "rotation": limb.rotation.tolist(),
             "origin_mm": limb.origin.tolist(),
         },
-        "markers": [_site_to_dict(site) for site in everywhere],
+        "markers": [_site_to_dict(site) for site in patient.marked],
         "mesh": {
             **asdict(made.mesh),
             "layers": [asdict(layer) for layer in limb.layers],
@@ -322,26 +331,19 @@ def _truth_to_dict(
     }
 
 
-def _format_study(
-    sites: Sequence[TrueSite],
-    detail: str,
-    seed: int,
-    limb: Limb,
-    measurements: SecondaryMeasurements,
-    socket: bool,
-) -> str:
-    """The content of ``study.toml`` for some sites of a limb, as a user would write it."""
+def _format_study(patient: _Patient) -> str:
+    """The content of ``study.toml`` for the indented sites, as a user would write it."""
     loader = PackageLoader("limbfit.phantom", "templates")
     environment = Environment(
         loader=loader, undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True
     )
     return environment.get_template("study.toml.j2").render(
-        sites=sites,
-        detail=detail,
-        seed=seed,
-        limb=limb,
-        measurements=measurements,
-        socket=socket,
+        sites=patient.indented,
+        detail=patient.detail,
+        seed=patient.seed,
+        limb=patient.limb,
+        measurements=patient.measurements,
+        socket=patient.has_socket,
         labels_file=LABELS_FILE.as_posix(),
         tendon=TENDON,
         tendon_label=TENDON_LABEL,
