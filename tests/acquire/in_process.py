@@ -149,8 +149,8 @@ class Bench:
             at, speed = self._stopped
             allowed = np.maximum(speed - BRAKING * (self.ms - at) / 1000, 0) + 1e-9
             assert (motors.speed_mm_s <= allowed).all(), "motion towards the limb with a stop active"
-        jammed = {fault.pin - 1 for fault in faults.on("stuck")}
-        free = np.array([k not in jammed for k in range(PINS)]) & (not faults.on("power"))
+        jammed = {fault.pin - 1 for fault in faults.find_active("stuck")}
+        free = np.array([k not in jammed for k in range(PINS)]) & (not faults.find_active("power"))
         over = self.device.limb.force_N > self._limit_N
         self._over = np.where(over & free, self._over + 1, 0)
         assert self._over.max() <= OVER_MS, f"over the limit of force for {self._over.max()} ms"

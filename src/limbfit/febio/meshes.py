@@ -111,21 +111,20 @@ def build_bodies(problem: Problem, motions: Sequence[Motion] = ()) -> list[FebBo
     system = System(problem)
     bodies: list[FebBody] = []
     for i, body in enumerate([] if system.bodies is None else system.bodies.all):
-        body_in_problem, first = body.stated, i == 0 and problem.indenter is not None
-        driven = motions[i] if motions else body_in_problem.motion
-        name = INDENTER if first else re.sub(r"[^\w-]+", "_", body_in_problem.name) or f"body_{i + 1}"
-        if name in {other.name for other in bodies}:
-            raise ProblemError(f"two rigid bodies have the name {name!r}", remedy="give each its own")
-        patch, front, pair = (PATCH, FRONT, "indentation") if first else (
-            f"{name}_patch", f"{name}_front", f"{name}_contact"
-        )  # fmt: skip
-        rail = find_rail(driven, body.start.frame)
-        motion = to_space(name, driven, body.start.frame) if rail is None else to_rail_motion(driven, rail)
-        faces = np.asarray(body_in_problem.faces, dtype=np.int64)
-        tool = _mesh_shape(body.start)
-        names = name, patch, front, pair
+        stated = body.stated
+        if i == 0 and problem.indenter is not None:
+            names = INDENTER, PATCH, FRONT, "indentation"
+        else:
+            name = re.sub(r"[^\w-]+", "_", stated.name) or f"body_{i + 1}"
+            names = name, f"{name}_patch", f"{name}_front", f"{name}_contact"
+        if names[0] in {other.name for other in bodies}:
+            raise ProblemError(f"two rigid bodies have the name {names[0]!r}", remedy="give each its own")
+        driven, frame = motions[i] if motions else stated.motion, body.start.frame
+        rail = find_rail(driven, frame)
+        motion = to_space(names[0], driven, frame) if rail is None else to_rail_motion(driven, rail)
+        tool, faces = _mesh_shape(body.start), np.asarray(stated.faces, dtype=np.int64)
         width = body.start.width
-        bodies.append(FebBody(*names, tool, body.pivot, motion, faces, body_in_problem.friction, width, rail))
+        bodies.append(FebBody(*names, tool, body.pivot, motion, faces, stated.friction, width, rail))
     return bodies
 
 

@@ -77,11 +77,11 @@ class FaultClock:
     def enter(self, phase: str) -> None:
         self._entered.setdefault(phase, self.now_us)
 
-    def on(self, kind: str) -> list[Fault]:
+    def find_active(self, kind: str) -> list[Fault]:
         """The faults of a kind that are on."""
         return [fault for fault in self.faults if fault.kind == kind and self._is_on(fault)]
 
-    def share(self, fault: Fault) -> float:
+    def compute_progress(self, fault: Fault) -> float:
         """How much of a fault's time has passed, 0 to 1."""
         start = self._start(fault)
         return 0.0 if start is None else min(max((self.now_us - start) / 1e6 / fault.duration_s, 0.0), 1.0)

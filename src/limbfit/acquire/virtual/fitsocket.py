@@ -97,7 +97,7 @@ class VirtualFitSocket:
 
     def feed(self, data: bytes) -> bytes:
         """Take bytes of the host; return the answer."""
-        if self.faults.on("deaf"):
+        if self.faults.find_active("deaf"):
             return b""
         out = b""
         for line in self._decoder.feed(data):
@@ -129,7 +129,7 @@ class VirtualFitSocket:
         if hello.version != wire.VERSION:
             self._decoder.refused.unknown += 1
             return b""
-        if self.is_home and not self.faults.on("button"):
+        if self.is_home and not self.faults.find_active("button"):
             self.stopped, self._given_up = "", False
         identity = wire.Identity(
             version=wire.VERSION,
@@ -236,8 +236,8 @@ class VirtualFitSocket:
         """Advance by a millisecond; return what the device sends at its end."""
         self.time_us += STEP_US
         self.faults.now_us = self.time_us - self._begun_us if self.is_armed else self.faults.now_us + STEP_US
-        jammed = [fault.pin - 1 for fault in self.faults.on("stuck")]
-        powered = not self.faults.on("power")
+        jammed = [fault.pin - 1 for fault in self.faults.find_active("stuck")]
+        powered = not self.faults.find_active("power")
         self._move_limb()
         self.motors.step(jammed, powered)
         self.limb.step(self.motors.head_mm)
@@ -258,12 +258,12 @@ class VirtualFitSocket:
             self.motors.head_mm,
             self.limb.force_N,
             self.limb.gap_mm,
-            [fault.pin - 1 for fault in faults.on("dead")],
-            [fault.pin - 1 for fault in faults.on("saturated")],
+            [fault.pin - 1 for fault in faults.find_active("dead")],
+            [fault.pin - 1 for fault in faults.find_active("saturated")],
         )
         flags = Flags.HOME * self.is_home | Flags.STOPPED * bool(self.stopped)
         flags |= Flags.NO_POWER * (not powered) | Flags.GIVEN_UP * self._given_up
-        flags |= Flags.BUTTON * bool(faults.on("button"))
+        flags |= Flags.BUTTON * bool(faults.find_active("button"))
         moving = int(np.packbits(self.motors.driving, bitorder="little").view("<u2")[0])
         return Sample(0, self.time_us, int(flags), moving, position, self._forces_mN, seen)
 
@@ -276,11 +276,11 @@ class VirtualFitSocket:
 
     def _check_limits(self, sample: Sample, powered: bool) -> bytes:
         """Stop at the device's own limits, and report that."""
-        if self.stopped or not (self.is_armed or self.faults.on("button")):
+        if self.stopped or not (self.is_armed or self.faults.find_active("button")):
             return b""
         code, pin = "", 0
         self._lag_times_us = np.where(self.motors.find_lagging(), self._lag_times_us + STEP_US, 0)
-        if self.faults.on("button"):
+        if self.faults.find_active("button"):
             code = "button"
         elif not powered:
             code = "power"
@@ -320,7 +320,7 @@ class VirtualFitSocket:
     def _move_limb(self) -> None:
         for fault in self.faults.faults:
             if fault.kind == "limb":
-                moved = fault.value * self.faults.share(fault)
+                moved = fault.value * self.faults.compute_progress(fault)
                 self.limb.shift(fault.pin, moved - self._limb_shifts_mm.get(fault, 0.0))
                 self._limb_shifts_mm[fault] = moved
 
@@ -329,11 +329,11 @@ class VirtualFitSocket:
 
     def _apply_faults(self, out: bytes) -> bytes:
         """Return what goes out now of the lines: faults lose, delay or corrupt them."""
-        if self.faults.on("lost"):
+        if self.faults.find_active("lost"):
             out = b""
-        if out and self.faults.on("corrupt"):
+        if out and self.faults.find_active("corrupt"):
             out = b"\n".join(self._corrupt(line) for line in out.split(b"\n")[:-1]) + b"\n"
-        late = self.faults.on("late")
+        late = self.faults.find_active("late")
         if out and (late or self._delayed):
             due = self.time_us + round(1000 * max([fault.value for fault in late], default=0.0))
             self._delayed.append((max(due, self._delayed[-1][0] if self._delayed else 0), out))

@@ -98,12 +98,12 @@ def read_geometry(root: XmlNode, materials: Iterable[str]) -> Geometry:
         pairs[name] = both
     most = len(numbers.ids)
     sets = {
-        name: np.array(numbers.of(group, _read_ids(group, most)), dtype=np.int64)
+        name: np.array(numbers.look_up(group, _read_ids(group, most)), dtype=np.int64)
         for name, group in _find_named(mesh, "NodeSet")
     }
     named = [group for group in mesh.all("Nodes") if group.attributes.get("name")]
     blocks = {
-        group.attributes["name"]: np.array(numbers.of(group, _read_identities(group))) for group in named
+        group.attributes["name"]: np.array(numbers.look_up(group, _read_identities(group))) for group in named
     }
     elements = {name: part.ids for name, part in parts.items()}
     elements |= {name: np.array(_read_ids(group)) for name, group in _find_named(mesh, "ElementSet")}
@@ -127,7 +127,7 @@ class _NodeNumbers:
                 raise node.error(f"node {node.identity()} is there twice")
         self.ids = np.array(list(self.place), dtype=np.int64)
 
-    def of(self, node: XmlNode, ids: list[int]) -> list[int]:
+    def look_up(self, node: XmlNode, ids: list[int]) -> list[int]:
         try:
             return [self.place[i] for i in ids]
         except KeyError as error:
@@ -177,7 +177,7 @@ def _read_part(group: XmlNode, domain: XmlNode, numbers: _NodeNumbers, used_ids:
             raise element.error(f"element {number} has {len(corners)} nodes; {cell_type} has {count}")
         used_ids.add(number)
         ids.append(number)
-        cells.append(numbers.of(element, corners))
+        cells.append(numbers.look_up(element, corners))
     if not ids:
         raise group.error("has no elements")
     formulation = _choose_formulation(domain, cell_type, rule)
@@ -211,7 +211,7 @@ def _read_faces(group: XmlNode, numbers: _NodeNumbers) -> Indices:
         corners = face.integers()
         if len(corners) != count:
             raise face.error(f"has {len(corners)} nodes, not {count}")
-        faces.append(numbers.of(face, corners))
+        faces.append(numbers.look_up(face, corners))
     return np.array(faces)
 
 
