@@ -41,14 +41,8 @@ FOLLOWED_BYTES = 1 << 22  # read at once by who follows a record: half a minute 
 _HEAD_BYTES = 1 << 16  # the first block and a closing line are shorter than these
 _CLOSING_BYTES = 64
 _NAMES = ("host_us", "device_us", "number", "flags", "moving")
-COLUMNS = (
-    *_NAMES,
-    *(
-        f"{letter}{pin}_{unit}"
-        for letter, unit in (("p", "um"), ("f", "mN"), ("c", "fF"))
-        for pin in range(1, PINS + 1)
-    ),
-)
+_CHANNELS = (("p", "um"), ("f", "mN"), ("c", "fF"))  # position, force, capacitance
+COLUMNS = (*_NAMES, *(f"{letter}{pin}_{unit}" for letter, unit in _CHANNELS for pin in range(1, PINS + 1)))
 _CLOSING = re.compile(rb"#block ([0-9]{1,9}) ([0-9]{1,9}) ([0-9A-F]{8})\n")
 
 

@@ -13,23 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from ..anatomy.grid import Grid
 from ..anatomy.imaging import read_volume
 from ..anatomy.meshing.engines import ENGINES
 from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
-from ..anatomy.segmentation.amputation import amputate_limb, label_map
+from ..anatomy.segmentation.amputation import amputate_limb
 from ..anatomy.segmentation.segmentation import segment
 from ..anatomy.sites.sites import compute_indenter_axis
 from ..anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface
 from ..arrays import Array
 from ..errors import InputError, LimbfitError
 from ..phantom.geometry import make_limb
-from ..phantom.mri import make_grid
+from ..phantom.mri import build_true_labels, make_grid
 from .parity import Row, Tell, find_reference
 
 SITES = 20
 SEEDS = (0, 1, 2)
-SLAB = 16
 INDENTER_MM = 20.0
 BELOW_CUT_MM = 25.0  # sites keep this far from the proximal cut
 CALF_PLANE = (-36.7, 13.3, -94.4), (-0.10164, -0.16645, 0.98080)
@@ -162,18 +160,10 @@ def list_limbs(shared: Path) -> dict[str, Callable[[], Anatomy]]:
     }
 
 
-def make_phantom_limb(seed: int, detail: str = "paper") -> Anatomy:
+def make_phantom_limb(seed: int) -> Anatomy:
     """The surfaces of a phantom as a label map on its scanner's grid shows them."""
-    limb, grid = make_limb(seed), make_grid(make_limb(seed), detail, seed)
-    skin, *bones = np.zeros((1 + len(limb.bone_names), *grid.shape), dtype=bool)
-    for k in range(0, grid.shape[0], SLAB):
-        slab = slice(k, min(k + SLAB, grid.shape[0]))
-        points = grid.points(slab, slice(0, grid.shape[1]), slice(0, grid.shape[2]))
-        skin[slab] = limb.skin(points) < 0
-        for bone, name in zip(bones, limb.bone_names):
-            bone[slab] = limb.bone(name, points) < 0
-    voxels = Grid(skin, np.array(grid.spacing), grid.origin, grid.direction)
-    return build_anatomy(label_map(voxels, skin, dict(zip(limb.bone_names, bones))))
+    limb = make_limb(seed)
+    return build_anatomy(build_true_labels(limb, make_grid(limb, "paper", seed)))
 
 
 def make_openlimb_mean(folder: Path) -> Anatomy:

@@ -26,10 +26,8 @@ _MAX_MESSAGE_BYTES = 32 * 2**20  # of FEBio's first and last words, bytes
 INSTALL_REMEDY = (
     f"install FEBio 4 (https://febio.org/downloads); put febio4 on the path or set {PROGRAM_VARIABLE} to it"
 )
-NORMAL_TERMINATION, ERROR_TERMINATION = (
-    "N O R M A L   T E R M I N A T I O N",
-    "E R R O R   T E R M I N A T I O N",
-)
+NORMAL_TERMINATION = "N O R M A L   T E R M I N A T I O N"
+ERROR_TERMINATION = "E R R O R   T E R M I N A T I O N"
 _VERSION = re.compile(r"^\s*version\s+(\d+(?:\.\w+)+)", re.MULTILINE)
 _CONVERGED = re.compile(r"------- converged at time : ([-+.\deE]+)")
 _FAILED = re.compile(r"------- failed to converge at time : ([-+.\deE]+)")

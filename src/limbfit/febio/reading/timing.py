@@ -171,7 +171,8 @@ def _read_formula(node: XmlNode) -> Callable[[Array], Array]:
         raise node.error(wrong, remedy)
     try:
         tree = ast.parse(text.replace("^", "**"), mode="eval").body
-        _evaluate(tree, np.zeros(1))
+        with np.errstate(all="ignore"):
+            _evaluate(tree, np.zeros(1))
     except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError):
         raise node.error(wrong, remedy) from None
 
@@ -198,11 +199,9 @@ def _evaluate(tree: ast.expr, t: Array) -> Array:
         case ast.BinOp(op=ast.Pow(), right=ast.BinOp(op=ast.Pow())):
             raise ValueError("a power of a power is read from the left by some, from the right by others")
         case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
-            with np.errstate(all="ignore"):
-                return _OPERATORS[type(op)](_evaluate(left, t), _evaluate(right, t))
+            return _OPERATORS[type(op)](_evaluate(left, t), _evaluate(right, t))
         case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in _FUNCTIONS:
-            with np.errstate(all="ignore"):
-                return _FUNCTIONS[name](_evaluate(argument, t))
+            return _FUNCTIONS[name](_evaluate(argument, t))
     raise ValueError("not known")
 
 
