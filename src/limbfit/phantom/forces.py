@@ -13,10 +13,10 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
 from ..anatomy.surfaces.surfaces import Anatomy, load_anatomy
+from ..arrays import Array
 from ..errors import RunError
 from ..fe import StepControl, solve
 from ..indentation import (
@@ -101,13 +101,13 @@ class TrueForce:
     mm, where cameras were. ``speeds`` (n,) m/s of shear waves in each tissue on the axis.
     """
 
-    times: NDArray[np.float64]
-    force: NDArray[np.float64]
+    times: Array
+    force: Array
     facts: dict[str, float | int | str]
-    layers: dict[str, tuple[float, NDArray[np.float64]]] = field(default_factory=dict)
-    skin_points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
-    skin_moves: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3, 0)))
-    speeds: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    layers: dict[str, tuple[float, Array]] = field(default_factory=dict)
+    skin_points: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    skin_moves: Array = field(default_factory=lambda: np.zeros((0, 3, 0)))
+    speeds: dict[str, Array] = field(default_factory=dict)
 
 
 @lru_cache(maxsize=1)

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..anatomy.meshing.layers import LayerSpec
+from ..arrays import Array
 from ..errors import InputError
 from .limb_shapes import (
     PROXIMAL_CUT_MM,
-    Array,
+    Floats,
     LimbShape,
     Shank,
     Thigh,
@@ -29,7 +29,7 @@ SKIN_LAYER = (LayerSpec("skin", 3.0),)
 SKIN_AND_FAT = (LayerSpec("skin", 2.0), LayerSpec("fat", 4.0))
 
 
-def build_rotation(axis: Array, angle: float) -> NDArray[np.float64]:
+def build_rotation(axis: Floats, angle: float) -> Array:
     """Rotation matrix (3, 3) about ``axis`` by ``angle`` radians (Rodrigues)."""
     x, y, z = np.asarray(axis, float) / np.linalg.norm(axis)
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -41,8 +41,8 @@ class Limb:
     """A residuum in patient space (LPS mm): ``x_lps = rotation @ x_limb + origin``."""
 
     shape: LimbShape
-    rotation: NDArray[np.float64]
-    origin: NDArray[np.float64]
+    rotation: Array
+    origin: Array
     layers: tuple[LayerSpec, ...] = SKIN_LAYER
     has_tendon: bool = False
 
@@ -60,55 +60,55 @@ class Limb:
         """Depth of the muscle under the skin's surface."""
         return sum(layer.thickness_mm or 0.0 for layer in self.layers)
 
-    def to_limb(self, points: Array) -> Array:
+    def to_limb(self, points: Floats) -> Floats:
         """Points (..., 3) from LPS to the limb frame."""
         return (points - self.origin.astype(points.dtype)) @ self.rotation.astype(points.dtype)
 
-    def to_patient(self, points: Array) -> NDArray[np.float64]:
+    def to_patient(self, points: Floats) -> Array:
         """Points (..., 3) from the limb frame to LPS."""
         return np.asarray(points, np.float64) @ self.rotation.T + self.origin
 
-    def skin(self, points: Array) -> Array:
+    def skin(self, points: Floats) -> Floats:
         """Skin field at LPS points (..., 3), unbounded proximally."""
         return compute_skin_field(self.shape, self.to_limb(points))
 
-    def bone(self, name: str, points: Array) -> Array:
+    def bone(self, name: str, points: Floats) -> Floats:
         """Field of one of its bones at LPS points (..., 3); the femur is unbounded proximally."""
         return self.shape.bone_field(name, self.to_limb(points))
 
-    def bones(self, points: Array) -> Array:
+    def bones(self, points: Floats) -> Floats:
         """Field of all bones together at LPS points (..., 3)."""
         local = self.to_limb(points)
         return np.minimum.reduce([self.shape.bone_field(name, local) for name in self.bone_names])
 
-    def tendon(self, points: Array) -> Array:
+    def tendon(self, points: Floats) -> Floats:
         """Field of the patellar tendon between the bones at LPS points (..., 3)."""
         assert isinstance(self.shape, Shank)
         return np.maximum(compute_tendon_field(self.shape, self.to_limb(points)), -self.bones(points))
 
-    def skin_point(self, angle: float, height: float) -> NDArray[np.float64]:
+    def skin_point(self, angle: float, height: float) -> Array:
         """The LPS point of the skin at an angle around the limb and a height above its tip."""
         return self.to_patient(compute_surface_point(self.shape, np.asarray(angle), np.asarray(height)))
 
-    def inward(self, points: Array) -> NDArray[np.float64]:
+    def inward(self, points: Floats) -> Array:
         """Unit inward skin normals (n, 3) at LPS points (n, 3)."""
         gradient = compute_gradient(self.skin, points)
         return -gradient / np.linalg.norm(gradient, axis=-1, keepdims=True)
 
-    def tissue_thickness(self, point: Array, axis: Array, limit: float = 40.0) -> float:
+    def tissue_thickness(self, point: Floats, axis: Floats, limit: float = 40.0) -> float:
         """Soft tissue between a skin point and the first bone along ``axis``; ``limit`` where none is met."""
         along = np.arange(0.0, limit, 0.1)
         inside = self.bones(point + along[:, None] * axis) < 0
         return float(along[inside.argmax()]) if inside.any() else limit
 
-    def move(self, rotation: Array, translation: Array) -> Limb:
+    def move(self, rotation: Floats, translation: Floats) -> Limb:
         """The limb after a rigid motion about its own middle (LPS)."""
         middle = self.to_patient(np.array([0.0, 0.0, PROXIMAL_CUT_MM / 2]))
         origin = rotation @ (self.origin - middle) + middle + translation
         return replace(self, rotation=rotation @ self.rotation, origin=origin)
 
     @cached_property
-    def proximal_normal(self) -> NDArray[np.float64]:
+    def proximal_normal(self) -> Array:
         """Proximal direction in LPS."""
         return self.rotation @ np.array([0.0, 0.0, 1.0])
 
@@ -135,7 +135,7 @@ def make_limb(
     return Limb(vary(LIMBS[kind], seed), build_rotation(lean_axis, lean) @ turn, origin, layers, tendon)
 
 
-def compute_gradient(field, points: Array, step: float = 0.05) -> NDArray[np.float64]:  # type: ignore[no-untyped-def]
+def compute_gradient(field, points: Floats, step: float = 0.05) -> Array:  # type: ignore[no-untyped-def]
     """Central differences (n, 3) of a field at points (n, 3)."""
     offsets = step * np.eye(3)
     return np.stack([(field(points + d) - field(points - d)) / (2 * step) for d in offsets], axis=-1)

@@ -16,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.floating]
+Floats = NDArray[np.floating]  # images are made in single precision
 PROXIMAL_CUT_MM = 250.0
 TENDON_MM = 24.0, 6.0  # width and thickness of the patellar tendon
 
@@ -43,11 +43,11 @@ class LimbShape(ABC):
         """Height from which places on the limb are counted downwards."""
 
     @abstractmethod
-    def section_radius(self, angle: Array, z: Array) -> Array:
+    def section_radius(self, angle: Floats, z: Floats) -> Floats:
         """Radius of the limb's section without the rounding of its distal end."""
 
     @abstractmethod
-    def bone_field(self, name: str, points: Array) -> Array:
+    def bone_field(self, name: str, points: Floats) -> Floats:
         """Field of a bone at points (..., 3) of the limb frame; a bone at the cut is unbounded proximally."""
 
 
@@ -66,22 +66,22 @@ def vary(base: LimbShape, seed: int) -> LimbShape:
     return replace(base, **drawn)
 
 
-def compute_smoothstep(t: Array) -> Array:
+def compute_smoothstep(t: Floats) -> Floats:
     """0 below 0, 1 above 1, with level ends."""
     t = np.clip(t, 0, 1)
     return t * t * (3 - 2 * t)
 
 
-def bump(t: Array) -> Array:
+def bump(t: Floats) -> Floats:
     """A bell of height 1 and standard deviation 1."""
     return np.exp(-0.5 * t * t)
 
 
-def _compute_dome(shape: LimbShape, z: Array) -> Array:
+def _compute_dome(shape: LimbShape, z: Floats) -> Floats:
     return np.clip((shape.dome - z) / shape.dome, 0, None)
 
 
-def compute_skin_field(shape: LimbShape, points: Array) -> Array:
+def compute_skin_field(shape: LimbShape, points: Floats) -> Floats:
     """Compute the skin field at limb points (..., 3): star-shaped sections on an ellipsoidal end."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     radius = shape.section_radius(np.arctan2(x, -y), z)
@@ -89,19 +89,19 @@ def compute_skin_field(shape: LimbShape, points: Array) -> Array:
     return (level - 1) * radius
 
 
-def compute_surface_point(shape: LimbShape, angle: Array, z: Array, inset: Array | float = 0.0) -> Array:
+def compute_surface_point(shape: LimbShape, angle: Floats, z: Floats, inset: Floats | float = 0.0) -> Floats:
     """Point (..., 3) at an angle and height, ``inset`` millimetres radially under the skin."""
     reach = np.sqrt(np.clip(1 - _compute_dome(shape, z) ** 2, 0, None))
     radius = shape.section_radius(angle, z) * reach - inset
     return np.stack([radius * np.sin(angle), -radius * np.cos(angle), z + 0 * radius], axis=-1)
 
 
-def extrude_section(section: Array, z: Array, low: float, high: float, rounding: float) -> Array:
+def extrude_section(section: Floats, z: Floats, low: float, high: float, rounding: float) -> Floats:
     """A prism from ``low`` to ``high`` over a section's field, its edges rounded."""
     return intersect_fields(section, np.maximum(z - high, low - z), rounding)
 
 
-def compute_triangle_distance(x: Array, y: Array, corners: tuple[Array, Array, Array]) -> Array:
+def compute_triangle_distance(x: Floats, y: Floats, corners: tuple[Floats, Floats, Floats]) -> Floats:
     """Exact signed distance to a triangle whose corners (..., 2) may vary from point to point."""
     squared, sides = [], []
     for start, end in zip(corners, (*corners[1:], corners[0]), strict=True):
@@ -116,8 +116,8 @@ def compute_triangle_distance(x: Array, y: Array, corners: tuple[Array, Array, A
 
 
 def compute_ellipsoid_distance(
-    points: Array, centre: tuple[float, float, float], axes: tuple[float, float, float]
-) -> Array:
+    points: Floats, centre: tuple[float, float, float], axes: tuple[float, float, float]
+) -> Floats:
     """First-order distance to an ellipsoid."""
     scaled = (points - np.array(centre, points.dtype)) / np.array(axes, points.dtype)
     k0 = np.linalg.norm(scaled, axis=-1)
@@ -125,14 +125,14 @@ def compute_ellipsoid_distance(
     return k0 * (k0 - 1) / np.maximum(k1, 1e-6)
 
 
-def intersect_fields(a: Array, b: Array, rounding: float) -> Array:
+def intersect_fields(a: Floats, b: Floats, rounding: float) -> Floats:
     """Field of what two bodies share, with rounded edges."""
     a, b = a + rounding, b + rounding
     outside = np.hypot(np.maximum(a, 0), np.maximum(b, 0))
     return np.minimum(np.maximum(a, b), 0) + outside - rounding
 
 
-def join_fields(a: Array, b: Array, blend: float) -> Array:
+def join_fields(a: Floats, b: Floats, blend: float) -> Floats:
     """Join two fields smoothly."""
     h = np.clip(blend - np.abs(a - b), 0, None) / blend
     return np.minimum(a, b) - h * h * blend / 4
@@ -165,7 +165,7 @@ class Shank(LimbShape):
         """The knee joint."""
         return self.joint
 
-    def section_radius(self, angle: Array, z: Array) -> Array:
+    def section_radius(self, angle: Floats, z: Floats) -> Floats:
         mean = self.radius_distal + (self.radius_proximal - self.radius_distal) * compute_smoothstep(z / 185)
         posterior = ((1 - np.cos(angle)) / 2) ** 2
         calf = self.calf * bump((z - self.joint + 60) / 42) * posterior
@@ -175,11 +175,11 @@ class Shank(LimbShape):
         popliteal = -3.0 * bump((z - self.joint - 5) / 18) * posterior
         return mean + calf + flat + knee + popliteal
 
-    def bone_field(self, name: str, points: Array) -> Array:
+    def bone_field(self, name: str, points: Floats) -> Floats:
         return _BONE_FIELDS[name](self, points)
 
 
-def _compute_tibia(shape: Shank, points: Array) -> Array:
+def _compute_tibia(shape: Shank, points: Floats) -> Floats:
     """A rounded triangle: crest under the skin, medial face along it, widening to the plateau."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     plateau = compute_smoothstep((z - shape.joint + 48) / 38)
@@ -189,7 +189,7 @@ def _compute_tibia(shape: Shank, points: Array) -> Array:
     section_z = np.minimum(z, shape.joint)
     depth = 3.5 + bevel + tuberosity
 
-    def blended(shaft: Array, target: tuple[float, float]) -> Array:
+    def blended(shaft: Floats, target: tuple[float, float]) -> Floats:
         return shaft[..., :2] + plateau[..., None] * (np.array(target, shaft.dtype) - shaft[..., :2])
 
     crest = compute_surface_point(
@@ -206,7 +206,7 @@ def _compute_tibia(shape: Shank, points: Array) -> Array:
     return extrude_section(section, z, shape.pad, shape.joint - shape.joint_gap / 2, 4.0)
 
 
-def _compute_fibula(shape: Shank, points: Array) -> Array:
+def _compute_fibula(shape: Shank, points: Floats) -> Floats:
     """A thin rod on the lateral side, posterior of the tibia, with a head below the knee."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     top = shape.joint - 13
@@ -219,7 +219,7 @@ def _compute_fibula(shape: Shank, points: Array) -> Array:
     return extrude_section(section, z, shape.fibula_cut, top, 5.0)
 
 
-def _compute_femur(shape: Shank, points: Array) -> Array:
+def _compute_femur(shape: Shank, points: Floats) -> Floats:
     """Two condyles on a shaft that leaves the image."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     low = shape.joint + shape.joint_gap / 2
@@ -231,14 +231,14 @@ def _compute_femur(shape: Shank, points: Array) -> Array:
     return join_fields(join_fields(medial, lateral, 8.0), shaft, 12.0)
 
 
-def _compute_patella(shape: Shank, points: Array) -> Array:
+def _compute_patella(shape: Shank, points: Floats) -> Floats:
     height = shape.joint + 33
     anterior = float(shape.section_radius(np.asarray(0.0), np.asarray(height)))
     axes = (shape.patella, 9.5, shape.patella + 1)
     return compute_ellipsoid_distance(points, (0.0, -(anterior - 7.0 - axes[1]), height), axes)
 
 
-def compute_tendon_field(shape: Shank, points: Array) -> Array:
+def compute_tendon_field(shape: Shank, points: Floats) -> Floats:
     """A flat band from within the patella's lower half to within the tibial tuberosity, under the skin."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     above = z - shape.joint
@@ -279,14 +279,14 @@ class Thigh(LimbShape):
         """The proximal cut, below the hip."""
         return PROXIMAL_CUT_MM
 
-    def section_radius(self, angle: Array, z: Array) -> Array:
+    def section_radius(self, angle: Floats, z: Floats) -> Floats:
         mean = self.radius_distal + (self.radius_proximal - self.radius_distal) * compute_smoothstep(z / 220)
         front = self.quadriceps * bump((z - 150) / 60) * ((1 + np.cos(angle)) / 2) ** 2
         inner = self.adductors * compute_smoothstep((z - 100) / 130) * ((1 + np.sin(angle)) / 2) ** 2
         outer = -self.flattening * compute_smoothstep((z - 60) / 80) * ((1 - np.sin(angle)) / 2) ** 3
         return mean + front + inner + outer
 
-    def bone_field(self, name: str, points: Array) -> Array:
+    def bone_field(self, name: str, points: Floats) -> Floats:
         """Field of the femur's bowed shaft at points (..., 3) of the limb frame, unbounded proximally."""
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
         aside = self.lateral * compute_smoothstep((z + 60) / 250)

@@ -25,8 +25,9 @@ from scipy.special import ndtr
 
 from ..anatomy.grid import DEFAULT_NAMES
 from ..anatomy.imaging import LabelMap
+from ..arrays import Array
 from .geometry import Limb, build_rotation
-from .limb_shapes import PROXIMAL_CUT_MM, intersect_fields
+from .limb_shapes import PROXIMAL_CUT_MM, Floats, intersect_fields
 
 FAT, MUSCLE, MARROW, CORTEX, TENDON, MARKER = 1.0, 0.5, 0.8, 0.12, 0.3, 1.15
 MARKER_DIAMETER_MM, MARKER_HEIGHT_MM = 9.0, 5.0
@@ -73,8 +74,8 @@ class ScanGrid:
 
     shape: tuple[int, int, int]
     spacing: tuple[float, float, float]
-    origin: NDArray[np.float64]
-    direction: NDArray[np.float64]
+    origin: Array
+    direction: Array
 
     def points(self, k: slice, j: slice, i: slice) -> NDArray[np.float32]:
         """LPS centres (nk, nj, ni, 3) of a block of voxels."""
@@ -100,10 +101,10 @@ def make_grid(limb: Limb, detail: str, seed: int) -> ScanGrid:
 class SkinMarker:
     """A bright disc on the skin: where it sits (LPS mm) and the outward direction."""
 
-    position: NDArray[np.float64]
-    outward: NDArray[np.float64]
+    position: Array
+    outward: Array
 
-    def field(self, points: NDArray[np.floating]) -> NDArray[np.floating]:
+    def field(self, points: Floats) -> Floats:
         """Field of a disc with rounded edges that reaches 2 mm into the skin."""
         offset = points - self.position.astype(points.dtype)
         height = offset @ self.outward.astype(points.dtype)
@@ -114,8 +115,8 @@ class SkinMarker:
 
 
 def _compute_occupancy(
-    field: NDArray[np.floating], spacing: tuple[float, float, float], offsets: Sequence[float]
-) -> list[NDArray[np.floating]]:
+    field: Floats, spacing: tuple[float, float, float], offsets: Sequence[float]
+) -> list[Floats]:
     """Compute the share of each voxel that lies deeper than ``offset`` inside, for each offset (mm)."""
     steps = [np.gradient(field, axis=axis) for axis in range(3)]
     per_voxel = np.sqrt(sum(g * g for g in steps))
@@ -126,7 +127,7 @@ def _compute_occupancy(
 
 
 def _compute_tissue(
-    limb: Limb, points: NDArray[np.floating], spacing: tuple[float, float, float], levels: Contrast
+    limb: Limb, points: Floats, spacing: tuple[float, float, float], levels: Contrast
 ) -> tuple:
     """Compute the noise-free signal of a block and the share of each voxel inside the skin."""
     skin, inner = _compute_occupancy(limb.skin(points), spacing, (0.0, limb.layers_mm))
@@ -141,9 +142,9 @@ def _compute_tissue(
 
 
 def _add_marker(
-    signal: NDArray[np.floating],
-    skin: NDArray[np.floating],
-    points: NDArray[np.floating],
+    signal: Floats,
+    skin: Floats,
+    points: Floats,
     spacing: tuple[float, float, float],
     marker: SkinMarker,
     levels: Contrast,
@@ -243,7 +244,7 @@ def _build_uid(seed: int, *names: object) -> UID:
     return generate_uid(entropy_srcs=["limbfit phantom", str(seed), *map(str, names)])
 
 
-def _format_decimals(values: Sequence[float] | NDArray[np.float64]) -> list[str]:
+def _format_decimals(values: Sequence[float] | Array) -> list[str]:
     return [format_number_as_ds(float(value)) for value in values]
 
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..errors import SiteError
 from .geometry import Limb
 from .limb_shapes import Shank
@@ -76,12 +76,12 @@ class TrueSite:
     name: str
     region: str
     fitted: bool
-    position: NDArray[np.float64]
-    axis: NDArray[np.float64]
+    position: Array
+    axis: Array
     depth: float
     speed: float
     thickness: float
-    hint: NDArray[np.float64]
+    hint: Array
 
     @property
     def ramp(self) -> Ramp:
@@ -138,7 +138,7 @@ def _build_true_site(limb: Limb, place: Place, random: np.random.Generator) -> T
     )
 
 
-def _sample_footprint(limb: Limb, position: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sample_footprint(limb: Limb, position: Array) -> Array:
     """Find skin points (25, 3) under a square indenter at a position, along its normal."""
     normal = -limb.inward(position[None])[0]
     proximal = limb.proximal_normal - normal * (limb.proximal_normal @ normal)

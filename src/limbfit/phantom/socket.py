@@ -10,11 +10,11 @@ import numpy as np
 from ..anatomy.frame import build_limb_frame
 from ..anatomy.surfaces.surfacefiles import write_surface
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
+from ..arrays import Array
 from ..socket import Area, Recipe, Socket, read_socket, rectify_limb
 from ..socket.landmarks import Directions, build_default_regions, find_directions, find_knee_centre
 from ..socket.trim import Trim
 from .geometry import Limb
-from .limb_shapes import Array
 from .surfaces import build_outer_surface
 
 FILE = Path("socket") / "socket.stl"

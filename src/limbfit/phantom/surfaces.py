@@ -11,9 +11,9 @@ import pyvista as pv
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
 from ..anatomy.surfaces.triangles import find_bodies, find_open_edges, from_pyvista
 from .geometry import TENDON, Limb, compute_gradient
-from .limb_shapes import PROXIMAL_CUT_MM, Array, compute_skin_field
+from .limb_shapes import PROXIMAL_CUT_MM, Floats, compute_skin_field
 
-Field = Callable[[Array], Array]
+Field = Callable[[Floats], Floats]
 Corner = tuple[float, float, float]  # of a box of the limb frame, mm
 
 STICK_OUT_MM = 6.0  # of the femur beyond the cut, so that the void it leaves is open there
@@ -55,7 +55,7 @@ def build_outer_surface(limb: Limb, thickness_mm: float, spacing: float = 2.4) -
     reach = thickness_mm + 4.0
     low, high = (-80.0 - reach, -85.0 - reach, -reach), (80.0 + reach, 85.0 + reach, PROXIMAL_CUT_MM)
 
-    def field(points: Array) -> Array:
+    def field(points: Floats) -> Floats:
         return compute_skin_field(limb.shape, points) - thickness_mm
 
     return _to_patient_space(limb, extract_contour(field, low, high, spacing))
