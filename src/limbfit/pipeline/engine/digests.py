@@ -71,6 +71,7 @@ def code_parts(function: Callable[..., Any]) -> dict[str, str]:
     return {format_source(file): _digest(file) for file in find_sources(function)}
 
 
+@cache
 def format_source(file: Path) -> str:
     """A source file's path in the package; the name alone of one that is outside."""
     return file.relative_to(PACKAGE).as_posix() if file.is_relative_to(PACKAGE) else file.name
