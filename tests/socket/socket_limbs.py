@@ -50,14 +50,14 @@ def revolved(profile: np.ndarray, around: int, centre: tuple[float, float] = (0.
 @cache
 def round_limb() -> Anatomy:
     """A cone of 40 to 52 mm radius on half a ball, with a tibia in it whose top is at z = 120."""
-    fall = np.linspace(0.0, np.pi / 2, 30)
+    fall = np.linspace(0.0, np.pi / 2, 16)
     end = np.column_stack([40.0 * np.sin(fall), 40.0 - 40.0 * np.cos(fall)])
-    z = np.linspace(40.0, TOP, 56)[1:]
+    z = np.linspace(40.0, TOP, 28)[1:]
     shank = np.column_stack([40.0 + 12.0 * (z - 40.0) / (TOP - 40.0), z])
     bone = np.array([[0.0, 25.0], [8.0, 27.0], [11.0, 60.0], [12.0, 100.0], [14.0, 118.0], [9.0, 120.0]])
     fibula = np.array([[0.0, 40.0], [4.0, 42.0], [4.0, 75.0], [5.0, 108.0], [3.0, 110.0]])
     return Anatomy(
-        revolved(np.vstack([end, shank]), 140),
+        revolved(np.vstack([end, shank]), 72),
         {"tibia": revolved(bone, 24, (0.0, -10.0)), "fibula": revolved(fibula, 16, (-22.0, 5.0))},
         np.array([0.0, 0.0, TOP]),
         CUT_NORMAL,

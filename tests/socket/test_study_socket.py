@@ -54,17 +54,23 @@ def drawn(study: Study) -> Socket:
     return build_socket(study, round_limb(), round_limb().skin)
 
 
-def test_a_study_without_the_table_has_a_socket(tmp_path: Path) -> None:
-    study = study_of(tmp_path)
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Study, Socket]:
+    """The study without a table, and its socket."""
+    study = study_of(tmp_path_factory.mktemp("plain"))
+    return study, drawn(study)
+
+
+def test_a_study_without_the_table_has_a_socket(plain: tuple[Study, Socket]) -> None:
+    study, socket = plain
     assert "socket" not in study.model_fields_set
-    socket = drawn(study)
     assert socket.points[socket.brim, 2].max() == pytest.approx(110.0, abs=1.5)  # 10 mm below the tibia
     assert (study.socket.donning_s, study.socket.hold_s) == (2.0, 10.0)
     assert [(load.name, load.duration_s, load.hold_s) for load in study.socket.loads] == [
         ("single stance", 1.0, 2.0)
     ]
     assert study.socket.liner.parameters == {"c_kPa": 100.0, "m": 2.0, "gamma": 0.1, "tau_s": 1.0}
-    force, moment, point = load_of(study, study.socket.loads[0], round_limb(), drawn(study))
+    force, moment, point = load_of(study, study.socket.loads[0], round_limb(), socket)
     np.testing.assert_allclose(force, [0.0, 0.0, 800.0], atol=1e-9)
     np.testing.assert_allclose(moment, 0.0, atol=1e-9)
     np.testing.assert_allclose(point, find_knee_centre(round_limb()))
@@ -84,7 +90,7 @@ def test_the_table_says_the_shape(tmp_path: Path) -> None:
     assert build_regions(study, round_limb())["shin"].faces.any()
 
 
-def test_loads_of_ones_own(tmp_path: Path) -> None:
+def test_loads_of_ones_own(tmp_path: Path, plain: tuple[Study, Socket]) -> None:
     text = (
         '[[socket.loads]]\nname = "mine"\nforce_N = [0, 10, 500]\nmoment_Nmm = [1e4, 0, 0]\n'
         "point = [0, 0, 90]\n"
@@ -92,112 +98,87 @@ def test_loads_of_ones_own(tmp_path: Path) -> None:
         "[socket.liner]\nmaterial = 'gel'\nm = 4\n"
     )
     study = study_of(tmp_path, text)
-    force, moment, point = load_of(study, study.socket.loads[0], round_limb(), drawn(study))
+    force, moment, point = load_of(study, study.socket.loads[0], round_limb(), plain[1])
     assert force.tolist() == [0, 10, 500]
     assert moment.tolist() == [1e4, 0, 0]
     assert point.tolist() == [0, 0, 90]
-    force, moment, _ = load_of(study, study.socket.loads[1], round_limb(), drawn(study))
+    force, moment, _ = load_of(study, study.socket.loads[1], round_limb(), plain[1])
     np.testing.assert_allclose(force, [200.0, -200.0, 1100.0])  # medial is +x: the fibula lies at -x
     np.testing.assert_allclose(moment, np.cross([50.0, -50.0, 0.0], force))
     assert study.socket.liner.parameters == {"c_kPa": 40.0, "m": 4.0, "gamma": 0.3, "tau_s": 1.0}
 
 
-def test_the_socket_of_a_limb_without_a_tibia_is_checked(tmp_path: Path, commands_unasked: None) -> None:
-    facts = check_study(study_of(tmp_path, "[socket]\nhold_s = 1\n", bones=False))["facts"]
-    assert any(fact.startswith("socket: ") and "cm3" in fact for fact in facts)
-
-
-@pytest.mark.parametrize("load", ["", 'name = "mine"\nforce_N = [0, 0, 800]\n'])
-def test_a_limb_without_a_tibia_is_loaded_through_its_middle_at_the_brim(tmp_path: Path, load: str) -> None:
-    study = study_of(tmp_path, load and f"[[socket.loads]]\n{load}", bones=False)
+def test_a_limb_without_a_tibia_is_loaded_through_its_middle_at_the_brim(tmp_path: Path) -> None:
     limb = round_limb()
     bare = replace(
         limb, bones={}, skin=Surface(limb.skin.points + np.array([7.0, -3.0, 0.0]), limb.skin.faces)
     )
+    study = study_of(tmp_path, bones=False)
+    own = study_of(tmp_path, '[[socket.loads]]\nname = "mine"\nforce_N = [0, 0, 800]\n', bones=False)
     socket = build_socket(study, bare, bare.skin)
-    force, moment, point = load_of(study, study.socket.loads[0], bare, socket)
-    np.testing.assert_allclose(force, [0.0, 0.0, 800.0], atol=1e-9)
-    np.testing.assert_allclose(moment, 0.0, atol=1e-9)
-    np.testing.assert_allclose(point, [7.0, -3.0, socket.points[socket.brim, 2].mean()], atol=0.1)
-    assert point[2] == pytest.approx(120.0, abs=2.0)  # 30 mm below the cut, less what the flare takes
+    for load in (*study.socket.loads, *own.socket.loads):
+        force, moment, point = load_of(study, load, bare, socket)
+        np.testing.assert_allclose(force, [0.0, 0.0, 800.0], atol=1e-9)
+        np.testing.assert_allclose(moment, 0.0, atol=1e-9)
+        np.testing.assert_allclose(point, [7.0, -3.0, socket.points[socket.brim, 2].mean()], atol=0.1)
+        assert point[2] == pytest.approx(120.0, abs=2.0)  # 30 mm below the cut, less what the flare takes
     assert not {name for name in build_regions(study, bare) if "tibia" in name or "knee" in name}
 
 
-def test_check_draws_the_socket(tmp_path: Path, commands_unasked: None) -> None:
-    study = study_of(tmp_path, "[socket]\nreduction_percent = 2\n")
-    facts = "\n".join(check_study(study)["facts"])
-    assert "a liner of 6 mm" in facts
-    assert "mm outside the skin" in facts
-    write_surface(tmp_path / "mine.stl", drawn(study).surface.flipped)
-    facts = "\n".join(check_study(study_of(tmp_path, "[socket]\nfile = 'mine.stl'\n"))["facts"])
-    assert "were turned" in facts
+def test_check_draws_the_socket_of_a_limb_without_a_tibia_too(tmp_path: Path, commands_unasked: None) -> None:
+    facts = check_study(study_of(tmp_path, "[socket]\nhold_s = 1\n", bones=False))["facts"]
+    told = "\n".join(fact for fact in facts if fact.startswith("socket: "))
+    assert all(words in told for words in ("a liner of 6 mm", "cm3", "mm outside the skin"))
 
 
+LOAD = '[[socket.loads]]\nname = "x"\n'
 DESIGN = "[[socket.design.regions]]\n"
-BAD: dict[str, tuple[str, str, bool]] = {
-    "unknown key": ("[socket]\nreduction = 3\n", "see docs/study.md", True),
-    "give either position (LPS, mm) or region": (AREA, "", True),
-    "no region is named 'knee cap'": (AREA + 'region = "knee cap"\n', "tibial crest", True),
-    "off the socket's face": (AREA + "position = [0, -90, 60]\n", "on the limb below the brim", True),
-    "steeper than 45 degrees": (
-        AREA.replace("20", "4") + "position = [0, -44, 60]\n",
-        "or less depth",
-        True,
-    ),
+AT = "position = [0, -44, 60]\n"
+BAD = {  # what is said, the study, the remedy
+    "unknown key": ("[socket]\nreduction = 3\n", "see docs/study.md"),
+    "give either position (LPS, mm) or region": (AREA, ""),
+    "no region is named 'knee cap'": (AREA + 'region = "knee cap"\n', "tibial crest"),
+    "off the socket's face": (AREA + "position = [0, -90, 60]\n", "on the limb below the brim"),
+    "steeper than 45 degrees": (AREA.replace("20", "4") + AT, "or less depth"),
     "beyond the limb's proximal cut": (
         "[socket]\ntrim_planes = [{ point = [0, 0, 160] }]\n",
         "move the trimline down",
-        True,
     ),
-    "trim_mm is a plane of its own": (
-        "[socket]\ntrim_mm = 9\ntrim_planes = [{ point = [0, 0, 90] }]\n",
-        "",
-        True,
-    ),
-    "trimline needs three points": ("[socket]\ntrimline = [[0, 0, 90]]\n", "", True),
-    "names must differ": ((AREA + "position = [0, -44, 60]\n") * 2, "", True),
+    "trim_mm is a plane of its own": ("[socket]\ntrim_mm = 9\ntrim_planes = [{ point = [0, 0, 90] }]\n", ""),
+    "trimline needs three points": ("[socket]\ntrimline = [[0, 0, 90]]\n", ""),
+    "names must differ": ((AREA + AT) * 2, ""),
     "'donning' is a name of the results' own": (
-        '[[socket.loads]]\nname = "donning"\nforce_N = [0, 0, 9]\n',
+        LOAD.replace("x", "donning") + "force_N = [0, 0, 9]\n",
         "give another",
-        True,
     ),
     "'the limb' is a name of the results' own": (
         '[[socket.regions]]\nname = "the limb"\nposition = [0, -46, 80]\nradius_mm = 15\n',
         "give another",
-        True,
     ),
-    "give either preset": ('[[socket.loads]]\nname = "x"\n', "", True),
-    "a preset has its own moment": (
-        '[[socket.loads]]\nname = "x"\npreset = "toe-off"\nmoment_Nmm = [0, 0, 1]\n',
-        "",
-        True,
-    ),
-    "no region is named 'heel'": (DESIGN + 'region = "heel"\nlimit_kPa = 90\n', "tibial crest", True),
-    "give pressure_kPa, limit_kPa or both": (DESIGN + 'region = "tibial crest"\n', "", True),
-    "'tibial crest' is given twice": (
-        (DESIGN + 'region = "tibial crest"\nlimit_kPa = 90\n') * 2,
-        "",
-        True,
-    ),
-    "nowhere.stl does not exist": ('[socket]\nfile = "nowhere.stl"\n', "", True),
+    "give either preset": (LOAD, ""),
+    "a preset has its own moment": (LOAD + 'preset = "toe-off"\nmoment_Nmm = [0, 0, 1]\n', ""),
+    "no region is named 'heel'": (DESIGN + 'region = "heel"\nlimit_kPa = 90\n', "tibial crest"),
+    "give pressure_kPa, limit_kPa or both": (DESIGN + 'region = "tibial crest"\n', ""),
+    "'tibial crest' is given twice": ((DESIGN + 'region = "tibial crest"\nlimit_kPa = 90\n') * 2, ""),
+    "nowhere.stl does not exist": ('[socket]\nfile = "nowhere.stl"\n', ""),
+}
+BAD_WITHOUT_BONES = {
     "passes beside the knee centre, which is not known": (
-        '[socket]\nside = "left"\n[[socket.loads]]\nname = "x"\npreset = "toe-off"\n',
+        '[socket]\nside = "left"\n' + LOAD + 'preset = "toe-off"\n',
         "state point",
-        False,
     ),
     "medial and lateral are not known": (
-        '[[socket.loads]]\nname = "x"\npreset = "toe-off"\npoint = [0, 0, 120]\n',
+        LOAD + 'preset = "toe-off"\npoint = [0, 0, 120]\n',
         "socket.side",
-        False,
     ),
 }
 
 
-@pytest.mark.parametrize("words", BAD)
+@pytest.mark.parametrize("words", [*BAD, *BAD_WITHOUT_BONES])
 def test_what_is_wrong_is_told_by_key(tmp_path: Path, words: str) -> None:
-    text, remedy, bones = BAD[words]
+    text, remedy = {**BAD, **BAD_WITHOUT_BONES}[words]
     with pytest.raises(StudyError) as caught:
-        check_study(study_of(tmp_path, text, bones))
+        check_study(study_of(tmp_path, text, bones=words in BAD))
     told = str(caught.value)
     assert words in told
     assert remedy in told
@@ -265,9 +246,11 @@ def test_a_shank_that_is_cut_below_the_knee_has_no_knee_centre_and_no_fibular_he
     assert {"tibial crest", "distal fibula", "medial middle"} <= regions.keys()
 
 
-def test_what_is_kept_of_a_socket_follows_the_names_of_the_bones(tmp_path: Path) -> None:
-    study, limb = study_of(tmp_path), round_limb()
-    socket, mesh = drawn(study), build_mesh_under(limb.skin)
+def test_what_is_kept_of_a_socket_follows_the_names_of_the_bones(
+    tmp_path: Path, plain: tuple[Study, Socket]
+) -> None:
+    (study, socket), limb = plain, round_limb()
+    mesh = build_mesh_under(limb.skin)
     (tmp_path / "limb.vtu").write_text("the same mesh")
     keys = set()
     for names in (("tibia", "fibula"), ("shin", "fibula"), ("shin", "splint")):
@@ -283,10 +266,12 @@ def build_mesh_under(skin: Surface) -> Mesh:
     return Mesh(skin.points, cell, "tet4", np.zeros(1, np.int64), ("skin",), {}, {"skin": skin.faces})
 
 
-def test_a_region_smaller_than_the_faces_of_the_mesh_has_the_nearest_of_them(tmp_path: Path) -> None:
+def test_a_region_smaller_than_the_faces_of_the_mesh_has_the_nearest_of_them(
+    tmp_path: Path, plain: tuple[Study, Socket]
+) -> None:
     text = '[[socket.regions]]\nname = "{}"\nposition = [0, -44, {}]\nradius_mm = 1\n'
     study = study_of(tmp_path, text.format("sore", 60) + text.format("above the brim", 135))
-    regions, socket, skin = build_regions(study, round_limb()), drawn(study), round_limb().skin
+    regions, socket, skin = build_regions(study, round_limb()), plain[1], round_limb().skin
     angle, height = np.meshgrid(np.radians(np.arange(0.0, 360.0, 16.0)), np.arange(20.0, 150.0, 11.0))
     middles = np.stack([44.0 * np.cos(angle), 44.0 * np.sin(angle), height], axis=-1).reshape(-1, 3)
     found = find_covered_regions(middles, skin, regions, socket)
