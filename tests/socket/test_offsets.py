@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
-import trimesh
 from socket_limbs import CUT_NORMAL, measure_circumference, round_limb
-from test_wall import thickness as measured_by_trimesh
 
 from limbfit.anatomy.frame import build_limb_frame
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, Zone, rectify_limb
-from limbfit.socket.rays import Offsets, compute_offsets, compute_profile
+from limbfit.socket.rays import LimbProfile, Offsets, compute_offsets, compute_profile
 from limbfit.socket.rectify import reduce_to_volume
 from limbfit.socket.trim import Trim
-from limbfit.socket.wall import build_wall, measure_thickness
 
 LIMB = round_limb()
 FRAME = build_limb_frame(LIMB.cut_point, LIMB.cut_normal)
@@ -34,8 +32,13 @@ def moved(by: np.ndarray) -> Surface:
     return Surface(points, LIMB.skin.faces)
 
 
+@cache
+def profile() -> LimbProfile:
+    return compute_profile(LIMB.skin, FRAME)
+
+
 def pressed(by: np.ndarray) -> Offsets:
-    return compute_offsets(compute_profile(LIMB.skin, FRAME), LIMB.skin, moved(by), FRAME)
+    return compute_offsets(profile(), LIMB.skin, moved(by), FRAME)
 
 
 def test_a_shaft_that_is_3_mm_thinner_gives_a_face_that_is() -> None:
@@ -60,18 +63,14 @@ def test_a_dent_is_where_it_was_pressed_and_nowhere_else() -> None:
     assert depth.max() == pytest.approx(4.0 / (1.0 + 4 * 5.0**2 / 2 / 15.0**2), rel=0.15)  # less by smoothing
     np.testing.assert_allclose(deepest, [0.0, -45.0 + 4.0, 80.0], atol=5.0)
     far = np.linalg.norm(face.points - [0.0, -45.0, 80.0], axis=1) > 45.0
-    assert np.abs(depth[far]).max() < 0.35  # facets of 5 mm
-
-
-def test_nothing_moves_where_nothing_was_pressed() -> None:
-    still = rectify_limb(LIMB.skin, FRAME, replace(PLAIN, offsets=pressed(np.zeros(len(LIMB.skin.points)))))
-    np.testing.assert_allclose(still.points, rectify_limb(LIMB.skin, FRAME, PLAIN).points, atol=1e-9)
+    still = rectify_limb(LIMB.skin, FRAME, PLAIN)
+    np.testing.assert_allclose(face.points[far], still.points[far], atol=2e-3)  # the dent's tail
 
 
 def test_a_surface_beside_the_limb_is_refused() -> None:
     aside = Surface(LIMB.skin.points + np.array([120.0, 0.0, 0.0]), LIMB.skin.faces)
     with pytest.raises(SurfaceError, match="does not surround") as caught:
-        compute_offsets(compute_profile(LIMB.skin, FRAME), LIMB.skin, aside, FRAME)
+        compute_offsets(profile(), LIMB.skin, aside, FRAME)
     assert caught.value.remedy
 
 
@@ -99,12 +98,3 @@ def test_the_control_has_the_volume_that_is_asked_for() -> None:
     found, reduction = reduce_to_volume(wanted.volume_mm3, LIMB.skin, FRAME, recipe)
     assert found.volume_mm3 == pytest.approx(wanted.volume_mm3, rel=1e-3)
     assert reduction == pytest.approx(5.0, abs=0.1)
-
-
-def test_the_thickness_that_is_told_is_that_of_another_tool() -> None:
-    face = rectify_limb(LIMB.skin, FRAME, replace(PLAIN, flare_mm=4.0))
-    body = build_wall(face, CUT_NORMAL, 3.5)
-    other = measured_by_trimesh(trimesh.Trimesh(body.points, body.faces, process=False), face)
-    mine = measure_thickness(body, face)
-    np.testing.assert_allclose(mine, other, atol=2e-3)
-    assert np.median(mine) == pytest.approx(3.5, rel=0.02)

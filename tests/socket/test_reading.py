@@ -33,7 +33,7 @@ def read(file: Path, unit: str = "mm", space: str | None = None) -> Socket:
 def drawn() -> Socket:
     limb = round_limb()
     return rectify_limb(
-        limb.skin, build_limb_frame(limb.cut_point, limb.cut_normal), Recipe(TRIM, flare_mm=0.0)
+        limb.skin, build_limb_frame(limb.cut_point, limb.cut_normal), Recipe(TRIM, flare_mm=0.0, edge_mm=6.0)
     )
 
 
@@ -62,10 +62,9 @@ def walled(thickness: float = 4.0) -> Surface:
     return body
 
 
-@pytest.mark.parametrize("suffix", [".stl", ".ply", ".obj"])
-def test_round_trip(tmp_path: Path, suffix: str) -> None:
-    write_surface(tmp_path / f"socket{suffix}", face())
-    socket = read(tmp_path / f"socket{suffix}")
+def test_round_trip(tmp_path: Path) -> None:
+    write_surface(tmp_path / "socket.stl", face())
+    socket = read(tmp_path / "socket.stl")
     assert socket.notes == ()
     assert not socket.open_distal
     assert socket.volume_mm3 == pytest.approx(drawn().volume_mm3, rel=1e-5)
@@ -103,19 +102,13 @@ def test_every_third_triangle_is_turned_back_and_said(tmp_path: Path, first: int
     assert f"{count} of its triangles were oriented against their neighbours" in socket.notes[0]
 
 
-def test_an_open_end(tmp_path: Path) -> None:
-    keep = face().triangles[:, :, 2].min(axis=1) > 15.0
-    write_surface(tmp_path / "tube.stl", Surface(face().points, face().faces[keep]))
-    socket = read(tmp_path / "tube.stl")
-    assert socket.open_distal
-    assert socket.points[socket.brim, 2].min() > 100.0
-
-
 def test_skin_and_bones_below_an_open_end_are_not_those_of_the_socket(tmp_path: Path) -> None:
     """The tibia reaches down to z = 25, out of a tube that ends at 50."""
     keep = face().triangles[:, :, 2].min(axis=1) > 50.0
     write_surface(tmp_path / "tube.stl", Surface(face().points, face().faces[keep]))
     socket, limb = read(tmp_path / "tube.stl"), round_limb()
+    assert socket.open_distal
+    assert socket.points[socket.brim, 2].min() > 100.0
     height = limb.skin.triangles.mean(axis=1)[:, 2]
     covered = socket.find_covered(limb.skin.triangles.mean(axis=1))
     assert not covered[height < 50.0].any()
@@ -172,31 +165,40 @@ def upside_down() -> Surface:
     return Surface(face().points * [1.0, -1.0, -1.0] + [0.0, 0.0, 112.0], face().faces)
 
 
-BAD: dict[str, Callable[[], Surface]] = {
-    "socket.unit": lambda: Surface(face().points * 1e-3, face().faces),
-    "from end to end, the limb": lambda: Surface(face().points * 25.4, face().faces),
-    "no opening": lambda: close_by_fans(face().flipped),
-    "a hole of": with_hole,
-    "does not surround the limb": lambda: moved(150.0, 20.0, 0.0),
-    "is 309 mm off": lambda: moved(0.0, 0.0, 400.0),
-    "into the bone": lambda: Surface(
-        (face().points - [0, 0, 60]) * [0.35, 0.35, 1] + [0, 0, 60], face().faces
+def narrow() -> Surface:
+    return Surface((face().points - [0, 0, 60]) * [0.35, 0.35, 1] + [0, 0, 60], face().faces)
+
+
+def twice() -> Surface:
+    points = np.vstack([face().points, moved(0.0, 0.0, 200.0).points])
+    return Surface(points, np.vstack([face().faces, face().faces + len(face().points)]))
+
+
+BAD: dict[str, tuple[Callable[[], Surface], str]] = {  # what is said, of what, the remedy
+    "mm from end to end": (lambda: Surface(face().points * 1e-3, face().faces), "say so (socket.unit)"),
+    "from end to end, the limb": (
+        lambda: Surface(face().points * 25.4, face().faces),
+        "say so (socket.unit)",
     ),
-    "opens towards the distal end": upside_down,
-    "crosses itself": crossed,
-    "separate pieces": lambda: Surface(
-        np.vstack([face().points, moved(0.0, 0.0, 200.0).points]),
-        np.vstack([face().faces, face().faces + len(face().points)]),
-    ),
+    "no opening": (lambda: close_by_fans(face().flipped), "open"),
+    "a hole of": (with_hole, "close it; only brim and end may be open"),
+    "does not surround the limb": (lambda: moved(150.0, 20.0, 0.0), "socket.space"),
+    "is 310 mm off": (lambda: moved(0.0, 0.0, 400.0), "socket.space"),
+    "into the bone": (narrow, "a socket is larger than the bones in it"),
+    "opens towards the distal end": (upside_down, "open it at the brim"),
+    "crosses itself": (crossed, ""),
+    "separate pieces": (twice, ""),
 }
 
 
 @pytest.mark.parametrize("words", BAD)
 def test_what_is_no_socket_of_this_limb_is_refused(tmp_path: Path, words: str) -> None:
-    write_surface(tmp_path / "socket.stl", BAD[words]())
+    change, remedy = BAD[words]
+    write_surface(tmp_path / "socket.stl", change())
     with pytest.raises(SurfaceError) as caught:
         read(tmp_path / "socket.stl")
     assert words in str(caught.value)
     assert str(caught.value).startswith(str(tmp_path / "socket.stl"))
     assert "\n" not in str(caught.value)
     assert caught.value.remedy
+    assert remedy in caught.value.remedy

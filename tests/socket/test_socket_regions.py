@@ -54,7 +54,7 @@ def test_sides_and_levels_of_a_round_limb() -> None:
     check_sides(round_limb())
 
 
-@pytest.mark.parametrize("name", ["mean", "limb-1"])
+@pytest.mark.parametrize("name", ["mean", pytest.param("limb-1", marks=pytest.mark.slow)])
 @pytest.mark.skipif(not FILES["mean"].is_file(), reason="shared/data is not here")
 def test_regions_of_real_limbs(name: str) -> None:
     limb = real_limb(name)
