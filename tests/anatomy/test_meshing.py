@@ -282,8 +282,9 @@ def mean_limb() -> tuple[Anatomy, BaseMesh]:
     return anatomy, build_base_mesh(anatomy, REAL)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not OPENLIMB.is_dir(), reason="the shared mean limb is not beside the repository")
-@pytest.mark.parametrize("name", ["1", pytest.param("4", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["1", "4"])
 def test_real_mean_limb(mean_limb: tuple[Anatomy, BaseMesh], name: str) -> None:
     site = json.loads((OPENLIMB / "sites.json").read_text(encoding="utf-8"))["sites"][name]
     place = np.array(site["position"]), np.array(site["axis"])
