@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import shutil
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -69,7 +70,7 @@ position = {place}
 def folder(tmp_path_factory) -> Path:
     """A study whose image carries an identity in tags, private tags, and names of files and folders."""
     folder = tmp_path_factory.mktemp("data") / "study-MARKERXP"
-    image, labels = leg_image([2.3, 2.3, 2.9], (54, 56, 54), rotation(1))
+    image, labels = leg_image([3.3, 3.3, 4.1], (38, 39, 38), rotation(1))
     write_dicom(folder / "mri-MARKERXQ", image, prefix="MARKERXR", uid=SERIES_UID, **IN_TAGS)
     for file in (folder / "mri-MARKERXQ").iterdir():
         plant(file)
@@ -159,6 +160,12 @@ def test_nothing_of_it_is_stored_or_said(folder, monkeypatch, capfd):
     assert set(record["inputs"]) == {"image.path"}
 
 
+def copied(folder: Path, place: Path) -> tuple[Path, Path]:
+    """A copy of the study without its results, and one of its slices."""
+    copy = shutil.copytree(folder, place / "copy", ignore=shutil.ignore_patterns("results"))
+    return copy, sorted((copy / "mri-MARKERXQ").iterdir())[3]
+
+
 def spoil_modality(data):
     data.Modality = "MARKERX1"
 
@@ -193,15 +200,10 @@ def spoil_rows(data):
     [spoil_modality, spoil_number, spoil_spacing, spoil_axes, spoil_colour, spoil_pixels, spoil_rows],
 )
 def test_errors_tell_no_value_of_a_tag(folder, tmp_path, monkeypatch, capfd, spoil):
-    copy = tmp_path / "copy"
-    copy.mkdir()
-    (copy / "study.toml").write_text((folder / "study.toml").read_text())
-    (copy / "mri-MARKERXQ").mkdir()
-    for n, file in enumerate(sorted((folder / "mri-MARKERXQ").iterdir())):
-        data = pydicom.dcmread(file)
-        if n == 3:
-            spoil(data)
-        data.save_as(copy / "mri-MARKERXQ" / file.name)
+    copy, file = copied(folder, tmp_path)
+    data = pydicom.dcmread(file)
+    spoil(data)
+    data.save_as(file)
     check_silent(copy, monkeypatch, capfd)
 
 
@@ -211,14 +213,8 @@ def test_errors_tell_no_value_of_a_tag(folder, tmp_path, monkeypatch, capfd, spo
 )
 def test_damaged_tags_tell_no_value_either(folder, tmp_path, monkeypatch, capfd, old):
     """Bytes of values and of their lengths overwritten, which makes pydicom and GDCM complain of them."""
-    copy = tmp_path / "copy"
-    copy.mkdir()
-    (copy / "study.toml").write_text((folder / "study.toml").read_text())
-    (copy / "mri-MARKERXQ").mkdir()
-    for n, file in enumerate(sorted((folder / "mri-MARKERXQ").iterdir())):
-        raw = file.read_bytes()
-        new = bytes(reversed(old)) if n == 3 else old
-        (copy / "mri-MARKERXQ" / file.name).write_bytes(raw.replace(old, new, 1))
+    copy, file = copied(folder, tmp_path)
+    file.write_bytes(file.read_bytes().replace(old, bytes(reversed(old)), 1))
     check_silent(copy, monkeypatch, capfd)
 
 

@@ -24,7 +24,7 @@ from limbfit.anatomy.surfaces.surfaces import (
 )
 from limbfit.mesh import write_vtu
 
-TOLERANCE_MM = 0.01
+TOLERANCE_MM, EDGE_MM = 0.01, 8.0
 OBLIQUE = rotation(2) @ np.diag([1.0, -1.0, 1.0])  # left-handed: rows run backward
 RAS = np.array([-1.0, -1.0, 1.0])
 
@@ -78,13 +78,13 @@ LABELS: dict[str, Callable[[Path, LabelMap], None]] = {
 
 @pytest.fixture(scope="module")
 def body() -> tuple[Volume, LabelMap]:
-    image, labels = leg_image([2.013, 2.297, 3.1], (50, 56, 60), OBLIQUE)
+    image, labels = leg_image([3.013, 3.297, 4.1], (38, 39, 40), OBLIQUE)
     return image.with_array(np.round(image.array)), labels
 
 
 @pytest.fixture(scope="module")
 def reference(body) -> Anatomy:
-    return build_anatomy(body[1], 6.0)
+    return build_anatomy(body[1], EDGE_MM)
 
 
 def assert_same(found: Anatomy, wanted: Anatomy) -> None:
@@ -107,7 +107,7 @@ def test_every_format_of_the_image_gives_the_same_surfaces(tmp_path, body, refer
     assert np.abs(seen.index_to_point(there) - inside).max() < TOLERANCE_MM
     grey = image.array[tuple(np.argwhere(labels.array > 1)[::97].T)]
     assert np.allclose(seen.array[tuple(there[:, ::-1].T)], grey)
-    assert_same(build_anatomy(read_labels(tmp_path / "labels.seg.nrrd", seen), 6.0), reference)
+    assert_same(build_anatomy(read_labels(tmp_path / "labels.seg.nrrd", seen), EDGE_MM), reference)
 
 
 @pytest.mark.parametrize("name", LABELS)
@@ -116,7 +116,7 @@ def test_every_format_of_the_labels_gives_the_same_surfaces(tmp_path, body, refe
     LABELS[name](tmp_path / name, labels)
     write_dicom(tmp_path / "dicom", image)
     placed = read_labels(tmp_path / name, read_volume(tmp_path / "dicom"))
-    assert_same(build_anatomy(placed, 6.0), reference)
+    assert_same(build_anatomy(placed, EDGE_MM), reference)
 
 
 def test_surfaces_and_mesh_keep_every_coordinate_on_disk(tmp_path, reference):
@@ -127,8 +127,9 @@ def test_surfaces_and_mesh_keep_every_coordinate_on_disk(tmp_path, reference):
 
 
 @pytest.mark.slow
-def test_the_mesh_on_disk_lies_where_the_body_lies(tmp_path, body, reference):
+def test_the_mesh_on_disk_lies_where_the_body_lies(tmp_path):
     """Read by another program (VTK): nodes of the skin on the skin, none of them in a bone."""
+    reference = build_anatomy(leg_image([2.013, 2.297, 3.1], (50, 56, 60), OBLIQUE)[1], 6.0)
     site = reference.skin.points[np.argmin(np.abs(reference.height(reference.skin.points) + 60))]
     settings = MeshSettings(element="tet4", edge_near_mm=8.0, edge_far_mm=20.0, flatness=1.6)
     mesh, _ = mesh_site(reference, site, compute_indenter_axis(reference.skin, site, 20.0), settings)

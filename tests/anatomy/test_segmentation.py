@@ -17,8 +17,7 @@ from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.mri import generate_slabs, make_grid
 
 SHAPE, SPACING = (62, 60, 60), [2.0, 2.0, 2.5]
-
-QUICK = ("straight", "flipped rows")  # the rows are oblique too
+QUICK = ("flipped rows",)  # which are oblique too
 
 
 def dice(a: np.ndarray, b: np.ndarray) -> float:
@@ -98,20 +97,26 @@ def test_what_is_no_mri_of_a_limb_is_refused(array, expected):
         segment(Volume(array, SPACING, [0, 0, 0], np.eye(3)))
 
 
-def test_outline_lies_at_half_the_signal_of_the_tissue_beside_it():
+@pytest.fixture(scope="module")
+def quiet() -> tuple[Volume, LabelMap]:
+    """An image with half of the noise, and its truth."""
+    return leg_image(SPACING, SHAPE, DIRECTIONS["straight"], noise=0.01)
+
+
+def test_outline_lies_at_half_the_signal_of_the_tissue_beside_it(quiet):
     """Bright fat at the skin does not push the outline outward: the volume is right to 0.5 %."""
-    image, truth = leg_image(SPACING, SHAPE, DIRECTIONS["straight"], noise=0.01)
+    image, truth = quiet
     limb = find_limb_mask(image, smooth_image(image))
     assert limb.sum() == pytest.approx(truth.limb.sum(), rel=0.005)
 
 
-def test_bias_field_is_the_coils():
-    image, truth = leg_image(SPACING, SHAPE, DIRECTIONS["straight"], noise=0.01)
-    found = estimate_bias_field(image, truth.limb)[truth.limb]
+def test_bias_field_is_the_coils(quiet):
+    image, truth = quiet
+    found = estimate_bias_field(image, truth.limb)
     before = image.array[truth.mask("soft tissue")]
-    after = before / estimate_bias_field(image, truth.limb)[truth.mask("soft tissue")]
+    after = before / found[truth.mask("soft tissue")]
     muscle = after < 1.5 * np.median(after)
-    assert found.std() > 0.02
+    assert found[truth.limb].std() > 0.02
     assert after[muscle].std() / after[muscle].mean() < 0.8 * before[muscle].std() / before[muscle].mean()
 
 
@@ -160,13 +165,19 @@ def test_names_by_size_and_place(bones, expected):
     assert name_bones(bones, np.array([1.0, 1.0, 2.0])) == expected
 
 
-def test_fat_enclosed_by_muscle_is_no_bone():
+def marrow() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Levels of a limb with a bright rod along it, the limb, and the distance from the rod's middle."""
     levels = np.ones((20, 40, 40), np.float32)
     limb = np.zeros(levels.shape, bool)
     limb[:, 4:-4, 4:-4] = True
     j, i = np.mgrid[:40, :40]
     radius = np.hypot(j - 20, i - 20)
     levels[:, radius < 6] = 2.0
+    return levels, limb, radius
+
+
+def test_fat_enclosed_by_muscle_is_no_bone():
+    levels, limb, radius = marrow()
     assert find_bones(levels, limb, np.ones(3), 100.0) == []
     levels[:, (radius >= 6) & (radius < 8)] = 0.2
     (bone,) = find_bones(levels, limb, np.ones(3), 100.0)
@@ -174,14 +185,9 @@ def test_fat_enclosed_by_muscle_is_no_bone():
 
 
 def test_a_leak_in_the_cortex_does_not_part_a_bone():
-    levels = np.ones((30, 40, 40), np.float32)
-    limb = np.zeros(levels.shape, bool)
-    limb[:, 4:-4, 4:-4] = True
-    j, i = np.mgrid[:40, :40]
-    radius = np.hypot(j - 20, i - 20)
-    levels[:, radius < 6] = 2.0
+    levels, limb, radius = marrow()
     levels[:, (radius >= 6) & (radius < 8)] = 0.2
-    levels[14:16, 20, 24:30] = 2.0
+    levels[9:11, 20, 24:30] = 2.0
     (bone,) = find_bones(levels, limb, np.ones(3), 100.0)
     assert (bone & (radius < 6)).any(axis=(1, 2)).all()
 
