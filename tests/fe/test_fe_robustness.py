@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from blocks import SKIN, block, punch
+from blocks import FINE_Z, SKIN, block, punch
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, OgdenQLV, Problem, Result, StepControl, Support, solve
@@ -40,7 +40,7 @@ def cases(robustness):
 
 @pytest.fixture(scope="module")
 def result() -> Result:
-    return solve(punch("tet10", 2, 1, depth=3.0), store="all")
+    return solve(punch("tet10", 2, 1, depth=3.0, z=FINE_Z), store="all")
 
 
 def test_a_linear_solver_of_no_such_name_is_refused():

@@ -12,7 +12,7 @@ from limbfit.anatomy.imaging import read_volume
 from limbfit.anatomy.surfaces.surfaces import load_anatomy
 from limbfit.errors import InputError
 from limbfit.phantom import build_true_sites, draw_true_parameters, make_limb, make_phantom, unpack_patient
-from limbfit.phantom.build import _format_study
+from limbfit.phantom.build import _format_study, _Patient
 from limbfit.phantom.record import SecondaryMeasurements
 from limbfit.phantom.sites import DETAIL_SITES, select_sites
 
@@ -37,9 +37,9 @@ def test_its_tissues_limb_sites_and_study_are_those_of_seed_0(packed: Path) -> N
     sites = build_true_sites(limb, 0)
     places = [marker["position_mm"] for marker in truth["markers"]]
     np.testing.assert_allclose(places, [site.position for site in sites], atol=1e-6, err_msg=ANEW)
-    indented = select_sites(sites, DETAIL_SITES["coarse"])
-    text = _format_study(indented, "coarse", 0, limb, SecondaryMeasurements(False, False, False), False)
-    assert (packed / "study.toml").read_text(encoding="utf-8") == text, ANEW
+    indented, forces = select_sites(sites, DETAIL_SITES["coarse"]), SecondaryMeasurements(False, False, False)
+    patient = _Patient(0, "coarse", limb, tuple(sites), tuple(indented), truth["parameters"], forces, False)
+    assert (packed / "study.toml").read_text(encoding="utf-8") == _format_study(patient), ANEW
 
 
 def test_a_folder_that_holds_something_is_not_touched(tmp_path: Path) -> None:
