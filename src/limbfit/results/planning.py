@@ -37,11 +37,9 @@ class SiteDesign(ResultPart):
     exhaustive: bool = Field(description="Whether every choice was compared.")
 
 
-class DesignCandidate(ResultPart):
+class DesignCandidate(DesignSite):
     """An indentation that may be made."""
 
-    site: str = Field(description="Name of the site.")
-    depth_mm: float = Field(description="Depth of the indentation.")
     peak_force_N: float = Field(description="Largest force.")
     bits: float = Field(description="Information that it alone adds, in bits.")
 

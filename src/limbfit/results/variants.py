@@ -38,6 +38,14 @@ class VariantRun(ResultPart):
     warnings: Sequence[str] = Field(description="What is doubtful, in words.")
 
 
+class VariedResult(StoredResult):
+    """Sites simulated with one thing changed."""
+
+    sites: Sequence[VariedSite] = Field(description="Each varied site.")
+    runs: Sequence[VariantRun] = Field(description="Each simulation.")
+    parameters: Parameters = Field(description="The identified parameters.")
+
+
 class StiffnessRun(VariantRun):
     """A simulation with other moduli of a tissue."""
 
@@ -57,15 +65,13 @@ class ForceDerivative(ResultPart):
     )
 
 
-class StiffnessResult(StoredResult):
+class StiffnessResult(VariedResult):
     """Force against the moduli of each tissue."""
 
     FILE: ClassVar = "sensitivity-c/sensitivity-c.json"
     COMMAND: ClassVar = "limbfit sensitivity --only c"
 
-    sites: Sequence[VariedSite] = Field(description="Each varied site.")
     runs: Sequence[StiffnessRun] = Field(description="Each simulation.")
-    parameters: Parameters = Field(description="The identified parameters.")
     equal_m: float | None = Field(description="The exponent that all tissues share here; null: none.")
     factors: Sequence[float] = Field(description="Factors of the moduli.")
     local: Sequence[ForceDerivative] = Field(description="Derivatives at all records.")
@@ -82,15 +88,13 @@ class VolumeRun(VariantRun):
     beyond_percent: float | None = Field(description="Share of the volume that changes by more than 1 %.")
 
 
-class VolumeResult(StoredResult):
+class VolumeResult(VariedResult):
     """Force and change of volume against the bulk modulus."""
 
     FILE: ClassVar = "sensitivity-kappa/sensitivity-kappa.json"
     COMMAND: ClassVar = "limbfit sensitivity --only kappa"
 
-    sites: Sequence[VariedSite] = Field(description="Each varied site.")
     runs: Sequence[VolumeRun] = Field(description="Each simulation.")
-    parameters: Parameters = Field(description="The identified parameters.")
     kappa_ratio: float = Field(description="The study's bulk modulus over the shear modulus.")
 
 
@@ -100,15 +104,13 @@ class FrictionRun(VariantRun):
     friction: float | str = Field(description="Coefficient of friction, `frictionless` or `sticky`.")
 
 
-class FrictionResult(StoredResult):
+class FrictionResult(VariedResult):
     """Force against the friction of the indenter."""
 
     FILE: ClassVar = "sensitivity-contact/sensitivity-contact.json"
     COMMAND: ClassVar = "limbfit sensitivity --only contact"
 
-    sites: Sequence[VariedSite] = Field(description="Each varied site.")
     runs: Sequence[FrictionRun] = Field(description="Each simulation.")
-    parameters: Parameters = Field(description="The identified parameters.")
     friction: float | str = Field(description="The study's friction.")
 
 
@@ -120,15 +122,13 @@ class IndenterRun(VariantRun):
     edge_radius_mm: float = Field(description="Radius of its edge.")
 
 
-class IndenterResult(StoredResult):
+class IndenterResult(VariedResult):
     """Force against the shape of the indenter."""
 
     FILE: ClassVar = "sensitivity-indenter/sensitivity-indenter.json"
     COMMAND: ClassVar = "limbfit sensitivity --only indenter"
 
-    sites: Sequence[VariedSite] = Field(description="Each varied site.")
     runs: Sequence[IndenterRun] = Field(description="Each simulation.")
-    parameters: Parameters = Field(description="The identified parameters.")
 
 
 class RefinedSite(VariedSite):
@@ -150,7 +150,7 @@ class RefinementRun(VariantRun):
     cells: int = Field(description="Number of cells.")
 
 
-class RefinementResult(StoredResult):
+class RefinementResult(VariedResult):
     """Force against the mesh."""
 
     FILE: ClassVar = "sensitivity-mesh/sensitivity-mesh.json"
@@ -158,7 +158,6 @@ class RefinementResult(StoredResult):
 
     sites: Sequence[RefinedSite] = Field(description="Each varied site.")
     runs: Sequence[RefinementRun] = Field(description="Each simulation.")
-    parameters: Parameters = Field(description="The identified parameters.")
 
 
 class CubeTissue(ResultPart):

@@ -11,8 +11,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
-from ...results.base import StoredResult
-from ...results.variants import VariantRun, VariedSite
+from ...results.variants import VariantRun, VariedResult, VariedSite
 from ...study import Indentation, Study
 from ..engine.context import Context
 from ..engine.storage import write_curves, write_result, write_rows
@@ -106,7 +105,7 @@ def measure_tissue_over_bone(model: SiteModel) -> float:
 def run_variants(
     context: Context,
     folder: Path,
-    result: type[StoredResult],
+    result: type[VariedResult],
     run: type[VariantRun],
     variants: Sequence[Variant],
     cache: SimulationCache | None = None,
@@ -122,7 +121,7 @@ def run_variants(
 def simulate_variants(
     context: Context,
     folder: Path,
-    result: type[StoredResult],
+    result: type[VariedResult],
     variants: Sequence[Variant],
     cache: SimulationCache | None = None,
 ) -> list[Simulation]:
@@ -182,7 +181,7 @@ def _change(simulation: Simulation, base: Simulation) -> dict[str, float | None]
 
 
 def store_variants(
-    context: Context, folder: Path, result: type[StoredResult], runs: Sequence[VariantRun], **more: Any
+    context: Context, folder: Path, result: type[VariedResult], runs: Sequence[VariantRun], **more: Any
 ) -> None:
     """The result as JSON, and its runs as ``runs.csv``."""
     parameters = context.results.calibration.parameters
