@@ -88,8 +88,10 @@ def make_table(
     headed: bool = True,
     words: str = "",
     **facts: Any,
-) -> Table:
+) -> Table | None:
     """A table of stored rows; caption and columns are those of ``table <name>``, or of other ``words``.
+
+    None where there is no row, and no ``foot`` either.
 
     ``marked`` tells which rows stand out: by an attribute that is true, or by a function of the row;
     ``headed``: the first cell is the heading of its row. Caption and columns may name ``facts``.
@@ -105,8 +107,10 @@ def make_table(
         ]
         stands_out = getattr(row, marked) if isinstance(marked, str) else marked and marked(row)
         body.append(Row((replace(cells[0], header=headed), *cells[1:]), bool(stands_out)))
-    caption = write_words(f"table {words or name}", **facts)
-    return Table(name, caption, head, tuple(body), tuple(foot), folded)
+    last = tuple(foot)
+    if not body and not last:
+        return None
+    return Table(name, write_words(f"table {words or name}", **facts), head, tuple(body), last, folded)
 
 
 @cache

@@ -62,6 +62,6 @@ def make_protocol_section(store: Results, content: ProtocolResult) -> Section:
         make_table("protocol-records", content.records),
         make_table("protocols", rows, marked=lambda row: row is rows[0], most=MAX_FACTOR),
         draw_expected_figure("protocols", rows, "the records of a protocol"),
-        make_table("protocol-pressures", content.pressures, protocols=rows) if content.pressures else None,
+        make_table("protocol-pressures", content.pressures, protocols=rows),
         make_bullets(f"{text}." for text in content.left_out),
     )

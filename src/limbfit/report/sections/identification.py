@@ -94,7 +94,7 @@ def make_convergence_section(store: Results) -> Section:
     )
 
 
-def make_iteration_table(store: Results, stage: SearchStage) -> Table:
+def make_iteration_table(store: Results, stage: SearchStage) -> Table | None:
     """Every accepted iterate of one identification stage."""
     known = tuple(stage.parameters)
     alike = all(values == stage.parameters[known[0]] for values in stage.parameters.values())
@@ -122,5 +122,4 @@ def describe_search(store: Results) -> tuple[Bullets | None, Table | None]:
     for site, one in store.calibration.contact.items():
         if (off := one.from_rest_percent or 0.0) > EQUAL_PERCENT:
             texts.append(write_words("doubt of the answer", site=site, off=off))
-    table = make_table("doubtful-simulations", rows, folded=True, kinds=_KINDS)
-    return make_bullets(texts), table if rows else None
+    return make_bullets(texts), make_table("doubtful-simulations", rows, folded=True, kinds=_KINDS)

@@ -21,7 +21,7 @@ def make_model_section(store: Results) -> Section:
         pictures.draw_surface_figure(store),
         pictures.draw_marker_figure(store),
         make_volume_table(store),
-        make_table("places", store.sites, marked="fitted") if store.sites else None,
+        make_table("places", store.sites, marked="fitted"),
         make_bullets((*(segment.warnings if segment else ()), *(surfaces.notes if surfaces else ()))),
         otherwise="No surfaces and sites are stored yet.",
     )
@@ -34,7 +34,7 @@ def make_volume_table(store: Results) -> Table | None:
     closed = {name: body.volume_mm3 / 1000 for name, body in bodies.items()}
     names = list(dict.fromkeys([*labels, *closed]))
     rows = [{"name": name, "labels": labels.get(name), "closed": closed.get(name)} for name in names]
-    return make_table("volumes", rows) if rows else None
+    return make_table("volumes", rows)
 
 
 def make_mesh_section(store: Results) -> Section:
@@ -48,9 +48,7 @@ def make_mesh_section(store: Results) -> Section:
         "meshes",
         "Meshes",
         pictures.draw_mesh_figure(store, store.fitted[:4]),
-        make_table("meshes", store.mesh.items(), marked=lambda row: row[0] in store.fitted)
-        if store.mesh
-        else None,
+        make_table("meshes", store.mesh.items(), marked=lambda row: row[0] in store.fitted),
         make_bullets(warnings),
         otherwise="No meshes are stored yet.",
     )

@@ -18,15 +18,14 @@ MAX_FACTOR = 1e3  # of an interval over its value, in the figure
 
 def make_crossvalidation_section(store: Results, content: CrossvalidateResult) -> Section:
     """What the experiment ``crossvalidate`` found."""
-    checks = content.emulator.checks
     return make_section(
         "crossvalidate",
         "Cross-validation",
         make_prose("crossvalidate", content=content),
         _draw_errors(content),
         make_table("crossvalidate-sites", content.sites, marked="fitted"),
-        make_table("crossvalidate-regions", content.regions) if content.regions else None,
-        make_table("crossvalidate-checks", checks) if checks else None,
+        make_table("crossvalidate-regions", content.regions),
+        make_table("crossvalidate-checks", content.emulator.checks),
     )
 
 
@@ -75,7 +74,7 @@ def make_regions_section(store: Results, content: RegionsResult) -> Section:
     )
 
 
-def make_error_table(store: Results, content: RegionsResult) -> Table:
+def make_error_table(store: Results, content: RegionsResult) -> Table | None:
     """The errors of each region's records with its own model and with the whole limb's."""
 
     def is_fitted(row: tuple[RegionFitted, str]) -> bool:

@@ -32,15 +32,12 @@ def make_prediction_section(store: Results) -> Section:
     """Everything about the sites that were not used, and table 2."""
     rows = [row for row in store.predicted if not row.fitted]
     quality = store.predict.fit_quality if store.predict else None
+    judged = quality.records if quality else ()
     return make_section(
         "prediction",
         "All sites, held-out sites",
-        make_site_table(store) if store.predicted else None,
-        make_table(
-            "fit-quality", quality.records, marked="fitted", found=quality, compared=store.compared_quantity
-        )
-        if quality and quality.records
-        else None,
+        make_site_table(store),
+        make_table("fit-quality", judged, marked="fitted", found=quality, compared=store.compared_quantity),
         figures.draw_error_figure(store),
         figures.draw_force_figure(store, rows, "time_s", "forces-held-out", 3),
         figures.draw_force_figure(store, rows, "displacement_mm", "loops-held-out", 3),
@@ -72,7 +69,7 @@ def make_domain_section(store: Results) -> Section:
     )
 
 
-def make_site_table(store: Results) -> Table:
+def make_site_table(store: Results) -> Table | None:
     """Table 2: largest force and errors of each site, fitted sites marked."""
     several = len({row.site for row in store.predicted}) < len(store.predicted)
     foot = _make_mean_rows(store)
@@ -99,4 +96,4 @@ def _count_sites(rows: Sequence[RecordPrediction]) -> str:
 def make_observed_table(store: Results) -> Table | None:
     """What was seen beside the force of each record, and how far its prediction is off; None: nothing."""
     rows = [(row, one) for row in store.predicted for one in row.observed]
-    return make_table("observed", rows, marked=lambda row: row[0].fitted) if rows else None
+    return make_table("observed", rows, marked=lambda row: row[0].fitted)

@@ -28,7 +28,7 @@ def make_record_section(store: Results) -> Section:
         "Indentation records",
         draw_record_figure(store, chosen[0]) if chosen else None,
         record_curves(store, tuple(dict.fromkeys(chosen))),
-        make_trace_table(store) if store.traces else None,
+        make_trace_table(store),
         otherwise="No indentation records are stored yet.",
     )
 
@@ -71,7 +71,7 @@ def _mark_phases(ax: Axes, phases: Sequence[RecordPhase]) -> None:
             text.set(color=MUTED, fontsize=6, ha="center", va="bottom", rotation=90)
 
 
-def make_trace_table(store: Results) -> Table:
+def make_trace_table(store: Results) -> Table | None:
     """Touch-down, peak, noise and phases of every record."""
     return make_table("trace-facts", store.traces.items(), marked=lambda row: row[1].site in store.fitted)
 
@@ -86,16 +86,14 @@ def make_record_check_section(store: Results) -> Section:
         _list_failures(store),
         make_bullets(f"{flag.text[:1].upper()}{flag.text[1:]}." for flag in flags)
         or make_prose("nothing doubtful", left_out=left_out),
-        make_table("flags", flags, format_words=_format_words) if flags else None,
+        make_table("flags", flags, format_words=_format_words),
         make_table(
             "left-out",
             left_out,
             marked=lambda row: row.standardised > MAX_STANDARDISED_ERROR,
             fitted=fitted,
             least=100 * MIN_ERROR_SHARE,
-        )
-        if left_out
-        else None,
+        ),
     )
 
 

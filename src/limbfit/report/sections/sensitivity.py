@@ -14,6 +14,7 @@ from ...results.variants import (
     IndenterResult,
     RefinementResult,
     StiffnessResult,
+    VariedResult,
     VariedSite,
     VolumeResult,
 )
@@ -27,11 +28,10 @@ from ..words import make_prose, make_table, write_words
 _COLOURS = (SIMULATED, ONE_MATERIAL, TRUTH, THIRD, MUTED, INK)
 _LINES: tuple[Any, ...] = ("-", "--", "-.", (0, (6, 2)), ":", "-")
 _STYLES = tuple(zip(_COLOURS, _LINES, strict=True))
-Compared = StiffnessResult | VolumeResult | FrictionResult | IndenterResult | RefinementResult
 _RANGE = ("J_min", "J_low", "J_high", "J_max")
 
 
-def make_sensitivity_section(store: Results, content: Compared, name: str) -> Section:
+def make_sensitivity_section(store: Results, content: VariedResult, name: str) -> Section:
     """Force with one thing changed at a time: in words, in curves, and in a table of the simulations."""
     title, draw_figure = _SECTIONS[name]
     stiffness = content if isinstance(content, StiffnessResult) else None
@@ -79,7 +79,7 @@ def _draw_stiffness_figure(store: Results, content: StiffnessResult) -> Figure:
     return make_figure(drawing, "sensitivity-c", content=content)
 
 
-def _draw_curves(ax: Axes, store: Results, name: str, site: VariedSite, content: Compared) -> None:
+def _draw_curves(ax: Axes, store: Results, name: str, site: VariedSite, content: VariedResult) -> None:
     """Force against time of every variant of a site."""
     curves = store.curves(name, site.site) or {}
     rows = [row for row in content.runs if row.site == site.site and row.completed]
@@ -162,7 +162,7 @@ def _draw_site_curves(store: Results, content: FrictionResult | IndenterResult) 
     return make_figure(drawing, name, words="compared models", title=_SECTIONS[name][0])
 
 
-def _list_warnings(content: Compared) -> Bullets | None:
+def _list_warnings(content: VariedResult) -> Bullets | None:
     """Simulations that did not reach their end, and what is doubtful about others."""
     runs = content.runs
     texts = [(row, f"stopped early: {row.reason}") for row in runs if not row.completed]

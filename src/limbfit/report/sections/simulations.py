@@ -81,7 +81,7 @@ def make_solver_section(store: Results) -> Section:
         "Solver",
         Note(f"The simulation did not reach the end of the record at: {failed}.") if failed else None,
         _list_warnings(store.predicted),
-        make_table("solver", store.predicted, marked="fitted") if store.predicted else None,
+        make_table("solver", store.predicted, marked="fitted"),
         make_pair_table("solver-facts", ("Fact", "Value"), known),
         otherwise="No simulations are stored yet.",
     )

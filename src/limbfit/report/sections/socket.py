@@ -61,7 +61,7 @@ def make_socket_section(store: Results, content: SocketResult) -> Section:
         ),
         make_interval_table(last, name),
         make_prose("socket worn", worn_s=content.worn_s),
-        make_published_table(content.published, last, name) if content.published else None,
+        make_published_table(content.published, last, name),
         make_prose("socket papers") if content.published else None,
         draw_inside_figure(store, name, last.inside, files[name]),
         _make_load_table("socket-inside", {name: state.inside for name, state in states.items()}),
@@ -75,6 +75,7 @@ def _make_load_table(name: str, rows: Mapping[str, Sequence[Any]], **facts: Any)
     body: list[Row] = []
     for load, own in rows.items():
         table = make_table(name, own, **facts)
+        assert table is not None  # each load has its regions and tissues
         body += [make_row(load, *(to_numeric("") for _ in table.head[1:]), marked=True), *table.rows]
     return Table(name, table.caption, table.head, tuple(body))
 
@@ -95,7 +96,9 @@ def make_interval_table(held: SocketState, title: str) -> Table | None:
     return make_table("socket-intervals", rows, names=sorted(first.interval_from), known=known, title=title)
 
 
-def make_published_table(published: Sequence[PublishedFindings], held: SocketState, title: str) -> Table:
+def make_published_table(
+    published: Sequence[PublishedFindings], held: SocketState, title: str
+) -> Table | None:
     """What others found over the regions of this result, beside its pressures when a part has been held."""
     here: dict[str, LoadedRegion] = {row.region: row for row in held.regions}
     rows = [

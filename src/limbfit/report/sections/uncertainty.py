@@ -38,7 +38,7 @@ def make_uncertainty_section(store: Results, content: UncertaintyResult) -> Sect
         draw_profile_figure(store, content),
         draw_pairs_figure(store, content),
         _make_evidence_table(content),
-        make_table("uncertainty-sources", content.sources) if content.sources else None,
+        make_table("uncertainty-sources", content.sources),
         draw_prediction_figure(store, content),
         make_table("uncertainty-predictions", found.sites, marked="fitted", found=found),
         Prose(emulator) if content.emulator.good_enough else Note(emulator),
