@@ -97,6 +97,11 @@ class Grid:
         return matrix
 
     @property
+    def geometry(self) -> tuple[Array, Array, Array]:
+        """Spacing, origin and direction, with which other samples of the grid are made."""
+        return self.spacing, self.origin, self.direction
+
+    @property
     def voxel_mm3(self) -> float:
         return float(np.prod(self.spacing))
 

@@ -19,8 +19,9 @@ from fastapi import APIRouter, Response
 from matplotlib.colors import to_hex
 from pydantic import BaseModel, Field
 
-from ..anatomy.imaging import LabelMap, Volume, read_labels, write_labels
-from ..anatomy.labels.labelfiles import colour_of
+from ..anatomy.grid import Grid, LabelMap, Volume
+from ..anatomy.imaging import read_labels, write_labels
+from ..anatomy.labels.labelfiles import get_colour
 from ..anatomy.surfaces.surfaces import read_surface
 from ..errors import InputError, RunError
 from ..pipeline.engine.digests import compute_file_digest
@@ -64,7 +65,7 @@ def get_facts(folder: Folder) -> dict[str, Any]:
             "base": shown.digest,
             "saved_to": shown.name_target(study),
             "names": [
-                {"value": value, "name": name, "colour": to_hex(colour_of(name, n))}
+                {"value": value, "name": name, "colour": to_hex(get_colour(name, n))}
                 for n, (value, name) in enumerate(sorted(labels.names.items()))
             ],
         }
@@ -196,11 +197,7 @@ def _respond_nifti(grid: Volume | LabelMap) -> Response:
     array = grid.array
     if array.dtype != np.uint8 and np.array_equal(array, np.round(array)) and np.abs(array).max() < 2**15:
         array = array.astype(np.int16)
-    image = sitk.GetImageFromArray(np.ascontiguousarray(array))
-    image.SetSpacing(grid.spacing.tolist())
-    image.SetOrigin(grid.origin.tolist())
-    image.SetDirection(grid.direction.ravel().tolist())
     with TemporaryDirectory() as place:
         file = Path(place) / "image.nii"
-        sitk.WriteImage(image, str(file))
+        sitk.WriteImage(Grid(array, *grid.geometry).to_sitk(), str(file))
         return Response(file.read_bytes(), media_type="application/octet-stream")

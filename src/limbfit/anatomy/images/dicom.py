@@ -315,8 +315,6 @@ def read_pixels(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
     with silence_readers():
         try:
             array = _read_files(slices) if slices[0].frame is None else _read_frames(slices)
-        except ImageError:
-            raise
         except Exception:  # its text may hold file names and tag values
             raise _build_decoding_error({header.syntax for header in slices}) from None
     if array.shape != (len(slices), slices[0].rows, slices[0].columns):

@@ -148,7 +148,7 @@ def build_labels(structures: Sequence[tuple[str, Sequence[Array]]], like: Grid) 
         with add_location(place=name):
             masks.append(rasterise_polygons(polygons, like))
     array, names = flatten(masks, [name for name, _ in structures])
-    return LabelMap(array, like.spacing, like.origin, like.direction, names)
+    return LabelMap(array, *like.geometry, names)
 
 
 def _read_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:

@@ -87,7 +87,7 @@ def read_dicom_seg(path: Path) -> LabelMap:
         raise LabelError(
             "the DICOM segmentation is damaged or cannot be decoded", remedy="export it again"
         ) from None
-    return LabelMap(array, grid.spacing, grid.origin, grid.direction, names)
+    return LabelMap(array, *grid.geometry, names)
 
 
 def _read_masks(data: FileDataset) -> tuple[Grid, list[Mask], list[str]]:

@@ -125,7 +125,7 @@ def place_on_grid(labels: LabelMap, like: Volume) -> LabelMap:
         )
     full = np.zeros(like.array.shape, dtype=np.uint8)
     full[tuple(slice(a, b) for a, b in zip(offset[::-1], last[::-1]))] = labels.array
-    return LabelMap(full, like.spacing, like.origin, like.direction, labels.names)
+    return LabelMap(full, *like.geometry, labels.names)
 
 
 def _format_shape(grid: Grid) -> str:

@@ -31,7 +31,7 @@ COLOURS: Mapping[str, tuple[float, float, float]] = {
 _OTHER_COLOURS = ((0.9, 0.6, 0.2), (0.4, 0.6, 0.9), (0.5, 0.8, 0.7), (0.8, 0.5, 0.6))
 
 
-def colour_of(name: str, number: int) -> tuple[float, float, float]:
+def get_colour(name: str, number: int) -> tuple[float, float, float]:
     """The colour of a tissue; those without one of their own take turns by their number."""
     return COLOURS.get(name, _OTHER_COLOURS[number % len(_OTHER_COLOURS)])
 
@@ -59,7 +59,7 @@ def write_seg_nrrd(path: Path, labels: LabelMap) -> None:
     }
     extent = " ".join(f"0 {n - 1}" for n in labels.size)
     for n, (value, name) in enumerate(sorted(labels.names.items())):
-        colour = colour_of(name, n)
+        colour = get_colour(name, n)
         header |= {
             f"Segment{n}_ID": f"Segment_{value}",
             f"Segment{n}_Name": name,

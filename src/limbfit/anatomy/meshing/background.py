@@ -17,13 +17,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...arrays import Array, Indices, Mask
-from ...mesh import compute_dihedral_angles
+from ...mesh import TET10_EDGES, compute_dihedral_angles
 from ...mesh.boxes import SIX_TETS
 
 Field = Callable[[Array], tuple[Array, Array]]
 
 PLANE, LAYER, BONE, REGION = 1, 2, 4, 8  # of regions the first's; each further one's is twice as large
-TET_EDGES = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
 CELL_FACTORS = (8.0, 4.0, 2.0)  # of the spacing: cells that are settled by one value
 CELL_RANGE, CELL_OFFSET = 1 << 20, 1 << 19  # three cell indices in one integer
 LONGEST_EDGE = 1.8  # of the spacing: the cubes' diagonal; both ends of a crossed edge are that near
@@ -76,7 +75,7 @@ def refine_grid(grid: TetGrid, near: Callable[[Array], Mask], spacing: float) ->
     edge = grid.spacing
     while edge > spacing:
         for length in edge * np.sqrt([3.0, 2.0, 1.0]):
-            ends = np.sort(grid.tets[:, TET_EDGES].reshape(-1, 2), axis=1)
+            ends = np.sort(grid.tets[:, TET10_EDGES].reshape(-1, 2), axis=1)
             a, b = np.moveaxis(grid.points[ends], 1, 0)
             ends = _select_unique_edges(ends[np.linalg.norm(b - a, axis=1) > 0.95 * length], len(grid.points))
             edges = ends[near(grid.points[ends].mean(axis=1))]
@@ -110,7 +109,7 @@ def cut(
     """
     values = compute_in_band(field, grid.points, LONGEST_EDGE * grid.spacing, grid.spacing, slack)
     chosen = grid.tets if region is None else grid.tets[grid.regions == region]
-    ends = np.sort(chosen[:, TET_EDGES].reshape(-1, 2), axis=1)
+    ends = np.sort(chosen[:, TET10_EDGES].reshape(-1, 2), axis=1)
     edges = _select_unique_edges(ends[values[ends[:, 0]] * values[ends[:, 1]] < 0], len(values))
     t = _find_roots(grid.points, edges, values, field)
     grid, snapped = _snap_vertices(grid, edges, t, bit)
@@ -233,7 +232,7 @@ def _find_first_crossed(tets: Indices, edges: Indices, offset: int) -> Indices:
     """Index (m,) of the first crossed edge of each tetrahedron; ``len(edges)`` where there is none."""
     if not len(edges):
         return np.zeros(len(tets), dtype=np.int64)
-    ends = np.sort(tets[:, TET_EDGES], axis=2)
+    ends = np.sort(tets[:, TET10_EDGES], axis=2)
     keys = edges[:, 0] * offset + edges[:, 1]
     key = np.where(
         ends[..., 1] < offset, ends[..., 0] * offset + ends[..., 1], -1

@@ -16,6 +16,7 @@ import numpy as np
 from ...arrays import Array, Indices
 from ...mesh import TET10_EDGES, Mesh, node_jacobians
 from ...mesh.cells import quadratic_simplex
+from ..surfaces.triangles import cross_edges
 from .background import project_to_level
 from .extrusion import Columns, find_bone_faces, find_inner_faces
 from .layers import LimbFields
@@ -119,8 +120,7 @@ def balance_bone_faces(mesh: Mesh, fields: LimbFields, straight: Array) -> Mesh:
     in_plane = mesh.points[nodes, 2] == 0.0
     shapes = _compute_shape_functions()
     for _ in range(ROUNDS):
-        corners = mesh.points[faces[:, :3]]
-        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        area = np.linalg.norm(cross_edges(mesh.points[faces[:, :3]]), axis=1)
         places = np.einsum("qk,fki->fqi", shapes, mesh.points[faces])
         level, _ = fields.void(places.reshape(-1, 3))
         lack = -level.reshape(places.shape[:2]).mean(axis=1)

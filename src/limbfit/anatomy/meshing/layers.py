@@ -28,7 +28,7 @@ from ...results.limb import BoneLoss, SkinLoss
 from ..frame import Frame, build_limb_frame
 from ..surfaces.surfaces import END_TOLERANCE_MM, Anatomy, check_cut
 from ..surfaces.thickness import SLOPE, limit_slope, transfer_values
-from ..surfaces.triangles import Surface, find_open_edges, from_pyvista
+from ..surfaces.triangles import Surface, cross_edges, find_open_edges, from_pyvista
 
 Level = tuple[Array, Array]  # a signed function at points and its gradient there
 
@@ -226,8 +226,7 @@ def evaluate_distance(surface: Surface, points: Array) -> Level:
     distance, face, nearest = surface.find_signed(points)
     close = np.abs(distance) < NORMAL_WITHIN_MM
     gradient = (points - nearest) / np.where(close, 1.0, distance)[:, None]
-    a, b, c = np.moveaxis(surface.triangles[face[close]], 1, 0)
-    normal = np.cross(b - a, c - a)
+    normal = cross_edges(surface.triangles[face[close]])
     gradient[close] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     return distance, gradient
 

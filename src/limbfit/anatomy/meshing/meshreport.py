@@ -11,7 +11,8 @@ import numpy as np
 from ...arrays import Array, Indices
 from ...mesh import Mesh, MeshQuality, compute_dihedral_angles, measure_quality
 from ...results.limb import BoneLoss, InterfaceError, MeshMeasures, RegionError, ThicknessMeasures
-from ..surfaces.surfaces import Anatomy, Surface
+from ..surfaces.surfaces import Anatomy
+from ..surfaces.triangles import Surface, cross_edges
 from .extrusion import find_bone_faces, find_inner_faces
 from .layers import LimbFields
 from .regions import build_region_level, find_interfaces
@@ -177,9 +178,8 @@ def compute_enclosed_volume(anatomy: Anatomy, fields: LimbFields, trimmed: Mappi
 
 def compute_volume_below_cut(surface: Surface) -> float:
     """Volume (mm3) of a closed surface below z = 0, by the divergence theorem with (0, 0, min(z, 0))."""
-    corners = surface.points[surface.faces]
-    normal_z = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] / 2.0
-    low, middle, high = np.sort(corners[..., 2], axis=1).T
+    normal_z = cross_edges(surface.triangles)[:, 2] / 2.0
+    low, middle, high = np.sort(surface.triangles[..., 2], axis=1).T
     return float(normal_z @ _compute_mean_negative_part(low, middle, high))
 
 

@@ -94,11 +94,11 @@ def _find_region_walls(mesh: Mesh, fields: LimbFields) -> list[tuple[Mask, Field
 
 def _find_places(mesh: Mesh, stack: Columns) -> Mask:
     """Masks (3, n) of the nodes on the cut plane, in the layers, and on bone."""
-    on_plane, in_layers, on_bone = np.zeros((3, len(mesh.points)), dtype=bool)
-    on_plane[:] = mesh.points[:, 2] == 0.0
-    in_layers[stack.base], in_layers[stack.top[0] :] = True, True
-    on_bone[mesh.node_sets["fixed_bone"]] = True
-    return np.stack([on_plane, in_layers, on_bone])
+    places = np.zeros((3, len(mesh.points)), dtype=bool)
+    places[0] = mesh.points[:, 2] == 0.0
+    places[1, stack.base] = places[1, stack.top[0] :] = True
+    places[2, mesh.node_sets["fixed_bone"]] = True
+    return places
 
 
 def improve_angles(

@@ -225,17 +225,17 @@ def voxelise_anatomy(anatomy: Anatomy, distal_mm: float = _MARGIN_MM) -> LabelMa
     grid = Grid(empty, np.full(3, VOXEL_MM), frame.to_patient(corner), frame.rotation.T)
     inner = {**anatomy.regions, **anatomy.bones}  # bones last: they stay whole where the two overlap
     masks = {name: fill_surface(body, grid) for name, body in inner.items()}
-    labels = label_map(grid, fill_surface(anatomy.skin, grid), masks)
+    labels = build_label_map(grid, fill_surface(anatomy.skin, grid), masks)
     return replace(labels, regions={name: name for name in anatomy.regions})
 
 
-def label_map(grid: Grid, limb: Mask, bones: Mapping[str, Mask]) -> LabelMap:
+def build_label_map(grid: Grid, limb: Mask, bones: Mapping[str, Mask]) -> LabelMap:
     """Labels on a grid: soft tissue where nothing but the limb is, then the bones in their order."""
     array = limb.astype(np.uint8)
     for value, mask in enumerate(bones.values(), start=2):
         array[mask] = value
     names: dict[int, str] = {1: SOFT_TISSUE, **dict(enumerate(bones, start=2))}
-    return LabelMap(array, grid.spacing, grid.origin, grid.direction, names)
+    return LabelMap(array, *grid.geometry, names)
 
 
 def fill_surface(surface: Surface, grid: Grid) -> Mask:

@@ -121,7 +121,7 @@ def _build_labels(
 ) -> LabelMap:
     array = limb.astype(np.uint8)
     known = dict(DEFAULT_NAMES)
-    values = {name: value for value, name in known.items()}
+    values = {name: value for value, name in DEFAULT_NAMES.items()}
     array[fat] = values[FAT]
     for mask, name in zip(bones, names):
         value = values.get(name, max(known) + 1)
@@ -130,4 +130,4 @@ def _build_labels(
     present = {value: name for value, name in known.items() if name not in BONES or name in names}
     whole = np.zeros(volume.array.shape, dtype=np.uint8)
     whole[box] = array
-    return LabelMap(whole, volume.spacing, volume.origin, volume.direction, present)
+    return LabelMap(whole, *volume.geometry, present)

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from ...arrays import Array
 from ...errors import SiteError
 from ..surfaces.surfaces import ON_CUT_MM, Anatomy
-from ..surfaces.triangles import Surface
+from ..surfaces.triangles import Surface, cross_edges
 
 MAX_OFF_SKIN_MM = 5.0
 SAMPLE_EDGE_MM = 1.0
@@ -70,7 +70,7 @@ def compute_indenter_axis(
     centre = np.asarray(position, dtype=float)
     points, normals = _sample_faces(skin, centre, width)
     face = skin.find_nearest(centre[None])[1]
-    axis = _normalise(-_compute_area_vectors(skin.points[skin.faces[face]])[0])
+    axis = _normalise(-cross_edges(skin.triangles[face])[0])
     for _ in range(AXIS_STEPS):
         across = compute_square_edges(axis, edge) @ (points - centre).T
         under = (np.abs(across) <= width / 2).all(axis=0) & (normals @ axis < 0)
@@ -99,8 +99,8 @@ def compute_square_edges(axis: Array, edge: ArrayLike | None = None) -> Array:
 
 
 def _sample_faces(skin: Surface, centre: Array, width: float) -> tuple[Array, Array]:
-    """Centroids and area vectors of small pieces of the faces near a footprint."""
-    corners, fine = skin.points[skin.faces], []
+    """Centroids of small pieces of the faces near a footprint, and normals as long as twice their areas."""
+    corners, fine = skin.triangles, []
     while len(corners):
         edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
         close = np.linalg.norm(corners.mean(axis=1) - centre, axis=1) - edges < width
@@ -108,7 +108,7 @@ def _sample_faces(skin: Surface, centre: Array, width: float) -> tuple[Array, Ar
         corners = _split_in_four(corners[close & (edges > SAMPLE_EDGE_MM)])
     corners = np.concatenate(fine)
     near = np.linalg.norm(corners.mean(axis=1) - centre, axis=1) < width
-    return corners[near].mean(axis=1), _compute_area_vectors(corners[near])
+    return corners[near].mean(axis=1), cross_edges(corners[near])
 
 
 def _split_in_four(corners: Array) -> Array:
@@ -116,10 +116,6 @@ def _split_in_four(corners: Array) -> Array:
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
     return np.concatenate([np.stack(part, axis=1) for part in parts])
-
-
-def _compute_area_vectors(corners: Array) -> Array:
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
 
 
 def _normalise(vector: Array) -> Array:

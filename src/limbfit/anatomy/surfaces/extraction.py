@@ -83,9 +83,7 @@ def _select_body(mask: Mask, grid: Grid, name: str) -> tuple[Mask, Grid]:
 def smooth_field(body: Mask, grid: Grid, edge_mm: float) -> tuple[Volume, float]:
     """Smoothed signed distance (mm, positive inside) on cubic voxels, and the level that keeps the volume."""
     distance = compute_signed_distance_to(body, grid)
-    smooth = Volume(
-        gaussian_filter(distance, _SIGMA_VOXELS, mode="nearest"), grid.spacing, grid.origin, grid.direction
-    )
+    smooth = Volume(gaussian_filter(distance, _SIGMA_VOXELS, mode="nearest"), *grid.geometry)
     # Fine enough for triangles of that edge.
     fine = resample_cubic(
         smooth.to_sitk(), smooth, edge_mm / 2.5, sitk.sitkBSpline3, float(smooth.array.min())

@@ -120,19 +120,12 @@ class Surface:
     @property
     def face_areas(self) -> Array:
         """(m,) mm2."""
-        return np.linalg.norm(self._face_vectors, axis=1) / 2
+        return np.linalg.norm(cross_edges(self.triangles), axis=1) / 2
 
     @property
     def face_normals(self) -> Array:
         """(m, 3) unit outward normals; zero for a degenerate face."""
-        vectors = self._face_vectors
-        length = np.linalg.norm(vectors, axis=1, keepdims=True)
-        return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
-
-    @property
-    def _face_vectors(self) -> Array:
-        a, b, c = np.moveaxis(self.triangles, 1, 0)
-        return np.cross(b - a, c - a)
+        return _normalise_rows(cross_edges(self.triangles))
 
     @property
     def area(self) -> float:
@@ -148,11 +141,10 @@ class Surface:
     @property
     def vertex_normals(self) -> Array:
         """(n, 3) unit normals, the faces around a vertex weighted by area."""
-        normals = np.zeros_like(self.points)
+        normals, vectors = np.zeros_like(self.points), cross_edges(self.triangles)
         for corner in range(3):
-            np.add.at(normals, self.faces[:, corner], self._face_vectors)
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+            np.add.at(normals, self.faces[:, corner], vectors)
+        return _normalise_rows(normals)
 
     @property
     def flipped(self) -> Surface:
@@ -167,6 +159,18 @@ class Surface:
     def to_pyvista(self) -> pv.PolyData:
         faces: Any = self.faces  # pyvista's stubs know no int64
         return pv.PolyData.from_regular_faces(self.points, faces)
+
+
+def cross_edges(triangles: Array) -> Array:
+    """Vectors (m, 3) along the normals of triangles (m, 3, 3), twice as long as their areas."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    return np.cross(b - a, c - a)
+
+
+def _normalise_rows(vectors: Array) -> Array:
+    """Unit vectors (n, 3); those of no length stay zero."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
 
 
 def from_pyvista(poly: pv.PolyData) -> Surface:

@@ -81,7 +81,7 @@ def segment_automatically(study: Study, volume: Volume) -> LabelMap:
                 for name, points in table.seeds.items()
             },
         )
-    labels = LabelMap(found.array, near.spacing, near.origin, near.direction, found.names)
+    labels = LabelMap(found.array, *near.geometry, found.names)
     return place_on_grid(labels, volume)
 
 
