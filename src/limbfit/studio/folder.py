@@ -32,6 +32,11 @@ class StudyFolder:
     def store(self) -> Store:
         return Store(self.results)
 
+    @property
+    def logs(self) -> list[Path]:
+        """The logs of runs, the newest last."""
+        return sorted((self.results / "log").glob("*.jsonl"))
+
     def load(self) -> Study:
         """The study as its file now states it; its records need not exist yet."""
         return load_study(self.file, recorded=False)
@@ -46,7 +51,6 @@ class StudyFolder:
     def changes(self) -> dict[str, str]:
         """A fingerprint of each thing that a page may have to read again."""
         results = self.results
-        logs = sorted((results / "log").glob("*.jsonl"))[-1:]
         work = results.glob(".work-calibrate-*/runs")
         return {
             "study": compute_fingerprint([self.file]),
@@ -56,7 +60,7 @@ class StudyFolder:
             "labels": compute_fingerprint(
                 results / place / "labels.seg.nrrd" for place in ("segment", "by-hand")
             ),
-            "log": compute_fingerprint([*logs, *work]),
+            "log": compute_fingerprint([*self.logs[-1:], *work]),
             "acquired": compute_fingerprint(sorted(self.folder.glob(f"{ACQUIRED}/*/*"))),
         }
 

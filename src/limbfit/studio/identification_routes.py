@@ -103,11 +103,10 @@ def _collect_iterates(
     if state != "done":
         stamp = folder.store.stamp("calibrate")
         finished = stamp.finished if stamp else ""
-        for log in reversed(_list_logs(folder)[-LOGS_SEARCHED:]):
-            rows = [
-                row for row in _read_events(log) if row["event"] == "fit" and row.get("stage") == "calibrate"
-            ]
-            facts = [row["facts"] for row in rows if row.get("facts") and row["time"] > finished]
+        for log in reversed(folder.logs[-LOGS_SEARCHED:]):
+            fits = [row for row in _read_events(log) if row["event"] == "fit"]
+            fits = [row for row in fits if row.get("stage") == "calibrate" and row["time"] > finished]
+            facts = [row["facts"] for row in fits if row.get("facts")]
             if facts:
                 return {"of": "log", "rows": facts}
     if calibration is None:
@@ -118,16 +117,11 @@ def _collect_iterates(
     return {"of": "answer", "rows": rows}
 
 
-def _list_logs(folder: StudyFolder) -> list[Path]:
-    return sorted((folder.results / "log").glob("*.jsonl"))
-
-
 def describe_last_run(folder: StudyFolder, is_running: bool) -> dict[str, Any] | None:
     """The run of the newest log: its command, how it ended, and its last progress; None without a log."""
-    logs = _list_logs(folder)
-    if not logs:
+    if not folder.logs:
         return None
-    events = _read_events(logs[-1])
+    events = _read_events(folder.logs[-1])
     progress = [row for row in events if row["event"] in ("progress", "fit")]
     end = _ENDS.get(events[-1]["event"]) if events else None
     if end is None:

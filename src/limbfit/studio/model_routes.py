@@ -64,7 +64,7 @@ def get_scene(folder: Folder) -> dict[str, Any]:
     meshed = MeshResult.find(folder.results)
     meshes = {site.name: folder.results / "mesh" / f"{site.name}.vtu" for site in study.sites}
     return {
-        "surfaces": {} if anatomy is None else _mark_each_surface(folder, study, anatomy),
+        "surfaces": {} if anatomy is None else _compute_fingerprints(folder, study, anatomy),
         "frame": build_patient_frame(None if anatomy is None else anatomy.cut_normal).tolist(),
         "sites": [_describe_site(site, study, anatomy, placed.get(site.name)) for site in study.sites],
         "meshes": {name: compute_fingerprint([file]) for name, file in meshes.items() if file.is_file()},
@@ -135,10 +135,10 @@ def post_removal(folder: Folder, name: str) -> dict[str, Any]:
 
 def read_anatomy(folder: StudyFolder, study: Study) -> Anatomy | None:
     """The stored surfaces, else those that the study gives; None where the image is not segmented yet."""
-    return _read_marked_anatomy(folder, mark_surfaces(folder, study))
+    return _read_cached_anatomy(folder, compute_surfaces_fingerprint(folder, study))
 
 
-def mark_surfaces(folder: StudyFolder, study: Study) -> str:
+def compute_surfaces_fingerprint(folder: StudyFolder, study: Study) -> str:
     """A text that changes with the files of the limb's surfaces and with what the study says of them."""
     given, geometry = study.surfaces, study.geometry
     files = [] if given is None else [given.skin, *given.bones.values()]
@@ -149,8 +149,8 @@ def mark_surfaces(folder: StudyFolder, study: Study) -> str:
 
 
 @lru_cache(maxsize=1)
-def _read_marked_anatomy(folder: StudyFolder, mark: str) -> Anatomy | None:
-    """The last anatomy is kept, by its ``mark``: to mend and check given surfaces can take seconds."""
+def _read_cached_anatomy(folder: StudyFolder, fingerprint: str) -> Anatomy | None:
+    """The last anatomy is kept, by its ``fingerprint``: to mend and check given surfaces can take seconds."""
     study = folder.load()
     if _has_made_surfaces(folder):
         return load_anatomy(folder.results / "surfaces")
@@ -168,7 +168,7 @@ def project_to_skin_of_study(folder: StudyFolder, position: Sequence[float]) -> 
     return [float(value) for value in point]
 
 
-def _mark_each_surface(folder: StudyFolder, study: Study, anatomy: Anatomy) -> dict[str, str]:
+def _compute_fingerprints(folder: StudyFolder, study: Study, anatomy: Anatomy) -> dict[str, str]:
     given = study.surfaces
     if given is None or _has_made_surfaces(folder):
         files = {SKIN: folder.artefact("surfaces", "skin.stl")}

@@ -26,7 +26,7 @@ from ..web.shapes import build_patient_frame, to_volume_shape
 from .editing import remove_area, set_area, set_trimline
 from .folder import StudyFolder, compute_fingerprint
 from .identification_routes import describe_last_run
-from .model_routes import Place, Text, mark_surfaces, project_to_skin_of_study, read_anatomy
+from .model_routes import Place, Text, compute_surfaces_fingerprint, project_to_skin_of_study, read_anatomy
 from .processes import find_running, find_starting, start_socket
 from .results_routes import read_arrays
 from .study_routes import Folder, StrictModel, respond_block
@@ -148,9 +148,8 @@ def get_shape(folder: Folder) -> dict[str, Any]:
     study = folder.load()
     table, anatomy = study.socket, read_anatomy(folder, study)
     regions = {} if anatomy is None else build_regions(study, anatomy)
-    mark = _mark(folder, study)
-    face = _build_face(folder, mark)
-    has_face = isinstance(face, Socket)
+    fingerprint = _compute_shape_fingerprint(folder, study)
+    face = _build_face(folder, fingerprint)
     return {
         "file": None if table.file is None else table.file.name,
         "reduction_percent": table.reduction_percent,
@@ -161,8 +160,8 @@ def get_shape(folder: Folder) -> dict[str, Any]:
             for area in table.areas
         ],
         "regions": list(regions),
-        "mark": mark,
-        "problem": None if has_face else face,
+        "mark": fingerprint,
+        "problem": None if isinstance(face, Socket) else face,
         "has_limb": anatomy is not None,
         "volume_cm3": face.volume_mm3 / 1000.0 if isinstance(face, Socket) else None,
     }
@@ -180,7 +179,7 @@ def _find_handles(folder: StudyFolder, study: Study) -> list[list[float]]:
     if anatomy is None or table.file is not None:
         return []
     try:
-        limb, frame = _compute_profile(folder, mark_surfaces(folder, study))
+        limb, frame = _compute_profile(folder, compute_surfaces_fingerprint(folder, study))
         if table.trimline and not table.trim_planes:
             return [[*map(float, row)] for row in wrap_trimline(limb, frame, np.array(table.trimline))]
         return [[*map(float, row)] for row in find_brim(limb, frame, trim_of(study, anatomy), HANDLE_COUNT)]
@@ -189,8 +188,8 @@ def _find_handles(folder: StudyFolder, study: Study) -> list[list[float]]:
 
 
 @lru_cache(maxsize=2)
-def _compute_profile(folder: StudyFolder, mark: str) -> tuple[LimbProfile, Frame]:
-    """That of the bare skin, and its frame; the last ones are kept, by the ``mark`` of the limb's surfaces.
+def _compute_profile(folder: StudyFolder, fingerprint: str) -> tuple[LimbProfile, Frame]:
+    """That of the bare skin, and its frame; the last ones are kept, by the ``fingerprint`` of surfaces.
 
     Raises `InputError` where there is no limb yet.
     """
@@ -209,7 +208,10 @@ def get_face(folder: Folder) -> Response:
     none.
     """
     study = folder.load()
-    face, anatomy = _build_face(folder, _mark(folder, study)), read_anatomy(folder, study)
+    face, anatomy = (
+        _build_face(folder, _compute_shape_fingerprint(folder, study)),
+        read_anatomy(folder, study),
+    )
     if not isinstance(face, Socket) or anatomy is None:
         raise InputError(face if isinstance(face, str) else NO_LIMB_YET)
     arrays = {
@@ -220,17 +222,17 @@ def get_face(folder: Folder) -> Response:
     return respond_block(arrays)
 
 
-def _mark(folder: StudyFolder, study: Study) -> str:
+def _compute_shape_fingerprint(folder: StudyFolder, study: Study) -> str:
     """Changes with the limb's surfaces, the socket's file and what the table says of the shape."""
     table = study.socket
     file = compute_fingerprint([] if table.file is None else [study.path(table.file)])
     settings = compute_digest(table.model_dump(mode="json", exclude={"design", "loads"}))
-    return f"{mark_surfaces(folder, study)} {file} {settings}"
+    return f"{compute_surfaces_fingerprint(folder, study)} {file} {settings}"
 
 
 @lru_cache(maxsize=2)
-def _build_face(folder: StudyFolder, mark: str) -> Socket | str:
-    """The face around the bare skin, or why there is none; the last ones are kept, by their ``mark``."""
+def _build_face(folder: StudyFolder, fingerprint: str) -> Socket | str:
+    """The face around the bare skin, or why there is none; the last ones are kept, by ``fingerprint``."""
     study = folder.load()
     try:
         anatomy = read_anatomy(folder, study)
@@ -263,7 +265,7 @@ def post_trimline(folder: Folder, line: TrimlineRequest) -> dict[str, Any]:
     """
     study = folder.load()
     with place_errors(study, "socket.trimline"):
-        limb, frame = _compute_profile(folder, mark_surfaces(folder, study))
+        limb, frame = _compute_profile(folder, compute_surfaces_fingerprint(folder, study))
         points = wrap_trimline(limb, frame, np.array(line.points))
         trim_limb(limb, frame, Trim(line=points))
     set_trimline(folder.file, points.tolist())

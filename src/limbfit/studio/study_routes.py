@@ -96,11 +96,11 @@ _LOCK = Lock()  # one request computes them while others wait
 def list_stages(folder: StudyFolder) -> list[dict[str, Any]]:
     """The rows of `study_status`; they are computed again only when an input or a result has changed."""
     with _LOCK:
-        return _read_marked_stages(folder, _mark(folder, folder.load()))
+        return _read_cached_stages(folder, _compute_fingerprint(folder, folder.load()))
 
 
 @lru_cache(maxsize=1)
-def _read_marked_stages(folder: StudyFolder, mark: str) -> list[dict[str, Any]]:
+def _read_cached_stages(folder: StudyFolder, fingerprint: str) -> list[dict[str, Any]]:
     return study_status(folder.load())
 
 
@@ -109,7 +109,7 @@ def list_stage_states(folder: StudyFolder) -> dict[str, str]:
     return {row["stage"]: row["state"] for row in list_stages(folder)}
 
 
-def _mark(folder: StudyFolder, study: Study) -> str:
+def _compute_fingerprint(folder: StudyFolder, study: Study) -> str:
     inputs = {study.path(path) for paths in list_input_files(study).values() for path in paths}
     below = [
         file for path in sorted(inputs) for file in (sorted(path.rglob("*")) if path.is_dir() else [path])

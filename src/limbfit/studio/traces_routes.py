@@ -10,6 +10,7 @@ from fastapi import APIRouter
 from pydantic import ConfigDict
 
 from ..anatomy.surfaces.surfaces import load_anatomy
+from ..arrays import Array
 from ..errors import InputError
 from ..pipeline.records.record_checks import record_flags
 from ..pipeline.records.traces import read_record
@@ -101,11 +102,11 @@ class _ReadRecord(NamedTuple):
 def _read(folder: StudyFolder, study: Study, record: Record) -> _ReadRecord:
     """A record with its curves; it is read again only when its file, its times or the table has changed."""
     file = study.path(record.trace)
-    return _read_marked_record(folder, record, f"{file} {compute_fingerprint([file])} {study.traces!r}")
+    return _read_cached_record(folder, record, f"{file} {compute_fingerprint([file])} {study.traces!r}")
 
 
 @lru_cache(maxsize=64)
-def _read_marked_record(folder: StudyFolder, record: Record, mark: str) -> _ReadRecord:
+def _read_cached_record(folder: StudyFolder, record: Record, fingerprint: str) -> _ReadRecord:
     trace, smooth, facts = read_record(folder.load(), record)
     even = smooth.resample(CURVE_POINTS)
     time, force, _ = average_in_bins(trace.time_s, trace.force_N, MAX_POINTS)
@@ -116,22 +117,15 @@ def _read_marked_record(folder: StudyFolder, record: Record, mark: str) -> _Read
         "stated": {"touch_down_s": record.touch_down_s, "peak_s": record.peak_s},
         "samples": len(trace.time_s),
         "step_s": float(np.median(np.diff(trace.time_s))),
-        "raw": {
-            "time_s": _shorten(time),
-            "displacement_mm": _shorten(moved),
-            "force_N": _shorten(force),
-        },
-        "regularised": {
-            "time_s": _shorten(even.time_s + facts.touch_down_s),
-            "displacement_mm": _shorten(even.displacement_mm),
-            "force_N": _shorten(even.force_N),
-        },
+        "raw": _round_curves(time, moved, force),
+        "regularised": _round_curves(even.time_s + facts.touch_down_s, even.displacement_mm, even.force_N),
     }
     return _ReadRecord(facts, content)
 
 
-def _shorten(values: np.ndarray) -> list[float]:
-    return np.round(values, 5).tolist()
+def _round_curves(time_s: Array, displacement_mm: Array, force_N: Array) -> dict[str, list[float]]:
+    curves = {"time_s": time_s, "displacement_mm": displacement_mm, "force_N": force_N}
+    return {name: np.round(values, 5).tolist() for name, values in curves.items()}
 
 
 def _collect_flags(
