@@ -8,7 +8,7 @@ import pytest
 from stored_results import write_results
 
 from limbfit.identify.checks.domain import SHEAR, TIME, Extent, RecordedRange, describe_outside
-from limbfit.report.formats import number
+from limbfit.report.formats import format_number
 from limbfit.report.page import Figure, Note, Section, Table
 from limbfit.report.sections.prediction import make_domain_section
 from limbfit.report.store import Results, load_store
@@ -63,7 +63,7 @@ def test_what_lies_outside_stands_in_words_in_a_picture_and_in_a_table(store):
     (table,) = blocks(section, Table)
     rows = [[cell.text for cell in row.cells] for row in table.rows]
     assert ["socket, stance", "shear strain", "skin", "–", "to 0.24", "to 0.36", "33"] in rows
-    assert ["socket, stance", "time", "–", "s", "7.0 to 15", f"1.0 to {number(3600.0)}", "100"] in rows
+    assert ["socket, stance", "time", "–", "s", "7.0 to 15", f"1.0 to {format_number(3600.0)}", "100"] in rows
 
 
 def test_where_nothing_lies_outside_the_report_says_so(store):

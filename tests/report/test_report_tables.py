@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from limbfit.report.formats import format_duration, format_fixed, number
+from limbfit.report.formats import format_duration, format_fixed, format_number
 from limbfit.report.sections.provenance import flatten_settings
 
 
@@ -30,11 +30,16 @@ from limbfit.report.sections.provenance import flatten_settings
     ],
 )
 def test_number(value: float | None, text: str) -> None:
-    assert number(value) == text
+    assert format_number(value) == text
 
 
 def test_a_number_of_two_digits_that_rounds_to_a_hundred_has_no_exponent() -> None:
-    assert [number(99.4, 2), number(99.96, 2), number(9.96, 2), number(0.0, 2)] == ["99", "100", "10", "0.0"]
+    assert [
+        format_number(99.4, 2),
+        format_number(99.96, 2),
+        format_number(9.96, 2),
+        format_number(0.0, 2),
+    ] == ["99", "100", "10", "0.0"]
 
 
 def test_fixed() -> None:

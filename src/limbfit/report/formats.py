@@ -11,7 +11,7 @@ _GREEK = dict(zip(["alpha", "beta", "gamma", "delta", "eta", "kappa", "mu", "tau
 _BELOW = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
-def number(value: Any, digits: int = 3) -> str:
+def format_number(value: Any, digits: int = 3) -> str:
     """A number to so many significant digits, without an exponent where a person can do without."""
     if not isinstance(value, int | float) or value != value:
         return NOTHING
@@ -39,7 +39,7 @@ def format_symbol(key: str) -> str:
     return _GREEK.get(letter, letter) + name[len(letter) :].translate(_BELOW)
 
 
-def label(name: str) -> str:
+def format_parameter(name: str) -> str:
     """``skin.c_kPa`` as ``skin c``."""
     tissue, _, kind = name.rpartition(".")
     return f"{tissue} {format_symbol(kind)}".strip()
@@ -58,15 +58,15 @@ def format_with_unit(key: str) -> str:
 
 def format_with_value(key: str, value: Any) -> str:
     """A parameter with its value: ``τ = 0.391 s``."""
-    return f"{format_symbol(key)} = {number(value)} {split_key(key)[1]}".strip()
+    return f"{format_symbol(key)} = {format_number(value)} {split_key(key)[1]}".strip()
 
 
 def format_limits(values: Any, digits: int = 3) -> str:
     """An interval: ``1.2 to 3.4``."""
-    return f"{number(values[0], digits)} to {number(values[1], digits)}" if values else NOTHING
+    return f"{format_number(values[0], digits)} to {format_number(values[1], digits)}" if values else NOTHING
 
 
-def count(value: Any) -> str:
+def format_count(value: Any) -> str:
     """A whole number with its thousands apart."""
     return f"{value:,}".replace(",", " ") if isinstance(value, int) else NOTHING
 
@@ -85,4 +85,4 @@ def format_duration(seconds: Any) -> str:
 
 def format_friction(value: Any) -> str:
     """How contact is, by the study's key: a word, or a coefficient."""
-    return value if isinstance(value, str) else f"with friction of coefficient {number(value)}"
+    return value if isinstance(value, str) else f"with friction of coefficient {format_number(value)}"

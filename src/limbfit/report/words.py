@@ -24,14 +24,14 @@ def make_environment(undefined: type[Undefined] = StrictUndefined, **options: An
     environment = Environment(loader=TEMPLATES, undefined=undefined, **options)
     environment.filters |= {
         "fixed": formats.format_fixed,
-        "number": formats.number,
+        "number": formats.format_number,
         "limits": formats.format_limits,
-        "label": formats.label,
+        "label": formats.format_parameter,
         "symbol": formats.format_symbol,
         "friction": formats.format_friction,
         "unit": formats.get_unit,
         "with_unit": formats.format_with_unit,
-        "count": formats.count,
+        "count": formats.format_count,
         "duration": formats.format_duration,
         "form": format,
         "sentence": _make_sentence,

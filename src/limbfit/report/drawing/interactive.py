@@ -179,7 +179,7 @@ def _read_site_curves(store: Results, site: str) -> Json | None:
     return None
 
 
-def record_curves(store: Results, sites: Sequence[str]) -> Interactive | None:
+def draw_record_curves(store: Results, sites: Sequence[str]) -> Interactive | None:
     """Each record as the robot wrote it and regularised, to choose from."""
     choices = {}
     for site in sites:

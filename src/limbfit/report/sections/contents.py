@@ -7,7 +7,7 @@ from statistics import fmean
 from typing import Any
 
 from ...extensions import Registry
-from ..formats import label, number
+from ..formats import format_number, format_parameter
 from ..page import Block, KeyNumber, Note, Page, Section, make_bullets, make_section
 from ..store import Results
 from ..words import make_prose, write_words
@@ -100,7 +100,7 @@ def list_key_numbers(store: Results) -> tuple[KeyNumber, ...]:
     first = next(p for p in store.law.parameters if p.key == store.law.moduli[0])
     for tissue in store.tissues:
         facts = {"tissue": tissue, "modulus": first, "interval": store.interval(tissue, first.key)}
-        modulus = number(store.stages[-1].parameters[tissue][first.key])
+        modulus = format_number(store.stages[-1].parameters[tissue][first.key])
         found.append(KeyNumber(modulus, "kPa", write_words("modulus", **facts)))
     seconds = [stage.seconds for stage in store.run.stages.values()] if store.run else []
     if seconds:
@@ -129,7 +129,7 @@ def _list_verdicts(store: Results) -> tuple[str, ...]:
         return ()
     groups: dict[str, list[str]] = {}
     for name, word in store.uncertainty.verdict.items():
-        groups.setdefault(word, []).append(label(name))
+        groups.setdefault(word, []).append(format_parameter(name))
     best_first = sorted(groups, key=lambda word: _RANKS.get(word.split()[0], 1))
     words = [f"{word.capitalize()}: {', '.join(groups[word])}." for word in best_first]
     combinations = store.uncertainty.combinations

@@ -9,7 +9,7 @@ import numpy as np
 from ...results.planning import DesignResult, ProtocolPlan, ProtocolResult, SiteDesign
 from ..drawing.colours import INK, MUTED, ONE_MATERIAL, SIMULATED, THIRD
 from ..drawing.plots import add_legend, make_figure, make_panels, set_log_scale, set_rows, styled
-from ..formats import label
+from ..formats import format_parameter
 from ..page import Figure, Section, make_bullets, make_section
 from ..store import Results
 from ..words import make_prose, make_table
@@ -44,7 +44,7 @@ def draw_expected_figure(name: str, designs: Designs, work: str) -> Figure:
         factors = np.minimum([row.factor_95[name] for name in names], MAX_FACTOR)
         at = np.arange(len(names)) + 0.16 * (k - (count - 1) / 2)
         ax.plot(factors, at, marker, color=color, ms=5, label=row.design)
-    set_rows(ax, [label(name) for name in names])
+    set_rows(ax, [format_parameter(name) for name in names])
     set_log_scale(ax, minor=True)
     ax.axvline(2, color=MUTED, lw=0.8, ls="--")
     ax.set_xlabel("Expected factor of the 95 % interval (–)")

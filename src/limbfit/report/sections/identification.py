@@ -7,7 +7,7 @@ from collections import Counter
 from ...results.identification import CorrelationMatrix, SearchStage
 from ..drawing.figures import draw_convergence_figure, draw_interval_figure
 from ..drawing.interactive import draw_convergence_curves
-from ..formats import format_fixed, label
+from ..formats import format_fixed, format_parameter
 from ..page import Block, Bullets, Cell, Section, Table, make_bullets, make_section
 from ..store import Results
 from ..words import make_prose, make_row, make_table, write_words
@@ -45,7 +45,7 @@ def make_parameter_section(store: Results) -> Section:
 
 def make_correlation_table(correlation: CorrelationMatrix) -> Table:
     """The correlation of every pair of parameters, coloured."""
-    heads = [label(name) for name in correlation.names]
+    heads = [format_parameter(name) for name in correlation.names]
     pairs = zip(heads, correlation.matrix, strict=True)
     rows = []
     for head, values in pairs:
@@ -76,7 +76,7 @@ def _describe_combinations(store: Results) -> tuple[Block | None, ...]:
     if not sentences:
         return ()
     for name in map(".".join, store.parameters):
-        sentences = [sentence.replace(name, label(name)) for sentence in sentences]
+        sentences = [sentence.replace(name, format_parameter(name)) for sentence in sentences]
     return make_prose("combinations"), Bullets(tuple(sentences))
 
 

@@ -10,7 +10,7 @@ from ...identify.checks.outliers import MAX_STANDARDISED_ERROR, MIN_ERROR_SHARE
 from ...results.records import RecordPhase
 from ..drawing.colours import GRID, INK, MUTED, SIMULATED
 from ..drawing.figures import thin_curves
-from ..drawing.interactive import record_curves
+from ..drawing.interactive import draw_record_curves
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..page import Figure, Note, Section, Table, make_bullets, make_section
 from ..store import Curves, Results
@@ -27,7 +27,7 @@ def make_record_section(store: Results) -> Section:
         "records",
         "Indentation records",
         draw_record_figure(store, chosen[0]) if chosen else None,
-        record_curves(store, tuple(dict.fromkeys(chosen))),
+        draw_record_curves(store, tuple(dict.fromkeys(chosen))),
         make_trace_table(store),
         otherwise="No indentation records are stored yet.",
     )

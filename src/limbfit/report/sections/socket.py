@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from ...results.socket import (
@@ -70,14 +71,14 @@ def make_socket_section(store: Results, content: SocketResult) -> Section:
     )
 
 
-def _make_load_table(name: str, rows: Mapping[str, Sequence[Any]], **facts: Any) -> Table:
+def _make_load_table(name: str, rows: Mapping[str, Sequence[Any]], **facts: Any) -> Table | None:
     """A table in which the rows of each load stand below a marked row with its name."""
-    body: list[Row] = []
+    table, body = None, list[Row]()
     for load, own in rows.items():
         table = make_table(name, own, **facts)
-        assert table is not None  # each load has its regions and tissues
-        body += [make_row(load, *(to_numeric("") for _ in table.head[1:]), marked=True), *table.rows]
-    return Table(name, table.caption, table.head, tuple(body))
+        if table is not None:
+            body += [make_row(load, *(to_numeric("") for _ in table.head[1:]), marked=True), *table.rows]
+    return table and replace(table, rows=tuple(body))
 
 
 def make_interval_table(held: SocketState, title: str) -> Table | None:

@@ -14,8 +14,7 @@ from ...results.models import ModelsResult
 from ...results.uncertainty import LikelihoodProfile, UncertaintyResult
 from ..drawing import plots
 from ..drawing.colours import INK, MEASURED, MUTED, SIMULATED, choose_truth_style
-from ..drawing.plots import add_legend, make_figure, make_panels, styled
-from ..formats import format_fixed, label
+from ..formats import format_fixed, format_parameter
 from ..page import Bullets, Figure, Note, Prose, Section, Table, make_section
 from ..store import Curves, Results, find_compared_quantity
 from ..words import make_prose, make_table, write_words
@@ -62,7 +61,7 @@ def draw_profile_figure(store: Results, content: UncertaintyResult) -> Figure | 
             ax.axvline(truth[name][0], **truth[name][1], label="truth")
         ax.set_ylim(0, 2.5 * one.threshold)
         plots.set_log_scale(ax)
-        ax.set_title(f"{label(name)}: {one.verdict}", fontsize=7.5)
+        ax.set_title(f"{format_parameter(name)}: {one.verdict}", fontsize=7.5)
     plots.add_legend(drawing, axes[0])
     return plots.make_figure(drawing, "profiles", profiles=profiles, checks=content.checks)
 
@@ -146,7 +145,7 @@ def _name_axis(axis: Axis, name: str, numbered: bool) -> None:
     if not numbered:
         axis.set_tick_params(labelbottom=False, labelleft=False)
     if name:
-        axis.set_label_text(label(name), fontsize=7)
+        axis.set_label_text(format_parameter(name), fontsize=7)
 
 
 @plots.styled
@@ -193,13 +192,13 @@ def make_models_section(store: Results, content: ModelsResult) -> Section:
     )
 
 
-@styled
+@plots.styled
 def _draw_model_figure(store: Results, content: ModelsResult) -> Figure | None:
     rows = [row for row in content.records if not row.fitted] or content.records
     found = store.with_curves("models", rows[:_MAX_PANELS])
     if not found:
         return None
-    drawing, axes = make_panels(len(found), min(len(found), 2), 2.8)
+    drawing, axes = plots.make_panels(len(found), min(len(found), 2), 2.8)
     for ax, (row, curves) in zip(axes, found, strict=False):
         what, unit = find_compared_quantity(curves)
         time = curves["time_s"]
@@ -211,5 +210,5 @@ def _draw_model_figure(store: Results, content: ModelsResult) -> Figure | None:
         ax.plot(time, curves[f"{what}_measured_{unit}"], color=INK, lw=1.0, label="measured")
         ax.set(title=f"site {row.record}", xlabel="time (s)", ylabel=f"{what} ({unit})")
         ax.set_xlim(0.0, float(np.max(time)))
-    add_legend(drawing, axes[0])
-    return make_figure(drawing, "models")
+    plots.add_legend(drawing, axes[0])
+    return plots.make_figure(drawing, "models")
