@@ -27,7 +27,7 @@ from ...arrays import Array
 from ...errors import ImageError, add_location
 from ...folders import list_files
 from ..grid import Volume, check_voxel_count
-from .dicom_headers import SliceHeader, read_headers, silence_readers
+from .dicom_headers import SliceHeader, read_headers, redact_errors
 
 _PLAIN_WORDS = {"dcm", "dicom", "ima", "im", "img", "image", "i", "slice", "mr", "ct", "pt", "ser", "series"}
 _MAX_COUNT = 9999  # of files; a larger number may be that of a person
@@ -312,11 +312,8 @@ def read_pixels(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
     """``[k, j, i]`` rescaled grey values of slices in their order. Raises `ImageError` for pixels that are
     cut short, cannot be decoded or do not match the headers.
     """
-    with silence_readers():
-        try:
-            array = _read_files(slices) if slices[0].frame is None else _read_frames(slices)
-        except Exception:  # its text may hold file names and tag values
-            raise _build_decoding_error({header.syntax for header in slices}) from None
+    with redact_errors(_build_decoding_error({header.syntax for header in slices})):
+        array = _read_files(slices) if slices[0].frame is None else _read_frames(slices)
     if array.shape != (len(slices), slices[0].rows, slices[0].columns):
         raise ImageError("the pixels do not match the headers", remedy="export the series again")
     return array
@@ -362,7 +359,7 @@ def _read_frames(slices: Sequence[SliceHeader]) -> NDArray[np.float32]:
 
 def _build_decoding_error(syntaxes: set[str]) -> ImageError:
     """What is wrong with pixels that no decoder took."""
-    uids = [UID(text) for text in syntaxes]
+    uids = [UID(text, pydicom.config.IGNORE) for text in syntaxes]  # a warning would quote them
     known = [uid for uid in uids if uid.is_valid and not uid.is_private and uid.is_transfer_syntax]
     names = sorted(uid.name for uid in known if uid.is_compressed)
     if names:

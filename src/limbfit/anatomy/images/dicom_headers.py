@@ -23,7 +23,7 @@ from pydicom.dataset import Dataset, FileDataset
 from pydicom.errors import InvalidDicomError
 
 from ...arrays import Array
-from ...errors import ImageError
+from ...errors import ImageError, InputError
 
 _TAGS = [
     "SOPClassUID",
@@ -77,8 +77,11 @@ class SliceHeader:
 
 
 @contextmanager
-def silence_readers() -> Iterator[None]:
-    """Silence pydicom and ITK, whose warnings quote values of tags and names of files."""
+def redact_errors(error: InputError) -> Iterator[None]:
+    """Raise ``error`` in place of whatever pydicom and ITK raise, and silence them; limbfit's errors pass.
+
+    Their errors and warnings quote values of tags and names of files.
+    """
     log = logging.getLogger("pydicom")
     shown, disabled = sitk.ProcessObject.GetGlobalWarningDisplay(), log.disabled
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
@@ -87,6 +90,10 @@ def silence_readers() -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
+    except InputError:
+        raise
+    except Exception:
+        raise error from None
     finally:
         sitk.ProcessObject.SetGlobalWarningDisplay(shown)
         log.disabled = disabled
@@ -97,27 +104,23 @@ def read_headers(path: Path) -> list[SliceHeader] | None:
     Raises `ImageError` for a damaged file; its text does not name it.
     """
     damaged = ImageError("the DICOM file is cut short or damaged", remedy="export the series again")
-    try:
-        with silence_readers():
+    with redact_errors(damaged):
+        try:
             tags = pydicom.dcmread(path, stop_before_pixels=True, specific_tags=list(_TAGS))
-            if "Segmentation" in _find_class_name(tags):  # beside its image, not one of its series
-                return []
-            if "Rows" not in tags or "Columns" not in tags:
-                kind = tags.file_meta.get("MediaStorageSOPClassUID") or tags.get("SOPClassUID")
-                if kind is None or kind.name.endswith(_IMAGE_CLASS):  # one that has them, or cut short before
-                    raise damaged
-                return []
-            return _read_slices(tags, path)
-    except InvalidDicomError:
-        head = path.read_bytes()[: _PREAMBLE + 4] if path.stat().st_size < 10_000 else b"?"
-        is_zero = len(head) < _PREAMBLE + 4 and not any(head)
-        if is_zero or path.suffix.lower() in (".dcm", ".ima"):  # the beginning of one, or all zeros
-            raise damaged from None
-        return None
-    except ImageError:
-        raise
-    except Exception:  # pydicom raises whatever a damaged value makes it raise, with the value in the text
-        raise damaged from None
+        except InvalidDicomError:
+            head = path.read_bytes()[: _PREAMBLE + 4] if path.stat().st_size < 10_000 else b"?"
+            is_zero = len(head) < _PREAMBLE + 4 and not any(head)
+            if is_zero or path.suffix.lower() in (".dcm", ".ima"):  # the beginning of one, or all zeros
+                raise damaged from None
+            return None
+        if "Segmentation" in _find_class_name(tags):  # beside its image, not one of its series
+            return []
+        if "Rows" not in tags or "Columns" not in tags:
+            kind = tags.file_meta.get("MediaStorageSOPClassUID") or tags.get("SOPClassUID")
+            if kind is None or kind.name.endswith(_IMAGE_CLASS):  # one that has them, or cut short before
+                raise damaged
+            return []
+        return _read_slices(tags, path)
 
 
 def _find_class_name(tags: FileDataset) -> str:

@@ -18,7 +18,7 @@ from ...arrays import Array, Indices, Mask
 from ...errors import LabelError
 from ...folders import list_files
 from ..grid import Grid, LabelMap, Volume
-from ..images.dicom_headers import find_functional_group, silence_readers
+from ..images.dicom_headers import find_functional_group, redact_errors
 from .contours import build_labels
 from .labelfiles import flatten, normalise_name
 
@@ -62,13 +62,11 @@ def _is_dicom(path: Path) -> bool:
 
 def _find_storage_class(path: Path) -> str | None:
     """The storage class, if it is one of a label map."""
-    try:
-        with silence_readers():
+    with redact_errors(LabelError("a damaged DICOM file", remedy="export it again")):
+        try:
             kind = str(pydicom.dcmread(path, specific_tags=["SOPClassUID"]).get("SOPClassUID", ""))
-    except (InvalidDicomError, OSError):
-        return None
-    except Exception:  # pydicom's texts quote values of tags
-        raise LabelError("a damaged DICOM file", remedy="export it again") from None
+        except (InvalidDicomError, OSError):
+            return None
     return kind if kind in (*SEGMENTATION, STRUCTURE_SET) else None
 
 
@@ -76,17 +74,10 @@ def read_dicom_seg(path: Path) -> LabelMap:
     """The segments of a DICOM-SEG file by their labels, on the grid of its own frames. Raises `LabelError`
     for a fractional segmentation, frames without a place or out of a stack, or a damaged file.
     """
-    try:
-        with silence_readers():
-            data = pydicom.dcmread(path)
-            grid, masks, labels = _read_masks(data)
+    what = "the DICOM segmentation is damaged or cannot be decoded"
+    with redact_errors(LabelError(what, remedy="export it again")):
+        grid, masks, labels = _read_masks(pydicom.dcmread(path))
         array, names = flatten(masks, [normalise_name(label) for label in labels])
-    except LabelError:
-        raise
-    except Exception:  # pydicom's texts quote values of tags
-        raise LabelError(
-            "the DICOM segmentation is damaged or cannot be decoded", remedy="export it again"
-        ) from None
     return LabelMap(array, *grid.geometry, names)
 
 
@@ -168,11 +159,8 @@ def read_rtstruct(path: Path, like: Volume | None) -> LabelMap:
     """
     if like is None:
         raise LabelError("contours need the image on which they were drawn")
-    try:
-        with silence_readers():
-            contours = _read_contours(pydicom.dcmread(path))
-    except Exception:  # pydicom's texts quote values of tags
-        raise LabelError("the structure set is damaged", remedy="export it again") from None
+    with redact_errors(LabelError("the structure set is damaged", remedy="export it again")):
+        contours = _read_contours(pydicom.dcmread(path))
     return build_labels(contours, like)
 
 
