@@ -201,12 +201,8 @@ def load_store(results: Path) -> Results:
     """
     if not results.is_dir():
         raise InputError("no results there", file=results, remedy="run the study first")
-    run, sites, calibration = (
-        RunResult.find(results),
-        SitesResult.find(results),
-        CalibrationResult.find(results),
-    )
-    traces, mesh = TracesResult.find(results), MeshResult.find(results)
+    run, calibration = RunResult.find(results), CalibrationResult.find(results)
+    sites, traces, mesh = SitesResult.find(results), TracesResult.find(results), MeshResult.find(results)
     experiments = run.experiments if run else {}
     done = [name for name, row in experiments.items() if row.state == "done"]
     outdated = [name for name, row in experiments.items() if row.state == "stale"]

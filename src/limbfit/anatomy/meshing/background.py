@@ -169,10 +169,8 @@ def _find_roots(points: Array, edges: Indices, values: Array, field: Field) -> A
         side = np.where(f * f_low > 0, 1, -1)
         repeated = np.where(side == last, 0.5, 1.0)
         low, high = np.where(side > 0, t, low), np.where(side > 0, high, t)
-        f_low, f_high = (
-            np.where(side > 0, f, f_low * repeated),
-            np.where(side > 0, f_high * repeated, f),
-        )
+        f_low = np.where(side > 0, f, f_low * repeated)
+        f_high = np.where(side > 0, f_high * repeated, f)
         last = side
     return low + (high - low) * f_low / (f_low - f_high)
 
@@ -184,12 +182,11 @@ def _snap_vertices(grid: TetGrid, edges: Indices, t: Array, bit: int) -> tuple[T
     free = (grid.mask[near] & ~grid.mask[far]) == 0
     chosen = np.flatnonzero((t < SNAP_FRACTION) & free)
     chosen = chosen[np.argsort(-t[chosen])]  # the nearest crossing of a vertex is written last
+    near, far, t = near[chosen], far[chosen], t[chosen]
     target = grid.points.copy()
-    target[near[chosen]] = grid.points[near[chosen]] + t[chosen, None] * (
-        grid.points[far[chosen]] - grid.points[near[chosen]]
-    )
+    target[near] = grid.points[near] + t[:, None] * (grid.points[far] - grid.points[near])
     moved = np.zeros(len(grid.points), dtype=bool)
-    moved[near[chosen]] = True
+    moved[near] = True
     moved = _select_sound_moves(grid, target, moved)
     return replace(grid, points=np.where(moved[:, None], target, grid.points)), moved
 
@@ -234,9 +231,8 @@ def _find_first_crossed(tets: Indices, edges: Indices, offset: int) -> Indices:
         return np.zeros(len(tets), dtype=np.int64)
     ends = np.sort(tets[:, TET10_EDGES], axis=2)
     keys = edges[:, 0] * offset + edges[:, 1]
-    key = np.where(
-        ends[..., 1] < offset, ends[..., 0] * offset + ends[..., 1], -1
-    )  # new nodes are on the level
+    # New nodes are on the level.
+    key = np.where(ends[..., 1] < offset, ends[..., 0] * offset + ends[..., 1], -1)
     place = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
     return np.where(keys[place] == key, place, len(edges)).min(axis=1)
 

@@ -87,17 +87,16 @@ def curve_diagonals(mesh: Mesh, target: Array, stack: Columns) -> Array:
     keys = _number_edges(ends, corners)
     order = np.argsort(keys)
     moved = target - mesh.points
-    feet, heads = (
-        moved[
-            corners + order[np.searchsorted(keys, _number_edges(nodes[sides[within]], corners), sorter=order)]
-        ]
-        for nodes in (stack.base, stack.top)
-    )
+
+    def get_moves(nodes: Indices) -> Array:
+        """Moves of the mid-edge nodes between the columns' ends (b,) at the two columns of each edge."""
+        edges = _number_edges(nodes[sides[within]], corners)
+        return moved[corners + order[np.searchsorted(keys, edges, sorter=order)]]
+
     part = share[ends[within]].mean(axis=1)[:, None]
+    feet, heads = get_moves(stack.base), get_moves(stack.top)
     target = target.copy()
-    target[corners + np.flatnonzero(within)] = (
-        mesh.points[corners:][within] + (1 - part) * feet + part * heads
-    )
+    target[corners:][within] = mesh.points[corners:][within] + (1 - part) * feet + part * heads
     return target
 
 

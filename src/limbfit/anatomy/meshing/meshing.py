@@ -260,9 +260,8 @@ def _mesh_base(
         mesh = to_tet10(mesh)
         if settings.curved:
             straight = node_jacobians(mesh).min(axis=1)
-            mesh = curve_mesh(
-                mesh, curve_diagonals(mesh, compute_curved_target(mesh, fields), stack), straight
-            )
+            target = curve_diagonals(mesh, compute_curved_target(mesh, fields), stack)
+            mesh = curve_mesh(mesh, target, straight)
             mesh = balance_bone_faces(mesh, fields, straight)
     _check_usable(mesh, fields)
     measures = measure_mesh(
@@ -315,18 +314,20 @@ def _grade_size(beyond: Array, limit: Array, settings: MeshSettings) -> Array:
 
 def compute_size_limit(fields: LimbFields, grid: TetGrid, settings: MeshSettings) -> Array:
     """Edge length (n,) at which layers, sheets of core over bone and regions keep their shape."""
-    far, points, slack = settings.edge_far_mm, grid.points, fields.floor_range_mm
-    under_layers = np.maximum(background.compute_in_band(fields.layer, points, far, grid.spacing, slack), 0.0)
-    sheet = np.abs(background.compute_in_band(fields.void, points, far, grid.spacing, slack)) + under_layers
+
+    def evaluate(level: background.Field) -> Array:
+        far, slack = settings.edge_far_mm, fields.floor_range_mm
+        return background.compute_in_band(level, grid.points, far, grid.spacing, slack)
+
+    under_layers = np.maximum(evaluate(fields.layer), 0.0)
+    sheet = np.abs(evaluate(fields.void)) + under_layers
     smallest = min(settings.edge_near_mm, settings.bone_clearance_mm)
     over_bone = np.maximum(SHEET_RATIO * settings.flatness * sheet, smallest)
-    depths = fields.layer_depths(points)
+    depths = fields.layer_depths(grid.points)
     thinnest = np.diff(depths, axis=0, prepend=0.0).min(axis=0)
     limit = np.minimum(LAYER_RATIO * settings.flatness * thinnest + under_layers, over_bone)
     for number in range(len(fields.regions)):
-        away = background.compute_in_band(
-            build_region_level(fields, number), points, far, grid.spacing, slack
-        )
+        away = evaluate(build_region_level(fields, number))
         edge = max(REGION_RATIO * measure_thickness(fields, number), settings.edge_near_mm)
         limit = np.minimum(limit, edge + np.maximum(away, 0.0))
     return limit

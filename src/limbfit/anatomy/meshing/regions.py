@@ -155,10 +155,8 @@ def find_interfaces(mesh: Mesh, layers: int) -> list[Indices]:
     """Outward faces (k, 3 or 6) of each region after a mesh's layers to what comes after it, to the core."""
     found = []
     for number in range(layers, len(mesh.region_names) - 1):
-        inner, outer = (
-            boundary_faces(mesh, mesh.regions == number),
-            boundary_faces(mesh, mesh.regions > number),
-        )
+        inner = boundary_faces(mesh, mesh.regions == number)
+        outer = boundary_faces(mesh, mesh.regions > number)
         found.append(inner[find_same_faces(inner[:, :3], outer[:, :3], len(mesh.points))])
     return found
 

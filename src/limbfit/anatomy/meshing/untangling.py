@@ -126,12 +126,10 @@ def thin_inverted_layers(points: Array, mesh: Mesh, stack: Columns, normals: Arr
         chosen = np.isin(stack.base, mesh.cells[bad]) | np.isin(stack.top, mesh.cells[bad])
         if not chosen.any():
             break
-        head = points[stack.top]
         feet, between = stack.base[chosen], chosen[stack.owner]
-        points[feet] = head[chosen] + THINNING_FACTOR * (points[feet] - head[chosen])
-        points[own[between]] = head[stack.owner[between]] + THINNING_FACTOR * (
-            points[own[between]] - head[stack.owner[between]]
-        )
+        nodes = np.concatenate([feet, own[between]])
+        heads = points[np.concatenate([stack.top[chosen], stack.top[stack.owner[between]]])]
+        points[nodes] = heads + THINNING_FACTOR * (points[nodes] - heads)
         inner = movable.copy()
         inner[feet] = False
         points = untangle_cells(points, mesh.cells, normals, inner)

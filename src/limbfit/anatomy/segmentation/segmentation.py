@@ -58,9 +58,8 @@ def segment(
     visible = rescale_above_air(volume) if ct else volume
     axis = find_limb_axis(visible)
     del visible
-    order = [*(n for n in range(3) if n != axis), axis]
-    found = _segment(volume.permute_axes(order), ct, bias_correction, min_bone_volume_mm3, seeds)
-    return found.permute_axes([order.index(n) for n in range(3)])
+    found = _segment(volume.turn_along(axis), ct, bias_correction, min_bone_volume_mm3, seeds)
+    return found.align_axes(volume.direction)
 
 
 def _segment(

@@ -85,10 +85,9 @@ def compute_square_edges(axis: Array, edge: ArrayLike | None = None) -> Array:
 
     Without ``edge``, the first is the cross product of axis and z, or of axis and x where axis is z.
     """
-    along_z = abs(axis[2]) > 0.999
-    first = (
-        np.cross(axis, [1.0, 0, 0] if along_z else [0, 0, 1.0]) if edge is None else np.asarray(edge, float)
-    )
+    if edge is None:
+        edge = np.cross(axis, [1.0, 0, 0] if abs(axis[2]) > 0.999 else [0, 0, 1.0])
+    first = np.asarray(edge, float)
     first = first - (first @ axis) * axis
     if np.linalg.norm(first) < 1e-6:
         raise SiteError(

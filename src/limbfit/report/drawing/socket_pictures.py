@@ -95,9 +95,8 @@ def draw_offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | No
     limit = max(float(np.percentile(np.abs(face.point_data[OFFSET]), 99)) for face in faces.values())
     limits = (-max(limit, 0.1), max(limit, 0.1))
     bar = (limits, "offset from the unloaded limb (mm)")
-    return make_picture_figure(
-        "socket-design-offset", _render_surfaces(store, faces, OFFSET, bar, OFFSET_MAP)
-    )
+    rows = _render_surfaces(store, faces, OFFSET, bar, OFFSET_MAP)
+    return make_picture_figure("socket-design-offset", rows)
 
 
 @silence_display_warning()
