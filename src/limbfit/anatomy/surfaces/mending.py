@@ -292,31 +292,30 @@ def _cap_open_end(surface: Surface, rim: Array, name: str) -> tuple[Surface, Cap
     point = rim.mean(axis=0)
     point = point + (((rim - point) @ normal).min() - INSIDE_MM) * normal
     cut = surface.to_pyvista().clip(normal=normal, origin=point).extract_surface(algorithm="dataset_surface")
-    body = find_bodies(from_pyvista(cut.triangulate().clean(tolerance=JOIN_MM, absolute=True).triangulate()))[
-        0
-    ]
+    joined = cut.triangulate().clean(tolerance=JOIN_MM, absolute=True).triangulate()
+    body = find_bodies(from_pyvista(joined))[0]
     loops = open_loops(body)
-    flat = _triangulate_polygon(body.points[loops[0]][::-1], normal) if len(loops) == 1 else None
-    if flat is None or Surface(body.points, loops[0][::-1][flat]).area > MAX_CAP_RATIO * _compute_area(rim):
+    faces = _triangulate_loop(body.points, loops[0][::-1], normal) if len(loops) == 1 else None
+    if faces is None or Surface(body.points, faces).area > MAX_CAP_RATIO * _compute_area(rim):
         raise SurfaceError(
             f"{name}: its open end at {format_place(rim.mean(axis=0))} cannot be closed by a plane",
             remedy="cut the end off straight, or close it",
         )
-    faces = loops[0][::-1][flat]
     area = Surface(body.points, faces).area
     cap = Cap(body.points[loops[0]], normal)
     return Surface(body.points, np.vstack([body.faces, faces])), cap, area
 
 
-def _triangulate_polygon(polygon: Array, normal: Array) -> Indices | None:
-    """Triangles (n - 2, 3) that fill a flat polygon (n, 3), seen from ``normal``; None where none do."""
+def _triangulate_loop(points: Array, loop: Indices, normal: Array) -> Indices | None:
+    """Faces (n - 2, 3) that fill a flat loop (n,) of points, seen from ``normal``; None where none do."""
+    polygon = points[loop]
     along = np.linalg.svd(normal[None])[2][1]
     flat = polygon @ np.column_stack([along, np.cross(normal, along)])
     faces = manifold3d.triangulate([flat]).astype(np.int64)
     # Of a simple outline the triangles' areas add up to that of the outline.
     if not np.isclose(Surface(polygon, faces).area, np.linalg.norm(_compute_area_vector(polygon)), rtol=1e-6):
         return None
-    return faces
+    return loop[faces]
 
 
 def _smooth_crossings(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
