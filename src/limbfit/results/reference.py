@@ -45,13 +45,13 @@ def build_schema(result: str) -> dict[str, Any]:
 
 def build_results_page() -> str:
     """All results with their keys, as Markdown."""
-    parts, told = [HEAD], set[type[ResultPart]]()
+    parts, described = [HEAD], set[type[ResultPart]]()
     for name, model in MODELS.items():
         parts.append(f"## {name}\n")
         parts.append(f"`{model.FILE.replace('*', '<name>')}`, by `{model.COMMAND}`. {_describe(model)}\n")
         for part in _list_parts(model):
-            if part not in told:
-                told.add(part)
+            if part not in described:
+                described.add(part)
                 parts += [] if part is model else [f"### {part.__name__}\n", f"{_describe(part)}\n"]
                 parts.append(_format_table(part))
     return "\n".join(parts)

@@ -134,7 +134,7 @@ def read_series(folder: str | Path, series_uid: str | None = None) -> Volume:
     ImageError
         For no or several series, slices missing, doubled, tilted or of different geometry.
     """
-    series = _choose(Path(folder), list_series(folder), series_uid)
+    series = _choose_series(Path(folder), list_series(folder), series_uid)
     with add_location(file=folder):
         slices, spacing, direction = stack_slices(series.slices)
         first = slices[0]
@@ -143,24 +143,24 @@ def read_series(folder: str | Path, series_uid: str | None = None) -> Volume:
         return Volume(read_pixels(slices), spacing, first.position, direction, first.modality)
 
 
-def _choose(folder: Path, found: list[Series], uid: str | None) -> Series:
+def _choose_series(folder: Path, series_list: list[Series], uid: str | None) -> Series:
     if uid is not None:
-        chosen = [series for series in found if series.uid == uid]
+        chosen = [series for series in series_list if series.uid == uid]
         if chosen:
             return chosen[0]
-        listing = "; ".join(series.summary for series in found)
+        listing = "; ".join(series.summary for series in series_list)
         raise ImageError(
             "no series of this folder has the UID asked for", file=folder, remedy=f"there are: {listing}"
         )
-    if len(found) > 1:
-        shown = "; ".join(series.summary for series in found[:6])
-        more = f"; and {len(found) - 6} more" if len(found) > 6 else ""
+    if len(series_list) > 1:
+        shown = "; ".join(series.summary for series in series_list[:6])
+        more = f"; and {len(series_list) - 6} more" if len(series_list) > 6 else ""
         raise ImageError(
-            f"{len(found)} series in one folder",
+            f"{len(series_list)} series in one folder",
             file=folder,
             remedy=f"choose one by its UID (image.series in study.toml): {shown}{more}",
         )
-    return found[0]
+    return series_list[0]
 
 
 def _is_one_stack(series: list[Series]) -> bool:
@@ -194,7 +194,7 @@ def stack_slices(slices: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Arra
     normal = np.cross(rows, columns)
     heights = np.array([header.position @ normal for header in slices])  # type: ignore[operator]
     ordered = [slices[n] for n in np.argsort(heights, kind="stable")]
-    spacing = _slice_spacing(ordered, normal)
+    spacing = _find_slice_spacing(ordered, normal)
     assert first.pixel_spacing is not None
     return (
         ordered,
@@ -271,7 +271,7 @@ def _compute_axes(header: SliceHeader) -> tuple[Array, Array]:
     return rows, columns / np.linalg.norm(columns)
 
 
-def _slice_spacing(slices: list[SliceHeader], normal: Array) -> float:
+def _find_slice_spacing(slices: list[SliceHeader], normal: Array) -> float:
     """The uniform distance between slices sorted along the normal."""
     places = np.array([header.position for header in slices])
     gaps = np.diff(places @ normal)

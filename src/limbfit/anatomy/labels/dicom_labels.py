@@ -124,7 +124,7 @@ def _stack_frames(groups: list[tuple[Dataset, Dataset]], shape: tuple[int, ...])
     heights = positions @ normal
     first = positions[np.argmin(heights)]
     sideways = positions - first - np.outer(heights - heights.min(), normal)
-    spacing = _slice_spacing(heights, tuple(float(s) for s in stated if s))
+    spacing = _find_slice_spacing(heights, tuple(float(s) for s in stated if s))
     if np.abs(sideways).max() > _TILT_MM or spacing is None:
         raise LabelError("frames that are no stack of slices", remedy="export it with the image as reference")
     index = np.rint((heights - heights.min()) / spacing).astype(np.int64)
@@ -138,11 +138,11 @@ def _stack_frames(groups: list[tuple[Dataset, Dataset]], shape: tuple[int, ...])
     return grid, index
 
 
-def _slice_spacing(heights: Array, stated: tuple[float, ...]) -> float | None:
+def _find_slice_spacing(heights: Array, header_mm: tuple[float, ...]) -> float | None:
     """A step of which all distances between frames are multiples: the header's, or the smallest gap."""
     above = heights - heights.min()
     gaps = np.diff(np.unique(above))
-    for step in (*stated, *gaps[gaps > 1e-3 * max(stated, default=1.0)][:1]):
+    for step in (*header_mm, *gaps[gaps > 1e-3 * max(header_mm, default=1.0)][:1]):
         off = np.abs(above / step - np.rint(above / step)).max()
         if step > 0 and off <= _ON_SLICE:
             return float(step)

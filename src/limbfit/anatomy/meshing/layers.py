@@ -171,9 +171,9 @@ def build_limb_fields(
     frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     skin = Surface(frame.to_limb(anatomy.skin.points), anatomy.skin.faces)
     bones, regions = (_prolong_bodies(bodies, frame) for bodies in (anatomy.bones, anatomy.regions))
-    long = prolong_surface(skin)
-    depths = _compute_layer_depths(layers, skin, long, fat_depth_mm)
-    fields = LimbFields(frame, long, bones, depths, bone_clearance_mm, regions=regions)
+    prolonged = prolong_surface(skin)
+    depths = _compute_layer_depths(layers, skin, prolonged, fat_depth_mm)
+    fields = LimbFields(frame, prolonged, bones, depths, bone_clearance_mm, regions=regions)
     return _thin_layers(fields) if policy == "thin-skin" else fields
 
 
@@ -187,14 +187,14 @@ def _prolong_bodies(bodies: Mapping[str, Surface], frame: Frame) -> dict[str, Su
 
 
 def _compute_layer_depths(
-    layers: tuple[LayerSpec, ...], skin: Surface, long: Surface, fat_depth_mm: Array | None
+    layers: tuple[LayerSpec, ...], skin: Surface, prolonged: Surface, fat_depth_mm: Array | None
 ) -> Array:
     """Depths (layers, n) of the layers' inner faces at the vertices of the prolonged skin, or (layers, 1)."""
     fat = np.zeros(1)
     if any(layer.thickness_mm is None for layer in layers):
         if fat_depth_mm is None:
             raise SurfaceError("a layer follows the fat, but fat_depth_mm is not given")
-        inside = np.minimum(long.points, [np.inf, np.inf, -SEAM_MM])
+        inside = np.minimum(prolonged.points, [np.inf, np.inf, -SEAM_MM])
         fat = transfer_values(skin, fat_depth_mm[None], inside)[0]
     depth, depths = np.zeros_like(fat), []
     for layer in layers:

@@ -135,10 +135,10 @@ def measure_tissue_under(anatomy: Anatomy, position: ArrayLike, axis: ArrayLike,
     u, v = np.meshgrid(width * _TICKS, width * _TICKS)
     # From outside: at its edges the footprint may lie off a curved skin.
     starts = centre + u.reshape(-1, 1) * along + v.reshape(-1, 1) * across - width * direction
-    ways = np.broadcast_to(direction, starts.shape)
+    directions = np.broadcast_to(direction, starts.shape)
 
     def find_first_hits(surface: Surface) -> Array:
-        return np.array([met.min(initial=np.inf) for met in surface.find_ray_hits(starts, ways)])
+        return np.array([met.min(initial=np.inf) for met in surface.find_ray_hits(starts, directions)])
 
     skin = find_first_hits(anatomy.skin)
     least = MAX_DEPTH_MM

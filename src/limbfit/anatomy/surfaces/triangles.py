@@ -88,7 +88,7 @@ class Surface:
         """Distance (k,) of points (k, 3) to a closed outward surface, mm, negative inside."""
         return self.find_signed(points)[0]
 
-    def find_ray_hits(self, starts: Array, ways: Array) -> list[Array]:
+    def find_ray_hits(self, starts: Array, directions: Array) -> list[Array]:
         """Distances, ascending, at which rays from points (n, 3) along unit vectors (n, 3) meet it, mm."""
         locator = vtkStaticCellLocator()
         locator.SetDataSet(self.to_pyvista())
@@ -97,9 +97,9 @@ class Surface:
         hits, cells = vtkPoints(), vtkIdList()
         hits.SetDataTypeToDouble()
         found = []
-        for start, way in zip(starts, ways):
-            locator.IntersectWithLine(start, start + far * way, 1e-6, hits, cells)
-            met = [(np.array(hits.GetPoint(i)) - start) @ way for i in range(hits.GetNumberOfPoints())]
+        for start, direction in zip(starts, directions):
+            locator.IntersectWithLine(start, start + far * direction, 1e-6, hits, cells)
+            met = [(np.array(hits.GetPoint(i)) - start) @ direction for i in range(hits.GetNumberOfPoints())]
             found.append(np.sort(np.array(met)))
         return found
 

@@ -367,12 +367,12 @@ def draw_mesh_figure(store: Results, sites: Sequence[str]) -> Figure | None:
     return make_picture_figure("mesh-cut", make_mesh_rows(found), keys, names=names, regions=list(colours))
 
 
-def make_mesh_rows(found: Sequence[tuple[PlacedSite, Grid, Shot, Shot]]) -> list[PictureRow]:
+def make_mesh_rows(cut_meshes: Sequence[tuple[PlacedSite, Grid, Shot, Shot]]) -> list[PictureRow]:
     """Whole meshes that :func:`render_cut_meshes` gave, and below them what is near the indenter."""
-    titles = [f"site {row.site}" for row, *_ in found]
+    titles = [f"site {row.site}" for row, *_ in cut_meshes]
     return [
-        PictureRow([whole for _, _, whole, _ in found], titles),
-        PictureRow([near for *_, near in found], [f"{title}, near the indenter" for title in titles]),
+        PictureRow([whole for _, _, whole, _ in cut_meshes], titles),
+        PictureRow([near for *_, near in cut_meshes], [f"{title}, near the indenter" for title in titles]),
     ]
 
 

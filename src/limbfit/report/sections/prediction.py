@@ -53,19 +53,20 @@ def make_prediction_section(store: Results) -> Section:
 def make_domain_section(store: Results) -> Section:
     """What predictions and the socket do to the tissue that no fitted record did."""
     predicted = [(one.record, one.outside_records) for one in store.predicted]
+    sentences = list(store.predict.outside_text) if store.predict else []
     socket = store.socket
     if socket is not None:
-        states = [("donning", socket.donning), *((load.name, load) for load in socket.loads)]
-        predicted += [(f"socket, {name}", one.outside_records or ()) for name, one in states]
+        states = socket.states.items()
+        predicted += [(f"socket, {name}", state.outside_records or ()) for name, state in states]
+        sentences += socket.outside_text
     rows = [(record, row) for record, outside in predicted for row in outside]
-    told = (*(store.predict.outside_text if store.predict else ()), *(socket.outside_text if socket else ()))
     return make_section(
         "domain",
         "Where the answer ends",
         make_prose("domain"),
-        map(Note, told),
+        map(Note, sentences),
         figures.draw_domain_figure(store),
-        make_table("outside-records", rows) if rows else Note(write_words("within")),
+        make_table("outside-records", rows) or Note(write_words("within")),
     )
 
 

@@ -81,29 +81,29 @@ def _make_load_table(name: str, rows: Mapping[str, Sequence[Any]], **facts: Any)
     return table and replace(table, rows=tuple(body))
 
 
-def make_interval_table(held: SocketState, title: str) -> Table | None:
+def make_interval_table(state: SocketState, title: str) -> Table | None:
     """How much of each interval goes with every identified parameter; what liner and friction change."""
-    first = held.regions[0]
+    first = state.regions[0]
     if first.interval_from is None:
         return None
     rows = [
         (one.region, "kPa", one.mean_kPa, one.interval_kPa, one.interval_from, one.change_kPa)
-        for one in held.regions
+        for one in state.regions
     ]
-    if isinstance(held, SocketLoad):
-        interval, causes = held.settling_interval_mm, held.settling_interval_from
-        rows.append(("settling", "mm", held.settling_mm, interval, causes, held.settling_change_mm))
+    if isinstance(state, SocketLoad):
+        interval, causes = state.settling_interval_mm, state.settling_interval_from
+        rows.append(("settling", "mm", state.settling_mm, interval, causes, state.settling_change_mm))
     known = {name: head for name, head in KNOWN.items() if name in (first.change_kPa or {})}
     return make_table("socket-intervals", rows, names=sorted(first.interval_from), known=known, title=title)
 
 
 def make_published_table(
-    published: Sequence[PublishedFindings], held: SocketState, title: str
+    published: Sequence[PublishedFindings], state: SocketState, title: str
 ) -> Table | None:
     """What others found over the regions of this result, beside its pressures when a part has been held."""
-    here: dict[str, LoadedRegion] = {row.region: row for row in held.regions}
+    here: dict[str, LoadedRegion] = {row.region: row for row in state.regions}
     rows = [
-        (name, here.get(name, held), one)
+        (name, here.get(name, state), one)
         for name in dict.fromkeys(name for one in published for name in one.regions)
         for one in published
         if name in one.regions

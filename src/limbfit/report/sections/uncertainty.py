@@ -66,10 +66,10 @@ def draw_profile_figure(store: Results, content: UncertaintyResult) -> Figure | 
     return plots.make_figure(drawing, "profiles", profiles=profiles, checks=content.checks)
 
 
-def _draw_profile(ax: Axes, one: LikelihoodProfile) -> None:
+def _draw_profile(ax: Axes, profile: LikelihoodProfile) -> None:
     """A profile, dashed and with open circles where it is extrapolated."""
-    values, rise = np.array(one.values), np.array(one.rise)
-    beyond = np.array(one.extrapolated, dtype=bool)
+    values, rise = np.array(profile.values), np.array(profile.rise)
+    beyond = np.array(profile.extrapolated, dtype=bool)
     # The neighbours too, so that the two lines meet.
     dashed = np.where(beyond | np.r_[beyond[1:], False] | np.r_[False, beyond[:-1]], rise, np.nan)
     ax.plot(values, np.where(beyond, np.nan, rise), color=SIMULATED, marker="o", ms=2.5, label="profile")
