@@ -104,9 +104,9 @@ def _collect_iterates(
         stamp = folder.store.stamp("calibrate")
         finished = stamp.finished if stamp else ""
         for log in reversed(folder.logs[-LOGS_SEARCHED:]):
-            fits = [row for row in _read_events(log) if row["event"] == "fit"]
-            fits = [row for row in fits if row.get("stage") == "calibrate" and row["time"] > finished]
-            facts = [row["facts"] for row in fits if row.get("facts")]
+            fits = [row for row in _read_events(log) if row["event"] == "fit" and row.get("facts")]
+            fits = [row for row in fits if row.get("stage") == "calibrate"]
+            facts = [row["facts"] for row in fits if row["time"] > finished]
             if facts:
                 return {"of": "log", "rows": facts}
     if calibration is None:

@@ -208,10 +208,8 @@ def get_face(folder: Folder) -> Response:
     none.
     """
     study = folder.load()
-    face, anatomy = (
-        _build_face(folder, _compute_shape_fingerprint(folder, study)),
-        read_anatomy(folder, study),
-    )
+    face = _build_face(folder, _compute_shape_fingerprint(folder, study))
+    anatomy = read_anatomy(folder, study)
     if not isinstance(face, Socket) or anatomy is None:
         raise InputError(face if isinstance(face, str) else NO_LIMB_YET)
     arrays = {
