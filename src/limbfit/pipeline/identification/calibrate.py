@@ -48,10 +48,8 @@ def run_calibrate(context: Context, folder: Path) -> None:
     with mesh_in_background(coarser, context.executor) as wait:
         starts, rounds = search_from_starts(problem, simulator)
         wait()
-    best = starts.best
-    responses = list(best.responses)
-    correction, spent = correct_answer(problem, simulator, best.parameters, responses, coarser)
-    found, known = sample_intervals(problem, simulator, best, correction, spent)
+    correction = correct_answer(problem, simulator, starts.best, coarser)
+    found, known = sample_intervals(problem, simulator, starts.best, correction)
     corrections = [_summarise_round(one, found.sites, problem) for one in rounds]
     relaxation = None
     if is_ogden(study.law.name) or study.law.name in (FIBRED, FUNG):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ...arrays import Array
 from ...errors import RunError
+from ...identify.fit.calibration import Calibration
 from ...identify.fit.multifidelity import MeshCorrection
 from ...study.meshing import MeshTable
 from ..engine.context import Context
@@ -25,11 +26,15 @@ NO_MESH_ERROR = "intervals do not count the error of the site's own mesh"
 @dataclass(frozen=True)
 class FineMeshCorrection:
     """Responses at an answer, what brings those of a search to the study's own meshes as they were there,
-    and one standard deviation (n,) N of what these lack at every site: none where no other mesh tells."""
+    and one standard deviation (n,) N of what these lack at every site: none where no other mesh tells.
+
+    ``simulations``: how many of meshes made for it alone it took.
+    """
 
     responses: Responses
     as_fine: Callable[[Responses], Responses]
     mesh_N: tuple[Array, ...] = ()
+    simulations: int = 0
 
 
 def correct_to_fine_meshes(
@@ -66,27 +71,25 @@ def plan_coarser_meshes(context: Context, records: RecordSet, folder: Path) -> l
 def correct_answer(
     problem: CalibrationProblem,
     simulator: RecordSimulator,
-    parameters: Array,
-    responses: Responses,
+    answer: Calibration,
     coarser: Sequence[MeshJob],
-) -> tuple[FineMeshCorrection, int]:
-    """The correction at the answer of a search whose ``responses`` are known, and how many simulations of
-    the planned ``coarser`` meshes it took."""
-    records = simulator.records
+) -> FineMeshCorrection:
+    """The correction at the answer of a search; the planned ``coarser`` meshes tell the mesh error."""
+    records, parameters, responses = simulator.records, answer.parameters, list(answer.responses)
     correction = FineMeshCorrection(responses, list)
     if records.is_coarsened:
         correction = correct_to_fine_meshes(problem, simulator, parameters)
     if not coarser:
-        return correction, 0
+        return correction
     models = [record.model for record in records.own]
     found = mesh_where_possible(coarser, models, simulator.executor, simulator.report, NO_MESH_ERROR)
     pairs = zip(records.own, found, strict=True)
     others = [replace(record, model=model) if model else None for record, model in pairs]
     if not any(others):
-        return correction, 0
+        return correction
     searched = simulator.search(parameters) if records.is_coarsened else responses
     errors = _estimate_mesh_errors(problem, simulator, parameters, searched, others)
-    return replace(correction, mesh_N=errors), records.simulations
+    return replace(correction, mesh_N=errors, simulations=records.simulations)
 
 
 def _estimate_mesh_errors(

@@ -48,12 +48,11 @@ def sample_intervals(
     simulator: RecordSimulator,
     found: Calibration,
     correction: FineMeshCorrection,
-    spent: int,
     moves: bool = True,
 ) -> tuple[Calibration, Uncertainty]:
     """The answer, which ``moves`` to what is most probable where that is wanted, and what is known of it.
 
-    Sampled on what was simulated near it and a little more, less what was ``spent`` on the correction;
+    Sampled on what was simulated near it and a little more, less what the correction took;
     linearised, and the answer stays, where that cannot be for simulations that fail.
     """
     records = simulator.records
@@ -66,7 +65,7 @@ def sample_intervals(
         simulator.report("a further evaluation, for the intervals")
         return correction.as_fine(simulator.search(parameters))
 
-    further = count_further_evaluations(records.simulations, spent)
+    further = count_further_evaluations(records.simulations, correction.simulations)
     about = known, evaluations, simulate, further
     moves = moves and problem.is_moved
     sampled = sample_uncertainty(*about, move_answer=moves)

@@ -120,10 +120,9 @@ def _fit_region(
 
     measured = [record.measured for record in judged]
     found, own, of_whole = fit_region(identify, simulate, measured, problem.unknowns, whole)
-    responses = list(found.responses)
     coarser = plan_coarser_meshes(context, records, folder / "coarser")
-    correction, spent = correct_answer(problem, simulator, found.parameters, responses, coarser)
-    _, known = sample_intervals(problem, simulator, found, correction, spent, moves=False)
+    correction = correct_answer(problem, simulator, found, coarser)
+    _, known = sample_intervals(problem, simulator, found, correction, moves=False)
     return RegionFitted(
         region=name,
         sites=[site.name for site in mine],
