@@ -22,7 +22,7 @@ from ...study import Study
 from ..engine.context import Context
 from ..engine.storage import write_curves, write_result
 from ..records.deviations import estimate_site_deviation, estimate_site_noise
-from ..records.record_checks import check_records
+from ..records.record_checks import check_records, read_record_warnings
 from ..records.records import RecordSet, SiteRecord, load_records, to_response
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
@@ -43,7 +43,7 @@ def run_predict(context: Context, folder: Path) -> None:
     answers = [Answer.of(stage, study) for stage in calibration.stages]
     one, best = answers[0].parameters, answers[-1].parameters
     known = PredictionModel.from_stored(calibration.uncertainty)
-    records = load_records(context, study.recorded)
+    records, limb = load_records(context, study.recorded), LimbGeometry.stored(context.store)
     cache = SimulationCache(
         folder / "runs", also=[context.store[stage] / "runs" for stage in ("calibrate", "predict")]
     )
@@ -53,14 +53,22 @@ def run_predict(context: Context, folder: Path) -> None:
     sites, correction = _simulate_records(context, cache, records, jobs)
     strains = _write_fields(context, folder, sites, len(jobs))
     bands = [_compute_band(study, site, best, known) if site.ours.completed else None for site in sites]
-    tested, loadings = _compare_with_records(context, sites, strains)
+    tested, loadings = _compare_with_records(limb, sites, strains)
     rows = []
     for site, band, loading in zip(sites, bands, loadings, strict=True):
         _write_curves(folder, site, band)
         rows.append(_summarise_site(site, _write_observed(folder, study, site, best, known), loading))
-    ours = [site.ours for site in sites]
+
+    def run_check(jobs: Sequence[SimulationJob]) -> list[SiteResponse]:
+        responses = []
+        for simulation in cache.run(jobs, context.executor):
+            context.tell("predict", 0, 0, f"looking at site {simulation.site} for what is wrong")
+            responses.append(to_response(simulation))
+        return responses
+
+    plain, ours = read_record_warnings(study, context.store, limb), [site.ours for site in sites]
     tie = build_problem(study).space.tie
-    warnings = check_records(context, cache, records.own, ours, best, one, records.searched, correction, tie)
+    warnings = check_records(plain, run_check, records, ours, best, one, correction, tie)
     judged = [(site, band) for site, band in zip(sites, bands, strict=True) if band is not None]
     of_mesh = calibration.uncertainty.residuals.mesh_misfit
     quality = _assess_fits(study, judged, best, known, of_mesh)
@@ -199,12 +207,9 @@ def _write_fields(
 
 
 def _compare_with_records(
-    context: Context,
-    sites: Sequence[SitePrediction],
-    strains: Mapping[str, Sequence[Extent]],
+    limb: LimbGeometry, sites: Sequence[SitePrediction], strains: Mapping[str, Sequence[Extent]]
 ) -> tuple[RecordedRange, list[Loading]]:
     """What the fitted records did to the tissue; what each site does, and what of it none of them did."""
-    limb = LimbGeometry.stored(context.store)
     axis = LimbAxis(limb.anatomy)
 
     def describe(site: SitePrediction, tested: RecordedRange | None = None) -> list[Extent]:

@@ -5,14 +5,14 @@ See `identify.plausibility` and `identify.outliers`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ...anatomy.sites.sites import compute_indenter_axis, measure_tissue_under
-from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
+from ...anatomy.surfaces.surfaces import Anatomy
 from ...arrays import Array
 from ...identify.checks.outliers import find_outliers
 from ...identify.checks.plausibility import RecordFacts, RecordWarning, check_plausibility, explain_warnings
@@ -25,25 +25,24 @@ from ...results.records import RecordFlag, TraceFacts
 from ...study import Record, Study
 from ...traces import SurfaceMotion
 from ..engine.context import Context
+from ..engine.store import Store
 from ..simulation.limb_geometry import LimbGeometry
-from ..simulation.simulations import SimulationCache
-from .records import SiteRecord, to_response
+from .records import RecordSet, SiteRecord
 from .secondary_measurements import ChosenPoints, choose_points
 
 
-def read_record_warnings(context: Context) -> tuple[RecordWarning, ...]:
-    """Flags on all records from the stages ``surfaces``, ``sites`` and ``traces``."""
-    study = context.study
-    traces = context.results.traces.sites
-    rows = {row.site: row for row in context.results.sites.sites}
-    raw = {name: read_curves(context.store["traces"] / f"{name}-raw.csv") for name in traces}
+def read_record_warnings(study: Study, store: Store, limb: LimbGeometry) -> tuple[RecordWarning, ...]:
+    """Flags on all records of the stage ``traces``, on the stored limb."""
+    traces = store.results.traces.sites
+    raw = {name: read_curves(store["traces"] / f"{name}-raw.csv") for name in traces}
     steps = {name: float(np.median(np.diff(curves["time_s"]))) for name, curves in raw.items()}
-    return record_flags(study, traces, steps, rows, load_anatomy(context.store["surfaces"]))
+    return record_flags(study, traces, steps, limb.places, limb.anatomy)
 
 
 def tell_flags(context: Context) -> None:
     """Warn of what is wrong with records before parameters are identified from them."""
-    for flag in read_record_warnings(context):
+    limb = LimbGeometry.stored(context.store)
+    for flag in read_record_warnings(context.study, context.store, limb):
         context.tell("calibrate", 0, 0, f"warning: {flag.text}")
 
 
@@ -128,13 +127,12 @@ def choose_surface_points(
 
 
 def check_records(
-    context: Context,
-    cache: SimulationCache,
-    records: Sequence[SiteRecord],
+    plain: Sequence[RecordWarning],
+    run: Callable[[Sequence[SimulationJob]], list[SiteResponse]],
+    given: RecordSet,
     ours: Sequence[SiteResponse],
     best: Array,
     one: Array,
-    searched: Sequence[SiteRecord],
     correction: MeshCorrection | None,
     tie: Array,
 ) -> dict[str, Any]:
@@ -144,29 +142,30 @@ def check_records(
 
     Parameters
     ----------
-    ours : the records' sites with the identified parameters ``best``, with derivatives; those that failed
+    plain : warnings of `read_record_warnings`.
+    run : simulates jobs, in order.
+    ours : the ``given`` records with the identified parameters ``best``, with derivatives; those that failed
         are not looked at.
     one : the answer with one material.
-    searched : the records on the meshes on which parameters are searched.
-    correction : brings responses there to those of the study's own meshes; None where they are the same.
+    correction : brings responses on the meshes of the search to those of the study's own meshes; None where
+        they are the same.
     tie : (p, k) which parameters the study lets move, and which of them together.
     """
-    plain = read_record_warnings(context)
     whole = [i for i, response in enumerate(ours) if response.completed]
-    records, searched = [records[i] for i in whole], [searched[i] for i in whole]
+    records, searched = [given.own[i] for i in whole], [given.searched[i] for i in whole]
     known, failed = [ours[i] for i in whole], list[str]()
 
     def simulate(parameters: Array) -> list[SiteResponse]:
         if np.array_equal(parameters, best):
             return known
-        found = _run(context, cache, [record.job(parameters, starts=[best]) for record in searched])
+        found = run([record.job(parameters, starts=[best]) for record in searched])
         found = found if correction is None else correction.select(whole)(found)
         failed.extend(f"site {r.site}, one material: {r.reason}" for r in found if not r.completed)
         return found
 
     def simulate_exchange(parameters: Array, i: int, j: int) -> tuple[SiteResponse, SiteResponse]:
         jobs = [_build_driven_job(searched[a], searched[b], parameters) for a, b in ((i, j), (j, i))]
-        one, two = _run(context, cache, jobs)
+        one, two = run(jobs)
         pairs = ((one, two), (two, one))
         failed.extend(f"site {a.site}, record of {b.site}: {a.reason}" for a, b in pairs if not a.completed)
         return one, two
@@ -200,11 +199,3 @@ def _build_driven_job(site: SiteRecord, other: SiteRecord, parameters: Array) ->
         skin_points=(),
     )
     return replace(site, model=model, times_s=other.times_s).job(parameters)
-
-
-def _run(context: Context, cache: SimulationCache, jobs: Sequence[SimulationJob]) -> list[SiteResponse]:
-    found = []
-    for simulation in cache.run(jobs, context.executor):
-        context.tell("predict", 0, 0, f"looking at site {simulation.site} for what is wrong")
-        found.append(to_response(simulation))
-    return found
