@@ -36,7 +36,6 @@ from .variants import (
     Variant,
     check_variants,
     choose_sites,
-    compare_variants,
     measure_tissue_over_bone,
     run_variants,
     simulate_variants,
@@ -259,11 +258,10 @@ def run_refinement(
     """Force at sites on meshes whose edges are ``factors`` times the study's, and what it tends to."""
     parameters, chosen = context.results.calibration.parameters, choose_sites(context, sites)
     variants = _build_variants(context, folder, chosen, _choose_factors(factors), parameters)
-    simulations = simulate_variants(context, folder, stored.RefinementResult, variants)
+    runs = simulate_variants(context, folder, stored.RefinementResult, stored.RefinementRun, variants)
     refined = [
-        stored.RefinedSite(**dict(one.summary), **_find_limit(one, variants, simulations)) for one in chosen
+        stored.RefinedSite(**dict(one.summary), **_find_limit(one.summary.site, runs)) for one in chosen
     ]
-    runs = compare_variants(variants, simulations, stored.RefinementRun)
     store_variants(context, folder, stored.RefinementResult, runs, sites=refined)
 
 
@@ -307,29 +305,26 @@ def _build_variants(
     return variants
 
 
-def _find_limit(
-    one: ChosenSite, variants: Sequence[Variant], simulations: Sequence[Simulation]
-) -> dict[str, Any]:
+def _find_limit(site: str, runs: Sequence[stored.RefinementRun]) -> dict[str, Any]:
     """The largest force that the meshes of a site tend to, and how far the study's mesh is from it.
 
     Nothing where they do not tend to anything yet. With an element whose forces do not change in one
     direction, the limit is the finest mesh's force, at no order.
     """
+    own = next(run for run in runs if run.site == site and run.base)
     done = {
-        float(variant.facts["edge_near_mm"]): float(simulation.force_N.max())
-        for variant, simulation in zip(variants, simulations, strict=True)
-        if variant.chosen is one and simulation.completed
+        run.edge_near_mm: run.peak_force_N
+        for run in runs
+        if run.site == site and run.peak_force_N is not None
     }
-    own = next(v for v in variants if v.chosen is one and v.base)
-    edge = float(own.facts["edge_near_mm"])
-    if len(done) >= 2 and edge in done:
-        found = extrapolate_richardson(list(done), list(done.values()), MESH_ORDERS[own.facts["element"]])
+    if len(done) >= 2 and own.edge_near_mm in done:
+        found = extrapolate_richardson(list(done), list(done.values()), MESH_ORDERS[own.element])
         finest = done[min(done)]
         if abs(found.limit - finest) <= FARTHEST * finest:
             return {
                 "limit_N": found.limit,
                 "order": found.order,
                 "order_measured": found.measured,
-                "error_percent": found.error_percent(done[edge]),
+                "error_percent": found.error_percent(done[own.edge_near_mm]),
             }
     return dict.fromkeys(("limit_N", "order", "order_measured", "error_percent"))

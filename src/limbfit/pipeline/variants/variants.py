@@ -112,9 +112,8 @@ def run_variants(
     **more: Any,
 ) -> None:
     """Simulate variants and store a ``result`` with a ``run`` of each, and ``more`` of its keys."""
-    simulations = simulate_variants(context, folder, result, variants, cache)
     sites = {variant.model.name: variant.chosen.summary for variant in variants}
-    runs = compare_variants(variants, simulations, run)
+    runs = simulate_variants(context, folder, result, run, variants, cache)
     store_variants(context, folder, result, runs, sites=list(sites.values()), **more)
 
 
@@ -122,10 +121,11 @@ def simulate_variants(
     context: Context,
     folder: Path,
     result: type[VariedResult],
+    run: type[Run],
     variants: Sequence[Variant],
     cache: SimulationCache | None = None,
-) -> list[Simulation]:
-    """Simulate them all, in order, and write the curves of each site."""
+) -> list[Run]:
+    """Simulate them all, in order, and write the curves of each site; a row ``run`` of each."""
     cache = open_experiment_cache(context, folder) if cache is None else cache
     done: list[Simulation] = []
     found = cache.run([variant.job() for variant in variants], context.executor)
@@ -134,10 +134,10 @@ def simulate_variants(
         words = f"site {simulation.site}, {variant.label}"
         context.tell(Path(result.FILE).stem, len(done), len(variants), words)
     _write_curves(folder, variants, done)
-    return done
+    return _compare_variants(variants, done, run)
 
 
-def compare_variants(
+def _compare_variants(
     variants: Sequence[Variant], simulations: Sequence[Simulation], run: type[Run]
 ) -> list[Run]:
     """A row of each: what was changed, its largest force, and how it differs from its site's base.
