@@ -115,7 +115,7 @@ def bench_of(name: str, folder: Path, shared: Path) -> Bench:
     context = Context(study, Store(study.results), SerialExecutor(), ignore_progress)
     limb = SocketLimb.of(context, "rectifications")
     plain = build_socket(study, limb.anatomy, limb.outer.skin)
-    return Bench(name, study, limb, limb.mesh(context, "rectifications", folder, plain)[0], plain)
+    return Bench(name, study, limb, limb.mesh(folder, plain, print)[0], plain)
 
 
 def drawn(bench: Bench, seed: int, case: int) -> limbfit.Study:

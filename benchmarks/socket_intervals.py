@@ -58,7 +58,7 @@ class Bench:
         self.off = np.log(to_vector(found["uncertainty"]["most_probable"], study.tissues) / self.centre)
         self.limb = SocketLimb.of(context, "intervals")
         self.socket: Socket = build_socket(study, self.limb.anatomy, self.limb.outer.skin)
-        self.mesh: Mesh = self.limb.mesh(context, "intervals", folder, self.socket)[0]
+        self.mesh: Mesh = self.limb.mesh(folder, self.socket, print)[0]
 
     def run(self, parameters: np.ndarray, *, known: bool = False, friction: float = 1.0) -> dict[str, Any]:
         """Means and settling at parameters; ``known``: with their deviations by derivatives."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -113,7 +114,7 @@ def run_socket_design(
     with place_errors(study, PLACE):
         limb, target = SocketLimb.of(context, NAME), build_target(study)
         plain, face = build_undeformed_socket(study, limb.anatomy, limb.outer.skin, optimise)
-        mesh, facts = limb.mesh(context, NAME, folder, face)
+        mesh, facts = limb.mesh(folder, face, partial(context.tell, NAME, 0, 0))
         kept = ResultFiles(folder / RUNS, also=[context.store[NAME] / RUNS])
         unloaded = SocketRun("", limb, mesh, parameters, face, kept)
         recipe = _compute_pressed_recipe(unloaded, plain, target, tell)

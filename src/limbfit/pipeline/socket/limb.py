@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from ...anatomy.frame import Frame, build_limb_frame
 from ...anatomy.meshing.layers import LayerSpec
@@ -16,6 +15,7 @@ from ...arrays import Array
 from ...indentation import Direction
 from ...mesh import Mesh, read_vtu
 from ...results.limb import MeshMeasures
+from ...results.socket import LinerFacts
 from ...socket import Socket
 from ...socket.landmarks import SkinRegion
 from ...study import Study
@@ -61,11 +61,11 @@ class SocketLimb:
             study, anatomy, outer, depth, build_regions(study, anatomy), find_fibre_directions(context)
         )
 
-    def mesh(self, context: Context, name: str, folder: Path, brim: Socket) -> tuple[Mesh, MeshMeasures]:
+    def mesh(self, folder: Path, brim: Socket, report: Callable[[str], None]) -> tuple[Mesh, MeshMeasures]:
         """The whole limb's mesh and its facts; that of an interrupted run is kept."""
         file = folder / MESH
         if not is_meshed(file):
-            context.tell(name, 0, 0, "a mesh of the whole limb")
+            report("a mesh of the whole limb")
             fine = BELOW_BRIM_MM - float(self.outer.height(brim.points).max())
             settings = self._choose_mesh_settings(mesh_edge_mm(self.study, brim))
             mesh, facts = mesh_limb(self.outer, settings, max(fine, 0.0), self.depth)
@@ -91,7 +91,7 @@ class SocketLimb:
         return build_limb_frame(self.anatomy.cut_point, self.anatomy.cut_normal)
 
     @property
-    def liner(self) -> dict[str, Any]:
+    def liner(self) -> LinerFacts:
         """What is stored of the liner."""
         table = self.study.socket.liner
-        return {"thickness_mm": table.thickness_mm, "material": table.material} | table.parameters
+        return LinerFacts(thickness_mm=table.thickness_mm, material=table.material, **table.parameters)

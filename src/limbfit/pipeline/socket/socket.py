@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,12 +14,13 @@ from ...anatomy.surfaces.surfaces import write_surface
 from ...arrays import Array
 from ...donning import DonningResult
 from ...donning.model import OUTER
+from ...execution import Executor
 from ...identify.checks.domain import Extent, RecordedRange, describe_outside
 from ...identify.fit.prediction import RelaxationSpread
 from ...indentation import Parameters
 from ...mesh import write_vtu
 from ...results.identification import RecordedExtents, RelaxationBeyond
-from ...results.socket import SocketResult
+from ...results.socket import SocketResult, SocketSamples, SocketShape
 from ...socket.landmarks import find_bone
 from ...socket.published import select_published_findings
 from ...study import Study
@@ -75,56 +76,68 @@ def run_socket(
     study, limb = context.study, SocketLimb.of(context, NAME)
     socket = build_loadable_socket(study, limb.anatomy, limb.outer.skin)
     write_surface(folder / "socket.stl", socket.surface)
-    mesh, facts = limb.mesh(context, NAME, folder, socket)
-    covariance = None if covariance_log is None else np.array(covariance_log)
+    mesh, facts = limb.mesh(folder, socket, partial(context.tell, NAME, 0, 0))
     kept = ResultFiles(folder / RUNS, also=[context.store[NAME] / RUNS])
-    run = SocketRun(NAME, limb, mesh, parameters, socket, kept, covariance is not None)
+    run = SocketRun(NAME, limb, mesh, parameters, socket, kept, sensitivities=covariance_log is not None)
     found = solve_run(run, partial(context.tell, NAME))
     known = None
-    if covariance is not None:
-        at, probable = (study.vector(one) for one in (parameters, most_probable or parameters))
-        known = ParameterSpread(covariance, np.log(probable / at))
-        if relaxation is not None:
-            spread = RelaxationSpread.from_stored(RelaxationBeyond.model_validate(relaxation))
-            known = known.relax(spread.own_weight, *spread.interpolate(study.socket.worn_s))
+    if covariance_log is not None:
+        off = np.log(study.vector(most_probable or parameters) / study.vector(parameters))
+        known = _build_spread(np.array(covariance_log), off, relaxation, study.socket.worn_s)
     content = summarise_run(run, found, known)
     compared = _compare_with_records(run, found, recorded_range)
     for held in (content["donning"], *content["loads"]):
         held |= compared[held.get("name", "donning")]
     outside_text, simulated = list[str](), None
-    if covariance is not None:
+    if covariance_log is not None:
         outside = {name_load(name): one["outside_records"] for name, one in compared.items()}
         outside_text = describe_outside(outside) if recorded_range else [NOT_COMPARED]
         if samples:
-            steps = [draw_step(covariance, number) for number in range(samples)]
-            simulated = _simulate_samples(context, run, content, steps)
-    table = study.socket
-    own = {
-        "parameters": parameters,
-        "parameters_from": parameters_from,
-        "socket": {
-            "source": "rectified" if table.file is None else table.file.name,
-            "reduction_percent": table.reduction_percent if table.file is None else None,
-            "areas": [area.name for area in table.areas],
-            "volume_cm3": socket.volume_mm3 / 1000.0,
-            "deepest_mm": socket.offset(limb.outer.skin).max(),
-            "notes": list(socket.notes),
-            "liner": limb.liner,
-        },
-        "mesh": facts,
+            steps = [draw_step(np.array(covariance_log), number) for number in range(samples)]
+            tell = partial(context.tell, NAME)
+            simulated = _simulate_samples(run, content, steps, context.executor, tell)
+    result = SocketResult(
+        **content,
+        parameters=parameters,
+        parameters_from=parameters_from,
+        socket=_describe_shape(run),
+        mesh=facts,
         # All that was found is of transtibial limbs.
-        "published": select_published_findings(run.faces) if find_bone(limb.anatomy, "tibia") else [],
-        "samples": simulated,
-        "worn_s": None if relaxation is None else table.worn_s,
-        "outside_text": outside_text,
-    }
-    result = SocketResult(**content | own)
+        published=select_published_findings(run.faces) if find_bone(limb.anatomy, "tibia") else [],
+        samples=simulated,
+        worn_s=None if relaxation is None else study.socket.worn_s,
+        outside_text=outside_text,
+    )
     write_result(folder / "socket.json", result)
     for i, one in enumerate(found.held.values()):
         fields = {"pressure_kPa": one.pressure, "shear_kPa": one.shear, "displacement_mm": one.displacement}
         write_vtu(mesh, folder / f"held-{i}.vtu", point_data=fields, cell_data=one.strains.fields)
     _write_tables(folder, result)
     kept.drop(run.begun)
+
+
+def _build_spread(
+    covariance: Array, off: Array, relaxation: Mapping[str, Any] | None, worn_s: float
+) -> ParameterSpread:
+    """How well parameters are known, as `ParameterSpread` has it, once the socket has been worn so long."""
+    known = ParameterSpread(covariance, off)
+    if relaxation is None:
+        return known
+    spread = RelaxationSpread.from_stored(RelaxationBeyond.model_validate(relaxation))
+    return known.relax(spread.own_weight, *spread.interpolate(worn_s))
+
+
+def _describe_shape(run: SocketRun) -> SocketShape:
+    table, face = run.limb.study.socket, run.face
+    return SocketShape(
+        source="rectified" if table.file is None else table.file.name,
+        reduction_percent=table.reduction_percent if table.file is None else None,
+        areas=[area.name for area in table.areas],
+        volume_cm3=face.volume_mm3 / 1000.0,
+        deepest_mm=face.offset(run.limb.outer.skin).max(),
+        notes=list(face.notes),
+        liner=run.limb.liner,
+    )
 
 
 def _compare_with_records(
@@ -151,14 +164,18 @@ def _compare_with_records(
 
 
 def _simulate_samples(
-    context: Context, run: SocketRun, content: dict[str, Any], steps: Sequence[Array]
-) -> dict[str, Any]:
+    run: SocketRun,
+    content: dict[str, Any],
+    steps: Sequence[Array],
+    executor: Executor,
+    tell: Callable[[float, float, str], None],
+) -> SocketSamples:
     """Simulate parameters whose logarithms differ by ``steps (k,)``, and widen the intervals by the misses.
 
     More friction is simulated beside them, where there is some, and what it changes stored. Told are how many
     draws came to their end, and why others did not.
     """
-    study, plain = context.study, replace(run, sensitivities=False)
+    study, plain = run.limb.study, replace(run, sensitivities=False)
     at = study.vector(run.parameters)
     jobs = [
         replace(plain, name=f"draw {n}", parameters=study.by_tissue(at * np.exp(step)))
@@ -169,9 +186,7 @@ def _simulate_samples(
         more = {"friction": table.friction * (1.0 + CHANGE_PERCENT / 100.0)}
         rougher = study.model_copy(update={"socket": table.model_copy(update=more)})
         jobs.append(replace(plain, name=FRICTION, limb=replace(run.limb, study=rougher)))
-    reasons = run_sockets(
-        jobs, context.executor, lambda done, words: context.tell(NAME, done, len(jobs), words)
-    )
+    reasons = run_sockets(jobs, executor, lambda done, words: tell(done, len(jobs), words))
     ended = [None if reason else simulate_socket(one)[0] for one, reason in zip(jobs, reasons, strict=True)]
     for other in filter(None, ended[len(steps) :]):
         store_change(content, other, FRICTION)
@@ -184,7 +199,7 @@ def _simulate_samples(
     found = found if len(found) > 1 else []  # one says nothing of a spread
     if found:
         widen_intervals(content, found)
-    return {"simulated": len(found), "failed": [reason for reason in reasons if reason]}
+    return SocketSamples(simulated=len(found), failed=[reason for reason in reasons if reason])
 
 
 def _write_tables(folder: Path, result: SocketResult) -> None:
