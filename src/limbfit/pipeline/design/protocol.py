@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, product
 from pathlib import Path
@@ -150,10 +150,12 @@ def run_protocol(
     donning and each load that they are of.
     """
     study = context.study
-    problem, centre, which = build_problem(study), study.vector(parameters), _select_named(study, determine)
+    problem, centre = build_problem(study), study.vector(parameters)
+    determine = _select_named(study, determine)
     known = problem.unknowns.with_start(centre)
-    space = build_space(known, problem.stages[-1])
-    rows = np.array(list(pressures.values())) if pressures else np.eye(len(known.names))[list(which)]
+    space, names = build_space(known, problem.stages[-1]), known.names
+    of_parameters = np.eye(len(names))[[names.index(name) for name in determine]]
+    rows = np.array(list(pressures.values())) if pressures else of_parameters
     tissues = sample_tissues(known, space, centre, draws, seed)
     noises = RecordNoise.from_sds(NoiseModel(**noise), **seen)
     planned, left_out = _plan_records(context, speeds_mm_s, holds_s, depths_mm, noises)
@@ -175,7 +177,7 @@ def run_protocol(
         plans[UNSEEN] = plan_records(blind, budget, wanted)
         told_by |= dict.fromkeys((UNSEEN, PLAIN), blind)
     told = [
-        _judge_plan(name, chosen, told_by[name], budget, wanted, (known.names, which), pressures)
+        _judge_plan(name, chosen, told_by[name], budget, wanted, names, determine, pressures)
         for name, chosen in plans.items()
     ]
     candidates = [one.to_row(rest_s) for one in found]
@@ -187,12 +189,12 @@ def run_protocol(
         setup_s=setup_s,
         rest_s=rest_s,
         criterion=wanted.criterion,
-        determine=[known.names[i] for i in which],
+        determine=determine,
         draws=tissues.tolist(),
         records=[candidates[i] for i in plans[DESIGNED]],
         pressures=list(pressures),
         protocols=told,
-        verdict=_describe_verdict(told[0], [known.names[i] for i in which]),
+        verdict=_describe_verdict(told[0], determine),
         candidates=candidates,
         left_out=left_out,
         parameters=parameters,
@@ -204,15 +206,15 @@ def run_protocol(
     _write_records(folder / "records.toml", content.records, seen)
 
 
-def _select_named(study: Study, determine: Sequence[str]) -> tuple[int, ...]:
-    """Numbers of the parameters to be determined: all that the study does not fix where none is named."""
+def _select_named(study: Study, determine: Sequence[str]) -> list[str]:
+    """The parameters to be determined, in flat order: all that the study does not fix where none is named."""
     names = [f"{tissue}.{name}" for tissue, name in study.parameters]
     free = [name for name in names if name not in study.fixed]
     for name in determine:
         if name not in free:
             what = "the study fixes" if name in names else "no parameter is named"
             raise InputError(f"{what} {name!r}", place="--determine", remedy=f"use {', '.join(free)}")
-    return tuple(names.index(name) for name in free if not determine or name in determine)
+    return [name for name in free if not determine or name in determine]
 
 
 def _plan_records(
@@ -238,13 +240,7 @@ def _plan_records(
         for name in study.all_indenters:
             planned_site = site.model_copy(update={"indenter": name})
             model = build_site_model(context, planned_site, (0.0, 1.0), (0.0, max(wanted)))
-            model = coarsen_model(context, model)
-            if noises.layers is not None:
-                model = replace(model, layers=find_layers_under(model))
-            if noises.skin is not None:
-                model = replace(model, skin_points=find_nearby_skin_points(model))
-            if noises.waves is not None:
-                model = replace(model, waves=place_waves_under(model, read_vtu(model.mesh)))
+            model = _add_gauges(coarsen_model(context, model), noises)
             thickness = measure_tissue_under(anatomy, model.position, model.axis, model.indenter.width_mm)
             most = DEEPEST_SHARE * thickness
             if most < max(wanted):
@@ -257,6 +253,17 @@ def _plan_records(
                 tool, is_usual = name or "indenter", depth == nearest
                 found.append(PlannedRecord(site.name, tool, depth, speed, hold, planned, is_usual))
     return found, list(dict.fromkeys(left_out))
+
+
+def _add_gauges(model: SiteModel, noises: RecordNoise) -> SiteModel:
+    """The model with all that can be read beside its force."""
+    if noises.layers is not None:
+        model = replace(model, layers=find_layers_under(model))
+    if noises.skin is not None:
+        model = replace(model, skin_points=find_nearby_skin_points(model))
+    if noises.waves is not None:
+        model = replace(model, waves=place_waves_under(model, read_vtu(model.mesh)))
+    return model
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,26 +382,24 @@ def _judge_plan(
     options: Sequence[RecordOption],
     budget: Budget,
     wanted: DesignTarget,
-    parameters: tuple[Sequence[str], Sequence[int]],
+    names: Sequence[str],
+    determine: Collection[str],
     pressures: Iterable[str],
 ) -> ProtocolPlan:
-    """A protocol, and what to expect of it: the middle of the draws and the worst.
-
-    ``parameters``: all of their names, and which are to be determined.
-    """
-    names, which = parameters
+    """A protocol, and what to expect of it: the middle of the draws and the worst, of all parameters."""
     covariances = wanted.compute_covariances(options, chosen, len(options[0].information))
     factors = compute_factors_95(covariances)
-    middle, worst = np.median(factors, axis=0), factors.max(axis=0)
+    middle = dict(zip(names, np.median(factors, axis=0).tolist(), strict=True))
+    worst = dict(zip(names, factors.max(axis=0).tolist(), strict=True))
     of_pressures = np.median(compute_factors_95(wanted.project(covariances)), axis=0)
     return ProtocolPlan(
         design=name,
         records=len(chosen),
         minutes=compute_duration_s(options, chosen, budget) / 60.0,
-        factor_95=dict(zip(names, middle.tolist(), strict=True)),
-        worst_95=dict(zip(names, worst.tolist(), strict=True)),
+        factor_95=middle,
+        worst_95=worst,
         pressures_95=dict(zip(pressures, of_pressures.tolist())),
-        determined=int(np.sum(middle[list(which)] <= DETERMINED)),
+        determined=sum(middle[name] <= DETERMINED for name in determine),
         cost=wanted.compute_cost(covariances),
     )
 
