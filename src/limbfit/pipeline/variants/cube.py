@@ -169,22 +169,9 @@ def compress_cube(
     back = int(np.argmin(np.abs(times - 2 * RAMP_S)))  # at its height again
     for material, facts in _list_tissues(parameters or {}, own, law):
         stress, least, most = compress(material, times, compression_percent)
-        table = material.table()
         stresses[facts["tissue"]] = stress.tolist()
-        row = CubeTissue(
-            **facts,
-            shear_modulus_kPa=material.instantaneous_modulus / (1.0 + table.prony[:, 0].sum()) / KPA,
-            instantaneous_modulus_kPa=material.instantaneous_modulus / KPA,
-            bulk_modulus_kPa=table.kappa / KPA,
-            prony=table.prony.tolist(),
-            terms=[(c / KPA, m) for c, m in table.terms] if table.has_terms else [],
-            peak_kPa=stress.max(),
-            back_kPa=stress[back],
-            end_kPa=stress[-1],
-            J_min=least,
-            J_max=most,
-        )
-        rows.append(row)
+        told = {"peak_kPa": stress.max(), "back_kPa": stress[back], "end_kPa": stress[-1]}
+        rows.append(CubeTissue(**facts, **_list_moduli(material), **told, J_min=least, J_max=most))
     content = CubeResult(
         side_mm=SIDE_MM,
         compression_percent=compression_percent,
@@ -196,12 +183,28 @@ def compress_cube(
         stress_kPa=stresses,
     )
     if output is not None:
-        output.mkdir(parents=True, exist_ok=True)
-        write_result(output / "cube.json", content)
-        curves = {format_column(name, "kPa"): np.array([0.0, *stress]) for name, stress in stresses.items()}
-        write_curves(output / "cube.csv", time_s=np.array([0.0, *times]), **curves)
-        (output / "cube.svg").write_text(report.draw_cube(content), encoding="utf-8")
+        _write_cube(output, content)
     return content.to_plain()
+
+
+def _list_moduli(material: Material) -> dict[str, Any]:
+    """The law of a tissue as it is stored: moduli in kPa, relaxation and Ogden terms."""
+    table = material.table()
+    return {
+        "shear_modulus_kPa": material.instantaneous_modulus / (1.0 + table.prony[:, 0].sum()) / KPA,
+        "instantaneous_modulus_kPa": material.instantaneous_modulus / KPA,
+        "bulk_modulus_kPa": table.kappa / KPA,
+        "prony": table.prony.tolist(),
+        "terms": [(c / KPA, m) for c, m in table.terms] if table.has_terms else [],
+    }
+
+
+def _write_cube(folder: Path, content: CubeResult) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    write_result(folder / "cube.json", content)
+    curves = {format_column(name, "kPa"): np.array([0.0, *kPa]) for name, kPa in content.stress_kPa.items()}
+    write_curves(folder / "cube.csv", time_s=np.array([0.0, *content.time_s]), **curves)
+    (folder / "cube.svg").write_text(report.draw_cube(content), encoding="utf-8")
 
 
 def check_compression(percent: float) -> None:
