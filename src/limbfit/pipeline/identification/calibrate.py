@@ -51,10 +51,6 @@ def run_calibrate(context: Context, folder: Path) -> None:
     correction = correct_answer(problem, simulator, starts.best, coarser)
     found, known = sample_intervals(problem, simulator, starts.best, correction)
     corrections = [_summarise_round(one, found.sites, problem) for one in rounds]
-    relaxation = None
-    if is_ogden(study.law.name) or study.law.name in (FIBRED, FUNG):
-        assessed = assess_relaxation(known, found.responses)
-        relaxation = None if assessed is None else assessed.summarise()
     simulations = simulator.run_answer(found.parameters)
     answers = {one.site: one for one in records.select_forces(simulations)}
     warnings = {site: list(one.warnings) for site, one in answers.items() if one.warnings}
@@ -68,13 +64,13 @@ def run_calibrate(context: Context, folder: Path) -> None:
         ),
         law=stored.StoredLaw(**study.law.record()),
         objective=study.calibration.objective,
-        uncertainty=_summarise_uncertainty(known, problem.study, relaxation),
+        uncertainty=_summarise_uncertainty(known, found.responses, study),
         forward_runs=len(kept),
         forward_runs_with_sensitivities=sum(one.jacobian is not None for one in kept),
         linear_solver=kept[0].facts["linear_solver"] if kept else None,
         element=kept[0].facts["element"] if kept else None,
         corrections=corrections,
-        multistart=_summarise_starts(starts, problem.study) if study.calibration.starts > 1 else None,
+        multistart=_summarise_starts(starts, problem) if study.calibration.starts > 1 else None,
         warnings=warnings,
         contact=summarise_contact(
             answers,
@@ -136,21 +132,25 @@ def _summarise_round(
     )
 
 
-def _summarise_starts(tried: MultistartResult, study: Study) -> stored.SearchStarts:
-    """What came of every start."""
-    names = [f"{tissue}.{name}" for tissue, name in study.parameters]
-    starts = []
+def _summarise_starts(tried: MultistartResult, problem: CalibrationProblem) -> stored.SearchStarts:
+    study, starts = problem.study, []
     for one in tried.starts:
         found = None if one.parameters is None else study.by_tissue(np.array(one.parameters))
         vectors = {"start": study.by_tissue(np.array(one.start)), "parameters": found}
         starts.append(stored.SearchStart(**vars(one) | vectors))
-    return stored.SearchStarts(summary=describe_starts(tried, names), reached=tried.reached, starts=starts)
+    return stored.SearchStarts(
+        summary=describe_starts(tried, problem.unknowns.names), reached=tried.reached, starts=starts
+    )
 
 
 def _summarise_uncertainty(
-    known: Uncertainty, study: Study, relaxation: stored.RelaxationSummary | None
+    known: Uncertainty, responses: Sequence[SiteResponse], study: Study
 ) -> stored.CalibrationUncertainty:
     """What is stored of the uncertainty; intervals by tissue and name, like the parameters."""
+    relaxation = None
+    if is_ogden(study.law.name) or study.law.name in (FIBRED, FUNG):
+        assessed = assess_relaxation(known, responses)
+        relaxation = None if assessed is None else assessed.summarise()
     verdicts = limit_verdicts(known.verdicts, known, relaxation)
     return stored.CalibrationUncertainty(
         method=known.method,

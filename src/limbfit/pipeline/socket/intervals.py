@@ -146,12 +146,11 @@ def spread_to_facts(
     spread: SimulationSpread | None, name: str, unit: str, value: float, slopes: Array | None
 ) -> dict[str, Any]:
     """As it is stored: interval, shares, changes and relaxation, by keys with its name and unit; or none."""
-    keys = tuple(f"{name}{key}" for key in (f"interval_{unit}", "interval_from", f"change_{unit}"))
-    keys += (f"{name}relaxation_{unit}",)
-    found = (
-        (None,) * len(keys) if spread is None or slopes is None else spread.told(value, slopes, _LEAST[unit])
-    )
-    return dict(zip(keys, found, strict=True))
+    parts = (f"interval_{unit}", "interval_from", f"change_{unit}", f"relaxation_{unit}")
+    keys = [f"{name}{part}" for part in parts]
+    if spread is None or slopes is None:
+        return dict.fromkeys(keys)
+    return dict(zip(keys, spread.told(value, slopes, _LEAST[unit]), strict=True))
 
 
 def draw_step(covariance: Array, number: int, seed: int = 0) -> Array:
