@@ -192,7 +192,6 @@ def _choose_designs(
 
 
 def _select_deepest(every: Sequence[Candidate]) -> tuple[int, ...]:
-    """The deepest candidate of each site."""
     best: dict[str, int] = {}
     for i, one in enumerate(every):
         if one.site not in best or one.depth_mm > every[best[one.site]].depth_mm:

@@ -119,9 +119,8 @@ def run_crossvalidate(
         checks += _check_folds(number, checked, solved, emulator, measured, sites)
         points, known = points + optima, known + solved
     last = Emulator(np.array(points), known)
-    summary = FoldEmulator(
-        runs=len(last.points), loo_percent=float(np.median(last.loo_percent)), checks=checks
-    )
+    loo_percent = float(np.median(last.loo_percent))
+    summary = FoldEmulator(runs=len(last.points), loo_percent=loo_percent, checks=checks)
     possible = comb(len(recorded), size)
     content = _build_result(study, problem.unknowns.names, tuple(sites), fits, size, possible, summary)
     write_result(folder / "crossvalidate.json", content)
@@ -215,7 +214,6 @@ def _build_result(
     possible: int,
     emulator: FoldEmulator,
 ) -> CrossvalidateResult:
-    """What ``crossvalidate.json`` holds."""
     regions = {site.name: site.region for site in study.sites}
     by_site = summarise_errors_by_site(found.folds, len(sites))
     return CrossvalidateResult(

@@ -44,9 +44,8 @@ def run_predict(context: Context, folder: Path) -> None:
     one, best = answers[0].parameters, answers[-1].parameters
     known = PredictionModel.from_stored(calibration.uncertainty)
     records, limb = load_records(context, study.recorded), LimbGeometry.stored(context.store)
-    cache = SimulationCache(
-        folder / "runs", also=[context.store[stage] / "runs" for stage in ("calibrate", "predict")]
-    )
+    earlier = [context.store[stage] / "runs" for stage in ("calibrate", "predict")]
+    cache = SimulationCache(folder / "runs", also=earlier)
     jobs = build_answer_jobs(records, answers[-1])
     if len(answers) > 1:
         jobs += _build_one_material_jobs(records, answers[0], best)

@@ -17,9 +17,8 @@ from ..records.records import RecordSet
 from ..simulation.simulations import SimulationCache
 
 Responses = list[SiteResponse]
-Report = Callable[
-    ..., None
-]  # of a line in words, and of `Progress.fit` and `Progress.facts` where it has some
+# Takes a line in words, and `Progress.fit` and `Progress.facts` where it has some.
+Report = Callable[..., None]
 # In logarithms of parameters: another simulation's states save work as first guesses as far as the first, and
 # half of it within the second; one that is farther than that is the next one's start.
 MAX_START_DISTANCE, MAX_SHORT_DISTANCE, MAX_WARM_STARTS = 1.5, 0.35, 8

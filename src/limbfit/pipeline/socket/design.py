@@ -236,7 +236,6 @@ def _solve_designs(designs: Sequence[_Design], executor: Executor, tell: Tell, b
 
 
 def _summarise_design(one: _Design) -> dict[str, Any]:
-    """What is stored of a design."""
     offset = -one.run.face.offset(one.run.limb.outer.skin)
     return {
         "name": one.run.name,

@@ -203,7 +203,6 @@ def _simulate_samples(
 
 
 def _write_tables(folder: Path, result: SocketResult) -> None:
-    """Regions and steps as CSV."""
     columns = ("mean_kPa", "peak_kPa", "shear_kPa", "shear_peak_kPa")
     rows = [
         [

@@ -53,11 +53,15 @@ class Found:
     changes: tuple[Change, ...]
     relaxation: RelaxationSummary | None
 
+    def compute_covariance(self, change: Change) -> Array:
+        """Of the logarithms (p, p), by one source."""
+        variant = change.variant
+        return self.gain.compute_covariance(change.force_N, variant.shared, variant.sites)
+
     @property
     def source_covariance(self) -> Array:
         """Of the logarithms (p, p), by all counted sources."""
-        counted = [change for change in self.changes if change.variant.counted]
-        parts = [self.gain.compute_covariance(c.force_N, c.variant.shared, c.variant.sites) for c in counted]
+        parts = [self.compute_covariance(change) for change in self.changes if change.variant.counted]
         return np.sum([np.zeros_like(self.known.covariance), *parts], axis=0)
 
 
@@ -198,7 +202,7 @@ def _summarise_source(found: Found, change: Change) -> stored.SourceEffect:
     if variant.shared:
         shift = found.gain.compute_shift(change.force_N)
     else:
-        shift = np.sqrt(np.diag(found.gain.compute_covariance(change.force_N, False, variant.sites)))
+        shift = np.sqrt(np.diag(found.compute_covariance(change)))
     return stored.SourceEffect(
         source=variant.source,
         change=variant.change,
@@ -277,7 +281,6 @@ def _describe_verdict(
     combinations: Sequence[stored.ParameterCombination],
     predictions: stored.IntervalSummary,
 ) -> list[str]:
-    """The answer in sentences."""
     words = []
     of_rows = (row.verdict for row in parameters if row.verdict != GIVEN)
     for word in dict.fromkeys((DETERMINED, WEAK, UNDETERMINED, *of_rows)):
@@ -301,12 +304,7 @@ def _describe_verdict(
         words.append(found.evidence.verdict[0].upper() + found.evidence.verdict[1:] + ".")
     counted = [change for change in found.changes if change.variant.counted]
     if counted:
-        largest = max(
-            counted,
-            key=lambda c: float(
-                np.trace(found.gain.compute_covariance(c.force_N, c.variant.shared, c.variant.sites))
-            ),
-        )
+        largest = max(counted, key=lambda change: float(np.trace(found.compute_covariance(change))))
         words.append(
             f"Beyond the records, {largest.variant.source} ({largest.variant.change}) would change the "
             "parameters most."

@@ -209,8 +209,7 @@ def mesh_share(study: Study) -> tuple[str, float]:
     order = MESH_ORDERS[study.mesh.element]
     how = "the difference itself" if order is None else f"extrapolated at order {order:g}"
     if study.mesh.coarse is not None:
-        return f"error of the fine mesh, in every interval already: {how}", estimate_own_mesh_error(
-            study.mesh
-        )
+        what = f"error of the fine mesh, in every interval already: {how}"
+        return what, estimate_own_mesh_error(study.mesh)
     what = f"error of the mesh, from edges {FINER:g} times as long: {how}"
     return what, estimate_coarse_error(order, 1 / FINER)

@@ -71,9 +71,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
         ExplorationSettings(table.runs, max(4, table.runs // 4), checked=table.checked, seed=table.seed),
         report=report,
     )
-    evidence = None
-    if len(problem.stages) > 1:
-        evidence = _compare_groupings(context, problem, explored)
+    evidence = _compare_groupings(context, problem, explored) if len(problem.stages) > 1 else None
     gain = FitSensitivity.linearise(known, correction.responses)
     changes = simulate_sources(context, folder, cache, records, best) if table.sources else []
     relaxation = calibration.uncertainty.relaxation
