@@ -86,6 +86,7 @@ def run_crossvalidate(
     sites: dict[str, tuple[int, ...]] = {}
     for i, one in enumerate(measured):
         sites[one.site_name] = (*sites.get(one.site_name, ()), i)
+    groups = list(sites.values())
     correction = correct_to_fine_meshes(problem, simulator, best)
 
     def simulate(points: Sequence[Array]) -> Runs:
@@ -107,9 +108,7 @@ def run_crossvalidate(
     regions, checks = list_choices_without_regions([site.region for site in recorded]), []
     for number, without in ((1, {}), (2, regions)):
         emulator = Emulator(np.array(points), known)
-        fits = _fit_choices(
-            context, emulator, problem, measured, list(sites.values()), (own, chosen, without)
-        )
+        fits = _fit_choices(context, emulator, problem, measured, groups, (own, chosen, without))
         # The study's own where it leaves a site out, and some from the best to the worst.
         ranked = sorted(fits.folds, key=lambda fold: fold.mean_heldout)
         places = np.linspace(0, len(ranked) - 1, min(_CHECKED - 1, len(ranked))).astype(int)

@@ -57,9 +57,8 @@ class SocketLimb:
         if thickness:
             context.tell(name, 0, 0, f"a liner of {thickness:g} mm around the limb")
             outer, depth = build_liner_surface(anatomy, thickness, depth)
-        return cls(
-            study, anatomy, outer, depth, build_regions(study, anatomy), find_fibre_directions(context)
-        )
+        regions, fibres = build_regions(study, anatomy), find_fibre_directions(context)
+        return cls(study, anatomy, outer, depth, regions, fibres)
 
     def mesh(self, folder: Path, brim: Socket, report: Callable[[str], None]) -> tuple[Mesh, MeshMeasures]:
         """The whole limb's mesh and its facts; that of an interrupted run is kept."""
