@@ -28,7 +28,7 @@ import numpy as np
 
 import limbfit
 from limbfit.execution import SerialExecutor
-from limbfit.identify.uncertainty.uncertainty import NORMAL_95
+from limbfit.identify.fit.prediction import NORMAL_95
 from limbfit.indentation import list_flat_names, to_parameters, to_vector
 from limbfit.mesh import Mesh
 from limbfit.phantom.build import draw_true_parameters

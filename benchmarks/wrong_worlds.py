@@ -35,11 +35,11 @@ from limbfit.identify.checks.fit_quality import assess_fit, refit_residuals
 from limbfit.identify.fit.calibration import CalibrationSettings, calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import Unknowns, build_stage_groupings
-from limbfit.identify.fit.prediction import MAX_FREEDOM, PredictionModel, compute_error_percent
+from limbfit.identify.fit.prediction import MAX_FREEDOM, NORMAL_95, PredictionModel, compute_error_percent
 from limbfit.identify.uncertainty.intervals import EvaluationStore, sample_uncertainty
 from limbfit.identify.uncertainty.noise import compute_depth_slope, estimate_record_noise
 from limbfit.identify.uncertainty.relaxation import GIVES_WAY, assess_relaxation, limit_verdicts
-from limbfit.identify.uncertainty.uncertainty import DETERMINED, NORMAL_95, estimate_uncertainty
+from limbfit.identify.uncertainty.uncertainty import DETERMINED, estimate_uncertainty
 from limbfit.results.identification import RecordFit
 
 Array = NDArray[np.float64]

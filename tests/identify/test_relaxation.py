@@ -13,9 +13,10 @@ from limbfit.fe import History, OgdenQLV, StepControl, solve
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import build_space, group_separately
-from limbfit.identify.fit.prediction import PredictionModel, RelaxationSpread
+from limbfit.identify.fit.prediction import PredictionModel, RelaxationSpread, widen_by_relaxation
 from limbfit.identify.uncertainty.noise import SiteNoise
 from limbfit.identify.uncertainty.relaxation import (
+    FURTHER,
     GIVES_WAY,
     MAX_SLOPE,
     OWN,
@@ -212,6 +213,29 @@ def test_records_of_a_power_law_are_told_and_later_moduli_lie_inside(of_power_la
     assert modulus > 1.2 * true  # what the model alone says of a minute
 
 
+def test_records_of_two_terms_ask_for_a_further_term_and_later_moduli_lie_inside():
+    """Two times that are a factor of 30 apart; up to the records' end the moduli are then well known."""
+    terms = [[(0.5 * gamma, 0.1), (0.5 * gamma, 3.0)] for gamma in TRUTH[[2, 6]]]
+    found = assess(held_sites(), [site.relax(TRUTH, terms) for site in held_sites()])
+    assert found.preferred == FURTHER
+    assert GIVES_WAY not in found.describe()
+    for number, (c, _, gamma, _) in enumerate(TRUTH.reshape(2, 4)):
+        _, (low, high) = found.state_modulus(number, 10.0)
+        assert low < c * (1 + 0.5 * gamma * np.exp(-10.0 / 3.0)) < high < 1.4 * low
+        _, (low, high) = found.state_modulus(number, 60.0)
+        assert low < c < high
+
+
+def test_tissue_that_relaxes_more_loses_contact_earlier_and_does_not_pull():
+    site, other = held_sites(20.0)[0], TRUTH.copy()
+    other[[2, 3, 6, 7]] = 6.0, 30.0, 6.0, 30.0
+    found = Superposition(site.times_s, site.respond(TRUTH), TRUTH, TISSUES)
+    force, exact = (one.respond(*by, other).force_N for one, by in ((found, [RelaxationModel()]), (site, [])))
+    lost = (site.respond(TRUTH).force_N > 0) & (exact == 0)
+    assert lost.sum() > 5
+    assert not force[lost].any()
+
+
 def test_a_hold_of_a_minute_narrows_what_is_open_after_it(of_model):
     sites = held_sites(60.0)
     found, held = of_model, assess(sites, [site.force(TRUTH) for site in sites])
@@ -264,10 +288,19 @@ def test_a_force_falls_by_the_factor_of_its_moduli_and_stays_positive(of_model):
     )
     force, times = np.array([2.0, 5.0]), np.array([10.0, 1e4])
     slopes = force[:, None] * np.tile([0.3, 0.0, 0.0, 0.0, 0.7, 0.0, 0.0, 0.0], (2, 1))
-    low, high, sd = spread.compute_beyond_N(force, slopes, times)
-    assert force + low == pytest.approx(force * np.exp(-3.0))
-    assert not high.any()
-    assert not sd.any()
+    none = np.zeros(2)
+    low, high = spread.widen_band(force, slopes, times, (force, force), none)
+    assert low == pytest.approx(force * np.exp(-3.0))
+    assert np.array_equal(high, force)
+
+
+def test_a_band_of_relaxation_holds_the_draws_and_no_force_below_zero():
+    """A modulus that is known within a factor, with a force in proportion to it."""
+    force, moved, sd = 5.0, -0.8, 0.6
+    ends = widen_by_relaxation(force, (force, force), 0.0, moved * force, sd * force, 0.0)
+    draws = force * np.exp(moved + sd * np.random.default_rng(0).standard_normal(10_000))
+    assert 0.0 < ends[0] < force * np.exp(moved) < ends[1]
+    assert np.mean((draws > ends[0]) & (draws < ends[1])) > 0.94
 
 
 def test_a_limb_that_gives_way_is_named_where_the_records_cannot_tell_it_from_relaxation(of_power_law):

@@ -24,7 +24,7 @@ from limbfit.donning import Load, SocketFit, build_socket_problem, build_socket_
 from limbfit.errors import InputError, RunError
 from limbfit.fe import OgdenQLV
 from limbfit.fe.kernel.laws import Laws
-from limbfit.identify.uncertainty.uncertainty import NORMAL_95
+from limbfit.identify.fit.prediction import NORMAL_95
 from limbfit.indentation import to_parameters
 from limbfit.pipeline.commands.run import run_experiment
 from limbfit.pipeline.socket.shape import build_socket

@@ -126,7 +126,7 @@ def test_intervals_of_predictions_widen_beyond_the_longest_load_as_those_of_a_ru
         curves.append(read_curves(folder / "predictions" / f"{record.name}.csv"))
     (low, wide), later = (one["force_low_N"] for one in curves), times > 0.6 * times[-1]
     np.testing.assert_array_equal(wide[~later], low[~later])
-    np.testing.assert_allclose(wide[later], np.maximum(low[later] - 1.5, 0.0), atol=1e-6)
+    np.testing.assert_allclose(wide[later], 0.5 * low[later], atol=1e-6)
     assert rows[1].half_width_percent > rows[0].half_width_percent + 5.0
 
 

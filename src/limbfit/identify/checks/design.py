@@ -30,8 +30,9 @@ from ...arrays import Array
 from ...errors import CalibrationError
 from ..fit.objective import SiteResponse
 from ..fit.parameters import SearchSpace, Unknowns
+from ..fit.prediction import NORMAL_95
 from ..uncertainty.noise import compute_skin_similarity
-from ..uncertainty.uncertainty import NORMAL_95, PriorPrecision
+from ..uncertainty.uncertainty import PriorPrecision
 
 Criterion = Literal["D", "A"]
 Cost = Callable[[Sequence[int]], float]

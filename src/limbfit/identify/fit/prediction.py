@@ -12,6 +12,7 @@ from ...arrays import Array
 from ...results.identification import CalibrationUncertainty, RecordResiduals, RelaxationBeyond
 from .objective import MeasuredCurve, SiteResponse, find_largest_magnitude
 
+NORMAL_95 = 1.959964  # half of a 95 % interval, in standard deviations of a normal distribution
 MAX_FREEDOM = 1e6  # of Student's distribution: a normal one
 MIN_FREEDOM = 3.0  # of a misfit: it is similar at other sites and in other studies
 
@@ -87,12 +88,30 @@ def compute_force_range(
     return np.minimum(response.force_N, other), np.maximum(response.force_N, other)
 
 
-def limit_fall(value: float, fall: float) -> float:
-    """By how much a force or pressure falls where moduli do, of what is ``fall`` to first order.
+def widen_by_relaxation(
+    value: Array | float,
+    ends: tuple[Array | float, Array | float],
+    half: Array | float,
+    moved: Array | float,
+    sd: Array | float,
+    fall: Array | float,
+) -> tuple[Array, Array]:
+    """Return the ends of the 95 % interval of positive values that relaxation beyond the records changes.
 
-    Moduli fall by factors, and so does the value: to first order it could become negative.
+    Before that it is ``half`` wider than ``ends`` on either side. To first order relaxation moves the values
+    by ``moved``, with a standard deviation ``sd``, and beside that they may be lower by anything up to
+    ``fall`` (higher, where it is negative). Moduli fall by factors, and so do the values, with all that is
+    uncertain of them: to first order they could become negative. All are numbers or (n,).
     """
-    return min(fall, -value * float(np.expm1(-max(fall, 0.0) / max(value, np.finfo(float).tiny))))
+    size = np.maximum(value, np.finfo(float).tiny)
+    low, high = (
+        value + np.maximum(change, 0.0) + value * np.expm1(np.minimum(change, 0.0) / size)
+        for change in (moved - np.maximum(fall, 0.0), moved - np.minimum(fall, 0.0))
+    )
+    less, more = np.minimum(low / size, 1.0), np.minimum(high / size, 1.0)
+    down = np.hypot(less * half, low * np.expm1(-NORMAL_95 * sd / size))
+    up = np.hypot(more * half, NORMAL_95 * sd)
+    return low - less * (value - ends[0]) - down, high + more * (ends[1] - value) + up
 
 
 @dataclass(frozen=True)
@@ -124,21 +143,23 @@ class RelaxationSpread:
         shift, fall = weights @ self.shift_log[i : i + 2], weights @ self.fall_log[i : i + 2]
         return shift, np.tensordot(weights, self.covariance_log[i : i + 2], 1), fall
 
-    def compute_beyond_N(self, force_N: Array, slopes: Array, times_s: Array) -> tuple[Array, Array, Array]:
-        """Return the lowest and the highest shift and the standard deviation (n,) of forces beyond the
-        records' longest load.
+    def widen_band(
+        self, force_N: Array, slopes: Array, times_s: Array, ends: tuple[Array, Array], half: Array
+    ) -> tuple[Array, Array]:
+        """Return the ends of a band that is ``half`` (n,) wider than ``ends`` on either side, and beyond the
+        records' longest load as wide as relaxation asks.
 
-        ``slopes`` (n, p) of ``force_N`` (n,) are by the logarithms of the parameters. All are zero within the
-        records' times.
+        ``slopes`` (n, p) of ``force_N`` (n,) are by the logarithms of the parameters.
         """
-        low, high, sd = np.zeros((3, len(times_s)))
+        low, high = ends[0] - half, ends[1] + half
         for i in np.flatnonzero(times_s > self.longest_s):
             shift_log, covariance, fall_log = self.interpolate(float(times_s[i]))
-            shift = float(slopes[i] @ shift_log)
-            fall = limit_fall(float(force_N[i]), float(slopes[i] @ fall_log))
-            low[i], high[i] = shift - max(fall, 0.0), shift - min(fall, 0.0)
-            sd[i] = np.sqrt(slopes[i] @ covariance @ slopes[i])
-        return low, high, sd
+            moved, fall = float(slopes[i] @ shift_log), float(slopes[i] @ fall_log)
+            sd = float(np.sqrt(slopes[i] @ covariance @ slopes[i]))
+            own = float(ends[0][i]), float(ends[1][i])
+            lower, higher = widen_by_relaxation(float(force_N[i]), own, float(half[i]), moved, sd, fall)
+            low[i], high[i] = min(low[i], lower), max(high[i], higher)
+        return low, high
 
     @classmethod
     def from_stored(cls, stored: RelaxationBeyond) -> RelaxationSpread:
@@ -230,14 +251,10 @@ class PredictionModel:
         misfit_N = misfit * find_largest_magnitude(response.force_N)
         site_N = self.site_factor * np.abs(site_N)
         own_N = np.hypot(np.hypot(known_N, misfit_N), site_N)
-        lower_N, higher_N, relaxation_N = np.zeros((3, len(response.force_N)))
-        if self.relaxation is not None and times_s is not None:
-            slopes = response.jacobian * parameters
-            lower_N, higher_N, relaxation_N = self.relaxation.compute_beyond_N(
-                response.force_N, slopes, times_s
-            )
-        own_N = np.hypot(own_N, relaxation_N)
         sd = compute_prediction_sd(response.jacobian, parameters, self.covariance_log, own_N)
         half = compute_half_width_95(sd**2, misfit_N**2, site_N**2, self.known_scale, self.site_freedom)
-        low, high = compute_force_range(response, parameters, self.most_probable)
-        return low + np.minimum(lower_N, 0.0) - half, high + np.maximum(higher_N, 0.0) + half
+        ends = compute_force_range(response, parameters, self.most_probable)
+        if self.relaxation is None or times_s is None:
+            return ends[0] - half, ends[1] + half
+        slopes = response.jacobian * parameters
+        return self.relaxation.widen_band(response.force_N, slopes, times_s, ends, half)

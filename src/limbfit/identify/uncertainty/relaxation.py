@@ -1,15 +1,16 @@
 """What is known of relaxation beyond the records: fits with other relaxations, without a simulation.
 
 Fitted to the records of force are the model's own terms alone, the same with a modulus that goes on to fall
-as ``(1 + t/T)^-s``, T being the longest load in the records, and a spectrum of fixed times whose amplitudes
-are a power of time (`superposition`). They are weighed by their restricted likelihoods, each with a misfit
-of its own. Up to T these fits say how far the modulus is known. Beyond T it falls as ``(t/T)^-s``: no record
-shows that part. All that is known of s is that it lies between 0 and what tissues have at most
-(`MAX_SLOPE`), so that intervals hold for every such s: they reach from the one end to the other.
+as ``(1 + t/T)^-s``, T being the longest load in the records, a spectrum of fixed times whose amplitudes are a
+power of time (`superposition`), and, where the records ask for it, the model's and a further term with and
+without that fall. They are weighed by their restricted likelihoods, each with a misfit of its own. Up to T
+these fits say how far the modulus is known. Beyond T it falls as ``(t/T)^-s``: no record shows that part. All
+that is known of s is that it lies between 0 and what tissues have at most (`MAX_SLOPE`), so that intervals
+hold for every such s: they reach from the one end to the other.
 
-A force that goes on to fall slowly looks the same if the limb gives way to the indenter. So each fit with a
-tail counts twice, half with its tail as relaxation, half without. Where the records prefer a tail,
-`RelaxationAssessment.describe` says so.
+A force that falls slowly and by little looks the same if the limb gives way to the indenter. So each fit with
+a tail, or with a further term that is slow and small, counts twice, half with that as relaxation, half
+without. Where the records prefer such fits, `RelaxationAssessment.describe` says so.
 """
 
 from __future__ import annotations
@@ -19,16 +20,19 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from scipy.linalg import block_diag, solve_triangular
 from scipy.optimize import nnls
 from scipy.special import expit, logsumexp, softmax
 
 from ...arrays import Array
 from ...results.identification import LongTermModulus, RelaxationBeyond, RelaxationPrior, RelaxationSummary
 from ..fit.objective import SiteResponse
-from ..fit.prediction import RelaxationSpread
+from ..fit.parameters import SearchSpace
+from ..fit.prediction import NORMAL_95, RelaxationSpread
+from ..fit.trust_region import SearchPoint, minimise
 from .discrepancy import ResidualModel, estimate_discrepancy
 from .superposition import RelaxationModel, Superposition, TissueParameters, find_tissue_parameters
-from .uncertainty import DETERMINED, NORMAL_95, WEAK, PriorPrecision, Uncertainty, choose_verdict
+from .uncertainty import DETERMINED, WEAK, PriorPrecision, Uncertainty, choose_verdict
 
 # Slopes of log G over log t. Muscle: 0.25 in vivo (Klatt et al. 2010); six pieces ex vivo (Iaquinta 2023,
 # perineal_indentation): 0.13 to 0.16 before 1 s, 0.18 to 0.22 from 3 to 10 s.
@@ -40,20 +44,24 @@ SOURCE = (
 _TAIL_SLOPES = (0.1, 0.2, 0.3)
 _SPECTRUM_SLOPES = (0.0, 0.1, 0.2, 0.3)
 _SHORTEST, _LONGEST, _SPECTRUM_TIMES = 0.02, 30.0, 12  # of the shortest ramp; of the longest load
-OWN, POWER_LAW, UNDECIDED = "the model's terms", "a power law", "undecided"
+OWN, FURTHER, POWER_LAW, UNDECIDED = "the model's terms", "a further term", "a power law", "undecided"
 NOT_LONG_TERM = "determined at {}; its long-term value not"
 NOT_ALONE = "not determined: another relaxation fits as well"
 GIVES_WAY = (
     "the force falls slowly until the records end: a limb that gives way to the indenter looks the same, and "
     "its tissue is stiffer in the long term; intervals count both, and are narrower where the limb is held"
 )
-_MIN_TAIL_WEIGHT = 0.5  # from which a limb may give way
+_MIN_WEIGHT = 0.5  # of slow fits, from which a limb may give way; of a further term, to be preferred
+_FURTHER_AMPLITUDES = (0.01, 10.0)  # of the modulus: bounds of a further term
+_SLOW = 0.5  # of the shortest ramp: from which a further term is
+_MAX_GIVEN_WAY = 0.3  # of the force: by how much a limb that recedes may seem to relax
+_FURTHER_STARTS = (0.1, 10.0, 100.0)  # of the model's first time: where the fits of a further term begin
 MIN_OWN_WEIGHT = 0.1  # of the answer: no other relaxation is quite that of the tissue
 LONG_TERM_S = 3600.0  # after which a modulus is long-term: a socket worn for an hour
 STATED_S = (1.0, 10.0)  # at which moduli are stated
 _DURATIONS_S = np.geomspace(1.0, 10 * LONG_TERM_S, 19)
 _STRONG_EVIDENCE = 6.0  # of twice the log of the ratio of two evidences (Kass and Raftery 1995)
-_MAX_FIT_STEPS, _FURTHER_FIT_STEPS, _FIT_TOLERANCE, _MAX_STEP_LOG = 12, 3, 1e-3, 1.0
+_MAX_FIT_STEPS, _FURTHER_FIT_STEPS, _FIT_TOLERANCE = 25, 5, 1e-3
 _ALIKE = 0.01  # of the largest force: with which a fit begins
 _DIFFERENCE = 1e-3
 _IN_CONTACT = 0.01  # of the largest force
@@ -74,15 +82,17 @@ class RelaxationAssessment:
     """Which relaxations fit the records at the ``known`` answer, and what they leave open.
 
     ``weights`` (w,) of the fitted relaxations, the model's own terms first. ``evidence`` is twice the
-    logarithm of how much more probable the records are with a power law than with the model's own terms.
-    ``tail_weight`` is the part of the weights that fits with a tail have. ``spread`` is what they leave open
-    of each tissue's modulus at any time.
+    logarithm of how much more probable the records are with other relaxations than with the model's own
+    terms. ``further_weight`` and ``tail_weight`` are the parts of the weights that fits with a further term
+    have, and those in which the limb may give way. ``spread`` is what they leave open of each tissue's
+    modulus at any time.
     """
 
     known: Uncertainty
     tissues: tuple[TissueParameters, ...]
     weights: Array
     evidence: float
+    further_weight: float
     tail_weight: float
     spread: RelaxationSpread
 
@@ -91,7 +101,9 @@ class RelaxationAssessment:
         """Which relaxation the records prefer, if they tell."""
         if abs(self.evidence) < _STRONG_EVIDENCE:
             return UNDECIDED
-        return POWER_LAW if self.evidence > 0 else OWN
+        if self.evidence < 0:
+            return OWN
+        return FURTHER if self.further_weight > _MIN_WEIGHT else POWER_LAW
 
     def state_modulus(self, number: int, duration_s: float) -> tuple[float, Array]:
         """Return the model's modulus so long after a step, and the 95 % interval (2,) that holds it; kPa."""
@@ -111,11 +123,12 @@ class RelaxationAssessment:
         longest = f"the records, whose longest load lasts {self.spread.longest_s:.0f} s,"
         preferred = {
             OWN: f"{longest} prefer the relaxation of the model to a power law of time",
+            FURTHER: f"{longest} prefer a further relaxation time to the model's alone",
             POWER_LAW: f"{longest} prefer relaxation as a power of time to that of the model",
             UNDECIDED: f"{longest} cannot tell the relaxation of the model from a power law of time",
         }
         found = [f"{preferred[self.preferred]} (2 ln B = {abs(self.evidence):.0f})"]
-        if self.preferred == POWER_LAW and self.tail_weight > _MIN_TAIL_WEIGHT:
+        if self.preferred in (FURTHER, POWER_LAW) and self.tail_weight > _MIN_WEIGHT:
             found.append(GIVES_WAY)
         for number, tissue in enumerate(self.tissues):
             modulus, (low, high) = self.state_modulus(number, LONG_TERM_S)
@@ -182,10 +195,11 @@ def assess_relaxation(known: Uncertainty, responses: Sequence[SiteResponse]) -> 
         return None
     records = _ForceRecords(known, [responses[i] for i in chosen], chosen, tissues)
     longest = records.longest_s
-    times = np.geomspace(_SHORTEST * records.shortest_ramp_s, _LONGEST * longest, _SPECTRUM_TIMES)
+    times = np.geomspace(*records.span_s, _SPECTRUM_TIMES)
     relaxations = [RelaxationModel(), *(RelaxationModel(slope, longest) for slope in _TAIL_SLOPES)]
     relaxations += [RelaxationModel(slope, longest, times) for slope in _SPECTRUM_SLOPES]
-    fits = [records.fit(relaxation) for relaxation in relaxations]
+    fits = [records.fit(relaxation, records.choose_start(relaxation)) for relaxation in relaxations]
+    fits += records.fit_further_terms(min(fit.criterion for fit in fits))
     weights, evidence = _weigh(fits)
     # The model's own terms keep the answer, whose covariance is counted with it.
     fits[0] = replace(fits[0], z=records.answer, covariance=0 * fits[0].covariance)
@@ -196,13 +210,14 @@ def assess_relaxation(known: Uncertainty, responses: Sequence[SiteResponse]) -> 
     spread = RelaxationSpread(
         longest, float(weights[0]), durations, np.array(shifts), np.array(covariances), falls
     )
-    tails = float(weights[[fit.relaxation.has_tail for fit in fits]].sum())
-    return RelaxationAssessment(known, tissues, weights, evidence, tails, spread)
+    tails = float(weights[[len(records.list_readings(fit)) > 1 for fit in fits]].sum())
+    furthers = float(weights[[fit.relaxation.has_further for fit in fits]].sum())
+    return RelaxationAssessment(known, tissues, weights, evidence, furthers, tails, spread)
 
 
 def _weigh(fits: Sequence[_Fit]) -> tuple[Array, float]:
-    """Return the weights (w,) of the relaxations, the model's own terms first, and the evidence for a power
-    law."""
+    """Return the weights (w,) of the relaxations, the model's own terms first, and the evidence for the
+    others."""
     half = -0.5 * np.array([fit.criterion for fit in fits])
     evidence = float(2 * (logsumexp(half[1:]) - np.log(len(half) - 1) - half[0]))
     own = max(float(expit(-evidence / 2)), MIN_OWN_WEIGHT)
@@ -210,7 +225,11 @@ def _weigh(fits: Sequence[_Fit]) -> tuple[Array, float]:
 
 
 class _ForceRecords:
-    """The records of force, and how well their residuals are known."""
+    """The records of force, and how well their residuals are known.
+
+    Every fit is over the model's unknowns and, for each tissue that relaxes freely, amplitude and time of a
+    further term (k,). Only fits with that term use them; what is known of them beforehand counts in all.
+    """
 
     def __init__(
         self,
@@ -220,19 +239,73 @@ class _ForceRecords:
         tissues: tuple[TissueParameters, ...],
     ) -> None:
         """Take the records of the numbers ``chosen``, whose ``responses`` are those at the answer."""
-        self.parameters, self.space, self.tissues = known.parameters, known.space, tissues
-        self.answer = known.space.reduce(np.log(known.parameters))
-        self.prior = PriorPrecision.from_unknowns(known.unknowns, known.space)
+        self.count = len(known.parameters)
         self.model = known.residual_model.select(chosen)
         self.measured = [known.measured[i] for i in chosen]
         pairs = [(one.times_s, r) for one, r in zip(self.model.noise, responses, strict=True)]
-        self.superpositions = [Superposition(times, r, known.parameters, tissues) for times, r in pairs]
         self.shortest_ramp_s = min(float(times[int(np.argmax(r.force_N))] - times[0]) for times, r in pairs)
         self.longest_s = max(_find_longest_load(times, r.force_N) for times, r in pairs)
+        self.span_s = _SHORTEST * self.shortest_ramp_s, _LONGEST * self.longest_s
+        self._add_further_terms(known, tissues)
+        self.superpositions = [Superposition(times, r, known.parameters, self.tissues) for times, r in pairs]
 
-    def fit(self, relaxation: RelaxationModel) -> _Fit:
+    def _add_further_terms(self, known: Uncertainty, tissues: Sequence[TissueParameters]) -> None:
+        free = [tissue.name for tissue in tissues if not tissue.is_given]
+        further = {name: (self.count + 2 * i, self.count + 2 * i + 1) for i, name in enumerate(free)}
+        self.tissues = tuple(replace(one, further=further.get(one.name, ())) for one in tissues)
+        bounds = np.tile(np.log([_FURTHER_AMPLITUDES, self.span_s]), (len(free), 1))
+        middle, space = bounds.mean(axis=1), known.space
+        self.parameters = np.r_[known.parameters, np.exp(middle)]
+        self.space = SearchSpace(
+            np.r_[space.fixed_log, 0.0 * middle],
+            block_diag(space.tie, np.eye(len(bounds))),
+            np.r_[space.lower, bounds[:, 0]],
+            np.r_[space.upper, bounds[:, 1]],
+            np.r_[space.fixed_values, np.exp(middle)],
+        )
+        self.answer = self.space.reduce(np.log(self.parameters))
+        stated = PriorPrecision.from_unknowns(known.unknowns, space)
+        rows = np.pad(stated.rows, ((0, 0), (0, len(bounds))))
+        self.prior = PriorPrecision(self.space.bounds_sd, rows, stated.target)
+
+    def choose_start(self, relaxation: RelaxationModel) -> Array:
+        """Where the fit of a relaxation (k,) without further terms begins."""
+        return self.answer if relaxation.spectrum_s is None else self._guess_start(relaxation)
+
+    def fit_further_terms(self, least: float) -> list[_Fit]:
+        """Fits with a further term, with and without a tail, of which the records ask for it.
+
+        ``least`` is the criterion of the fits without. A term that the records do not ask for is another
+        relaxation once more.
+        """
+        terms = RelaxationModel(longest_s=self.longest_s, has_further=True)
+        starts = [self._move_further_times(factor) for factor in _FURTHER_STARTS]
+        best = min((self.fit(terms, start) for start in starts), key=lambda fit: fit.criterion)
+        fits = [best, *(self.fit(replace(terms, slope=slope), best.z) for slope in _TAIL_SLOPES)]
+        return [fit for fit in fits if fit.criterion < least - _STRONG_EVIDENCE]
+
+    def _move_further_times(self, factor: float) -> Array:
+        """The answer (k,) with further times that are a factor times the model's first."""
+        p = self.parameters.copy()
+        for tissue in self.tissues:
+            if tissue.further:
+                p[tissue.further[1]] = factor * p[tissue.times[0]]
+        return self.space.reduce(np.log(p))
+
+    def list_readings(self, fit: _Fit) -> list[RelaxationModel]:
+        """The relaxation of a fit and, if it may be that of a limb that gives way, what is left without."""
+        own, held_s, p = fit.relaxation, _SLOW * self.shortest_ramp_s, self.space.expand(fit.z)
+        if own.spectrum_s is not None:
+            return [own]
+        held = RelaxationModel(has_further=own.has_further, held_s=held_s)
+        force, force_held = (
+            sum(float(one.respond(relaxation, p).force_N.sum()) for one in self.superpositions)
+            for relaxation in (own, held)
+        )
+        return [own, held] if 1.0 < force_held / force < 1.0 + _MAX_GIVEN_WAY else [own]
+
+    def fit(self, relaxation: RelaxationModel, start: Array) -> _Fit:
         """Fit a relaxation, first with equal errors everywhere, then by what its residuals say of misfit."""
-        start = self.answer if relaxation.spectrum_s is None else self._guess_start(relaxation)
         z, _ = self._solve(relaxation, start, self._assume_equal_errors(), _MAX_FIT_STEPS)
         found = estimate_discrepancy(self.model, *self._linearise(relaxation, z), self.prior.precision)
         stated = self.prior.compute_deviations(z)
@@ -252,17 +325,22 @@ class _ForceRecords:
         self, relaxation: RelaxationModel, z: Array, model: ResidualModel, steps: int
     ) -> tuple[Array, Array]:
         """Generalised least squares from z (k,) on; the answer and its covariance (k, k)."""
-        prior = self.prior
-        for _ in range(steps):
+        own = block_diag(*(model.own_covariance(i) for i in range(len(self.measured))))
+        shared, prior = np.concatenate(model.shared_deviations), self.prior
+        factor = np.linalg.cholesky(own + shared @ shared.T)
+
+        def evaluate(z: Array) -> SearchPoint:
             residuals, scaled = self._linearise(relaxation, z)
-            precision, weighted = prior.weigh(scaled, model)
-            slope = prior.bound_precision @ (z - self.answer) + prior.rows.T @ prior.compute_deviations(z)
-            slope = slope + sum(W.T @ r for r, W in zip(residuals, weighted))
-            step = np.clip(-np.linalg.solve(precision, slope), -_MAX_STEP_LOG, _MAX_STEP_LOG)
-            z = np.clip(z + step, self.space.lower, self.space.upper)
-            if np.abs(step).max() < _FIT_TOLERANCE:
-                break
-        return z, np.asarray(np.linalg.inv(precision))
+            rows = np.column_stack([np.concatenate(residuals), np.concatenate(scaled)])
+            known = np.column_stack([(z - self.answer) / prior.sd, np.diag(1.0 / prior.sd)])
+            stated = np.column_stack([prior.compute_deviations(z), prior.rows])
+            whole = np.concatenate([solve_triangular(factor, rows, lower=True), known, stated])
+            return SearchPoint(z, whole[:, 0], whole[:, 1:])
+
+        point, bounds = evaluate(z), (self.space.lower, self.space.upper)
+        for step in minimise(evaluate, point, *bounds, tolerance=_FIT_TOLERANCE, max_iterations=steps):
+            point = step.point
+        return point.z, np.asarray(np.linalg.inv(point.jacobian.T @ point.jacobian))
 
     def _guess_start(self, relaxation: RelaxationModel) -> Array:
         """Guess a spectrum's start: forces are linear in a modulus, and in that times an amplitude."""
@@ -299,18 +377,19 @@ class _ForceRecords:
         within, own = min(duration_s, self.longest_s), RelaxationModel()
         shares, changes, inner = [], [], []
         for fit, weight in zip(fits, weights, strict=True):
-            relaxations = (fit.relaxation, own) if fit.relaxation.has_tail else (fit.relaxation,)
-            for relaxation in relaxations:
+            readings = self.list_readings(fit)
+            for relaxation in readings:
                 at = self._elastic_log(relaxation, fit.z, within)
                 points = fit.z + _DIFFERENCE * np.eye(len(fit.z))
                 D = np.array([self._elastic_log(relaxation, z, within) - at for z in points]) / _DIFFERENCE
-                shares.append(weight / len(relaxations))
+                shares.append(weight / len(readings))
                 changes.append(at)
                 inner.append(D.T @ fit.covariance @ D)
         change = np.array(changes) - self._elastic_log(own, self.answer, duration_s)
         mean = np.array(shares) @ change
-        apart = change - mean
-        return mean, np.einsum("w,wi,wj->ij", shares, apart, apart) + np.tensordot(shares, inner, 1)
+        apart, kept = change - mean, slice(self.count)
+        covariance = np.einsum("w,wi,wj->ij", shares, apart, apart) + np.tensordot(shares, inner, 1)
+        return mean[kept], covariance[kept, kept]
 
     def _elastic_log(self, relaxation: RelaxationModel, z: Array, duration_s: float) -> Array:
         """Logarithms (p,) of moduli so long after a step and of other elastic parameters; 0 of the rest."""

@@ -24,6 +24,7 @@ from ..fit.parameters import SearchSpace
 
 _TAIL_BINS = np.geomspace(2.0**-14, 8.0, 18)  # edges, of T over the times of a tail
 _DIFFERENCE = 1e-3
+_FOREVER_S = 1e9  # of a term that does not relax
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,10 @@ class RelaxationTerms:
 
 @dataclass(frozen=True)
 class TissueParameters:
-    """Numbers of a tissue's parameters in the flat vector; ``is_given`` if its relaxation does not move."""
+    """Numbers of a tissue's parameters in the flat vector; ``is_given`` if its relaxation does not move.
+
+    ``further`` are amplitude and time of a term that the model does not have, if there is one.
+    """
 
     name: str
     moduli: tuple[int, ...]
@@ -48,6 +52,7 @@ class TissueParameters:
     amplitudes: tuple[int, ...]
     times: tuple[int, ...]
     is_given: bool
+    further: tuple[int, ...] = ()
 
     def own_terms(self, p: Array) -> RelaxationTerms:
         """The model's relaxation at parameters p."""
@@ -76,15 +81,19 @@ def find_tissue_parameters(names: Sequence[str], space: SearchSpace) -> tuple[Ti
 
 @dataclass(frozen=True)
 class RelaxationModel:
-    """A relaxation that the records are fitted with: the model's terms, with a tail, or a spectrum.
+    """A relaxation that the records are fitted with: the model's terms, with or without a further term and a
+    tail, or a spectrum.
 
     A spectrum's amplitudes are ``gamma tau_i^-slope exp(-tau_i / end)``, Fung's (1993) where the slope is 0.
-    Its end takes the place of a tissue's first relaxation time and is in units of ``longest_s``.
+    Its end takes the place of a tissue's first relaxation time and is in units of ``longest_s``. Beside a
+    further term, terms slower than ``held_s`` do not relax.
     """
 
     slope: float = 0.0
     longest_s: float = 1.0
     spectrum_s: Array | None = None
+    has_further: bool = False
+    held_s: float = np.inf
 
     @property
     def has_tail(self) -> bool:
@@ -97,12 +106,17 @@ class RelaxationModel:
             power = compute_power_law_terms(own.amplitudes[0], self.slope, self.spectrum_s)
             ends = np.exp(-self.spectrum_s / (self.longest_s * own.times_s[0]))
             return RelaxationTerms(1.0, power * ends, self.spectrum_s)
+        amplitudes, times = own.amplitudes, own.times_s
+        if self.has_further and tissue.further:
+            amplitude, time = p[list(tissue.further)]
+            amplitudes, times = np.append(amplitudes, amplitude), np.append(times, time)
+            times = np.where(times > self.held_s, _FOREVER_S, times)
         if not self.has_tail:
-            return own
+            return RelaxationTerms(1.0, amplitudes, times)
         # (1 + t/T)^-s is a mixture of exponentials whose rates times T have a gamma distribution.
         share, middle = gammainc(self.slope, _TAIL_BINS), np.sqrt(_TAIL_BINS[1:] * _TAIL_BINS[:-1])
-        amplitudes = np.r_[own.amplitudes, np.diff(share)]
-        return RelaxationTerms(float(share[0]), amplitudes, np.r_[own.times_s, self.longest_s / middle])
+        amplitudes, times = np.r_[amplitudes, np.diff(share)], np.r_[times, self.longest_s / middle]
+        return RelaxationTerms(float(share[0]), amplitudes, times)
 
 
 def _convolve(elastic: Array, times_s: Array, taus: Array) -> Array:
@@ -139,8 +153,8 @@ class Superposition:
         ]
 
     def respond(self, relaxation: RelaxationModel, p: Array) -> SiteResponse:
-        """Force (n,) and derivatives (n, p) with a relaxation at parameters p."""
-        change = np.log(p / self.parameters)
+        """Force (n,) and derivatives (n, p) with a relaxation at parameters p, further terms among them."""
+        change = np.log(p[: len(self.parameters)] / self.parameters)
         total, slopes = np.zeros(len(self.times_s)), np.zeros((len(self.times_s), len(p)))
         for elastic, tissue in zip(self.elastic, self.tissues, strict=True):
             terms, n = relaxation.terms(tissue, p), len(tissue.moduli)
@@ -157,9 +171,13 @@ class Superposition:
                 over_end = terms.amplitudes * terms.times_s / (relaxation.longest_s * p[tissue.times[0]])
                 slopes[:, tissue.times[0]] = np.tensordot(over_end, histories, 1) @ factors
                 continue
-            for k, (amplitude, time) in enumerate(zip(tissue.amplitudes, tissue.times, strict=True)):
+            of_terms = [*zip(tissue.amplitudes, tissue.times, strict=True)]
+            if relaxation.has_further and tissue.further:
+                of_terms.append((tissue.further[0], tissue.further[1]))
+            for k, (amplitude, time) in enumerate(of_terms):
                 slopes[:, amplitude] = terms.amplitudes[k] * (histories[k] @ factors)
                 around = p[time] * np.exp([-_DIFFERENCE, _DIFFERENCE])
                 low, high = _convolve(elastic, self.times_s, around) @ factors
                 slopes[:, time] = terms.amplitudes[k] * (high - low) / (2 * _DIFFERENCE)
-        return SiteResponse(total * self.in_contact[:, 0], slopes * self.in_contact / p)
+        touching = self.in_contact & (total > 0)[:, None]  # what relaxes more loses contact earlier
+        return SiteResponse(total * touching[:, 0], slopes * touching / p)

@@ -36,7 +36,6 @@ from .noise import SiteNoise
 DETERMINED, WEAK, UNDETERMINED = "determined", "weakly determined", "not determined by these data"
 GIVEN = "given, not identified"
 LINEARISED, SAMPLED = "linearised", "sampled"
-NORMAL_95 = 1.959964  # half of a 95 % interval, in standard deviations of a normal distribution
 # A 95 % interval of at most -20 to +25 % is called determined, one of a half to twofold weakly so.
 _MAX_DETERMINED_FACTOR, _MAX_WEAK_FACTOR = 1.25, 2.0
 # Whatever the width: an interval that is hardly narrower than the bounds comes from the bounds.

@@ -20,8 +20,8 @@ import tomlkit
 
 from ...arrays import Array
 from ...errors import InputError
+from ...identify.fit.prediction import NORMAL_95
 from ...identify.uncertainty.model_comparison import compute_mixture_interval, weigh_models
-from ...identify.uncertainty.uncertainty import NORMAL_95
 from ...laws import FIBRED, FUNG, LAWS, OGDEN, POWER
 from ...results import models as stored
 from ...results.curves import read_curves

@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
-from ...identify.fit.prediction import limit_fall
-from ...identify.uncertainty.uncertainty import NORMAL_95
+from ...identify.fit.prediction import NORMAL_95, widen_by_relaxation
 from ...laws import LAWS, OGDEN
 from ...study import Study
 
@@ -122,13 +121,12 @@ class SimulationSpread:
         size, own = sign * value, sign * slopes[list(self.identified)]
         along = known.covariance @ own
         variance = max(float(own @ along), 0.0)
-        moved, further = float(own @ known.shift), max(float(own @ known.relaxation @ own), 0.0)
-        fall = limit_fall(size, float(np.sum(own * known.fall)))
-        kept = 1.0 - max(fall, 0.0) / max(size, np.finfo(float).tiny)
-        low, high = sorted((size, size + float(own @ known.off)))
-        width = high - low + 2.0 * NORMAL_95 * np.sqrt(variance)
-        half = NORMAL_95 * np.sqrt(variance + further)
-        low, high = kept * (low + moved - half), high + moved + half - min(fall, 0.0)
+        moved, fall = (float(np.sum(own * part)) for part in (known.shift, known.fall))
+        sd = float(np.sqrt(max(float(own @ known.relaxation @ own), 0.0)))
+        off, half = float(own @ known.off), NORMAL_95 * np.sqrt(variance)
+        width = abs(off) + 2.0 * half
+        own_ends = size + min(off, 0.0), size + max(off, 0.0)
+        low, high = map(float, widen_by_relaxation(size, own_ends, half, moved, sd, fall))
         ends = sorted((sign * min(low, size), sign * max(high, size)))
         rest = min(width / max(high - low, np.finfo(float).tiny), 1.0) ** 2 if known.is_relaxed else 1.0
         scale = np.maximum(np.diag(known.covariance) * variance, np.finfo(float).tiny)
@@ -138,7 +136,8 @@ class SimulationSpread:
         found = {name: float(shares[name]) for name in sorted(shares, key=lambda name: -shares[name])}
         by = _CHANGE * slopes
         changes = dict(zip(self.names, map(float, by), strict=True))
-        relaxation = [sign * moved, float(np.sqrt(further)), sign * fall]
+        lower = -size * np.expm1(-max(fall, 0.0) / max(size, np.finfo(float).tiny)) + min(fall, 0.0)
+        relaxation = [sign * moved, sd, sign * float(lower)]
         return [max(end, least) for end in ends], found, changes, relaxation
 
 

@@ -11,13 +11,17 @@ import numpy as np
 
 from ...arrays import Array
 from ...identify.fit.objective import SiteResponse
-from ...identify.fit.prediction import RelaxationSpread, compute_force_range, compute_half_width_95
+from ...identify.fit.prediction import (
+    NORMAL_95,
+    RelaxationSpread,
+    compute_force_range,
+    compute_half_width_95,
+)
 from ...identify.uncertainty.exploration import Exploration
 from ...identify.uncertainty.relaxation import limit_verdicts
 from ...identify.uncertainty.uncertainty import (
     DETERMINED,
     GIVEN,
-    NORMAL_95,
     UNDETERMINED,
     WEAK,
     FitSensitivity,
@@ -248,15 +252,13 @@ def _write_prediction(
         "misfit": np.full(len(force), (share * peak) ** 2),
     }
     total = np.sum(list(variances.values()), axis=0)
-    lower, higher = np.zeros((2, len(force)))
-    if found.relaxation is not None:
-        spread = RelaxationSpread.from_stored(found.relaxation.beyond)
-        lower, higher, sd = spread.compute_beyond_N(force, scaled, record.times_s)
-        total += sd**2
     estimated = variances["misfit"], variances["site"]
     half = compute_half_width_95(total, *estimated, model.known_scale, model.site_freedom)
-    low, high = compute_force_range(response, parameters, found.explored.posterior.median)
-    low, high = low + np.minimum(lower, 0.0) - half, high + np.maximum(higher, 0.0) + half
+    ends = compute_force_range(response, parameters, found.explored.posterior.median)
+    low, high = ends[0] - half, ends[1] + half
+    if found.relaxation is not None:
+        spread = RelaxationSpread.from_stored(found.relaxation.beyond)
+        low, high = spread.widen_band(force, scaled, record.times_s, ends, half)
     half_width, low = float(np.mean(high - low)) / 2, np.maximum(low, 0.0)
     write_curves(
         folder / "predictions" / f"{record.name}.csv",
