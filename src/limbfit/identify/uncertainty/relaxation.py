@@ -21,7 +21,6 @@ from itertools import product
 
 import numpy as np
 from scipy.linalg import block_diag, solve_triangular
-from scipy.optimize import nnls
 from scipy.special import expit, logsumexp, softmax
 
 from ...arrays import Array
@@ -43,6 +42,7 @@ SOURCE = (
 )
 _TAIL_SLOPES = (0.1, 0.2, 0.3)
 _SPECTRUM_SLOPES = (0.0, 0.1, 0.2, 0.3)
+_SPECTRUM_START = 0.3, 3.0  # amplitude and end, where fits of a spectrum begin
 _SHORTEST, _LONGEST, _SPECTRUM_TIMES = 0.02, 30.0, 12  # of the shortest ramp; of the longest load
 OWN, FURTHER, POWER_LAW, UNDECIDED = "the model's terms", "a further term", "a power law", "undecided"
 NOT_LONG_TERM = "determined at {}; its long-term value not"
@@ -269,8 +269,14 @@ class _ForceRecords:
         self.prior = PriorPrecision(self.space.bounds_sd, rows, stated.target)
 
     def choose_start(self, relaxation: RelaxationModel) -> Array:
-        """Where the fit of a relaxation (k,) without further terms begins."""
-        return self.answer if relaxation.spectrum_s is None else self._guess_start(relaxation)
+        """Where the fit of a relaxation (k,) without a further term begins."""
+        if relaxation.spectrum_s is None:
+            return self.answer
+        p = self.parameters.copy()
+        for tissue in self.tissues:
+            if not tissue.is_given:
+                p[[tissue.amplitudes[0], tissue.times[0]]] = _SPECTRUM_START
+        return self.space.reduce(np.log(p))
 
     def fit_further_terms(self, least: float) -> list[_Fit]:
         """Fits with a further term, with and without a tail, of which the records ask for it.
@@ -341,27 +347,6 @@ class _ForceRecords:
         for step in minimise(evaluate, point, *bounds, tolerance=_FIT_TOLERANCE, max_iterations=steps):
             point = step.point
         return point.z, np.asarray(np.linalg.inv(point.jacobian.T @ point.jacobian))
-
-    def _guess_start(self, relaxation: RelaxationModel) -> Array:
-        """Guess a spectrum's start: forces are linear in a modulus, and in that times an amplitude."""
-        p = self.parameters.copy()
-        for tissue in self.tissues:
-            if not tissue.is_given:
-                p[[tissue.amplitudes[0], tissue.times[0]]] = 1.0
-        rows = []
-        for one, curve in zip(self.superpositions, self.measured, strict=True):
-            slopes, parts = one.respond(relaxation, p).jacobian * p, []
-            for tissue in self.tissues:
-                of_terms = slopes[:, tissue.amplitudes].sum(axis=1)
-                parts += [slopes[:, tissue.moduli].sum(axis=1) - of_terms, of_terms]
-            rows.append(np.column_stack([*parts, curve.force_N]) / curve.peak_N)
-        table = np.vstack(rows)
-        shares = np.maximum(nnls(table[:, :-1], table[:, -1])[0].reshape(-1, 2), _DIFFERENCE)
-        for tissue, (modulus, amplitude) in zip(self.tissues, shares, strict=True):
-            p[list(tissue.moduli)] *= modulus
-            if not tissue.is_given:
-                p[tissue.amplitudes[0]] = amplitude / modulus
-        return self.space.reduce(np.log(p))
 
     def _linearise(self, relaxation: RelaxationModel, z: Array) -> tuple[list[Array], list[Array]]:
         p = self.space.expand(z)
