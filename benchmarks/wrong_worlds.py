@@ -277,7 +277,6 @@ def run_draw(world: World, seed: int, hold_s: float, after_s: float) -> dict[str
         "times_noise": max(phase.times_noise for one in quality for phase in one.phases),
         "prefers": relaxation.preferred,
         "gives_way": GIVES_WAY in relaxation.describe(),
-        "weights": relaxation.weights.tolist(),
         "determined": [word == DETERMINED for word in known.verdicts],
         "still_determined": [word == DETERMINED for word in verdicts],
         "inside": inside.tolist(),

@@ -10,14 +10,14 @@ from bars import BARS, PAPER, SITES, TRUE_THREE, TRUTH, Bars, records, simulate,
 from scipy.linalg import block_diag
 
 from limbfit.identify.fit.calibration import calibrate
-from limbfit.identify.fit.objective import MeasuredCurve
+from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import group_separately
 from limbfit.identify.fit.prediction import (
     MAX_FREEDOM,
+    NORMAL_95,
     PredictionModel,
     combine_freedom,
     compute_error_percent,
-    compute_prediction_sd,
     summarise_errors,
 )
 from limbfit.identify.uncertainty.discrepancy import ResidualModel, _RestrictedLikelihood, compute_matern
@@ -355,17 +355,21 @@ def test_prediction_intervals_match_the_spread_of_predictions():
         if seed == 0:
             noise = estimate_curve_noise(found.responses, data)
             u = estimate_uncertainty(found.parameters, found.responses, data, PAPER, noise)
-            predicted = compute_prediction_sd(
-                held_out.respond(found.parameters).jacobian, found.parameters, u.covariance
+            response, known = (
+                held_out.respond(found.parameters),
+                (u.covariance, found.parameters, {}, 0.0, 1e6),
             )
+            low, high = PredictionModel(*known).compute_interval_95(response, found.parameters, "elsewhere")
+            predicted = (high - low) / (2 * NORMAL_95)
     spread = np.std(forces, axis=0)
     ratio = predicted[10:50] / spread[10:50]
     assert 0.6 < np.median(ratio) < 1.7
 
 
 def test_noise_adds_to_a_prediction():
-    sd = compute_prediction_sd(np.zeros((3, 2)), np.ones(2), np.eye(2), noise_N=0.05)
-    assert sd == pytest.approx([0.05] * 3)
+    response, model = SiteResponse(np.ones(3), np.zeros((3, 2))), (np.eye(2), np.ones(2), {}, 0.0, 1e6)
+    low, high = PredictionModel(*model).compute_interval_95(response, np.ones(2), "elsewhere", noise_N=0.05)
+    assert (high - low) / (2 * NORMAL_95) == pytest.approx([0.05] * 3, rel=1e-5)
 
 
 def test_the_error_is_the_papers():

@@ -5,7 +5,7 @@ The limbs are phantoms of several seeds, a mean residuum, and a real calf that i
 
 from __future__ import annotations
 
-import resource
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -77,9 +77,9 @@ def bench_meshing(
         tell(done * sites, len(makers) * sites, name)
         anatomy = make()
         check_anatomy(anatomy)
-        start = measure_cpu_seconds()
+        start = sum(os.times()[:4])
         base = build_base_mesh(anatomy, settings)
-        seconds_base[name] = measure_cpu_seconds() - start
+        seconds_base[name] = sum(os.times()[:4]) - start
         for i, (position, axis) in enumerate(draw_random_sites(anatomy, sites)):
             try:
                 rows.append({"limb": name, **_measure_mesh(anatomy, position, axis, settings, base)})
@@ -102,10 +102,10 @@ def bench_meshing(
 
 
 def _measure_mesh(anatomy: Anatomy, position: Any, axis: Any, settings: MeshSettings, base: BaseMesh) -> Row:
-    start = measure_cpu_seconds()
+    start = sum(os.times()[:4])
     _, report = mesh_site(anatomy, position, axis, settings, base)
     return {
-        "seconds": measure_cpu_seconds() - start,
+        "seconds": sum(os.times()[:4]) - start,
         "nodes": report.nodes,
         "cells": report.cells,
         "dihedral": report.min_dihedral_deg,
@@ -136,12 +136,6 @@ def _summarise(rows: list[Row], failed: list[str]) -> dict[str, Any]:
         "seconds_median": float(np.median(column["seconds"])),
         "seconds_max": float(column["seconds"].max()),
     }
-
-
-def measure_cpu_seconds() -> float:
-    """CPU seconds of this process and of the mesher's processes that ended."""
-    usage = [resource.getrusage(scope) for scope in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(part.ru_utime + part.ru_stime for part in usage)
 
 
 def list_limbs(shared: Path) -> dict[str, Callable[[], Anatomy]]:

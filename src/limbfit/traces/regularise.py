@@ -34,8 +34,8 @@ class Regularised:
     """Curves from touch-down: (n,) arrays that start at time 0, displacement 0, force 0.
 
     ``knots_s`` and ``knots_mm`` are the corners of the displacement; ``phases`` what it does, from touch-down
-    on. ``noise_N`` and ``noise_mm`` are standard deviations of what was smoothed away. ``curve`` is the force
-    as the splines that it is made of.
+    on. ``noise_N`` is the standard deviation of what was smoothed away. ``curve`` is the force as the splines
+    that it is made of.
     """
 
     time_s: Array
@@ -45,7 +45,6 @@ class Regularised:
     knots_mm: Array
     phases: tuple[MotionPhase, ...]
     noise_N: float
-    noise_mm: float
     curve: SmoothCurve = field(repr=False)
 
     @property
@@ -129,7 +128,6 @@ def regularise(
         knots_mm=knots_mm,
         phases=phases,
         noise_N=compute_rms(force[inside] - curve(trace.time_s[inside] - start)),
-        noise_mm=compute_rms(trace.displacement_mm[inside] - line(trace.time_s[inside])),
         curve=curve,
     )
 
@@ -314,7 +312,6 @@ def regularise_creep(
         knots_mm=curve(knots),
         phases=phases,
         noise_N=compute_rms(force[inside] - np.interp(since[inside], knots, knots_N)),
-        noise_mm=compute_rms(moved[inside] - curve(since[inside])),
         curve=curve,
         knots_N=knots_N,
     )

@@ -63,22 +63,6 @@ def summarise_errors(errors_percent: Sequence[float]) -> tuple[int, float | None
     return errors.size, float(errors.mean()) if errors.size else None, sd
 
 
-def compute_prediction_sd(
-    jacobian: Array, parameters: Array, covariance_log: Array, noise_N: Array | float = 0.0
-) -> Array:
-    """Return the standard deviation (n,) in N of a predicted force by linear theory.
-
-    Parameters
-    ----------
-    jacobian : (n, p) derivatives of the force with respect to the parameters.
-    covariance_log : (p, p) covariance of the logarithms of the parameters (``Uncertainty.covariance``).
-    noise_N : standard deviation, (n,) or scalar, of what a new record adds: noise and the misfit of the
-        model.
-    """
-    scaled = jacobian * parameters
-    return np.sqrt(np.einsum("ni,ij,nj->n", scaled, covariance_log, scaled) + noise_N**2)
-
-
 def compute_force_range(
     response: SiteResponse, parameters: Array, most_probable: Array
 ) -> tuple[Array, Array]:
@@ -250,11 +234,10 @@ class PredictionModel:
         known_N, misfit = self.find_residual_sd(name, unit, noise_N)
         misfit_N = misfit * find_largest_magnitude(response.force_N)
         site_N = self.site_factor * np.abs(site_N)
-        own_N = np.hypot(np.hypot(known_N, misfit_N), site_N)
-        sd = compute_prediction_sd(response.jacobian, parameters, self.covariance_log, own_N)
-        half = compute_half_width_95(sd**2, misfit_N**2, site_N**2, self.known_scale, self.site_freedom)
+        slopes, estimated = response.jacobian * parameters, (misfit_N**2, site_N**2)
+        variance = np.einsum("ni,ij,nj->n", slopes, self.covariance_log, slopes) + known_N**2 + sum(estimated)
+        half = compute_half_width_95(variance, *estimated, self.known_scale, self.site_freedom)
         ends = compute_force_range(response, parameters, self.most_probable)
         if self.relaxation is None or times_s is None:
             return ends[0] - half, ends[1] + half
-        slopes = response.jacobian * parameters
         return self.relaxation.widen_band(response.force_N, slopes, times_s, ends, half)

@@ -175,15 +175,16 @@ class ResidualModel:
         """Covariance (n, n) of what record i shares with no other: its noise and its misfit."""
         return self.noise[i].covariance + self.misfit_covariance(i)
 
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (N, N) of the residuals of all records, one after the other."""
+        shared = np.concatenate(self.shared_deviations)
+        return block_diag(*(self.own_covariance(i) for i in range(len(self.noise)))) + shared @ shared.T
+
     def solve(self, rows: Sequence[Array]) -> list[Array]:
         """Return the inverse covariance of all records times ``rows`` (n, k) of each, record by record."""
-        factors = [cho_factor(self.own_covariance(i)) for i in range(len(self.noise))]
-        found = [cho_solve(factor, one) for factor, one in zip(factors, rows, strict=True)]
-        shared = self.shared_deviations
-        known = [cho_solve(factor, one) for factor, one in zip(factors, shared)]
-        inner = np.eye(shared[0].shape[1]) + sum(E.T @ K for E, K in zip(shared, known))
-        amount = np.linalg.solve(inner, sum(E.T @ one for E, one in zip(shared, found)))
-        return [one - K @ amount for one, K in zip(found, known)]
+        ends = np.cumsum([len(one) for one in rows])[:-1]
+        return np.split(cho_solve(cho_factor(self.covariance), np.concatenate(rows)), ends)
 
     def misfit_covariance(self, i: int) -> Array:
         """Covariance (n, n) of the misfit of record i."""

@@ -29,7 +29,7 @@ from ..fit.objective import SiteResponse
 from ..fit.parameters import SearchSpace
 from ..fit.prediction import NORMAL_95, RelaxationSpread
 from ..fit.trust_region import SearchPoint, minimise
-from .discrepancy import ResidualModel, estimate_discrepancy
+from .discrepancy import estimate_discrepancy
 from .superposition import RelaxationModel, Superposition, TissueParameters, find_tissue_parameters
 from .uncertainty import DETERMINED, WEAK, PriorPrecision, Uncertainty, choose_verdict
 
@@ -81,16 +81,14 @@ class _Fit:
 class RelaxationAssessment:
     """Which relaxations fit the records at the ``known`` answer, and what they leave open.
 
-    ``weights`` (w,) of the fitted relaxations, the model's own terms first. ``evidence`` is twice the
-    logarithm of how much more probable the records are with other relaxations than with the model's own
-    terms. ``further_weight`` and ``tail_weight`` are the parts of the weights that fits with a further term
-    have, and those in which the limb may give way. ``spread`` is what they leave open of each tissue's
-    modulus at any time.
+    ``evidence`` is twice the logarithm of how much more probable the records are with other relaxations than
+    with the model's own terms. ``further_weight`` and ``tail_weight`` are the parts of the weights that fits
+    with a further term have, and those in which the limb may give way. ``spread`` is what they leave open of
+    each tissue's modulus at any time.
     """
 
     known: Uncertainty
     tissues: tuple[TissueParameters, ...]
-    weights: Array
     evidence: float
     further_weight: float
     tail_weight: float
@@ -198,7 +196,7 @@ def assess_relaxation(known: Uncertainty, responses: Sequence[SiteResponse]) -> 
     times = np.geomspace(*records.span_s, _SPECTRUM_TIMES)
     relaxations = [RelaxationModel(), *(RelaxationModel(slope, longest) for slope in _TAIL_SLOPES)]
     relaxations += [RelaxationModel(slope, longest, times) for slope in _SPECTRUM_SLOPES]
-    fits = [records.fit(relaxation, records.choose_start(relaxation)) for relaxation in relaxations]
+    fits = [records.fit(relaxation, records.build_start(relaxation)) for relaxation in relaxations]
     fits += records.fit_further_terms(min(fit.criterion for fit in fits))
     weights, evidence = _weigh(fits)
     # The model's own terms keep the answer, whose covariance is counted with it.
@@ -212,12 +210,11 @@ def assess_relaxation(known: Uncertainty, responses: Sequence[SiteResponse]) -> 
     )
     tails = float(weights[[len(records.list_readings(fit)) > 1 for fit in fits]].sum())
     furthers = float(weights[[fit.relaxation.has_further for fit in fits]].sum())
-    return RelaxationAssessment(known, tissues, weights, evidence, furthers, tails, spread)
+    return RelaxationAssessment(known, tissues, evidence, furthers, tails, spread)
 
 
 def _weigh(fits: Sequence[_Fit]) -> tuple[Array, float]:
-    """Return the weights (w,) of the relaxations, the model's own terms first, and the evidence for the
-    others."""
+    """Return the weights (w,), the model's own terms first, and the evidence for the other relaxations."""
     half = -0.5 * np.array([fit.criterion for fit in fits])
     evidence = float(2 * (logsumexp(half[1:]) - np.log(len(half) - 1) - half[0]))
     own = max(float(expit(-evidence / 2)), MIN_OWN_WEIGHT)
@@ -268,14 +265,14 @@ class _ForceRecords:
         rows = np.pad(stated.rows, ((0, 0), (0, len(bounds))))
         self.prior = PriorPrecision(self.space.bounds_sd, rows, stated.target)
 
-    def choose_start(self, relaxation: RelaxationModel) -> Array:
-        """Where the fit of a relaxation (k,) without a further term begins."""
-        if relaxation.spectrum_s is None:
-            return self.answer
+    def build_start(self, relaxation: RelaxationModel, factor: float = 1.0) -> Array:
+        """Where the fit of a relaxation (k,) begins; a further time is a factor times the model's first."""
         p = self.parameters.copy()
         for tissue in self.tissues:
-            if not tissue.is_given:
+            if relaxation.spectrum_s is not None and not tissue.is_given:
                 p[[tissue.amplitudes[0], tissue.times[0]]] = _SPECTRUM_START
+            if relaxation.has_further and tissue.further:
+                p[tissue.further[1]] = factor * p[tissue.times[0]]
         return self.space.reduce(np.log(p))
 
     def fit_further_terms(self, least: float) -> list[_Fit]:
@@ -285,18 +282,10 @@ class _ForceRecords:
         relaxation once more.
         """
         terms = RelaxationModel(longest_s=self.longest_s, has_further=True)
-        starts = [self._move_further_times(factor) for factor in _FURTHER_STARTS]
+        starts = [self.build_start(terms, factor) for factor in _FURTHER_STARTS]
         best = min((self.fit(terms, start) for start in starts), key=lambda fit: fit.criterion)
         fits = [best, *(self.fit(replace(terms, slope=slope), best.z) for slope in _TAIL_SLOPES)]
         return [fit for fit in fits if fit.criterion < least - _STRONG_EVIDENCE]
-
-    def _move_further_times(self, factor: float) -> Array:
-        """The answer (k,) with further times that are a factor times the model's first."""
-        p = self.parameters.copy()
-        for tissue in self.tissues:
-            if tissue.further:
-                p[tissue.further[1]] = factor * p[tissue.times[0]]
-        return self.space.reduce(np.log(p))
 
     def list_readings(self, fit: _Fit) -> list[RelaxationModel]:
         """The relaxation of a fit and, if it may be that of a limb that gives way, what is left without."""
@@ -312,28 +301,19 @@ class _ForceRecords:
 
     def fit(self, relaxation: RelaxationModel, start: Array) -> _Fit:
         """Fit a relaxation, first with equal errors everywhere, then by what its residuals say of misfit."""
-        z, _ = self._solve(relaxation, start, self._assume_equal_errors(), _MAX_FIT_STEPS)
+        peaks_N = np.concatenate([np.full(len(one.force_N), one.peak_N) for one in self.measured])
+        z, _ = self._solve(relaxation, start, np.diag((_ALIKE * peaks_N) ** 2), _MAX_FIT_STEPS)
         found = estimate_discrepancy(self.model, *self._linearise(relaxation, z), self.prior.precision)
         stated = self.prior.compute_deviations(z)
-        z, covariance = self._solve(relaxation, z, found, _FURTHER_FIT_STEPS)
+        z, covariance = self._solve(relaxation, z, found.covariance, _FURTHER_FIT_STEPS)
         return _Fit(relaxation, z, covariance, found.criterion + float(stated @ stated))
 
-    def _assume_equal_errors(self) -> ResidualModel:
-        """The residuals' covariance if the model were off by as much of the largest force everywhere."""
-        noise = [
-            replace(one, covariance=(_ALIKE * peak) ** 2 * np.eye(len(one.times_s)))
-            for one, peak in zip(self.model.noise, self.model.peaks_N, strict=True)
-        ]
-        off = np.zeros(len(noise))
-        return replace(self.model, noise=tuple(noise), misfit=off, correlation=1.0, mesh_N=(), site_N=())
-
     def _solve(
-        self, relaxation: RelaxationModel, z: Array, model: ResidualModel, steps: int
+        self, relaxation: RelaxationModel, z: Array, covariance: Array, steps: int
     ) -> tuple[Array, Array]:
-        """Generalised least squares from z (k,) on; the answer and its covariance (k, k)."""
-        own = block_diag(*(model.own_covariance(i) for i in range(len(self.measured))))
-        shared, prior = np.concatenate(model.shared_deviations), self.prior
-        factor = np.linalg.cholesky(own + shared @ shared.T)
+        """Generalised least squares from z (k,) on, with errors of a covariance (N, N); the answer and its
+        covariance (k, k)."""
+        factor, prior = np.linalg.cholesky(covariance), self.prior
 
         def evaluate(z: Array) -> SearchPoint:
             residuals, scaled = self._linearise(relaxation, z)

@@ -150,14 +150,8 @@ class _LinearisedEstimate:
         slope = prior.rows.T @ prior.compute_deviations(z) + sum(W.T @ r for r, W in zip(residuals, weighted))
         centre = np.clip(z - best @ slope, space.lower, space.upper)
         gradients = [J.T @ W for J, W in zip(jacobians, curvatures, strict=True)]
-
-        def propagate(covariances: Sequence[Array]) -> Array:
-            """Covariance (k, k) of the cost's gradient if that of each record is (n, n) N^2."""
-            return np.asarray(sum(G @ C @ G.T for G, C in zip(gradients, covariances, strict=True)))
-
-        G, records = np.hstack(gradients), range(len(residuals))
-        shared = G @ np.concatenate(model.shared_deviations)
-        M = propagate([model.own_covariance(i) for i in records]) + shared @ shared.T
+        G = np.hstack(gradients)
+        M = G @ model.covariance @ G.T
         H = G @ np.concatenate(jacobians)
         of_priors = prior.rows.T @ prior.rows
         # What the bounds say has no place in the estimator: it counts as beside records of the mean noise.
@@ -167,7 +161,7 @@ class _LinearisedEstimate:
         known_before = prior_share**2 * of_priors + spread**2 * prior.bound_precision
         covariance = by_records + inverse @ known_before @ inverse
         unexplained = _compute_unexplained(centre - z, covariance - best)
-        of_misfit = propagate([model.misfit_covariance(i) for i in records])
+        of_misfit = sum(own @ model.misfit_covariance(i) @ own.T for i, own in enumerate(gradients))
         of_sites = inverse @ G @ np.concatenate(model.site_deviations)
         return cls(
             centre=centre,
