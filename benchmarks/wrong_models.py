@@ -225,7 +225,7 @@ class World:
         if not file.is_file():
             stack = (skin + truth.skin_mm, muscle + truth.bone_mm - truth.skin_mm)
             write_vtu(layered_block(stack, TISSUES, divisions=TRUE_DIVISIONS, height_mm=5.0), file)
-        angle = np.radians(truth.tilt_degrees)
+        angle = np.radians(truth.tilt_degrees if indenter is INDENTER else 0.0)  # the rig's, no socket's
         model = replace(
             build_block_model(name, file, TRUE_STEPS, "tet10p0", depth),
             knots_s=tuple(knots_s),

@@ -348,7 +348,7 @@ def _compare_hold(
     at, (centre, covariance) = value(np.zeros(8)), sampled
     off, variance = float(slope @ np.log(centre / best)), float(slope @ covariance @ slope)
     weight, shift, further, fall = spread
-    found, ends = {"error": 100 * float(np.expm1(at - true))}, (at, at)
+    found = {"error": 100 * float(np.expm1(at - true))}
     for word, share, moved, added, falls in (
         ("before", 1.0, 0.0, 0.0, 0.0),
         ("after", weight, float(slope @ shift), float(slope @ further @ slope), float(slope @ fall)),
@@ -356,7 +356,7 @@ def _compare_hold(
         half = NORMAL_95 * np.sqrt(share * variance + added)
         low, high = at + moved + share * min(0.0, off) - half, at + moved + share * max(0.0, off) + half
         low -= falls
-        low, high = ends = min(low, ends[0]), max(high, ends[1])  # as those of a socket
+        low, high = min(low, at), max(high, at)  # as those of a socket
         found |= {f"{word}_inside": 100.0 * (low <= true <= high)}
         found |= {f"{word}_half": 50 * float(np.exp(high - at) - np.exp(low - at))}
     return found

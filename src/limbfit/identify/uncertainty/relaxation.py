@@ -69,12 +69,13 @@ _IN_CONTACT = 0.01  # of the largest force
 
 @dataclass(frozen=True)
 class _Fit:
-    """A relaxation fitted to the records: z (k,), covariance (k, k), and minus twice the log evidence."""
+    """A relaxation fitted to the records: z (k,), covariance (k, k), -2 log of the evidence, mean log misfit."""
 
     relaxation: RelaxationModel
     z: Array
     covariance: Array
     criterion: float
+    misfit_log: float
 
 
 @dataclass(frozen=True)
@@ -217,7 +218,9 @@ def _weigh(fits: Sequence[_Fit]) -> tuple[Array, float]:
     """Return the weights (w,), the model's own terms first, and the evidence for the other relaxations."""
     half = -0.5 * np.array([fit.criterion for fit in fits])
     evidence = float(2 * (logsumexp(half[1:]) - np.log(len(half) - 1) - half[0]))
-    own = max(float(expit(-evidence / 2)), MIN_OWN_WEIGHT)
+    # Where relaxation explains little of the misfit, as of sites that differ, it is not what the model lacks.
+    left = float(np.exp(fits[1 + int(np.argmax(half[1:]))].misfit_log - fits[0].misfit_log))
+    own = max(float(expit(-evidence / 2)), min(left, 1.0), MIN_OWN_WEIGHT)
     return np.r_[own, (1 - own) * softmax(half[1:])], evidence
 
 
@@ -306,7 +309,8 @@ class _ForceRecords:
         found = estimate_discrepancy(self.model, *self._linearise(relaxation, z), self.prior.precision)
         stated = self.prior.compute_deviations(z)
         z, covariance = self._solve(relaxation, z, found.covariance, _FURTHER_FIT_STEPS)
-        return _Fit(relaxation, z, covariance, found.criterion + float(stated @ stated))
+        criterion = found.criterion + float(stated @ stated)
+        return _Fit(relaxation, z, covariance, criterion, float(np.mean(np.log(found.misfit))))
 
     def _solve(
         self, relaxation: RelaxationModel, z: Array, covariance: Array, steps: int

@@ -42,21 +42,19 @@ class ParameterSpread:
     ----------
     covariance : (p, p).
     off : (p,) how far the most probable ones are from those that are simulated.
-    own_weight : of that answer, beside other relaxations that the records allow.
     shift, relaxation : (p,) and (p, p) what relaxation beyond the records moves them by, and adds; or 0.
     fall : (p,) by how much they may be lower beside that; or 0.
     """
 
     covariance: Array
     off: Array
-    own_weight: float = 1.0
     shift: Array | float = 0.0
     relaxation: Array | float = 0.0
     fall: Array | float = 0.0
 
     def relax(self, own_weight: float, shift: Array, relaxation: Array, fall: Array) -> ParameterSpread:
         """The same when a socket has been worn for long, of what `RelaxationSpread` says."""
-        return ParameterSpread(self.covariance, self.off, own_weight, shift, relaxation, fall)
+        return ParameterSpread(own_weight * self.covariance, own_weight * self.off, shift, relaxation, fall)
 
     @property
     def is_relaxed(self) -> bool:
@@ -68,8 +66,7 @@ class ParameterSpread:
         both, shape = np.ix_(chosen, chosen), self.covariance.shape
         shift, fall = (np.broadcast_to(one, shape[:1])[chosen] for one in (self.shift, self.fall))
         relaxation = np.broadcast_to(self.relaxation, shape)[both]
-        own = self.covariance[both], self.off[chosen], self.own_weight
-        return ParameterSpread(*own, shift, relaxation, fall)
+        return ParameterSpread(self.covariance[both], self.off[chosen], shift, relaxation, fall)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +110,7 @@ class SimulationSpread:
 
         Returns
         -------
-        interval : 95 %, from ``least`` on; it holds the interval without relaxation beyond the records.
+        interval : 95 %, the value itself included, from ``least`` on.
         shares : of its squared width by the parameters and `RELAXATION`, percent, that would go if one were
             known, largest first.
         changes : of the value where each parameter of the simulation is ``CHANGE_PERCENT`` larger.
@@ -127,10 +124,9 @@ class SimulationSpread:
         moved, fall = (float(np.sum(own * part)) for part in (known.shift, known.fall))
         sd = float(np.sqrt(max(float(own @ known.relaxation @ own), 0.0)))
         off, half = float(own @ known.off), NORMAL_95 * np.sqrt(variance)
-        width, weight = abs(off) + 2.0 * half, known.own_weight
-        mixed = size + weight * min(off, 0.0), size + weight * max(off, 0.0)
-        low, high = map(float, widen_by_relaxation(size, mixed, np.sqrt(weight) * half, moved, sd, fall))
-        low, high = min(low, size + min(off, 0.0) - half), max(high, size + max(off, 0.0) + half)
+        own_ends, width = (size + min(off, 0.0), size + max(off, 0.0)), abs(off) + 2.0 * half
+        widened = widen_by_relaxation(size, own_ends, half, moved, sd, fall)
+        low, high = min(float(widened[0]), size), max(float(widened[1]), size)
         ends = sorted((sign * low, sign * high))
         rest = min(width / max(high - low, np.finfo(float).tiny), 1.0) ** 2 if known.is_relaxed else 1.0
         scale = np.maximum(np.diag(known.covariance) * variance, np.finfo(float).tiny)
