@@ -69,7 +69,7 @@ _IN_CONTACT = 0.01  # of the largest force
 
 @dataclass(frozen=True)
 class _Fit:
-    """A relaxation fitted to the records: z (k,), covariance (k, k), -2 log of the evidence, mean log misfit."""
+    """A relaxation fitted to the records: z (k,), covariance (k, k), -2 log evidence, and mean log misfit."""
 
     relaxation: RelaxationModel
     z: Array
