@@ -23,6 +23,10 @@ def test_the_peak_is_kept_and_the_noise_is_gone(seed):
     error = curve.force_N - truth(curve.time_s + touch.time_s)
     assert np.sqrt(np.mean(error**2)) < 0.015
     assert curve.noise_N == pytest.approx(0.03, rel=0.1)
+    since = trace.time_s - touch.time_s
+    line = np.interp(since, curve.knots_s, curve.knots_mm) + touch.displacement_mm
+    left = (trace.displacement_mm - line)[(since >= 0.0) & (since <= curve.knots_s[-1])]
+    assert np.std(left) == pytest.approx(0.005, rel=0.1)
 
 
 def test_displacement_is_a_line_in_and_a_line_out():
