@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -45,7 +44,7 @@ from limbfit.anatomy.surfaces.mending import build_closed_anatomy, open_loops
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, build_anatomy, find_bodies, read_surface
 from limbfit.anatomy.surfaces.thickness import measure_fat_depth
 from limbfit.anatomy.surfaces.triangles import from_pyvista
-from limbfit.bench.meshing import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, draw_random_sites
+from limbfit.bench.meshing import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, draw_random_sites, measure_cpu_seconds
 from limbfit.errors import LimbfitError
 from limbfit.fe import solve
 from limbfit.indentation import SiteModel, build_problem, build_steps
@@ -154,7 +153,7 @@ def faults(mesh: Mesh, report: Any) -> list[str]:
 
 def site_row(limb: Limb, base: BaseMesh, settings: MeshSettings, site: tuple[Array, Array]) -> dict[str, Any]:
     """What became of one mesh; a failure says why."""
-    start = sum(os.times()[:4])
+    start = measure_cpu_seconds()
     try:
         mesh, report = mesh_site(limb.anatomy, *site, settings, base)
     except LimbfitError as error:
@@ -169,7 +168,7 @@ def site_row(limb: Limb, base: BaseMesh, settings: MeshSettings, site: tuple[Arr
         "volume_error": report.volume_error,
         "layer_mm": report.layer_mean_mm,
         "repairs": list(report.repairs),
-        "seconds": sum(os.times()[:4]) - start,
+        "seconds": measure_cpu_seconds() - start,
         "mesh": mesh,
     }
 
@@ -178,7 +177,7 @@ def simulated(
     mesh: Mesh, site: tuple[Array, Array], depth_mm: float, within_mm: float | None
 ) -> dict[str, Any]:
     """The indentation of a site by the default indenter and tissue, in and out."""
-    start, ramp = sum(os.times()[:4]), depth_mm / SPEED_MM_S
+    start, ramp = measure_cpu_seconds(), depth_mm / SPEED_MM_S
     position, axis = (tuple(float(x) for x in part) for part in site)
     with tempfile.TemporaryDirectory() as folder:
         knots = (0.0, ramp, 2 * ramp), (0.0, depth_mm, 0.0)
@@ -200,7 +199,7 @@ def simulated(
         "reason": result.reason,
         "peak_N": result.peak_force,
         "simulated_nodes": len(problem.mesh.points),
-        "solving_s": sum(os.times()[:4]) - start,
+        "solving_s": measure_cpu_seconds() - start,
         "doubts": [doubt.text for doubt in result.doubts],
     }
 

@@ -12,6 +12,7 @@ from ...arrays import Array
 from ...results.identification import CalibrationUncertainty, RecordResiduals, RelaxationBeyond
 from .objective import MeasuredCurve, SiteResponse, find_largest_magnitude
 
+Values = Array | float  # numbers, or (n,)
 NORMAL_95 = 1.959964  # half of a 95 % interval, in standard deviations of a normal distribution
 MAX_FREEDOM = 1e6  # of Student's distribution: a normal one
 MIN_FREEDOM = 3.0  # of a misfit: it is similar at other sites and in other studies
@@ -72,26 +73,25 @@ def compute_force_range(
     return np.minimum(response.force_N, other), np.maximum(response.force_N, other)
 
 
+def change_by_factor(value: Values, change: Values) -> Array:
+    """Return positive values after a ``change`` to first order, by which alone they could become negative:
+    moduli fall by factors, and so do they."""
+    size = np.maximum(value, np.finfo(float).tiny)
+    return np.asarray(value * np.exp(np.minimum(change, 0.0) / size) + np.maximum(change, 0.0))
+
+
 def widen_by_relaxation(
-    value: Array | float,
-    ends: tuple[Array | float, Array | float],
-    half: Array | float,
-    moved: Array | float,
-    sd: Array | float,
-    fall: Array | float,
+    value: Values, ends: tuple[Values, Values], half: Values, moved: Values, sd: Values, fall: Values
 ) -> tuple[Array, Array]:
     """Return the ends of the 95 % interval of positive values that relaxation beyond the records changes.
 
     Before that it is ``half`` wider than ``ends`` on either side. To first order relaxation moves the values
     by ``moved``, with a standard deviation ``sd``, and beside that they may be lower by anything up to
-    ``fall`` (higher, where it is negative). Moduli fall by factors, and so do the values, with all that is
-    uncertain of them: to first order they could become negative. All are numbers or (n,).
+    ``fall`` (higher, where it is negative). Values fall by factors, with all that is uncertain of them.
     """
     size = np.maximum(value, np.finfo(float).tiny)
-    low, high = (
-        value + np.maximum(change, 0.0) + value * np.expm1(np.minimum(change, 0.0) / size)
-        for change in (moved - np.maximum(fall, 0.0), moved - np.minimum(fall, 0.0))
-    )
+    low = change_by_factor(value, moved - np.maximum(fall, 0.0))
+    high = change_by_factor(value, moved - np.minimum(fall, 0.0))
     less, more = np.minimum(low / size, 1.0), np.minimum(high / size, 1.0)
     down = np.hypot(less * half, low * np.expm1(-NORMAL_95 * sd / size))
     up = np.hypot(more * half, NORMAL_95 * sd)
@@ -138,10 +138,9 @@ class RelaxationSpread:
         low, high = ends[0] - half, ends[1] + half
         for i in np.flatnonzero(times_s > self.longest_s):
             shift_log, covariance, fall_log = self.interpolate(float(times_s[i]))
-            moved, fall = float(slopes[i] @ shift_log), float(slopes[i] @ fall_log)
-            sd = float(np.sqrt(slopes[i] @ covariance @ slopes[i]))
-            own = float(ends[0][i]), float(ends[1][i])
-            lower, higher = widen_by_relaxation(float(force_N[i]), own, float(half[i]), moved, sd, fall)
+            moved, sd = slopes[i] @ shift_log, np.sqrt(slopes[i] @ covariance @ slopes[i])
+            own, fall = (ends[0][i], ends[1][i]), slopes[i] @ fall_log
+            lower, higher = widen_by_relaxation(force_N[i], own, half[i], moved, sd, fall)
             low[i], high[i] = min(low[i], lower), max(high[i], higher)
         return low, high
 

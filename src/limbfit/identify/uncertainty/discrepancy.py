@@ -283,9 +283,7 @@ def limit_to_mean_square(
     residual, jacobian = scale * np.concatenate(residuals), scale[:, None] * np.concatenate(jacobians)
     if len(residual) <= jacobian.shape[1]:  # the fit leaves nothing that could tell
         return model
-    own = block_diag(*(model.own_covariance(i) for i in range(len(residuals))))
-    sites = np.concatenate(model.site_deviations)
-    covariance = scale[:, None] * (own + sites @ sites.T) * scale
+    covariance = scale[:, None] * replace(model, mesh_N=()).covariance * scale
     directions = np.linalg.qr(jacobian)[0]
     along = covariance @ directions
     within = directions.T @ along

@@ -15,8 +15,9 @@ without. Where the records prefer such fits, `RelaxationAssessment.describe` say
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -202,14 +203,16 @@ def assess_relaxation(known: Uncertainty, responses: Sequence[SiteResponse]) -> 
     weights, evidence = _weigh(fits)
     # The model's own terms keep the answer, whose covariance is counted with it.
     fits[0] = replace(fits[0], z=records.answer, covariance=0 * fits[0].covariance)
+    readings = [records.list_readings(fit) for fit in fits]
+    parts = [(fit, one, share / len(own)) for fit, share, own in zip(fits, weights, readings) for one in own]
     durations = np.unique(np.r_[_DURATIONS_S, longest])  # between these all is linear, but for that corner
-    shifts, covariances = zip(*(records.spread(fits, weights, t) for t in durations), strict=True)
+    shifts, covariances = zip(*(records.spread(parts, t) for t in durations), strict=True)
     is_modulus = np.array([name.endswith("_kPa") for name in known.names])
     falls = MAX_SLOPE * np.outer(np.log(np.maximum(durations / longest, 1.0)), is_modulus)
     spread = RelaxationSpread(
         longest, float(weights[0]), durations, np.array(shifts), np.array(covariances), falls
     )
-    tails = float(weights[[len(records.list_readings(fit)) > 1 for fit in fits]].sum())
+    tails = float(weights[[len(own) > 1 for own in readings]].sum())
     furthers = float(weights[[fit.relaxation.has_further for fit in fits]].sum())
     return RelaxationAssessment(known, tissues, evidence, furthers, tails, spread)
 
@@ -304,27 +307,28 @@ class _ForceRecords:
 
     def fit(self, relaxation: RelaxationModel, start: Array) -> _Fit:
         """Fit a relaxation, first with equal errors everywhere, then by what its residuals say of misfit."""
-        peaks_N = np.concatenate([np.full(len(one.force_N), one.peak_N) for one in self.measured])
-        z, _ = self._solve(relaxation, start, np.diag((_ALIKE * peaks_N) ** 2), _MAX_FIT_STEPS)
+        alike_N = _ALIKE * np.concatenate([np.full(len(one.force_N), one.peak_N) for one in self.measured])
+        z, _ = self._solve(relaxation, start, lambda rows: rows / alike_N[:, None], _MAX_FIT_STEPS)
         found = estimate_discrepancy(self.model, *self._linearise(relaxation, z), self.prior.precision)
         stated = self.prior.compute_deviations(z)
-        z, covariance = self._solve(relaxation, z, found.covariance, _FURTHER_FIT_STEPS)
+        whiten = partial(solve_triangular, np.linalg.cholesky(found.covariance), lower=True)
+        z, covariance = self._solve(relaxation, z, whiten, _FURTHER_FIT_STEPS)
         criterion = found.criterion + float(stated @ stated)
         return _Fit(relaxation, z, covariance, criterion, float(np.mean(np.log(found.misfit))))
 
     def _solve(
-        self, relaxation: RelaxationModel, z: Array, covariance: Array, steps: int
+        self, relaxation: RelaxationModel, z: Array, whiten: Callable[[Array], Array], steps: int
     ) -> tuple[Array, Array]:
-        """Generalised least squares from z (k,) on, with errors of a covariance (N, N); the answer and its
-        covariance (k, k)."""
-        factor, prior = np.linalg.cholesky(covariance), self.prior
+        """Generalised least squares from z (k,) on, of rows (N, ...) that ``whiten`` gives unit errors; the
+        answer and its covariance (k, k)."""
+        prior = self.prior
 
         def evaluate(z: Array) -> SearchPoint:
             residuals, scaled = self._linearise(relaxation, z)
             rows = np.column_stack([np.concatenate(residuals), np.concatenate(scaled)])
             known = np.column_stack([(z - self.answer) / prior.sd, np.diag(1.0 / prior.sd)])
             stated = np.column_stack([prior.compute_deviations(z), prior.rows])
-            whole = np.concatenate([solve_triangular(factor, rows, lower=True), known, stated])
+            whole = np.concatenate([whiten(rows), known, stated])
             return SearchPoint(z, whole[:, 0], whole[:, 1:])
 
         point, bounds = evaluate(z), (self.space.lower, self.space.upper)
@@ -338,22 +342,22 @@ class _ForceRecords:
         residuals = [r.force_N - one.force_N for r, one in zip(found, self.measured, strict=True)]
         return residuals, [self.space.pull_back(r.jacobian, p) for r in found]
 
-    def spread(self, fits: Sequence[_Fit], weights: Array, duration_s: float) -> tuple[Array, Array]:
+    def spread(
+        self, parts: Sequence[tuple[_Fit, RelaxationModel, float]], duration_s: float
+    ) -> tuple[Array, Array]:
         """Mean (p,) and covariance (p, p) of elastic parameters at a time, over those of the answer.
 
-        Later than the longest load, a modulus is that at its end.
+        ``parts`` are fits, a reading of each, and its weight. Later than the longest load, a modulus is that
+        at its end.
         """
-        within, own = min(duration_s, self.longest_s), RelaxationModel()
-        shares, changes, inner = [], [], []
-        for fit, weight in zip(fits, weights, strict=True):
-            readings = self.list_readings(fit)
-            for relaxation in readings:
-                at = self._elastic_log(relaxation, fit.z, within)
-                points = fit.z + _DIFFERENCE * np.eye(len(fit.z))
-                D = np.array([self._elastic_log(relaxation, z, within) - at for z in points]) / _DIFFERENCE
-                shares.append(weight / len(readings))
-                changes.append(at)
-                inner.append(D.T @ fit.covariance @ D)
+        within, own, shares = min(duration_s, self.longest_s), RelaxationModel(), [part[2] for part in parts]
+        changes, inner = [], []
+        for fit, relaxation, _ in parts:
+            at = self._elastic_log(relaxation, fit.z, within)
+            points = fit.z + _DIFFERENCE * np.eye(len(fit.z))
+            D = np.array([self._elastic_log(relaxation, z, within) - at for z in points]) / _DIFFERENCE
+            changes.append(at)
+            inner.append(D.T @ fit.covariance @ D)
         change = np.array(changes) - self._elastic_log(own, self.answer, duration_s)
         mean = np.array(shares) @ change
         apart, kept = change - mean, slice(self.count)

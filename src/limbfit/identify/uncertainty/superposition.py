@@ -52,7 +52,7 @@ class TissueParameters:
     amplitudes: tuple[int, ...]
     times: tuple[int, ...]
     is_given: bool
-    further: tuple[int, ...] = ()
+    further: tuple[int, int] | tuple[()] = ()
 
     def own_terms(self, p: Array) -> RelaxationTerms:
         """The model's relaxation at parameters p."""
@@ -173,7 +173,7 @@ class Superposition:
                 continue
             of_terms = [*zip(tissue.amplitudes, tissue.times, strict=True)]
             if relaxation.has_further and tissue.further:
-                of_terms.append((tissue.further[0], tissue.further[1]))
+                of_terms.append(tissue.further)
             for k, (amplitude, time) in enumerate(of_terms):
                 slopes[:, amplitude] = terms.amplitudes[k] * (histories[k] @ factors)
                 around = p[time] * np.exp([-_DIFFERENCE, _DIFFERENCE])

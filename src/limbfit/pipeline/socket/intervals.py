@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
-from ...identify.fit.prediction import NORMAL_95, widen_by_relaxation
+from ...identify.fit.prediction import NORMAL_95, change_by_factor, widen_by_relaxation
 from ...laws import LAWS, OGDEN
 from ...study import Study
 
@@ -134,10 +134,8 @@ class SimulationSpread:
         if known.is_relaxed:
             shares[RELAXATION] = 100.0 * (1.0 - rest)
         found = {name: float(shares[name]) for name in sorted(shares, key=lambda name: -shares[name])}
-        by = _CHANGE * slopes
-        changes = dict(zip(self.names, map(float, by), strict=True))
-        lower = -size * np.expm1(-max(fall, 0.0) / max(size, np.finfo(float).tiny)) + min(fall, 0.0)
-        relaxation = [sign * moved, sd, sign * float(lower)]
+        changes = dict(zip(self.names, map(float, _CHANGE * slopes), strict=True))
+        relaxation = [sign * moved, sd, sign * (size - float(change_by_factor(size, -fall)))]
         return [max(end, least) for end in ends], found, changes, relaxation
 
 

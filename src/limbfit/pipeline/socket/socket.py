@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,6 @@ from ...anatomy.surfaces.surfaces import write_surface
 from ...arrays import Array
 from ...donning import DonningResult
 from ...donning.model import OUTER
-from ...execution import Executor
 from ...identify.checks.domain import Extent, RecordedRange, describe_outside
 from ...identify.fit.prediction import RelaxationSpread
 from ...indentation import Parameters
@@ -94,8 +93,7 @@ def run_socket(
         outside_text = describe_outside(outside) if recorded_range else [NOT_COMPARED]
         if samples:
             steps = [draw_step(np.array(covariance_log), number) for number in range(samples)]
-            tell = partial(context.tell, NAME)
-            simulated = _simulate_samples(run, content, steps, context.executor, tell)
+            simulated = _simulate_samples(context, run, content, steps)
     result = SocketResult(
         **content,
         parameters=parameters,
@@ -164,11 +162,7 @@ def _compare_with_records(
 
 
 def _simulate_samples(
-    run: SocketRun,
-    content: dict[str, Any],
-    steps: Sequence[Array],
-    executor: Executor,
-    tell: Callable[[float, float, str], None],
+    context: Context, run: SocketRun, content: dict[str, Any], steps: Sequence[Array]
 ) -> SocketSamples:
     """Simulate parameters whose logarithms differ by ``steps (k,)``, and widen the intervals by the misses.
 
@@ -186,7 +180,8 @@ def _simulate_samples(
         more = {"friction": table.friction * (1.0 + CHANGE_PERCENT / 100.0)}
         rougher = study.model_copy(update={"socket": table.model_copy(update=more)})
         jobs.append(replace(plain, name=FRICTION, limb=replace(run.limb, study=rougher)))
-    reasons = run_sockets(jobs, executor, lambda done, words: tell(done, len(jobs), words))
+    tell = partial(context.tell, NAME)
+    reasons = run_sockets(jobs, context.executor, lambda done, words: tell(done, len(jobs), words))
     ended = [None if reason else simulate_socket(one)[0] for one, reason in zip(jobs, reasons, strict=True)]
     for other in filter(None, ended[len(steps) :]):
         store_change(content, other, FRICTION)
