@@ -127,6 +127,8 @@ def test_labels_corrected_by_hand_are_those_of_the_study_each_time(tmp_path):
 def test_impossible_models_are_refused_in_one_line(tmp_path):
     with pytest.raises(InputError, match="no model is named 'yeti'; use all, or some of two-terms, power"):
         select_models(["yeti"])
+    with pytest.raises(InputError, match="no model is named 'yeti'"):
+        select_models(["all", "yeti"])
     with pytest.raises(InputError, match="no model is named"):
         select_models([])
     assert select_models(["fung", "all"]) == tuple(MODELS)

@@ -134,12 +134,11 @@ def select_models(names: Sequence[str]) -> tuple[str, ...]:
 
     Raises `InputError` for a name that no model has.
     """
-    chosen = tuple(dict.fromkeys(MODELS if "all" in names else names))
-    unknown = [name for name in chosen if name not in MODELS]
-    if unknown or not chosen:
+    unknown = [name for name in names if name not in (*MODELS, "all")]
+    if unknown or not names:
         what = f"no model is named {unknown[0]!r}" if unknown else "no model is named"
         raise InputError(what, place="--models", remedy="use all, or some of " + ", ".join(MODELS))
-    return chosen
+    return tuple(dict.fromkeys(MODELS if "all" in names else names))
 
 
 def derive_study(study: Study, name: str) -> Study:
