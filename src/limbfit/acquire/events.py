@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum, IntFlag
-from typing import ClassVar
+from typing import ClassVar, dataclass_transform
 
 from ..study import AcquireTable
 
@@ -76,11 +76,15 @@ Whole = int  # 0 or more
 Positive = int
 
 
+@dataclass_transform(frozen_default=True)
 class Message:
-    """What a line of the wire says: a verb and its words, which are the fields in their order."""
+    """What a line of the wire says: a verb and its words, which are the fields of a kind in their order."""
 
-    __slots__ = ()
     verb: ClassVar[str]
+
+    def __init_subclass__(cls, verb: str) -> None:
+        cls.verb = verb
+        dataclass(frozen=True)(cls)
 
     @classmethod
     def words(cls) -> dict[str, str]:
@@ -92,33 +96,27 @@ class Message:
         return " ".join((self.verb, *(str(getattr(self, name)) for name in self.words())))
 
 
-@dataclass(frozen=True, slots=True)
-class Move(Message):
+class Move(Message, verb="MOVE"):
     """Drive a pin (1 to 14) to a position; it halts by itself at a force (0: at none)."""
 
-    verb: ClassVar[str] = "MOVE"
     pin: Pin
     target_um: Whole
     speed_um_s: Positive
     halt_mN: Whole = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Hold(Message):
+class Hold(Message, verb="HOLD"):
     """Halt a pin where it is."""
 
-    verb: ClassVar[str] = "HOLD"
     pin: Pin
 
 
-@dataclass(frozen=True, slots=True)
-class Stop(Message):
+class Stop(Message, verb="STOP"):
     """Halt everything at once, then bring every pin home; stays until the session ends.
 
     The reason holds what devices said, and stays off the wire.
     """
 
-    verb: ClassVar[str] = "STOP"
     reason: str = ""
 
     @classmethod
@@ -126,11 +124,9 @@ class Stop(Message):
         return {}
 
 
-@dataclass(frozen=True, slots=True)
-class Fence(Message):
+class Fence(Message, verb="FENCE"):
     """From now on a pin may not go beyond a position."""
 
-    verb: ClassVar[str] = "FENCE"
     pin: Pin
     position_um: Positive
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import re
 from binascii import crc32
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, get_args
+from typing import Any, get_args
 
 from .events import PINS, Fence, Hold, Message, Move, Pin, Positive, Sample, Stop
 
@@ -165,20 +165,16 @@ class Decoder:
 # -- from limbfit to the device
 
 
-@dataclass(frozen=True, slots=True)
-class Hello(Message):
+class Hello(Message, verb="HELLO"):
     """Opens a session; the only line without salt."""
 
-    verb: ClassVar[str] = "HELLO"
     version: Positive
     nonce: Nonce
 
 
-@dataclass(frozen=True, slots=True)
-class SetLimits(Message):
+class SetLimits(Message, verb="LIMITS"):
     """The device's own limits for this session: it takes the lower of these and those built in."""
 
-    verb: ClassVar[str] = "LIMITS"
     pin: Pin
     force_mN: Positive
     clamp_mN: Positive
@@ -187,49 +183,38 @@ class SetLimits(Message):
     watchdog_ms: Positive
 
 
-@dataclass(frozen=True, slots=True)
-class NoteSite(Message):
+class NoteSite(Message, verb="SITE"):
     """The site at which the session is."""
 
-    verb: ClassVar[str] = "SITE"
     name: Word
 
 
-@dataclass(frozen=True, slots=True)
-class NotePhase(Message):
+class NotePhase(Message, verb="PHASE"):
     """The phase in which the session is, for the device's display and log."""
 
-    verb: ClassVar[str] = "PHASE"
     name: Word
 
 
-@dataclass(frozen=True, slots=True)
-class Heartbeat(Message):
+class Heartbeat(Message, verb="BEAT"):
     """limbfit lives, and has dealt with the sample of this number."""
 
-    verb: ClassVar[str] = "BEAT"
     number: Number
 
 
-@dataclass(frozen=True, slots=True)
-class Bye(Message):
+class Bye(Message, verb="BYE"):
     """Ends the session."""
-
-    verb: ClassVar[str] = "BYE"
 
 
 # -- from the device to limbfit
 
 
-@dataclass(frozen=True, slots=True)
-class Identity(Message):
+class Identity(Message, verb="ID"):
     """What a device says of itself when greeted.
 
     ``clock`` is ``real``, or ``paced``: the device's time waits for limbfit, which then lives by it.
     ``touch_fF`` is the capacitance of a head that touches skin; ``calibrated`` the day of its calibration.
     """
 
-    verb: ClassVar[str] = "ID"
     version: Positive
     nonce: Nonce
     pins: Positive
@@ -247,37 +232,29 @@ class Identity(Message):
         return self.clock == "paced"
 
 
-@dataclass(frozen=True, slots=True)
-class Accepted(Message):
+class Accepted(Message, verb="OK"):
     """The command of this number is being done."""
 
-    verb: ClassVar[str] = "OK"
     number: Number
 
 
-@dataclass(frozen=True, slots=True)
-class Declined(Message):
+class Declined(Message, verb="NO"):
     """The command of this number is not done, and why, in a word."""
 
-    verb: ClassVar[str] = "NO"
     number: Number
     code: Word
 
 
-@dataclass(frozen=True, slots=True)
-class LimitTripped(Message):
+class LimitTripped(Message, verb="FAULT"):
     """The device stopped by itself: why, in a word, and at which pin (0: none)."""
 
-    verb: ClassVar[str] = "FAULT"
     code: Word
     pin: PinOrNone
 
 
-@dataclass(frozen=True, slots=True)
-class OutOfReach(Message):
+class OutOfReach(Message, verb="STUCK"):
     """After a stop these pins (a bit each) do not come home."""
 
-    verb: ClassVar[str] = "STUCK"
     pins: PinBits
 
 
