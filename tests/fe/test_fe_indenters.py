@@ -139,7 +139,7 @@ def within(depth: float) -> Problem:
 def test_start_inside_the_tissue_is_refused():
     with pytest.raises(ProblemError, match=r"starts 1\.3 mm inside the tissue, deepest at .*; move it out"):
         solve(within(1.3))
-    assert System(within(0.0)).bodies is not None
+    assert System(within(0.0)).bodies.all
 
 
 @pytest.mark.parametrize(

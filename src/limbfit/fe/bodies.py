@@ -107,7 +107,10 @@ def count_body_rows(bodies: Sequence[RigidBody]) -> int:
 
 
 class Bodies:
-    """See the module docstring.  ``levers (c, 3, k)`` are those of the last tangent that was evaluated."""
+    """See the module docstring; there may be none.
+
+    ``levers (c, 3, k)`` are those of the last tangent that was evaluated.
+    """
 
     def __init__(self, problem: Problem, element: Element, points: Array, pattern: Pattern) -> None:
         self.pattern, self.nodes = pattern, len(points)
@@ -129,10 +132,10 @@ class Bodies:
             check_clear(surface, body.tool(start, drive, growth).body, stated.name)
         self.rows, self.count, self.free = row, first, column
         self.levers = np.zeros((first, 3, column))
-        self.frames = np.concatenate(
-            [np.broadcast_to(b.frame, (b.surface.areas.size, 3, 3)) for b in self.all]
-        )
-        self._spread = sp.hstack([self._build_shares(body.surface) for body in self.all], format="csr")
+        frames = [np.broadcast_to(b.frame, (b.surface.areas.size, 3, 3)) for b in self.all]
+        self.frames = np.concatenate(frames or [np.zeros((0, 3, 3))])
+        shares = [self._build_shares(body.surface) for body in self.all]
+        self._spread = sp.hstack(shares or [sp.csr_matrix((self.unknowns, 0))], format="csr")
         self._positions = [find_positions(b.surface.faces, pattern.numbers, pattern.indptr, pattern.indices)
                            for b in self.all]  # fmt: skip
         self._locate_border()

@@ -83,7 +83,7 @@ def compute_contact_pressure(system: System, laws: Laws, state: State) -> Array:
     a corner's force goes to the mid-edge nodes beside it, and it gets the mean of their pressures.
     """
     pressure = np.zeros(len(system.points))
-    if system.bodies is None:
+    if not system.bodies.all:
         return pressure
     penalty = state.penalty * laws.modulus
     found = system.bodies.evaluate(state.rows, state.drives, penalty, np.inf, state.grips, tangent=False)

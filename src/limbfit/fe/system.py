@@ -136,16 +136,14 @@ class System:
             self._apply_prestretch(np.asarray(problem.prestretch, dtype=float))
         self._number_unknowns(problem)
         self._build_pattern(problem)
-        self.bodies: Bodies | None = None
         pattern = Pattern(self.indptr, self.indices, self.numbers)
         self.pressures = Pressures(self.element, self.points, problem.pressures, pattern)
-        if problem.rigid_bodies:
-            self.bodies = Bodies(problem, self.element, self.points, pattern)
+        self.bodies = Bodies(problem, self.element, self.points, pattern)
 
     @property
     def indenter(self) -> Indenter | None:
         """The problem's indenter where it starts."""
-        if self.bodies is None or self.problem.indenter is None:
+        if self.problem.indenter is None:
             return None
         start = self.bodies.first.start
         assert isinstance(start, Indenter)
@@ -205,7 +203,7 @@ class System:
     def impose(self, u: Array, increment: Increment) -> Array:
         """``u`` with supported components, and coordinates of bodies that are held, at their values."""
         held = np.where(self.supported, self.factors * increment.displacement, u)
-        return held if self.bodies is None else self.bodies.impose(held, increment.drives)
+        return self.bodies.impose(held, increment.drives)
 
     def elements(self, cells: slice) -> Elements:
         """Some of the elements, as the kernels take them."""
@@ -245,7 +243,7 @@ class System:
             load_norm = max(load_norm, pressure_norm)
             if tangent:
                 self.pressures.add_tangent(u, increment.pressures, data)
-        if not np.isfinite(energy) or self.bodies is None:
+        if not np.isfinite(energy) or not self.bodies.all:
             return Evaluation(energy, residual, data if tangent else None, load_norm=load_norm)
         found = self._evaluate_contact(u, increment, tangent)
         driving, loads, loads_norm = self.bodies.evaluate_drives(u, increment.drives, increment.penalty)
@@ -267,15 +265,14 @@ class System:
         return share * float((laws.fibre[:, 2] * volumes ** (2.0 / 3.0)).max())
 
     def _evaluate_contact(self, u: Array, increment: Increment, tangent: bool = False) -> Contacts:
-        assert self.bodies is not None
         return self.bodies.evaluate(
             u, increment.drives, increment.penalty, increment.flat_from, increment.grips, tangent
         )
 
     def contact_force(self, u: Array, increment: Increment) -> Array:
         """The contact part of the residual (r, 3), N."""
-        return np.zeros_like(u) if self.bodies is None else self._evaluate_contact(u, increment).residual
+        return self._evaluate_contact(u, increment).residual
 
     def tools(self, u: Array, increment: Increment) -> list[Tool]:
         """The rigid bodies where they are at ``u (r, 3)``."""
-        return [] if self.bodies is None else self.bodies.tools(u, increment.drives)
+        return self.bodies.tools(u, increment.drives)

@@ -93,7 +93,6 @@ class Tractions:
 
 def compute_tractions(system: System, laws: Laws, state: State, body: int = 0) -> Tractions:
     """Those of the ``body``-th of a problem's rigid bodies in a state."""
-    assert system.bodies is not None
     one, penalty = system.bodies.all[body], state.penalty * laws.modulus
     found = system.bodies.evaluate(state.rows, state.drives, penalty, np.inf, state.grips, tangent=False)
     normals, forces = found.touch.normals[one.points], -found.touch.forces[one.points]

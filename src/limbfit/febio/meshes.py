@@ -108,9 +108,8 @@ def build_bodies(problem: Problem, motions: Sequence[Motion] = ()) -> list[FebBo
 
     Raises `ProblemError` for a motion that FEBio cannot be given, and for two bodies of one name.
     """
-    system = System(problem)
     bodies: list[FebBody] = []
-    for i, body in enumerate([] if system.bodies is None else system.bodies.all):
+    for i, body in enumerate(System(problem).bodies.all):
         stated = body.stated
         if i == 0 and problem.indenter is not None:
             names = INDENTER, PATCH, FRONT, "indentation"

@@ -72,7 +72,6 @@ class FacePenalties:
     """
 
     def __init__(self, system: System, contacts: Sequence[Contact], times: Array) -> None:
-        assert system.bodies is not None
         self.system, self.times = system, np.asarray(times)
         first = float(self.times[0])
         mean = compute_mean_stiffness(contacts[0], system.problem, first)

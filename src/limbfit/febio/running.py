@@ -215,7 +215,6 @@ class LogTables:
         """Return force and moment (6,) about a point of a rigid body on tissue that it touches or carries."""
         total = np.zeros(6)
         if name in self.bodies:
-            assert self.system.bodies is not None
             i = list(self.bodies).index(name)
             body = self.system.bodies.all[i]
             force, conjugate = step.reactions[i].reshape(2, 3) @ body.frame

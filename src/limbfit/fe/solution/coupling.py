@@ -19,7 +19,7 @@ import scipy.sparse.linalg as spla
 from ...arrays import Array
 from ..kernel.laws import Laws
 from ..system import Evaluation, Increment, System
-from .direction import find_touching_bodies, update_springs
+from .direction import update_springs
 from .factor import Factor
 from .linear import NotPositiveDefiniteError
 from .newton import Equilibrium, NewtonControl, compute_reaction_scale, compute_residual_norm
@@ -47,10 +47,10 @@ class Coupling:
             if found is None:
                 continue
             if self._blocks is None:
-                self._blocks = np.zeros((find_touching_bodies(system).count, 3, 3))
+                self._blocks = np.zeros((self._bodies.count, 3, 3))
             stiff = (increment.penalty * tool.surface.areas)[..., None, None]
             in_space = tool.body.frame.T @ (stiff * found) @ tool.body.frame
-            self._blocks[find_touching_bodies(system).all[i].points] = in_space.reshape(-1, 3, 3)
+            self._blocks[self._bodies.all[i].points] = in_space.reshape(-1, 3, 3)
 
     def __bool__(self) -> bool:
         return self._rims is not None or self._blocks is not None
@@ -63,13 +63,13 @@ class Coupling:
     def __call__(self, x: Array) -> Array:
         """``C x (n, p)``."""
         out = np.zeros_like(x) if self._rims is None else self._rims @ x
-        if self._blocks is None or self._bodies is None:
+        if self._blocks is None:
             return np.asarray(out)
         return np.asarray(out + self._bodies.spread_forces(self._blocks @ self._bodies.move_springs(x)))
 
     def project_on_axis(self, x: Array) -> Array:
         """What ``C x`` changes the force of the first body along its axis by (p,), N."""
-        if self._blocks is None or self._bodies is None:
+        if self._blocks is None:
             return np.zeros(x.shape[1])
         return self._bodies.project_on_axis(self._blocks @ self._bodies.move_springs(x))
 

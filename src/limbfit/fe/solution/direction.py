@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array
-from ..bodies import Bodies
 from ..contact.contact import Touch
 from ..system import Evaluation, System
 from .factor import Factor, LinearSolution
@@ -52,12 +51,6 @@ def find_newton_direction(
     return direction.reshape(at.residual.shape)
 
 
-def find_touching_bodies(system: System) -> Bodies:
-    """The rigid bodies of a system that has some."""
-    assert system.bodies is not None
-    return system.bodies
-
-
 def _change(factor: Factor, at: Evaluation, touch: Touch, closed: Bools) -> SpringChange | None:
     """How the springs of a set of closed points differ from the factor's; None where too many close or open.
 
@@ -82,7 +75,7 @@ def _match_springs(
 def _solve_with_contact(
     system: System, at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: float
 ) -> LinearSolution:
-    bodies = find_touching_bodies(system)
+    bodies = system.bodies
     found, closed = LinearSolution(np.zeros_like(b), True, True), touch.closed
     for _ in range(ROUNDS):
         guess = found.x
@@ -127,8 +120,7 @@ def _predict_closed(
     springs = _change(factor, at, touch, closed)
     if springs is None:
         return x, touch.closed
-    bodies = find_touching_bodies(system)
-    before = bodies.move_springs(x[:, 0])
+    before = system.bodies.move_springs(x[:, 0])
     y = factor.forward(b - factor.multiply(at.tangent, x) if x.any() else b)
     moved = factor.columns.displace_points(y, closed | touch.closed)
     part = None
@@ -173,7 +165,7 @@ def _begin(system: System, at: Evaluation, factor: Factor) -> None:
     if at.touch is None:
         factor.factorise(at.tangent)
     else:
-        without = find_touching_bodies(system).with_springs(at.tangent, -at.touch.blocks)
+        without = system.bodies.with_springs(at.tangent, -at.touch.blocks)
         factor.factorise(without, np.zeros_like(at.touch.blocks))
 
 

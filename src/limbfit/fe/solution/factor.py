@@ -72,8 +72,7 @@ class Factor:
     ) -> None:  # fmt: skip
         self._system, self._moduli, self._choice, self._threads = system, moduli, name, threads
         self._last = last
-        moving = system.bodies is not None and system.bodies.free > 0
-        suits = not moving and system.cells.shape[1] == 10
+        suits = not system.bodies.free and system.cells.shape[1] == 10
         fewest = MIN_IN_MANY_STEPS if steps > MANY_STEPS else MIN_MULTIGRID
         many = system.unknowns >= fewest and not lasting
         if name == "auto" and suits and (many or prefers_multigrid()):
@@ -350,7 +349,7 @@ def compute_shear_stiffness(system: System, moduli: Array) -> Array:
 def compute_body_stiffness(system: System, moduli: Array) -> tuple[NDArray[np.int32], Array]:
     """Diagonal entries of the coordinates that are free to move rigid bodies, and what holds those of bodies
     that touch nothing (k,), N/mm."""
-    if system.bodies is None or not system.bodies.free:
+    if not system.bodies.free:
         return np.zeros(0, dtype=np.int32), np.zeros(0)
     return system.indptr[-1 - system.bodies.free : -1], system.bodies.compute_grounding(
         float(np.mean(moduli))

@@ -112,8 +112,7 @@ def equilibrate(
         last = norm
         if norm <= NEAR_EQUILIBRIUM * scale:
             evaluate.use_exact_tangent()
-        if system.bodies is not None:
-            direction = system.bodies.compute_trusted_share(direction) * direction
+        direction = system.bodies.compute_trusted_share(direction) * direction
         evaluate.predict_friction(u, direction)
         wants_tangent = control.tangent or forcing > sufficient
         found = _search_along_line(evaluate, u, here, direction, wants_tangent)

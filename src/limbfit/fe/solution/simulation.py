@@ -93,9 +93,8 @@ class SteppedRun:
         self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
         self.deepest = control.penetration * measure_indenter_travel(self.system, self.laws.modulus)
         self.touch = IndenterStart.of(problem)
-        rest, drives = np.zeros((self.system.rows, 3)), self.touch.shift_drives(problem.drives(0.0))
-        if self.system.bodies is not None:
-            rest = self.system.bodies.impose(rest, drives)
+        drives = self.touch.shift_drives(problem.drives(0.0))
+        rest = self.system.bodies.impose(np.zeros((self.system.rows, 3)), drives)
         still = np.zeros((*rest.shape, self.laws.count)) if sensitivities else None
         self.rest = self._read_coordinates(rest, drives)
         self.onset: Step | None = None  # the equilibrium at time 0, where it is another than that
@@ -154,7 +153,7 @@ class SteppedRun:
         before, self.problem = self.problem, self.problem.take_over_forces(step.time, step.reactions)
         bodies = zip(before.rigid_bodies, self.problem.rigid_bodies)
         took = [old.motion is not new.motion for old, new in bodies]
-        if any(took) and self.takeover is not None and self.system.bodies is not None:
+        if any(took) and self.takeover is not None:
             self.takeover = self.takeover.update(took, self.system.bodies, step.state, self.laws.modulus)
 
     def _equilibrate_onset(self) -> bool:
@@ -355,8 +354,8 @@ class SteppedRun:
 
     def _read_coordinates(self, u: Array, drives: Drives) -> Array:
         """Where the rigid bodies are (b, 6), mm and rad."""
-        bodies = [] if self.system.bodies is None else self.system.bodies.tools(u, drives)
-        return np.array([tool.pose.coordinates for tool in bodies]).reshape(-1, 6)
+        tools = self.system.bodies.tools(u, drives)
+        return np.array([tool.pose.coordinates for tool in tools]).reshape(-1, 6)
 
     def _build_state(
         self, time: float, displacement: float, u: Array, stiffness: float, du: Array | None,
@@ -394,16 +393,16 @@ class SteppedRun:
             held = stiff * grip.differentiate_anchors(tool)
             held = np.einsum("ij,fqip->fqjp", tool.body.frame, held).reshape(-1, 3, laws.count)  # in space
             change += tool.distribute_forces(held)
-            if i == 0 and system.bodies is not None:
+            if i == 0:
                 d_reaction -= system.bodies.first.frame[2] @ held.sum(axis=0)
-        if self.takeover is not None and system.bodies is not None:
+        if self.takeover is not None:
             change[system.nodes :] -= self.takeover.remaining(
                 self.problem.rigid_bodies, system.bodies, increment.time
             )
         coupling = Coupling(system, increment, u)
         b = -change.reshape(-1, laws.count)[system.free]
         pushed = self.touch.differentiate_contact_forces(system, at, coupling)
-        if pushed is not None and system.bodies is not None:
+        if pushed is not None:
             b -= system.bodies.spread_forces(pushed)
             d_reaction += system.bodies.project_on_axis(pushed)
         weights = self._compute_guess_weights(increment.time)

@@ -32,8 +32,6 @@ MAX_LAST = 1.5
 
 def find_touched_unknowns(system: System, problem: Problem) -> Index:
     """Unknowns where bodies will touch, for the factor to eliminate last; none where they are too many."""
-    if system.bodies is None:
-        return NONE
     found = system.bodies.find_swept_unknowns([body.motion for body in problem.rigid_bodies])
     return found if len(found) <= MAX_LAST * system.unknowns ** (2 / 3) else NONE
 
@@ -48,10 +46,8 @@ class SpringColumns:
 
     def __init__(self, system: System, halves: Halves) -> None:
         self._bodies, self._unknowns, self._halves = system.bodies, system.unknowns, halves
-        self.inner = np.zeros(0, dtype=bool)
-        if system.bodies is not None:
-            self.inner = system.bodies.find_points_on(halves.last)
-            self._shares = system.bodies.select_shares(halves.last)
+        self.inner = system.bodies.find_points_on(halves.last)
+        self._shares = system.bodies.select_shares(halves.last)
         self.clear(None)
 
     def clear(self, blocks: Array | None) -> None:
@@ -72,7 +68,7 @@ class SpringColumns:
 
         ``touched (c,)``: springs to be pushed along ``normals (c, 3)`` although they may not differ.
         """
-        if self.blocks is None or self._bodies is None:
+        if self.blocks is None:
             return None
         frames = self._bodies.frames  # on a flat face only the last axis is stiff
         change = frames @ (blocks - self.blocks) @ frames.transpose(0, 2, 1)
@@ -89,7 +85,6 @@ class SpringColumns:
 
         Where only inner points are ``closed (c,)``, the others are taken to stay.
         """
-        assert self._bodies is not None
         if not self.inner.any() or (closed & ~self.inner).any():
             return self._bodies.move_springs(self._halves.backward(y))[..., 0]
         x = self._halves.backward(y[self._halves.last], True)
@@ -114,7 +109,6 @@ class SpringColumns:
     def _add(self, new: list[tuple[int, int]], inner: bool) -> None:
         if not new:
             return
-        assert self._bodies is not None
         self.keys.update({key: len(self.keys) + i for i, key in enumerate(new)})
         points, axes = np.array(new).T
         unit = np.zeros((len(self.inner), 3, len(new)))

@@ -36,7 +36,7 @@ def measure_indenter_travel(system: System, modulus: float) -> float:
     ``modulus``, ``F / (4 mu w)``, and no more than half a width.
     """
     bodies = system.problem.rigid_bodies
-    if system.bodies is None:
+    if not bodies:
         return float(np.abs(system.problem.history.driver).max())
     grown = [-one.surface.gaps_at_rest(one.start.grown(1.0)).min() for one in system.bodies.all
              if one.stated.motion.grows]  # fmt: skip
@@ -56,8 +56,7 @@ def build_grips(
 ) -> tuple[StickyContact | None, ...]:
     """What holds the points of each body at first, where it is at rest; None where nothing ever does."""
     grips: list[StickyContact | None] = []
-    tools = [] if system.bodies is None else system.bodies.tools(u, drives)
-    for body, tool in zip([] if system.bodies is None else system.bodies.all, tools, strict=True):
+    for body, tool in zip(system.bodies.all, system.bodies.tools(u, drives), strict=True):
         friction = body.stated.friction
         if friction in ("frictionless", 0.0):
             grips.append(None)
@@ -109,7 +108,6 @@ class IndenterStart:
 
     def touch_down(self, system: System, u: Array, drives: Drives, du: Array | None) -> IndenterStart:
         """The start once it touches the tissue at ``u (r, 3)``, whose derivative is ``du (r, 3, p)``."""
-        assert system.bodies is not None
         body = system.bodies.first
         surface = replace(body.surface, points=body.surface.points + u[: system.nodes])
         offset = find_touching_offset(surface, body.start)
@@ -134,7 +132,7 @@ class IndenterStart:
         self, system: System, at: Evaluation, coupling: Coupling
     ) -> Array | None:
         """Derivative (c, 3, p) of the forces on the contact points through the offset alone, N."""
-        if self.slope is None or system.bodies is None or at.touch is None:
+        if self.slope is None or at.touch is None:
             return None
         points, axis = system.bodies.first.points, system.bodies.first.frame[2]
         out = np.zeros((system.bodies.count, 3, len(self.slope)))
@@ -144,7 +142,7 @@ class IndenterStart:
 
     def relative_to_touch(self, system: System, du: Array | None) -> Array | None:
         """Derivatives (r, 3, p) of displacements, relative to where the indenter touched."""
-        if du is None or self.slope is None or system.bodies is None:
+        if du is None or self.slope is None:
             return du
         return du - system.bodies.first.frame[2][:, None] * self.slope
 
