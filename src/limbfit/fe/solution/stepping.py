@@ -33,10 +33,7 @@ from .control import StepControl
 from .simulation import SteppedRun
 
 # What is kept of steps; of a run as it is; and of its parts, as dataclasses.
-_COLUMNS = (
-    "time", "displacement", "force", "penetration", "contact_area", "newton_iterations", "force_sensitivity",
-    "reactions", "coordinates", "displacement_sensitivity",
-)  # fmt: skip
+_COLUMNS = tuple(one.name for one in fields(Step) if one.name != "state")
 _PLAIN = ("stiffness", "damping", "floor", "pushing", "unbalanced", "unsettled")
 _PARTS = ("memory", "slope", "pace", "takeover")
 
