@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum, IntFlag
-from typing import ClassVar, dataclass_transform
+from typing import Annotated, Any, ClassVar, dataclass_transform, get_origin, get_type_hints
 
 from ..study import AcquireTable
 
@@ -70,30 +70,33 @@ class LinkLost:
 Event = Sample | Signal | Abort | LinkLost
 
 
-# Types of the words of messages, which say what values have a meaning.
-Pin = int  # 1 to 14
-Whole = int  # 0 or more
-Positive = int
+MAX_VALUE = 1_000_000  # no length, speed or force of this device is larger (um, um/s, mN)
+# Types of the words of messages, with the values that have a meaning.
+Pin = Annotated[int, range(1, PINS + 1)]
+Whole = Annotated[int, range(MAX_VALUE + 1)]
+Positive = Annotated[int, range(1, MAX_VALUE + 1)]
 
 
 @dataclass_transform(frozen_default=True)
 class Message:
-    """What a line of the wire says: a verb and its words, which are the fields of a kind in their order."""
+    """What a line of the wire says: a verb and its words.
+
+    ``words`` are the fields of a kind whose type says what values they have, in their order, and these
+    values: a range, or a pattern.
+    """
 
     verb: ClassVar[str]
+    words: ClassVar[dict[str, Any]]
 
     def __init_subclass__(cls, verb: str) -> None:
+        types = get_type_hints(cls, include_extras=True)
         cls.verb = verb
+        cls.words = {name: of.__metadata__[0] for name, of in types.items() if get_origin(of) is Annotated}
         dataclass(frozen=True)(cls)
-
-    @classmethod
-    def words(cls) -> dict[str, str]:
-        """The fields that go on the wire, and their types."""
-        return {name: cls.__annotations__[name] for name in cls.__match_args__}  # type: ignore[attr-defined]
 
     @property
     def body(self) -> str:
-        return " ".join((self.verb, *(str(getattr(self, name)) for name in self.words())))
+        return " ".join((self.verb, *(str(getattr(self, name)) for name in self.words)))
 
 
 class Move(Message, verb="MOVE"):
@@ -118,10 +121,6 @@ class Stop(Message, verb="STOP"):
     """
 
     reason: str = ""
-
-    @classmethod
-    def words(cls) -> dict[str, str]:
-        return {}
 
 
 class Fence(Message, verb="FENCE"):

@@ -16,7 +16,7 @@ from __future__ import annotations
 import re
 from binascii import crc32
 from dataclasses import dataclass, field
-from typing import Any, get_args
+from typing import Annotated, Any, get_args
 
 from .events import PINS, Fence, Hold, Message, Move, Pin, Positive, Sample, Stop
 
@@ -29,27 +29,13 @@ _INTEGER = re.compile(r"[0-9]{1,9}\Z", re.ASCII)
 _SAMPLE = re.compile(
     rf"S ([0-9]{{1,15}}),([0-9]{{1,4}}),([0-9]{{1,5}})((?:,-?[0-9]{{1,8}}){{{3 * PINS}}})\Z", re.ASCII
 )
-MAX_VALUE = 1_000_000  # no length, speed or force of this device is larger (um, um/s, mN)
-# Further types of words, and the values that each type has.
-Number = int  # of a line: may be larger than any length, speed or force
-PinOrNone = int  # 0: none
-PinBits = int  # a bit for each
-Word = str
-Nonce = str
-Clock = str
-_INTEGERS = {
-    "Pin": range(1, PINS + 1),
-    "PinOrNone": range(PINS + 1),
-    "PinBits": range(1 << PINS),
-    "Whole": range(MAX_VALUE + 1),
-    "Positive": range(1, MAX_VALUE + 1),
-    "Number": range(MAX_NUMBER + 1),
-}
-_TEXTS = {
-    "Word": re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,39}\Z", re.ASCII),
-    "Nonce": re.compile(r"[0-9a-f]{16}\Z"),
-    "Clock": re.compile(r"(real|paced)\Z"),
-}
+# Further types of words.
+Number = Annotated[int, range(MAX_NUMBER + 1)]  # of a line: may be larger than any length, speed or force
+PinOrNone = Annotated[int, range(PINS + 1)]  # 0: none
+PinBits = Annotated[int, range(1 << PINS)]  # a bit for each
+Word = Annotated[str, re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,39}\Z", re.ASCII)]
+Nonce = Annotated[str, re.compile(r"[0-9a-f]{16}\Z")]
+Clock = Annotated[str, re.compile(r"(real|paced)\Z")]
 
 
 def derive_salt(host_nonce: str, device_nonce: str) -> int:
@@ -279,18 +265,18 @@ def _parse(body: str, kinds: dict[str, Any]) -> Any:
     """The message that a body states, of the kinds by their verbs; None where it is exactly none of them."""
     verb, *words = body.split(" ")
     kind = kinds.get(verb)
-    if kind is None or len(words) != len(kind.words()):
+    if kind is None or len(words) != len(kind.words):
         return None
-    values = [_parse_word(word, of) for word, of in zip(words, kind.words().values(), strict=True)]
+    values = [_parse_word(word, known) for word, known in zip(words, kind.words.values(), strict=True)]
     return None if None in values else kind(*values)
 
 
-def _parse_word(word: str, kind: str) -> str | int | None:
+def _parse_word(word: str, known: range | re.Pattern[str]) -> str | int | None:
     """The value of a word, or None where its type has no such value."""
-    if kind in _TEXTS:
-        return word if _TEXTS[kind].match(word) else None
+    if isinstance(known, re.Pattern):
+        return word if known.match(word) else None
     number = int(word) if _INTEGER.match(word) else -1
-    return number if number in _INTEGERS[kind] else None
+    return number if number in known else None
 
 
 def format_sample(sample: Sample) -> str:
