@@ -1,5 +1,6 @@
 """The implicit limb: anatomy where a textbook has it, surfaces that lie on the fields."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -9,27 +10,32 @@ from scipy.spatial import cKDTree
 from limbfit.anatomy.grid import BONES
 from limbfit.anatomy.surfaces.surfaces import check_closed
 from limbfit.phantom.geometry import Limb, build_rotation, make_limb
-from limbfit.phantom.sites import DETAIL_SITES, FITTED, SAFE_SHARE, build_true_sites, select_sites
+from limbfit.phantom.sites import DETAIL_SITES, FITTED, SAFE_SHARE, TrueSite, build_true_sites, select_sites
 from limbfit.phantom.surfaces import build_true_anatomy
 
 SEEDS = (0, 1, 2, 3)
+SPACING_MM = 3.0  # of the points at which fields are asked
 
 
-def grid_of(limb: Limb, spacing: float = 2.0) -> np.ndarray:
-    """Points of the limb's box in LPS."""
-    axes = [np.arange(-70, 71, spacing), np.arange(-75, 76, spacing), np.arange(-2, 249, spacing)]
-    return limb.to_patient(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
+@pytest.fixture(scope="module", params=SEEDS)
+def fields(request) -> tuple[Limb, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """A limb, heights of points of its box, the skin's field there, and those of its bones."""
+    limb = make_limb(request.param)
+    axes = [np.arange(-70, 71, SPACING_MM), np.arange(-75, 76, SPACING_MM), np.arange(-2, 249, SPACING_MM)]
+    local = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    points = limb.to_patient(local)
+    return limb, local[..., 2], limb.skin(points), {name: limb.bone(name, points) for name in BONES}
 
 
 @pytest.fixture(scope="module")
 def anatomy():
-    return build_true_anatomy(make_limb(0))
+    return build_true_anatomy(make_limb(0), 4.0)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_crest_lies_3_to_5_mm_under_the_skin(seed: int) -> None:
     limb = make_limb(seed)
-    heights = np.arange(70.0, limb.shape.joint - 60, 4.0)
+    heights = np.arange(70.0, limb.shape.joint - 60, 8.0)
     depths = []
     for height in heights:
         angles = np.linspace(-0.3, 0.6, 46)
@@ -40,30 +46,21 @@ def test_the_crest_lies_3_to_5_mm_under_the_skin(seed: int) -> None:
     assert max(depths) <= 5.0
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_bones_are_inside_the_skin_and_do_not_overlap(seed: int) -> None:
-    limb = make_limb(seed)
-    points = grid_of(limb)
-    fields = {name: limb.bone(name, points) for name in BONES}
-    assert all((limb.skin(points)[field < 0] < -2.5).all() for field in fields.values())
-    inside = sum((field < 0).astype(int) for field in fields.values())
-    assert inside.max() == 1
+def test_bones_are_inside_the_skin_and_do_not_overlap(fields) -> None:
+    _, _, skin, bones = fields
+    assert all((skin[field < 0] < -2.5).all() for field in bones.values())
+    assert sum((field < 0).astype(int) for field in bones.values()).max() == 1
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_sizes_of_a_transtibial_residuum(seed: int) -> None:
-    limb = make_limb(seed)
-    local = limb.to_limb(grid_of(limb))
-    points = limb.to_patient(local)
-    skin, z = limb.skin(points) < 0, local[..., 2]
-    area = [skin[(np.abs(z - height) < 0.5)].sum() * 4.0 for height in (40, 230)]
+def test_sizes_of_a_transtibial_residuum(fields) -> None:
+    _, z, skin, bones = fields
+    area = [(skin < 0)[np.abs(z - height) < 0.5 * SPACING_MM].sum() * SPACING_MM**2 for height in (40, 231)]
     assert 38 < np.sqrt(area[0] / np.pi) < 50
     assert 57 < np.sqrt(area[1] / np.pi) < 66
-    tibia, fibula = (z[limb.bone(name, points) < 0].min() for name in ("tibia", "fibula"))
+    tibia, fibula = (z[bones[name] < 0].min() for name in ("tibia", "fibula"))
     assert 19 < tibia < 27
     assert tibia < fibula < tibia + 20
-    volume = skin.sum() * 8 / 1e6
-    assert 1.8 < volume < 3.0  # litres
+    assert 1.8 < (skin < 0).sum() * SPACING_MM**3 / 1e6 < 3.0  # litres
 
 
 def test_the_joint_gap_separates_femur_and_tibia() -> None:
@@ -90,7 +87,7 @@ def test_true_surfaces_are_closed_and_on_the_fields(anatomy) -> None:
     assert np.abs(limb.skin(anatomy.skin.points[below])).max() < 1e-6
     middle = anatomy.skin.triangles.mean(axis=1)
     middle = middle[anatomy.height(middle) < -1]
-    assert np.abs(limb.skin(middle)).max() < 0.1
+    assert np.abs(limb.skin(middle)).max() < 0.1 * (4.0 / 2.4) ** 2  # 0.1 mm at the default spacing
     for name, bone in anatomy.bones.items():
         check_closed(bone, name)
         distal = bone.points[anatomy.height(bone.points) < 5]
@@ -121,7 +118,7 @@ def test_a_moved_limb_is_the_same_limb_elsewhere() -> None:
     np.testing.assert_allclose(moved.skin_point(1.0, 100.0), there, atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", SEEDS[:2])
 def test_sites_lie_on_the_skin_in_four_regions_at_safe_depths(seed: int) -> None:
     limb = make_limb(seed)
     sites = build_true_sites(limb, seed)
@@ -144,7 +141,8 @@ def test_the_coarse_phantom_has_all_fitted_sites_and_two_more() -> None:
     assert len(coarse) == len(set(coarse)) == 6
 
 
-def test_sites_that_are_all_held_out_elsewhere_are_fitted_where_they_are_alone():
-    sites = build_true_sites(make_limb(0), 0)
+def test_sites_that_are_all_held_out_elsewhere_are_fitted_where_they_are_alone() -> None:
+    first = TrueSite("02", "tibia", False, np.zeros(3), np.zeros(3), 3.0, 1.0, 10.0, np.zeros(3))
+    sites = [first, replace(first, name="03"), replace(first, name="05", fitted=True)]
     assert [site.fitted for site in select_sites(sites, ["02", "05"])] == [False, True]
     assert [site.fitted for site in select_sites(sites, ["02", "03"])] == [True, True]

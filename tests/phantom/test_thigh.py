@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from test_phantom_folder import cubic_law
+from small_phantoms import cubic_law, few_voxels
 
 from limbfit import run_study
 from limbfit.anatomy.imaging import write_labels
 from limbfit.anatomy.segmentation.segmentation import segment
+from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface
 from limbfit.errors import InputError, StudyError
 from limbfit.phantom import Limb, build_true_sites, make_limb, make_phantom
 from limbfit.phantom.forces import choose_discretisation
 from limbfit.phantom.mri import LABELS_FILE, build_true_labels, make_grid
 from limbfit.phantom.sites import DETAIL_SITES, SAFE_SHARE
-from limbfit.phantom.socket import LINER_MM, make_socket
+from limbfit.phantom.socket import LINER_MM, Area, make_socket
 from limbfit.phantom.surfaces import build_outer_surface, build_true_anatomy
 from limbfit.pipeline.commands.check import check_study
 from limbfit.pipeline.socket.shape import build_regions, load_of
+from limbfit.socket import Socket
 from limbfit.study import load_study
 from scanned import build_image
 
@@ -58,8 +61,10 @@ def regions(sites) -> set[str]:
 
 
 def test_the_default_segmentation_finds_its_femur_and_calls_it_no_tibia() -> None:
+    """In slices of 6 mm of the distal 144 mm, where the femur ends."""
     limb = thigh(0)
     grid = make_grid(limb, "coarse", 0)
+    grid = replace(grid, shape=(24, 76, 76), spacing=(*grid.spacing[:2], 6.0))
     labels = segment(build_image(limb, grid, seed=0), bias_correction=False)
     assert labels.bone_names == ("bone-1",)
     points = grid.points(*(slice(0, size) for size in grid.shape))
@@ -68,9 +73,15 @@ def test_the_default_segmentation_finds_its_femur_and_calls_it_no_tibia() -> Non
         assert 2.0 * (mask & true).sum() / (mask.sum() + true.sum()) > 0.98  # Dice
 
 
-def test_its_socket_presses_in_where_it_says() -> None:
+@pytest.fixture(scope="module")
+def rectified() -> tuple[Anatomy, Surface, Socket, list[Area]]:
+    """The limb, its liner, and its socket with the areas of that."""
     anatomy, liner = build_true_anatomy(thigh(0), 8.0), build_outer_surface(thigh(0), LINER_MM, 8.0)
-    socket, areas = make_socket(anatomy, liner, THIGH)
+    return anatomy, liner, *make_socket(anatomy, liner, THIGH)
+
+
+def test_its_socket_presses_in_where_it_says(rectified) -> None:
+    anatomy, liner, socket, areas = rectified
     assert -40.0 < anatomy.height(socket.points[socket.brim]).mean() < -25.0
     depth = socket.offset(liner)
     for area in areas:
@@ -91,23 +102,23 @@ def test_a_limb_that_there_is_not_is_refused(tmp_path: Path, keywords, message: 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_its_study_needs_no_tibia(tmp_path: Path) -> None:
-    truth = make_phantom(tmp_path / "study", limb=THIGH, socket=True, sites=["05"], mapping=cubic_law)
+def test_its_study_needs_no_tibia(tmp_path: Path, rectified) -> None:
+    with few_voxels():
+        truth = make_phantom(tmp_path / "study", limb=THIGH, socket=True, sites=["05"], mapping=cubic_law)
+        labels = build_true_labels(thigh(0), make_grid(thigh(0), "coarse", 0))
     assert truth["limb"]["kind"] == THIGH
     assert "tibia" not in json.dumps(truth)
     assert "transfemoral residuum" in (tmp_path / "study" / "study.toml").read_text()
     study = load_study(tmp_path / "study")
     assert study.socket.side == "right"
-    anatomy = build_true_anatomy(thigh(0), 8.0)
+    anatomy, _, socket, _ = rectified
     names = set(build_regions(study, anatomy))
     assert {"anterior proximal", "medial distal", "lateral middle"} <= names
     assert not {name for name in names if "tibia" in name or "patella" in name}
-    socket, _ = make_socket(anatomy, build_outer_surface(thigh(0), LINER_MM, 8.0), THIGH)
     force, moment, point = load_of(study, study.socket.loads[0], anatomy, socket)
     assert force == pytest.approx(800.0 * anatomy.cut_normal)
     assert not moment.any()
     assert point == pytest.approx(socket.points[socket.brim].mean(axis=0), abs=5.0)
-    labels = build_true_labels(thigh(0), make_grid(thigh(0), "coarse", 0))
     (tmp_path / "study" / LABELS_FILE.parent).mkdir()
     write_labels(tmp_path / "study" / LABELS_FILE, labels)
     with (tmp_path / "study" / "study.toml").open("a") as file:
