@@ -28,7 +28,7 @@ def played(problem, folder, **control):
     return result, [pv.read(file) for _, file in animation.frames]
 
 
-@pytest.fixture(scope="module", params=[("hex8", 12), ("tet10", 10)], ids=["hex8", "tet10"])
+@pytest.fixture(scope="module", params=[("hex8", 10), ("tet10", 7)], ids=["hex8", "tet10"])
 def elastic(request, tmp_path_factory):
     """A long-term elastic block under a flat round punch that covers several faces."""
     problem = replace(
@@ -81,7 +81,7 @@ def test_pressure_is_there_where_the_punch_is(elastic):
     top = peak.points[:, 2] == 0.0
     assert (peak["contact_pressure_kPa"][top & under] > 0.0).all()
     assert (peak["contact_pressure_kPa"][~top] == 0.0).all()
-    far = np.hypot(*peak.points[:, :2].T) > 24.0
+    far = np.hypot(*peak.points[:, :2].T) > 28.0  # a face of 8.6 mm beyond the punch
     assert (peak["contact_pressure_kPa"][far] == 0.0).all()
     assert (grids[0]["contact_pressure_kPa"] == 0.0).all()
     assert grids[-1]["contact_pressure_kPa"].max() < 1e-3 * peak["contact_pressure_kPa"].max()
