@@ -1,8 +1,9 @@
-"""One body, stored in every format with other axes, gives the same surfaces and mesh in patient space."""
+"""One body, stored in every format with other axes, gives the same labels and surfaces in patient space."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import zip_longest
 from pathlib import Path
 
 import nrrd
@@ -13,6 +14,7 @@ from damaging import write_rtstruct, write_seg
 from limbs import leg_image, rotation, write_dicom
 from scipy.spatial import cKDTree
 
+from limbfit.anatomy.grid import SOFT_TISSUE
 from limbfit.anatomy.imaging import LabelMap, Volume, read_labels, read_volume, write_labels, write_volume
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_site
 from limbfit.anatomy.sites.sites import compute_indenter_axis
@@ -96,26 +98,32 @@ def assert_same(found: Anatomy, wanted: Anatomy) -> None:
     assert np.abs(found.cut_normal - wanted.cut_normal).max() < 1e-5
 
 
-@pytest.mark.parametrize("name", IMAGES)
-def test_every_format_of_the_image_gives_the_same_surfaces(tmp_path, body, reference, name):
+PAIRS = zip_longest(IMAGES, LABELS, fillvalue="labels.seg.nrrd")
+
+
+@pytest.mark.parametrize(("image_name", "labels_name"), PAIRS)
+def test_every_format_gives_the_same_labels_in_the_same_places(tmp_path, body, image_name, labels_name):
     image, labels = body
-    IMAGES[name](tmp_path / name, image)
+    IMAGES[image_name](tmp_path / image_name, image)
+    LABELS[labels_name](tmp_path / labels_name, labels)
+    seen = read_volume(tmp_path / image_name)
+    found = read_labels(tmp_path / labels_name, seen)
+    places = np.argwhere(labels.array > 0)
+    points = image.index_to_point(places[:, ::-1])
+    there = np.rint(seen.point_to_index(points)).astype(int)
+    assert np.abs(found.index_to_point(there) - points).max() < TOLERANCE_MM
+    there = tuple(there[:, ::-1].T)
+    assert np.allclose(seen.array[there], image.array[tuple(places.T)])
+    assert (found.array > 0).sum() == len(places)
+    for name in (SOFT_TISSUE, *labels.bone_names):
+        assert np.array_equal(found.mask(name)[there], labels.mask(name)[tuple(places.T)]), name
+
+
+def test_an_image_whose_axes_are_turned_gives_the_same_surfaces(tmp_path, body, reference):
+    image, labels = body
+    IMAGES["image.mha"](tmp_path / "image.mha", image)
     write_ras_segmentation(tmp_path / "labels.seg.nrrd", labels)
-    seen = read_volume(tmp_path / name)
-    inside = image.index_to_point(np.argwhere(labels.array > 1)[::97, ::-1])
-    there = np.rint(seen.point_to_index(inside)).astype(int)
-    assert np.abs(seen.index_to_point(there) - inside).max() < TOLERANCE_MM
-    grey = image.array[tuple(np.argwhere(labels.array > 1)[::97].T)]
-    assert np.allclose(seen.array[tuple(there[:, ::-1].T)], grey)
-    assert_same(build_anatomy(read_labels(tmp_path / "labels.seg.nrrd", seen), EDGE_MM), reference)
-
-
-@pytest.mark.parametrize("name", LABELS)
-def test_every_format_of_the_labels_gives_the_same_surfaces(tmp_path, body, reference, name):
-    image, labels = body
-    LABELS[name](tmp_path / name, labels)
-    write_dicom(tmp_path / "dicom", image)
-    placed = read_labels(tmp_path / name, read_volume(tmp_path / "dicom"))
+    placed = read_labels(tmp_path / "labels.seg.nrrd", read_volume(tmp_path / "image.mha"))
     assert_same(build_anatomy(placed, EDGE_MM), reference)
 
 
