@@ -22,9 +22,9 @@ ROOMS = ("dicom", "file", "labels", "surfaces")
 def leg(tmp_path_factory) -> Whole:
     """A smaller limb than the benchmark's, its labels the truth."""
     folder = tmp_path_factory.mktemp("leg")
-    image, labels = leg_image([3.3, 3.4, 4.1], (38, 40, 38), rotation(4))
+    image, labels = leg_image([4.2, 4.3, 5.1], (31, 31, 30), rotation(4))
     image = image.with_array(np.round(image.array))
-    write_dicom(folder / "mri", image, SpacingBetweenSlices="4.1")
+    write_dicom(folder / "mri", image, SpacingBetweenSlices="5.1")
     return Whole(folder, image, labels, build_anatomy(labels, 8.0))
 
 

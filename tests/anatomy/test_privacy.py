@@ -199,6 +199,7 @@ def spoil_rows(data):
     "spoil",
     [spoil_modality, spoil_number, spoil_spacing, spoil_axes, spoil_colour, spoil_pixels, spoil_rows],
 )
+@pytest.mark.usefixtures("commands_unasked")
 def test_errors_tell_no_value_of_a_tag(folder, tmp_path, monkeypatch, capfd, spoil):
     copy, file = copied(folder, tmp_path)
     data = pydicom.dcmread(file)
@@ -211,6 +212,7 @@ def test_errors_tell_no_value_of_a_tag(folder, tmp_path, monkeypatch, capfd, spo
     "old",
     [b"MARKERX1", b"DS\x10\x00", b"UI\x0e\x00", b"7777003", b"PN\x18\x00", b"19470911", b"CS\x02\x00MR"],
 )
+@pytest.mark.usefixtures("commands_unasked")
 def test_damaged_tags_tell_no_value_either(folder, tmp_path, monkeypatch, capfd, old):
     """Bytes of values and of their lengths overwritten, which makes pydicom and GDCM complain of them."""
     copy, file = copied(folder, tmp_path)
