@@ -26,7 +26,7 @@ from limbfit.anatomy.surfaces.surfaces import (
 from limbfit.errors import LabelError, MeshingError, SurfaceError
 from limbfit.mesh import Mesh, boundary_faces
 
-COARSE = MeshSettings(edge_near_mm=6.0, edge_far_mm=15.0, near_radius_mm=10.0, growth=0.6)
+COARSE = MeshSettings(edge_near_mm=6.0, edge_far_mm=24.0, near_radius_mm=10.0, growth=0.9)
 CUT = np.array([12.0, -80.0, 300.0])  # the middle of the limb's proximal cut, LPS mm
 
 
@@ -50,8 +50,8 @@ def limb_without() -> Anatomy:
     return build_closed_anatomy(bare.skin, bare.bones, (bare.cut_point, bare.cut_normal))[0]
 
 
-INSIDE = ([-14.0, 0.0, -40.0], [5.0, 9.0, 16.0])
-THROUGH = ([23.0, 0.0, -40.0], [8.0, 9.0, 16.0])  # the sheet of muscle between bone and layer
+INSIDE = ([-14.0, 0.0, -40.0], [5.0, 8.0, 11.0])
+THROUGH = ([23.0, 0.0, -40.0], [8.0, 8.0, 11.0])  # the sheet of muscle between bone and layer
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +170,7 @@ def test_a_label_becomes_a_region_and_no_bone(tmp_path) -> None:
     assert set(labels.bone_names) == {"scar", "tibia"}  # of a label that the study does not name
     labels = labels.with_regions({"mark": "scar"})
     assert labels.bone_names == ("tibia",)
-    built = build_anatomy(labels, 3.0, (anatomy.cut_point, anatomy.cut_normal))
+    built = build_anatomy(labels, 4.0, (anatomy.cut_point, anatomy.cut_normal))
     check_anatomy(built)
     assert set(built.bones) == {"tibia"}
     assert built.regions["mark"].volume == pytest.approx(anatomy.regions["scar"].volume, rel=0.02)
@@ -186,5 +186,5 @@ def test_a_label_becomes_a_region_and_no_bone(tmp_path) -> None:
 def test_a_virtual_amputation_keeps_what_is_proximal_of_it() -> None:
     anatomy = with_regions(scar=([-14.0, 0.0, -30.0], [5.0, 9.0, 16.0]))
     labels = amputate_limb(voxelise_anatomy(anatomy), at(0.0, 0.0, -30.0), [0.0, 0.0, 1.0], pad_mm=10.0)
-    built = build_anatomy(labels, 3.0, (anatomy.cut_point, anatomy.cut_normal))
+    built = build_anatomy(labels, 5.0, (anatomy.cut_point, anatomy.cut_normal))
     assert built.regions["scar"].volume == pytest.approx(anatomy.regions["scar"].volume / 2, rel=0.05)

@@ -104,12 +104,12 @@ def inner_node(mesh, stack) -> int:
     return int(core[mesh.points[core, 2] < -5.0][0])
 
 
-@pytest.mark.parametrize("where", ["core", "skin", "foot of a column", "columns"])
+@pytest.mark.parametrize("where", ["core", "foot of a column", "columns"])
 def test_inverted_cells_are_mended_and_told(spoiled, anatomy, base, site, where):
     places = []
 
     def spoil(mesh, stack):
-        nodes = {"skin": stack.top[40], "foot of a column": stack.base[40], "columns": stack.top[40]}
+        nodes = {"foot of a column": stack.base[40], "columns": stack.top[40]}
         node = int(nodes.get(where, inner_node(mesh, stack)))
         places.append(mesh.points[node])
         worse = crossed(mesh, stack) if where == "columns" else through(mesh, node)
@@ -124,21 +124,6 @@ def test_inverted_cells_are_mended_and_told(spoiled, anatomy, base, site, where)
     place = [float(x) for x in told[1].split(",")]
     assert np.linalg.norm(place - base.fields.frame.to_patient(places[0])) < 25.0
     assert abs(report.volume_error) < 0.01
-
-
-def test_thinner_layers_alone_make_crossed_columns_sound(spoiled, anatomy, base, site):
-    made = []
-
-    def spoil(mesh, stack):
-        made.append((crossed(mesh, stack), stack))
-        return mesh
-
-    spoiled(spoil)
-    mesh_site(anatomy, *site, COARSE, base)
-    worse, stack = made[0]
-    assert find_inverted_cells(worse).any()
-    points = thin_inverted_layers(worse.points, worse, stack, *find_constraints(worse, base.fields, stack))
-    assert (compute_volumes(points, worse.cells) > 0).all()
 
 
 def test_what_cannot_be_mended_is_refused_with_its_place(monkeypatch, spoiled, anatomy, base, site):
@@ -158,19 +143,27 @@ def test_a_mesher_that_fails_is_told_with_a_place(anatomy, base, site):
         mesh_site(anatomy, *site, hurried, base)
 
 
-def test_a_sound_mesh_is_left_alone(monkeypatch, anatomy, base, core, site):
-    kept = []
+def test_a_sound_mesh_is_left_alone_and_thinner_layers_alone_make_crossed_columns_sound(
+    monkeypatch, anatomy, base, core, site
+):
+    given = []
 
     def watched(mesh, fields, stack):
         after, repairs = repair_mesh(mesh, fields, stack)
-        kept.append(np.array_equal(after.points, mesh.points) and not find_inverted_cells(mesh).any())
+        given.append((mesh, after, stack))
         return after, repairs
 
     monkeypatch.setitem(ENGINES, "mmg", lambda *task: core)
     monkeypatch.setattr(meshing, "repair_mesh", watched)
     _, report = mesh_site(anatomy, *site, COARSE, base)
-    assert kept == [True]
+    ((mesh, after, stack),) = given
     assert report.repairs == ()
+    assert not find_inverted_cells(mesh).any()
+    assert np.array_equal(after.points, mesh.points)
+    worse = crossed(mesh, stack)
+    assert find_inverted_cells(worse).any()
+    points = thin_inverted_layers(worse.points, worse, stack, *find_constraints(worse, base.fields, stack))
+    assert (compute_volumes(points, worse.cells) > 0).all()
 
 
 def test_a_tangled_star_is_untangled():

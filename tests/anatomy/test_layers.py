@@ -12,7 +12,7 @@ from test_meshing import COARSE, conforms, limb, site_of
 from limbfit.anatomy.grid import LabelMap
 from limbfit.anatomy.meshing.background import compute_volumes
 from limbfit.anatomy.meshing.extrusion import build_columns, choose_even_steps
-from limbfit.anatomy.meshing.layers import LayerSpec
+from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields
 from limbfit.anatomy.meshing.meshing import build_base_mesh, mesh_site
 from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy
 from limbfit.anatomy.surfaces.thickness import measure_fat_depth, read_thickness, write_thickness
@@ -99,7 +99,7 @@ def fat_thickness(angle: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def fatty() -> tuple[LabelMap, Anatomy]:
     """A cylinder of 40 mm radius, rounded below, in 1.5 mm of skin and a fat that varies around it."""
-    spacing = 1.2
+    spacing = 1.5
     axis = np.arange(-48.0, 48.0, spacing)
     z, y, x = np.meshgrid(np.arange(0.0, 90.0, spacing), axis, axis, indexing="ij")
     low = np.minimum(z - 45.0, 0.0)
@@ -108,12 +108,17 @@ def fatty() -> tuple[LabelMap, Anatomy]:
     array[(depth > 1.5) & (depth < fat_thickness(np.arctan2(y, x)))] = 2
     array[(np.hypot(x, y) < 6.0) & (z > 40)] = 2  # an island of fat
     labels = LabelMap(array, [spacing] * 3, [-48.0, -48.0, 0.0], np.eye(3), {1: "soft tissue", 2: "fat"})
-    return labels, build_anatomy(labels, 4.0)
+    return labels, build_anatomy(labels, 6.0)
 
 
-def test_fat_depth_is_that_of_its_inner_face(fatty: tuple) -> None:
-    labels, anatomy = fatty
-    depth = measure_fat_depth(labels, anatomy)
+@pytest.fixture(scope="module")
+def depth(fatty: tuple) -> np.ndarray:
+    """Of the fat's inner face at the vertices of the skin, mm."""
+    return measure_fat_depth(*fatty)
+
+
+def test_fat_depth_is_that_of_its_inner_face(fatty: tuple, depth: np.ndarray) -> None:
+    _, anatomy = fatty
     x, y, z = anatomy.skin.points.T
     side = (z > 50) & (z < 84)
     error = depth[side] - fat_thickness(np.arctan2(y, x)[side])
@@ -121,14 +126,13 @@ def test_fat_depth_is_that_of_its_inner_face(fatty: tuple) -> None:
     assert np.abs(error).max() < 0.8
 
 
-def test_a_map_makes_a_layer_of_that_thickness(fatty: tuple, tmp_path: Path) -> None:
-    labels, anatomy = fatty
-    depth = measure_fat_depth(labels, anatomy)
+def test_a_map_makes_a_layer_of_that_thickness(fatty: tuple, depth: np.ndarray, tmp_path: Path) -> None:
+    _, anatomy = fatty
     write_thickness(tmp_path / "map.vtp", anatomy.skin, depth)
     again = read_thickness(tmp_path / "map.vtp", anatomy.skin)
     np.testing.assert_allclose(again, depth, atol=1e-4)
     layers = (LayerSpec("skin", 1.5), LayerSpec("fat", None))
-    settings = replace(COARSE, layers=layers)
+    settings = replace(COARSE, edge_far_mm=24.0, growth=0.9, layers=layers)
     with pytest.raises(SurfaceError, match="fat_depth_mm is not given"):
         build_base_mesh(anatomy, settings)
     base = build_base_mesh(anatomy, settings, again)
@@ -154,6 +158,7 @@ def test_a_map_needs_fat(fatty: tuple) -> None:
 
 def test_fat_is_at_least_as_thick_as_the_least() -> None:
     anatomy = limb()
-    settings = replace(COARSE, layers=(LayerSpec("skin", 1.5), LayerSpec("fat", None, 2.0)))
-    fields = build_base_mesh(anatomy, settings, np.zeros(len(anatomy.skin.points))).fields
+    layers = LayerSpec("skin", 1.5), LayerSpec("fat", None, 2.0)
+    none = np.zeros(len(anatomy.skin.points))
+    fields = build_limb_fields(anatomy, layers, COARSE.bone_clearance_mm, fat_depth_mm=none)
     np.testing.assert_allclose(fields.depths[:, 0], [1.5, 3.5])

@@ -17,8 +17,8 @@ from limbfit.mesh import measure_quality
 THICKNESS = 6.0
 SETTINGS = MeshSettings(
     edge_near_mm=8.0,
-    edge_far_mm=20.0,
-    growth=0.6,
+    edge_far_mm=24.0,
+    growth=0.9,
     layers=(LayerSpec("liner", THICKNESS), LayerSpec("skin", 3.0)),
 )
 
@@ -29,8 +29,14 @@ def oblique() -> Anatomy:
 
 
 @pytest.fixture(scope="module")
-def lined(oblique: Anatomy) -> Anatomy:
-    return build_liner_surface(oblique, THICKNESS)[0]
+def made(oblique: Anatomy) -> tuple[Anatomy, np.ndarray]:
+    """The limb in its liner, and the depth of its fat, which is 4 mm in the skin."""
+    return build_liner_surface(oblique, THICKNESS, np.full(len(oblique.skin.points), 4.0))
+
+
+@pytest.fixture(scope="module")
+def lined(made: tuple[Anatomy, np.ndarray]) -> Anatomy:
+    return made[0]
 
 
 def test_the_outer_face_is_a_thickness_outside_the_skin(oblique: Anatomy, lined: Anatomy) -> None:
@@ -43,8 +49,8 @@ def test_the_outer_face_is_a_thickness_outside_the_skin(oblique: Anatomy, lined:
     assert lined.height(lined.skin.points).max() == pytest.approx(0.0, abs=1e-6)
 
 
-def test_depth_of_fat_is_counted_from_the_outer_face(oblique: Anatomy) -> None:
-    lined, depth = build_liner_surface(oblique, THICKNESS, np.full(len(oblique.skin.points), 4.0))
+def test_depth_of_fat_is_counted_from_the_outer_face(made: tuple[Anatomy, np.ndarray]) -> None:
+    lined, depth = made
     assert depth == pytest.approx(np.full(len(lined.skin.points), 4.0 + THICKNESS))
 
 

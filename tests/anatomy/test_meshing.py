@@ -17,7 +17,7 @@ from limbfit.anatomy.meshing import engines
 from limbfit.anatomy.meshing.background import LAYER, build_box_grid, compute_in_band, compute_volumes, cut
 from limbfit.anatomy.meshing.curving import curve_diagonals
 from limbfit.anatomy.meshing.extrusion import build_columns
-from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, evaluate_distance
+from limbfit.anatomy.meshing.layers import LayerSpec, evaluate_distance
 from limbfit.anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
 from limbfit.anatomy.meshing.meshreport import check_quality
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, read_surface
@@ -138,11 +138,11 @@ def test_sets_lie_on_their_surfaces(meshed: tuple, oblique: Anatomy) -> None:
     assert (np.einsum("ij,ij->i", normals, outward) > 0).all()
 
 
-def test_coarse_faces_lie_on_a_bone_in_the_mean(oblique: Anatomy) -> None:
+def test_coarse_faces_lie_on_a_bone_in_the_mean(oblique: Anatomy, base: BaseMesh) -> None:
     """With its nodes on the bone they would cut 0.24 mm into it."""
     position, axis = site_of(oblique, np.array([1.0, 0.2, 0.1]), -35.0)
-    settings = MeshSettings(edge_far_mm=30.0, near_radius_mm=14.0, growth=0.6, flatness=1.6)
-    mesh, report = mesh_site(oblique, position, axis, settings)
+    settings = replace(COARSE, edge_far_mm=30.0, growth=0.9, flatness=1.6)
+    mesh, report = mesh_site(oblique, position, axis, settings, base)
     faces, bone = boundary_faces(mesh), mesh.node_sets["fixed_bone"]
     faces = faces[np.isin(faces, bone).all(axis=1)]
     faces = faces[~np.isin(faces, mesh.node_sets["fixed_proximal"]).all(axis=1)]
@@ -179,27 +179,21 @@ def test_curved_elements_follow_the_skin_better_than_straight_ones(
     assert abs(report.volume_error) < abs(straight.volume_error) / 2
 
 
-def test_shallow_bone_is_trimmed_and_reported() -> None:
-    deep, shallow = limb(), limb(bone_offset=19.0)
-    fields = build_limb_fields(deep, COARSE.layers, COARSE.bone_clearance_mm)
-    assert fields.measure_trimmed_bones()["tibia"].volume_mm3 == 0.0
+def test_shallow_bone_is_trimmed_and_reported(base: BaseMesh) -> None:
+    assert base.trimmed["tibia"].volume_mm3 == 0.0  # of a deep one
+    shallow, settings = limb(bone_offset=19.0), replace(COARSE, edge_far_mm=24.0, growth=0.9)
     position, axis = site_of(shallow, np.array([1.0, 0, 0]), -40.0)
-    mesh, report = mesh_site(shallow, position, axis, COARSE)
-    trimmed = report.trimmed_bone["tibia"]
-    fields = build_limb_fields(shallow, COARSE.layers, COARSE.bone_clearance_mm)
-    nearest = fields.depth(fields.frame.to_limb(shallow.bones["tibia"].points))[0][
-        fields_below(fields, shallow)
-    ].min()
+    made = build_base_mesh(shallow, settings)
+    mesh, report = mesh_site(shallow, position, axis, settings, made)
+    trimmed, fields = report.trimmed_bone["tibia"], made.fields
+    bone = shallow.bones["tibia"].points
+    nearest = fields.depth(fields.frame.to_limb(bone[shallow.height(bone) <= 0]))[0].min()
     assert trimmed.depth_mm == pytest.approx(4.5 - nearest, abs=1e-6)
     assert trimmed.volume_mm3 > 0
     depth = fields.depth(fields.frame.to_limb(mesh.points[mesh.node_sets["fixed_bone"]]))[0]
     assert depth.min() > 4.5 - 0.1
     assert abs(report.volume_error) < 0.005
     assert report.min_dihedral_deg >= 8.0
-
-
-def fields_below(fields: object, anatomy: Anatomy) -> np.ndarray:
-    return anatomy.height(anatomy.bones["tibia"].points) <= 0
 
 
 def test_cutting_a_grid_keeps_volume_and_signs() -> None:
