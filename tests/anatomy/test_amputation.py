@@ -8,7 +8,6 @@ from limbs import DIRECTIONS, leg_image
 
 from limbfit.anatomy.imaging import LabelMap
 from limbfit.anatomy.segmentation.amputation import amputate_limb
-from limbfit.anatomy.surfaces.surfaces import build_anatomy, check_anatomy
 from limbfit.errors import LabelError, SurfaceError
 
 PAD = 16.0
@@ -79,15 +78,6 @@ def test_thick_slices_are_divided(leg, stump):
     assert np.allclose(stump.index_to_point([-0.5, -0.5, -0.5]), low)
 
 
-def test_the_stump_becomes_surfaces(plane, stump):
-    anatomy = build_anatomy(stump, 4.0)
-    check_anatomy(anatomy)
-    point, normal = plane
-    below = [(s.points - point) @ normal for s in (anatomy.skin, *anatomy.bones.values())]
-    assert below[0].min() == pytest.approx(-PAD, abs=1.0)
-    assert all(b.min() == pytest.approx(0, abs=1.0) for b in below[1:])
-
-
 @pytest.mark.parametrize(
     ("shift", "factor", "pad", "expected"),
     [
@@ -108,20 +98,3 @@ def test_impossible_planes_are_refused(leg, plane, shift, factor, pad, expected)
 def test_a_plane_along_the_limb_is_refused(leg, plane):
     with pytest.raises(LabelError, match=r"does not cross the limb: its normal is 8[0-9] degrees"):
         amputate_limb(leg, plane[0], np.cross(plane[1], [0.3, 0.1, 0.5]), PAD)
-
-
-def test_a_plane_that_cuts_nothing_off_is_refused(stump):
-    """The stump's bones end at its plane; a plane in the pad below them leaves all of them."""
-    low = stump.compute_heights(*_below(stump)) < 0
-    assert low.any()
-    with pytest.raises(LabelError, match="cuts nothing off"):
-        amputate_limb(stump, *_below(stump), 4.0)
-
-
-def _below(stump) -> tuple[np.ndarray, np.ndarray]:
-    """A plane across the limb, 5 mm beyond the lowest bone."""
-    normal = stump.direction[:, 2]
-    index = np.argwhere((stump.array > 0) & (stump.array != stump.soft_value))[:, ::-1]
-    points = stump.index_to_point(index)
-    lowest = points[(points @ normal).argmin()]
-    return lowest - 5.0 * normal, normal

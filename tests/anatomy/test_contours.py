@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from limbs import DIRECTIONS, grid, leg_image
+from limbs import DIRECTIONS, leg_image
 
 from limbfit.anatomy.labels.contours import (
     fill_even_odd,
     find_outlines,
-    rasterise_polygons,
     read_contours,
     write_contours,
 )
@@ -50,28 +49,6 @@ def test_a_label_map_survives_its_contour_file(tmp_path, direction):
     back = read_contours(tmp_path / "leg.csv", image)
     assert np.array_equal(back.array, truth.array)
     assert back.bone_names == truth.bone_names
-
-
-def _on_slices(slices: list[float], direction: np.ndarray) -> tuple:
-    like = grid(SHAPE, SPACING, direction)
-    points = circle(10.0, 40)
-    polygons = [like.index_to_point(np.column_stack([points, np.full(40, k)])) for k in slices]
-    return polygons, like
-
-
-@pytest.mark.parametrize(
-    ("slices", "expected"),
-    [
-        ([3.0, 4.4, 5.0], "do not lie on the slices"),
-        ([3.0, 5.0], "1 slices without"),
-        ([11.0, 12.0], "outside"),
-        ([], "no contours"),
-    ],
-)
-def test_contours_of_another_image_are_refused(slices, expected):
-    polygons, like = _on_slices(slices, DIRECTIONS["oblique"])
-    with pytest.raises(LabelError, match=expected):
-        rasterise_polygons(polygons, like)
 
 
 @pytest.mark.parametrize(

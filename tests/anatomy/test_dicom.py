@@ -23,25 +23,17 @@ def refusal(folder, **options) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["straight", "oblique", "permuted"])
-def test_geometry_and_grey_values_survive(tmp_path, name):
+@pytest.mark.parametrize("name", DIRECTIONS)
+def test_no_voxel_moves_and_none_changes(tmp_path, name):
+    """A flipped stack is read along its normal."""
     image = volume(DIRECTIONS[name])
     write_dicom(tmp_path, image)
     (tmp_path / "README.txt").write_text("not an image")
     back = read_volume(tmp_path)
-    assert np.abs(back.affine - image.affine).max() < 1e-4
-    assert np.array_equal(back.array, image.array)
-
-
-@pytest.mark.parametrize("name", ["flipped slices", "flipped rows"])
-def test_a_flipped_stack_is_read_along_its_normal_without_moving_a_voxel(tmp_path, name):
-    image = volume(DIRECTIONS[name])
-    write_dicom(tmp_path, image)
-    back = read_volume(tmp_path)
-    index = np.array([3, 1, 2])
+    index = np.argwhere(np.ones(image.array.shape))[:, ::-1]
     there = np.rint(back.point_to_index(image.index_to_point(index))).astype(int)
-    assert np.abs(back.index_to_point(there) - image.index_to_point(index)).max() < 0.01
-    assert back.array[tuple(there[::-1])] == image.array[tuple(index[::-1])]
+    assert np.abs(back.index_to_point(there) - image.index_to_point(index)).max() < 1e-3
+    assert np.array_equal(back.array[tuple(there[:, ::-1].T)], image.array.ravel())
     assert np.linalg.det(back.direction) > 0
 
 

@@ -104,14 +104,6 @@ def test_even_odd_leaves_holes_and_fills_islands_in_them():
     assert np.array_equal(fill_even_odd([keyhole], 12, 11), inside(0.5, 9.5) ^ inside(2.5, 7.5))
 
 
-def test_a_slanted_triangle_has_its_area():
-    corners = np.array([[3.3, 1.2], [80.7, 20.1], [30.9, 90.4]])
-    (a, b), (c, d) = corners[1] - corners[0], corners[2] - corners[0]
-    assert fill_even_odd([corners], 100, 100).sum() == pytest.approx((a * d - b * c) / 2, rel=0.01)
-    assert np.array_equal(fill_even_odd([corners[::-1]], 100, 100), fill_even_odd([corners], 100, 100))
-    assert np.array_equal(fill_even_odd([corners[:, ::-1]], 100, 100), fill_even_odd([corners], 100, 100).T)
-
-
 @pytest.mark.parametrize(
     ("options", "expected"),
     [

@@ -23,7 +23,6 @@ from limbfit.anatomy.meshing.untangling import (
     find_inverted_cells,
     repair_mesh,
     thin_inverted_layers,
-    untangle_cells,
 )
 from limbfit.anatomy.sites.sites import compute_indenter_axis, project_to_skin
 from limbfit.errors import MeshingError
@@ -164,27 +163,6 @@ def test_a_sound_mesh_is_left_alone_and_thinner_layers_alone_make_crossed_column
     assert find_inverted_cells(worse).any()
     points = thin_inverted_layers(worse.points, worse, stack, *find_constraints(worse, base.fields, stack))
     assert (compute_volumes(points, worse.cells) > 0).all()
-
-
-def test_a_tangled_star_is_untangled():
-    # Eight tetrahedra about one node of an octahedron, the node outside of it.
-    tips = np.vstack([np.eye(3), -np.eye(3)])
-    tets = []
-    for x in (0, 3):
-        for y in (1, 4):
-            for z in (2, 5):
-                flip = (x, y, z) if (x < 3) ^ (y < 4) ^ (z < 5) else (y, x, z)
-                tets.append([6, *flip])
-    tets = np.array(tets)
-    middle = np.vstack([tips, [[0.0, 0.0, 0.0]]])
-    if (compute_volumes(middle, tets) < 0).all():
-        tets = tets[:, [0, 2, 1, 3]]
-    assert (compute_volumes(middle, tets) > 0).all()
-    points = np.vstack([tips, [[1.1, 0.9, 0.2]]])
-    movable = np.arange(7) == 6
-    found = untangle_cells(points, tets, np.zeros((7, 3)), movable)
-    assert (compute_volumes(found, tets) > 0).all()
-    assert np.array_equal(found[:6], tips)
 
 
 @needs_limbs

@@ -132,7 +132,7 @@ def test_a_map_makes_a_layer_of_that_thickness(fatty: tuple, depth: np.ndarray, 
     again = read_thickness(tmp_path / "map.vtp", anatomy.skin)
     np.testing.assert_allclose(again, depth, atol=1e-4)
     layers = (LayerSpec("skin", 1.5), LayerSpec("fat", None))
-    settings = replace(COARSE, edge_far_mm=24.0, growth=0.9, layers=layers)
+    settings = replace(COARSE, layers=layers)
     with pytest.raises(SurfaceError, match="fat_depth_mm is not given"):
         build_base_mesh(anatomy, settings)
     base = build_base_mesh(anatomy, settings, again)

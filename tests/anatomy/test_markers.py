@@ -79,8 +79,8 @@ def test_motion_of_a_limb() -> None:
 def test_motion_between_fine_images_is_as_exact() -> None:
     """Voxels of 0.5 mm, of blobs that the shift moves analytically."""
     random = np.random.default_rng(0)
-    centres, widths = random.uniform(12, 48, (14, 3)), random.uniform(4, 8, 14)
-    k, j, i = np.mgrid[:120, :120, :120].astype(np.float32) * 0.5
+    centres, widths = random.uniform(10, 38, (14, 3)), random.uniform(4, 8, 14)
+    k, j, i = np.mgrid[:96, :96, :96].astype(np.float32) * 0.5
 
     def blobs(shift: np.ndarray) -> Volume:
         total = np.zeros(k.shape, np.float32)
@@ -152,32 +152,24 @@ def test_markers_that_nobody_asks_for_are_left_over() -> None:
     assert list(matched) == ["a"]
 
 
-def test_a_missing_marker_is_named_with_the_nearest_distance() -> None:
-    hints = {"near": np.zeros(3), "far-1": np.array([40.0, 0, 0]), "far-2": np.array([0.0, 80, 0])}
-    with pytest.raises(SiteError, match=r"far-1 \(nearest at 40.0 mm\), far-2 .*; correct 'near'"):
-        match_markers([marker_at(0)], hints)
-
-
-def test_two_names_for_one_marker_are_told() -> None:
-    hints = {"a": np.zeros(3), "b": np.array([2.0, 0, 0])}
-    with pytest.raises(SiteError, match="no marker of its own within 15 mm for"):
-        match_markers([marker_at(0)], hints)
-
-
-def test_misses_and_doubles_are_told_together() -> None:
-    hints = {"a": np.zeros(3), "b": np.array([0.0, 90, 0])}
-    with pytest.raises(SiteError, match=r"no marker .* b \(nearest.*; more than one marker .* of a;"):
-        match_markers([marker_at(-6), marker_at(7)], hints)
-
-
-def test_two_markers_for_one_name_are_told() -> None:
-    with pytest.raises(SiteError, match="more than one marker within 15 mm of a;"):
-        match_markers([marker_at(-6), marker_at(7)], {"a": np.zeros(3)})
-
-
-def test_no_marker_at_all_names_the_sites() -> None:
-    with pytest.raises(SiteError, match="for a, b"):
-        match_markers([], {"a": np.zeros(3), "b": np.ones(3)})
+@pytest.mark.parametrize(
+    ("markers", "hints", "told"),
+    [
+        (
+            [0],
+            {"near": 0, "far-1": 40, "far-2": 80},
+            r"far-1 \(nearest at 40.0 mm\), far-2 .*; correct 'near'",
+        ),
+        ([0], {"a": 0, "b": 2}, "no marker of its own within 15 mm for"),
+        ([-6, 7], {"a": 0, "b": 90}, r"no marker .* b \(nearest.*; more than one marker .* of a;"),
+        ([-6, 7], {"a": 0}, "more than one marker within 15 mm of a;"),
+        ([], {"a": 0, "b": 1}, "for a, b"),
+    ],
+)
+def test_missing_and_doubled_markers_are_told_by_the_names_of_their_sites(markers, hints, told) -> None:
+    places = {name: np.array([float(x), 0.0, 0.0]) for name, x in hints.items()}
+    with pytest.raises(SiteError, match=told):
+        match_markers([marker_at(x) for x in markers], places)
 
 
 def test_matching_does_not_depend_on_the_order_of_markers() -> None:

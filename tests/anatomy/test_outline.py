@@ -76,8 +76,10 @@ def on_a_table(image: Volume, inside: np.ndarray, level: float, thick_mm: float)
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("contrast", "level"), [("UTE", 0.6), ("T1", 1.0), ("CT", -80.0)])
-def test_a_table_that_touches_the_limb_is_no_limb(images, inside, contrast, level):
-    image = on_a_table(images[contrast], inside, level, 12.0)
+def test_a_table_that_touches_the_limb_is_no_limb(limb, contrast, level):
+    grid = make_grid(limb, "coarse", SEED)
+    inside = limb.skin(grid.points(*(slice(0, n) for n in grid.shape))) < 0
+    image = on_a_table(build_image(limb, grid, seed=SEED, levels=CONTRASTS[contrast]), inside, level, 12.0)
     labels = segment(image)
     assert dice(labels.limb, inside) > 0.985
     outside = labels.limb & ~inside

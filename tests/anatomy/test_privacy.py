@@ -56,7 +56,8 @@ name = "leg"
 [image]
 path = "mri-MARKERXQ"
 series = "{uid}"
-{labels}
+[segmentation]
+bias_correction = false
 [geometry]
 surface_edge_mm = 8.0
 [[sites]]
@@ -77,7 +78,7 @@ def folder(tmp_path_factory) -> Path:
     middle = np.array(labels.size) // 2
     first = np.flatnonzero(labels.limb[middle[2], middle[1]])[0]
     skin = labels.index_to_point([first - 0.5, middle[1], middle[2]])
-    text = STUDY.format(uid=SERIES_UID, labels="", place=[round(float(x), 2) for x in skin])
+    text = STUDY.format(uid=SERIES_UID, place=[round(float(x), 2) for x in skin])
     (folder / "study.toml").write_text(text)
     return folder
 
@@ -166,44 +167,27 @@ def copied(folder: Path, place: Path) -> tuple[Path, Path]:
     return copy, sorted((copy / "mri-MARKERXQ").iterdir())[3]
 
 
-def spoil_modality(data):
-    data.Modality = "MARKERX1"
-
-
-def spoil_number(data):
-    data.SeriesNumber = "77"
-    data.Modality = "OT"
-
-
-def spoil_spacing(data):
-    del data.PixelSpacing
-
-
-def spoil_axes(data):
-    data.ImageOrientationPatient = [1, 0, 0, 0.5, 0.5, 0]
-
-
-def spoil_colour(data):
-    data.SamplesPerPixel = 3
-
-
-def spoil_pixels(data):
-    data.PixelData = data.PixelData[:100]
-
-
-def spoil_rows(data):
-    data.Rows = 7
-
-
 @pytest.mark.parametrize(
-    "spoil",
-    [spoil_modality, spoil_number, spoil_spacing, spoil_axes, spoil_colour, spoil_pixels, spoil_rows],
+    "changes",
+    [
+        {"Modality": "MARKERX1"},
+        {"SeriesNumber": "77", "Modality": "OT"},
+        {"PixelSpacing": None},
+        {"ImageOrientationPatient": [1, 0, 0, 0.5, 0.5, 0]},
+        {"SamplesPerPixel": 3},
+        {"PixelData": b"\0" * 100},
+        {"Rows": 7},
+    ],
 )
 @pytest.mark.usefixtures("commands_unasked")
-def test_errors_tell_no_value_of_a_tag(folder, tmp_path, monkeypatch, capfd, spoil):
+def test_errors_tell_no_value_of_a_tag(folder, tmp_path, monkeypatch, capfd, changes):
     copy, file = copied(folder, tmp_path)
     data = pydicom.dcmread(file)
-    spoil(data)
+    for tag, value in changes.items():
+        if value is None:
+            delattr(data, tag)
+        else:
+            setattr(data, tag, value)
     data.save_as(file)
     check_silent(copy, monkeypatch, capfd)
 

@@ -10,7 +10,7 @@ from scipy.ndimage import label
 from limbfit.anatomy.grid import BONES
 from limbfit.anatomy.imaging import LabelMap, Volume, read_volume
 from limbfit.anatomy.segmentation.body import estimate_bias_field, find_limb_mask, smooth_image
-from limbfit.anatomy.segmentation.bones import compute_escape_level, find_bones, name_bones
+from limbfit.anatomy.segmentation.bones import find_bones, name_bones
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.errors import ImageError
 from limbfit.phantom.geometry import make_limb
@@ -115,26 +115,6 @@ def test_bias_field_is_the_coils(quiet):
     muscle = after < 1.5 * np.median(after)
     assert found[truth.limb].std() > 0.02
     assert after[muscle].std() / after[muscle].mean() < 0.8 * before[muscle].std() / before[muscle].mean()
-
-
-def escape_by_definition(plane: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Largest level at which a voxel is still connected to the outside, tried level by level."""
-    found = np.zeros_like(plane)
-    for level in np.unique(plane):
-        parts, _ = label(~inside | (plane >= level))
-        outside = np.unique(parts[~inside])
-        out = np.isin(parts, outside[outside > 0])
-        found[out] = level
-    return found
-
-
-def test_escape_level_is_its_definition():
-    random = np.random.default_rng(2)
-    plane = random.integers(1, 9, size=(14, 12)).astype(np.float32)
-    inside = np.zeros(plane.shape, bool)
-    inside[2:-2, 2:-2] = True
-    fast = compute_escape_level(plane[None], inside[None])[0]
-    assert np.array_equal(fast[inside], escape_by_definition(plane, inside)[inside])
 
 
 def shaft(low: int, high: int, centre: int, radius: float) -> np.ndarray:

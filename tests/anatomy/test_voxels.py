@@ -11,7 +11,7 @@ from limbfit.anatomy.segmentation.amputation import amputate_anatomy, voxelise_a
 from limbfit.anatomy.surfaces.surfaces import check_anatomy
 from limbfit.errors import LabelError
 
-PAD, EDGE = 10.0, 3.0
+PAD, EDGE = 10.0, 5.0
 
 
 @pytest.fixture(scope="module")

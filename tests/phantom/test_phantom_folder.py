@@ -135,13 +135,6 @@ def test_impossible_wishes_are_refused(tmp_path, keywords, error, message) -> No
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_that_holds_something_is_not_touched(tmp_path) -> None:
-    (tmp_path / "mine.txt").write_text("keep")
-    with pytest.raises(InputError, match="there is something already"):
-        make_phantom(tmp_path, mapping=cubic_law)
-    assert (tmp_path / "mine.txt").read_text() == "keep"
-
-
 @pytest.mark.slow
 def test_simulated_forces_are_those_of_soft_tissue(tmp_path) -> None:
     truth = make_phantom(tmp_path / "study", sites=["05", "15"])
