@@ -15,6 +15,7 @@ from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.record import SecondaryMeasurements
 from limbfit.phantom.sites import TrueSite, build_true_sites
 from limbfit.phantom.surfaces import build_true_anatomy
+from small_limb import limb
 
 NAMES = [f"{number:02d}" for number in range(1, 19)]
 
@@ -40,6 +41,19 @@ def test_site_is_simulated_to_its_end(phantom, name):
     assert found.times[peak] == pytest.approx(site.depth / site.speed, rel=0.02)
     assert np.all(np.diff(found.force[:peak]) > -0.02)
     assert found.force[-1] == pytest.approx(0.0, abs=0.05)
+
+
+def test_only_the_tissue_about_a_site_is_kept(tmp_path):
+    anatomy = limb()
+    save_anatomy(tmp_path, anatomy)
+    place, axis = anatomy.cut_point + np.array([31.0, 0.0, -35.0]), np.array([-1.0, 0.0, 0.0])
+    site = TrueSite("05", "tibia", True, place, axis, 3.0, 0.96, 15.0, hint=place)
+    edges = replace(DISCRETISATIONS["coarse"].mesh, edge_near_mm=8.0, element="tet4")
+    mesh = mesh_true_site(site, tmp_path, edges, 25.0)
+    away = np.linalg.norm(mesh.points[mesh.cells].mean(axis=1) - place, axis=1)
+    assert len(mesh.cells) > 50
+    assert 15.0 < away.max() < 40.0
+    assert set(mesh.region_names) == {"skin", "muscle"}
 
 
 def test_a_site_shows_what_is_asked_for_and_no_more():
