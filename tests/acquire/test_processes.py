@@ -1,4 +1,4 @@
-"""Both ends as processes, on real sockets and terminals: whole sessions, kills, hostile devices."""
+"""Both ends on real sockets and terminals: sessions, kills (of processes), hostile devices."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
@@ -22,14 +24,24 @@ import numpy as np
 import pytest
 from in_process import settings
 
+import limbfit
 from acquiring import SPEED, fitsocket, start
 from limbfit.acquire import LineDevice, LiveUpdate, Session, connect, read_recording, run_session
 from limbfit.acquire.events import Abort, Flags, Sample, Signal
 from limbfit.acquire.line_protocol import Encoder, SetLimits
 from limbfit.acquire.protocol import Phase
+from limbfit.acquire.virtual import Fault, Serving, read_faults
 from limbfit.errors import RunError
 from limbfit.pipeline.records.traces import read_record
 from limbfit.study import load_study
+
+
+@pytest.fixture(autouse=True)
+def usual_priority() -> Iterator[None]:
+    """A session in this process asks for real time, which the other tests do not need."""
+    yield
+    if hasattr(os, "sched_setscheduler"):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def acquire(study, address: str, *words: object) -> tuple[int, dict, str]:
@@ -112,10 +124,9 @@ def is_home(address: str) -> bool:
     return False
 
 
-def wait_for_record(study, samples: int, process: subprocess.Popen) -> Path:
+def wait_for_record(study, samples: int) -> Path:
     """Until the record that a session is writing has so many rows."""
     for _ in range(1200):
-        assert process.poll() is None, process.stderr.read()
         files = list(study.glob("acquired/*/*/record.csv"))
         if files and files[0].read_bytes().count(b"\n") > samples:
             return files[0]
@@ -123,68 +134,102 @@ def wait_for_record(study, samples: int, process: subprocess.Popen) -> Path:
     raise AssertionError("no record is written")
 
 
-def kill_the_host(ready, samples: int) -> None:
-    with fitsocket(ready, "--speed", SPEED) as (address, device):
-        host = start("acquire", ready, "--device", address, "--unattended", "--site", "1", "--depth", 4.0)
-        file = wait_for_record(ready, samples, host)
+@contextmanager
+def device_here(study, *, faults: tuple[Fault, ...] = (), speed: float = float(SPEED)):
+    """A virtual FitSocket on a port, in a thread of this process; its address and that thread."""
+    device = limbfit.virtual_fitsocket(load_study(study, recorded=False), faults=faults, paced=speed > 1)
+    serving = Serving.on_port("127.0.0.1", 0)
+    how = {"speed": speed, "tell": lambda line: None}
+    thread = Thread(target=limbfit.serve_fitsocket, args=(device, serving), kwargs=how)
+    thread.start()
+    try:
+        yield serving.address, thread
+    finally:
+        serving.stop()
+        thread.join(20)
+
+
+@contextmanager
+def once_recorded(study, samples: int, act: Callable[[], object]):
+    """``act`` is done in a thread once the record of a session has so many rows."""
+
+    def wait() -> None:
+        wait_for_record(study, samples)
+        act()
+
+    thread = Thread(target=wait)
+    thread.start()
+    yield
+    thread.join(60)
+
+
+SESSION = ("--unattended", "--site", "1", "--depth", 4.0)
+
+
+def kill_the_host(ready, limbfit, samples: int) -> None:
+    with device_here(ready) as (address, device):
+        host = start("acquire", ready, "--device", address, *SESSION)
+        file = wait_for_record(ready, samples)
         host.kill()
         host.communicate()
         assert is_home(address)
-        assert device.poll() is None
+        assert device.is_alive()
     found = read_recording(file)
     rows = sum(line[:1].isdigit() for line in file.read_bytes().split(b"\n"))
     assert rows - len(found.number) <= 50
     assert np.all(np.diff(found.device_us) == 2000)
 
 
-def kill_the_device(ready, samples: int) -> None:
-    with fitsocket(ready, "--speed", SPEED) as (address, device):
-        host = start("acquire", ready, "--device", address, "--unattended", "--site", "1", "--depth", 4.0)
-        file = wait_for_record(ready, samples, host)
-        device.kill()
-        _, err = host.communicate(timeout=60)
-    assert host.returncode == 1
+def kill_the_device(ready, limbfit, samples: int) -> None:
+    with fitsocket(ready, "--speed", SPEED) as (address, device), once_recorded(ready, samples, device.kill):
+        assert address.startswith("tcp://127.0.0.1:")  # unless another is asked for
+        code, _, err = limbfit("acquire", ready, "--device", address, *SESSION)
+    assert code == 1
     assert "whether the device has retracted is not known" in err
     assert "Traceback" not in err
-    found = read_recording(file)
+    found = read_recording(wait_for_record(ready, samples))
     assert found.lost_bytes == 0
     assert found.phases()[-1][0] == "unreachable"
     assert not (ready / "1.csv").exists()
 
 
-def test_a_killed_host_leaves_a_readable_record_and_a_retracted_device(ready) -> None:
-    kill_the_host(ready, 600)
+def test_a_killed_host_leaves_a_readable_record_and_a_retracted_device(ready, limbfit) -> None:
+    kill_the_host(ready, limbfit, 600)
 
 
-def test_a_killed_device_ends_the_session_with_a_reason(ready) -> None:
-    kill_the_device(ready, 600)
+def test_a_killed_device_ends_the_session_with_a_reason(ready, limbfit) -> None:
+    kill_the_device(ready, limbfit, 600)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("end", [kill_the_host, kill_the_device])
-def test_both_ends_killed_at_random_moments(ready, end, seed: int) -> None:
-    end(ready, random.Random(seed).randrange(60, 8000))
+def test_both_ends_killed_at_random_moments(ready, limbfit, end, seed: int) -> None:
+    end(ready, limbfit, random.Random(seed).randrange(60, 8000))
 
 
-def test_termination_retracts(ready) -> None:
-    with fitsocket(ready, "--speed", SPEED) as (address, _):
-        host = start("acquire", ready, "--device", address, "--unattended", "--site", "1", "--depth", 4.0)
-        file = wait_for_record(ready, 600, host)
-        host.send_signal(signal.SIGTERM)
-        _, err = host.communicate(timeout=60)
-    assert host.returncode == 1
-    assert "signal SIGTERM (stopped)" in err
-    assert read_recording(file).phases()[-1][0] == "stopped"
-
-
-def test_faults_on_demand_stop_the_session(ready, tmp_path) -> None:
-    faults = tmp_path / "faults.toml"
-    faults.write_text('[[faults]]\nkind = "button"\nphase = "clamp"\nat_s = 0.2\nduration_s = 0.5\n')
-    with fitsocket(ready, "--speed", SPEED, "--faults", faults) as (address, _):
-        code, found, err = acquire(ready, address, "--unattended", "--depth", 4.0)
+def test_termination_retracts(ready, limbfit) -> None:
+    before = signal.signal(
+        signal.SIGTERM, signal.SIG_IGN
+    )  # of the tests, which only the session's may replace
+    terminate = partial(os.kill, os.getpid(), signal.SIGTERM)
+    with device_here(ready) as (address, _), once_recorded(ready, 600, terminate):
+        code, _, err = limbfit("acquire", ready, "--device", address, *SESSION)
+    signal.signal(signal.SIGTERM, before)
     assert code == 1
-    (row,) = found["sites"]  # the second site is not begun
+    assert "signal SIGTERM (stopped)" in err
+    assert read_recording(wait_for_record(ready, 600)).phases()[-1][0] == "stopped"
+
+
+def test_faults_on_demand_stop_the_session(ready, limbfit, tmp_path) -> None:
+    file = tmp_path / "faults.toml"
+    file.write_text('[[faults]]\nkind = "button"\nphase = "clamp"\nat_s = 0.2\nduration_s = 0.5\n')
+    with device_here(ready, faults=read_faults(file)) as (address, _):
+        code, out, err = limbfit(
+            "acquire", ready, "--device", address, "--json", "--unattended", "--depth", 4.0
+        )
+    assert code == 1
+    (row,) = json.loads(out)["sites"]  # the second site is not begun
     assert "button" in row["reason"], err
     assert row["phase"] == "stopped"
 
@@ -268,8 +313,8 @@ def test_the_operator_s_keys_in_a_terminal(ready) -> None:
     assert 1.0 < depth < 15.0
 
 
-def test_the_server_binds_to_loopback_and_takes_one_host(ready) -> None:
-    with fitsocket(ready) as (address, process):
+def test_the_server_takes_one_host_that_greets_it(ready) -> None:
+    with device_here(ready, speed=1.0) as (address, device):
         host, port = re.fullmatch(r"tcp://(127\.0\.0\.1):(\d+)", address).groups()
         first = LineDevice(connect(address))
         second = socket.create_connection((host, int(port)))
@@ -285,7 +330,7 @@ def test_the_server_binds_to_loopback_and_takes_one_host(ready) -> None:
         assert noisy.recv(100) == b""
         for closed in (second, silent, noisy):
             closed.close()
-        assert process.poll() is None
+        assert device.is_alive()
         assert is_home(address)
 
 
