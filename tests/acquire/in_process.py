@@ -170,8 +170,8 @@ class Bench:
 
 @cache
 def _course() -> dict[Phase, Bench]:
-    """A session whose ramps are held, as it was when it first came to each of its phases."""
-    bench, found = Bench(hold_s=0.2), {}
+    """A session of two ramps, the second held, as it was when it first came to each of its phases."""
+    bench, found = Bench(hold_s=0.2, precondition=1, search_force_N=8.0), {}
     while not bench.session.protocol.is_over:
         found.setdefault(bench.phase, deepcopy(bench))
         before = bench.phase
@@ -179,7 +179,7 @@ def _course() -> dict[Phase, Bench]:
             bench.millisecond()
             if bench.phase is before:
                 bench.operate()
-    return found
+    return found | {bench.phase: bench}
 
 
 def session_in(phase: Phase, *faults: Fault) -> Bench:

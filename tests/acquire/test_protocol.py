@@ -28,33 +28,19 @@ def test_every_phase_can_be_reached_left_and_stopped() -> None:
         assert Phase.STOPPING in ways or phase is Phase.STOPPING
 
 
-def test_the_paper_s_order() -> None:
-    bench = Bench(repeats=2, precondition=2, depth_mm=3.0)
-    bench.until()
-    found = phases(bench)
-    assert found[-1] == "done"
-    order = [p for p in found if p not in ("clamp", "settle")]
+def test_the_paper_s_order_in_which_each_ramp_that_counts_is_held() -> None:
+    bench = session_in(Phase.DONE)
+    order = [p for p in phases(bench) if p not in ("clamp", "settle")]
     assert order == [
         *("position", "approach", "back", "ready", "search", "return", "pause"),
-        *("load", "unload", "load", "unload"),  # preconditioning, without a pause between
-        *("pause", "load", "unload", "pause", "load", "unload", "retract", "release", "done"),
+        *("load", "unload"),  # preconditioning is not held
+        *("pause", "load", "hold", "unload", "retract", "release", "done"),
     ]
     protocol = bench.session.protocol
     assert protocol.depth_um - protocol.touch_um == pytest.approx(3000, abs=150)
     true_gap = bench.device.limb._gap[0]
     assert protocol.touch_um / 1000 == pytest.approx(true_gap, abs=0.08)
     assert bench.device.is_home
-
-
-def test_each_ramp_that_counts_is_held() -> None:
-    bench = Bench(repeats=2, precondition=1, depth_mm=3.0, hold_s=0.4)
-    bench.until()
-    found = phases(bench)
-    held = ("pause", "load", "hold", "unload")
-    assert found[found.index("pause") :] == [
-        *("pause", "load", "unload"),  # preconditioning is not held
-        *(*held, *held, "retract", "release", "done"),
-    ]
 
 
 def test_a_hold_longer_than_a_phase_may_take_is_refused() -> None:
@@ -64,7 +50,7 @@ def test_a_hold_longer_than_a_phase_may_take_is_refused() -> None:
 
 def test_neighbours_stay_off_while_eleven_clamp() -> None:
     bench = Bench(pin=14)
-    bench.until(Phase.LOAD)
+    bench.until(Phase.APPROACH)
     force, position = bench.device.limb.force_N, bench.device.motors.position_mm
     clamps = [pin - 1 for pin in bench.settings.clamps]
     assert len(clamps) == 11
@@ -74,8 +60,8 @@ def test_neighbours_stay_off_while_eleven_clamp() -> None:
 
 
 def test_letting_go_halts_at_once_and_a_shallow_search_is_none() -> None:
-    bench = Bench(depth_mm=0.3)
-    bench.until(Phase.SEARCH)
+    bench = session_in(Phase.SEARCH)
+    bench.depth_mm = 0.3
     bench.until(Phase.BACK)
     assert bench.phase is Phase.BACK  # 0.3 mm are too shallow: back to the start, to try again
     bench.depth_mm = 2.0
@@ -126,9 +112,10 @@ def test_a_wait_longer_than_a_phase_may_take_is_refused(key: str) -> None:
 
 
 def test_the_comfortable_force_ends_the_search_whoever_holds_the_key() -> None:
-    bench = Bench(depth_mm=99.0, search_force_N=4.0)
+    bench = session_in(Phase.SEARCH)
+    bench.depth_mm = 99.0
     bench.until(Phase.RETURN)
-    assert bench.device.limb.force_N[0] == pytest.approx(4.0, abs=0.5)
+    assert bench.device.limb.force_N[0] == pytest.approx(bench.settings.search_force_N, abs=0.5)
 
 
 FAULTS = {
@@ -197,8 +184,7 @@ def test_an_abort_in_any_phase_retracts(phase: Phase) -> None:
 
 
 def test_an_operator_who_does_not_come_is_not_waited_for_forever() -> None:
-    bench = Bench(operator_limit_s=1.0)
-    bench.until(Phase.READY)
+    bench = session_in(Phase.READY)
     bench.settle()
     assert "ready took longer" in bench.session.protocol.reason
     assert FAST["time_limit_s"] > 1

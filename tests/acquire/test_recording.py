@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import json
+from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -152,34 +153,32 @@ def test_a_record_is_never_overwritten(written) -> None:
         Recorder(written, {})
 
 
-def session(tmp_path, **changes):
+def session(file, **changes):
     """A whole session, recorded."""
-    bench = Bench(depth_mm=3.0, **changes)
-    file = tmp_path / "record.csv"
-    head = {
-        "site": "1",
-        "settings": {
-            "pin": 1,
-            "repeats": bench.settings.repeats,
-            "precondition": bench.settings.precondition,
-            "ramp_speed_mm_s": bench.settings.ramp_speed_mm_s,
-        },
-        "device": {"range_mN": 50_000},
-    }
-    recorder = bench.session.recorder = Recorder(file, json.loads(json.dumps(head)))
+    bench = Bench(depth_mm=3.0, precondition=1, settle_s=0.5, **changes)
+    stated = ("pin", "repeats", "precondition", "ramp_speed_mm_s")
+    settings = {key: getattr(bench.settings, key) for key in stated}
+    recorder = bench.session.recorder = Recorder(
+        file, {"site": "1", "settings": settings, "device": {"range_mN": 50_000}}
+    )
     bench.until()
     recorder.close()
     return bench, read_recording(file)
+
+
+@pytest.fixture(scope="module")
+def held(tmp_path_factory):
+    """A good session, whose ramps are held."""
+    file = tmp_path_factory.mktemp("session") / "record.csv"
+    return session(file, repeats=1, ramp_speed_mm_s=2.5, hold_s=0.6, pause_s=2.0)
 
 
 def checks(recording) -> dict[str, bool | None]:
     return {check.name: check.passed for check in check_record(recording).checks}
 
 
-def test_a_good_session_is_called_good_and_its_ramps_are_kept_with_their_holds(tmp_path) -> None:
-    bench, recording = session(
-        tmp_path, repeats=1, precondition=1, ramp_speed_mm_s=2.5, hold_s=0.6, pause_s=2.0, settle_s=0.5
-    )
+def test_a_good_session_is_called_good_and_its_ramps_are_kept_with_their_holds(held) -> None:
+    bench, recording = held
     verdict = check_record(recording)
     assert verdict.is_good, verdict
     found = find_ramps(recording)
@@ -198,9 +197,9 @@ def test_a_good_session_is_called_good_and_its_ramps_are_kept_with_their_holds(t
     assert np.diff(curve.force_N[inside])[[0, -1]].max() < 0.0  # it relaxes
 
 
-def test_what_is_wrong_is_named(tmp_path) -> None:
-    _, recording = session(tmp_path, ramp_speed_mm_s=6.0, settle_s=0.5)
-    recording.head["settings"]["ramp_speed_mm_s"] = 0.96  # and the device ran at 6 mm/s
+def test_what_is_wrong_is_named(held) -> None:
+    recording = deepcopy(held[1])
+    recording.head["settings"]["ramp_speed_mm_s"] = 0.96  # and the device ran at 2.5 mm/s
     assert checks(recording)["speed"] is False
     recording.force_mN[recording.host_us > 3_000_000, 0] += 400
     recording.force_mN[100, 7] = 50_000
@@ -209,20 +208,14 @@ def test_what_is_wrong_is_named(tmp_path) -> None:
     assert found["saturation"] is False
     keep = np.ones(len(recording.number), dtype=bool)
     keep[200:220] = False
-    thinned = type(recording)(
-        **{
-            name: value[keep] if isinstance(value, np.ndarray) else value
-            for name, value in vars(recording).items()
-        }
-    )
+    arrays = {name: value for name, value in vars(recording).items() if isinstance(value, np.ndarray)}
+    thinned = replace(recording, **{name: value[keep] for name, value in arrays.items()})
     assert checks(thinned)["samples"] is False
 
 
 @pytest.mark.slow
 def test_ramps_that_do_not_repeat_are_named(tmp_path) -> None:
-    _, recording = session(
-        tmp_path, repeats=2, precondition=1, ramp_speed_mm_s=1.4, pause_s=3.0, settle_s=0.5
-    )
+    _, recording = session(tmp_path / "record.csv", repeats=2, ramp_speed_mm_s=1.4, pause_s=3.0)
     assert checks(recording)["repeatability"] is True
     second = [event["at_us"] for event in recording.events if event.get("phase") == "load"][2]
     recording.force_mN[recording.host_us > second, 0] *= 2

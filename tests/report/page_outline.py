@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from html.parser import HTMLParser
+from pathlib import Path
+
+from limbfit.report.build import _render
+from limbfit.report.page import Page, Section
+from limbfit.report.sections.contents import build_summary, list_key_numbers
+from limbfit.report.store import Results, load_store
 
 VOID = {"meta", "link", "br", "img", "input", "hr", "path", "image", "use", "line", "circle"}
 
@@ -38,3 +45,10 @@ def section_of(text: str, name: str) -> str:
 
 def without_scripts(text: str) -> str:
     return re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
+
+
+def render_sections(results: Path, *makers: Callable[[Results], Section]) -> str:
+    """A page of its summary and those sections alone, as a whole report has them."""
+    store = load_store(results)
+    sections = tuple(make(store) for make in makers)
+    return _render(Page("", "", list_key_numbers(store), build_summary(store), sections, ""))
