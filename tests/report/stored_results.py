@@ -255,8 +255,8 @@ def _phases(first_s: float, touch_s: float, seconds: float) -> list[dict]:
 
 def _limb_mesh() -> Mesh:
     """Tetrahedra of the limb in rings: region 0 in the outermost 3 mm, bones left out."""
-    z = np.linspace(-126, 60, 36)
-    angle = np.linspace(0, 2 * np.pi, 49)
+    z = np.linspace(-126, 60, 24)
+    angle = np.linspace(0, 2 * np.pi, 33)
     ring, zz, a = np.meshgrid(np.arange(12), z, angle, indexing="ij")
     inner = radius(zz) - 3.0
     r = np.where(ring < 10, inner * (0.02 + 0.98 * ring / 9), inner + 1.5 * (ring - 9))
