@@ -60,6 +60,7 @@ def test_an_own_mesh_is_stiffer_over_its_bone(run, capsys) -> None:
     assert "count nodes from 0" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_an_own_curve_tells_the_tissue_that_made_it(run) -> None:
     left = run("your-own-curve")
     truth = {"skin.c": 0.012, "muscle.c": 0.005, "muscle.gamma": 2.0}

@@ -23,7 +23,6 @@ from limbfit.report.store import load_store
 from limbfit.report.words import write_words
 from unpacking import unpack
 
-
 SITES = tuple(row for row in ALL_SITES if row[0] not in ("LA-3", "PO-4"))
 
 

@@ -29,7 +29,7 @@ def make_segmented(folder: Path) -> Path:
     """The study's folder, stage ``segment`` done."""
     limb = make_limb(3)
     fine = build_image(limb, make_grid(limb, "coarse", 3), seed=3)
-    part = Volume(fine.array[30:100], fine.spacing, fine.index_to_point([0, 0, 30]), fine.direction)
+    part = Volume(fine.array[45:85], fine.spacing, fine.index_to_point([0, 0, 45]), fine.direction)
     write_volume(folder / "image.nrrd", part)
     (folder / "study.toml").write_text(STUDY)
     run_study(load_study(folder), until="segment", listener=lambda progress: None)

@@ -19,15 +19,6 @@ def ended(process, within_s=60.0):
         time.sleep(0.05)
 
 
-def test_no_code_of_the_folder_is_run(tmp_path):
-    for name in ("limbfit", "psutil", "typer"):
-        (tmp_path / f"{name}.py").write_text("open('ran', 'w').close()")
-    with (tmp_path / "said").open("wb") as said:
-        ended(start_command(["-m", "limbfit", "--version"], tmp_path, said))
-    assert not (tmp_path / "ran").exists()
-    assert b"Traceback" not in (tmp_path / "said").read_bytes()
-
-
 def test_a_command_is_found_and_interrupted(tmp_path):
     words = ["-c", "import time; time.sleep(600)", str(tmp_path)]
     process = start_command([*words, "more"], tmp_path)
@@ -39,14 +30,19 @@ def test_a_command_is_found_and_interrupted(tmp_path):
     assert find_command(words) is None
 
 
-def test_a_run_works_beside_the_link_that_names_the_study_file(study, tmp_path):
+def test_a_run_works_beside_the_link_that_names_the_study_file_and_runs_no_code_beside_it(study, tmp_path):
+    for name in ("limbfit", "psutil", "typer"):
+        (study / f"{name}.py").write_text("open('ran', 'w').close()")
     other = tmp_path / "other"
     other.mkdir()
-    (study / "study.toml").rename(other / "study.toml")
+    text = (study / "study.toml").read_text() + "[traces]\nsmoothing = 0.1\n"
+    (study / "study.toml").unlink()
+    (other / "study.toml").write_text(text)
     (study / "study.toml").symlink_to(other / "study.toml")
     ended(start_run(StudyFolder(study / "study.toml"), "traces", None, ())["process"])
     assert (study / "results" / "traces" / "stage.json").is_file()
     assert not (other / "results").exists()
+    assert not (study / "ran").exists()
 
 
 def test_a_stage_to_repeat_that_comes_after_the_last_one_is_refused_at_once(study):

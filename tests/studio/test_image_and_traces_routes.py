@@ -134,7 +134,8 @@ def test_image_and_labels_lie_where_the_study_has_them(limb, tmp_path):
 
 def test_stated_times_are_stored_beside_the_comments(study):
     file = study / "study.toml"
-    file.write_text(file.read_text().replace('trace = "1.csv"', 'trace = "1.csv"  # by the robot'))
+    text = file.read_text().replace('trace = "1.csv"', 'trace = "1.csv"  # by the robot')
+    file.write_text(text + "[traces]\nsmoothing = 0.1\n")
     run_study(load_study(study), until="traces", listener=lambda progress: None)
     client = client_of(study)
     found = client.get("/api/traces/1").json()

@@ -75,8 +75,8 @@ def state(page, view: str, kind: str):
     return page.locator(f".view.{view} .state.{kind}:visible")
 
 
-def test_every_view_says_that_it_is_read_what_is_missing_and_what_is_wrong(begun, serve, open_page):
-    page = open_page(serve(begun), may_say="status of 422")
+def test_every_view_says_that_it_is_read_what_is_missing_and_what_is_wrong(begun, serve_here, open_page):
+    page = open_page(serve_here(begun), may_say="status of 422")
     for view, (what, path) in READ.items():
         with held(page, path):
             show(page, view)

@@ -23,13 +23,13 @@ def states(folder) -> dict[str, str]:
     return {row["stage"]: row["state"] for row in study_status(load_study(folder))}
 
 
-def test_a_dragged_touch_down_is_stored_and_hostile_names_stay_text(study, serve, open_page):
+def test_a_dragged_touch_down_is_stored_and_hostile_names_stay_text(study, serve_here, open_page):
     file = study / "study.toml"
     hostile = "<img src=x onerror=window.hacked=1><script>window.hacked=1</script>"
     text = file.read_text().replace('"stump"', f'"{hostile}"')
     file.write_text(text.replace('name = "1"', f'name = "1"  # first\nregion = "{hostile}"'))
     run_study(load_study(study), until="traces", listener=lambda progress: None)
-    address = serve(study)
+    address = serve_here(study)
     page = open_page(address + "#/traces")
     handle = page.locator("[data-key=touch_down_s]").first
     handle.wait_for()

@@ -203,9 +203,8 @@ def test_the_page_names_no_other_server():
 
 HOSTILE = [
     "..%2fsecret.txt",
-    "..", ".", "../study.toml", "..%2fstudy.toml", "%2e%2e%2fstudy.toml", "....//study.toml", "/etc/passwd",
-    "..\\study.toml", "C:\\secret", "\x00", "a\x00.stl", "link.txt", "linked", ".lock", "", "~", "*", "con:",
-    "skin.stl/../../study.toml", "secret.txt",
+    "..", "../study.toml", "%2e%2e%2fstudy.toml", "....//study.toml", "/etc/passwd", "..\\study.toml",
+    "a\x00.stl", "link.txt", ".lock", "", "~", "skin.stl/../../study.toml",
 ]  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from browsing import WITHOUT_WEBGL, serious_findings, until
 from limbfit import load_study
 
 # Where the camera looks from each side, by the key that shows it (LPS).
-SIDES = {"1": (0, 1, 0), "2": (-1, 0, 0), "3": (0, -1, 0), "4": (1, 0, 0)}
+SIDES = {"1": (0, 1, 0), "4": (1, 0, 0)}
 
 
 def hit(study, direction) -> np.ndarray:
@@ -31,8 +31,8 @@ def click_middle(page) -> None:
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
 
 
-def test_a_click_on_the_skin_becomes_a_site_within_a_millimetre(study, serve, open_page):
-    page = open_page(serve(study) + "#/model")
+def test_a_click_on_the_skin_becomes_a_site_within_a_millimetre(study, serve_here, open_page):
+    page = open_page(serve_here(study) + "#/model")
     page.get_by_label("skin", exact=True).wait_for()  # the surfaces are there
     for key, direction in SIDES.items():
         page.locator(".view.model .lf-canvas").focus()
@@ -46,7 +46,7 @@ def test_a_click_on_the_skin_becomes_a_site_within_a_millimetre(study, serve, op
         page.get_by_role("heading", name=f"Site side-{key}").wait_for()
         found = np.array(load_study(study).site(f"side-{key}").position)
         assert np.linalg.norm(found - hit(study, direction)) < 1.0
-    assert page.locator(".site-list button").count() == 6
+    assert page.locator(".site-list button").count() == 2 + len(SIDES)
     assert serious_findings(page) == []
 
 

@@ -11,10 +11,10 @@ from limbfit.phases import find_boundaries
 from limbfit.traces import Trace, find_touch_down, read_trace, regularise, touch_down_at
 
 
-@pytest.mark.parametrize("p", [1.0, 1.5, 2.0])
+@pytest.mark.parametrize("p", [1.0, 2.0])
 @pytest.mark.parametrize("slack", [0.0, 0.4, 2.0])
 def test_touch_down_is_found_under_noise(p, slack):
-    for seed in range(3):
+    for seed in range(2):
         trace, _ = record(slack=slack, p=p, seed=seed)
         touch = find_touch_down(trace)
         assert abs(touch.displacement_mm - slack) < max(0.1, 2.5 * touch.uncertainty_mm), touch
@@ -23,7 +23,7 @@ def test_touch_down_is_found_under_noise(p, slack):
 
 
 def test_touch_down_does_not_mind_an_offset_or_a_wait_before_the_ramp():
-    for seed in range(3):
+    for seed in range(2):
         trace, _ = record(offset=0.2, wait=1.5, seed=seed)
         touch = find_touch_down(trace)
         assert touch.displacement_mm == pytest.approx(0.4, abs=0.1)
@@ -34,7 +34,7 @@ def test_touch_down_does_not_mind_an_offset_or_a_wait_before_the_ramp():
 
 def test_more_noise_means_more_uncertainty_and_no_bias():
     errors, stated = [], []
-    for seed in range(12):
+    for seed in range(8):
         touch = find_touch_down(record(noise_N=0.1, seed=seed)[0])
         errors.append(touch.displacement_mm - 0.4)
         stated.append(touch.uncertainty_mm)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -34,7 +35,7 @@ def kinds(found):
 
 
 def test_a_sound_record_is_left_alone():
-    for seed in range(5):
+    for seed in range(3):
         trace, _ = record(seed)
         found = interpret_record(trace)
         assert found.trace is trace
@@ -76,7 +77,7 @@ def spiked(values, size, seed=3, per_mille=1.0):
     return spikes, places
 
 
-@pytest.mark.parametrize("size", [1.0, 5.0, 500.0])
+@pytest.mark.parametrize("size", [1.0, 500.0])
 def test_spikes_are_taken_out_and_counted(size):
     trace, clean = record()
     force, places = spiked(trace.force_N, size)
@@ -180,12 +181,21 @@ def test_noise_is_no_contact(seed):
 
 
 def test_contact_is_seen_in_noise():
-    for seed in range(5):
+    for seed in range(3):
         with pytest.raises(TraceError, match="begins in contact"):
             interpret_record(cut(fast(seed), 1.9))
 
 
 # --- what `limbfit check` says
+
+
+@pytest.fixture
+def study(pristine, tmp_path):
+    """The stump, and a smoothing that need not be chosen anew for each record."""
+    folder = shutil.copytree(pristine, tmp_path / "study")
+    file = folder / "study.toml"
+    file.write_text(file.read_text() + "[traces]\nsmoothing = 0.1\n")
+    return folder
 
 
 def checked(study):
@@ -199,8 +209,6 @@ def change(study, name, edit):
 
 
 def test_check_tells_what_was_mended(study):
-    assert checked(study)["flags"] == []
-
     def spoil(table):
         table[:, 2] += 0.05 * table[:, 0]
         table[[300, 900], 2] += 5.0
@@ -235,7 +243,6 @@ def test_check_names_the_file_of_a_record_that_begins_in_contact(study):
 
 
 def test_check_says_that_a_record_has_loading_only(study):
-    assert not any("loading only" in fact for fact in checked(study)["facts"])
     change(study, "1", lambda table: table[: int(table[:, 1].argmax())])
     found = checked(study)
     assert any(fact.startswith("site 1:") and "loading only" in fact for fact in found["facts"])
@@ -250,7 +257,9 @@ def same_place(study):
 
 def test_two_sites_at_one_place_with_different_records_are_told(study):
     same_place(study)
-    assert checked(study)["flags"] == []  # repeats of one record
+    sound = checked(study)  # repeats of one record
+    assert sound["flags"] == []
+    assert not any("loading only" in fact for fact in sound["facts"])
     write_trace(study / "2.csv", peak=9.0)
     (flag,) = checked(study)["flags"]
     assert flag["sites"] == ["1", "2"]
@@ -290,8 +299,7 @@ def test_a_mesh_of_billions_of_cells_is_refused(study, table):
     load_study(study)
 
 
-@pytest.mark.parametrize("value", [9.0, 9999.0])
-@pytest.mark.parametrize("place", [0, 300, -1])
+@pytest.mark.parametrize(("place", "value"), [(0, 9999.0), (300, 9.0), (-1, 9999.0)])
 def test_one_sample_that_sticks_out_is_replaced_wherever_it_is(place, value):
     trace, _ = record(clear=1.0)
     for column in ("displacement_mm", "force_N"):

@@ -13,7 +13,10 @@ from conftest import COARSE
 from limbfit.errors import InputError
 from limbfit.identify.checks.design import sample_tissues
 from limbfit.pipeline.design.protocol import DESIGNED, PLAIN, UNSEEN
+from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.problem import build_problem
+from limbfit.report.sections.design import make_protocol_section
+from limbfit.report.store import load_store
 
 BALL = '[indenters.ball]\nshape = "sphere"\nwidth_mm = 12.0\n[acquire]\nforce_limit_N = 45.0\n'
 
@@ -110,9 +113,11 @@ def test_what_cannot_be_planned_is_one_line(found) -> None:
 def test_it_is_in_the_report(found) -> None:
     study, _ = found
     content = limbfit.plan_protocol(study, minutes=6, depths_mm=(3.0,), holds_s=(0, 10), draws=1)
-    text = Path(limbfit.report_study(study)["report"]).read_text()
-    assert "Which records to make" in text
-    assert content["verdict"].split(";")[0] in text
+    section = make_protocol_section(load_store(study.results), Store(study.results).results.protocol)
+    assert section.title == "Which records to make"
+    assert any(
+        content["verdict"].split(";")[0] in block.text for block in section.blocks if block.kind == "prose"
+    )
 
 
 @pytest.mark.slow

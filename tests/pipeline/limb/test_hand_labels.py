@@ -94,15 +94,22 @@ def test_hand_work_in_the_results_wins_and_survives(folder):
     assert facts(study)["method"] == "automatic"
 
 
-def test_hand_work_is_kept_where_the_study_names_labels(folder):
-    study = study_of(folder)
-    first = segmented(study)
-    write_labels(folder / "mine.seg.nrrd", first)
-    write_labels(study.results / "segment" / "labels.seg.nrrd", with_a_notch(first))
-    study = study_of(folder, '[segmentation]\nlabels = "mine.seg.nrrd"\n')
-    assert np.array_equal(segmented(study).array, first.array)
+def test_hand_work_is_kept_where_the_study_names_labels(tmp_path):
+    """What was corrected of the first is laid aside where it names others."""
+    y, x = np.indices((20, 20)) - 9.5
+    leg = np.repeat([np.where(np.hypot(x, y) < 9, 1, 0) + np.where(np.hypot(x, y) < 4, 1, 0)], 16, axis=0)
+    made = LabelMap(leg, [4.0] * 3, np.zeros(3), np.eye(3), {1: "soft tissue", 2: "tibia"})
+    write_volume(tmp_path / "image.nrrd", Volume(leg, made.spacing, made.origin, made.direction))
+    found = {}
+    for name, labels in (("first", made), ("second", with_a_notch(with_a_notch(made)))):
+        write_labels(tmp_path / f"{name}.seg.nrrd", labels)
+        study = study_of(tmp_path, f'[segmentation]\nlabels = "{name}.seg.nrrd"\n')
+        found[name] = segmented(study)
+        assert np.array_equal(found[name].array, labels.array)
+        if name == "first":
+            write_labels(study.results / "segment" / "labels.seg.nrrd", with_a_notch(made))
     kept = read_labels(study.results / "by-hand" / "labels.seg.nrrd")
-    assert np.array_equal(kept.array, with_a_notch(first).array)
+    assert np.array_equal(kept.array, with_a_notch(made).array)
 
 
 @pytest.mark.slow

@@ -123,8 +123,9 @@ def write_study(folder: Path, text: str = STUDY) -> Study:
 
 @pytest.fixture(scope="module")
 def over(tmp_path_factory) -> SiteModel:
-    settings = MeshSettings(edge_near_mm=6.0, edge_far_mm=20.0, near_radius_mm=8.0, growth=0.9)
-    return model_of(tmp_path_factory.mktemp("scar"), "over", settings)
+    settings = MeshSettings(edge_near_mm=8.0, edge_far_mm=24.0, near_radius_mm=8.0, growth=1.0)
+    model = model_of(tmp_path_factory.mktemp("scar"), "over", settings)
+    return replace(model, steps=SolverTable(load_steps=3, unload_steps=2))
 
 
 def test_a_site_over_it_feels_it_with_exact_derivatives(over: SiteModel) -> None:

@@ -45,6 +45,12 @@ def context(folder: Path, more: str = "") -> Context:
     return block_context(block_study(folder, "", more), TRUTH)
 
 
+@pytest.fixture(scope="module")
+def found(tmp_path_factory) -> Context:
+    """The block with its record, which the tests leave as it is."""
+    return context(tmp_path_factory.mktemp("block"))
+
+
 def over_bone(context: Context) -> SiteRecord:
     """The block of 18 mm, whose bottom is bone."""
     record = load_site_record(context, context.study.recorded[0])
@@ -64,8 +70,7 @@ def test_thin_tissue_is_stiffer_by_its_thickness() -> None:
     assert compute_thickness_slope(0.01, 1.0) < 0.03
 
 
-def test_a_site_is_off_by_its_surfaces_and_a_little_more(tmp_path: Path) -> None:
-    found = context(tmp_path)
+def test_a_site_is_off_by_its_surfaces_and_a_little_more(found: Context) -> None:
     radius = 20.0 / np.sqrt(np.pi)
     share = compute_expected_share(over_bone(found).model, 0.5)
     assert share == pytest.approx(
@@ -74,10 +79,8 @@ def test_a_site_is_off_by_its_surfaces_and_a_little_more(tmp_path: Path) -> None
     assert compute_expected_share(load_site_record(found, found.study.recorded[0]).model, 0.5) == LEAST_SHARE
 
 
-def test_where_surfaces_are_known_from(tmp_path: Path) -> None:
+def test_where_surfaces_are_known_from(found: Context, tmp_path: Path) -> None:
     """Of files, whatever an earlier image has left, of an image by its voxels, or as stated."""
-    (tmp_path / "stated").mkdir()
-    found = context(tmp_path)
     assert estimate_surface_error_mm(found.study, found.store) == GIVEN_MM
     labels = sitk.Image(4, 4, 4, sitk.sitkUInt8)
     labels.SetSpacing((1.0, 1.0, 8.0))
@@ -86,13 +89,12 @@ def test_where_surfaces_are_known_from(tmp_path: Path) -> None:
     assert estimate_surface_error_mm(found.study, found.store) == GIVEN_MM
     imaged = found.study.model_copy(update={"image": ImageTable(path=Path("mri"))})
     assert estimate_surface_error_mm(imaged, found.store) == pytest.approx(2.0 * OF_A_VOXEL)
-    stated = context(tmp_path / "stated", "[calibration]\nsurface_error_mm = 0.1\n")
-    assert estimate_surface_error_mm(stated.study, stated.store) == 0.1
+    stated = block_study(tmp_path, "", "[calibration]\nsurface_error_mm = 0.1\n")
+    assert estimate_surface_error_mm(stated, found.store) == 0.1
 
 
-def test_a_stiffer_site_moves_its_force_along_all_moduli(tmp_path: Path) -> None:
+def test_a_stiffer_site_moves_its_force_along_all_moduli(found: Context) -> None:
     """Derivatives by both c times c, as much of it as is expected; exponents and times have no part."""
-    found = context(tmp_path)
     record = over_bone(found)
     parameters = found.study.vector(TRUTH)
     moduli = [i for i, (_, name) in enumerate(found.study.parameters) if name == "c_kPa"]
@@ -103,9 +105,8 @@ def test_a_stiffer_site_moves_its_force_along_all_moduli(tmp_path: Path) -> None
     assert off == pytest.approx(12.0 * np.linspace(0, 1, 5) * compute_expected_share(record.model, GIVEN_MM))
 
 
-def test_thinner_tissue_under_an_indenter_has_faster_waves(tmp_path: Path) -> None:
+def test_thinner_tissue_under_an_indenter_has_faster_waves(found: Context) -> None:
     """By the share of its strain, and not at rest, where its own stiffness alone may differ."""
-    found = context(tmp_path)
     record, parameters = over_bone(found), found.study.vector(TRUTH)
     speeds = np.array([4.0, 4.0, 4.5, 6.0])
     at = np.eye(4, len(record.times_s))
@@ -133,7 +134,7 @@ def test_slow_noise_of_a_record_is_not_taken_for_the_force(tmp_path: Path, lag: 
     since = table[:, 0] - facts.touch_down_s
     force = np.interp(since, smooth.time_s, smooth.force_N, right=0.0)
     sd, stated = 0.005 * smooth.peak_force_N, []
-    for seed in range(4):
+    for seed in range(2):
         new = np.random.default_rng(seed).standard_normal(len(table) + 1000)
         noise = lfilter([np.sqrt(1 - lag**2)], [1.0, -lag], new)[1000:]
         rows = np.stack([*table.T[:2], force + sd * noise], axis=1)
@@ -142,9 +143,8 @@ def test_slow_noise_of_a_record_is_not_taken_for_the_force(tmp_path: Path, lag: 
     assert np.mean(stated) == pytest.approx(sd, rel=0.2 if lag else 0.03)
 
 
-def test_what_is_seen_at_a_held_out_site_is_off_as_the_site_is(tmp_path: Path) -> None:
+def test_what_is_seen_at_a_held_out_site_is_off_as_the_site_is(found: Context, tmp_path: Path) -> None:
     """Speeds of waves: beside what noise and parameters leave open, by the thickness of the tissue."""
-    found = context(tmp_path)
     record, parameters = over_bone(found), found.study.vector(TRUTH)
     speeds, times = np.array([4.0, 5.0, 6.0]), record.times_s[:3]
     at = np.eye(3, len(record.times_s))

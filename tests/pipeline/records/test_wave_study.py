@@ -92,6 +92,7 @@ def test_speeds_are_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
 
 def test_a_place_that_is_not_there_is_refused(tmp_path: Path, monkeypatch) -> None:
     rough = PUNCH.replace("load_steps = 8", "load_steps = 2").replace("unload_steps = 8", "unload_steps = 2")
+    rough += "[traces]\nsmoothing = 0.1\n"
     context = replace(BLOCK, tools=rough).stored(tmp_path, monkeypatch, WAVES)
     file = tmp_path / "a-waves.csv"
     text = file.read_text()

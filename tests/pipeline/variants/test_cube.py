@@ -66,16 +66,23 @@ def test_stress_is_that_of_the_closed_form(tissue):
     assert most == pytest.approx(1.0, abs=1e-3)
 
 
-def test_the_papers_bulk_modulus_keeps_the_volume_within_a_percent():
-    found = compress_cube()
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """The published tissues and those of a study, compressed, and the folder of the results."""
+    folder = tmp_path_factory.mktemp("cube")
+    return compress_cube(folder, parameters={"skin": SKIN, "muscle": MUSCLE}), folder
+
+
+def test_the_papers_bulk_modulus_keeps_the_volume_within_a_percent(stored):
+    found, _ = stored
     paper = next(row for row in found["tissues"] if "Sengeh" in row["tissue"])
     assert 0.99 < paper["J_min"] < 0.9975
     assert paper["bulk_modulus_kPa"] == pytest.approx(522.0)
     assert paper["instantaneous_modulus_kPa"] == pytest.approx(5.22 * 4.57)
 
 
-def test_a_study_stands_beside_the_published_and_lends_its_relaxation(tmp_path):
-    found = compress_cube(tmp_path, parameters={"skin": SKIN, "muscle": MUSCLE})
+def test_a_study_stands_beside_the_published_and_lends_its_relaxation(stored):
+    found, folder = stored
     rows = {row["tissue"]: row for row in found["tissues"]}
     assert rows["skin (this study)"]["kind"] == "skin"
     assert rows["muscle (this study)"]["kind"] == "muscle"
@@ -84,11 +91,11 @@ def test_a_study_stands_beside_the_published_and_lends_its_relaxation(tmp_path):
     assert lim["prony"] == [[2.0, 0.5]]
     assert lim["terms"] == [[20.0, 11.0]]
     assert rows["rat tibialis anterior (Bosboom 2001)"]["prony"] == [[0.549, 6.01]]
-    assert json.loads((tmp_path / "cube.json").read_text())["stress_kPa"].keys() == rows.keys()
-    table = np.genfromtxt(tmp_path / "cube.csv", delimiter=",", names=True)
+    assert json.loads((folder / "cube.json").read_text())["stress_kPa"].keys() == rows.keys()
+    table = np.genfromtxt(folder / "cube.csv", delimiter=",", names=True)
     assert table["time_s"][-1] == 2.0
     assert table["skin_this_study_kPa"].max() == pytest.approx(rows["skin (this study)"]["peak_kPa"])
-    drawn = (tmp_path / "cube.svg").read_text()
+    drawn = (folder / "cube.svg").read_text()
     assert drawn.startswith("<?xml")
     assert "var(--" not in drawn
 
