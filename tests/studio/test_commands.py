@@ -35,12 +35,10 @@ def test_a_run_works_beside_the_link_that_names_the_study_file_and_runs_no_code_
         (study / f"{name}.py").write_text("open('ran', 'w').close()")
     other = tmp_path / "other"
     other.mkdir()
-    text = (study / "study.toml").read_text() + "[traces]\nsmoothing = 0.1\n"
-    (study / "study.toml").unlink()
-    (other / "study.toml").write_text(text)
+    (study / "study.toml").rename(other / "study.toml")
     (study / "study.toml").symlink_to(other / "study.toml")
-    ended(start_run(StudyFolder(study / "study.toml"), "traces", None, ())["process"])
-    assert (study / "results" / "traces" / "stage.json").is_file()
+    ended(start_run(StudyFolder(study / "study.toml"), "surfaces", None, ())["process"])
+    assert (study / "results" / "surfaces" / "stage.json").is_file()
     assert not (other / "results").exists()
     assert not (study / "ran").exists()
 

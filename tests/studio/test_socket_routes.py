@@ -20,7 +20,7 @@ AREA = {"name": "front", "position": [0.0, -41.0, 60.0], "radius_mm": 25.0, "dep
 def page(study):
     """The stump with a socket and a comment in its file, as its page talks to it."""
     file = study / "study.toml"
-    file.write_text(file.read_text() + "[socket]\nface_edge_mm = 8.0\ntrim_mm = 34.0  # of the brim\n")
+    file.write_text(file.read_text() + "[socket]\ntrim_mm = 34.0  # of the brim\n")
     door = AccessGuard("127.0.0.1", 8123)
     client = TestClient(create_app(StudyFolder(file), door), base_url=ORIGIN, headers={"Origin": ORIGIN})
     assert client.get("/", params={"token": door.token}).status_code == 200

@@ -208,31 +208,25 @@ def change(study, name, edit):
     np.savetxt(file, edit(table), delimiter=",", header="time_s,displacement_mm,force_N", comments="")
 
 
-def test_check_tells_what_was_mended(study):
-    def spoil(table):
+def test_check_tells_what_was_mended_and_what_is_wrong_and_not_mended(study):
+    def drift(table):
         table[:, 2] += 0.05 * table[:, 0]
         table[[300, 900], 2] += 5.0
         return table
 
-    change(study, "1", spoil)
-    found = checked(study)
-    assert [(flag["sites"], flag["kind"]) for flag in found["flags"]] == [(["1"], "spikes"), (["1"], "drift")]
-    assert "site 1: the force drifts by +0.05" in found["flags"][1]["text"]
-    json.dumps(found)
-
-
-def test_check_tells_what_is_wrong_and_not_mended(study):
-    def spoil(table):
+    def cut_off(table):
         table[:, 2] = np.minimum(table[:, 2], 0.7 * table[:, 2].max())
         return table[(table[:, 0] < 2.0) | (table[:, 0] > 2.6)]
 
-    change(study, "1", spoil)
+    change(study, "1", drift)
+    change(study, "2", cut_off)
     found = checked(study)
-    assert {(flag["sites"][0], flag["kind"]) for flag in found["flags"]} == {
-        ("1", "gap"),
-        ("1", "saturation"),
-    }
-    assert any("site 1: the force stays at" in flag["text"] for flag in found["flags"])
+    told = {(*flag["sites"], flag["kind"]): flag["text"] for flag in found["flags"]}
+    assert list(told)[:2] == [("1", "spikes"), ("1", "drift")]
+    assert set(told) == {("1", "spikes"), ("1", "drift"), ("2", "gap"), ("2", "saturation")}
+    assert "site 1: the force drifts by +0.05" in told["1", "drift"]
+    assert any("site 2: the force stays at" in text for text in told.values())
+    json.dumps(found)
 
 
 def test_check_names_the_file_of_a_record_that_begins_in_contact(study):
