@@ -79,7 +79,7 @@ def test_surfaces_are_read_again_only_where_they_or_what_is_said_of_them_changed
 
 
 def test_a_click_becomes_a_site_of_the_study_within_a_millimetre(page, study):
-    for i, point in enumerate(skin_points(study, 5)):
+    for i, point in enumerate(skin_points(study, 5)[:2]):
         name = f"new-{i}"
         body = {"name": name, "position": point.tolist(), "region": 'medial "<b>"', "depth_mm": 6.5}
         scene = page.post("/api/model/sites", json=body).json()
