@@ -5,21 +5,14 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import pytest
-import uvicorn
-
-from limbfit.studio.folder import StudyFolder
-from limbfit.studio.guard import AccessGuard
-from limbfit.studio.server import create_app
 
 WITH_WEBGL = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 WITHOUT_WEBGL = ("--no-sandbox", "--disable-3d-apis")
@@ -104,28 +97,6 @@ def serve() -> Iterator[Callable[[Path], str]]:
     for process in running:
         process.terminate()
         process.wait(30)
-
-
-@pytest.fixture
-def serve_here() -> Iterator[Callable[[Path], str]]:
-    """`serve` by a thread of this process, which need not be started and take in the whole package."""
-    running = []
-
-    def start(study: Path) -> str:
-        listener = socket.create_server(("127.0.0.1", 0))
-        guard = AccessGuard("127.0.0.1", listener.getsockname()[1])
-        app = create_app(StudyFolder(study / "study.toml"), guard)
-        config = uvicorn.Config(app, log_level="critical", lifespan="off", timeout_graceful_shutdown=2)
-        server = uvicorn.Server(config)
-        thread = Thread(target=server.run, kwargs={"sockets": [listener]})
-        thread.start()
-        running.append((server, thread))
-        return guard.address
-
-    yield start
-    for server, thread in running:
-        server.should_exit = True
-        thread.join(30)
 
 
 def serious_findings(page: Any) -> list[tuple[str, list[str]]]:

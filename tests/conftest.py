@@ -12,12 +12,12 @@ import pytest
 import pyvista as pv
 
 from acquiring import ready
-from browsing import launch, open_page, playwright, serve, serve_here
+from browsing import launch, open_page, playwright, serve
 from limbfit.cli import main
 from limbfit.errors import InputError
 from limbfit.febio import find_febio
 
-__all__ = ["launch", "open_page", "playwright", "ready", "serve", "serve_here"]
+__all__ = ["launch", "open_page", "playwright", "ready", "serve"]
 
 # Where the tests run in the background of a script, interrupts are ignored, and so they would be in the
 # processes that tests interrupt.

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from serving_here import serve_here as serve_here
 
 from browsing import serious_findings
 from conftest import write_trace

@@ -10,6 +10,7 @@ import numpy as np
 import psutil
 import pytest
 from limb_image import make_segmented
+from serving_here import serve_here as serve_here
 
 from browsing import serious_findings, until
 from limbfit import run_study, study_status

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 import pyvista as pv
+from serving_here import serve_here as serve_here
 from stored_fields import write_outcome, write_stored
 
 from browsing import WITHOUT_WEBGL, serious_findings, until
