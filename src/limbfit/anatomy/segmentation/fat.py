@@ -80,7 +80,9 @@ def _compute_isodata_level(values: Field) -> float:
         if above.all() or not above.any():
             return np.nan
         low, high = float(values[~above].mean()), float(values[above].mean())
-        level = (low + high) / 2
+        level, before = (low + high) / 2, level
+        if level == before:  # more rounds would change nothing
+            break
     return level if high > _MIN_FAT_LEVEL * low else np.nan
 
 
