@@ -81,7 +81,7 @@ def test_sensitivities_of_a_contracting_muscle_under_a_punch():
     """It tenses while it is pressed; forces by the active stress, the fibres and the ground."""
     muscle = Contractile(TISSUE, 0.006)
     problem = punch(
-        "tet10", 2, 1, 4.0, materials={"skin": GROUND, "muscle": muscle}, fibres=ASKEW,
+        "hex8", 2, 1, 4.0, materials={"skin": GROUND, "muscle": muscle}, fibres=ASKEW,
         activation=Activation([0.0, 4.0, 9.0], [0.0, 1.0, 0.5]),
     )  # fmt: skip
     control = StepControl(load_steps=3, unload_steps=2, tolerance=1e-10)

@@ -110,7 +110,7 @@ def test_force_control_gives_back_the_displacement():
 
     Both with stresses that are linear in a step: a quadratic course begins anew where what drives turns.
     """
-    problem = punch("tet10", 2, 1, history=History(TIMES, np.array([0.0, 4.0, 4.0])))
+    problem = punch("hex8", 2, 1, history=History(TIMES, np.array([0.0, 4.0, 4.0])))
     linear = replace(CONTROL, stress="linear")
     driven = solve(problem, linear)
     history = History(driven.times, force=driven.force)
@@ -122,7 +122,7 @@ def test_force_control_gives_back_the_displacement():
 
 
 def test_a_held_force_creeps_and_its_displacement_has_sensitivities():
-    problem = punch("tet10", 2, 1, history=History(TIMES, force=np.array([0.0, 2.0, 2.0])))
+    problem = punch("hex8", 2, 1, history=History(TIMES, force=np.array([0.0, 2.0, 2.0])))
     centre = solve(problem, CONTROL, sensitivities=True, store="all")
     loaded = centre.times >= 2.0 - 1e-9
     assert (np.diff(centre.displacement[loaded]) > 0.0).all()
@@ -134,7 +134,7 @@ def test_a_held_force_creeps_and_its_displacement_has_sensitivities():
 
 def test_tissue_that_comes_back_under_no_force_moves_the_indenter_between_steps_too():
     history = History(np.array([0.0, 1.0, 2.0, 6.0]), force=np.array([0.0, 2.0, 0.0, 0.0]))
-    problem, control = punch("tet10", 2, 1, history=history), replace(CONTROL, tolerance=1e-5)
+    problem, control = punch("hex8", 2, 1, history=history), replace(CONTROL, tolerance=1e-5)
     found = solve(problem, control, sensitivities=True)
     left = found.displacement[found.times == 2.0][0]
     assert 0.0 < found.displacement[-1] < 0.3 * left
@@ -147,7 +147,7 @@ def test_tissue_that_comes_back_under_no_force_moves_the_indenter_between_steps_
 
 def test_a_force_that_acts_from_the_beginning_deforms_tissue_before_it_relaxes():
     """At time 0 relaxing tissue is as stiff as elastic tissue of its instantaneous modulus."""
-    problem = punch("tet10", 2, 1, history=History(np.array([0.0, 4.0]), force=np.array([1.0, 1.0])))
+    problem = punch("hex8", 2, 1, history=History(np.array([0.0, 4.0]), force=np.array([1.0, 1.0])))
     sudden = {
         name: OgdenQLV(law.c * (1.0 + law.gamma), law.m, 0.0, 1.0, law.kappa_ratio / (1.0 + law.gamma))
         for name, law in problem.materials.items()
@@ -164,7 +164,7 @@ def test_a_force_that_acts_from_the_beginning_deforms_tissue_before_it_relaxes()
 
 def test_a_body_goes_over_from_displacement_to_force():
     """Pressed 3 mm and held, then left with the force that it had at the end: it creeps on from there."""
-    problem = punch("tet10", 2, 1)
+    problem = punch("hex8", 2, 1)
     pressed = Motion.of([0.0, 1.0, 3.0], z=[0.0, 3.0, 3.0])
     tool = RigidBody(problem.indenter.moved(1.0), problem.contact_faces, pressed)
     control = replace(CONTROL, times=(0.25, 0.5, 0.75, 1.0, 2.0, 3.0), tolerance=1e-8)
@@ -197,7 +197,7 @@ def test_a_body_goes_over_from_displacement_to_force():
 
 def test_a_force_that_is_taken_over_depends_on_the_parameters():
     """Of a stiffer block: what held the tool was larger, and the force begins with that."""
-    problem = punch("tet4", 2, 1)
+    problem = punch("hex8", 2, 1)
     pressed = Motion.of([0.0, 1.0, 2.0], z=[0.0, 3.0, 3.0])
     left = Motion.of([0.0, 1.0, 1.5], force={"z": [np.nan, 0.5, 0.5]})
     tool = RigidBody(problem.indenter.moved(1.0), problem.contact_faces, pressed.then(left), 0.4)
@@ -218,7 +218,7 @@ def test_a_force_that_is_taken_over_depends_on_the_parameters():
 
 def test_the_force_of_a_body_that_turned_with_friction_has_derivatives():
     """Along the axis at its start, whereto its anchors turn with it."""
-    problem = punch("tet10", 2, 1)
+    problem = punch("hex8", 2, 1)
     ball = Indenter("sphere", 20.0, centre=(0.0, 0.0, 0.05), axis=(0, 0, -1))
     motion = Motion.of(
         [0.0, 1.0, 2.0], z=[0.0, 2.5, 2.5], x=[0, 0, 1.5], turn_x=[0, 0, 0.5], turn_y=[0, 0, 0.4]
@@ -234,7 +234,7 @@ def test_the_force_of_a_body_that_turned_with_friction_has_derivatives():
 def test_steps_go_on_for_what_moves_when_the_indenter_has_left():
     """A second body that comes down meanwhile is met; what supports move is stepped through as asked."""
     up = History(np.array([0.0, 2.0, 4.0]), np.array([0.0, 2.0, 0.0]))
-    problem = punch("tet10", 2, 1, history=up)
+    problem = punch("hex8", 2, 1, history=up)
     pin = Indenter("square", 16.0, 1.0, axis=(0, 0, -1), centre=(20.0, 18.0, 0.0))
     down = Motion.of([0.0, 3.5, 3.8, 4.0], z=[0.0, 0.0, 2.0, 0.0])
     steps = StepControl(load_steps=3, unload_steps=5)
@@ -252,7 +252,7 @@ def test_steps_go_on_for_what_moves_when_the_indenter_has_left():
 
 def test_a_free_plate_lies_down_on_what_is_askew():
     """A plate pressed by a force and free to turn rests without moment, turned towards the softer side."""
-    problem = punch("tet10", 2, 1)
+    problem = punch("hex8", 2, 1)
     motion = Motion.of([0.0, 1.0, 2.0], force={"z": [0.0, 2.0, 2.0], "turn_x": 0.0, "turn_y": 0.0})
     plate = RigidBody(
         Indenter("square", 20.0, centre=(22.0, 0.0, 0.0), axis=(0, 0, -1)), problem.contact_faces, motion
@@ -294,7 +294,7 @@ def test_two_bodies_are_each_other_s_mirror():
 
 def test_a_rotation_of_everything_changes_nothing():
     """Block, supports and tool turned together: the same forces."""
-    problem = punch("tet4", 2, 1, history=History(TIMES, np.array([0.0, 3.0, 3.0])))
+    problem = punch("hex8", 2, 1, history=History(TIMES, np.array([0.0, 3.0, 3.0])))
     plain = solve(problem, CONTROL)
     turn = Rotation.from_rotvec([0.4, -0.8, 1.1])
     tool = problem.indenter
@@ -308,7 +308,7 @@ def test_a_rotation_of_everything_changes_nothing():
     np.testing.assert_allclose(solve(turned, CONTROL).force, plain.force, rtol=1e-6, atol=1e-8)
 
 
-PUNCHED, SHORT = punch("tet10", 2, 1).contact_faces, Motion.of([0.0, 1.0])
+PUNCHED, SHORT = punch("hex8", 2, 1).contact_faces, Motion.of([0.0, 1.0])
 
 
 @pytest.mark.parametrize(
@@ -324,7 +324,7 @@ PUNCHED, SHORT = punch("tet10", 2, 1).contact_faces, Motion.of([0.0, 1.0])
 )
 def test_what_cannot_be_is_refused(change, said):
     with pytest.raises(ProblemError, match=said):
-        solve(punch("tet10", 2, 1, **change), CONTROL)
+        solve(punch("hex8", 2, 1, **change), CONTROL)
 
 
 def test_a_motion_is_told_what_is_wrong():

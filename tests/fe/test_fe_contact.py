@@ -87,7 +87,7 @@ def test_what_cannot_be_solved_is_a_partial_result_with_its_reason():
     history = History(np.array([0.0, 10.0, 10.01]), np.array([0.0, 1.0, 21.0]))
     times = (*np.linspace(0.1, 10.0, 40), 10.01)
     result = solve(
-        punch("tet10", 2, 1, history=history), StepControl(times=times, max_iterations=5, max_cuts=1)
+        punch("hex8", 2, 1, history=history), StepControl(times=times, max_iterations=5, max_cuts=1)
     )
     assert not result.completed
     assert "stopped at" in result.reason

@@ -127,7 +127,7 @@ def test_inflation_of_a_tube_is_the_closed_form(law):
 
 def test_derivatives_of_the_force_beside_a_pressure_with_a_free_rim():
     """An indenter on a half-pressed surface: its force by sensitivities and by central differences."""
-    problem = punch("tet10", 2, 1, history=History(np.array([0.0, 2.0]), np.array([0.0, 2.0])))
+    problem = punch("hex8", 2, 1, history=History(np.array([0.0, 2.0]), np.array([0.0, 2.0])))
     middle = problem.mesh.points[problem.contact_faces].mean(axis=1)
     pressed = problem.contact_faces[middle[:, 0] > 0.0]
     problem = replace(problem, pressures=(Pressure(pressed, [0.0, 2.0], [0.0, 0.004]),))
@@ -139,7 +139,7 @@ def test_derivatives_of_the_force_beside_a_pressure_with_a_free_rim():
 
 
 def test_a_pressure_that_stays_is_stepped_to_where_it_is_reached_and_leaves_no_force_at_free_nodes():
-    problem = punch("tet10", 2, 1, indenter=None, history=History(np.array([0.0, 3.0]), np.zeros(2)))
+    problem = punch("hex8", 2, 1, indenter=None, history=History(np.array([0.0, 3.0]), np.zeros(2)))
     problem = replace(problem, pressures=(Pressure(problem.contact_faces, [0.0, 1.0], [0.0, 0.002]),))
     problem = replace(problem, contact_faces=problem.contact_faces[:0])
     found = solve(problem, StepControl(unload_steps=3))
@@ -155,6 +155,6 @@ def test_a_pressure_that_cannot_be_is_refused():
         Pressure(np.zeros((1, 6), int), [0.0, 1.0], [1.0])
     with pytest.raises(ProblemError, match="do not grow from 0"):
         Pressure(np.zeros((1, 6), int), [0.5, 1.0], [1.0, 1.0])
-    flat = punch("tet10", 2, 1, pressures=(Pressure(np.zeros((1, 3), int), [0.0, 1.0], [0.0, 1.0]),))
+    flat = punch("hex8", 2, 1, pressures=(Pressure(np.zeros((1, 3), int), [0.0, 1.0], [0.0, 1.0]),))
     with pytest.raises(ProblemError, match="pressed faces have shape"):
         System(flat)

@@ -90,7 +90,7 @@ def test_forces_and_tangent_are_derivatives(element):
 
 def taut(stretch: float) -> Problem:
     """The block of `punch` whose skin is stretched in its plane."""
-    problem = punch("tet10", 2, 1, depth=4.0)
+    problem = punch("hex8", 2, 1, depth=4.0)
     history = History(np.array([0.0, 4.0, 7.0]), np.array([0.0, 4.0, 1.0]))
     mesh, skin = problem.mesh, problem.mesh.region_names.index("skin")
     stretches = np.where(mesh.regions == skin, stretch**-2.0, 1.0)
@@ -102,7 +102,7 @@ def taut(stretch: float) -> Problem:
 def test_taut_skin_is_stiffer_and_no_stretch_is_none():
     control = StepControl(load_steps=4, unload_steps=3, tolerance=1e-10)
     plain = solve(replace(taut(1.0), prestretch=None), control)
-    none, tense = solve(taut(1.0), control), solve(taut(1.15), control)
+    none, tense = solve(taut(1.0), control), solve(taut(1.2), control)
     np.testing.assert_allclose(none.force, plain.force, atol=1e-7 * plain.peak_force)
     assert tense.completed, tense.reason
     assert tense.peak_force > 1.05 * plain.peak_force
@@ -112,7 +112,7 @@ def test_tissue_that_swells_against_an_indenter_presses_it_from_the_beginning():
     """It has done so long since: nothing changes while the indenter stays."""
     still = History(np.array([0.0, 1.0]), np.zeros(2))
     stretch = isochoric_stretch(UP, 0.9)
-    problem = punch("tet10", 2, 1, history=still, start="as-given", prestretch=stretch)
+    problem = punch("hex8", 2, 1, history=still, start="as-given", prestretch=stretch)
     problem = replace(problem, indenter=replace(problem.indenter, centre=(0.0, 0.0, 0.0)))
     found = solve(problem, StepControl(tolerance=1e-8), sensitivities=True)
     assert found.force[0] > 0.1
@@ -145,6 +145,6 @@ def test_what_cannot_be_is_refused():
         isochoric_stretch(np.zeros(3), 1.1)
     with pytest.raises(ProblemError, match="a pre-stretch is not positive"):
         isochoric_stretch(UP, 0.0)
-    forced = punch("tet10", 2, 1, history=History(np.array([0.0, 1.0]), force=np.array([0.0, 1.0])))
+    forced = punch("hex8", 2, 1, history=History(np.array([0.0, 1.0]), force=np.array([0.0, 1.0])))
     with pytest.raises(ProblemError, match="touches pre-strained tissue is driven by displacement"):
         solve(replace(forced, prestretch=np.eye(3)))

@@ -13,14 +13,14 @@ TIGHT = StepControl(load_steps=3, unload_steps=3, tolerance=1e-10)
 
 
 def test_sensitivities_equal_central_differences():
-    centre = solve(punch("tet4", 2, 1), TIGHT, sensitivities=True, store="all")
+    centre = solve(punch("hex8", 2, 1), TIGHT, sensitivities=True, store="all")
     for region, name in centre.parameter_names:
         slope, difference = parameter_slope(centre, TIGHT, region, name)
         error = np.abs(difference - slope).max()
         assert error <= 1e-4 * np.abs(difference).max(), (region, name)
 
 
-@pytest.mark.parametrize(("cell_type", "element"), [("hex8", ""), ("tet10", "tet10p0")])
+@pytest.mark.parametrize(("cell_type", "element"), [("tet4", ""), ("tet10", "tet10p0")])
 def test_sensitivities_of_other_elements_equal_central_differences(cell_type, element):
     """Along one direction of all eight parameters."""
     centre = solve(punch(cell_type, 2, 1, element=element), TIGHT, sensitivities=True, store="all")
@@ -31,7 +31,7 @@ def test_sensitivities_of_other_elements_equal_central_differences(cell_type, el
 def test_an_edge_taken_as_flat_on_the_way_changes_no_answer(monkeypatch):
     """Rounded edges are left out of the tangent of every closed point, but near the equilibrium."""
     rounded = Indenter(axis=(0, 0, -1), centre=(0.0, 0.0, 1.0), edge_radius=3.0)
-    problem = punch("tet10", 2, 1, indenter=rounded)
+    problem = punch("hex8", 2, 1, indenter=rounded)
     monkeypatch.setattr(sensitivity, "TOLERANCE", 1e-6)
     usual = solve(problem, TIGHT, sensitivities=True)
     monkeypatch.setattr(simulation, "STEEP_PRESSURE", 1e-6)

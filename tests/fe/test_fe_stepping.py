@@ -18,7 +18,7 @@ from limbfit.fe.solution.control import schedule_steps
 
 @pytest.fixture(scope="module")
 def problem():
-    return punch("tet10", 2, 1, depth=3.0)
+    return punch("hex8", 2, 1, depth=3.0)
 
 
 STEPS = StepControl(load_steps=5, unload_steps=4)

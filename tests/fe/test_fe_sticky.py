@@ -53,7 +53,7 @@ def test_anchors_neither_push_nor_pull_along_the_normal():
 def slip_and_force(friction: str) -> tuple[float, np.ndarray]:
     """How far pressed points move across the axis of a ball from step to step, mm at most; the forces."""
     tool = Indenter("sphere", 40.0, centre=(0.0, 0.0, 1.0))
-    problem = punch("tet10", 2, 1, friction=friction, indenter=tool, contact_rule="nodes")
+    problem = punch("hex8", 2, 1, friction=friction, indenter=tool, contact_rule="nodes")
     system = System(problem)
     nodes = system.bodies.first.surface.faces[:, 0]
     slip, forces, pressed, u = 0.0, [], np.zeros(len(nodes), dtype=bool), np.zeros_like(system.points)

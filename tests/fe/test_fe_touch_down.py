@@ -23,12 +23,12 @@ def tensed(active: float = 0.006, **changes) -> Problem:
     muscle = Contractile(TISSUE, active)
     tense = Activation([0.0, 1.0], [0.0, 1.0])
     changes = {"fibres": ASKEW, "activation": tense, "touch_down_s": HELD_S, "history": COURSE} | changes
-    return punch("tet10", 2, 1, materials={"skin": GROUND, "muscle": muscle}, **changes)
+    return punch("hex8", 2, 1, materials={"skin": GROUND, "muscle": muscle}, **changes)
 
 
 def clamped(**changes) -> Problem:
     """A block that a second punch presses beside the first one."""
-    problem = punch("tet10", 2, 1, history=COURSE, touch_down_s=HELD_S, **changes)
+    problem = punch("hex8", 2, 1, history=COURSE, touch_down_s=HELD_S, **changes)
     end = float(COURSE.times[-1])
     pin = Indenter("square", 16.0, 1.0, axis=(0, 0, -1), centre=(20.0, 18.0, 0.0))
     motion = Motion.of([0.0, 1.0, end], force={"z": [0.0, 0.4, 0.4]})
@@ -85,7 +85,7 @@ def test_derivatives_beside_a_clamp():
 
 
 def test_what_cannot_be_is_refused():
-    problem = punch("tet10", 2, 1, history=COURSE, touch_down_s=HELD_S)
+    problem = punch("hex8", 2, 1, history=COURSE, touch_down_s=HELD_S)
     for changes, match in (
         ({"touch_down_s": 20.0}, "not within the history"),
         ({"start": "as-given"}, "driven by displacement that starts touching"),
