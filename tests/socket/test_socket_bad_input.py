@@ -55,9 +55,8 @@ def test_a_file_that_is_no_socket_of_this_limb_is_refused_by_check_and_socket(li
 
 
 def test_a_rectification_that_cuts_into_a_bone_is_refused(limbfit, tmp_path):
-    study = small_limb(tmp_path, DEEP + NO_LINER)
-    for verb in ("check", "socket"):
-        check_refused(limbfit(verb, study), "study.toml", "into the bone tibia", "the depths of the areas")
+    told = limbfit("check", small_limb(tmp_path, DEEP + NO_LINER))
+    check_refused(told, "study.toml", "into the bone tibia", "the depths of the areas")
 
 
 def check_refused(told: tuple[int, str, str], *words: str) -> None:

@@ -21,6 +21,7 @@ from limbfit.pipeline.commands.run import run_experiment
 from limbfit.pipeline.engine.partial_results import ResultFiles
 from limbfit.pipeline.socket.limb import SocketLimb
 from limbfit.pipeline.socket.shape import (
+    build_loadable_socket,
     build_regions,
     build_socket,
     find_covered_regions,
@@ -126,9 +127,11 @@ def test_a_limb_without_a_tibia_is_loaded_through_its_middle_at_the_brim(tmp_pat
 
 
 def test_check_draws_the_socket_of_a_limb_without_a_tibia_too(tmp_path: Path, commands_unasked: None) -> None:
-    facts = check_study(study_of(tmp_path, "[socket]\nhold_s = 1\n", bones=False))["facts"]
+    facts = check_study(study_of(tmp_path, "[socket]\nedge_mm = 12\n", bones=False))["facts"]
     told = "\n".join(fact for fact in facts if fact.startswith("socket: "))
-    assert all(words in told for words in ("a liner of 6 mm", "cm3", "mm outside the skin"))
+    assert all(
+        words in told for words in ("a liner of 6 mm", "meshed at 12 mm", "cm3", "mm outside the skin")
+    )
 
 
 LOAD = '[[socket.loads]]\nname = "x"\n'
@@ -157,7 +160,6 @@ BAD = {  # what is said, the study, the remedy
     ),
     "give either preset": (LOAD, ""),
     "a preset has its own moment": (LOAD + 'preset = "toe-off"\nmoment_Nmm = [0, 0, 1]\n', ""),
-    "no region is named 'heel'": (DESIGN + 'region = "heel"\nlimit_kPa = 90\n', "tibial crest"),
     "give pressure_kPa, limit_kPa or both": (DESIGN + 'region = "tibial crest"\n', ""),
     "'tibial crest' is given twice": ((DESIGN + 'region = "tibial crest"\nlimit_kPa = 90\n') * 2, ""),
     "nowhere.stl does not exist": ('[socket]\nfile = "nowhere.stl"\n', ""),
@@ -177,14 +179,21 @@ BAD_WITHOUT_BONES = {
 @pytest.mark.parametrize("words", [*BAD, *BAD_WITHOUT_BONES])
 def test_what_is_wrong_is_told_by_key(tmp_path: Path, words: str) -> None:
     text, remedy = {**BAD, **BAD_WITHOUT_BONES}[words]
+    limb = round_limb() if words in BAD else replace(round_limb(), bones={})
     with pytest.raises(StudyError) as caught:
-        check_study(study_of(tmp_path, text, bones=words in BAD))
+        build_loadable_socket(study_of(tmp_path, text, bones=words in BAD), limb, limb.skin)
     told = str(caught.value)
     assert words in told
     assert remedy in told
     assert "study.toml" in told
     assert "socket" in told
     assert "\n" not in told
+
+
+def test_check_refuses_a_region_of_the_design_that_the_limb_has_not(tmp_path: Path) -> None:
+    study = study_of(tmp_path, DESIGN + 'region = "heel"\nlimit_kPa = 90\n')
+    with pytest.raises(StudyError, match=r"socket\.design\.regions: no region is named 'heel'.*tibial crest"):
+        check_study(study)
 
 
 def test_tissues_of_people_are_taken_though_they_know_nothing_of_another_tissue(tmp_path: Path) -> None:
@@ -284,7 +293,7 @@ def test_a_trimline_may_end_with_its_first_point(tmp_path: Path) -> None:
     angle = np.radians(np.arange(0.0, 360.0, 45.0))
     line = np.column_stack([50.0 * np.cos(angle), 50.0 * np.sin(angle), 100.0 + 5.0 * np.cos(angle)])
     open_line, closed = (
-        drawn(study_of(tmp_path, f"[socket]\ntrimline = {np.vstack(one).tolist()}\n"))
+        drawn(study_of(tmp_path, f"[socket]\nface_edge_mm = 8\ntrimline = {np.vstack(one).tolist()}\n"))
         for one in ([line], [line, line[:1]])
     )
     np.testing.assert_array_equal(open_line.points, closed.points)
