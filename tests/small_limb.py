@@ -31,10 +31,14 @@ distal_clearance_mm = 3.0
 __all__ = ["limb", "revolved", "small_limb"]
 
 
-def small_limb(folder: Path, text: str) -> Path:
-    """Write the limb into a folder, and a study whose table ``[socket]`` goes on with ``text``."""
+def small_limb(folder: Path, text: str, edge_mm: float = 14.0) -> Path:
+    """Write the limb into a folder, and a study whose table ``[socket]`` goes on with ``text``.
+
+    ``edge_mm``: of its mesh under the socket.
+    """
     anatomy = limb()
     write_surface(folder / "skin.stl", anatomy.skin)
     write_surface(folder / "tibia.stl", anatomy.bones["tibia"])
-    (folder / "study.toml").write_text(LIMB + text)
+    stated = LIMB.replace("edge_mm = 14.0", f"edge_mm = {edge_mm}")
+    (folder / "study.toml").write_text(stated + text)
     return folder

@@ -1,4 +1,4 @@
-"""Many tests draw sockets around the same limb: the 20,000 rays to its surface are shot once for all of them."""
+"""Many tests draw sockets around the same limb: its surface is probed by 20,000 rays once for all of them."""
 
 from __future__ import annotations
 
