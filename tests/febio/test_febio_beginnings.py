@@ -250,14 +250,19 @@ PUSHES = '<rigid_load type="rigid_force"><rb>clamp</rb><dof>Rx</dof><value lc="L
 HOLDS = '<rigid_bc type="rigid_fixed"><rb>clamp</rb><Rx_dof>1</Rx_dof></rigid_bc>'
 
 
+@pytest.fixture(scope="module")
+def taut_text(tmp_path_factory) -> str:
+    """What is written of a clamped block with a pre-stretch."""
+    file = tmp_path_factory.mktemp("taut") / "model.feb"
+    write_feb(block(bodies=(CLAMP,), history=COURSE, prestretch=TAUT), file, FebSettings(steps=LATE))
+    return file.read_text()
+
+
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_limbfit_has_not_is_refused_with_its_line(tmp_path, case):
+def test_what_limbfit_has_not_is_refused_with_its_line(tmp_path, taut_text, case):
     change, words = REFUSED[case]
-    problem = block(bodies=(CLAMP,), history=COURSE, prestretch=TAUT)
-    write_feb(problem, tmp_path / "model.feb", FebSettings(steps=LATE))
-    text = change((tmp_path / "model.feb").read_text())
     with pytest.raises(ProblemError, match=rf"(?s)line \d+.*{words}|{words}"):
-        to_problem(read_feb(written(tmp_path, text, "changed.feb")))
+        to_problem(read_feb(written(tmp_path, change(taut_text))))
 
 
 CONTRACTIONS = {
@@ -274,14 +279,20 @@ CONTRACTIONS = {
 }
 
 
-@pytest.mark.parametrize("case", CONTRACTIONS)
-def test_contractions_that_limbfit_has_not_are_refused(tmp_path, case):
-    change, words = CONTRACTIONS[case]
+@pytest.fixture(scope="module")
+def tensed_text(tmp_path_factory) -> str:
+    """What is written of a block of which both tissues contract."""
+    file = tmp_path_factory.mktemp("tensed") / "model.feb"
     both = TENSES | {"materials": {"skin": TENSED, "muscle": TENSED}}
-    write_feb(block(**both), tmp_path / "model.feb", FebSettings(steps=EXACT))
-    text = change((tmp_path / "model.feb").read_text())
+    write_feb(block(**both), file, FebSettings(steps=EXACT))
+    return file.read_text()
+
+
+@pytest.mark.parametrize("case", CONTRACTIONS)
+def test_contractions_that_limbfit_has_not_are_refused(tmp_path, tensed_text, case):
+    change, words = CONTRACTIONS[case]
     with pytest.raises(ProblemError, match=rf"line \d+.*{words}|{words}.*line \d+|{words}"):
-        to_problem(read_feb(written(tmp_path, text, "changed.feb")))
+        to_problem(read_feb(written(tmp_path, change(tensed_text))))
 
 
 def test_what_febio_cannot_express_is_refused(tmp_path):

@@ -242,13 +242,19 @@ THIRD = (
 SECOND = '<contact type="sliding-elastic" surface_pair="sheet_contact"><fric_coeff>0.1</fric_coeff></contact>'
 
 
+@pytest.fixture(scope="module")
+def let_go_text(tmp_path_factory) -> str:
+    """What is written of a sheet that goes over from displacement to force."""
+    file = tmp_path_factory.mktemp("let-go") / "model.feb"
+    write_feb(block(bodies=(sheet(MOTIONS["let go"]),)), file, FebSettings())
+    return file.read_text()
+
+
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_limbfit_has_not_is_refused(tmp_path, case):
+def test_what_limbfit_has_not_is_refused(tmp_path, let_go_text, case):
     change, words = REFUSED[case]
-    write_feb(block(bodies=(sheet(MOTIONS["let go"]),)), tmp_path / "model.feb", FebSettings())
-    text = change((tmp_path / "model.feb").read_text())
     with pytest.raises(ProblemError, match=words):
-        to_problem(read_feb(written(tmp_path, text)))
+        to_problem(read_feb(written(tmp_path, change(let_go_text))))
 
 
 SOCKET = Path(__file__).parents[3] / "shared" / "reference" / "socket"

@@ -42,7 +42,7 @@ INDENTERS = {
 }
 
 
-def block(element="tet10", shape="square", divisions=4):
+def block(element="tet4", shape="square", divisions=4):
     return replace(build_punched_block(element, divisions), indenter=INDENTERS[shape])
 
 
