@@ -97,7 +97,7 @@ def test_bars_all_three_intervals_agree_and_hold_the_truth():
     space = build_space(PAPER, group_separately(NAMES))
     likelihood = Likelihood(emulator, data, u.residual_model, PAPER, space)
     best = likelihood.find_optimum(np.log(TRUTH))
-    found = sample_posterior(likelihood, best.z, u.covariance, steps=700, seed=2)
+    found = sample_posterior(likelihood, best.z, u.covariance, steps=400, seed=2)
     assert np.log(found.median / best.parameters) == pytest.approx(np.zeros(8), abs=0.1)
     sampled = (np.log(found.samples) @ np.array([c.weights for c in u.combinations]).T).std(axis=0)
     stated = np.array([np.sqrt(c.weights @ u.covariance @ c.weights) for c in u.combinations])
