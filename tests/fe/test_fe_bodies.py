@@ -412,10 +412,9 @@ def test_distances_from_an_open_surface_are_those_of_its_triangles():
     assert np.isinf(surface.signed_distance(beyond)).all()
 
 
-@pytest.mark.parametrize("mu", [0.0, 0.2])
-def test_a_press_fit_is_lames_and_comes_off_by_its_friction(mu):
+def test_a_press_fit_is_lames_and_comes_off_by_its_friction():
     """A rigid ring pushed over a tube: the pressure of plane strain, small strain; and the pull mu p A."""
-    inner, outer, n, overlap = 10.0, 20.0, 24, 0.04
+    inner, outer, n, overlap, mu = 10.0, 20.0, 24, 0.04, 0.2
     law = NeoHookean(0.01, kappa_ratio=20.0)
     mesh = sector(np.linspace(inner, outer, 13), n)
     height = float(mesh.points[:, 2].max())
@@ -430,4 +429,4 @@ def test_a_press_fit_is_lames_and_comes_off_by_its_friction(mu):
     pressure = press_fit(law, inner, outer, overlap)
     radial, axial = -found.reactions[-1, 0, 0], found.reactions[-1, 0, 2]
     assert radial == pytest.approx(pressure * outer * height, rel=0.01)
-    assert axial == pytest.approx(mu * np.pi / 2 * radial, rel=0.01, abs=1e-6 * radial)
+    assert axial == pytest.approx(mu * np.pi / 2 * radial, rel=0.01)

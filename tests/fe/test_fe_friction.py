@@ -107,8 +107,8 @@ PRESS_AND_DRAG = History(
 DRAG_TIMES = tuple(np.concatenate([np.linspace(0.25, 1.0, 4), np.linspace(1.2, 3.0, 10)]))
 
 
-@pytest.mark.parametrize("mu", [0.1, 0.5])  # with 0.8 a block this soft rolls before it slips
-def test_at_full_slip_the_friction_is_mu_times_the_normal_force(mu):
+def test_at_full_slip_the_friction_is_mu_times_the_normal_force():
+    mu = 0.5  # with 0.8 a block this soft rolls before it slips
     result = solve(dragged_block(mu, PRESS_AND_DRAG), StepControl(times=DRAG_TIMES))
     assert result.completed, result.reason
     assert not result.doubts

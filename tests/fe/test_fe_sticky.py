@@ -75,7 +75,9 @@ def test_what_touches_does_not_slip_and_lets_go_at_the_end():
     assert stuck[-1] == 0.0
 
 
-@pytest.mark.parametrize(("shape", "element"), [("square", "tet4"), ("sphere", "tet10")])
+@pytest.mark.parametrize(
+    ("shape", "element"), [pytest.param("square", "tet4", marks=pytest.mark.slow), ("sphere", "tet10")]
+)
 def test_sensitivities_of_sticky_contact_equal_central_differences(shape, element):
     """Along one direction in the space of all eight parameters."""
     tight = StepControl(load_steps=3, unload_steps=2, tolerance=1e-10)

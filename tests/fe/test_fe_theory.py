@@ -20,10 +20,9 @@ NONE = np.zeros(0, dtype=int)
 NO_FACES = np.zeros((0, 3), dtype=int)
 
 
-@pytest.mark.parametrize("law", [SAMPLES["two times"], SAMPLES["elastic"]], ids=["two times", "elastic"])
-def test_uniaxial_compression_with_relaxation(law):
+def test_uniaxial_compression_with_relaxation():
     """Sides free: 30 % in 0.5 s, held, half released; incompressible: ``lambda^2 S_a - S_l/lambda``."""
-    law = replace(law, kappa_ratio=1e5)
+    law = replace(SAMPLES["two times"], kappa_ratio=1e5)
     history = History(np.array([0.0, 0.5, 1.0, 1.5]), np.array([0.0, 0.3, 0.3, 0.15]))
     fine = np.linspace(0.0, 1.5, 3001)
     axial = 1.0 - history.at(fine)
@@ -35,8 +34,7 @@ def test_uniaxial_compression_with_relaxation(law):
         reference = exact[np.round(times / 1.5 * 3000).astype(int)]
         errors.append(np.abs(uniaxial(law, history, times) - reference).max() / np.abs(exact).max())
     assert errors[1] < 1e-3
-    if law.prony:  # second order in the step
-        assert errors[0] > 3.0 * errors[1]
+    assert errors[0] > 3.0 * errors[1]  # second order in the step
 
 
 def uniaxial(law, history: History, times: np.ndarray) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -217,12 +216,6 @@ def test_a_tissue_that_is_called_as_the_liner_is_refused(tmp_path: Path) -> None
             StudyError, match=r"geometry: a tissue is named 'liner', .*; give it another name"
         ):
             run_experiment(study, experiment)
-
-
-def test_a_table_without_shape_is_a_study_of_its_keys(tmp_path: Path) -> None:
-    table: dict[str, Any] = study_of(tmp_path, "[socket]\nfriction = 'sticky'\n").socket.model_dump()
-    assert table["friction"] == "sticky"
-    assert table["loads"][0]["preset"] == "single stance"
 
 
 def cut_limb(height: float, above: float = 6.0) -> Anatomy:
