@@ -59,7 +59,7 @@ def test_punch_stays_out_and_comes_back_to_rest(cell_type):
     [
         (4.7e-5, 20.0, 10.0, 0.01),
         pytest.param(0.047, 2.0, 0.01, 10.0, marks=pytest.mark.slow),
-        (0.047, 20.0, 10.0, 10.0),
+        pytest.param(0.047, 20.0, 10.0, 10.0, marks=pytest.mark.slow),
         pytest.param(4.7e-5, 2.0, 10.0, 10.0, marks=pytest.mark.slow),
     ],
 )
