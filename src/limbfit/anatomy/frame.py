@@ -16,7 +16,7 @@ from .grid import Grid
 from .morphology import find_box
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frame:
     """The rigid map between patient space and the limb frame."""
 

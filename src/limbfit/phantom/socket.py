@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from ..anatomy.frame import build_limb_frame
 from ..anatomy.surfaces.surfacefiles import write_surface
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
 from ..arrays import Array
@@ -58,7 +57,7 @@ def make_socket(anatomy: Anatomy, outer: Surface, kind: str = "transtibial") -> 
     directions = find_directions(anatomy, "right")
     regions = build_default_regions(anatomy, directions)
     areas = [Area(name, regions[name].position, radius, depth) for name, radius, depth in AREAS[kind]]
-    knee, frame = find_knee_centre(anatomy), build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    knee, frame = find_knee_centre(anatomy), anatomy.frame
     if knee is None:
         trim = Trim([(anatomy.cut_point - BELOW_CUT_MM * anatomy.cut_normal, anatomy.cut_normal)])
     else:
@@ -85,8 +84,7 @@ def write_socket(folder: Path, limb: Limb, anatomy: Anatomy) -> dict[str, Any]:
     socket, areas = make_socket(anatomy, outer, limb.kind)
     (folder / FILE).parent.mkdir()
     write_surface(folder / FILE, socket.surface)
-    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
-    read_socket(folder / FILE, outer=outer, frame=frame, bones=anatomy.bones)
+    read_socket(folder / FILE, outer=outer, frame=anatomy.frame, bones=anatomy.bones)
     return {
         "file": FILE.as_posix(),
         "liner_mm": LINER_MM,

@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 
-from ..anatomy.frame import build_limb_frame
 from ..anatomy.surfaces.surfaces import ON_CUT_MM, Anatomy
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array, Mask
@@ -116,7 +115,7 @@ def find_load_point(anatomy: Anatomy, brim: Array) -> Array:
     knee = find_knee_centre(anatomy)
     if knee is not None:
         return knee
-    frame, skin = build_limb_frame(anatomy.cut_point, anatomy.cut_normal), anatomy.skin
+    frame, skin = anatomy.frame, anatomy.skin
     z = min(float(frame.to_limb(brim)[:, 2].mean()), -1.0)  # below the cut, which closes the skin
     local = Surface(frame.to_limb(skin.points), skin.faces)
     x, y, _ = measure_section(cut_section(local, (0.0, 0.0, z), (0.0, 0.0, 1.0)))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
@@ -121,9 +122,10 @@ class LimbProfile:
         return value
 
 
+@lru_cache(maxsize=4)
 def compute_profile(outer: Surface, frame: Frame) -> LimbProfile:
-    """Compute the radii of a limb's closed outer surface (LPS mm) in its frame. Raises `SurfaceError` where
-    the surface does not surround its own middle line.
+    """Compute the radii of a limb's closed outer surface (LPS mm) in its frame; those of the last limbs are
+    kept. Raises `SurfaceError` where the surface does not surround its own middle line.
     """
     local = Surface(frame.to_limb(outer.points), outer.faces)
     rays = _build_rays(local)

@@ -12,14 +12,13 @@ import numpy as np
 from fastapi import APIRouter, Response
 from pydantic import Field
 
-from ..anatomy.frame import Frame, build_limb_frame
 from ..errors import InputError, SurfaceError
 from ..mesh import read_vtu
 from ..pipeline.engine.digests import compute_digest
 from ..pipeline.socket.shape import build_regions, build_socket, place_errors, trim_of
 from ..results.socket import SocketDesignResult, SocketLoad, SocketResult, SocketSimulation, SocketState
 from ..socket import Socket
-from ..socket.rays import LimbProfile, compute_profile
+from ..socket.rays import compute_profile
 from ..socket.trim import Trim, find_brim, trim_limb, wrap_trimline
 from ..study import Study
 from ..web.shapes import build_patient_frame, to_volume_shape
@@ -179,25 +178,12 @@ def _find_handles(folder: StudyFolder, study: Study) -> list[list[float]]:
     if anatomy is None or table.file is not None:
         return []
     try:
-        limb, frame = _compute_profile(folder, compute_surfaces_fingerprint(folder, study))
+        limb, frame = compute_profile(anatomy.skin, anatomy.frame), anatomy.frame
         if table.trimline and not table.trim_planes:
             return [[*map(float, row)] for row in wrap_trimline(limb, frame, np.array(table.trimline))]
         return [[*map(float, row)] for row in find_brim(limb, frame, trim_of(study, anatomy), HANDLE_COUNT)]
     except SurfaceError:
         return []  # `problem` says why there is no face
-
-
-@lru_cache(maxsize=2)
-def _compute_profile(folder: StudyFolder, fingerprint: str) -> tuple[LimbProfile, Frame]:
-    """That of the bare skin, and its frame; the last ones are kept, by the ``fingerprint`` of surfaces.
-
-    Raises `InputError` where there is no limb yet.
-    """
-    anatomy = read_anatomy(folder, folder.load())
-    if anatomy is None:
-        raise InputError(NO_LIMB_YET)
-    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
-    return compute_profile(anatomy.skin, frame), frame
 
 
 @router.get("/face")
@@ -262,8 +248,11 @@ def post_trimline(folder: Folder, line: TrimlineRequest) -> dict[str, Any]:
     it does not go once around the limb, or leaves no socket; the file is left as it was.
     """
     study = folder.load()
+    anatomy = read_anatomy(folder, study)
+    if anatomy is None:
+        raise InputError(NO_LIMB_YET)
     with place_errors(study, "socket.trimline"):
-        limb, frame = _compute_profile(folder, compute_surfaces_fingerprint(folder, study))
+        limb, frame = compute_profile(anatomy.skin, anatomy.frame), anatomy.frame
         points = wrap_trimline(limb, frame, np.array(line.points))
         trim_limb(limb, frame, Trim(line=points))
     set_trimline(folder.file, points.tolist())

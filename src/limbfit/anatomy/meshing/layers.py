@@ -25,7 +25,7 @@ import numpy as np
 from ...arrays import Array
 from ...errors import SurfaceError
 from ...results.limb import BoneLoss, SkinLoss
-from ..frame import Frame, build_limb_frame
+from ..frame import Frame
 from ..surfaces.surfaces import END_TOLERANCE_MM, Anatomy, check_cut
 from ..surfaces.thickness import SLOPE, limit_slope, transfer_values
 from ..surfaces.triangles import Surface, cross_edges, find_open_edges, from_pyvista
@@ -168,7 +168,7 @@ def build_limb_fields(
         When the skin does not reach the cut plane, or the fat's depth is needed and not given.
     """
     check_cut(anatomy)
-    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    frame = anatomy.frame
     skin = Surface(frame.to_limb(anatomy.skin.points), anatomy.skin.faces)
     bones, regions = (_prolong_bodies(bodies, frame) for bodies in (anatomy.bones, anatomy.regions))
     prolonged = prolong_surface(skin)

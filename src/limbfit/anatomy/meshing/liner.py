@@ -8,7 +8,6 @@ import numpy as np
 import pyvista as pv
 
 from ...arrays import Array
-from ..frame import build_limb_frame
 from ..surfaces.surfaces import Anatomy, cut_and_cap
 from ..surfaces.thickness import transfer_values
 from ..surfaces.triangles import Surface, find_bodies, from_pyvista
@@ -34,7 +33,7 @@ def build_liner_surface(
     anatomy : with the liner's outer surface for its skin.
     fat_depth_mm : (m,) depth of the fat's inner face below the vertices of that surface.
     """
-    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    frame = anatomy.frame
     skin = Surface(frame.to_limb(anatomy.skin.points), anatomy.skin.faces)
     long = prolong_surface(skin)
     liner = cut_and_cap(

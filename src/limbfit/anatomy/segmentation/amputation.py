@@ -16,7 +16,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 
 from ...arrays import Array, Mask
 from ...errors import LabelError
-from ..frame import build_limb_frame, find_proximal_end
+from ..frame import find_proximal_end
 from ..grid import SOFT_TISSUE, Grid, LabelMap
 from ..morphology import find_largest_piece
 from ..surfaces.extraction import compute_signed_distance_to
@@ -215,7 +215,7 @@ def voxelise_anatomy(anatomy: Anatomy, distal_mm: float = _MARGIN_MM) -> LabelMa
 
     ``distal_mm`` of empty voxels are left beyond the limb's end.
     """
-    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    frame = anatomy.frame
     points = frame.to_limb(anatomy.skin.points)
     low = points.min(axis=0) - [_MARGIN_MM, _MARGIN_MM, distal_mm]
     high = np.array([*(points.max(axis=0)[:2] + _MARGIN_MM), 0.0])

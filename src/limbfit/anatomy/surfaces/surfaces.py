@@ -20,7 +20,7 @@ from scipy.ndimage import label as connected
 from ...arrays import Array, Indices, Mask
 from ...errors import InputError, LabelError, SurfaceError, add_location
 from ...results.limb import SurfaceMeasures, SurfacesResult
-from ..frame import ProximalEnd, find_proximal_end, select_layer
+from ..frame import Frame, ProximalEnd, build_limb_frame, find_proximal_end, select_layer
 from ..grid import LabelMap
 from ..morphology import find_box
 from .extraction import extract_fine_surface, extract_surface, remesh
@@ -67,6 +67,11 @@ class Anatomy:
     def height(self, points: ArrayLike) -> Array:
         """(...) distance of points beyond the cut plane, mm; negative inside the limb."""
         return (np.asarray(points, dtype=float) - self.cut_point) @ self.cut_normal
+
+    @cached_property
+    def frame(self) -> Frame:
+        """Axes of the limb at its proximal cut."""
+        return build_limb_frame(self.cut_point, self.cut_normal)
 
     @cached_property
     def open_skin(self) -> Surface:

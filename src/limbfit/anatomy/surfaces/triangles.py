@@ -28,7 +28,7 @@ _SMALLEST_OTHER_MM = 15.0
 _LARGEST_MM = 3000.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Surface:
     """Triangles in LPS mm: ``points`` (n, 3), ``faces`` (m, 3), counter-clockwise seen from outside.
 

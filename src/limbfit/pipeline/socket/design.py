@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.frame import build_limb_frame
 from ...anatomy.surfaces.surfaces import Anatomy, write_surface
 from ...anatomy.surfaces.triangles import Surface
 from ...arrays import Array
@@ -74,8 +73,8 @@ def build_undeformed_socket(
     cannot be made.
     """
     with place_errors(study, PLACE):
-        recipe, frame = build_recipe(study, anatomy), build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
-        plain = rectify_limb(outer, frame, replace(recipe, reduction_percent=0.0))
+        recipe = build_recipe(study, anatomy)
+        plain = rectify_limb(outer, anatomy.frame, replace(recipe, reduction_percent=0.0))
         for load in study.socket.loads:
             load_of(study, load, anatomy, plain)
         regions, middles = build_regions(study, anatomy), outer.triangles.mean(axis=1)
@@ -119,7 +118,7 @@ def run_socket_design(
         unloaded = SocketRun("", limb, mesh, parameters, face, kept)
         recipe = _compute_pressed_recipe(unloaded, plain, target, tell)
         designed = _build_face(limb, recipe, {})
-        reduced, percent = reduce_to_volume(designed.volume_mm3, limb.outer.skin, limb.frame, plain)
+        reduced, percent = reduce_to_volume(designed.volume_mm3, limb.outer.skin, limb.anatomy.frame, plain)
         control = _Design(replace(unloaded, name=CONTROL, face=reduced), {"reduction_percent": percent})
         design = _Design(replace(unloaded, name=DESIGN, face=designed), {"depths_mm": {}})
         designs, found = _solve_designs([control, design], context.executor, tell, 1), None
@@ -204,14 +203,14 @@ def _compute_pressed_recipe(unloaded: SocketRun, plain: Recipe, target: Target, 
     given = unloaded.key, code_digest(press_limb), pressure.tolist()
     _, fields = kept.get(compute_digest("pressed", *given), make)
     before, after = extract_outer_surface(mesh), extract_outer_surface(mesh, fields["displacement"])
-    profile = compute_profile(limb.outer.skin, limb.frame)
-    return replace(plain, offsets=compute_offsets(profile, before, after, limb.frame))
+    profile = compute_profile(limb.outer.skin, limb.anatomy.frame)
+    return replace(plain, offsets=compute_offsets(profile, before, after, limb.anatomy.frame))
 
 
 def _build_face(limb: SocketLimb, recipe: Recipe, depths: Mapping[str, float]) -> Socket:
     """The face of a recipe with depths (mm) over regions; it can be given its wall."""
     zones = [build_zone(region, limb.anatomy, limb.regions, depth) for region, depth in depths.items()]
-    face = rectify_limb(limb.outer.skin, limb.frame, replace(recipe, areas=zones))
+    face = rectify_limb(limb.outer.skin, limb.anatomy.frame, replace(recipe, areas=zones))
     build_socket_wall(limb.study, limb.anatomy, face)
     return face
 

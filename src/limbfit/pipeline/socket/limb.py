@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ...anatomy.frame import Frame, build_limb_frame
 from ...anatomy.meshing.layers import LayerSpec
 from ...anatomy.meshing.liner import build_liner_surface
 from ...anatomy.meshing.meshing import MeshSettings, mesh_limb
@@ -83,11 +82,6 @@ class SocketLimb:
             growth=GROWTH,
             flatness=FLATNESS,
         )
-
-    @property
-    def frame(self) -> Frame:
-        """Axes of the limb at its proximal cut."""
-        return build_limb_frame(self.anatomy.cut_point, self.anatomy.cut_normal)
 
     @property
     def liner(self) -> LinerFacts:

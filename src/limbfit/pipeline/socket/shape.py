@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...anatomy.frame import build_limb_frame
 from ...anatomy.surfaces.surfaces import Anatomy
 from ...anatomy.surfaces.triangles import Surface
 from ...arrays import Array
@@ -50,7 +49,7 @@ def build_socket(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
     outer : the closed surface that the socket touches, skin or liner on skin; flat at the same proximal cut.
         Around the bare skin, a rectified face may come nearer to the bones by the liner's thickness.
     """
-    table, frame = study.socket, build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
+    table, frame = study.socket, anatomy.frame
     with place_errors(study):
         if table.file is not None:
             return read_socket(
