@@ -102,7 +102,8 @@ def _read_geometry(study: Study) -> tuple[LimbGeometry | None, tuple[str, ...] |
         return LimbGeometry(anatomy, places), None, facts
     facts, bones = _describe_image(study)
     store = Store(study.results)
-    are_placed = store.stamp("sites") and store.state("sites", compute_keys(study)["sites"]).state == "done"
+    key = compute_keys(study, "sites")["sites"]
+    are_placed = store.stamp("sites") and store.state("sites", key).state == "done"
     return LimbGeometry.stored(store) if are_placed else None, bones, facts
 
 

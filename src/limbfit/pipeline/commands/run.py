@@ -100,16 +100,17 @@ def list_stages(study: Study) -> tuple[Stage, ...]:
     return tuple(stage for stage in STAGES if stage.name != "segment" or study.image is not None)
 
 
-def compute_keys(study: Study) -> dict[str, str]:
-    """The key of every stage: a digest of its settings, input files, code and of the stages it stands on.
+def compute_keys(study: Study, until: str = "report") -> dict[str, str]:
+    """The key of every stage, or of those ``until`` one: a digest of its settings, input files, code and of
+    the stages it stands on.
 
     The calibration's is the one that it has in the study of its fitted sites alone: whatever is held out can
     change, come and go without it. The report's covers the experiments and other models that it shows.
     """
-    return {name: key.digest for name, key in _compute_chain(Keys(study)).items()}
+    return {name: key.digest for name, key in _compute_chain(Keys(study), until).items()}
 
 
-def _compute_chain(keys: Keys) -> dict[str, StageKey]:
+def _compute_chain(keys: Keys, until: str = "report") -> dict[str, StageKey]:
     """See `compute_keys`."""
     fitted = _select_calibration_inputs(keys.study)
     plain = [site.model_copy(update={"region": "", "fitted": False}) for site in keys.study.sites]
@@ -132,6 +133,8 @@ def _compute_chain(keys: Keys) -> dict[str, StageKey]:
             alone[stage.name] = key_alone.digest
             key = key_alone if stage.name == "calibrate" else key
         chain[stage.name], below[stage.name] = key, key.digest
+        if stage.name == until:
+            break
     return chain
 
 

@@ -199,7 +199,7 @@ def run_febio_site(prepared: PreparedIndentation, program: Path, folder: Path) -
 def read_recorded_range(study: Study) -> RecordedExtents | None:
     """What the fitted records did to the tissue; None where the prediction, which stores it, is not done."""
     store = Store(study.results)
-    if store.state("predict", compute_keys(study)["predict"]).state != "done":
+    if store.state("predict", compute_keys(study, "predict")["predict"]).state != "done":
         return None
     return store.results.predict.recorded_range
 
@@ -219,7 +219,7 @@ def choose_parameters(study: Study, given: Parameters | None = None) -> tuple[Pa
     if store.stamp("calibrate") is None:
         start = {tissue: study.material.of(tissue, "start") for tissue in study.tissues}
         return start, "start of the study"
-    if store.state("calibrate", compute_keys(study)["calibrate"]).state != "done":
+    if store.state("calibrate", compute_keys(study, "calibrate")["calibrate"]).state != "done":
         raise InputError(
             "the identified parameters are stale: made from other inputs, settings or code",
             file=store["calibrate"] / "calibration.json",
