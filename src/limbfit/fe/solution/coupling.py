@@ -98,24 +98,24 @@ def solve_coupled(
 def _solve_gmres(
     at: Evaluation, factor: Factor, coupling: Coupling, b: Array, guess: Array, tolerance: float
 ) -> Array:
-    """Solutions (n, p) of ``(K + C) x = b``; columns that are not within the tolerance count as inexact."""
-    springs, shape = update_springs(at, factor), (len(b), len(b))
+    """Solutions (n, p) of ``(K + C) x = b``; where not all are within the tolerance, they count as inexact.
+    As one vector, of columns brought to one length, they share the reading of the factor.
+    """
+    springs, size = update_springs(at, factor), np.linalg.norm(b, axis=0)
+    scale = np.where(size > 0.0, size / max(size.max(), 1e-300), 1.0)
 
     def product(x: Array) -> Array:
-        x = x.reshape(-1, 1)
+        x = x.reshape(b.shape)
         return (factor.multiply(at.tangent, x) + coupling(x)).ravel()
 
     def precondition(r: Array) -> Array:
-        return factor.precondition(r.reshape(-1, 1), springs).ravel()
+        return factor.precondition(r.reshape(b.shape), springs).ravel()
 
-    A, M = (spla.LinearOperator(shape, matvec=apply, dtype=float) for apply in (product, precondition))
-    out = guess.copy()
-    for i in range(b.shape[1]):
-        out[:, i], failed = spla.gmres(
-            A, b[:, i], guess[:, i], rtol=tolerance, restart=VECTORS, maxiter=RESTARTS, M=M
-        )
-        factor.counts["inexact"] += int(failed > 0)
-    return out
+    A, M = (spla.LinearOperator((b.size, b.size), matvec=f, dtype=float) for f in (product, precondition))
+    start, share = (guess / scale).ravel(), tolerance / np.sqrt(b.shape[1])
+    x, failed = spla.gmres(A, (b / scale).ravel(), start, rtol=share, restart=VECTORS, maxiter=RESTARTS, M=M)
+    factor.counts["inexact"] += int(failed > 0)
+    return np.asarray(scale * x.reshape(b.shape))
 
 
 def couple(
