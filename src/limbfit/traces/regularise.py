@@ -254,8 +254,7 @@ def _choose_penalty(x: Array, y: Array, w: Array) -> float:
     loops: in the modes of the spline (Green and Silverman 1994, sections 2.3 and 3.3). Raises `ValueError`.
     """
     n, h = len(x), np.diff(x)
-    Q = np.column_stack([np.diag(1 / h[:-1]), np.zeros((n - 2, 2))])  # second differences: Q y
-    Q += np.eye(n - 2, n, 2) / h[1:, None] - np.eye(n - 2, n, 1) * (1 / h[:-1] + 1 / h[1:])[:, None]
+    Q = np.diff(np.diff(np.eye(n), axis=0) / h[:, None], axis=0)  # second differences: Q y
     R = np.diag(h[:-1] + h[1:]) / 3 + (np.diag(h[1:-1], 1) + np.diag(h[1:-1], -1)) / 6
     rough, modes = eigh(Q / w @ Q.T, R)
     back, size = (Q / w).T @ modes, modes.T @ (Q @ y)
