@@ -102,8 +102,7 @@ def _read_geometry(study: Study) -> tuple[LimbGeometry | None, tuple[str, ...] |
         return LimbGeometry(anatomy, places), None, facts
     facts, bones = _describe_image(study)
     store = Store(study.results)
-    key = compute_keys(study, "sites")["sites"]
-    are_placed = store.stamp("sites") and store.state("sites", key).state == "done"
+    are_placed = store.state("sites", compute_keys(study, "sites")["sites"]).state == "done"
     return LimbGeometry.stored(store) if are_placed else None, bones, facts
 
 

@@ -101,8 +101,7 @@ def list_stages(study: Study) -> tuple[Stage, ...]:
 
 
 def compute_keys(study: Study, until: str = "report") -> dict[str, str]:
-    """The key of every stage, or of those ``until`` one: a digest of its settings, input files, code and of
-    the stages it stands on.
+    """The key of every stage ``until`` one: a digest of its settings, input files, code and lower stages.
 
     The calibration's is the one that it has in the study of its fitted sites alone: whatever is held out can
     change, come and go without it. The report's covers the experiments and other models that it shows.
