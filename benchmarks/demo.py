@@ -101,9 +101,8 @@ def main() -> None:
     if program is not None:
         rows.append(run_site(program, asked.folder, asked.site, asked.time_limit))
     for row in rows:
-        print(
-            f"{row['what']:16} {row['seconds']:8.1f} s {row['cpu_seconds']:8.1f} CPU s  {row.get('reason', '')}"
-        )
+        times = f"{row['seconds']:8.1f} s {row['cpu_seconds']:8.1f} CPU s"
+        print(f"{row['what']:16} {times}  {row.get('reason', '')}")
     facts: dict[str, Any] = {"threads": count_usable_cores(), "rows": rows}
     if program is not None and not asked.finished and not rows[-1]["reason"]:
         facts["ratio"] = rows[-1]["seconds"] / rows[-2]["seconds"]
