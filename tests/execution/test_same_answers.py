@@ -10,6 +10,7 @@ import pytest
 from layered import build_block_site, layered_block
 from limbfit.execution import ProcessExecutor, SerialExecutor
 from limbfit.indentation import SimulationJob, simulate
+from limbfit.pipeline.commands.run import ensure_compiled
 from limbfit.study import SolverTable
 
 TISSUES = ("skin", "muscle")
@@ -72,6 +73,7 @@ def test_the_way_to_an_answer_does_not_change_its_force(jobs):
 
 @pytest.mark.slow
 def test_executors_and_numbers_of_workers_give_the_same_bits(jobs):
+    ensure_compiled()  # as every command does before it solves
     keys = [job.model.name for job in jobs]
     found = []
     for executor in (SerialExecutor(), ProcessExecutor(1), ProcessExecutor(2)):

@@ -12,6 +12,7 @@ from ..contact.rigid import Indenter
 from ..kernel.assembly import is_compiled
 from ..kernel.laws import Laws
 from ..materials import OgdenQLV
+from ..memory import compute_elastic_stresses
 from ..observables import compute_element_fields
 from ..problem import History, Problem
 from .control import StepControl
@@ -46,4 +47,6 @@ def compile_kernels() -> None:
     )
     found = solve(problem, steps=StepControl(times=(0.5, 1.0)), sensitivities=True)
     if found.deepest is not None:
-        compute_element_fields(found.system, Laws.build([tissue, tissue]), found.deepest)
+        laws = Laws.build([tissue, tissue])
+        compute_element_fields(found.system, laws, found.deepest)
+        compute_elastic_stresses(found.system, laws, found.deepest.u)  # of steps without derivatives

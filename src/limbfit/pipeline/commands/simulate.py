@@ -24,7 +24,7 @@ from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
 from ..simulation.simulations import CURVE_POINTS
 from .experiments import IDENTIFIED
-from .run import compute_keys, run_study
+from .run import compute_keys, ensure_compiled, run_study
 
 FEB_NAME, FORCES = "model.feb", "forces.txt"
 
@@ -71,6 +71,7 @@ def prepare_site(
     stated = study.indentation(name)
     used, origin = choose_parameters(study, parameters)
     run_study(study, until="mesh", listener=listener)
+    ensure_compiled()
     context = Context(study, Store(study.results), SerialExecutor(), listener)
     return PreparedIndentation(context, stated, build_model(context, stated), used, origin)
 
