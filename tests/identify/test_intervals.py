@@ -58,7 +58,7 @@ def valley_record(repeat, forces):
 @pytest.mark.slow
 def test_on_a_bent_valley_the_stated_intervals_hold_the_truth():
     found = coverage_study(Valley(), BENT_TRUTH, BENT, valley_record, repeats=24)
-    assert found.linearised.share < 0.85  # what it was
+    assert found.linearised.determined.mean() < 0.5 < found.stated.determined.mean()  # what simulations add
     assert 0.9 <= found.stated.share <= 0.99
     assert found.stated.by_parameter.min() > 0.85
     assert found.further <= 10
