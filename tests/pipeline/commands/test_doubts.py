@@ -17,6 +17,7 @@ from completing import complete
 from conftest import write_trace
 from limbfit import check_study, load_study, run_study
 from limbfit.anatomy.imaging import write_labels, write_volume
+from limbfit.pipeline.records.traces import read_record
 from limbfit.report.page import Bullets
 from limbfit.report.sections.model import make_model_section
 from limbfit.report.sections.records import make_record_check_section
@@ -36,7 +37,7 @@ def five(study, commands_unasked):
     ]
     (study / "study.toml").write_text(head + "".join(tables))
     for k in range(5):
-        write_trace(study / f"{k}.csv", depth=5.0 + 0.2 * k, peak=5.0 + 0.3 * k, rate=50.0)
+        write_trace(study / f"{k}.csv", depth=5.0 + 0.2 * k, peak=5.0 + 0.3 * k, rate=20.0)
     return study
 
 
@@ -56,10 +57,7 @@ def test_clean_records_are_not_flagged(five):
     assert flags(five) == []
 
 
-@pytest.mark.parametrize(
-    ("factors", "word"),
-    [((1, 1, 1 / 9.80665), "kgf"), ((1, 1, 9.80665), "9.81"), ((1, 0.1, 1), "cm"), ((10, 1, 1), "time")],
-)
+@pytest.mark.parametrize(("factors", "word"), [((1, 1, 1 / 9.80665), "kgf"), ((1, 0.1, 1), "cm")])
 def test_a_record_in_another_unit_is_told(five, factors, word):
     rewrite(five, "3", *factors)
     told = flags(five)
@@ -72,13 +70,14 @@ def test_a_record_in_another_unit_is_told(five, factors, word):
 
 def test_an_export_of_a_rig_is_read_and_what_was_done_is_told(five):
     """In kilonewtons, below a preamble: the same site, and a remark."""
-    plain = check_study(load_study(five), listener=lambda event: None)["sites"]["3"]
+    study = load_study(five)
+    _, _, plain = read_record(study, study.recorded[3])
     head, *rows = (five / "3.csv").read_text().splitlines()
     table = np.loadtxt(rows, delimiter=",") * (1, 1, 1e-3)
     lines = ["Rig,7", head, "s,mm,kN", *(",".join(map(repr, row)) for row in table.tolist())]
     (five / "3.csv").write_text("\n".join(lines))
     told = check_study(load_study(five), listener=lambda event: None)
-    assert told["sites"]["3"]["peak_force_N"] == pytest.approx(plain["peak_force_N"], rel=1e-6)
+    assert told["sites"]["3"]["peak_force_N"] == pytest.approx(plain.peak_force_N, rel=1e-6)
     assert [(flag["sites"], flag["kind"]) for flag in told["flags"]] == [(["3"], "reading")]
     words = "the header in line 2 is skipped; column 'force_N' is converted from kN to N"
     assert words in told["flags"][0]["text"]

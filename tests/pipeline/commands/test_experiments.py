@@ -7,6 +7,7 @@ from importlib import import_module
 
 import pytest
 
+from conftest import write_trace
 from limbfit import Progress, run_experiment, study_status
 from limbfit.errors import InputError, RunError
 from limbfit.pipeline.commands.experiments import EXPERIMENTS, Experiment, register_experiment
@@ -36,6 +37,14 @@ def run_peaks(context, folder, *, factor: float = 1.0, parameters_from: str = ""
 
 
 PEAKS = Experiment("peaks", run_peaks, needs=("traces",), tables=("material",))
+
+
+@pytest.fixture
+def study(study):
+    """With records of few samples."""
+    for name in ("1.csv", "2.csv"):
+        write_trace(study / name, rate=20.0)
+    return study
 
 
 @pytest.fixture(autouse=True)
