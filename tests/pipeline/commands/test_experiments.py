@@ -73,26 +73,18 @@ def test_an_experiment_is_done_once_after_the_stages_it_needs(study):
     assert [event.text for event in told if event.stage == "peaks"] == ["is up to date"]
 
 
-def test_a_stopped_experiment_goes_on_in_its_own_folder(study):
+@pytest.mark.parametrize("options", [{}, {"factor": 2.0}], ids=["its defaults", "others"])
+def test_a_stopped_experiment_has_begun_and_goes_on_in_its_own_folder(study, options):
     def stop(event: Progress) -> None:
         if event.text == "halfway":
             raise StoppedError
 
     with pytest.raises(StoppedError):
-        run_experiment(load_study(study), "peaks", listener=stop)
+        run_experiment(load_study(study), "peaks", **options, listener=stop)
     assert state(study) == "begun"
-    run_experiment(load_study(study), "peaks", listener=stop)  # what it had begun is there: no second half
+    # What it had begun is there: no second half.
+    run_experiment(load_study(study), "peaks", **options, listener=stop)
     assert state(study) == "done"
-
-
-def test_an_experiment_that_was_stopped_at_its_first_try_has_begun_whatever_its_options(study):
-    def stop(event: Progress) -> None:
-        if event.text == "halfway":
-            raise StoppedError
-
-    with pytest.raises(StoppedError):
-        run_experiment(load_study(study), "peaks", factor=2.0, listener=stop)
-    assert state(study) == "begun"
 
 
 def test_an_experiment_is_not_done_on_records_that_are_others_by_now(study):

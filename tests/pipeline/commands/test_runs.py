@@ -79,7 +79,6 @@ def test_stages_are_done_anew_where_asked_for(alone):
 
 
 def test_a_report_of_what_there_is_before_a_run_is_not_that_of_the_run(alone):
-    run_study(load_study(alone), until="traces", listener=quiet)
     report_study(load_study(alone), listener=quiet)
     row = rows_of(alone)["report"]
     assert (row["state"], row["why"]) == ("stale", ["stage predict changed"])
