@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -64,29 +65,29 @@ def parse(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
+def list_statements(nodes: list[ast.stmt], inside: bool = False) -> Iterator[tuple[ast.stmt, bool]]:
+    """Every statement below these, and whether it is inside a function."""
+    for node in nodes:
+        yield node, inside
+        deeper = inside or isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+        for field in ("body", "handlers", "cases", "orelse", "finalbody"):
+            yield from list_statements(getattr(node, field, []), deeper)
+
+
 @cache
 def imports(path: Path) -> list[tuple[str, int, bool]]:
     """(absolute module, line, inside a function) of every limbfit import in a file."""
-    tree = parse(path)
-    inside = {
-        id(child)
-        for node in ast.walk(tree)
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
-        for child in ast.walk(node)
-        if child is not node
-    }
     package = module_name(path).split(".")
     if path.name != "__init__.py":
         package = package[:-1]
     found = []
-    for node in ast.walk(tree):
+    for node, inside in list_statements(parse(path).body):
         if isinstance(node, ast.Import):
-            found += [(alias.name, node.lineno, id(node) in inside) for alias in node.names]
+            found += [(alias.name, node.lineno, inside) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else []
             stem = ".".join([*base, node.module] if node.module else base)
-            names = [f"{stem}.{alias.name}" for alias in node.names]
-            found += [(name, node.lineno, id(node) in inside) for name in names]
+            found += [(f"{stem}.{alias.name}", node.lineno, inside) for alias in node.names]
     return [entry for entry in found if entry[0].split(".")[0] == "limbfit"]
 
 

@@ -267,7 +267,7 @@ SCRIPT = """
 import math
 from limbfit.execution import ProcessExecutor
 print("started")
-with ProcessExecutor(2) as executor:
+with ProcessExecutor(1) as executor:
     print(list(executor.map(math.sqrt, [1, 4, 9])))
 """
 
@@ -351,10 +351,10 @@ def test_a_hung_worker_costs_one_retry_and_twice_is_lost_with_the_reason(tmp_pat
 
 
 def test_a_worker_over_its_memory_is_ended_and_the_others_go_on():
-    with ProcessExecutor(2, limits=Limits(memory_GB=1.2)) as executor:
-        answers = list(executor.map(swell, [1, 1800, 2], on_lost=told))
+    with ProcessExecutor(2, limits=Limits(memory_GB=0.8)) as executor:
+        answers = list(executor.map(swell, [1, 1100, 2], on_lost=told))
     assert answers[::2] == [1.0, 1.0]
-    assert answers[1] == "1800: it needed more than execution.memory_limit_GB = 1.2 GB, twice"
+    assert answers[1] == "1100: it needed more than execution.memory_limit_GB = 0.8 GB, twice"
 
 
 def test_a_job_that_kills_every_worker_can_be_a_failure_instead_of_an_end(pool):

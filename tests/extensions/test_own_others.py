@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from conftest import write_trace
 from guide import from_the_guide
 from limbfit import load_study, run_experiment
 from limbfit.anatomy.images.formats import register_image_format
@@ -89,6 +90,8 @@ def test_options_may_be_numbers_and_arrays_of_numpy(few, study, monkeypatch):
 
 def named(study: Path, extensions: Path) -> Path:
     """The study with the experiment, and an indenter of its own."""
+    for name in ("1.csv", "2.csv"):
+        write_trace(study / name, rate=20.0)
     for name in ("stiffness.py", "tapered.py"):
         (study / name).write_text((extensions / name).read_text())
     file = study / "study.toml"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import os
 import resource
-import shutil
 import sys
 from contextlib import suppress
 
@@ -13,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from conftest import write_trace
 from limbfit import Progress, run_study
 from limbfit.anatomy.imaging import read_labels
 from limbfit.cli import main
@@ -127,7 +127,7 @@ def test_deeply_nested_toml_is_refused(study, monkeypatch, capsys):
 
 
 def test_a_bomb_of_zeros_in_a_compressed_image(study, monkeypatch, capsys):
-    with gzip.open(study / "image.nii.gz", "wb", compresslevel=9) as stream:
+    with gzip.open(study / "image.nii.gz", "wb", compresslevel=1) as stream:
         for _ in range(100):
             stream.write(bytes(1_000_000))
     file = study / "study.toml"
@@ -158,7 +158,7 @@ def test_an_image_that_states_more_voxels_than_memory_is_refused_unread(study, m
 @pytest.mark.parametrize("size", [b"64 64 64", b"9000 9000 9000"])
 def test_a_bomb_in_a_label_map_is_refused_unread(tmp_path, size):
     file = tmp_path / "labels.seg.nrrd"
-    file.write_bytes(HUGE % size + gzip.compress(bytes(200_000_000), 1))
+    file.write_bytes(HUGE % size + gzip.compress(bytes(100_000_000), 1))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(LabelError, match=r"names no segment|more than 1e"):
         read_labels(file)
@@ -222,7 +222,8 @@ def test_a_stage_that_is_a_link_is_replaced_and_its_target_left_alone(study, tmp
     (elsewhere / "precious").write_text("kept")
     (study / "results").mkdir()
     (study / "results/traces").symlink_to(elsewhere, target_is_directory=True)
-    shutil.copyfile(study / "1.csv", study / "2.csv")
+    for name in ("1.csv", "2.csv"):
+        write_trace(study / name, rate=20.0)
     run_study(load_study(study), until="traces", listener=quiet)
     assert (elsewhere / "precious").read_text() == "kept"
     assert os.listdir(elsewhere) == ["precious"]

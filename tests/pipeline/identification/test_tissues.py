@@ -78,7 +78,8 @@ def test_stages_share_by_parameter_and_a_single_tissue_has_one():
 
 def test_forces_and_sensitivities_of_three_tissues_equal_central_differences(tmp_path):
     mesh = layered_block((1.5, 6.0, 16.0), divisions=2)
-    model = build_block_site("1", tmp_path / "1.vtu", mesh, 4.0, STEPS)
+    few = SolverTable(load_steps=3, unload_steps=2)
+    model = build_block_site("1", tmp_path / "1.vtu", mesh, 4.0, few)
     times = tuple(np.linspace(0.0, model.knots_s[-1], 15))
     truth = to_vector(TRUTH, TISSUES)
 
