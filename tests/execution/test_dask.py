@@ -124,8 +124,8 @@ def test_a_study_on_a_cluster_that_loses_a_worker_every_twenty_seconds_has_the_s
     more = SITES.format("3", [-40.0, 0.0, 60.0]) + SITES.format("4", [0.0, -40.0, 60.0])
     file.write_text(file.read_text() + more + COARSE.replace("tet4", "tet10"))
     alone = shutil.copytree(study, tmp_path / "alone")
-    run_study(load_study(alone), until="predict", listener=lambda event: None)
-    run_study(load_study(study), until="mesh", listener=lambda event: None)
+    run_study(load_study(alone), until="predict")
+    run_study(load_study(study), until="mesh")
     lost: list[int] = []
     with distributed.LocalCluster(3, threads_per_worker=1, dashboard_address=None, memory_limit=0) as cluster:
         run = subprocess.Popen(

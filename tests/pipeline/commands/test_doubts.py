@@ -42,7 +42,7 @@ def five(study, commands_unasked):
 
 
 def flags(study):
-    return check_study(load_study(study), listener=lambda event: None)["flags"]
+    return check_study(load_study(study))["flags"]
 
 
 def rewrite(study, name, *factors):
@@ -76,7 +76,7 @@ def test_an_export_of_a_rig_is_read_and_what_was_done_is_told(five):
     table = np.loadtxt(rows, delimiter=",") * (1, 1, 1e-3)
     lines = ["Rig,7", head, "s,mm,kN", *(",".join(map(repr, row)) for row in table.tolist())]
     (five / "3.csv").write_text("\n".join(lines))
-    told = check_study(load_study(five), listener=lambda event: None)
+    told = check_study(load_study(five))
     assert told["sites"]["3"]["peak_force_N"] == pytest.approx(plain.peak_force_N, rel=1e-6)
     assert [(flag["sites"], flag["kind"]) for flag in told["flags"]] == [(["3"], "reading")]
     words = "the header in line 2 is skipped; column 'force_N' is converted from kN to N"
@@ -109,7 +109,7 @@ def test_an_image_that_says_twice_where_it_lies_is_told_by_check_stage_and_repor
     )
     study = load_study(tmp_path)
     words = "image: its qform and sform differ by up to 30.0 mm; the sform is used"
-    facts = check_study(study, listener=lambda event: None)["facts"]
+    facts = check_study(study)["facts"]
     assert sum(fact.startswith(f"warning: {words}") for fact in facts) == 1
     said = []
     run_study(study, until="segment", listener=lambda event: said.append(event.text))

@@ -16,10 +16,6 @@ from limbfit.pipeline.engine.storage import write_json
 from limbfit.study import load_study
 
 
-def quiet(event: Progress) -> None:
-    """A listener that does nothing."""
-
-
 class StoppedError(Exception):
     """Stands for a kill: nothing in limbfit catches it."""
 
@@ -64,7 +60,7 @@ def change(study, old: str, new: str) -> None:
 
 def test_an_experiment_is_done_once_after_the_stages_it_needs(study):
     assert state(study) == "missing"
-    found = run_experiment(load_study(study), "peaks", listener=quiet)
+    found = run_experiment(load_study(study), "peaks")
     assert found["peaks_N"]["1"] == pytest.approx(6.0, abs=0.2)
     assert state(study) == "done"
     assert state(study, "traces") == "done"
@@ -98,13 +94,13 @@ def test_an_experiment_is_not_done_on_records_that_are_others_by_now(study):
 
 
 def test_options_settings_and_records_decide_an_experiment(study):
-    once = run_experiment(load_study(study), "peaks", listener=quiet)
-    twice = run_experiment(load_study(study), "peaks", factor=2.0, listener=quiet)
+    once = run_experiment(load_study(study), "peaks")
+    twice = run_experiment(load_study(study), "peaks", factor=2.0)
     assert twice["peaks_N"]["1"] == pytest.approx(2 * once["peaks_N"]["1"])
     assert state(study) == "done"  # judged with the options that it was run with
     change(study, "[surfaces]", "[material]\nkappa_ratio = 50\n[surfaces]")
     assert state(study) == "stale"
-    run_experiment(load_study(study), "peaks", listener=quiet)
+    run_experiment(load_study(study), "peaks")
     change(study, 'trace = "2.csv"', 'trace = "1.csv"')
     assert state(study) == "stale"
 
@@ -112,7 +108,7 @@ def test_options_settings_and_records_decide_an_experiment(study):
 @pytest.mark.parametrize(("origin", "after"), [("identified", "stale"), ("given", "done")])
 def test_what_was_done_with_identified_parameters_is_stale_where_others_are_identified(study, origin, after):
     """It does not need the calibration; it says that its parameters are from there."""
-    run_experiment(load_study(study), "peaks", parameters_from=origin, listener=quiet)
+    run_experiment(load_study(study), "peaks", parameters_from=origin)
     assert state(study) == "done"
     change(study, "[surfaces]", "[calibration]\nmax_iterations = 3\n[surfaces]")
     assert state(study) == after
@@ -122,7 +118,7 @@ def test_what_was_done_with_identified_parameters_is_stale_where_others_are_iden
 
 def test_the_report_is_stale_once_there_is_an_experiment_to_show(study):
     before = compute_keys(load_study(study))
-    run_experiment(load_study(study), "peaks", listener=quiet)
+    run_experiment(load_study(study), "peaks")
     after = compute_keys(load_study(study))
     assert after.pop("report") != before.pop("report")
     assert after == before
@@ -138,7 +134,7 @@ def run_peaks(context, folder, *, factor=1.0):
 
 
 def test_an_experiment_changes_when_its_code_does(study, monkeypatch, tmp_path):
-    run_experiment(load_study(study), "peaks", listener=quiet)
+    run_experiment(load_study(study), "peaks")
     (tmp_path / "other_code.py").write_text(OTHER_CODE)
     monkeypatch.syspath_prepend(tmp_path)
     other = import_module("other_code").run_peaks
@@ -150,9 +146,9 @@ def test_an_experiment_changes_when_its_code_does(study, monkeypatch, tmp_path):
 
 def test_what_there_is_not_is_refused(study):
     with pytest.raises(InputError, match="no experiment is named 'nothing'"):
-        run_experiment(load_study(study), "nothing", listener=quiet)
+        run_experiment(load_study(study), "nothing")
     with pytest.raises(InputError, match="peaks has no option colour"):
-        run_experiment(load_study(study), "peaks", colour="red", listener=quiet)
+        run_experiment(load_study(study), "peaks", colour="red")
 
 
 def test_names_are_folders_that_do_not_shadow_each_other():

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from conftest import write_trace
-from limbfit import Progress, run_study
+from limbfit import run_study
 from limbfit.anatomy.imaging import read_labels
 from limbfit.cli import main
 from limbfit.errors import InputError, LabelError, RunError
@@ -203,16 +203,12 @@ def test_names_that_would_leave_the_folder_or_the_line_are_refused(study, monkey
     assert "\x1b" not in err
 
 
-def quiet(event: Progress) -> None:
-    """A listener that does nothing."""
-
-
 def test_results_that_are_a_link_out_of_the_study_are_not_written(study, tmp_path):
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (study / "results").symlink_to(elsewhere, target_is_directory=True)
     with pytest.raises(RunError, match="is a link"):
-        run_study(load_study(study), until="surfaces", listener=quiet)
+        run_study(load_study(study), until="surfaces")
     assert not os.listdir(elsewhere)
 
 
@@ -224,7 +220,7 @@ def test_a_stage_that_is_a_link_is_replaced_and_its_target_left_alone(study, tmp
     (study / "results/traces").symlink_to(elsewhere, target_is_directory=True)
     for name in ("1.csv", "2.csv"):
         write_trace(study / name, rate=20.0)
-    run_study(load_study(study), until="traces", listener=quiet)
+    run_study(load_study(study), until="traces")
     assert (elsewhere / "precious").read_text() == "kept"
     assert os.listdir(elsewhere) == ["precious"]
     assert (study / "results/traces/traces.json").is_file()

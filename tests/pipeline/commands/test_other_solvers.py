@@ -32,10 +32,6 @@ TISSUES = {
 }
 
 
-def quiet(_):
-    pass
-
-
 @pytest.fixture
 def coarse(study):
     with (study / "study.toml").open("a") as stream:
@@ -48,14 +44,14 @@ def test_febio_absent_is_said_before_anything_runs(coarse, monkeypatch, tmp_path
     monkeypatch.setenv("PATH", str(tmp_path))
     for call in (compare_site, lambda *a, **k: simulate_site(*a, solver="febio", **k)):
         with pytest.raises(InputError, match="FEBio is not installed here; install FEBio 4"):
-            call(coarse, "1", listener=quiet)
+            call(coarse, "1")
     assert not coarse.results.exists()
 
 
 def test_formats_and_sites_are_checked(coarse):
     for to, site, words in (("xyz", None, "is no format"), ("feb", "9", "no site"), ("feb", "", "no site")):
         with pytest.raises(InputError, match=words):
-            export_study(coarse, to, site=site, listener=quiet)
+            export_study(coarse, to, site=site)
 
 
 OWN_LAW = """
@@ -108,7 +104,7 @@ def test_a_record_under_force_has_no_forces_to_compare(tmp_path):
     with pytest.raises(
         InputError, match=r"study.toml: a: a force drives the indenter, and there is none to be"
     ):
-        compare_site(study, "a", febio_log=tmp_path / "forces.txt", listener=quiet)
+        compare_site(study, "a", febio_log=tmp_path / "forces.txt")
 
 
 def test_the_curve_of_a_partial_simulation_ends_where_that_ends(tmp_path):
@@ -126,13 +122,11 @@ def test_the_curve_of_a_partial_simulation_ends_where_that_ends(tmp_path):
 @pytest.mark.slow
 def test_a_site_goes_out_and_its_forces_come_back(coarse, tmp_path):
     out = tmp_path / "out"
-    found = export_study(coarse, "feb", site="1", output=out, parameters=TISSUES, listener=quiet)
+    found = export_study(coarse, "feb", site="1", output=out, parameters=TISSUES)
     (file,) = found["sites"][0]["files"]
-    solved = simulate_feb(file, out / "febio", listener=quiet)
+    solved = simulate_feb(file, out / "febio")
     assert solved["completed"]
-    compared = compare_site(
-        coarse, "1", parameters=TISSUES, febio_log=out / "febio" / "1-forces.txt", listener=quiet
-    )
+    compared = compare_site(coarse, "1", parameters=TISSUES, febio_log=out / "febio" / "1-forces.txt")
     # a penalty as stiff as limbfit's own: what is left is steps and facets
     assert compared["limbfit_matched"]["difference"]["max_percent"] < 1.0
     assert compared["limbfit"]["difference"]["max_percent"] < 1.5
@@ -148,7 +142,7 @@ def test_a_site_goes_out_and_its_forces_come_back(coarse, tmp_path):
     text = (out / "febio" / "1-forces.txt").read_text()
     half = text[: text.index("*Step  = 20\n")]
     (out / "half.txt").write_text(half)
-    partial = compare_site(coarse, "1", parameters=TISSUES, febio_log=out / "half.txt", listener=quiet)
+    partial = compare_site(coarse, "1", parameters=TISSUES, febio_log=out / "half.txt")
     assert not partial["febio"]["completed"]
     assert "the table ends at" in partial["febio"]["reason"]
     _optimisation(coarse, out)

@@ -15,10 +15,6 @@ from limbfit.mesh import read_vtu
 from limbfit.study import load_study
 
 
-def quiet(event: Progress) -> None:
-    """A listener that does nothing."""
-
-
 @pytest.fixture
 def coarse(study):
     file = study / "study.toml"
@@ -52,10 +48,10 @@ def test_interrupted_calibration_goes_on_and_ends_the_same(coarse, tmp_path_fact
     states = {row["stage"]: row["state"] for row in study_status(load_study(coarse))}
     assert states["mesh"] == "done"
     assert states["calibrate"] == "begun"
-    resumed = run_study(load_study(coarse), listener=quiet)
+    resumed = run_study(load_study(coarse))
     runs = coarse / "results/calibrate/runs"
     assert all((runs / name).stat().st_mtime_ns == stamp for name, stamp in kept.items())
-    straight = run_study(load_study(other), listener=quiet)
+    straight = run_study(load_study(other))
     for tissue, values in straight["parameters"].items():
         for name, value in values.items():
             assert resumed["parameters"][tissue][name] == pytest.approx(value, rel=1e-4)
@@ -118,16 +114,16 @@ def check_another_held_out_record_leaves_the_calibration(study) -> None:
 
 
 def check_identified_parameters_are_used_until_stale(study) -> None:
-    found = simulate_site(load_study(study), "1", listener=quiet)
+    found = simulate_site(load_study(study), "1")
     identified = json.loads((study / "results/calibrate/calibration.json").read_text())["stages"][-1]
     assert found["parameters_from"] == "identified"
     assert found["parameters"] == identified["parameters"]
     file = study / "study.toml"
     file.write_text(file.read_text() + "lower = { c_kPa = 0.1, m = 2.0, gamma = 0.01, tau_s = 0.01 }\n")
     with pytest.raises(InputError, match=r"identified parameters are stale.*limbfit run.*--parameters"):
-        simulate_site(load_study(study), "1", listener=quiet)
+        simulate_site(load_study(study), "1")
     given = {tissue: {**values, "c_kPa": 5.0} for tissue, values in identified["parameters"].items()}
-    assert simulate_site(load_study(study), "1", parameters=given, listener=quiet)["parameters"] == given
+    assert simulate_site(load_study(study), "1", parameters=given)["parameters"] == given
 
 
 @pytest.mark.slow
@@ -138,7 +134,7 @@ def test_planned_indentation_is_simulated_without_a_record(coarse):
     steps = coarse / "results/simulate/2.pvd"  # of an animation that was made before
     steps.parent.mkdir(parents=True)
     steps.write_text("")
-    found = simulate_site(load_study(coarse), "2", parameters=None, listener=quiet)
+    found = simulate_site(load_study(coarse), "2", parameters=None)
     assert found["completed"]
     assert not steps.exists()
     assert found["depth_mm"] == 3.0
@@ -164,7 +160,7 @@ start = { c_kPa = 3.0 }
 def test_three_tissues_from_surfaces_to_report(coarse):
     file = coarse / "study.toml"
     file.write_text(file.read_text() + LAYERS)
-    summary = run_study(load_study(coarse), listener=quiet)
+    summary = run_study(load_study(coarse))
     tissues = ("skin", "fat", "calf")
     assert tuple(summary["parameters"]) == tuple(summary["intervals_95"]) == tissues
     assert summary["mean_error_fitted_percent"] < 10.0

@@ -44,10 +44,6 @@ position = {position}
 """
 
 
-def quiet(progress):
-    pass
-
-
 def with_scar(labels: LabelMap) -> LabelMap:
     """A ball beside the tibia."""
     middle = np.argwhere(labels.mask("tibia"))[:, ::-1].mean(axis=0)
@@ -79,7 +75,7 @@ def first(tmp_path_factory):
     )
     (folder / "study.toml").write_text(text + SITE.format(trace="1.csv", position=position))
     study = load_study(folder)
-    run_study(study, until="traces", listener=quiet)
+    run_study(study, until="traces")
     return study, position
 
 
@@ -107,9 +103,9 @@ def test_its_surfaces_are_the_surfaces_of_another_study(tmp_path, first, command
     """Bones stick out of the skin's flat end, which is no coordinate plane: it is the cut."""
     results = first[0].results
     study = second(tmp_path, first, surfaces_of(results), SCAR.format(results))
-    told = check_study(study, listener=quiet)["facts"]
+    told = check_study(study)["facts"]
     assert sum("the proximal cut is its flat end at" in fact for fact in told) == 1
-    run_study(study, until="sites", listener=quiet)
+    run_study(study, until="sites")
     before, after = load_anatomy(results / "surfaces"), load_anatomy(study.results / "surfaces")
     assert after.cut_normal == pytest.approx(before.cut_normal, abs=1e-6)
     assert abs(before.height(after.cut_point)) < 1e-3
@@ -132,10 +128,10 @@ def test_a_bone_that_reaches_out_where_no_end_is_flat_names_the_key(tmp_path, fi
     with pytest.raises(
         SurfaceError, match=r"all at one end of the limb; .* say where: geometry\.proximal_cut"
     ):
-        check_study(second(tmp_path, first, text, SCAR.format(results)), listener=quiet)
+        check_study(second(tmp_path, first, text, SCAR.format(results)))
     cut = f"{{ point = {limb.cut_point.tolist()}, normal = {limb.cut_normal.tolist()} }}"
     study = second(tmp_path, first, text, SCAR.format(results), cut=cut)
-    check_study(study, listener=quiet)
+    check_study(study)
 
 
 @pytest.mark.parametrize(("key", "file"), [("labels", "labels.seg.nrrd"), ("contours", "contours.csv")])
@@ -144,7 +140,7 @@ def test_its_labels_and_contours_are_those_of_another_study(tmp_path, first, key
     shutil.copy(first[0].path("image.nii.gz"), tmp_path)
     text = IMAGE.replace('labels = "given.seg.nrrd"', f'{key} = "{results}/segment/{file}"')
     study = second(tmp_path, first, text)
-    run_study(study, until="segment", listener=quiet)
+    run_study(study, until="segment")
     before, after = (read_labels(of / "segment" / "labels.seg.nrrd") for of in (results, study.results))
     assert (
         {"soft tissue", "tibia", "fibula", "scar"} <= set(after.names.values()) <= set(before.names.values())

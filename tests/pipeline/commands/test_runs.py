@@ -19,7 +19,7 @@ import psutil
 import pytest
 
 from conftest import write_trace
-from limbfit import Progress, diagnose, report_study, run_batch, run_study, study_status
+from limbfit import diagnose, report_study, run_batch, run_study, study_status
 from limbfit.errors import InputError, RunError
 from limbfit.execution import Limits, SerialExecutor, make_executor, share_executor
 from limbfit.pipeline.commands.doctor import compress_test_cube, judge_self_test
@@ -29,10 +29,6 @@ from limbfit.pipeline.engine.store import LOCK, is_held, lock
 from limbfit.study import load_study
 
 STORED = Path(__file__).parents[2] / "results" / "stored"
-
-
-def quiet(event: Progress) -> None:
-    """A listener that does nothing."""
 
 
 @pytest.fixture
@@ -50,7 +46,7 @@ def rows_of(study) -> dict[str, dict]:
 
 
 def test_status_names_the_setting_and_the_input_that_changed(alone):
-    run_study(load_study(alone), until="traces", listener=quiet)
+    run_study(load_study(alone), until="traces")
     assert rows_of(alone)["traces"]["state"] == "done"
     file = alone / "study.toml"
     file.write_text(file.read_text() + "[traces]\nsmoothing = 0.5\n")
@@ -79,7 +75,7 @@ def test_stages_are_done_anew_where_asked_for(alone):
 
 
 def test_a_report_of_what_there_is_before_a_run_is_not_that_of_the_run(alone):
-    report_study(load_study(alone), listener=quiet)
+    report_study(load_study(alone))
     row = rows_of(alone)["report"]
     assert (row["state"], row["why"]) == ("stale", ["stage predict changed"])
 
@@ -89,10 +85,10 @@ def test_the_log_tells_what_happened_and_no_names_of_files(alone):
     (alone / "2.csv").rename(secret)
     file = alone / "study.toml"
     file.write_text(file.read_text().replace("2.csv", secret.name))
-    run_study(load_study(alone), until="sites", listener=quiet)
+    run_study(load_study(alone), until="sites")
     secret.write_text("time_s,displacement_mm,force_N\n0,0,zero\n")
     with pytest.raises(InputError, match=r"Doe\^Jane"):
-        run_study(load_study(alone), until="traces", listener=quiet)
+        run_study(load_study(alone), until="traces")
     first, second = sorted((alone / "results/log").glob("*.jsonl"))
     events = [json.loads(line) for line in first.read_text().splitlines()]
     assert [events[0]["event"], events[-1]["event"]] == ["begin", "end"]
@@ -126,20 +122,20 @@ def test_a_run_until_a_stage_tells_nothing_of_later_stages_that_are_not_up_to_da
         shutil.copy(STORED / name, alone / "results" / name)
     (alone / "results" / "report").mkdir()
     (alone / "results" / "report" / "report.html").touch()
-    summary = run_study(load_study(alone), until="traces", listener=quiet)
+    summary = run_study(load_study(alone), until="traces")
     assert summary.keys() == {"study", "results", "until"}
-    (row,) = run_batch([alone], until="traces", workers=1, listener=quiet)
+    (row,) = run_batch([alone], until="traces", workers=1)
     assert (row["mean_error_fitted_percent"], row["report"]) == (None, None)
     predicted = alone / "results" / "predict" / "predict.json"
     predicted.write_text(predicted.read_text().replace("{", '{"of another version": 1,', 1))
-    assert run_study(load_study(alone), until="traces", listener=quiet) == summary
+    assert run_study(load_study(alone), until="traces") == summary
 
 
 def test_a_stage_whose_stamp_is_cut_short_is_made_anew(alone):
-    run_study(load_study(alone), until="traces", listener=quiet)
+    run_study(load_study(alone), until="traces")
     (alone / "results" / "traces" / "stage.json").write_text("")  # as a power cut leaves it
     assert rows_of(alone)["traces"]["state"] == "missing"
-    run_study(load_study(alone), until="traces", listener=quiet)
+    run_study(load_study(alone), until="traces")
     assert rows_of(alone)["traces"]["state"] == "done"
 
 
@@ -193,14 +189,14 @@ def test_a_study_that_another_user_runs_counts_as_held(alone):
 def test_a_folder_that_cannot_be_written_is_one_clear_line(alone):
     (alone / "results").mkdir(mode=0o500)
     with without_rights(), pytest.raises(RunError, match="no permission to write"):
-        run_study(load_study(alone), until="traces", listener=quiet)
+        run_study(load_study(alone), until="traces")
 
 
 def test_a_batch_lists_failures_and_does_the_rest(alone, tmp_path):
     broken = shutil.copytree(alone, tmp_path / "broken")
     (broken / "1.csv").write_text("nothing\n")
     paths = [alone, broken, tmp_path / "missing"]
-    rows = list(run_batch(paths, until="traces", workers=1, listener=quiet))
+    rows = list(run_batch(paths, until="traces", workers=1))
     assert [row["state"] for row in rows] == ["done", "failed", "failed"]
     assert rows[0]["error"] is None
     assert "no such study" in rows[2]["error"]
@@ -211,7 +207,7 @@ def test_a_batch_lists_failures_and_does_the_rest(alone, tmp_path):
 def test_forty_studies_leave_no_growth_in_the_parent(alone, tmp_path):
     paths = [shutil.copytree(alone, tmp_path / f"s{i}") for i in range(40)]
     sizes = []
-    for row in run_batch(paths, until="traces", workers=2, listener=quiet):
+    for row in run_batch(paths, until="traces", workers=2):
         assert row["state"] == "done", row
         sizes.append(psutil.Process().memory_info().rss / 1e6)
     assert sizes[-1] - sizes[9] < 20.0, sizes
@@ -236,7 +232,7 @@ def test_no_room_for_a_file_is_one_clear_line_and_the_run_goes_on_later(alone):
     assert "written" in done.stderr.splitlines()[-1]
     assert "internal error" not in done.stderr
     assert "Traceback" not in done.stderr
-    run_study(load_study(alone), until="traces", listener=quiet)
+    run_study(load_study(alone), until="traces")
     assert rows_of(alone)["traces"]["state"] == "done"
 
 
@@ -264,7 +260,7 @@ def test_a_full_and_a_read_only_disk_are_one_clear_line(alone, how):
     assert last.startswith("error: ")
     assert re.search("disk is full|file system is read-only", last), last
     assert all(re.match(r"\[ *[\d.]+ s\] ", line) for line in progress), progress
-    run_study(load_study(alone), until="traces", listener=quiet)
+    run_study(load_study(alone), until="traces")
 
 
 def test_the_self_test_knows_its_answer():

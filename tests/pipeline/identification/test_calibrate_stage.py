@@ -14,7 +14,7 @@ from layered import store_blocks
 from limbfit.errors import StudyError
 from limbfit.execution import Limits, SerialExecutor, make_executor
 from limbfit.indentation import to_vector
-from limbfit.pipeline.engine.context import Context, Progress
+from limbfit.pipeline.engine.context import Context, ignore_progress
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
@@ -66,10 +66,6 @@ def write_study(folder: Path, more: str = COARSE_MESHES) -> Study:
     return load_study(folder)
 
 
-def quiet(event: Progress) -> None:
-    """A listener that does nothing."""
-
-
 class Disturbed(SerialExecutor):
     """Fails simulations at random, or is interrupted after some."""
 
@@ -88,7 +84,7 @@ class Disturbed(SerialExecutor):
 
 def calibrated(study: Study, store: Store, executor=None) -> dict:
     store["calibrate"].mkdir(exist_ok=True)
-    run_calibrate(Context(study, store, executor or SerialExecutor(), quiet), store["calibrate"])
+    run_calibrate(Context(study, store, executor or SerialExecutor(), ignore_progress), store["calibrate"])
     return store.results.calibration.to_plain()
 
 
@@ -131,7 +127,7 @@ def test_two_meshes_give_the_fine_one_s_answer_with_the_coarse_one_s_derivatives
 def test_held_out_sites_are_predicted_on_the_fine_mesh(blocks):
     study, store, _ = blocks
     store["predict"].mkdir(exist_ok=True)
-    run_predict(Context(study, store, SerialExecutor(), quiet), store["predict"])
+    run_predict(Context(study, store, SerialExecutor(), ignore_progress), store["predict"])
     predicted = store.results.predict.to_plain()
     assert predicted["mean_error_fitted_percent"] < 1.0
     assert predicted["mean_error_heldout_percent"] < 1.5

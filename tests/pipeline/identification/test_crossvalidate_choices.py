@@ -17,7 +17,7 @@ from limbfit.identify.checks.crossvalidation import list_choices, rank_fold, spr
 from limbfit.identify.fit.objective import MeasuredCurve
 from limbfit.identify.fit.parameters import build_space
 from limbfit.identify.uncertainty.emulator import Emulator
-from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.engine.context import Context, ignore_progress
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.crossvalidation import _build_result, _check_folds, _fit_choices
 from limbfit.pipeline.identification.problem import build_problem
@@ -52,7 +52,7 @@ def found(tmp_path):
     for name in ("skin.stl", "0.csv", "1.csv", "2.csv"):
         (tmp_path / name).touch()
     study = load_study(tmp_path)
-    context = Context(study, Store(study.results), None, lambda event: None)
+    context = Context(study, Store(study.results), None, ignore_progress)
     problem = build_problem(study)
     best = ANSWER.start.copy()
     best[[3, 7]] = 0.4  # tied

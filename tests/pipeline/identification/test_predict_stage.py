@@ -17,7 +17,7 @@ from limbfit.execution import SerialExecutor
 from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_parameters, to_vector
 from limbfit.indentation import simulating as indentation
 from limbfit.mesh import write_vtu
-from limbfit.pipeline.engine.context import Context
+from limbfit.pipeline.engine.context import Context, ignore_progress
 from limbfit.pipeline.engine.storage import write_json
 from limbfit.pipeline.engine.store import COARSE, Store
 from limbfit.pipeline.identification.predict import run_predict
@@ -104,7 +104,7 @@ class Blocks:
         """The stage's rows by site; some simulations lost, some done anew."""
         folder.mkdir()
         executor = Losing(self.known, lost, anew)
-        run_predict(Context(self.study, self.store, executor, lambda event: None), folder)
+        run_predict(Context(self.study, self.store, executor, ignore_progress), folder)
         return {row["site"]: row for row in json.loads((folder / "predict.json").read_text())["sites"]}
 
 

@@ -15,7 +15,7 @@ from limbfit.identify.fit.parameters import Unknowns, build_stage_groupings, gro
 from limbfit.indentation import SimulationJob, list_flat_names, simulate, to_parameters, to_vector
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.commands.run import compute_keys
-from limbfit.pipeline.engine.context import Context, Progress
+from limbfit.pipeline.engine.context import Context, ignore_progress
 from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.identification.problem import build_unknowns
@@ -54,10 +54,6 @@ def write_study(folder: Path, more: str = "", sites: tuple[tuple[str, bool], ...
         text += SITE.format(name=name, fitted=str(fitted).lower())
     (folder / "study.toml").write_text(text, encoding="utf-8")
     return load_study(folder)
-
-
-def quiet(event: Progress) -> None:
-    """A listener that does nothing."""
 
 
 def test_flat_vectors_go_by_tissue_then_parameter():
@@ -220,7 +216,7 @@ def test_three_tissues_are_identified_from_blocks_and_reported(tmp_path):
     sites = tuple((name, fitted) for name, (_, _, fitted) in BLOCKS.items())
     study = write_study(tmp_path, LAYERS + "[calibration]\nrelative_tolerance = 1e-4\n", sites)
     store = store_blocks(study, BLOCKS, TRUTH, 4)
-    context = Context(study, store, SerialExecutor(), quiet)
+    context = Context(study, store, SerialExecutor(), ignore_progress)
     for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
         store[stage].mkdir()
         run(context, store[stage])
