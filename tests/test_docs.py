@@ -13,6 +13,7 @@ import pytest
 
 import limbfit
 from conftest import coarse_mesh, write_trace
+from editing import append
 from limbfit.pipeline.commands.experiments import EXPERIMENTS
 from limbfit.study import Study
 
@@ -156,8 +157,7 @@ def test_python_of_the_readme_runs(
 ) -> None:
     """As a script, on a study that is small: from its inputs to its report."""
     settings = coarse_mesh(edge_near_mm=12.0).replace("load_steps = 4", "load_steps = 2")
-    with (study / "study.toml").open("a") as stream:
-        stream.write(f"{settings}[calibration]\nmax_iterations = 1\nfixed = {FIXED}\n")
+    append(study, f"{settings}[calibration]\nmax_iterations = 1\nfixed = {FIXED}\n")
     for name in ("1.csv", "2.csv"):
         write_trace(study / name, rate=20.0)
     study.rename(study.parent / "patient")

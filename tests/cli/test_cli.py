@@ -12,17 +12,11 @@ import pytest
 import pyvista as pv
 import typer
 
+from editing import append, edit
 from limbfit import __version__
 from limbfit.cli.app import GROUPS, app
 from limbfit.cli.commands import show_findings, show_summary
 from limbfit.cli.console import print_line, print_table
-
-
-def edit(study, old: str, new: str) -> None:
-    file = study / "study.toml"
-    text = file.read_text()
-    assert old in text
-    file.write_text(text.replace(old, new))
 
 
 @pytest.fixture
@@ -107,8 +101,7 @@ hold_s = 3600.0
 
 def test_check_says_what_goes_beyond_the_fitted_records(limbfit, commands_unasked, study, capsys):
     """A site a quarter around the limb, one that is planned deep and fast, and a load of an hour."""
-    file = study / "study.toml"
-    file.write_text(file.read_text() + PLANNED)
+    append(study, PLANNED)
     code, out, _ = limbfit("check", study, "--json")
     found = json.loads(out)
     assert code == 0

@@ -16,6 +16,7 @@ import pytest
 from test_execution import die, heard, nap, refuse, solve, threads, told
 
 from conftest import COARSE
+from editing import append
 from limbfit import run_study
 from limbfit.errors import InputError, TraceError
 from limbfit.execution import THREAD_VARIABLES, DaskExecutor, Limits, SerialExecutor
@@ -120,9 +121,8 @@ position = {}
 @pytest.mark.slow
 def test_a_study_on_a_cluster_that_loses_a_worker_every_twenty_seconds_has_the_same_bits(study, tmp_path):
     """Three workers, the study through ``--scheduler``; beside it the same study in one process."""
-    file = study / "study.toml"
     more = SITES.format("3", [-40.0, 0.0, 60.0]) + SITES.format("4", [0.0, -40.0, 60.0])
-    file.write_text(file.read_text() + more + COARSE.replace("tet4", "tet10"))
+    append(study, more + COARSE.replace("tet4", "tet10"))
     alone = shutil.copytree(study, tmp_path / "alone")
     run_study(load_study(alone), until="predict")
     run_study(load_study(study), until="mesh")

@@ -8,6 +8,7 @@ from importlib import import_module
 import pytest
 
 from conftest import write_trace
+from editing import edit
 from limbfit import Progress, run_experiment, study_status
 from limbfit.errors import InputError, RunError
 from limbfit.pipeline.commands.experiments import EXPERIMENTS, Experiment, register_experiment
@@ -53,11 +54,6 @@ def state(study, name: str = "peaks") -> str:
     return rows.get(name, "missing")
 
 
-def change(study, old: str, new: str) -> None:
-    file = study / "study.toml"
-    file.write_text(file.read_text().replace(old, new))
-
-
 def test_an_experiment_is_done_once_after_the_stages_it_needs(study):
     assert state(study) == "missing"
     found = run_experiment(load_study(study), "peaks")
@@ -98,10 +94,10 @@ def test_options_settings_and_records_decide_an_experiment(study):
     twice = run_experiment(load_study(study), "peaks", factor=2.0)
     assert twice["peaks_N"]["1"] == pytest.approx(2 * once["peaks_N"]["1"])
     assert state(study) == "done"  # judged with the options that it was run with
-    change(study, "[surfaces]", "[material]\nkappa_ratio = 50\n[surfaces]")
+    edit(study, "[surfaces]", "[material]\nkappa_ratio = 50\n[surfaces]")
     assert state(study) == "stale"
     run_experiment(load_study(study), "peaks")
-    change(study, 'trace = "2.csv"', 'trace = "1.csv"')
+    edit(study, 'trace = "2.csv"', 'trace = "1.csv"')
     assert state(study) == "stale"
 
 
@@ -110,7 +106,7 @@ def test_what_was_done_with_identified_parameters_is_stale_where_others_are_iden
     """It does not need the calibration; it says that its parameters are from there."""
     run_experiment(load_study(study), "peaks", parameters_from=origin)
     assert state(study) == "done"
-    change(study, "[surfaces]", "[calibration]\nmax_iterations = 3\n[surfaces]")
+    edit(study, "[surfaces]", "[calibration]\nmax_iterations = 3\n[surfaces]")
     assert state(study) == after
     (row,) = [row for row in study_status(load_study(study)) if row["stage"] == "peaks"]
     assert row["why"] == ["stage calibrate changed"] * (after == "stale")

@@ -17,6 +17,7 @@ import psutil
 import pytest
 
 from conftest import COARSE
+from editing import append
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.commands.run import STAGE_NAMES
 
@@ -105,8 +106,7 @@ def killed(folder: Path, after_lines: int, and_s: float, workers: int) -> str:
 @pytest.mark.slow
 @pytest.mark.parametrize("kills", [3, 30])
 def test_a_run_killed_at_random_moments_ends_the_same(study, tmp_path, kills):
-    file = study / "study.toml"
-    file.write_text(file.read_text() + COARSE)
+    append(study, COARSE)
     straight = shutil.copytree(study, tmp_path / "straight")
     lines, random = finish(straight, 1), np.random.default_rng(7)
     for i in range(kills):
@@ -134,8 +134,7 @@ def test_a_run_killed_at_random_moments_ends_the_same(study, tmp_path, kills):
 @pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("at", ["mesh 0/2", "evaluation 2"])
 def test_an_interrupt_ends_the_run_with_its_workers_and_meshers(study, workers, at):
-    file = study / "study.toml"
-    file.write_text(file.read_text() + COARSE)
+    append(study, COARSE)
     run = begin(study, workers)
     while at not in (line := run.stderr.readline()):
         assert line, "the run ended before"

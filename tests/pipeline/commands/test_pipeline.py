@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from conftest import COARSE
+from editing import append, edit
 from limbfit import Progress, run_study, simulate_site, study_status
 from limbfit.errors import InputError
 from limbfit.mesh import read_vtu
@@ -17,8 +18,7 @@ from limbfit.study import load_study
 
 @pytest.fixture
 def coarse(study):
-    file = study / "study.toml"
-    file.write_text(file.read_text() + COARSE)
+    append(study, COARSE)
     return study
 
 
@@ -118,8 +118,7 @@ def check_identified_parameters_are_used_until_stale(study) -> None:
     identified = json.loads((study / "results/calibrate/calibration.json").read_text())["stages"][-1]
     assert found["parameters_from"] == "identified"
     assert found["parameters"] == identified["parameters"]
-    file = study / "study.toml"
-    file.write_text(file.read_text() + "lower = { c_kPa = 0.1, m = 2.0, gamma = 0.01, tau_s = 0.01 }\n")
+    append(study, "lower = { c_kPa = 0.1, m = 2.0, gamma = 0.01, tau_s = 0.01 }\n")
     with pytest.raises(InputError, match=r"identified parameters are stale.*limbfit run.*--parameters"):
         simulate_site(load_study(study), "1")
     given = {tissue: {**values, "c_kPa": 5.0} for tissue, values in identified["parameters"].items()}
@@ -128,9 +127,8 @@ def check_identified_parameters_are_used_until_stale(study) -> None:
 
 @pytest.mark.slow
 def test_planned_indentation_is_simulated_without_a_record(coarse):
-    file = coarse / "study.toml"
     planned = "depth_mm = 3.0\nposition = [0.0, 40.0, 50.0]"
-    file.write_text(file.read_text().replace('trace = "2.csv"\nposition = [0.0, 40.0, 50.0]', planned))
+    edit(coarse, 'trace = "2.csv"\nposition = [0.0, 40.0, 50.0]', planned)
     steps = coarse / "results/simulate/2.pvd"  # of an animation that was made before
     steps.parent.mkdir(parents=True)
     steps.write_text("")
@@ -158,8 +156,7 @@ start = { c_kPa = 3.0 }
 
 @pytest.mark.slow
 def test_three_tissues_from_surfaces_to_report(coarse):
-    file = coarse / "study.toml"
-    file.write_text(file.read_text() + LAYERS)
+    append(coarse, LAYERS)
     summary = run_study(load_study(coarse))
     tissues = ("skin", "fat", "calf")
     assert tuple(summary["parameters"]) == tuple(summary["intervals_95"]) == tissues
@@ -177,7 +174,7 @@ def test_three_tissues_from_surfaces_to_report(coarse):
     assert "outermost first: skin (2.0 mm), fat (6.0 mm)" in report
     before = {row["stage"]: row["state"] for row in study_status(load_study(coarse))}
     assert set(before.values()) == {"done"}
-    file.write_text(file.read_text().replace('"calf"', '"muscle"'))
+    edit(coarse, '"calf"', '"muscle"')
     after = {row["stage"]: row["state"] for row in study_status(load_study(coarse))}
     assert {after[stage] for stage in ("mesh", "calibrate", "predict", "report")} == {"stale"}
     assert after["traces"] == "done"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from conftest import COARSE
+from editing import append, edit
 from limbfit import Progress, reproduce_study, run_study
 from limbfit.anatomy.grid import Volume
 from limbfit.anatomy.imaging import read_volume, write_volume
@@ -86,8 +87,7 @@ def test_an_attempt_that_was_ended_while_it_copied_goes_on(study, tmp_path):
 
 @pytest.mark.slow
 def test_a_study_comes_out_the_same_and_a_changed_one_is_refused(study, tmp_path):
-    file = study / "study.toml"
-    file.write_text(file.read_text() + COARSE)
+    append(study, COARSE)
     run_study(load_study(study))
     record = study / "results/run.json"
     known = json.loads(record.read_text())
@@ -99,7 +99,7 @@ def test_a_study_comes_out_the_same_and_a_changed_one_is_refused(study, tmp_path
     assert found["versions"]["numpy"][0] == "1.0"
     with pytest.raises(InputError, match="holds something else"):
         reproduce_study(record, study / "results")
-    file.write_text(file.read_text().replace("max_iterations = 2", "max_iterations = 3"))
+    edit(study, "max_iterations = 2", "max_iterations = 3")
     with pytest.raises(InputError, match="has changed since: calibration"):
         reproduce_study(record, tmp_path / "other")
     (study / "1.csv").write_text((study / "1.csv").read_text() + "\n")

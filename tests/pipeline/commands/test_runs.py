@@ -19,6 +19,7 @@ import psutil
 import pytest
 
 from conftest import write_trace
+from editing import append, edit
 from limbfit import diagnose, report_study, run_batch, run_study, study_status
 from limbfit.errors import InputError, RunError
 from limbfit.execution import Limits, SerialExecutor, make_executor, share_executor
@@ -34,8 +35,7 @@ STORED = Path(__file__).parents[2] / "results" / "stored"
 @pytest.fixture
 def alone(study):
     """The study on this process alone, with records of few samples."""
-    file = study / "study.toml"
-    file.write_text(file.read_text() + "[execution]\nworkers = 1\n")
+    append(study, "[execution]\nworkers = 1\n")
     for name in ("1.csv", "2.csv"):
         write_trace(study / name, rate=20.0)
     return study
@@ -48,8 +48,7 @@ def rows_of(study) -> dict[str, dict]:
 def test_status_names_the_setting_and_the_input_that_changed(alone):
     run_study(load_study(alone), until="traces")
     assert rows_of(alone)["traces"]["state"] == "done"
-    file = alone / "study.toml"
-    file.write_text(file.read_text() + "[traces]\nsmoothing = 0.5\n")
+    append(alone, "[traces]\nsmoothing = 0.5\n")
     rows = rows_of(alone)
     assert rows["traces"]["why"] == ["setting traces.smoothing changed"]
     assert rows["surfaces"]["why"] == []
@@ -83,8 +82,7 @@ def test_a_report_of_what_there_is_before_a_run_is_not_that_of_the_run(alone):
 def test_the_log_tells_what_happened_and_no_names_of_files(alone):
     secret = alone / "Doe^Jane.csv"
     (alone / "2.csv").rename(secret)
-    file = alone / "study.toml"
-    file.write_text(file.read_text().replace("2.csv", secret.name))
+    edit(alone, "2.csv", secret.name)
     run_study(load_study(alone), until="sites")
     secret.write_text("time_s,displacement_mm,force_N\n0,0,zero\n")
     with pytest.raises(InputError, match=r"Doe\^Jane"):
@@ -103,16 +101,15 @@ def test_the_log_tells_what_happened_and_no_names_of_files(alone):
 
 def test_a_log_names_no_folder_with_spaces_and_keeps_words_that_hold_the_name_of_an_input(alone):
     (alone / "e").mkdir()
-    file = alone / "study.toml"
     (alone / "1.csv").rename(alone / "e" / "ring")
-    file.write_text(file.read_text().replace("1.csv", "e/ring"))
+    edit(alone, "1.csv", "e/ring")
     study = load_study(alone)
     said = redact_paths(
         r"touring: e/ring is not C:\Users\Jane Doe\scan.dcm, nor /home/Jane Q Doe/x/y.dcm", study
     )
     assert said == "touring: <sites.1.trace> is not <path>, nor <path>"
     (alone / "ring").write_bytes((alone / "e" / "ring").read_bytes())
-    file.write_text(file.read_text().replace("e/ring", "ring"))
+    edit(alone, "e/ring", "ring")
     assert redact_paths("touring with ring", load_study(alone)) == "touring with <sites.1.trace>"
 
 
