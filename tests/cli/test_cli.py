@@ -222,7 +222,8 @@ def open_skin(study):
 
 def rewrite(study, change) -> None:
     table = np.loadtxt(study / "1.csv", delimiter=",", skiprows=1)
-    header = change(table) or "time_s,displacement_mm,force_N"
+    change(table)
+    header = "time_s,displacement_mm,force_N"
     np.savetxt(study / "1.csv", table, delimiter=",", header=header, comments="")
 
 
@@ -232,10 +233,6 @@ def spoil_nan(table):
 
 def spoil_time(table):
     table[100, 0] = table[90, 0]
-
-
-def spoil_columns(table):
-    return "t,x,F"
 
 
 def spoil_contact(table):
@@ -269,7 +266,6 @@ SPOILT = {
     ),
     "no number": (lambda s: rewrite(s, spoil_nan), ("1.csv", "force_N")),
     "time that goes back": (lambda s: rewrite(s, spoil_time), ("1.csv", "time")),
-    "other columns": (lambda s: rewrite(s, spoil_columns), ("1.csv", "time_s")),
     "no contact": (lambda s: rewrite(s, spoil_contact), ("1.csv", "contact")),
     "metres": (lambda s: rewrite(s, spoil_unit), ("1.csv", "mm")),
 }

@@ -104,12 +104,11 @@ def killed(folder: Path, after_lines: int, and_s: float, workers: int) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kills", [3, 30])
-def test_a_run_killed_at_random_moments_ends_the_same(study, tmp_path, kills):
+def test_a_run_killed_at_random_moments_ends_the_same(study, tmp_path):
     append(study, COARSE)
     straight = shutil.copytree(study, tmp_path / "straight")
     lines, random = finish(straight, 1), np.random.default_rng(7)
-    for i in range(kills):
+    for i in range(30):
         after, and_s = int(random.integers(lines)), float(random.uniform(0.0, 1.0))
         folder, workers = shutil.copytree(study, tmp_path / f"killed-{i}"), 1 + i % 2
         results = folder / "results"

@@ -59,11 +59,8 @@ def changed(study: Study, name: str) -> set[str]:
     ("name", "stages"),
     [
         ("two-terms", {"calibrate", "predict", "report"}),
-        ("power", {"calibrate", "predict", "report"}),
-        (FUNG, {"calibrate", "predict", "report"}),
         ("fibres", {"calibrate", "predict", "report"}),
         ("thinner", {"surfaces", "sites", "mesh", "calibrate", "predict", "report"}),
-        ("thicker", {"surfaces", "sites", "mesh", "calibrate", "predict", "report"}),
         ("friction", {"sites", "mesh", "calibrate", "predict", "report"}),
     ],
 )

@@ -128,14 +128,6 @@ def test_a_run_until_a_stage_tells_nothing_of_later_stages_that_are_not_up_to_da
     assert run_study(load_study(alone), until="traces") == summary
 
 
-def test_a_stage_whose_stamp_is_cut_short_is_made_anew(alone):
-    run_study(load_study(alone), until="traces")
-    (alone / "results" / "traces" / "stage.json").write_text("")  # as a power cut leaves it
-    assert rows_of(alone)["traces"]["state"] == "missing"
-    run_study(load_study(alone), until="traces")
-    assert rows_of(alone)["traces"]["state"] == "done"
-
-
 def test_the_record_of_a_run_names_no_program_and_no_extension(alone, tmp_path):
     outside = tmp_path / "jane"
     outside.mkdir()

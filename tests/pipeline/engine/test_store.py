@@ -78,13 +78,15 @@ def test_a_clock_that_a_power_cut_has_left_in_part_starts_anew(tmp_path, left):
     assert store.make("mesh", "a", lambda folder: {}).seconds < 10.0
 
 
-def test_a_stage_whose_result_is_cut_short_is_made_anew(tmp_path):
+def test_a_stage_whose_result_or_stamp_is_cut_short_is_made_anew(tmp_path):
     store = Store(tmp_path)
     store.make("calibrate", "a", lambda folder: write_json(folder / "calibration.json", {"c": 1}) or {})
     whole = (store["calibrate"] / "calibration.json").read_bytes()
     for left in (b"", whole[:-2], bytes(len(whole))):
         (store["calibrate"] / "calibration.json").write_bytes(left)
         assert store.state("calibrate", "a").state == "begun"
+    (store["calibrate"] / "stage.json").write_text("")  # as a power cut leaves it
+    assert store.state("calibrate", "a").state == "missing"
     store.make("calibrate", "a", lambda folder: write_json(folder / "calibration.json", {"c": 1}) or {})
     assert store.state("calibrate", "a").state == "done"
 
