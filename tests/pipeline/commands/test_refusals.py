@@ -139,7 +139,10 @@ def test_what_the_limb_decides_is_said_before_meshing(study):
         design_study(unfitted, depths_mm=(40.0,))
     for change in (BONELESS, FAST, WIDE, BOTH_FITTED):
         given = with_change(study, change)
-    refused = check_study(given)["refused"]
+    found = check_study(given)
+    refused = found["refused"]
+    said = {f"cannot run: limbfit {', '.join(row['commands'])}: {row['why']}" for row in refused}
+    assert said <= set(found["facts"])
     for command, call, words in (
         ("sensitivity --only c", experiment("sensitivity-c"), "the limb has no bone"),
         ("socket design", design_socket, "120 mm is as wide as the socket"),
