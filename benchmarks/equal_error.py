@@ -83,7 +83,8 @@ def tell_times(site: str, ours: list[dict[str, Any]], theirs: list[dict[str, Any
             print(f"{site}: limbfit is not within {goal:g} %")
         elif other is None:
             print(
-                f"{site}, within {goal:g} %: limbfit {own:.1f} s, FEBio over {longest:.0f} s: over {longest / own:.0f}"
+                f"{site}, within {goal:g} %: limbfit {own:.1f} s, FEBio over {longest:.0f} s: "
+                f"over {longest / own:.0f}"
             )
         else:
             print(f"{site}, within {goal:g} %: limbfit {own:.1f} s, FEBio {other:.1f} s: {other / own:.1f}")

@@ -70,8 +70,8 @@ def test_the_mesh_is_no_coarser_than_they_are_wide_and_searched_as_a_whole(tmp_p
 def test_a_clamped_site_is_indented_from_where_its_skin_is_then(context):
     """Force and its derivatives, which follow the place where the indenter touches too.
 
-    Pins on so coarse a skin can come to rest in several places: differences are taken in that of the start, as a
-    search goes from one simulation to the next.
+    Pins on so coarse a skin can come to rest in several places: differences are taken in that of the start,
+    as a search goes from one simulation to the next.
     """
     study = context.study
     model = build_model(context, study.sites[0])
