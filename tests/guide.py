@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from layered import store_blocks
-from limbfit import load_study
+from layered import blocks_study, store_blocks
 from limbfit.execution import Limits, make_executor
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.identification.calibrate import run_calibrate
@@ -35,13 +34,6 @@ edge_near_mm = 6.0
 [calibration]
 tied = {tied}
 """
-SITE = """
-[[sites]]
-name = "{name}"
-fitted = true
-trace = "{name}.csv"
-position = [0.0, 0.0, 0.0]
-"""
 
 
 def from_the_guide(word: str, file: Path) -> Path:
@@ -62,13 +54,9 @@ def identified(
     """
     if extension is not None:
         shutil.copy(extension, folder / extension.name)
-    for name in ("skin.stl", *(f"{name}.csv" for name in BLOCKS)):
-        (folder / name).touch()
     tied = [[f"{tissue}.{key}" for tissue in ("skin", "muscle")] for key in truth]
-    sites = "".join(SITE.format(name=name) for name in BLOCKS)
-    text = TEXT.format(extensions=[extension.name] if extension else [], tied=tied) + stated + sites
-    (folder / "study.toml").write_text(text, encoding="utf-8")
-    study = load_study(folder)
+    text = TEXT.format(extensions=[extension.name] if extension else [], tied=tied) + stated
+    study = blocks_study(folder, text, dict.fromkeys(BLOCKS, True))
     store = store_blocks(study, BLOCKS, {tissue: dict(truth) for tissue in study.tissues}, 4, coarse=4)
     store["calibrate"].mkdir()
     with make_executor(2, Limits(0.0, 0.0)) as executor:

@@ -63,6 +63,26 @@ def block_study(folder: Path, material: str, more: str = "", site: str = "") -> 
     return load_study(folder)
 
 
+BLOCK_SITE = """
+[[sites]]
+name = "{name}"
+fitted = {fitted}
+trace = "{name}.csv"
+position = [0.0, 0.0, 0.0]
+"""
+
+
+def blocks_study(folder: Path, text: str, sites: Mapping[str, bool]) -> Study:
+    """The study of ``text`` and ``sites``, which are fitted or not; records that are there stay."""
+    for name in ("skin.stl", *(f"{name}.csv" for name in sites)):
+        (folder / name).touch()
+    text += "".join(
+        BLOCK_SITE.format(name=name, fitted=str(fitted).lower()) for name, fitted in sites.items()
+    )
+    (folder / "study.toml").write_text(text, encoding="utf-8")
+    return load_study(folder)
+
+
 def block_context(study: Study, truth: Parameters) -> Context:
     """That of a `block_study`, 18 mm of skin and muscle pressed by 3 mm, up to its records."""
     store = store_blocks(study, {"a": ((3.0, 15.0), 3.0, True)}, truth, 3)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from layered import store_blocks
+from layered import blocks_study, store_blocks
 from limbfit.errors import StudyError
 from limbfit.execution import Limits, SerialExecutor, make_executor
 from limbfit.indentation import to_vector
@@ -20,7 +20,7 @@ from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.identification.problem import build_groupings, build_problem
 from limbfit.priors import SOURCE
-from limbfit.study import Study, load_study
+from limbfit.study import Study
 
 TISSUES = ("skin", "muscle")
 TRUTH = {
@@ -46,24 +46,11 @@ unload_steps = 3
 penalty_per_mm = 100.0
 """
 COARSE_MESHES = "[mesh.coarse]\nedge_near_mm = 6.0\n"
-SITE = """
-[[sites]]
-name = "{name}"
-fitted = {fitted}
-trace = "{name}.csv"
-position = [0.0, 0.0, 0.0]
-"""
 
 
 def write_study(folder: Path, more: str = COARSE_MESHES) -> Study:
     """Blocks as sites of a study."""
-    text = TEXT + more
-    for name, (_, _, fitted) in BLOCKS.items():
-        text += SITE.format(name=name, fitted=str(fitted).lower())
-        (folder / f"{name}.csv").touch()
-    (folder / "skin.stl").touch()
-    (folder / "study.toml").write_text(text, encoding="utf-8")
-    return load_study(folder)
+    return blocks_study(folder, TEXT + more, {name: fitted for name, (_, _, fitted) in BLOCKS.items()})
 
 
 class Disturbed(SerialExecutor):

@@ -12,7 +12,7 @@ import pytest
 import pyvista as pv
 
 from completing import complete
-from layered import layered_block, store_blocks
+from layered import blocks_study, layered_block, store_blocks
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_parameters, to_vector
 from limbfit.indentation import simulating as indentation
@@ -24,7 +24,7 @@ from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.simulation.simulations import compute_job_digest
 from limbfit.results.curves import read_curves
 from limbfit.results.identification import CalibrationResult
-from limbfit.study import Study, load_study
+from limbfit.study import Study
 
 TISSUES = ("skin", "muscle")
 TRUTH = {
@@ -35,7 +35,6 @@ BEST = to_vector(TRUTH, TISSUES)
 ONE = np.tile([6.0, 5.0, 2.5, 0.4], 2)
 # thickness of skin and muscle, depth, whether fitted
 BLOCKS = {"near": ((3.0, 9.0), 2.5, True), "aside": ((3.0, 13.0), 3.5, False)}
-SITE = '[[sites]]\nname = "{0}"\nfitted = {1}\ntrace = "{0}.csv"\nposition = [0.0, 0.0, 0.0]\n'
 TEXT = """
 [study]
 name = "two blocks"
@@ -111,14 +110,8 @@ class Blocks:
 @pytest.fixture(scope="module")
 def blocks(tmp_path_factory) -> Blocks:
     """Two blocks identified at the truth, with two materials and with one."""
-    folder = tmp_path_factory.mktemp("blocks")
-    text = TEXT
-    for name, (_, _, fitted) in BLOCKS.items():
-        text += SITE.format(name, str(fitted).lower())
-        (folder / f"{name}.csv").touch()
-    (folder / "skin.stl").touch()
-    (folder / "study.toml").write_text(text, encoding="utf-8")
-    study = load_study(folder)
+    fitted = {name: fitted for name, (_, _, fitted) in BLOCKS.items()}
+    study = blocks_study(tmp_path_factory.mktemp("blocks"), TEXT, fitted)
     store = store_blocks(study, BLOCKS, TRUTH, 4, coarse=3)
     store["calibrate"].mkdir()
     write_json(store["calibrate"] / "calibration.json", complete(CalibrationResult, calibration()))

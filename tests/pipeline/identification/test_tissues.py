@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from layered import TISSUES, TRUTH, build_block_site, layered_block, store_blocks
+from layered import TISSUES, TRUTH, blocks_study, build_block_site, layered_block, store_blocks
 from limbfit.cli.commands import parse_parameters
 from limbfit.errors import InputError, StudyError
 from limbfit.execution import SerialExecutor
@@ -35,25 +35,11 @@ skin = "skin.stl"
 load_steps = 5
 unload_steps = 4
 """
-SITE = """
-[[sites]]
-name = "{name}"
-fitted = {fitted}
-trace = "{name}.csv"
-position = [0.0, 0.0, 0.0]
-"""
 STEPS = SolverTable(load_steps=5, unload_steps=4)
 
 
 def write_study(folder: Path, more: str = "", sites: tuple[tuple[str, bool], ...] = (("1", True),)) -> Study:
-    text = TEXT + more
-    (folder / "skin.stl").touch()
-    for name, fitted in sites:
-        if not (folder / f"{name}.csv").is_file():
-            (folder / f"{name}.csv").write_text(name)
-        text += SITE.format(name=name, fitted=str(fitted).lower())
-    (folder / "study.toml").write_text(text, encoding="utf-8")
-    return load_study(folder)
+    return blocks_study(folder, TEXT + more, dict(sites))
 
 
 def test_flat_vectors_go_by_tissue_then_parameter():
