@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from importlib import import_module
 
@@ -9,7 +10,7 @@ import pytest
 
 from conftest import write_trace
 from editing import edit
-from limbfit import Progress, run_experiment, study_status
+from limbfit import Progress, run_experiment, run_study, study_status
 from limbfit.errors import InputError, RunError
 from limbfit.pipeline.commands.experiments import EXPERIMENTS, Experiment, register_experiment
 from limbfit.pipeline.commands.run import compute_keys
@@ -36,12 +37,19 @@ def run_peaks(context, folder, *, factor: float = 1.0, parameters_from: str = ""
 PEAKS = Experiment("peaks", run_peaks, needs=("traces",), tables=("material",))
 
 
-@pytest.fixture
-def study(study):
-    """With records of few samples."""
+@pytest.fixture(scope="module")
+def traced(pristine, tmp_path_factory):
+    """The study with records of few samples, after the stages that the experiment needs."""
+    folder = shutil.copytree(pristine, tmp_path_factory.mktemp("traced") / "study")
     for name in ("1.csv", "2.csv"):
-        write_trace(study / name, rate=20.0)
-    return study
+        write_trace(folder / name, rate=20.0)
+    run_study(load_study(folder), until="traces")
+    return folder
+
+
+@pytest.fixture
+def study(traced, tmp_path):
+    return shutil.copytree(traced, tmp_path / "study")
 
 
 @pytest.fixture(autouse=True)
@@ -55,6 +63,7 @@ def state(study, name: str = "peaks") -> str:
 
 
 def test_an_experiment_is_done_once_after_the_stages_it_needs(study):
+    shutil.rmtree(study / "results")
     assert state(study) == "missing"
     found = run_experiment(load_study(study), "peaks")
     assert found["peaks_N"]["1"] == pytest.approx(6.0, abs=0.2)
@@ -80,6 +89,8 @@ def test_a_stopped_experiment_has_begun_and_goes_on_in_its_own_folder(study, opt
 
 
 def test_an_experiment_is_not_done_on_records_that_are_others_by_now(study):
+    shutil.rmtree(study / "results")
+
     def edit(event: Progress) -> None:
         if event.stage == "traces" and event.text.startswith("done"):
             (study / "2.csv").write_bytes((study / "2.csv").read_bytes() + b"\n")
