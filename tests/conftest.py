@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from acquiring import ready
 from browsing import launch, open_page, playwright, serve
 from limbfit.cli import main
 from limbfit.errors import InputError
+from limbfit.fe.solution.compiling import are_compiled
 from limbfit.febio import find_febio
 
 __all__ = ["launch", "open_page", "playwright", "ready", "serve"]
@@ -23,6 +26,14 @@ __all__ = ["launch", "open_page", "playwright", "ready", "serve"]
 # processes that tests interrupt.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """After an installation one process compiles the kernels while tests are collected, not every worker."""
+    if not hasattr(session.config, "workerinput") and not are_compiled():
+        words = "from limbfit.fe.solution.compiling import compile_kernels; compile_kernels()"
+        subprocess.Popen([sys.executable, "-c", words])
+
 
 STUDY = """
 [study]
