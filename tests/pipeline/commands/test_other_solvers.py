@@ -127,9 +127,11 @@ def test_a_site_goes_out_and_its_forces_come_back(coarse, tmp_path):
     solved = simulate_feb(file, out / "febio")
     assert solved["completed"]
     compared = compare_site(coarse, "1", parameters=TISSUES, febio_log=out / "febio" / "1-forces.txt")
-    # a penalty as stiff as limbfit's own: what is left is steps and facets
-    assert compared["limbfit_matched"]["difference"]["max_percent"] < 1.0
-    assert compared["limbfit"]["difference"]["max_percent"] < 1.5
+    # A penalty as stiff as limbfit's own: what is left are facets, and contact along the skin's normal (the
+    # indenter's here), for which the export states 2 %.
+    for which in ("limbfit_matched", "limbfit"):
+        assert compared[which]["difference"]["max_percent"] < 2.0
+    assert "within 2 % of the peak" in found["sites"][0]["notes"][-1]
     assert "as stiff as limbfit's" in found["sites"][0]["notes"][0]
     assert compared["febio"]["completed"]
     stored = json.loads((coarse.results / "compare" / "1.json").read_text())
