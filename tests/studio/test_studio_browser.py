@@ -146,7 +146,8 @@ def _token(page) -> str:
 @pytest.mark.slow
 def test_a_run_outlives_its_server(study, coarse_settings, serve, open_page):
     file = study / "study.toml"
-    file.write_text(file.read_text() + coarse_settings)
+    longer = coarse_settings.replace("edge_near_mm = 8.0", "edge_near_mm = 4.0")  # than a server starts
+    file.write_text(file.read_text() + longer)
     page = open_page(serve(study) + "#/identification")
     page.locator("#run-start").click()
     until(
