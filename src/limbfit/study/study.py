@@ -11,47 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
+from .. import laws
 from ..errors import InputError, StudyError
-from ..laws import (
-    FIBRE_KEYS,
-    LAWS,
-    OGDEN,
-    POWER,
-    Parameters,
-    TissueLaw,
-    has_fibres,
-    is_ogden,
-    list_flat_names,
-    to_parameters,
-    to_vector,
-)
 from ..priors import of_tissues
 from ..relaxation import choose_relaxation_times
+from . import tables
 from .material import MaterialTable
 from .meshing import MeshTable, list_indenter_widths, replace_edges
 from .records import RECORDED, STORED_ENDINGS, Indentation, Record, RecordTable, Site, list_records
 from .socket import SocketTable
-from .tables import (
-    AcquireTable,
-    CalibrationTable,
-    ClampsTable,
-    ExecutionTable,
-    FebioTable,
-    GeometryTable,
-    ImageTable,
-    IndenterTable,
-    MarkupsTable,
-    PriorTable,
-    SegmentationTable,
-    SolverTable,
-    StudyTable,
-    SurfacesTable,
-    TomlTable,
-    TracesTable,
-    UncertaintyTable,
-    Vector,
-    find_repeated,
-)
 
 
 def _replace_lists(content: Any) -> Any:
@@ -61,29 +29,29 @@ def _replace_lists(content: Any) -> Any:
     return tuple(map(_replace_lists, content)) if isinstance(content, list) else content
 
 
-class Study(TomlTable):
+class Study(tables.TomlTable):
     """A checked study; ``folder`` is where it lives, ``notes`` what its user should know."""
 
-    study: StudyTable
-    image: ImageTable | None = None
-    segmentation: SegmentationTable = SegmentationTable()
-    surfaces: SurfacesTable | None = None
-    geometry: GeometryTable = GeometryTable()
+    study: tables.StudyTable
+    image: tables.ImageTable | None = None
+    segmentation: tables.SegmentationTable = tables.SegmentationTable()
+    surfaces: tables.SurfacesTable | None = None
+    geometry: tables.GeometryTable = tables.GeometryTable()
     mesh: MeshTable = MeshTable()
-    indenter: IndenterTable = IndenterTable()
-    indenters: dict[str, IndenterTable] = Field(default={})
-    clamps: ClampsTable | None = None
-    traces: TracesTable = TracesTable()
-    markups: MarkupsTable | None = None
+    indenter: tables.IndenterTable = tables.IndenterTable()
+    indenters: dict[str, tables.IndenterTable] = Field(default={})
+    clamps: tables.ClampsTable | None = None
+    traces: tables.TracesTable = tables.TracesTable()
+    markups: tables.MarkupsTable | None = None
     sites: tuple[Site, ...]
     records: tuple[RecordTable, ...] = ()
     material: MaterialTable = MaterialTable()
-    calibration: CalibrationTable = CalibrationTable()
-    uncertainty: UncertaintyTable = UncertaintyTable()
-    solver: SolverTable = SolverTable()
-    febio: FebioTable = FebioTable()
-    execution: ExecutionTable = ExecutionTable()
-    acquire: AcquireTable = AcquireTable()
+    calibration: tables.CalibrationTable = tables.CalibrationTable()
+    uncertainty: tables.UncertaintyTable = tables.UncertaintyTable()
+    solver: tables.SolverTable = tables.SolverTable()
+    febio: tables.FebioTable = tables.FebioTable()
+    execution: tables.ExecutionTable = tables.ExecutionTable()
+    acquire: tables.AcquireTable = tables.AcquireTable()
     socket: SocketTable = SocketTable()
     file: Path = Field(default=Path("study.toml"), exclude=True)
     notes: tuple[str, ...] = Field(default=(), exclude=True)
@@ -130,28 +98,28 @@ class Study(TomlTable):
         return (*(one.name for one in layers), *(one.name for one in regions), self.geometry.core)
 
     @property
-    def law(self) -> TissueLaw:
+    def law(self) -> laws.TissueLaw:
         """The law of all tissues, with the study's relaxation times, where it has some."""
-        law = LAWS[self.material.law]
-        if law.name != POWER:
+        law = laws.LAWS[self.material.law]
+        if law.name != laws.POWER:
             return law
         times = choose_relaxation_times(*self.material.relaxation_span_s)
         return replace(law, relaxation_times_s=tuple(times.tolist()))
 
     @property
-    def fibres(self) -> dict[str, Literal["axis", "flow"] | Vector]:
+    def fibres(self) -> dict[str, Literal["axis", "flow"] | tables.Vector]:
         """Direction of the fibres in the tissues that have some: the limb's axis in the core by default."""
-        if not has_fibres(self.material.law):
+        if not laws.has_fibres(self.material.law):
             return {}
         return self.material.fibres or {self.geometry.core: "axis"}
 
     @property
     def fixed(self) -> tuple[str, ...]:
         """The parameters that stay at their start: those stated, and of fibres that a tissue has not."""
-        if not has_fibres(self.material.law):
+        if not laws.has_fibres(self.material.law):
             return self.calibration.fixed
         bare = [tissue for tissue in self.tissues if tissue not in self.fibres]
-        without = (f"{tissue}.{key}" for tissue in bare for key in FIBRE_KEYS if key in self.law.keys)
+        without = (f"{tissue}.{key}" for tissue in bare for key in laws.FIBRE_KEYS if key in self.law.keys)
         return tuple(dict.fromkeys((*self.calibration.fixed, *without)))
 
     @property
@@ -160,23 +128,23 @@ class Study(TomlTable):
         return tuple(self.path(file) for file in self.study.extensions)
 
     @property
-    def all_indenters(self) -> dict[str | None, IndenterTable]:
+    def all_indenters(self) -> dict[str | None, tables.IndenterTable]:
         """The study's indenters by name; that of ``[indenter]`` under None."""
-        named: dict[str | None, IndenterTable] = {None: self.indenter}
+        named: dict[str | None, tables.IndenterTable] = {None: self.indenter}
         return named | dict(self.indenters)
 
-    def indenter_of(self, indentation: Indentation) -> IndenterTable:
+    def indenter_of(self, indentation: Indentation) -> tables.IndenterTable:
         """The indenter of a record or of a planned indentation, its file as a path of this machine."""
         found = self.all_indenters[indentation.indenter]
         return found.model_copy(update={"file": None if found.file is None else self.path(found.file)})
 
     @property
-    def used_indenters(self) -> dict[str | None, IndenterTable]:
+    def used_indenters(self) -> dict[str | None, tables.IndenterTable]:
         """Those of `all_indenters` that touch somewhere."""
         used = {one.indenter for one in self.indentations}
         return {name: one for name, one in self.all_indenters.items() if name in used}
 
-    def indenters_at(self, site: Site) -> tuple[IndenterTable, ...]:
+    def indenters_at(self, site: Site) -> tuple[tables.IndenterTable, ...]:
         """The indenters that touch at a site."""
         return tuple(self.all_indenters[one.indenter] for one in self.records_at(site) or (site,))
 
@@ -187,24 +155,24 @@ class Study(TomlTable):
     @property
     def parameters(self) -> tuple[tuple[str, str], ...]:
         """(tissue, parameter) in the order of every flat vector."""
-        return list_flat_names(self.tissues, self.material.law)
+        return laws.list_flat_names(self.tissues, self.material.law)
 
-    def by_tissue(self, vector: Iterable[float]) -> Parameters:
+    def by_tissue(self, vector: Iterable[float]) -> laws.Parameters:
         """A flat vector as ``{tissue: {name: value}}``."""
-        return to_parameters(vector, self.tissues, self.material.law)
+        return laws.to_parameters(vector, self.tissues, self.material.law)
 
-    def vector(self, parameters: Parameters) -> NDArray[np.float64]:
+    def vector(self, parameters: laws.Parameters) -> NDArray[np.float64]:
         """The flat vector of ``{tissue: {name: value}}``."""
-        return to_vector(parameters, self.tissues, self.material.law)
+        return laws.to_vector(parameters, self.tissues, self.material.law)
 
     @property
-    def priors(self) -> dict[str, PriorTable]:
+    def priors(self) -> dict[str, tables.PriorTable]:
         """The priors of parameters by name: those stated, else those of people."""
         table, people = self.calibration, {}
         if table.priors is not None:
             known = of_tissues(self.tissues, table.prior_tissues)
             people = {
-                name: PriorTable(median=median, factor=factor)
+                name: tables.PriorTable(median=median, factor=factor)
                 for name, (median, factor) in known.items()
                 if name not in table.fixed
             }
@@ -283,7 +251,7 @@ class Study(TomlTable):
     def _check_sites(cls, sites: tuple[Site, ...]) -> tuple[Site, ...]:
         if not sites:
             raise ValueError("the study has no site")
-        if doubled := find_repeated(site.name for site in sites):
+        if doubled := tables.find_repeated(site.name for site in sites):
             raise ValueError(f"site names must differ; given twice: {', '.join(doubled)}")
         return sites
 
@@ -302,7 +270,7 @@ class Study(TomlTable):
                     f"records.{table.name}: no site is named {table.site!r}; they are {', '.join(names)}"
                 )
         names += [table.full_name for table in self.records]
-        if doubled := find_repeated(names):
+        if doubled := tables.find_repeated(names):
             raise ValueError(
                 f"two records, or a record and a site, have the name {doubled[0]!r}; name one anew"
             )
@@ -339,8 +307,8 @@ class Study(TomlTable):
                 raise ValueError(f"material.{key}: {one.name} has {seen}, which sees no {what}; leave it out")
 
     def _check_indenters(self) -> None:
-        tables: list[Site | RecordTable] = [*self.sites, *self.records]
-        for one in tables:
+        stated: list[Site | RecordTable] = [*self.sites, *self.records]
+        for one in stated:
             if one.indenter is not None and one.indenter not in self.indenters:
                 known = ", ".join(self.indenters) or "none"
                 what = f"{one.key}: no indenter is named {one.indenter!r}"
@@ -358,9 +326,9 @@ class Study(TomlTable):
             raise ValueError(f"calibration.tied: the tissue of {bare[0]} has no fibres; leave it out")
         if self.calibration.priors is None:
             return
-        if not is_ogden(self.material.law):
+        if not laws.is_ogden(self.material.law):
             raise ValueError(
-                f'calibration.priors: people are described by the law "{OGDEN}", the study has '
+                f'calibration.priors: people are described by the law "{laws.OGDEN}", the study has '
                 f'"{self.material.law}"; leave it out, or state calibration.prior'
             )
         try:

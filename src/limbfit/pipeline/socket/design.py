@@ -38,18 +38,8 @@ from ..engine.partial_results import Made, ResultFiles
 from ..engine.storage import write_result, write_table
 from ..engine.store import RUNS
 from ..simulation.limb_geometry import LimbGeometry
+from . import shape
 from .limb import SocketLimb
-from .shape import (
-    build_recipe,
-    build_regions,
-    build_socket_wall,
-    build_target,
-    check_regions,
-    check_tissues,
-    find_covered_regions,
-    load_of,
-    place_errors,
-)
 from .simulation import SocketRun, run_sockets, simulate_socket
 
 NAME, PLACE = "socket_design", "socket.design"
@@ -59,7 +49,7 @@ CONTROL, DESIGN, OPTIMISED = "control", "design", "optimised"
 
 def check_socket_design(study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]) -> None:
     """Refuse tissues as `check_tissues`, and a shape, load, region or target that the limb cannot have."""
-    check_tissues(study)
+    shape.check_tissues(study)
     if limb is not None:
         build_undeformed_socket(study, limb.anatomy, limb.anatomy.skin, options["optimise"])
 
@@ -72,20 +62,22 @@ def build_undeformed_socket(
     Raises `StudyError` where loads, regions or the target pressure are not those of this limb, or the wall
     cannot be made.
     """
-    with place_errors(study, PLACE):
-        recipe = build_recipe(study, anatomy)
+    with shape.place_errors(study, PLACE):
+        recipe = shape.build_recipe(study, anatomy)
         plain = rectify_limb(outer, anatomy.frame, replace(recipe, reduction_percent=0.0))
         for load in study.socket.loads:
-            load_of(study, load, anatomy, plain)
-        regions, middles = build_regions(study, anatomy), outer.triangles.mean(axis=1)
-        covered = find_covered_regions(middles, anatomy.skin, regions, plain)
-        check_regions(study, [one.region for one in study.socket.design.regions], f"{PLACE}.regions", covered)
-        check_regions(study, optimise, "--optimise", covered)
-        if not build_target(study).at(middles, anatomy, regions, plain).any():
+            shape.load_of(study, load, anatomy, plain)
+        regions, middles = shape.build_regions(study, anatomy), outer.triangles.mean(axis=1)
+        covered = shape.find_covered_regions(middles, anatomy.skin, regions, plain)
+        shape.check_regions(
+            study, [one.region for one in study.socket.design.regions], f"{PLACE}.regions", covered
+        )
+        shape.check_regions(study, optimise, "--optimise", covered)
+        if not shape.build_target(study).at(middles, anatomy, regions, plain).any():
             raise SurfaceError(
                 "no pressure is stated anywhere on the limb", remedy="state one below the brim"
             )
-        build_socket_wall(study, anatomy, plain)
+        shape.build_socket_wall(study, anatomy, plain)
     return recipe, plain
 
 
@@ -110,8 +102,8 @@ def run_socket_design(
     def tell(done: float, words: str) -> None:
         context.tell(NAME, done, total, words)
 
-    with place_errors(study, PLACE):
-        limb, target = SocketLimb.of(context, NAME), build_target(study)
+    with shape.place_errors(study, PLACE):
+        limb, target = SocketLimb.of(context, NAME), shape.build_target(study)
         plain, face = build_undeformed_socket(study, limb.anatomy, limb.outer.skin, optimise)
         mesh, facts = limb.mesh(folder, face, partial(context.tell, NAME, 0, 0))
         kept = ResultFiles(folder / RUNS, also=[context.store[NAME] / RUNS])
@@ -126,7 +118,7 @@ def run_socket_design(
             best, found = _optimise_depths(context, recipe, designs, optimise, simulations, tell)
             designs.append(best)
     last = designs[-1].run
-    walled = build_socket_wall(study, limb.anatomy, last.face)
+    walled = shape.build_socket_wall(study, limb.anatomy, last.face)
     write_surface(folder / "socket.stl", walled)
     thickness = measure_thickness(walled, last.face)
     content = {
@@ -211,7 +203,7 @@ def _build_face(limb: SocketLimb, recipe: Recipe, depths: Mapping[str, float]) -
     """The face of a recipe with depths (mm) over regions; it can be given its wall."""
     zones = [build_zone(region, limb.anatomy, limb.regions, depth) for region, depth in depths.items()]
     face = rectify_limb(limb.outer.skin, limb.anatomy.frame, replace(recipe, areas=zones))
-    build_socket_wall(limb.study, limb.anatomy, face)
+    shape.build_socket_wall(limb.study, limb.anatomy, face)
     return face
 
 

@@ -13,27 +13,8 @@ from ...arrays import Array
 from ...results.socket import SocketResult, TissueStrainInside
 from ..page import Figure
 from ..store import Results
+from . import pictures
 from .colours import MUTED, SIMULATED, THIRD
-from .pictures import (
-    FIELD_MAP,
-    SIDES,
-    Grid,
-    Mark,
-    PictureRow,
-    Shot,
-    View,
-    cut_behind,
-    make_field_plotter,
-    make_four_views,
-    make_picture_figure,
-    make_whole_view,
-    normalise,
-    read_limb_frame,
-    read_linear,
-    render_field,
-    render_views,
-    silence_display_warning,
-)
 from .plots import add_legend, make_figure, make_panels, styled
 
 FIELDS = (("pressure_kPa", "pressure (kPa)"), ("shear_kPa", "shear (kPa)"))
@@ -42,7 +23,7 @@ SHEAR, MARKED = "shear_strain", "#d62728"
 OFFSET, OFFSET_MAP = "offset_mm", "RdBu_r"
 
 
-@silence_display_warning()
+@pictures.silence_display_warning()
 def draw_pressure_figures(store: Results, files: Mapping[str, Path], name: str) -> tuple[Figure, ...]:
     """Pressure and shear on four sides, one colour scale for all the stored fields, by their titles."""
     surfaces = {title: _read_surface(file) for title, file in files.items() if file.is_file()}
@@ -53,11 +34,11 @@ def draw_pressure_figures(store: Results, files: Mapping[str, Path], name: str) 
         top = max(float(np.max(surface.point_data[field])) for surface in surfaces.values())
         rows = _render_surfaces(store, surfaces, field, ((0.0, max(top, 1e-6)), words))
         title = f"{name}-{field.removesuffix('_kPa')}"
-        figures.append(make_picture_figure(title, rows, words="socket surface", field=words))
+        figures.append(pictures.make_picture_figure(title, rows, words="socket surface", field=words))
     return tuple(figures)
 
 
-def _read_surface(file: Path) -> Grid:
+def _read_surface(file: Path) -> pictures.Grid:
     """The deformed outer surface with straight-edged triangles, and what is stored at its nodes."""
     grid = pv.read(file)
     faces = np.asarray(grid.field_data[OUTER])[:, :3]
@@ -72,21 +53,21 @@ def _read_surface(file: Path) -> Grid:
 
 def _render_surfaces(
     store: Results,
-    surfaces: Mapping[str, Grid],
+    surfaces: Mapping[str, pictures.Grid],
     field: str,
     bar: tuple[tuple[float, float], str],
-    colours: str = FIELD_MAP,
-) -> list[PictureRow]:
+    colours: str = pictures.FIELD_MAP,
+) -> list[pictures.PictureRow]:
     """A row of four sides for every surface, by its title; ``bar``: limits and title of the colours."""
-    views = make_four_views(store, next(iter(surfaces.values())))
+    views = pictures.make_four_views(store, next(iter(surfaces.values())))
     rows = []
     for title, surface in surfaces.items():
-        shots = render_views(make_field_plotter(surface, field, bar[0], colours), views)
-        rows.append(PictureRow(shots, [f"{title}, {side}" for side in SIDES], bar, colours))
+        shots = pictures.render_views(pictures.make_field_plotter(surface, field, bar[0], colours), views)
+        rows.append(pictures.PictureRow(shots, [f"{title}, {side}" for side in pictures.SIDES], bar, colours))
     return rows
 
 
-@silence_display_warning()
+@pictures.silence_display_warning()
 def draw_offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | None:
     """Faces of sockets by their titles, coloured by how far outside the unloaded limb they are."""
     faces = {title: pv.read(file) for title, file in files.items() if file.is_file()}
@@ -96,42 +77,42 @@ def draw_offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | No
     limits = (-max(limit, 0.1), max(limit, 0.1))
     bar = (limits, "offset from the unloaded limb (mm)")
     rows = _render_surfaces(store, faces, OFFSET, bar, OFFSET_MAP)
-    return make_picture_figure("socket-design-offset", rows)
+    return pictures.make_picture_figure("socket-design-offset", rows)
 
 
-@silence_display_warning()
+@pictures.silence_display_warning()
 def draw_inside_figure(
     store: Results, title: str, inside: Sequence[TissueStrainInside], file: Path
 ) -> Figure | None:
     """Cuts along and across the limb through the place of the largest shear, coloured by it."""
     if not file.is_file():
         return None
-    grid, worst = read_linear(file), max(inside, key=lambda tissue: tissue.shear)
+    grid, worst = pictures.read_linear(file), max(inside, key=lambda tissue: tissue.shear)
     place = np.asarray(worst.place_mm, dtype=float)
     shear = np.asarray(grid.cell_data[SHEAR])
     limits = (0.0, max(float(np.percentile(shear, 99.5)), 1e-6))
     nearest = np.argmin(np.linalg.norm(np.asarray(grid.points) - place, axis=1))
-    mark = Mark("largest", place + np.asarray(grid.point_data["displacement_mm"])[nearest], MARKED)
-    shots: list[Shot] = []
+    mark = pictures.Mark("largest", place + np.asarray(grid.point_data["displacement_mm"])[nearest], MARKED)
+    shots: list[pictures.Shot] = []
     for view in _make_cut_views(store, grid, place):
-        pixels = render_field(cut_behind(grid, view, smooth=True), view, SHEAR, limits)[0]
+        pixels = pictures.render_field(pictures.cut_behind(grid, view, smooth=True), view, SHEAR, limits)[0]
         shots.append((pixels, view, [mark]))
-    row = PictureRow(shots, ("along the limb", "across the limb"), (limits, "shear strain"))
-    return make_picture_figure("socket-inside", [row], title=title, worst=worst)
+    row = pictures.PictureRow(shots, ("along the limb", "across the limb"), (limits, "shear strain"))
+    return pictures.make_picture_figure("socket-inside", [row], title=title, worst=worst)
 
 
-def _make_cut_views(store: Results, grid: Grid, place: Array) -> tuple[View, View]:
+def _make_cut_views(store: Results, grid: pictures.Grid, place: Array) -> tuple[pictures.View, pictures.View]:
     """The whole limb, cut along it through its middle and a place, and across it there."""
-    _, back, up = read_limb_frame(store)
+    _, back, up = pictures.read_limb_frame(store)
     points = np.asarray(grid.points)
     middle = points.mean(axis=0)
     outwards = (place - middle) - (place - middle) @ up * up
-    normal = normalise(np.cross(outwards if np.linalg.norm(outwards) > 1.0 else back, up))
-    along = make_whole_view(points, normal, up, margin_mm=10)
+    normal = pictures.normalise(np.cross(outwards if np.linalg.norm(outwards) > 1.0 else back, up))
+    along = pictures.make_whole_view(points, normal, up, margin_mm=10)
     along = replace(along, focal=along.focal + ((place - middle) @ normal) * normal)
     wide = float(np.abs((points - middle) - np.outer((points - middle) @ up, up)).max()) + 8
     across_focal = middle + ((place - middle) @ up) * up
-    return along, View(across_focal, -up, -back, wide, (900, 900))
+    return along, pictures.View(across_focal, -up, -back, wide, (900, 900))
 
 
 @styled
