@@ -17,6 +17,7 @@ from ...arrays import Array
 from ...mesh import Mesh, write_vtu
 from ...results.limb import MeshingSettings, MeshMeasures, MeshResult, MeshSet
 from ...study import Study
+from ...study.meshing import EdgesTable
 from ..engine.context import Context
 from ..engine.files import THICKNESS
 from ..engine.storage import write_result
@@ -106,16 +107,15 @@ def read_stored_depth(surfaces: Path, anatomy: Anatomy, settings: MeshSettings) 
     return read_thickness(surfaces / THICKNESS, anatomy.skin) if mapped else None
 
 
-def mesh_settings(study: Study) -> MeshSettings:
-    """How the site meshes of a study are made."""
+def mesh_settings(study: Study, stated: EdgesTable | None = None) -> MeshSettings:
+    """How the site meshes of a study are made, with its own edges or others that are ``stated``."""
     table, geometry = study.mesh, study.geometry
+    edges = (stated or table).model_dump(include=set(EdgesTable.model_fields))
+    if study.clamps is not None:  # far from the site, edges are no longer than pins that press there are wide
+        edges["edge_far_mm"] = min(edges["edge_far_mm"], study.clamps.width_mm)
     return MeshSettings(
+        **edges,
         element=table.cell_type,
-        edge_near_mm=table.edge_near_mm,
-        edge_far_mm=_choose_far_mm(study, table.edge_far_mm),
-        near_radius_mm=table.near_radius_mm,
-        growth=table.growth,
-        flatness=table.flatness,
         engine=table.engine,
         time_limit_s=table.time_limit_s,
         layers=tuple(
@@ -130,16 +130,8 @@ def mesh_settings(study: Study) -> MeshSettings:
 
 def build_coarse_settings(study: Study) -> MeshSettings | None:
     """How the second, coarse meshes are made; None where the study wants none."""
-    table = study.mesh.coarse
-    if table is None:
-        return None
-    coarse = replace(mesh_settings(study), **table.model_dump())
-    return replace(coarse, edge_far_mm=_choose_far_mm(study, table.edge_far_mm))
-
-
-def _choose_far_mm(study: Study, stated: float) -> float:
-    """Edge length far from the site: no longer than pins that press there are wide."""
-    return stated if study.clamps is None else min(stated, study.clamps.width_mm)
+    coarse = study.mesh.coarse
+    return None if coarse is None else mesh_settings(study, coarse)
 
 
 def run_mesh(context: Context, folder: Path) -> None:
