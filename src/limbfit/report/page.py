@@ -122,17 +122,6 @@ class Page:
     footer: str
 
 
-def make_section(
-    name: str, title: str, *blocks: Block | Iterable[Block | None] | None, otherwise: str = ""
-) -> Section:
-    """A section of the blocks that exist; where there are none, a note says ``otherwise``."""
-    found: list[Block] = []
-    for one in blocks:
-        group = (one,) if one is None or isinstance(one, Block) else one
-        found += [block for block in group if block is not None]
-    return Section(name, title, tuple(found) or (Note(otherwise),))
-
-
 def make_bullets(sentences: Iterable[str]) -> Bullets | None:
     """A list of the sentences; None where there are none."""
     items = tuple(sentences)

@@ -11,7 +11,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template, Undefined
 
 from . import formats
-from .page import Cell, Figure, Prose, Row, Table
+from .page import Block, Cell, Figure, Note, Prose, Row, Section, Table
 
 TEMPLATES = PackageLoader("limbfit.report", "templates")
 _COLUMN = re.compile(r"\| (.*?) \|([|=])(.*?)(?:\|%(.*))?")
@@ -53,6 +53,16 @@ def write_columns(name: str, **facts: Any) -> list[tuple[str, str, str, str]]:
         head, kind, text, share = map(_join_lines, found.groups(default=""))
         columns.append((head, kind, text, share))
     return columns
+
+
+def make_section(name: str, *blocks: Block | Iterable[Block | None] | None) -> Section:
+    """A section of the blocks that exist; ``section <name>`` is its title, and the note without any."""
+    found: list[Block] = []
+    for one in blocks:
+        group = (one,) if one is None or isinstance(one, Block) else one
+        found += [block for block in group if block is not None]
+    title, missing = (_join_lines(part.render()) for part in _read_templates()[f"section {name}"])
+    return Section(name, title, tuple(found) or (Note(missing),))
 
 
 def make_prose(name: str, **facts: Any) -> Prose | None:

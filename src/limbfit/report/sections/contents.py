@@ -8,9 +8,9 @@ from typing import Any
 
 from ...extensions import Registry
 from ..formats import format_number, format_parameter
-from ..page import Block, KeyNumber, Note, Page, Section, make_bullets, make_section
+from ..page import Block, KeyNumber, Note, Page, Section, make_bullets
 from ..store import Results
-from ..words import make_prose, write_words
+from ..words import make_prose, make_section, write_words
 from .cube import make_cube_section
 from .design import make_design_section, make_protocol_section
 from .identification import make_convergence_section, make_parameter_section
@@ -86,7 +86,7 @@ def _list_experiment_sections(store: Results) -> tuple[Section, ...]:
     ]
     if store.outdated:
         notes = (Note(write_words("outdated", experiment=name)) for name in store.outdated)
-        found.append(make_section("outdated", "Left out", notes))
+        found.append(make_section("outdated", notes))
     return tuple(found)
 
 
@@ -120,7 +120,7 @@ def build_summary(store: Results) -> tuple[Block, ...]:
         errors=[row.error_percent for row in heldout if row.error_percent is not None],
         means=[fmean(one) for one in store.predict.compare_held_out() if one] if store.predict else [],
     )
-    return make_section("summary", "Summary", prose, make_bullets(_list_verdicts(store))).blocks
+    return make_section("summary", prose, make_bullets(_list_verdicts(store))).blocks
 
 
 def _list_verdicts(store: Results) -> tuple[str, ...]:

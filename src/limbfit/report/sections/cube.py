@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from ...results.variants import CubeResult, CubeTissue
 from ..drawing.colours import INK, MEASURED, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH
 from ..drawing.plots import make_figure, make_panels, make_standalone, styled
-from ..page import Figure, Section, make_section
+from ..page import Figure, Section
 from ..store import Results
-from ..words import make_prose, make_table
+from ..words import make_prose, make_section, make_table
 
 KINDS = {"skin": "Figure 8. Skin, adipose tissue", "muscle": "Figure 9. Muscle, soft tissue below the skin"}
 _OWN = ((SIMULATED, "-"), (THIRD, "-"), (INK, "-"))
@@ -23,10 +23,8 @@ _OTHERS = ((ONE_MATERIAL, "--"), (TRUTH, "-."), (THIRD, (0, (6, 2))), (MUTED, ":
 def make_cube_section(store: Results, content: CubeResult) -> Section:
     """What the experiment ``cube`` found."""
     words = make_prose("cube", content=content, own=filter(_is_own, content.tissues))
-    title = "Comparison with published tissues"
-    return make_section(
-        "cube", title, words, draw_cube_figure(content), make_table("cube", content.tissues, marked=_is_own)
-    )
+    table = make_table("cube", content.tissues, marked=_is_own)
+    return make_section("cube", words, draw_cube_figure(content), table)
 
 
 def _is_own(row: CubeTissue) -> bool:

@@ -10,9 +10,9 @@ from ...results.planning import DesignResult, ProtocolPlan, ProtocolResult, Site
 from ..drawing.colours import INK, MUTED, ONE_MATERIAL, SIMULATED, THIRD
 from ..drawing.plots import add_legend, make_figure, make_panels, set_log_scale, set_rows, styled
 from ..formats import format_parameter
-from ..page import Figure, Section, make_bullets, make_section
+from ..page import Figure, Section, make_bullets
 from ..store import Results
-from ..words import make_prose, make_table
+from ..words import make_prose, make_section, make_table
 
 Designs = Sequence[SiteDesign | ProtocolPlan]
 _STYLES = ((SIMULATED, "o"), (THIRD, "D"), (ONE_MATERIAL, "s"), (MUTED, "^"), (INK, "v"))
@@ -24,7 +24,6 @@ def make_design_section(store: Results, content: DesignResult) -> Section:
     """What the experiment ``design`` found."""
     return make_section(
         "design",
-        "Which sites to test",
         make_prose("design", content=content),
         make_table("designs", content.designs, marked=lambda row: row.design == OWN, most=MAX_FACTOR),
         draw_expected_figure("designs", content.designs, "testing the sites of a design"),
@@ -57,7 +56,6 @@ def make_protocol_section(store: Results, content: ProtocolResult) -> Section:
     rows = content.protocols
     return make_section(
         "protocol",
-        "Which records to make",
         make_prose("protocol", content=content),
         make_table("protocol-records", content.records),
         make_table("protocols", rows, marked=lambda row: row is rows[0], most=MAX_FACTOR),

@@ -8,9 +8,9 @@ from ...results.identification import CorrelationMatrix, SearchStage
 from ..drawing.figures import draw_convergence_figure, draw_interval_figure
 from ..drawing.interactive import draw_convergence_curves
 from ..formats import format_fixed, format_parameter
-from ..page import Block, Bullets, Cell, Section, Table, make_bullets, make_section
+from ..page import Block, Bullets, Cell, Section, Table, make_bullets
 from ..store import Results
-from ..words import make_prose, make_row, make_table, write_words
+from ..words import make_prose, make_row, make_section, make_table, write_words
 
 _KINDS = {
     "folded": "elements inside out",
@@ -27,12 +27,10 @@ def make_parameter_section(store: Results) -> Section:
     """Table 1, intervals and correlations."""
     known = store.uncertainty
     if known is None:
-        none = "No parameters have been identified yet."
-        return make_section("parameters", "Parameters", otherwise=none)
+        return make_section("parameters")
     truth = store.truth.get("parameters", {})
     return make_section(
         "parameters",
-        "Parameters",
         make_table("parameters", store.parameters, store=store, known=known, truth=truth),
         draw_interval_figure(store),
         make_correlation_table(known.correlation),
@@ -84,13 +82,11 @@ def make_convergence_section(store: Results) -> Section:
     """How the identification went."""
     return make_section(
         "convergence",
-        "Convergence of the identification",
         make_bullets(write_words("end of a stage", stage=stage) for stage in store.stages),
         draw_convergence_figure(store),
         draw_convergence_curves(store),
         describe_search(store),
         (make_iteration_table(store, stage) for stage in store.stages if stage.iterations),
-        otherwise="No identification is stored yet.",
     )
 
 

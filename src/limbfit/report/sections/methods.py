@@ -22,11 +22,6 @@ from ..words import make_environment
 from .provenance import flatten_settings
 
 Part = tuple[str, str]  # a heading and its paragraph
-ELEMENTS = {
-    "tet4": "linear tetrahedra (tet4)",
-    "tet10": "quadratic tetrahedra (tet10)",
-    "tet10p0": "quadratic tetrahedra with constant pressure (tet10p0)",
-}
 
 
 def make_method_section(store: Results) -> Section:
@@ -71,7 +66,7 @@ def write_method_parts(store: Results) -> tuple[Part, ...]:
         heldout={row.site for row in store.predicted if not row.fitted},
         experiments=_list_experiments(store),
         seconds=sum(stage.seconds for stage in store.run.stages.values()) if store.run else 0.0,
-        **{"NOTHING": NOTHING, "OGDEN": OGDEN, "ACTIVE": ACTIVE, "elements": ELEMENTS},
+        **{"NOTHING": NOTHING, "OGDEN": OGDEN, "ACTIVE": ACTIVE},
         span=_format_span,
         pairs=_format_pairs,
         describe_indenter=lambda one: SHAPES[one["shape"]].describe(one),

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from ..drawing import pictures
 from ..drawing.interactive import make_explorer
-from ..page import Prose, Section, Table, make_bullets, make_section
+from ..page import Prose, Section, Table, make_bullets
 from ..store import Results
-from ..words import make_table
+from ..words import make_section, make_table
 
 
 def make_model_section(store: Results) -> Section:
@@ -14,7 +14,6 @@ def make_model_section(store: Results) -> Section:
     segment, surfaces = store.segment, store.surfaces
     return make_section(
         "model",
-        "The model",
         Prose(f"Segmentation: {segment.method}.") if segment else None,
         make_explorer(store),
         pictures.draw_slices_figure(store),
@@ -23,7 +22,6 @@ def make_model_section(store: Results) -> Section:
         make_volume_table(store),
         make_table("places", store.sites, marked="fitted"),
         make_bullets((*(segment.warnings if segment else ()), *(surfaces.notes if surfaces else ()))),
-        otherwise="No surfaces and sites are stored yet.",
     )
 
 
@@ -46,9 +44,7 @@ def make_mesh_section(store: Results) -> Section:
     )
     return make_section(
         "meshes",
-        "Meshes",
         pictures.draw_mesh_figure(store, store.fitted[:4]),
         make_table("meshes", store.mesh.items(), marked=lambda row: row[0] in store.fitted),
         make_bullets(warnings),
-        otherwise="No meshes are stored yet.",
     )

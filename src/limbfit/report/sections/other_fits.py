@@ -9,9 +9,9 @@ from ...results.uncertainty import CrossvalidateResult, RegionFitted, RegionsRes
 from ..drawing.colours import HELD_OUT, INK, MUTED, ONE_MATERIAL, SIMULATED, choose_tissue_style
 from ..drawing.plots import add_legend, make_figure, make_panels, set_log_scale, styled
 from ..formats import format_fixed, format_with_unit
-from ..page import Figure, Section, Table, make_bullets, make_section
+from ..page import Figure, Section, Table, make_bullets
 from ..store import Results
-from ..words import make_prose, make_row, make_table, to_numeric
+from ..words import make_prose, make_row, make_section, make_table, to_numeric
 
 MAX_FACTOR = 1e3  # of an interval over its value, in the figure
 
@@ -20,7 +20,6 @@ def make_crossvalidation_section(store: Results, content: CrossvalidateResult) -
     """What the experiment ``crossvalidate`` found."""
     return make_section(
         "crossvalidate",
-        "Cross-validation",
         make_prose("crossvalidate", content=content),
         _draw_errors(content),
         make_table("crossvalidate-sites", content.sites, marked="fitted"),
@@ -65,7 +64,6 @@ def make_regions_section(store: Results, content: RegionsResult) -> Section:
     parameters = [(tissue, key) for tissue in content.whole.parameters for key in store.law.keys]
     return make_section(
         "regions",
-        "Regions",
         make_prose("regions", content=content, verdicts=verdicts),
         make_bullets(f"Left out: {text}." for text in content.left_out),
         make_table("regions", parameters, store=store, content=content),

@@ -8,9 +8,9 @@ from ...results.identification import RecordPrediction, average_records
 from ..drawing import figures
 from ..drawing.pictures import draw_field_figure
 from ..formats import NOTHING, format_fixed
-from ..page import Note, Row, Section, Table, make_section
+from ..page import Note, Row, Section, Table
 from ..store import Results
-from ..words import make_prose, make_row, make_table, to_numeric, write_words
+from ..words import make_prose, make_row, make_section, make_table, to_numeric, write_words
 
 
 def make_fit_section(store: Results) -> Section:
@@ -18,13 +18,11 @@ def make_fit_section(store: Results) -> Section:
     rows = [row for row in store.predicted if row.fitted]
     return make_section(
         "fit",
-        "Fitted sites",
         figures.draw_force_figure(store, rows, "time_s", "forces-fitted", 2),
         figures.draw_layer_figure(store, fitted=True),
         figures.draw_wave_figure(store, fitted=True),
         figures.draw_skin_figure(store, fitted=True),
         draw_field_figure(store, store.fitted[:4], "predict", "field"),
-        otherwise="No simulated forces of fitted sites are stored yet.",
     )
 
 
@@ -35,7 +33,6 @@ def make_prediction_section(store: Results) -> Section:
     judged = quality.records if quality else ()
     return make_section(
         "prediction",
-        "All sites, held-out sites",
         make_site_table(store),
         make_table("fit-quality", judged, marked="fitted", found=quality, compared=store.compared_quantity),
         figures.draw_error_figure(store),
@@ -46,7 +43,6 @@ def make_prediction_section(store: Results) -> Section:
         figures.draw_skin_figure(store, fitted=False),
         make_observed_table(store),
         Note(write_words("unseen")) if store.predicted and not rows else None,
-        otherwise="No predictions are stored yet.",
     )
 
 
@@ -62,7 +58,6 @@ def make_domain_section(store: Results) -> Section:
     rows = [(record, row) for record, outside in predicted for row in outside]
     return make_section(
         "domain",
-        "Where the answer ends",
         make_prose("domain"),
         map(Note, sentences),
         figures.draw_domain_figure(store),

@@ -6,21 +6,20 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ..formats import NOTHING, format_duration
-from ..page import Section, Table, make_section
+from ..page import Section, Table
 from ..store import Results
-from ..words import make_prose, make_row, make_table, to_numeric, write_words
+from ..words import make_prose, make_row, make_section, make_table, to_numeric, write_words
 
 
 def make_timing_section(store: Results) -> Section:
     """How long it took, and on what."""
     if store.run is None:
-        return make_section("timing", "Computing time", otherwise="No times are stored.")
+        return make_section("timing")
     stages = store.run.stages
     seconds = [stage.seconds for stage in stages.values()]
     total = make_row("Total", to_numeric(format_duration(sum(seconds))), "")
     return make_section(
         "timing",
-        "Computing time",
         make_table("timing", stages.items(), foot=(total,), longest=max([*seconds, 1e-9])),
         make_prose("machine", machine=store.run.machine),
     )
@@ -30,7 +29,7 @@ def make_settings_section(store: Results) -> Section:
     """Every setting of the study file."""
     flat = flatten_settings(store.run.settings if store.run else {})
     table = make_pair_table("all-settings", ("Key", "Value"), flat)
-    return make_section("settings", "Settings", table, otherwise="No settings are stored.")
+    return make_section("settings", table)
 
 
 def make_provenance_section(store: Results) -> Section:
@@ -39,10 +38,8 @@ def make_provenance_section(store: Results) -> Section:
     versions = {"limbfit": run.limbfit, **run.versions} if run else {}
     return make_section(
         "provenance",
-        "Versions and inputs",
         make_pair_table("versions", ("Library", "Version"), versions),
         make_pair_table("inputs", head, run.inputs if run else {}),
-        otherwise="No versions and input hashes are stored.",
     )
 
 

@@ -12,9 +12,9 @@ from ..drawing.colours import GRID, INK, MUTED, SIMULATED
 from ..drawing.figures import thin_curves
 from ..drawing.interactive import draw_record_curves
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
-from ..page import Figure, Note, Section, Table, make_bullets, make_section
+from ..page import Figure, Note, Section, Table, make_bullets
 from ..store import Curves, Results
-from ..words import make_prose, make_table
+from ..words import make_prose, make_section, make_table
 
 MAX_NAMED_PHASES = 6  # whose names have room in a panel
 
@@ -25,11 +25,9 @@ def make_record_section(store: Results) -> Section:
     chosen = [name for name in (*fitted, *store.traces) if store.curves("traces", name)]
     return make_section(
         "records",
-        "Indentation records",
         draw_record_figure(store, chosen[0]) if chosen else None,
         draw_record_curves(store, tuple(dict.fromkeys(chosen))),
         make_trace_table(store),
-        otherwise="No indentation records are stored yet.",
     )
 
 
@@ -82,7 +80,6 @@ def make_record_check_section(store: Results) -> Section:
     flags, left_out = (store.predict.flags, store.predict.left_out) if store.predict else ((), ())
     return make_section(
         "doubts",
-        "Records in doubt",
         _list_failures(store),
         make_bullets(f"{flag.text[:1].upper()}{flag.text[1:]}." for flag in flags)
         or make_prose("nothing doubtful", left_out=left_out),

@@ -21,9 +21,9 @@ from ...results.variants import (
 from ..drawing.colours import GRID, INK, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH, choose_tissue_style
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import format_fixed
-from ..page import Bullets, Figure, Section, make_bullets, make_section
+from ..page import Bullets, Figure, Section, make_bullets
 from ..store import Results
-from ..words import make_prose, make_table, write_words
+from ..words import make_prose, make_section, make_table, write_words
 
 _COLOURS = (SIMULATED, ONE_MATERIAL, TRUTH, THIRD, MUTED, INK)
 _LINES: tuple[Any, ...] = ("-", "--", "-.", (0, (6, 2)), ":", "-")
@@ -33,16 +33,16 @@ _RANGE = ("J_min", "J_low", "J_high", "J_max")
 
 def make_sensitivity_section(store: Results, content: VariedResult, name: str) -> Section:
     """Force with one thing changed at a time: in words, in curves, and in a table of the simulations."""
-    title, draw_figure = _SECTIONS[name]
+    draw_figure = _FIGURES[name]
     stiffness = content if isinstance(content, StiffnessResult) else None
     facts = {
         "element": store.calibration.element if store.calibration else None,
         "changes": write_words("changes of the force", runs=content.runs),
     }
+    title = write_words(f"section {name}")
     words = "compared models" if draw_figure is _draw_site_curves else ""
     return make_section(
         name,
-        title,
         make_prose(name, content=content, **facts),
         make_prose("leading tissues", found=_find_leading_tissues(stiffness)) if stiffness else None,
         draw_figure(store, content),
@@ -159,7 +159,7 @@ def _draw_site_curves(store: Results, content: FrictionResult | IndenterResult) 
         _draw_curves(ax, store, name, site, content)
         ax.set_ylabel("Force (N)")
     add_legend(drawing, axes[0])
-    return make_figure(drawing, name, words="compared models", title=_SECTIONS[name][0])
+    return make_figure(drawing, name, words="compared models", title=write_words(f"section {name}"))
 
 
 def _list_warnings(content: VariedResult) -> Bullets | None:
@@ -170,12 +170,11 @@ def _list_warnings(content: VariedResult) -> Bullets | None:
     return make_bullets(f"Site {row.site}, {row.label}: {text}" for row, text in texts)
 
 
-# Of each experiment by its name: the title of its section, and what draws its figure.
-_SECTIONS: dict[str, tuple[str, Callable[[Results, Any], Figure]]] = {
-    "sensitivity-c": ("Sensitivity to the stiffness of the tissues", _draw_stiffness_figure),
-    "sensitivity-kappa": ("Sensitivity to the bulk modulus", _draw_kappa_figure),
-    "sensitivity-contact": ("Sensitivity to friction", _draw_site_curves),
-    "sensitivity-indenter": ("Sensitivity to the indenter", _draw_site_curves),
-    "sensitivity-mesh": ("Mesh independence", _draw_mesh_figure),
+_FIGURES: dict[str, Callable[[Results, Any], Figure]] = {  # what draws that of each experiment
+    "sensitivity-c": _draw_stiffness_figure,
+    "sensitivity-kappa": _draw_kappa_figure,
+    "sensitivity-contact": _draw_site_curves,
+    "sensitivity-indenter": _draw_site_curves,
+    "sensitivity-mesh": _draw_mesh_figure,
 }
-SENSITIVITIES = {name: partial(make_sensitivity_section, name=name) for name in _SECTIONS}
+SENSITIVITIES = {name: partial(make_sensitivity_section, name=name) for name in _FIGURES}

@@ -10,9 +10,9 @@ from ..drawing.colours import MEASURED, SIMULATED, TRUTH
 from ..drawing.figures import draw_simulated_figure
 from ..drawing.pictures import draw_field_figure
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
-from ..page import Bullets, Figure, Note, Section, make_bullets, make_section
+from ..page import Bullets, Figure, Note, Section, make_bullets
 from ..store import Results
-from ..words import make_prose, make_table, write_words
+from ..words import make_prose, make_section, make_table, write_words
 from .provenance import make_pair_table
 
 
@@ -21,7 +21,6 @@ def make_simulated_section(store: Results) -> Section:
     sites = [row.site for row in store.simulated]
     return make_section(
         "simulated",
-        "Simulated indentations",
         _list_warnings(store.simulated),
         draw_simulated_figure(store),
         draw_field_figure(store, sites[:4], "simulate", "field-simulated"),
@@ -38,7 +37,6 @@ def make_comparison_section(store: Results) -> Section:
     """Curves and differences of the sites that ``limbfit compare`` solved."""
     return make_section(
         "comparison",
-        "Comparison with FEBio",
         make_prose("comparison"),
         draw_compared_figure(store),
         make_table("compared", store.compared),
@@ -78,10 +76,8 @@ def make_solver_section(store: Results) -> Section:
     failed = ", ".join(row.record for row in store.predicted if not row.completed)
     return make_section(
         "solver",
-        "Solver",
         Note(f"The simulation did not reach the end of the record at: {failed}.") if failed else None,
         _list_warnings(store.predicted),
         make_table("solver", store.predicted, marked="fitted"),
         make_pair_table("solver-facts", ("Fact", "Value"), known),
-        otherwise="No simulations are stored yet.",
     )

@@ -21,9 +21,9 @@ from ..drawing.socket_pictures import (
     draw_settling_figure,
 )
 from ..formats import format_symbol
-from ..page import Note, Row, Section, Table, make_section
+from ..page import Note, Row, Section, Table
 from ..store import Results
-from ..words import make_prose, make_row, make_table, to_numeric
+from ..words import make_prose, make_row, make_section, make_table, to_numeric
 
 # What counts as known, and how its change is headed.
 KNOWN = {
@@ -45,7 +45,6 @@ def make_socket_section(store: Results, content: SocketResult) -> Section:
     origin = ORIGINS.get(content.parameters_from, content.parameters_from)
     return make_section(
         "socket",
-        "The limb in its socket",
         Note(
             "A simulation for research, not a medical device: it says what a rigid socket does to this model "
             "of the limb."
@@ -121,7 +120,6 @@ def make_socket_design_section(store: Results, content: SocketDesignResult) -> S
     failed = [(i, trial.reason) for i, trial in enumerate(found.trials if found else ()) if trial.reason]
     return make_section(
         "socket_design",
-        "The design of a socket",
         Note("A simulation for research, not a medical device: no socket here has been worn."),
         make_prose("socket design", content=content, origin=origin),
         draw_offset_figure(store, {one.name: folder / f"{one.name}-face.vtp" for one in designs}),

@@ -15,9 +15,9 @@ from ...results.uncertainty import LikelihoodProfile, UncertaintyResult
 from ..drawing import plots
 from ..drawing.colours import INK, MEASURED, MUTED, SIMULATED, choose_truth_style
 from ..formats import format_fixed, format_parameter
-from ..page import Bullets, Figure, Note, Prose, Section, Table, make_section
+from ..page import Bullets, Figure, Note, Prose, Section, Table
 from ..store import Curves, Results, find_compared_quantity
-from ..words import make_prose, make_table, write_words
+from ..words import make_prose, make_section, make_table, write_words
 
 TrueValues = dict[str, tuple[float, dict[str, Any]]]  # by name: a true parameter and its line
 MAX_DRAWS, MAX_SITES = 300, 18
@@ -29,7 +29,6 @@ def make_uncertainty_section(store: Results, content: UncertaintyResult) -> Sect
     emulator = write_words("emulator", emulator=content.emulator, chain=content.posterior)
     return make_section(
         "uncertainty",
-        "What the records determine",
         Bullets(tuple(content.verdict)),
         make_prose("uncertainty", residuals=content.residuals),
         make_table("uncertainty-parameters", content.parameters),
@@ -183,7 +182,6 @@ def make_models_section(store: Results, content: ModelsResult) -> Section:
     """What ``limbfit uncertainty --models`` found."""
     return make_section(
         "models",
-        "Other models of the same records",
         make_prose("models"),
         make_table("models", content.models),
         _draw_model_figure(store, content),
