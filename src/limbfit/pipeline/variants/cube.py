@@ -6,12 +6,13 @@ A cube of 10 mm between frictionless plates that hold on to it: compressed over 
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict
 
 from ... import report
 from ...arrays import Array
@@ -33,27 +34,17 @@ from ..simulation.limb_geometry import LimbGeometry
 from .variants import format_column
 
 
-@dataclass(frozen=True)
-class PublishedTissue:
-    """A tissue of the literature.
+class PublishedTissue(BaseModel):
+    """A tissue of the literature; ``published.toml`` says what its keys are."""
 
-    Parameters
-    ----------
-    kind : ``skin`` or ``muscle``: beside which of a study's tissues it is shown.
-    values : the numbers as printed.
-    terms : (c_k in kPa, m_k) of the Ogden terms that they were put into.
-    bulk_kPa : bulk modulus: 100 times ``c``, as in the paper, or times the shear modulus.
-    relaxation : (gamma, tau in s) of ``G = 1 + gamma exp(-t/tau)``; None: not published; () : elastic.
-    conversion : what was done to the numbers, in words.
-    source : the citation, and where the numbers were taken from.
-    """
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
-    kind: str
+    kind: Literal["skin", "muscle"]
     values: str
     terms: tuple[tuple[float, float], ...]
     bulk_kPa: float
-    relaxation: tuple[float, float] | tuple[()] | None
+    relaxation: tuple[float, float] | tuple[()] | None = None
     conversion: str
     source: str
 
@@ -66,63 +57,10 @@ class PublishedTissue:
         return Ogden(terms, relaxation, kappa_ratio=self.bulk_kPa / shear)
 
 
-_FIRST_ORDER = (
-    "c and m of FEBio's first-order Ogden, c/m² Σ(λᵐ − 1), the law that the paper names: the shear modulus "
-    "of small strains is c/2"
+_FILE = Path(__file__).with_name("published.toml")
+PUBLISHED = tuple(
+    PublishedTissue(**row) for row in tomllib.loads(_FILE.read_text(encoding="utf-8"))["tissues"]
 )
-_SECOND_ORDER = "the law of limbfit, c/m² Σ(λᵐ + λ⁻ᵐ − 2); γ read without the unit that the paper prints"
-_PAPER = "Sengeh, Moerman, Petron and Herr, J. Mech. Behav. Biomed. Mater. 59 (2016) 379"
-_LIM = (
-    "Lim, Hong, Chen and Weerasooriya 2011, pig skin in tension, as quoted by Sengeh et al. 2016 [their 44]"
-)
-_AFFAGARD = (
-    "Affagard et al., human thigh muscles in vivo, as quoted by Dao and Ho Ba Tho, Appl. Bionics Biomech. "
-    "2018, 7631818, table 2"
-)
-_NEO_HOOKEAN = "neo-Hookean C10 (I1 − 3): one Ogden term, m = 2 and c = 4 C10; shear modulus 2 C10"
-_NO_RELAXATION = "; no relaxation published: that of the study's own tissue"
-
-PUBLISHED = (
-    PublishedTissue(
-        "residuum, skin–adipose (Sengeh 2016)", "skin", "c = 5.22 kPa, m = 4.79, γ = 3.57, τ = 0.32 s",
-        ((5.22, 4.79), (5.22, -4.79)), 522.0, (3.57, 0.32), _SECOND_ORDER, f"{_PAPER}, table 1",
-    ),
-    PublishedTissue(
-        "pig skin, along the spine (Lim 2011)", "skin", "c = 20 kPa, m = 11",
-        ((20.0, 11.0),), 2000.0, None, _FIRST_ORDER + _NO_RELAXATION, _LIM,
-    ),
-    PublishedTissue(
-        "pig skin, across the spine (Lim 2011)", "skin", "c = 8 kPa, m = 7",
-        ((8.0, 7.0),), 800.0, None, _FIRST_ORDER + _NO_RELAXATION, _LIM,
-    ),
-    PublishedTissue(
-        "pig subdermal fat (Sims 2010)", "skin", "μ = 0.53 kPa, Prony α = 0.39, τ = 700 s",
-        ((1.06, 2.0),), 53.0, (),
-        "neo-Hookean: one Ogden term, m = 2 and c = 2 μ; left elastic, since within 2 s of τ = 700 s the "
-        "stress relaxes by less than 0.2 %",
-        "Sims et al., Biomech. Model. Mechanobiol. 9 (2010) 703, abstract",
-    ),
-    PublishedTissue(
-        "residuum, muscle complex (Sengeh 2016)", "muscle", "c = 5.20 kPa, m = 4.78, γ = 3.47, τ = 0.34 s",
-        ((5.20, 4.78), (5.20, -4.78)), 520.0, (3.47, 0.34), _SECOND_ORDER, f"{_PAPER}, table 1",
-    ),
-    PublishedTissue(
-        "rat tibialis anterior (Bosboom 2001)", "muscle", "c = 15.6 kPa, m = 21.4, γ = 0.549, τ = 6.01 s",
-        ((15.6, 21.4),), 1560.0, (0.549, 6.01),
-        _FIRST_ORDER + "; its δ = 0.549 read as γ, as in the paper",
-        "Bosboom et al., J. Biomech. 34 (2001) 1365, abstract, and as quoted by Sengeh et al. 2016 [their 9]",
-    ),
-    PublishedTissue(
-        "human thigh, softest (Affagard)", "muscle", "C10 = 1.75 kPa",
-        ((7.0, 2.0),), 350.0, None, _NEO_HOOKEAN + _NO_RELAXATION, _AFFAGARD,
-    ),
-    PublishedTissue(
-        "human thigh, stiffest (Affagard)", "muscle", "C10 = 3.75 kPa",
-        ((15.0, 2.0),), 750.0, None, _NEO_HOOKEAN + _NO_RELAXATION, _AFFAGARD,
-    ),
-)  # fmt: skip
-
-
 SIDE_MM, RAMP_S, HOLD_S = 10.0, 0.5, 1.0
 STEPS = 40  # in each ramp, and in the time held
 COMPRESSION_PERCENT = 20.0
