@@ -7,10 +7,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from ..errors import InputError
 from ..laws import ACTIVE, LAWS, OGDEN
 from ..relaxation import DEFAULT_SPAN_S, choose_relaxation_times
-from .tables import Direction, Positive, TomlTable
+from .tables import Direction, Positive, TomlTable, refuse_value
 
 KAPPA_RATIO = (10.0, 1e4)
 End = Literal["lower", "start", "upper"]
@@ -81,10 +80,8 @@ class MaterialTable(TissueRange):
         name = content.get("law", OGDEN) if isinstance(content, dict) else None
         if not isinstance(name, str):
             return content
-        try:
+        with refuse_value():
             law = LAWS[name]
-        except InputError as error:
-            raise ValueError(str(error)) from None
         known = {which: {p.key: getattr(p, which) for p in law.parameters} for which in _ENDS}
         given = {which: content.get(which, {}) for which in _ENDS}
         filled = {which: known[which] | values for which, values in given.items() if isinstance(values, dict)}
@@ -93,10 +90,8 @@ class MaterialTable(TissueRange):
     @field_validator("relaxation_span_s")
     @classmethod
     def _check_span(cls, span: tuple[float, float]) -> tuple[float, float]:
-        try:
+        with refuse_value():
             choose_relaxation_times(*span)
-        except InputError as error:
-            raise ValueError(str(error)) from None
         return span
 
     @field_validator("kappa_ratio")

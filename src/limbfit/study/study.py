@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from .. import laws
-from ..errors import InputError, StudyError
+from ..errors import StudyError
 from ..priors import of_tissues
 from ..relaxation import choose_relaxation_times
 from . import tables
@@ -331,10 +331,8 @@ class Study(tables.TomlTable):
                 f'calibration.priors: people are described by the law "{laws.OGDEN}", the study has '
                 f'"{self.material.law}"; leave it out, or state calibration.prior'
             )
-        try:
+        with tables.refuse_value("calibration.prior_tissues: "):
             of_tissues(self.tissues, self.calibration.prior_tissues)
-        except InputError as error:
-            raise ValueError(f"calibration.prior_tissues: {error}") from None
 
     def _check_geometry(self) -> None:
         if self.geometry.regions and self.mesh.engine != "mmg":

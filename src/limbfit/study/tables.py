@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -48,6 +49,15 @@ def _check_length(vector: Vector) -> Vector:
 
 Direction = Annotated[Vector, AfterValidator(_check_length)]
 Friction = Annotated[Literal["frictionless", "sticky"] | float, BeforeValidator(_check_friction)]
+
+
+@contextmanager
+def refuse_value(place: str = "") -> Iterator[None]:
+    """Turn an `InputError` into the `ValueError` of which pydantic makes an error of the table."""
+    try:
+        yield
+    except InputError as error:
+        raise ValueError(f"{place}{error}") from None
 
 
 class TomlTable(BaseModel):
@@ -244,10 +254,8 @@ class IndenterTable(TomlTable):
     @field_validator("shape")
     @classmethod
     def _check_shape(cls, name: str) -> str:
-        try:
+        with refuse_value():
             return SHAPES[name].name
-        except InputError as error:
-            raise ValueError(str(error)) from None
 
     @model_validator(mode="before")
     @classmethod
@@ -271,10 +279,8 @@ class IndenterTable(TomlTable):
         if self.edge_radius_mm >= self.width_mm / 2:
             raise ValueError("edge_radius_mm must be smaller than half of width_mm")
         if self.file is None:
-            try:
+            with refuse_value():
                 shape.of(Size(self.width_mm, self.edge_radius_mm, self.measures))
-            except InputError as error:
-                raise ValueError(str(error)) from None
 
 
 class TracesTable(TomlTable):

@@ -23,17 +23,12 @@ from ..drawing.socket_pictures import (
 from ..formats import format_symbol
 from ..page import Note, Row, Section, Table
 from ..store import Results
-from ..words import make_prose, make_row, make_section, make_table, to_numeric
+from ..words import make_prose, make_row, make_section, make_table, to_numeric, write_words
 
 # What counts as known, and how its change is headed.
 KNOWN = {
     "liner.c_kPa": f"Change, liner {format_symbol('c')} 10 % larger",
     "friction": "Change, friction 10 % larger",
-}
-ORIGINS = {
-    "identified": "identified from this limb's records",
-    "literature": "those of people (medians), not of this limb",
-    "given": "given by hand",
 }
 
 
@@ -42,13 +37,10 @@ def make_socket_section(store: Results, content: SocketResult) -> Section:
     folder, states = store.folder / "socket", content.states
     files = {name: folder / f"held-{i}.vtu" for i, name in enumerate(states)}
     name, last = list(states.items())[-1]
-    origin = ORIGINS.get(content.parameters_from, content.parameters_from)
+    origin = write_words("origin", of=content.parameters_from)
     return make_section(
         "socket",
-        Note(
-            "A simulation for research, not a medical device: it says what a rigid socket does to this model "
-            "of the limb."
-        ),
+        Note(write_words("socket note")),
         make_prose("socket shape", content=content, origin=origin),
         (Note(f"The socket's file: {text}.") for text in content.socket.notes),
         make_prose("socket loads", content=content),
@@ -115,12 +107,12 @@ def make_socket_design_section(store: Results, content: SocketDesignResult) -> S
     folder, designs, found = store.folder / "socket_design", content.designs, content.optimisation
     last = len(designs[0].simulation.loads)  # donning is the first
     held = {one.name: folder / f"{one.name}-{last}.vtu" for one in designs}
-    origin = ORIGINS.get(content.parameters_from, content.parameters_from)
+    origin = write_words("origin", of=content.parameters_from)
     limits = found.limits_kPa if found else {}
     failed = [(i, trial.reason) for i, trial in enumerate(found.trials if found else ()) if trial.reason]
     return make_section(
         "socket_design",
-        Note("A simulation for research, not a medical device: no socket here has been worn."),
+        Note(write_words("socket design note")),
         make_prose("socket design", content=content, origin=origin),
         draw_offset_figure(store, {one.name: folder / f"{one.name}-face.vtp" for one in designs}),
         make_prose("socket design loads", designs=designs),
