@@ -67,23 +67,14 @@ class StoredResult(ResultPart):
     def find(cls, results: Path, name: str = "") -> Self | None:
         """Read it from a results folder, ``name`` in place of the star; None where it is not there.
 
-        Raises
-        ------
-        InputError
-            In one line, for a file that is not JSON or has not the keys of this version.
+        Raises `InputError` as `read_file`.
         """
         file = results / cls.FILE.replace("*", name)
         return cls.read_file(file, f"run {cls.COMMAND} again") if file.is_file() else None
 
     @classmethod
     def read(cls, results: Path, name: str = "") -> Self:
-        """Read it as `find` does.
-
-        Raises
-        ------
-        InputError
-            Also where it is not there.
-        """
+        """Read it as `find` does. Raises `InputError` also where it is not there."""
         found = cls.find(results, name)
         if found is None:
             file = results / cls.FILE.replace("*", name)
