@@ -6,7 +6,7 @@ The limbs are phantoms of several seeds, a mean residuum, and a real calf that i
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 
 from ..anatomy.imaging import read_volume
 from ..anatomy.meshing.engines import ENGINES
-from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
+from ..anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
 from ..anatomy.segmentation.amputation import amputate_limb
 from ..anatomy.segmentation.segmentation import segment
 from ..anatomy.sites.sites import compute_indenter_axis
@@ -24,7 +24,8 @@ from ..arrays import Array
 from ..errors import InputError, LimbfitError
 from ..phantom.geometry import make_limb
 from ..phantom.mri import build_true_labels, make_grid
-from .parity import Row, Tell, find_reference
+from ..results.limb import MeshMeasures
+from .parity import Tell, find_reference
 
 SITES = 20
 SEEDS = (0, 1, 2)
@@ -70,7 +71,7 @@ def bench_meshing(
     settings = replace(settings or MeshSettings(), engine=engine)
     if makers is None:
         makers = list_limbs(shared or find_reference(Path.cwd()).parent)
-    rows: list[Row] = []
+    rows: list[tuple[str, float, MeshMeasures]] = []  # limb, CPU seconds, mesh
     failed: list[str] = []
     seconds_base = {}
     for done, (name, make) in enumerate(makers.items()):
@@ -81,8 +82,10 @@ def bench_meshing(
         base = build_base_mesh(anatomy, settings)
         seconds_base[name] = measure_cpu_seconds() - start
         for i, (position, axis) in enumerate(draw_random_sites(anatomy, sites)):
+            start = measure_cpu_seconds()
             try:
-                rows.append({"limb": name, **_measure_mesh(anatomy, position, axis, settings, base)})
+                _, mesh = mesh_site(anatomy, position, axis, settings, base)
+                rows.append((name, measure_cpu_seconds() - start, mesh))
             except LimbfitError as error:
                 failed.append(f"{name}, site {i}: {error}")
             tell(done * sites + i + 1, len(makers) * sites, name)
@@ -93,7 +96,7 @@ def bench_meshing(
         "failed": failed,
         "limbs": {
             name: _summarise(
-                [row for row in rows if row["limb"] == name],
+                [row for row in rows if row[0] == name],
                 [text for text in failed if text.startswith(f"{name},")],
             )
             for name in makers
@@ -101,40 +104,26 @@ def bench_meshing(
     }
 
 
-def _measure_mesh(anatomy: Anatomy, position: Any, axis: Any, settings: MeshSettings, base: BaseMesh) -> Row:
-    start = measure_cpu_seconds()
-    _, report = mesh_site(anatomy, position, axis, settings, base)
-    return {
-        "seconds": measure_cpu_seconds() - start,
-        "nodes": report.nodes,
-        "cells": report.cells,
-        "dihedral": report.min_dihedral_deg,
-        "error_mean": report.interface_error_mm.mean,
-        "error_max": report.interface_error_mm.max,
-        "thickness": report.layer_mean_mm,
-        "thickness_std": report.layer_std_mm,
-        "volume_error": report.volume_error,
-    }
-
-
-def _summarise(rows: list[Row], failed: list[str]) -> dict[str, Any]:
+def _summarise(rows: Sequence[tuple[str, float, MeshMeasures]], failed: Sequence[str]) -> dict[str, Any]:
     summary: dict[str, Any] = {"sites": len(rows) + len(failed), "failures": len(failed)}
     if not rows:
         return summary
-    column = {key: np.array([row[key] for row in rows]) for key in rows[0] if key != "limb"}
+    _, seconds, meshes = zip(*rows, strict=True)
+    errors = [mesh.interface_error_mm for mesh in meshes]
+    angles = [mesh.min_dihedral_deg for mesh in meshes]
     return summary | {
-        "min_dihedral_deg": float(column["dihedral"].min()),
-        "median_of_min_dihedral_deg": float(np.median(column["dihedral"])),
-        "nodes_median": float(np.median(column["nodes"])),
-        "cells_median": float(np.median(column["cells"])),
-        "cells_max": int(column["cells"].max()),
-        "interface_error_mean_mm": float(column["error_mean"].mean()),
-        "interface_error_max_mm": float(column["error_max"].max()),
-        "thickness_mean_mm": float(column["thickness"].mean()),
-        "thickness_std_mm": float(column["thickness_std"].mean()),
-        "volume_error_max_percent": float(100 * np.abs(column["volume_error"]).max()),
-        "seconds_median": float(np.median(column["seconds"])),
-        "seconds_max": float(column["seconds"].max()),
+        "min_dihedral_deg": min(angles),
+        "median_of_min_dihedral_deg": float(np.median(angles)),
+        "nodes_median": float(np.median([mesh.nodes for mesh in meshes])),
+        "cells_median": float(np.median([mesh.cells for mesh in meshes])),
+        "cells_max": max(mesh.cells for mesh in meshes),
+        "interface_error_mean_mm": float(np.mean([error.mean for error in errors])),
+        "interface_error_max_mm": max(error.max for error in errors),
+        "thickness_mean_mm": float(np.mean([mesh.layer_mean_mm for mesh in meshes])),
+        "thickness_std_mm": float(np.mean([mesh.layer_std_mm for mesh in meshes])),
+        "volume_error_max_percent": 100 * max(abs(mesh.volume_error) for mesh in meshes),
+        "seconds_median": float(np.median(seconds)),
+        "seconds_max": max(seconds),
     }
 
 
