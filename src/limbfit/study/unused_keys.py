@@ -255,10 +255,7 @@ UNUSED_SITE_KEYS: tuple[UnusedKeys, ...] = (
 def check_unused_keys(study: Study, content: Mapping[str, Any]) -> None:
     """Refuse keys that ``content``, the file as read, states without effect; defaults are no statement.
 
-    Raises
-    ------
-    StudyError
-        With the key, why it has no effect and what to do.
+    Raises `StudyError` with the key, why it has no effect and what to do.
     """
     for key, why, remedy in _find_unused_keys(study, content):
         raise StudyError(f"without effect: {why}", place=key, remedy=remedy)

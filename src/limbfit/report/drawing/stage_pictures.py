@@ -46,17 +46,9 @@ ANGLES_DEG = (0.0, 72.0)  # the smallest dihedral angle of a regular tetrahedron
 
 
 def draw_stage(results: Path, stage: str, file: Path) -> Path:
-    """Draw what a finished stage made into a PNG file; its path.
+    """Draw what a stage (``surfaces``, ``sites`` or ``mesh``) made into a PNG file; its path.
 
-    Parameters
-    ----------
-    results : the results folder of a study.
-    stage : ``surfaces``, ``sites`` or ``mesh``.
-
-    Raises
-    ------
-    InputError
-        When the stage has not been done.
+    Raises `InputError` where the ``results`` of the study lack it.
     """
     store = load_store(results)
     if "skin" not in store.surface_files:
