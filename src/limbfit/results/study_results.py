@@ -8,6 +8,7 @@ from typing import Protocol, TypeVar
 
 from ..arrays import Array
 from ..errors import InputError
+from . import variants
 from .base import StoredResult
 from .curves import read_curves
 from .identification import CalibrationResult, PredictResult
@@ -18,14 +19,6 @@ from .records import TracesResult
 from .runs import CompareResult, RunResult, SimulateResult, StageStamp
 from .socket import SocketDesignResult, SocketResult
 from .uncertainty import CrossvalidateResult, RegionsResult, UncertaintyResult
-from .variants import (
-    CubeResult,
-    FrictionResult,
-    IndenterResult,
-    RefinementResult,
-    StiffnessResult,
-    VolumeResult,
-)
 
 R = TypeVar("R", bound=StoredResult)
 
@@ -73,12 +66,12 @@ class StudyResults:
     uncertainty = Single(UncertaintyResult)
     crossvalidate = Single(CrossvalidateResult)
     regions = Single(RegionsResult)
-    sensitivity_c = Single(StiffnessResult)
-    sensitivity_kappa = Single(VolumeResult)
-    sensitivity_contact = Single(FrictionResult)
-    sensitivity_indenter = Single(IndenterResult)
-    sensitivity_mesh = Single(RefinementResult)
-    cube = Single(CubeResult)
+    sensitivity_c = Single(variants.StiffnessResult)
+    sensitivity_kappa = Single(variants.VolumeResult)
+    sensitivity_contact = Single(variants.FrictionResult)
+    sensitivity_indenter = Single(variants.IndenterResult)
+    sensitivity_mesh = Single(variants.RefinementResult)
+    cube = Single(variants.CubeResult)
     models = Single(ModelsResult)
     models_socket = Single(SocketOfModels)
     socket = Single(SocketResult)

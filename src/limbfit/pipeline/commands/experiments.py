@@ -31,16 +31,9 @@ from ..simulation.limb_geometry import Check, LimbGeometry
 from ..socket.design import check_socket_design, run_socket_design
 from ..socket.socket import check_socket, run_socket
 from ..uncertainty.uncertainty import run_uncertainty
+from ..variants import sensitivity
 from ..variants.cube import check_cube, run_cube
 from ..variants.regions import check_regions, run_regions
-from ..variants.sensitivity import (
-    check_refinement,
-    run_contact,
-    run_indenter,
-    run_kappa,
-    run_refinement,
-    run_stiffness,
-)
 from ..variants.variants import check_variants
 
 
@@ -97,11 +90,11 @@ _OWN: tuple[Experiment, ...] = (
     *(
         Experiment(f"sensitivity-{name}", run, _SIMULATED, _TABLES, _VARIED, _RECORD, check=check)
         for name, run, check in (
-            ("c", run_stiffness, check_variants),
-            ("kappa", run_kappa, check_variants),
-            ("contact", run_contact, check_variants),
-            ("indenter", run_indenter, check_variants),
-            ("mesh", run_refinement, check_refinement),
+            ("c", sensitivity.run_stiffness, check_variants),
+            ("kappa", sensitivity.run_kappa, check_variants),
+            ("contact", sensitivity.run_contact, check_variants),
+            ("indenter", sensitivity.run_indenter, check_variants),
+            ("mesh", sensitivity.run_refinement, sensitivity.check_refinement),
         )
     ),
     Experiment(

@@ -9,15 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from ...results.variants import (
-    FrictionResult,
-    IndenterResult,
-    RefinementResult,
-    StiffnessResult,
-    VariedResult,
-    VariedSite,
-    VolumeResult,
-)
+from ...results import variants as stored
 from ..drawing.colours import GRID, INK, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH, choose_tissue_style
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..formats import format_fixed
@@ -31,10 +23,10 @@ _STYLES = tuple(zip(_COLOURS, _LINES, strict=True))
 _RANGE = ("J_min", "J_low", "J_high", "J_max")
 
 
-def make_sensitivity_section(store: Results, content: VariedResult, name: str) -> Section:
+def make_sensitivity_section(store: Results, content: stored.VariedResult, name: str) -> Section:
     """Force with one thing changed at a time: in words, in curves, and in a table of the simulations."""
     draw_figure = _FIGURES[name]
-    stiffness = content if isinstance(content, StiffnessResult) else None
+    stiffness = content if isinstance(content, stored.StiffnessResult) else None
     facts = {
         "element": store.calibration.element if store.calibration else None,
         "changes": write_words("changes of the force", runs=content.runs),
@@ -52,11 +44,11 @@ def make_sensitivity_section(store: Results, content: VariedResult, name: str) -
     )
 
 
-def _name_site(row: VariedSite) -> str:
+def _name_site(row: stored.VariedSite) -> str:
     return f"site {row.site}, {row.role}" if row.role else f"site {row.site}"
 
 
-def _find_leading_tissues(content: StiffnessResult) -> dict[str, dict[str, float]]:
+def _find_leading_tissues(content: stored.StiffnessResult) -> dict[str, dict[str, float]]:
     """The largest change of the force by each tissue, by site: whether thin and thick sites differ in it."""
     found: dict[str, dict[str, float]] = {}
     for row in content.runs:
@@ -67,7 +59,7 @@ def _find_leading_tissues(content: StiffnessResult) -> dict[str, dict[str, float
 
 
 @styled
-def _draw_stiffness_figure(store: Results, content: StiffnessResult) -> Figure:
+def _draw_stiffness_figure(store: Results, content: stored.StiffnessResult) -> Figure:
     sites = content.sites[:2]
     drawing, axes = make_panels(len(sites) + 1, len(sites) + 1, 2.9)
     tissues = list(content.parameters)
@@ -79,7 +71,9 @@ def _draw_stiffness_figure(store: Results, content: StiffnessResult) -> Figure:
     return make_figure(drawing, "sensitivity-c", content=content)
 
 
-def _draw_curves(ax: Axes, store: Results, name: str, site: VariedSite, content: VariedResult) -> None:
+def _draw_curves(
+    ax: Axes, store: Results, name: str, site: stored.VariedSite, content: stored.VariedResult
+) -> None:
     """Force against time of every variant of a site."""
     curves = store.curves(name, site.site) or {}
     rows = [row for row in content.runs if row.site == site.site and row.completed]
@@ -92,7 +86,7 @@ def _draw_curves(ax: Axes, store: Results, name: str, site: VariedSite, content:
     ax.margins(x=0.01)
 
 
-def _draw_derivatives(ax: Axes, content: StiffnessResult, tissues: Sequence[str]) -> None:
+def _draw_derivatives(ax: Axes, content: stored.StiffnessResult, tissues: Sequence[str]) -> None:
     for i, tissue in enumerate(tissues):
         rows = [row for row in content.local if row.peak_percent_per_percent[tissue] is not None]
         depth = [row.tissue_mm for row in rows]
@@ -106,7 +100,7 @@ def _draw_derivatives(ax: Axes, content: StiffnessResult, tissues: Sequence[str]
 
 
 @styled
-def _draw_kappa_figure(store: Results, content: VolumeResult) -> Figure:
+def _draw_kappa_figure(store: Results, content: stored.VolumeResult) -> Figure:
     drawing, axes = make_panels(2, 2, 2.7)
     for i, site in enumerate(content.sites):
         color, line = _STYLES[i % len(_STYLES)]
@@ -130,7 +124,7 @@ def _draw_kappa_figure(store: Results, content: VolumeResult) -> Figure:
 
 
 @styled
-def _draw_mesh_figure(store: Results, content: RefinementResult) -> Figure:
+def _draw_mesh_figure(store: Results, content: stored.RefinementResult) -> Figure:
     sites = content.sites[:2]
     drawing, axes = make_panels(len(sites) + 1, len(sites) + 1, 2.7)
     for ax, site in zip(axes, sites, strict=False):
@@ -152,8 +146,8 @@ def _draw_mesh_figure(store: Results, content: RefinementResult) -> Figure:
 
 
 @styled
-def _draw_site_curves(store: Results, content: FrictionResult | IndenterResult) -> Figure:
-    name = "sensitivity-contact" if isinstance(content, FrictionResult) else "sensitivity-indenter"
+def _draw_site_curves(store: Results, content: stored.FrictionResult | stored.IndenterResult) -> Figure:
+    name = "sensitivity-contact" if isinstance(content, stored.FrictionResult) else "sensitivity-indenter"
     drawing, axes = make_panels(len(content.sites), 2, 2.7)
     for ax, site in zip(axes, content.sites, strict=True):
         _draw_curves(ax, store, name, site, content)
@@ -162,7 +156,7 @@ def _draw_site_curves(store: Results, content: FrictionResult | IndenterResult) 
     return make_figure(drawing, name, words="compared models", title=write_words(f"section {name}"))
 
 
-def _list_warnings(content: VariedResult) -> Bullets | None:
+def _list_warnings(content: stored.VariedResult) -> Bullets | None:
     """Simulations that did not reach their end, and what is doubtful about others."""
     runs = content.runs
     texts = [(row, f"stopped early: {row.reason}") for row in runs if not row.completed]

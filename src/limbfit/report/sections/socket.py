@@ -6,14 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from ...results.socket import (
-    LoadedRegion,
-    PublishedFindings,
-    SocketDesignResult,
-    SocketLoad,
-    SocketResult,
-    SocketState,
-)
+from ...results import socket as stored
 from ..drawing.socket_pictures import (
     draw_inside_figure,
     draw_offset_figure,
@@ -32,7 +25,7 @@ KNOWN = {
 }
 
 
-def make_socket_section(store: Results, content: SocketResult) -> Section:
+def make_socket_section(store: Results, content: stored.SocketResult) -> Section:
     """What the experiment ``socket`` found."""
     folder, states = store.folder / "socket", content.states
     files = {name: folder / f"held-{i}.vtu" for i, name in enumerate(states)}
@@ -72,7 +65,7 @@ def _make_load_table(name: str, rows: Mapping[str, Sequence[Any]], **facts: Any)
     return table and replace(table, rows=tuple(body))
 
 
-def make_interval_table(state: SocketState, title: str) -> Table | None:
+def make_interval_table(state: stored.SocketState, title: str) -> Table | None:
     """How much of each interval goes with every identified parameter; what liner and friction change."""
     first = state.regions[0]
     if first.interval_from is None:
@@ -81,7 +74,7 @@ def make_interval_table(state: SocketState, title: str) -> Table | None:
         (one.region, "kPa", one.mean_kPa, one.interval_kPa, one.interval_from, one.change_kPa)
         for one in state.regions
     ]
-    if isinstance(state, SocketLoad):
+    if isinstance(state, stored.SocketLoad):
         interval, causes = state.settling_interval_mm, state.settling_interval_from
         rows.append(("settling", "mm", state.settling_mm, interval, causes, state.settling_change_mm))
     known = {name: head for name, head in KNOWN.items() if name in (first.change_kPa or {})}
@@ -89,10 +82,10 @@ def make_interval_table(state: SocketState, title: str) -> Table | None:
 
 
 def make_published_table(
-    published: Sequence[PublishedFindings], state: SocketState, title: str
+    published: Sequence[stored.PublishedFindings], state: stored.SocketState, title: str
 ) -> Table | None:
     """What others found over the regions of this result, beside its pressures when a part has been held."""
-    here: dict[str, LoadedRegion] = {row.region: row for row in state.regions}
+    here: dict[str, stored.LoadedRegion] = {row.region: row for row in state.regions}
     rows = [
         (name, here.get(name, state), one)
         for name in dict.fromkeys(name for one in published for name in one.regions)
@@ -102,7 +95,7 @@ def make_published_table(
     return make_table("socket-published", rows, title=title)
 
 
-def make_socket_design_section(store: Results, content: SocketDesignResult) -> Section:
+def make_socket_design_section(store: Results, content: stored.SocketDesignResult) -> Section:
     """What the experiment ``socket_design`` found."""
     folder, designs, found = store.folder / "socket_design", content.designs, content.optimisation
     last = len(designs[0].simulation.loads)  # donning is the first
