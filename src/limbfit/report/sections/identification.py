@@ -12,14 +12,6 @@ from ..page import Block, Bullets, Cell, Section, Table, make_bullets
 from ..store import Results
 from ..words import make_prose, make_row, make_section, make_table, write_words
 
-_KINDS = {
-    "folded": "elements inside out",
-    "slipped": "force falls in loading",
-    "sunk": "indenter too deep in the skin",
-    "unbalanced": "equilibrium beyond the tolerance",
-    "unsettled": "friction not settled",
-    "inexact": "inexact sensitivities",
-}
 EQUAL_PERCENT = 0.01  # of the largest force: what the tolerance of an equilibrium leaves
 
 
@@ -109,7 +101,7 @@ def describe_search(store: Results) -> tuple[Bullets | None, Table | None]:
     rows, answer = found.search, found.answer
     texts = []
     if rows:
-        kinds = Counter(_KINDS[row.kind] for row in rows)
+        kinds = Counter(row.kind for row in rows)
         used = sum(row.iterate is not None for row in rows)
         texts.append(write_words("doubts of the search", found=found, kinds=kinds, used=used))
     texts += [
@@ -118,4 +110,4 @@ def describe_search(store: Results) -> tuple[Bullets | None, Table | None]:
     for site, one in store.calibration.contact.items():
         if (off := one.from_rest_percent or 0.0) > EQUAL_PERCENT:
             texts.append(write_words("doubt of the answer", site=site, off=off))
-    return make_bullets(texts), make_table("doubtful-simulations", rows, folded=True, kinds=_KINDS)
+    return make_bullets(texts), make_table("doubtful-simulations", rows, folded=True)
