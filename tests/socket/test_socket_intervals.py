@@ -31,7 +31,7 @@ def spread_of(
 
 def test_interval_and_shares_are_those_of_drawn_parameters():
     spread = spread_of()
-    interval, shares, changes, _ = spread.told(50.0, SLOPES)
+    interval, shares, changes, _ = spread.propagate(50.0, SLOPES)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(2), COVARIANCE, 200_000)
     values = 50.0 + draws @ SLOPES[:2]
     assert (interval[1] - interval[0]) / 2 == pytest.approx(NORMAL_95 * values.std(), rel=0.01)
@@ -43,22 +43,24 @@ def test_interval_and_shares_are_those_of_drawn_parameters():
 
 
 def test_an_interval_covers_the_most_probable_parameters_too():
-    plain, *_ = spread_of().told(50.0, SLOPES)
+    plain, *_ = spread_of().propagate(50.0, SLOPES)
     for step in (0.3, -0.3):  # of the skin's c, whose slope is 3 kPa
-        (low, high), *_ = spread_of([step, 0.0]).told(50.0, SLOPES)
+        (low, high), *_ = spread_of([step, 0.0]).propagate(50.0, SLOPES)
         assert (low, high) == pytest.approx((plain[0] + min(3 * step, 0.0), plain[1] + max(3 * step, 0.0)))
 
 
 def test_an_interval_counts_relaxation_beyond_the_records_and_holds_the_value():
     """Moduli fall by 40 % on average, with a deviation of 20 %; the simulated value stays inside."""
     further = np.array([[0.04, 0.0], [0.0, 0.0]])
-    interval, _, _, (moved, sd, fall) = spread_of(shift=[-0.4, 0.0], relaxation=further).told(50.0, SLOPES)
+    interval, _, _, (moved, sd, fall) = spread_of(shift=[-0.4, 0.0], relaxation=further).propagate(
+        50.0, SLOPES
+    )
     draws = np.random.default_rng(0).multivariate_normal([-0.4, 0.0], COVARIANCE + further, 200_000)
     values = 50.0 + draws @ SLOPES[:2]
     assert (moved, sd, fall) == pytest.approx((3.0 * -0.4, 3.0 * 0.2, 0.0))
     half = NORMAL_95 * values.std()  # moduli fall by factors, draws do not
     assert interval == pytest.approx([values.mean() - half, values.mean() + half], abs=0.1)
-    (low, high), *_ = spread_of(shift=[-4.0, 0.0]).told(50.0, SLOPES)
+    (low, high), *_ = spread_of(shift=[-4.0, 0.0]).propagate(50.0, SLOPES)
     assert low < 50.0 * np.exp(-12.0 / 50.0)
     assert high == 50.0
 
@@ -67,16 +69,16 @@ def test_an_interval_counts_relaxation_beyond_the_records_and_holds_the_value():
 def test_an_interval_reaches_to_the_farthest_fall_and_loses_nothing_at_the_other_end(fall_log):
     """A pressure that is proportional to a modulus falls by the same factor, and stays positive."""
     slopes = np.array([50.0, *SLOPES[1:]])
-    plain, *_ = spread_of().told(50.0, slopes)
-    (low, high), *_, (_, _, fall) = spread_of(fall=[fall_log, 0.0]).told(50.0, slopes)
+    plain, *_ = spread_of().propagate(50.0, slopes)
+    (low, high), *_, (_, _, fall) = spread_of(fall=[fall_log, 0.0]).propagate(50.0, slopes)
     assert fall == pytest.approx(50.0 * (1 - np.exp(-fall_log)))
     assert (low, high) == pytest.approx((plain[0] * np.exp(-fall_log), plain[1]))
 
 
 def test_most_of_an_interval_comes_from_relaxation_where_that_makes_it_wide():
     slopes = np.array([50.0, *SLOPES[1:]])
-    plain, alone, *_ = spread_of().told(50.0, slopes)
-    worn, shares, *_ = spread_of(fall=[0.8, 0.0]).told(50.0, slopes)
+    plain, alone, *_ = spread_of().propagate(50.0, slopes)
+    worn, shares, *_ = spread_of(fall=[0.8, 0.0]).propagate(50.0, slopes)
     left = ((plain[1] - plain[0]) / (worn[1] - worn[0])) ** 2
     assert next(iter(shares)) == "relaxation"
     assert shares["relaxation"] == pytest.approx(100.0 * (1.0 - left))

@@ -133,7 +133,7 @@ class TooLargeError(Exception):
 def _limit_body(receive: Receive) -> Receive:
     length = 0
 
-    async def bounded() -> Message:
+    async def receive_limited() -> Message:
         nonlocal length
         message = await receive()
         length += len(message.get("body", b""))
@@ -141,13 +141,13 @@ def _limit_body(receive: Receive) -> Receive:
             raise TooLargeError
         return message
 
-    return bounded
+    return receive_limited
 
 
 def _add_headers(send: Send, cookie: str) -> Send:
     """Every answer with the headers that keep it where it belongs; an answer's own policy stays."""
 
-    async def dressed(message: Message) -> None:
+    async def send_with_headers(message: Message) -> None:
         if message["type"] == "http.response.start":
             headers = MutableHeaders(scope=message)
             for name, value in _HEADERS.items():
@@ -156,4 +156,4 @@ def _add_headers(send: Send, cookie: str) -> Send:
                 headers.append("Set-Cookie", cookie)
         await send(message)
 
-    return dressed
+    return send_with_headers

@@ -84,7 +84,7 @@ class PlannedRecord:
         return 2.0 * self.depth_mm / self.speed_mm_s + self.hold_s
 
     @property
-    def told(self) -> str:
+    def words(self) -> str:
         held = f", held for {self.hold_s:g} s" if self.hold_s else ""
         return f"site {self.site}, {self.indenter}, {self.depth_mm:.1f} mm at {self.speed_mm_s:g} mm/s{held}"
 
@@ -172,12 +172,12 @@ def run_protocol(
     off_mm = estimate_surface_error_mm(study, context.store)
     options, blind = ([one.to_option(rest_s, off_mm, which) for one in found] for which in (0, 1))
     plans = _build_plans([one.planned for one in found], options, budget, wanted)
-    told_by: dict[str, Sequence[RecordOption]] = dict.fromkeys(plans, options)
+    options_of: dict[str, Sequence[RecordOption]] = dict.fromkeys(plans, options)
     if noises.has_secondary:
         plans[UNSEEN] = plan_records(blind, budget, wanted)
-        told_by |= dict.fromkeys((UNSEEN, PLAIN), blind)
-    told = [
-        _judge_plan(name, chosen, told_by[name], budget, wanted, names, determine, pressures)
+        options_of |= dict.fromkeys((UNSEEN, PLAIN), blind)
+    protocols = [
+        _judge_plan(name, chosen, options_of[name], budget, wanted, names, determine, pressures)
         for name, chosen in plans.items()
     ]
     candidates = [one.to_row(rest_s) for one in found]
@@ -193,8 +193,8 @@ def run_protocol(
         draws=tissues.tolist(),
         records=[candidates[i] for i in plans[DESIGNED]],
         pressures=list(pressures),
-        protocols=told,
-        verdict=_describe_verdict(told[0], determine),
+        protocols=protocols,
+        verdict=_describe_verdict(protocols[0], determine),
         candidates=candidates,
         left_out=left_out,
         parameters=parameters,
@@ -267,7 +267,7 @@ def _add_gauges(model: SiteModel, noises: RecordNoise) -> SiteModel:
 
 
 @dataclass(frozen=True, eq=False)
-class _Simulated:
+class SimulatedRecord:
     """A planned record at every draw of the tissues.
 
     ``information`` (2, d, p, p) is what it tells, with what is seen beside its force and without: zero where
@@ -293,7 +293,7 @@ class _Simulated:
 
 def _simulate_planned(
     context: Context, folder: Path, planned: Sequence[PlannedRecord], tissues: Array, noise: RecordNoise
-) -> tuple[list[_Simulated], list[str]]:
+) -> tuple[list[SimulatedRecord], list[str]]:
     """Simulate each record at each draw, with derivatives; and what was left out.
 
     That is what does not come to its end, or presses harder at the first draw than the device may.
@@ -305,7 +305,7 @@ def _simulate_planned(
     for k, one in enumerate(planned):
         information, peak_N, failed = np.zeros((2, draws, p, p)), 0.0, 0
         for draw, (job, simulation) in enumerate(islice(simulations, draws)):
-            context.tell("protocol", k * draws + draw + 1, len(jobs), one.told)
+            context.tell("protocol", k * draws + draw + 1, len(jobs), one.words)
             if draw == 0:
                 peak_N = float(simulation.force_N.max())
             if simulation.completed:
@@ -313,14 +313,14 @@ def _simulate_planned(
             else:
                 failed += 1
         if peak_N > limit:
-            left_out.append(f"{one.told}: {peak_N:.1f} N, over acquire.force_limit_N ({limit:g} N)")
+            left_out.append(f"{one.words}: {peak_N:.1f} N, over acquire.force_limit_N ({limit:g} N)")
         elif failed == draws:
-            left_out.append(f"{one.told}: not simulated to the end")
+            left_out.append(f"{one.words}: not simulated to the end")
         else:
-            found.append(_Simulated(one, information, peak_N))
+            found.append(SimulatedRecord(one, information, peak_N))
             if failed:
                 where = f"at {failed} of {draws} draws"
-                left_out.append(f"{one.told}: not simulated to the end {where}, and is not counted there")
+                left_out.append(f"{one.words}: not simulated to the end {where}, and is not counted there")
     return found, left_out
 
 

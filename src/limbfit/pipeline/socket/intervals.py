@@ -103,7 +103,7 @@ class SimulationSpread:
         ]
         return cls(keyed, order, known.select(simulated))
 
-    def told(
+    def propagate(
         self, value: float, slopes: Array, least: float = 0.0
     ) -> tuple[list[float], dict[str, float], dict[str, float], list[float]]:
         """What is known of a value by its slopes (p,) by the logarithms of all parameters.
@@ -147,7 +147,7 @@ def spread_to_facts(
     keys = [f"{name}{part}" for part in parts]
     if spread is None or slopes is None:
         return dict.fromkeys(keys)
-    return dict(zip(keys, spread.told(value, slopes, _LEAST[unit]), strict=True))
+    return dict(zip(keys, spread.propagate(value, slopes, _LEAST[unit]), strict=True))
 
 
 def draw_step(covariance: Array, number: int, seed: int = 0) -> Array:

@@ -109,7 +109,7 @@ class SocketRun:
         )
 
     @property
-    def begun(self) -> str:
+    def partial_key(self) -> str:
         """The key under which it is kept after donning and each load, to go on where it was killed."""
         return f"begun-{self.key}"
 
@@ -128,7 +128,7 @@ def solve_run(run: SocketRun, tell: Callable[[float, float, str], None]) -> Donn
         tell(row.time, end, words)
 
     problem = build_socket_problem(run.mesh, run.laws, run.face, fit)
-    before = None if kept is None else kept.find(run.begun)
+    before = None if kept is None else kept.find(run.partial_key)
     found = simulate_donning(
         replace(problem, fibres=build_fibre_field(run.limb.fibres, run.mesh)),
         fit,
@@ -136,7 +136,7 @@ def solve_run(run: SocketRun, tell: Callable[[float, float, str], None]) -> Donn
         sensitivities=run.sensitivities,
         on_row=on_row,
         threads=run.threads,
-        keep=None if kept is None else lambda part: kept.put(run.begun, pack(part)),
+        keep=None if kept is None else lambda part: kept.put(run.partial_key, pack(part)),
         begin=None if before is None else unpack(*before),
     )
     if not found.result.completed:
@@ -155,12 +155,12 @@ def run_sockets(
     beside: Executor = executor if len(left) > 1 else SerialExecutor()
     shares, before = dict.fromkeys((run.name for run in left), 0.0), len(runs) - len(left)
 
-    def told(run: SocketRun, message: tuple[float, str]) -> None:
+    def tell_share(run: SocketRun, message: tuple[float, str]) -> None:
         shares[run.name], words = message
         tell(before + sum(shares.values()), f"{run.name}: {words}")
 
     threads = beside.threads_for(len(left))
-    reasons = beside.map(_run_socket, [replace(run, threads=threads) for run in left], on_report=told)
+    reasons = beside.map(_run_socket, [replace(run, threads=threads) for run in left], on_report=tell_share)
     found = dict(zip(shares, reasons, strict=True))
     return [found.get(run.name, "") for run in runs]
 
@@ -188,7 +188,7 @@ def simulate_socket(run: SocketRun) -> Made:
         return summarise_run(run, found), fields
 
     made = run.kept.get(run.key, make)
-    run.kept.drop(run.begun)
+    run.kept.drop(run.partial_key)
     return made
 
 

@@ -111,7 +111,7 @@ def run_socket(
         fields = {"pressure_kPa": one.pressure, "shear_kPa": one.shear, "displacement_mm": one.displacement}
         write_vtu(mesh, folder / f"held-{i}.vtu", point_data=fields, cell_data=one.strains.fields)
     _write_tables(folder, result)
-    kept.drop(run.begun)
+    kept.drop(run.partial_key)
 
 
 def _build_spread(

@@ -47,7 +47,7 @@ _MOST_OFF = 0.5  # of the rise that ends an interval: differences beyond it are 
 
 
 @dataclass(frozen=True)
-class Found:
+class Findings:
     """All that the experiment found; see the parts for what they are."""
 
     known: Uncertainty
@@ -70,7 +70,7 @@ class Found:
 
 
 def write_results(
-    folder: Path, study: Study, found: Found, predicted: Sequence[tuple[SiteRecord, SiteResponse]]
+    folder: Path, study: Study, found: Findings, predicted: Sequence[tuple[SiteRecord, SiteResponse]]
 ) -> None:
     """``uncertainty.json``, and CSV: parameters, draws, profiles, sources, predictions.
 
@@ -140,7 +140,7 @@ def write_results(
     write_table(folder / "profiles.csv", heads, lines)
 
 
-def _summarise_parameters(found: Found) -> list[stored.ParameterUncertainty]:
+def _summarise_parameters(found: Findings) -> list[stored.ParameterUncertainty]:
     """One row for every parameter: calibrated, its interval by every method, the verdict on all sources."""
     known, posterior, space = found.known, found.explored.posterior, found.explored.likelihood.space
     profiles = {one.name: one for one in found.explored.profiles}
@@ -169,7 +169,7 @@ def _summarise_parameters(found: Found) -> list[stored.ParameterUncertainty]:
     ]
 
 
-def _summarise_combinations(found: Found) -> list[stored.ParameterCombination]:
+def _summarise_combinations(found: Findings) -> list[stored.ParameterCombination]:
     """The principal axes of the posterior, as its draws, the linearisation and the sources see them."""
     known, posterior, space = found.known, found.explored.posterior, found.explored.likelihood.space
     axes = compute_principal_axes(posterior.covariance, space)
@@ -195,7 +195,7 @@ def _summarise_combinations(found: Found) -> list[stored.ParameterCombination]:
     ]
 
 
-def _summarise_source(found: Found, change: Change) -> stored.SourceEffect:
+def _summarise_source(found: Findings, change: Change) -> stored.SourceEffect:
     """One line of the table: change of force in percent of the largest, change of parameters in percent.
 
     A source of each site's own changes parameters by the root of the sum of squares over sites.
@@ -219,7 +219,7 @@ def _summarise_source(found: Found, change: Change) -> stored.SourceEffect:
 
 
 def _write_prediction(
-    folder: Path, study: Study, found: Found, record: SiteRecord, response: SiteResponse
+    folder: Path, study: Study, found: Findings, record: SiteRecord, response: SiteResponse
 ) -> stored.IntervalParts:
     """A record's interval as CSV, and its row: how wide, why, and how much of the record lies inside.
 
@@ -278,7 +278,7 @@ def _write_prediction(
 
 
 def _describe_verdict(
-    found: Found,
+    found: Findings,
     parameters: Sequence[stored.ParameterUncertainty],
     combinations: Sequence[stored.ParameterCombination],
     predictions: stored.IntervalSummary,

@@ -30,7 +30,7 @@ from ..identification.problem import CalibrationProblem, build_problem
 from ..identification.record_simulator import RecordSimulator
 from ..records.records import SiteRecord, load_records, to_response
 from ..simulation.simulations import SimulationCache, open_experiment_cache
-from .result import Found, write_results
+from .result import Findings, write_results
 from .sources import simulate_sources
 
 _NEAR = 4.0  # runs of the calibration whose error is at most this many times the least, plus 3 %, are used
@@ -75,7 +75,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     gain = FitSensitivity.linearise(known, correction.responses)
     changes = simulate_sources(context, folder, cache, records, best) if table.sources else []
     relaxation = calibration.uncertainty.relaxation
-    found = Found(known, explored, evidence, gain, tuple(changes), relaxation)
+    found = Findings(known, explored, evidence, gain, tuple(changes), relaxation)
     write_results(folder, study, found, _predict_records(context, cache, calibration))
     return {"runs": explored.rounds[-1].runs}
 
