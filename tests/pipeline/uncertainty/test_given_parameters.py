@@ -29,7 +29,12 @@ from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.problem import build_problem
 from limbfit.pipeline.records.deviations import estimate_site_noise
 from limbfit.pipeline.records.records import load_site_record
-from limbfit.pipeline.uncertainty.result import Found, _summarise_parameters, _write_flat, _write_prediction
+from limbfit.pipeline.uncertainty.result import (
+    Findings,
+    _summarise_parameters,
+    _write_flat,
+    _write_prediction,
+)
 from limbfit.pipeline.uncertainty.uncertainty import _compare_groupings
 from limbfit.results.curves import read_curves
 from limbfit.results.identification import CalibrationResult, PredictResult
@@ -119,7 +124,7 @@ def test_intervals_of_predictions_widen_beyond_the_longest_load_as_those_of_a_ru
     rows, curves = [], []
     for one in (None, relaxation):
         stated = one and SimpleNamespace(beyond=one)
-        found = Found(known, explored, None, None, (), stated)
+        found = Findings(known, explored, None, None, (), stated)
         folder = tmp_path / str(len(rows))
         (folder / "predictions").mkdir(parents=True)
         rows.append(_write_prediction(folder, context.study, found, record, response))
