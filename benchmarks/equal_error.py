@@ -1,13 +1,11 @@
-"""The time that limbfit and FEBio need for the same error of the largest force, each with its own best
-element.
+"""The time that limbfit and FEBio need for the same error of the largest force, each with its best element.
 
 The posterior and the tibial site of ``convergence.py``, on meshes of decreasing size: limbfit with its
 default element, steps and contact; FEBio itself with quadratic tetrahedra and the settings of limbfit's
 export, on as many threads, one after the other. The error is that against the limit which `convergence.py`
-found from both sides. A size whose FEBio takes longer than the limit is a lower bound of its time.
+found from both sides. Where no mesh of FEBio's comes so near, its longest run is a lower bound of its time.
 
-    python benchmarks/equal_error.py FOLDER --site posterior --limbfit 6 4.5 3.5 --febio 3.5 2.7 2.2 --threads
-    2
+    python benchmarks/equal_error.py FOLDER --site posterior --limbfit 6 4.5 3.5 --febio 3.5 --threads 2
 
 FEBio is that of FEBIO_CMD, of the path, or beside the repository. Runs are kept in FOLDER and not done twice.
 """
