@@ -102,6 +102,8 @@ def _read_geometry(study: Study) -> tuple[LimbGeometry | None, tuple[str, ...] |
         return LimbGeometry(anatomy, places), None, facts
     facts, bones = _describe_image(study)
     store = Store(study.results)
+    if store.stamp("sites") is None:  # then there is no need to read every image for its digest
+        return None, bones, facts
     are_placed = store.state("sites", compute_keys(study, "sites")["sites"]).state == "done"
     return LimbGeometry.stored(store) if are_placed else None, bones, facts
 
