@@ -9,8 +9,6 @@ the limit, and waits for the stop: each trial a session of its own through the s
 for no real-time priority at limbfit's end.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import multiprocessing

@@ -10,8 +10,6 @@ of the eight parameters are determined, how many intervals hold the true value, 
 is kept in the folder.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

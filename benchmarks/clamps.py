@@ -6,8 +6,6 @@ Sites of the synthetic patient (`limbfit phantom`), at its true tissues, indente
 that eleven pins clamp (`limbfit.indentation.clamps`).  What came of it: docs/loads.md.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

@@ -13,8 +13,6 @@ Each solves in a process of its own.  Then tables are printed (with ``--json`` t
 ``convergence.png`` is drawn.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import multiprocessing

@@ -1,7 +1,5 @@
 """What the runs of ``convergence.py`` say: limits, errors, costs at equal error, tables and the figure."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

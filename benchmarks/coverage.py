@@ -16,8 +16,6 @@ of another shape than the one that the method assumes.  The tissue of each site 
 the truth by as much as is expected of it (``--differ 1``; 0: alike).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import resource

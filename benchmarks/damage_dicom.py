@@ -1,7 +1,5 @@
 """Ways to damage a DICOM series."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path

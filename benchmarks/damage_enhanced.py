@@ -1,7 +1,5 @@
 """Ways to damage an Enhanced MR file, which holds a whole series in its frames."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

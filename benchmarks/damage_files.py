@@ -1,7 +1,5 @@
 """Ways to damage image files: NIfTI, NRRD and MetaImage."""
 
-from __future__ import annotations
-
 import gzip
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Ways to damage label maps: ``.seg.nrrd``, label images, DICOM-SEG and RTSTRUCT."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

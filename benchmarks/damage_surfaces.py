@@ -1,7 +1,5 @@
 """Ways to damage surface files."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

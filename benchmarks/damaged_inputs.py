@@ -14,8 +14,6 @@ silent   done, but with other surfaces, or without saying what was repaired
 wrong    refused where it should not be, done where it should not be, or refused in other words
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import multiprocessing

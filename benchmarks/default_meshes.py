@@ -7,8 +7,6 @@ the study's mesh of its site and on one with 0.6 of the edges, fine to 1.5 times
 Fine meshes are kept in the folder.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from pathlib import Path

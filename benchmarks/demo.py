@@ -8,8 +8,6 @@ stage and of all (with the start of the program and its workers). FEBio then sol
 writes of one site, on the same cores. Its program is that of FEBIO_CMD, or on the path.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

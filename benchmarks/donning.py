@@ -11,8 +11,6 @@ grows onto it in 2 s, is held for 10 s, and is then pushed on by 800 N with all 
 (relieved) to 6 mm (pressed in).  ``--grown`` ends when the socket has grown, with the pressure by region.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import resource

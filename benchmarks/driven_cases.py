@@ -1,7 +1,5 @@
 """Cases of `robustness.py` with friction, forces and a second body: what a socket asks of the solver."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -10,8 +10,6 @@ found from both sides. Where no mesh of FEBio's comes so near, its longest run i
 FEBio is that of FEBIO_CMD, of the path, or beside the repository. Runs are kept in FOLDER and not done twice.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import tempfile

@@ -27,8 +27,6 @@ cell. Every cell that is done is a line of ``cells.jsonl`` in the folder, with i
 a kill, finished cells are not run again. The exit code is 1 where a cell is red.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -6,8 +6,6 @@ For `everything.py`. The device's clock waits for limbfit, so that a busy machin
 The exit code is that of the device where it does not start, else that of ``limbfit acquire``.
 """
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

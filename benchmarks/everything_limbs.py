@@ -8,8 +8,6 @@ noise, becomes their records. ``labels`` and ``surfaces`` are the phantom of see
 comes from another program: its image with a label map in NIfTI, and the surfaces that limbfit itself stored.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shutil

@@ -20,8 +20,6 @@ default tissue and indenter, as in a search of parameters; with ``--whole`` all 
 ``--json`` are not done again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -12,8 +12,6 @@ once in ``--folder``; cases in the file of ``--json`` are not run again, and one
 from its simulations.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -5,8 +5,6 @@ Its records come from other meshes (edges of 3 mm instead of 6, finer surfaces),
 steps than the study has, with 0.05 N of noise; what is true of them is in ``truth.json``.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace

@@ -1,7 +1,5 @@
 """The small study of `identification.py`, its copies, and what an identification of one ended with."""
 
-from __future__ import annotations
-
 import resource
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The identification of `identification.py` where a drawn share of the simulations fails."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence

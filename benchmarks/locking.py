@@ -10,8 +10,6 @@ its three finest levels, the last of which (``--finest``) only tet10 solves.
 writes locking.json and locking.png into the folder; without one it prints the table only.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

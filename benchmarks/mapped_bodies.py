@@ -5,8 +5,6 @@ A body is a grid of boxes, six tetrahedra each, whose lines follow the bone belo
 Lengths in mm; the limb's axis is z, its proximal end at the top.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

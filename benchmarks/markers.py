@@ -9,8 +9,6 @@ the one that has the markers on.  ``--coarseness`` is the size of voxels over th
 (1.18 x 1.15 x 1.00 mm).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import resource

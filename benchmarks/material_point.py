@@ -4,8 +4,6 @@ Its elastic force is a power of the depth; the memory, the steps and the force b
 own.  Thousands of steps cost nothing, so the error of a few is known exactly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace

@@ -9,8 +9,6 @@ force is from what the part so corrected expects at the moved parameters, the er
 derivatives, and processor seconds from rest and from first guesses.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from dataclasses import replace

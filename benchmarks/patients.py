@@ -11,8 +11,6 @@ Seeds in the file of ``--json`` are not run again.  A patient of the coarse deta
 processor.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

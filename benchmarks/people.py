@@ -10,8 +10,6 @@ in FOLDER. Everybody is left out once: the mixed model of the others (`populatio
 what their compressions are under the recorded force. Results: docs/validation.md.
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

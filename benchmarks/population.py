@@ -7,8 +7,6 @@ Reads shared/data/multis (65 people under an ultrasound probe) and the package's
 How it is done, with what assumptions and results: docs/priors.md.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ force, and its layers' compressions are read with linear theory as those of peop
 is the error of linear theory and the stiffening of the law together. Time is treated in closed form.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

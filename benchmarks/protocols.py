@@ -11,8 +11,6 @@ of rest after it, 60 s to prepare a site with an indenter. What is done is kept 
 stopped goes on.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

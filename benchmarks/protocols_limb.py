@@ -1,7 +1,5 @@
 """The true limb of `protocols.py`: its records, and the studies that are made of them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

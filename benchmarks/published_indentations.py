@@ -7,8 +7,6 @@ Every input that a text states is a row of `STATED`, with the place where it is 
 varied. Results and what could not be rebuilt: docs/validation.md.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import replace

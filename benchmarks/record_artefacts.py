@@ -11,8 +11,6 @@ is refused or carries a remark on that artefact.  The exit code is 0 when 95 % o
 and at most 2 % of the clean records carry a remark.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

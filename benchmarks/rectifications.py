@@ -15,8 +15,6 @@ such face can be drawn) or ``stopped`` (the simulation did not come to its end),
 Cases in the file of ``--json`` are not run again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

@@ -10,8 +10,6 @@ simulations are then held against physics; see `broken_laws`.  Cases in the file
 run again, so that a run can be stopped and gone on with.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import multiprocessing

@@ -1,7 +1,5 @@
 """The limbs, indenters and materials of `robustness.py`: a case follows from its seed and number alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

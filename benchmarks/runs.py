@@ -11,8 +11,6 @@ Sites are structured blocks of quadratic tetrahedra under the square punch; ``di
 With ``--json FILE`` the figures are also stored.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import pickle

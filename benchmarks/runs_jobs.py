@@ -1,7 +1,5 @@
 """What workers do for `runs.py`: functions of a script's own module cannot travel to them."""
 
-from __future__ import annotations
-
 import os
 import resource
 from pathlib import Path

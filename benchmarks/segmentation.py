@@ -13,8 +13,6 @@ voxels, and only cost is measured: of the check for one limb, labels, surfaces, 
 The largest memory is that of the process so far, so voxels go from large to small.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import resource

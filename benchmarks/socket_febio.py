@@ -6,8 +6,6 @@ limbfit runs FEBio's inputs of ``shared/reference/socket`` with FEBio's steps an
 febio-parity`` does, without compilation; then FEBio itself does (its program: FEBIO_CMD, or on the path).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import tempfile

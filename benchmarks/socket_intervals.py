@@ -15,8 +15,6 @@ what the tissues of the synthetic patient of that seed do, and whether it lies w
 in the file of ``--json`` are not run again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

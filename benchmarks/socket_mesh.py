@@ -6,8 +6,6 @@ Runs ``limbfit socket`` on a study with several ``socket.edge_mm``, and tells by
 peak and the settling differ from those of the finest mesh, with the time of each.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

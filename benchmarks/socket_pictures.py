@@ -7,8 +7,6 @@ an area over the patellar tendon and relief over the fibular head; the designs o
 Chromium with software WebGL; LIMBFIT_CHROMIUM names another program.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil

@@ -20,8 +20,6 @@ Printed at the end: the first value, the medians of the first and of
 the last quarter, and the slope after the first quarter.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -7,8 +7,6 @@ Prints root mean square and largest error over the whole curve in percent of the
 the steps, and the number of steps and of Newton iterations.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from dataclasses import replace

@@ -21,8 +21,6 @@ or the comparison with the records says that the load lies outside them (D). Eve
 ``draws.jsonl``; after a kill, those are not run again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -16,8 +16,6 @@ do (after).  ``--hold``: one fitted site is held so long in its record.  Last co
 records prefer, and how often the user is warned that the limb may give way to the indenter.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """A study whose records are yet to be made, and both ends of a session as their commands start them."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Real browsers for tests of pages: Chromium with software WebGL, and the studio as its command starts it."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

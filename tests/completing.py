@@ -1,7 +1,5 @@
 """Stored results of which a test states what it is about."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from types import UnionType
 from typing import Any, Union, get_args, get_origin

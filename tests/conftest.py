@@ -1,7 +1,5 @@
 """A small study that every test may copy: a rounded stump around a bone, two sites with records."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

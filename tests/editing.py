@@ -1,7 +1,5 @@
 """Changes of a study's file, as a user makes them between two commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 

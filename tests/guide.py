@@ -1,7 +1,5 @@
 """The Python files that docs/extending.md shows, and a small study that is identified with one of them."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Mapping

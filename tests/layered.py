@@ -1,7 +1,5 @@
 """Blocks of layered tissue under a square punch as sites of a study: real solving without the mesher."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise

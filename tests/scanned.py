@@ -1,7 +1,5 @@
 """The image of a synthetic limb in memory, without a detour by files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

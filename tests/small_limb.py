@@ -1,7 +1,5 @@
 """A small limb with one bone as a study of surfaces, for tests of sockets."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

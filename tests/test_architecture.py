@@ -1,7 +1,5 @@
 """The house rule: arrows point down only, and no import hides inside a function."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from functools import cache

@@ -1,7 +1,5 @@
 """The documentation points to what exists."""
 
-from __future__ import annotations
-
 import doctest
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """Names tell what comes back: a function of a module begins with a verb, or converts one thing to another."""
 
-from __future__ import annotations
-
 import ast
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The public names exist, and the light part of the package stays light."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

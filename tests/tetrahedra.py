@@ -1,7 +1,5 @@
 """Tetrahedra that tests make by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from limbfit.arrays import Array, Indices

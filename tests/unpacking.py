@@ -1,7 +1,5 @@
 """Blocks of arrays read back, as ``static/arrays.js`` reads them."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

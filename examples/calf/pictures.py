@@ -6,8 +6,6 @@ Writes ``slices.png`` (outline and bones over every fifth slice) and ``surfaces.
 in how many slices limb, tibia and fibula were found.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -7,8 +7,6 @@ exist. Nobody pushed on this calf, so the sites plan an indentation (depth and s
 record; ``limbfit simulate`` predicts its force.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 from pathlib import Path

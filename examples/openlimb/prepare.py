@@ -6,8 +6,6 @@ INPUTS is the folder ``openlimb-study`` (skin.stl, tibia.stl, fibula.stl, sites.
 exist. The truth that FEBio was given goes to ``truth.json``, which no stage of limbfit reads.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

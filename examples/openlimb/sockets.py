@@ -9,8 +9,6 @@ The STL is the mean limb as OpenLimb gives it, five bodies: skin, femur, patella
 pressures of control and design over the bony prominences, and the largest anywhere.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -5,8 +5,6 @@ One sample is ``lag`` times the one before plus something new, so that samples k
 independent: a factor of 39 where the correlation of neighbours is 0.95.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

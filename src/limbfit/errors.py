@@ -16,8 +16,6 @@
 A *failed simulation* is not an exception: it is a result with ``completed=False`` and a reason.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

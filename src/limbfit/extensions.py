@@ -4,8 +4,6 @@ A file is run once in every process that needs it, workers among them, and again
 digest counts wherever it can change an answer.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from hashlib import sha256

@@ -4,8 +4,6 @@ Names and units are those of docs/fields.md; stress is Cauchy stress in the orde
 which is also VTK's order of symmetric tensors.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The files of a folder that somebody looked into."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 _LEFT = (".DS_Store", "Thumbs.db", "desktop.ini")  # by systems; so are names that begin with ._

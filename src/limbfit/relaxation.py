@@ -6,8 +6,6 @@ Biomechanics, chapter 7), which relaxes with the logarithm of time.  What would 
 does not: it is in the 1.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

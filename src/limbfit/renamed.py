@@ -1,7 +1,5 @@
 """Documented names that have become others: the old ones keep working, with a warning."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 from collections.abc import Mapping

@@ -3,8 +3,6 @@
 What must never happen is checked on every millisecond of the device (`Bench.millisecond`).
 """
 
-from __future__ import annotations
-
 from copy import deepcopy
 from functools import cache
 

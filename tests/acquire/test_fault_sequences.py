@@ -5,8 +5,6 @@ On every millisecond: no motion towards the limb with a stop active, no force ov
 moved by anybody: its force is not counted, but the end must say that it is out of reach.
 """
 
-from __future__ import annotations
-
 from copy import deepcopy
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Addresses and ports that cannot be used: one clear line each, with what to do."""
 
-from __future__ import annotations
-
 import os
 import socket
 import threading

@@ -1,7 +1,5 @@
 """The key that is held, as a terminal tells of it."""
 
-from __future__ import annotations
-
 from limbfit.acquire.events import Abort, Signal
 from limbfit.acquire.operator import Keyboard
 

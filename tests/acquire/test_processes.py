@@ -1,7 +1,5 @@
 """Both ends on real sockets and terminals: sessions, kills (of processes), hostile devices."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty

@@ -1,7 +1,5 @@
 """The state machine: the paper's order, what each limit leads to, and that every stop has its reason."""
 
-from __future__ import annotations
-
 from queue import SimpleQueue
 
 import numpy as np

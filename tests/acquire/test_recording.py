@@ -1,7 +1,5 @@
 """Records: what was written is read, whatever a crash or a bad disk leaves of it."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import replace
 

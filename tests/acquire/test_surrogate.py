@@ -1,7 +1,5 @@
 """The limb's force: within 1 % of what was simulated, sound for any other history."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

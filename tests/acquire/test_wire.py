@@ -1,7 +1,5 @@
 """Malformed, spoilt, replayed, reordered and oversized lines: refused, counted, never acted on."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

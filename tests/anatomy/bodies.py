@@ -1,7 +1,5 @@
 """Closed surfaces of revolution: an analytic limb with one bone."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface

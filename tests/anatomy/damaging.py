@@ -1,7 +1,5 @@
 """The writers of enhanced DICOM, DICOM-SEG and RTSTRUCT, which are the benchmarks'."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

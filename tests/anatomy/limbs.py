@@ -1,7 +1,5 @@
 """Synthetic limbs, grids and DICOM files for the tests of this room."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Virtual amputation: bones end at the plane, a rounded pad covers them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from limbs import DIRECTIONS, leg_image

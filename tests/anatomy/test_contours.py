@@ -1,7 +1,5 @@
 """Contours on slices: rasterised, written and read back."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from limbs import DIRECTIONS, leg_image

@@ -1,7 +1,5 @@
 """Regions inside the core: conforming meshes of them, where they touch bone, layer and each other, errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """One case of each kind of damage ends in one clear line; all kinds, with the model, in the slow test."""
 
-from __future__ import annotations
-
 import sys
 
 import damaging  # noqa: F401

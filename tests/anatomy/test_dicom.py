@@ -1,7 +1,5 @@
 """DICOM folders: geometry kept, ambiguity and damage refused, identity never told."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from limbs import CALF, DIRECTIONS, IDENTITY, volume, write_dicom

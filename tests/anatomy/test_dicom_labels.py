@@ -1,7 +1,5 @@
 """DICOM-SEG and RTSTRUCT as label maps on the grid of their image."""
 
-from __future__ import annotations
-
 import numpy as np
 import pydicom
 import pytest

@@ -1,7 +1,5 @@
 """Meshes of anatomy from elsewhere: inverted cells are mended and told, real limbs meshed as they come."""
 
-from __future__ import annotations
-
 import re
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Images keep their place in the patient through every format, oblique and flipped axes included."""
 
-from __future__ import annotations
-
 import json
 
 import nrrd

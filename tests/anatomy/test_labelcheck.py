@@ -1,7 +1,5 @@
 """Strays in a label map are dropped and said, what is ambiguous is refused; one limb in an image."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

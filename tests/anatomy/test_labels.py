@@ -1,7 +1,5 @@
 """Label maps: the .seg.nrrd of 3D Slicer, layered, cropped or in RAS, and plain label images."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Layers of tissue: conforming columns, thickness from the fat, several layers, layers thinned over bone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A liner outside the skin, and the mesh of a whole limb in it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from bodies import limb

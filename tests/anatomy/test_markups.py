@@ -1,7 +1,5 @@
 """Sites from the control points of 3D Slicer."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

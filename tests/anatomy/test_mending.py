@@ -1,7 +1,5 @@
 """Surfaces as scans and atlases give them: open ends are capped, small holes filled, and both are told."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Site meshes of an analytic limb and of a real mean limb: volumes, layer, quality, sets, failures."""
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace

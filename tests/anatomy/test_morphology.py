@@ -1,7 +1,5 @@
 """Morphology by distance maps is that by balls, voxel by voxel."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import ndimage

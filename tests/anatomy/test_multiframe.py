@@ -1,7 +1,5 @@
 """Enhanced multi-frame DICOM, and the list of series."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The outline with what lies around and inside a limb in real images: supports, ghosts, air; CT and T1."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

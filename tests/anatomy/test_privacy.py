@@ -1,7 +1,5 @@
 """Nothing that identifies a patient leaves the inputs: not in what is stored, not in what is said."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import shutil

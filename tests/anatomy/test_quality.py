@@ -1,7 +1,5 @@
 """The quality measures find what is wrong with a label map, in the slice where it is, and nothing else."""
 
-from __future__ import annotations
-
 import json
 
 import matplotlib.image

@@ -1,7 +1,5 @@
 """One body, stored with other axes and in the other space, gives the same surfaces in patient space."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import nrrd

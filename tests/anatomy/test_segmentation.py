@@ -1,7 +1,5 @@
 """Limb and bones found in synthetic, phantom and real images."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from limbs import CALF, DIRECTIONS, leg_image

@@ -1,7 +1,5 @@
 """Sites: the nearest skin point, and the mean inward normal under a square footprint."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

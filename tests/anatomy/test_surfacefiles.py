@@ -1,7 +1,5 @@
 """Surface files say their space or are told it, and are in millimetres or a stated unit."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import pyvista as pv

@@ -1,7 +1,5 @@
 """Surfaces: measures, files, what may not pass, and from labels to a closed limb."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A bone thinner than the grid that is cut along it stays whole, and a mesh that lost it says so."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

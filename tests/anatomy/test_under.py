@@ -1,7 +1,5 @@
 """Tissue under an indenter, where it is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import pyvista as pv

@@ -1,7 +1,5 @@
 """Closed surfaces as label maps, and amputated there: bones end at the plane, a pad of tissue beyond."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from bodies import limb

@@ -1,7 +1,5 @@
 """The benchmarks measure what they say, and fail in words."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The benchmark of meshes counts what failed and measures what was made."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

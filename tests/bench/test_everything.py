@@ -1,7 +1,5 @@
 """The matrix of limbs and commands: how a cell ended, its limit, and that it goes on after a kill."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import sys

@@ -1,7 +1,5 @@
 """The command line: exit codes, one-line errors, JSON, nothing half-written."""
 
-from __future__ import annotations
-
 import io
 import json
 import sys

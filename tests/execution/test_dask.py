@@ -1,7 +1,5 @@
 """A real Dask cluster of local processes: the same answers, threads pinned, workers that are killed."""
 
-from __future__ import annotations
-
 import gc
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Executors: same answers from all of them, and workers that fail, die, keep state and stop."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """A simulation's answer depends on its job alone: not on the order, the executor or the number of workers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

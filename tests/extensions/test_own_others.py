@@ -1,7 +1,5 @@
 """An image format and an experiment registered from outside the package, as the guide shows them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Structured blocks of every element, for tests: six tetrahedra or one hexahedron per box."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Sample materials, and their energies written a second time, from invariants, to be held against."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Active stress along fibres: closed forms, tangent, no relaxation, derivatives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

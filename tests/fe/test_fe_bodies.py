@@ -1,7 +1,5 @@
 """Rigid bodies that turn, that forces drive, and several of them at once."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

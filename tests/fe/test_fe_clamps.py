@@ -1,7 +1,5 @@
 """The pins that clamp a limb: where they are, what they do, and the indentation between them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

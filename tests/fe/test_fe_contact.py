@@ -1,7 +1,5 @@
 """Indenters and contact: derivatives, touch-down, penetration, robustness, partial results."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from blocks import MUSCLE, SKIN, block, check_derivatives, drive, punch

@@ -1,7 +1,5 @@
 """What a simulation doubts about itself: counted, told, and by kind."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

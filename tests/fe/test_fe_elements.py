@@ -1,7 +1,5 @@
 """Elements: rigid motion, patch test, order of interpolation, symmetric tangent, the energy's derivatives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Parity with FEBio 4.11 on its own meshes: the benchmark's cases and code, held to 1 % and 1e-6."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Fibres: uniaxial stretch in closed form, tangent, objectivity, sensitivities, patch, and none at all."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Coulomb friction: its law, its limits, derivatives, and what it does not do (creep)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Indenters as signed distances: derivatives, triangle surfaces against the other shapes, refusals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Elements side by side against the kernels of one point, and elements alone against all together."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from blocks import block

@@ -1,7 +1,5 @@
 """Linear solvers are peers: the same answer from each that works here, and a refusal where there is none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Material laws at a point: energy, stress, moduli, parameters and relaxation against independent forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from blocks import block, punch

@@ -1,7 +1,5 @@
 """Follower pressure: its derivatives, tubes and spheres in closed form, and a tube of FEBio."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

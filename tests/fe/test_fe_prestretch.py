@@ -1,7 +1,5 @@
 """Tissue that is strained where the mesh is: closed forms, tangent, relaxation, derivatives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

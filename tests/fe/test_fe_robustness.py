@@ -1,7 +1,5 @@
 """Hard indentations, results of what cannot be solved, and the benchmark that counts them."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import sys

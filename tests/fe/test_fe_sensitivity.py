@@ -1,7 +1,5 @@
 """Sensitivities against central differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from blocks import parameter_slope, punch, slope_and_difference

@@ -1,7 +1,5 @@
 """How the friction of a step settles where its normal force is renewed."""
 
-from __future__ import annotations
-
 import numpy as np
 from blocks import punch
 

@@ -1,7 +1,5 @@
 """Smooth surfaces as rigid bodies: their distances, their brim, and how they grow onto the tissue."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from blocks import press_fit, punch, quarter_tube, sector

@@ -1,7 +1,5 @@
 """What a socket needs beside FEBio's stored results: friction, press fit, force, follower pressure."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Time stepping, interpolation, warm starts, results."""
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 from itertools import pairwise

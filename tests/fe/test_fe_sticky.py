@@ -1,7 +1,5 @@
 """Sticky contact: no slip once in touch, derivatives, release, and what sticking does to the force."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

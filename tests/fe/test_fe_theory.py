@@ -1,7 +1,5 @@
 """The solver against theory: relaxation, Hertz, the flat punch, manufactured fields, bonded blocks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """An indenter that touches tissue which has moved before: where, what it feels, and its derivatives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

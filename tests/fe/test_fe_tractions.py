@@ -1,7 +1,5 @@
 """Pressure and shear of rigid bodies on the tissue, and that they balance what is stated."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The error of the steps in time over the whole curve, on a layer whose exact force is known."""
 
-from __future__ import annotations
-
 import sys
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A small input of FEBio 4 that the tests of this folder change."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What moves tissue before it is indented, both ways: clamps, contraction, pre-stretch, later touch-down."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

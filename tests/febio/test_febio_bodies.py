@@ -1,7 +1,5 @@
 """Rigid bodies of any motion, both ways: read from an input, written, and read back with the same forces."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Fibres in FEBio's files, both ways."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Inputs that are broken, hostile or beyond limbfit: one line that names the place, and no harm done."""
 
-from __future__ import annotations
-
 import re
 import tracemalloc
 

@@ -8,8 +8,6 @@ forces are within 0.5 %; a round indenter touches single points at other times, 
 Run with ``python -m pytest -m febio``; FEBio is that of ``FEBIO_CMD``, of the path, or beside the repository.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

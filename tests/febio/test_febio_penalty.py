@@ -1,7 +1,5 @@
 """Contact stiffness as FEBio has it: held to its algorithm, and to the forces that it logged."""
 
-from __future__ import annotations
-
 import gzip
 from dataclasses import replace
 from pathlib import Path

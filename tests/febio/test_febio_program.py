@@ -5,8 +5,6 @@ of a real run and ends as that run ended.  No record of a run that ended well is
 are made up from the others'.
 """
 
-from __future__ import annotations
-
 import stat
 import subprocess
 import sys

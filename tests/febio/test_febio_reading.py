@@ -1,7 +1,5 @@
 """FEBio's files: what is read from them, load curves among it, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

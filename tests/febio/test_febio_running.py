@@ -1,7 +1,5 @@
 """FEBio inputs solved by limbfit: held to FEBio's own results through the files, and to simple truths."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

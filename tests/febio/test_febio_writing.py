@@ -1,7 +1,5 @@
 """What is written for FEBio and Abaqus is the same problem, read by limbfit itself and by others."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Fields on disk: what ParaView reads is the mechanics that was computed."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 

@@ -5,8 +5,6 @@ At each site incompressible bars, one of each tissue, compressed together betwee
 length and section from site to site, as tissue does. Derivatives come by complex step, exact to rounding.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Do 95 % intervals hold the truth in 95 % of cases? Asked of a model whose truth is known, many times."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """The identification against a closed-form viscoelastic model whose truth is known (see bars.py)."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from bars import (

@@ -1,7 +1,5 @@
 """Parameters that are fixed, tied or known; weights; several starts, and a search continued from a bound."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from zlib import crc32
 

@@ -1,7 +1,5 @@
 """Choices of sites, their fits and their standing, on bars whose truth is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import comb
 

@@ -1,7 +1,5 @@
 """The best sites to test and the records of a session, against brute force and simple models."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations
 

@@ -1,7 +1,5 @@
 """What a prediction does to the tissue beside what the fitted records did: listed with both, and in words."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The emulator: exact where it can be, honest about its error, derivatives that belong to its forces."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from bars import NAMES, PAPER, TRUTH, records, simulate

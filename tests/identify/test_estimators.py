@@ -1,7 +1,5 @@
 """Each covariance is that of the estimator that was used, by 200 simulated calibrations of every kind."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

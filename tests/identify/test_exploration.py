@@ -1,7 +1,5 @@
 """From a calibration to posterior and profiles with few runs; sources as shifts; coverage of it all."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from bars import NAMES, PAPER, SITES, TRUTH, records, simulate

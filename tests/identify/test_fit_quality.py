@@ -1,7 +1,5 @@
 """The verdict on a fit: silent where the model is right, and plain where it cannot follow."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Intervals from what a calibration simulated anyway: on a bent valley, and where simulations fail."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

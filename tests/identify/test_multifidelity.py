@@ -1,7 +1,5 @@
 """Coarse simulations corrected by fine ones; closed-form models whose truth is known (see bars.py)."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from dataclasses import replace

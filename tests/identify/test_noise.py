@@ -1,7 +1,5 @@
 """Noise of a record: what averaging leaves of it, and what a doubtful touch-down adds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

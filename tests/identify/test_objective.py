@@ -1,7 +1,5 @@
 """What a doubtful touch-down does to a record counts for less, and no more than that."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

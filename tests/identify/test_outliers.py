@@ -1,7 +1,5 @@
 """Wrong records are found, right ones left alone, on bars whose truth is known."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Records judged before a simulation: against Hayes' layer, against one another, and against the skin."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Posterior, profile and evidence against closed forms, and against each other on the bars."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from bars import NAMES, PAPER, TRUTH, records, simulate

@@ -1,7 +1,5 @@
 """How much of an interval comes from what was known beforehand; priors of people on the bars of bars.py."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Regions of a limb whose tissues differ are told apart; sites that fail do not stop the others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

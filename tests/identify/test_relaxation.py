@@ -1,7 +1,5 @@
 """Relaxation beyond the records: superposition, which relaxation fits, and what is left open."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Uncertainty told plainly: intervals that cover, verdicts that match what the data can see."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

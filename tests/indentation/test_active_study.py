@@ -1,7 +1,5 @@
 """Muscle that contracts in a study: its law, when it acts, what follows, what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

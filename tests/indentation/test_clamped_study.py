@@ -1,7 +1,5 @@
 """Clamping pins in a study: what they decide, hold and change, and what of them is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

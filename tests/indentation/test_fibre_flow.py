@@ -1,7 +1,5 @@
 """Fibres along a flow: straight in a bar, around in a ring, the same in a part of a mesh; what has no way."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

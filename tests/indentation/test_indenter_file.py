@@ -1,7 +1,5 @@
 """A study whose indenter is a surface file: read, checked, and part of what makes results stale."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The tissue near a site: a part of a mesh, its force against the whole one's, first guesses from it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Several relaxation terms in a study: named, bounded, searched, shown."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import pytest

@@ -1,7 +1,5 @@
 """Points of the skin around the indenter as material points, and their moves in a simulation."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pre-stretch in a study: in which tissue, along what, what it decides, what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

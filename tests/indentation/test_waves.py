@@ -1,7 +1,5 @@
 """Speeds of shear waves on the strain that an indentation makes: closed forms, derivatives, places."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A law from outside the package, and the exponential one: at a point, in the solver, in a study."""
 
-from __future__ import annotations
-
 import pickle
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Relaxation as a power of time: its terms, a study that asks for it, FEBio's files."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Volume meshes: quality against closed forms, promotion, checks, and files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Own meshes, solutions that show themselves, and own curves fitted, as a notebook has them."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The notebooks of the documentation, run as plain Python in a folder of their own, and what they say."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

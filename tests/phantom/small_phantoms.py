@@ -3,8 +3,6 @@
 The formula takes the way of the ``mapping`` that `make_phantom` is given anyway.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial

@@ -1,7 +1,5 @@
 """Sites of the phantom: all are simulated to their end on defaults; one shows what is asked for."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

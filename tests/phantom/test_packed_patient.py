@@ -1,7 +1,5 @@
 """The patient that comes with limbfit is the one that ``limbfit phantom`` makes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

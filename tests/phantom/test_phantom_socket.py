@@ -1,7 +1,5 @@
 """The phantom's socket: it fits any limb, and is read back from its file as deep as its truth says."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

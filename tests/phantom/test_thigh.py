@@ -1,7 +1,5 @@
 """The transfemoral phantom: a thigh by its sizes, segmented as it is, from the folder to the report."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

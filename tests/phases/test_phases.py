@@ -1,7 +1,5 @@
 """Phases of an indentation, from corners and from samples of its displacement."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The fit behind the priors of people: its mechanics, its statistics, and its table in the package."""
 
-from __future__ import annotations
-
 import sys
 import tomllib
 from dataclasses import replace

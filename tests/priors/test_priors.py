@@ -1,7 +1,5 @@
 """The priors of people in a study: which tissue has which, what is refused, what is stored and shown."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The benchmark of real relaxation curves: closed forms, and its verdict on curves of known laws."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Layers pressed by the solver instead of by linear theory, for the benchmark of people."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a page of a report consists of."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from html.parser import HTMLParser

@@ -1,7 +1,5 @@
 """A small results folder with every file that a finished study stores, made from formulas."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

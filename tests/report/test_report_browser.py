@@ -1,7 +1,5 @@
 """The report as a file in a real browser: nothing is asked for, and its figures answer."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """The report of a finished study."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Reports of studies in which something is more, missing, broken or hostile."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

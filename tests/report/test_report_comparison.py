@@ -1,7 +1,5 @@
 """The section that shows FEBio beside limbfit, where both solved a site."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the report says of predictions and socket loads that go beyond the fitted records."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """What was seen beside the force, in the report: a figure of each kind, a row of each thing seen."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

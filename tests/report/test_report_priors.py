@@ -1,7 +1,5 @@
 """The report says what was known beforehand, and how much of each interval comes from it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What table and report say beside a socket's pressures: where intervals come from, what others found."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 
 import pytest

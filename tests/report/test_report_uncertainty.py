@@ -1,7 +1,5 @@
 """What is extrapolated looks so."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 from stored_results import write_results

@@ -1,7 +1,5 @@
 """Stored results: their models against real files, older files, the page and schemas, and a notebook."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

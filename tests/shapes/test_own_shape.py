@@ -1,7 +1,5 @@
 """A shape registered from outside the package: its distance and facets, in studies, and identified."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path

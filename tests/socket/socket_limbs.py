@@ -1,7 +1,5 @@
 """Limbs for the tests of the socket's shape: a round one, and real ones where they are here."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 With one thread: what several add up comes in any order.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import asdict
 from pathlib import Path

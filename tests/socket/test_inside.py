@@ -1,7 +1,5 @@
 """Strain inside a limb in its socket."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

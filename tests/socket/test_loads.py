@@ -1,7 +1,5 @@
 """Standard loads: their size, their line past the knee, and the names that a study knows."""
 
-from __future__ import annotations
-
 from typing import get_args
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From a deformed surface to a socket's face; areas and zones; the control of the same volume."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

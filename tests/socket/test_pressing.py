@@ -1,7 +1,5 @@
 """A limb under pressure: a ball of tissue around a rigid one in closed form; the surface that comes of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import pyvista as pv

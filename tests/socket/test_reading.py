@@ -1,7 +1,5 @@
 """A socket from a file is the one that was written, or refused in one line with the remedy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path

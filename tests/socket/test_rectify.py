@@ -1,7 +1,5 @@
 """A rectified socket has the circumferences, depths and clearances that were asked for."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

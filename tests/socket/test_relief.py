@@ -1,7 +1,5 @@
 """The search for depths: synthetic limbs whose pressures are known functions of the depths."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A socket that cannot be this limb's, from the command line: one line with what is wrong and the remedy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

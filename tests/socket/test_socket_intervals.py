@@ -1,7 +1,5 @@
 """Intervals of a socket's results: what they come from, against drawn parameters; doubts in its words."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

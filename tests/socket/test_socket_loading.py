@@ -1,7 +1,5 @@
 """What a socket's loads do to the tissue in figures, on a block of which all of them are known."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

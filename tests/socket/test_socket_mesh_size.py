@@ -1,7 +1,5 @@
 """How fine a limb is meshed under its socket, where the study does not say so."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

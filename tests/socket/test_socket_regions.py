@@ -1,7 +1,5 @@
 """Named regions lie where their names say, and together cover the limb."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from socket_limbs import FILES, real_limb, round_limb

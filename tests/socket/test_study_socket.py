@@ -1,7 +1,5 @@
 """The table [socket] of a study: its shape, regions and loads, and what is wrong told by key."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The pressure that a socket is designed for, over a limb whose regions and bones are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A wall for printing is watertight and as thick as asked, by a tool that did not make it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A study with a small image of a synthetic limb, segmented."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from limbfit import run_study

@@ -1,7 +1,5 @@
 """The studio served by a thread of the tests' own process, which need not be started."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path

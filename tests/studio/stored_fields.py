@@ -1,7 +1,5 @@
 """Results of one site made from formulas: fields of some steps, parameters, errors and curves."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Curves in a real browser: a part is enlarged by drag, a double click shows all."""
 
-from __future__ import annotations
-
 import pytest
 
 from browsing import until

@@ -1,7 +1,5 @@
 """Commands that the studio starts: in the study's folder, without running what lies there."""
 
-from __future__ import annotations
-
 import time
 
 import psutil

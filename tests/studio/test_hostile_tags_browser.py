@@ -1,7 +1,5 @@
 """Markup in DICOM tags and in names: nothing of it runs on any view, no tag is shown, sent or stored."""
 
-from __future__ import annotations
-
 import gzip
 from warnings import catch_warnings, simplefilter
 

@@ -1,7 +1,5 @@
 """Labels painted and times stated through the studio: what is stored, turns stale, and is refused."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """A session seen in a real browser while `limbfit acquire` records it from a virtual FitSocket."""
 
-from __future__ import annotations
-
 import re
 import time
 

@@ -1,7 +1,5 @@
 """A session followed through the studio while its record is written: all of it, once, and nothing else."""
 
-from __future__ import annotations
-
 import json
 import os
 import time

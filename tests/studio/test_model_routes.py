@@ -1,7 +1,5 @@
 """The view Model's server side: places that clicks give end in the study file, its comments stay."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """What the view Results makes and gives away, in a real browser: simulations played, files downloaded."""
 
-from __future__ import annotations
-
 import re
 import shutil
 

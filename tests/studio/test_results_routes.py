@@ -1,7 +1,5 @@
 """The view Results' server side: stored fields as they are stored, runs kept and compared, files to keep."""
 
-from __future__ import annotations
-
 import json
 import time
 

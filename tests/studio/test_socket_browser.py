@@ -1,7 +1,5 @@
 """The view Socket in a real browser, over stored runs made from formulas."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The view Socket's server side: the shape and its offsets; areas of the page end in the study file."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient

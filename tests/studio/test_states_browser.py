@@ -1,7 +1,5 @@
 """Every view in a real browser with nothing to show: it is being read, is missing, or cannot be read."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any

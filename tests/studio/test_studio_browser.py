@@ -1,7 +1,5 @@
 """The shell and the views Image, Traces and Identification in a real browser."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Who gets in: one secret, this host, this origin; files of the study only; what is hostile stays text."""
 
-from __future__ import annotations
-
 import itertools
 import socket
 import threading

@@ -1,7 +1,5 @@
 """The views Model and Results in a real browser."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Studies in which every key acts, and who computes something else when it has another value."""
 
-from __future__ import annotations
-
 import copy
 import json
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """load_study: what it accepts, and that each refusal is one line with file, key and remedy."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

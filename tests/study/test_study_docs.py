@@ -1,7 +1,5 @@
 """Every key of the study file stands in docs/study.md, with its default, and nothing else does."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterator

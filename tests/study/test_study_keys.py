@@ -1,7 +1,5 @@
 """Every key of a study changes what is computed."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Mapping
 from functools import cache

@@ -1,7 +1,5 @@
 """Every key of a study that could not change what is computed is refused, and no key is left over."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

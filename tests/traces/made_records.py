@@ -4,8 +4,6 @@ The synthetic record is a power-law solid with quasi-linear relaxation, F = a d^
 G(t) = 1 + gamma exp(-t / tau): it starts with slack, is pushed in at constant speed and drawn back.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Touch-down is found under noise, in records of others and where it is stated."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from made_records import OPENLIMB, RELAXATION, needs_openlimb, needs_relaxation, record

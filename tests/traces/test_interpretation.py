@@ -1,7 +1,5 @@
 """Records that are not what they seem: mended with a remark, or refused in one line."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Holds, rates and cycles: every phase of a record is found and smoothed by itself."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """What goes wrong with a record is told with its figures, and the touch-down knows no better than it can."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Curves made of records keep the peak and lose the noise."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 

@@ -1,7 +1,5 @@
 """Ordinary exports of test rigs are read to the same record in s, mm and N, and what was done is said."""
 
-from __future__ import annotations
-
 import datetime
 import sys
 

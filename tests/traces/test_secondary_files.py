@@ -1,7 +1,5 @@
 """What is measured beside the force, from the file to what is compared: moves of the skin, shear waves."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -5,8 +5,6 @@ of its memory, and differ as devices and limbs do: 1 to 2 mm/s, 8 to 12 mm, 10 t
 clearance, relaxation of 0.3 to 4 times the lasting stiffness within 0.2 to 5 s.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.signal import lfilter

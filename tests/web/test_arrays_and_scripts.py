@@ -1,7 +1,5 @@
 """Blocks of arrays, inlined scripts, and shapes that are drawn."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 

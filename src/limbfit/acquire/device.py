@@ -3,8 +3,6 @@
 A wire is a TCP connection, or a serial port (with ``pip install 'limbfit[serial]'``).
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import re

@@ -1,7 +1,5 @@
 """What happens and what is done about it: the types that protocol, safety, device and record share."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum, IntFlag
 from typing import Annotated, Any, ClassVar, dataclass_transform, get_origin, get_type_hints

@@ -11,8 +11,6 @@ Each message is a type. A body that is not exactly one of these is no message: `
 `docs/device-protocol.md` is the reference for whoever writes the other end.
 """
 
-from __future__ import annotations
-
 import re
 from binascii import crc32
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The operator: a key that is held, seen through a terminal; or nobody."""
 
-from __future__ import annotations
-
 from queue import SimpleQueue
 
 from .events import Abort, Event, Signal

@@ -5,8 +5,6 @@ Events come in and actions go out; there is no clock, no wire and no file. One `
 be done. `TRANSITIONS` alone says where a session can go.
 """
 
-from __future__ import annotations
-
 from enum import StrEnum
 
 from .events import (

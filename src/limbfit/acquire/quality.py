@@ -1,7 +1,5 @@
 """Checks of a session's record, made while the limb is still in the device."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

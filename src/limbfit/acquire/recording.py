@@ -12,8 +12,6 @@ from the block before.  What a crash leaves after the last of them is not believ
 Comments start with ``#``, so a table reader that skips them reads the rows.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import os

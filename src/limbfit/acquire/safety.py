@@ -4,8 +4,6 @@
 moved in the clamps, that a sensor does not answer to a push, that a step takes too long - stands below it.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, replace
 

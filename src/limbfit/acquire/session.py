@@ -5,8 +5,6 @@ after each sample tells the device which sample has been dealt with, so that the
 way round, not only whether something arrives.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import sys

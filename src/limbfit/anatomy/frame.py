@@ -3,8 +3,6 @@
 In the limb frame the proximal cut is the plane z = 0 and the limb lies at z <= 0; millimetres.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

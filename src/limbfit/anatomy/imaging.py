@@ -4,8 +4,6 @@ Images: DICOM folders, NIfTI, NRRD, MetaImage.  Label maps: ``.seg.nrrd``, any l
 RTSTRUCT.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -5,8 +5,6 @@ A mask dilated by a ball holds what lies within the ball's radius of it. Exact d
 ``[j, i]`` for one slice; spacings are mm along i, j and k.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray

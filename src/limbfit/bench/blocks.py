@@ -1,7 +1,5 @@
 """Structured two-layer blocks under the square punch, of any size: meshes that need no mesher."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

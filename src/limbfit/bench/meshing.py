@@ -3,8 +3,6 @@
 The limbs are phantoms of several seeds, a mean residuum, and a real calf that is amputated virtually.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

@@ -4,8 +4,6 @@ The cases that FEBio has solved are data here, with everything that is set for e
 (friction, press fit, force control, pressure) are FEBio's own inputs, run as they are.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence

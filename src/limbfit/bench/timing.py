@@ -1,7 +1,5 @@
 """Time and memory of single simulations, each in a process of its own: reference cases, and blocks."""
 
-from __future__ import annotations
-
 import resource
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """Indentations on a device: recorded, shown while they run, judged; and a device that is a program."""
 
-from __future__ import annotations
-
 import os
 import select
 import signal

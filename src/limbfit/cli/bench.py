@@ -1,7 +1,5 @@
 """``limbfit bench``: the solver against FEBio's results, its time and memory, meshes, identification."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """The commands of one study: made, checked, run, simulated; and its geometry, stage by stage."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

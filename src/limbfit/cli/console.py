@@ -1,7 +1,5 @@
 """What the commands print with: results on standard output, progress and errors on standard error."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

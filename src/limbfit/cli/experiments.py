@@ -1,7 +1,5 @@
 """The commands of the experiments: each runs one and prints its result as JSON or in words."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial

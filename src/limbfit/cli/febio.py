@@ -1,7 +1,5 @@
 """Other solvers: FEBio's inputs on limbfit's own, a study's sites as their inputs, both side by side."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """The commands around studies: many of them, one again, the studio, the machine; and where jobs run."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from functools import wraps

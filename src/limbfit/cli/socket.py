@@ -1,7 +1,5 @@
 """The commands of the socket: its load on the limb, and its design."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any
 

@@ -3,8 +3,6 @@
 The deformed surface of a limb under pressure is the shape of a socket.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -6,8 +6,6 @@ update (C. G. Broyden, Math. Comput. 19:577, 1965).  A proposal solves the linea
 within a trust region around the best design so far.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -4,8 +4,6 @@ A job is anything that can be pickled, and the function that does it is importab
 order of the jobs whatever runs them, so a caller cannot tell one executor from another except by the time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from contextvars import ContextVar

@@ -1,7 +1,5 @@
 """The interface of every executor, the limits of a job, and the executor that needs no workers."""
 
-from __future__ import annotations
-
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -5,8 +5,6 @@ installed for them. Every Dask worker does its jobs in a process of its own (`pr
 and can be ended, as a thread of Dask cannot.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

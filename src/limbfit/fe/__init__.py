@@ -20,8 +20,6 @@ cannot be solved to its end is a result with ``completed = False`` and a ``reaso
 the same mesh with other materials is quicker with ``warm_start=result`` of a run with ``store="all"``.
 """
 
-from __future__ import annotations
-
 from ..shapes import RigidSurface as RigidSurface
 from .contact.open_surface import OpenSurface as OpenSurface
 from .contact.rigid import Indenter as Indenter

@@ -4,8 +4,6 @@ What is free to move a body joins the unknowns: its coordinates come after those
 times `Tool.unit`).  All contact points of all bodies are numbered in one row.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What a problem must be before anything is solved."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..arrays import Array

@@ -3,8 +3,6 @@
 The caller decides by the kind what to do with the simulation; the text is for the user.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal

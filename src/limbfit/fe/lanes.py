@@ -5,8 +5,6 @@ calls of the C library, and places that are constant offsets in a record.  Of tw
 time that they do not overlap, but only where a loop has 16 turns or more.
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Fields of one accepted step, at elements and nodes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

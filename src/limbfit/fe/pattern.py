@@ -1,7 +1,5 @@
 """The sparse pattern of a discretisation: which unknowns meet, and where their entries are."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ acts on the tissue turns in some, and so does contact: where it is lost, the spl
 on to zero; where it is found again, that of the steps after comes from there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise

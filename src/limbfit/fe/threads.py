@@ -1,7 +1,5 @@
 """Threads that share one simulation, kept out of each other's way."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """What a rigid body does to the tissue at one accepted step: pressure and shear, and their resultants."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

@@ -8,8 +8,6 @@ finite strain.
 Source: Abaqus Theory Guide, "Hyperelastic material behavior", "Finite-strain viscoelasticity".
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What drives a problem, written as FEBio's load curves, rigid conditions and steps of the analysis."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise

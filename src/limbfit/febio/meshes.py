@@ -5,8 +5,6 @@ backwards. The side walls are left out below the steepest part of the rounded ed
 FEBio's contact from converging, and the skin under a punch does not reach them.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ in the indenter's frame, where the force is along z.
 Source: FEBio User Manual 4.0, chapter 6.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -7,8 +7,6 @@ each face (``auto_penalty`` 1).
 Source: FEBio, ``FEContactInterface::AutoPenalty``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Inputs of other programs: their templates filled in, and written."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any

@@ -10,8 +10,6 @@ Source: FEBio User Manual 4.0, chapter 4, and the section on ``MeshData``; ``FEA
 ``FEPreStrainUncoupledElastic``.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field

@@ -7,8 +7,6 @@ Laplace's equation gives does: one at one attachment, zero at the other, no flow
 (Choi and Blemker 2013, PLoS ONE 8, e77576).
 """
 
-from __future__ import annotations
-
 from collections.abc import Container, Iterable
 from typing import Literal
 

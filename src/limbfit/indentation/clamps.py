@@ -5,8 +5,6 @@ beside it stay clear of the skin so that tissue can bulge, and the other eleven 
 before the test.  There they then stay where they are; here each keeps its force.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -5,8 +5,6 @@ them a simulation costs a fraction, and its force is off by some percent, nearly
 (docs/convergence.md): good for a search whose forces the whole mesh corrects, and for first guesses.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

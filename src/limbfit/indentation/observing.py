@@ -5,8 +5,6 @@ it. Both are followed as material points (`mesh.gauges`, `find_skin_points`), wh
 derivatives come from the steps. Speeds of waves follow from both (`waves`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Grids of boxes, and the cells that they are cut into."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..arrays import Array, Indices

@@ -4,8 +4,6 @@ Local coordinates: tetrahedra and triangles on the unit simplex, hexahedra and q
 nodes in VTK order.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

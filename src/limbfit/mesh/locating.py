@@ -4,8 +4,6 @@ A line meets faces between regions; the points of these faces are followed as ma
 thickness of a region loses is then a fixed linear function of the nodal displacements: a gauge.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Meshes with their fields as VTU, and collections of them as PVD."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from os.path import relpath

@@ -1,7 +1,5 @@
 """Tissue parameters from measured curves of your own problems, with what the curves leave open."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

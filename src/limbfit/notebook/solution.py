@@ -1,7 +1,5 @@
 """A simulation that shows itself: its curve as a plot, its steps as grids of pyvista."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, fields

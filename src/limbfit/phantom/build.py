@@ -10,8 +10,6 @@ DIR/
   study.toml                  what a user would write
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import tempfile

@@ -6,8 +6,6 @@ mean dilatation each: with the pressure as it comes, forces of such meshes are 5
 (docs/convergence.md), which a calibration would put into the moduli.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path

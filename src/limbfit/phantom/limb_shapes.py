@@ -6,8 +6,6 @@ length of its gradient where a sharper distance is needed. Angles around the lim
 through medial (+pi/2) to posterior (pi).
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace

@@ -10,8 +10,6 @@ of a signal with complex Gaussian noise.
 The true label map is what someone who knew the limb would have drawn on the image.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

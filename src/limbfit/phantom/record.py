@@ -4,8 +4,6 @@ The robot starts clear of the skin, moves at constant speed to its depth, straig
 and records a little longer. Its displacement counts from the start, not from touch-down.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ below the knee joint, or a thigh's proximal cut), so that they keep their anatom
 changes the limb.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

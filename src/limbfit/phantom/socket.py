@@ -1,7 +1,5 @@
 """The phantom's socket: what a prosthetist would make of its true shape, as a file beside the patient."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The phantom's surfaces as closed triangles, straight from the implicit fields and not from the image."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

@@ -6,8 +6,6 @@ The tissues of people are ``skin``, ``fat``, ``skin_fat`` (skin with its fat, on
 skin without its fat no c is known: its compression does not tell. How the priors came about: docs/priors.md.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path

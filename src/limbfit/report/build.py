@@ -1,7 +1,5 @@
 """Stored results to one HTML file, with styles and scripts inside; beside it methods, tables and figures."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,7 +1,5 @@
 """Numbers, times and parameters as the report writes them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from ..laws import split_key

@@ -4,8 +4,6 @@ Everything here is text that has not been escaped yet, but for ``Figure.markup``
 make themselves (inline SVG in which names were already escaped).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """The stored results of a study, read and nothing more: JSON summaries, CSV curves, paths of geometry."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

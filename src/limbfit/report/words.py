@@ -1,7 +1,5 @@
 """The words of the report, from ``templates/words.j2``: paragraphs, captions, what pictures show, tables."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What every stored result is: a frozen model that knows its keys, checked when written and when read."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

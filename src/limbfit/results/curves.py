@@ -1,7 +1,5 @@
 """Curves and tables of numbers as CSV files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

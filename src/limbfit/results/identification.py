@@ -1,7 +1,5 @@
 """The identified parameters and their predictions: what the stages `calibrate` and `predict` store."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """The limb: what the stages `segment`, `surfaces`, `sites` and `mesh` store."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Other models of the same records, weighed, and what predictions and sockets owe to the choice."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Which records to make: the experiments `design` and `protocol`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """The records as they are used: what the stage `traces` stores; and what warnings about records say."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 

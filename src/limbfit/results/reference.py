@@ -1,7 +1,5 @@
 """The stored results as a page of Markdown (docs/results.md), and as JSON schemas."""
 
-from __future__ import annotations
-
 import sys
 import types
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """What was done, with what and when: `run.json`, `stage.json`, and what single commands store."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 

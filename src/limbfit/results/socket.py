@@ -1,7 +1,5 @@
 """The limb in its socket: the experiments `socket` and `socket_design`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 

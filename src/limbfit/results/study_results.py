@@ -1,7 +1,5 @@
 """All stored results of a study by name, each read when it is first used."""
 
-from __future__ import annotations
-
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol, TypeVar

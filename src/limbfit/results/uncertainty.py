@@ -1,7 +1,5 @@
 """How far the answer can be trusted: the experiments `uncertainty`, `crossvalidate` and `regions`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 

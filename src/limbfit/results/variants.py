@@ -1,7 +1,5 @@
 """What force depends on: the experiments `sensitivity-*` and `cube`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 

@@ -4,8 +4,6 @@ One class says everything of a shape.  Your own is registered by `register_shape
 docs/extending.md.
 """
 
-from __future__ import annotations
-
 from ..errors import InputError
 from ..extensions import Registry
 from .builtin import Cylinder, Sphere, Square, Stl

@@ -1,7 +1,5 @@
 """The shapes that limbfit knows: square, cylinder, sphere, and a closed triangle surface from a file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self

@@ -1,7 +1,5 @@
 """The front of an indenter in flat faces: grids of quadrilaterals, disks, bodies of revolution."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

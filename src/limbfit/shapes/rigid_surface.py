@@ -5,8 +5,6 @@ the radius and the distance from them, less the radius, is the distance from the
 The flat faces stay where they are, and the gradient is continuous as deep as the radius.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -4,8 +4,6 @@ The frame of a shape: origin at the middle of its foremost face, z along the axi
 edge; the body lies at ``z <= 0``.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from abc import ABC, abstractmethod

@@ -5,8 +5,6 @@ A tree is three flat arrays, for compiled code: ``boxes (k, 6)`` (lower and uppe
 by leaf).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Round areas and whole regions that are pressed into a socket's face, or relieved, besides its reduction."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self

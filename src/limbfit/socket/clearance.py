@@ -1,7 +1,5 @@
 """A socket's face clear of the limb, moved along its rays, which cannot fold it, and of the bones inside."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -3,8 +3,6 @@
 Regions are sides and levels of the skin, places over bones, and what the user states.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal

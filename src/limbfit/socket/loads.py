@@ -6,8 +6,6 @@ of heel strike and toe-off: after the loading conditions I and II of ISO 10328, 
 and to a tenth in their slope. They combine the largest moments of stance: for judging sockets side by side.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

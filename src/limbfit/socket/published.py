@@ -4,8 +4,6 @@ Only findings that the cited abstracts state. Pressures in kPa, which depend on 
 and thresholds of pain stand in the papers alone: no abstract gives them by region.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Collection
 from pathlib import Path

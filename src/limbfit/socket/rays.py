@@ -7,8 +7,6 @@ it, which is negative) and its radius. Rays do not cross, so a face that has one
 station cannot fold. `Offsets` are moves along them, such as the shape that pressures give a socket.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache

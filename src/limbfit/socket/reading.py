@@ -1,7 +1,5 @@
 """A socket's inner face from a file, checked against the limb that it shall surround."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal

@@ -3,8 +3,6 @@
 The face consists of even triangles between rings of points around the limb.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal

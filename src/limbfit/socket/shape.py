@@ -1,7 +1,5 @@
 """A socket's inner face: an open triangle surface around a limb, and what is measured on it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

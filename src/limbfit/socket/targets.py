@@ -1,7 +1,5 @@
 """The pressure that a socket is meant to have on the limb: presets, tissue depth, and values of regions."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Where the brim of a socket runs: planes and a closed line across the limb's meridians."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

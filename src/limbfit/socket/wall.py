@@ -1,7 +1,5 @@
 """A socket to be printed: a wall around its inner face, a round brim and a flat face for an adapter."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import manifold3d

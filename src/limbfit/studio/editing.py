@@ -4,8 +4,6 @@ Every change is made on the text, written beside the file, read back as a study,
 place: a change that the study file's own checks refuse leaves the file as it was.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile

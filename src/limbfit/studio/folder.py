@@ -1,7 +1,5 @@
 """The folder of a study: paths stay inside it, and fingerprints show which of its files have changed."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass

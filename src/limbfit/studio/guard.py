@@ -5,8 +5,6 @@ can make the browser send requests to 127.0.0.1, by a name that resolves to it t
 requests carry another ``Host`` or ``Origin``, and no cookie, since ours is ``SameSite=Strict``.
 """
 
-from __future__ import annotations
-
 import hmac
 import secrets
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The view Identification: runs started and stopped, how far they are, how the search goes, what came out."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

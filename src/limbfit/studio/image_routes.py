@@ -5,8 +5,6 @@ corrected by hand from then on. Where the study names labels of its own, the cor
 beside the study file, which then names that one: the given file stays as it is.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path

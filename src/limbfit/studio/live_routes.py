@@ -1,7 +1,5 @@
 """The session that is being recorded, read from its record while it is written; nothing is commanded here."""
 
-from __future__ import annotations
-
 import math
 import re
 import time

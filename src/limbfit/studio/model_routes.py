@@ -1,7 +1,5 @@
 """The view Model: surfaces, meshes and sites of the limb, and changes of sites in the study file."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Sequence
 from functools import lru_cache

@@ -6,8 +6,6 @@ started it, and the study's log tells what it does. A simulation of one site is
 writes after every step tell how far it is.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import signal

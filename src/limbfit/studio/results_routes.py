@@ -1,7 +1,5 @@
 """The view Results: parameters and errors, fields to play, runs kept for comparison, files to download."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import tempfile

@@ -1,7 +1,5 @@
 """The studio's server: a socket on this machine, the application behind it, a browser that opens its page."""
 
-from __future__ import annotations
-
 import logging
 import os
 import socket

@@ -1,7 +1,5 @@
 """The routes of the view Socket: the shape with its areas, and stored runs and designs, step by step."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What every view needs: the study, its stages, what changed, and files to download."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import lru_cache
 from threading import Lock

@@ -1,7 +1,5 @@
 """The view Traces: raw and regularised records, warnings about them, and stated touch-downs and peaks."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Reading a study; errors name the file, the key and the remedy."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The table ``[material]``: the law of the tissues, start and bounds of its parameters."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 

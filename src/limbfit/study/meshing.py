@@ -1,7 +1,5 @@
 """The tables of ``study.toml`` that say how sites are meshed, and how many cells that makes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 

@@ -1,7 +1,5 @@
 """The tables ``[socket]`` and ``[socket.design]``: shape, liner, donning, loads, and designed pressures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 

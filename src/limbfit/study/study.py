@@ -1,7 +1,5 @@
 """A study as a whole: its tables, and what must hold between them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The tables of ``study.toml``: their keys, types, defaults and limits; units are in the names."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """Keys of a study that have no effect beside its other keys are refused, from one table."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """The displacement as a broken line: straight pieces between few corners."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

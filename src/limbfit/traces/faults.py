@@ -5,8 +5,6 @@ Times are rounded, samples lost; a force is frozen, at the end of its range, jum
 What is certain is mended (times); for the rest a warning says what happened, where and how much.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -5,8 +5,6 @@ Nothing is interpreted here: names, stated units and cells are as they are in th
 Sources: National Instruments, Specification for the LabVIEW Measurement File (.lvm); npTDMS's documentation.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

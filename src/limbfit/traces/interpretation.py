@@ -6,8 +6,6 @@ a record that begins in contact is refused, because nobody knows where its skin 
 done, and what the user should know (`faults`, `passivity`); the touch-down's deviation counts it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

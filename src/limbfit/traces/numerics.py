@@ -1,7 +1,5 @@
 """Numerics that the trace modules share: noise and its correlation, runs, means and interpolation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

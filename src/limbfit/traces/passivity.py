@@ -6,8 +6,6 @@ is a sum of powers of the depth and of what memory leaves of them, all with posi
 swing, but a person who breathes does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ A unit is converted where the file states it, beside a name in brackets or in a 
 that is not known is refused.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

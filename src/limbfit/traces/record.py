@@ -1,7 +1,5 @@
 """Records: the type, and the checks that every record passes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

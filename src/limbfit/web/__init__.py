@@ -4,8 +4,6 @@
 Nothing here knows a study or a page.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import re

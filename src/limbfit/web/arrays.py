@@ -6,8 +6,6 @@ little-endian. The head has ``arrays``: name to ``type`` (``f4``, ``u4``, ``u2``
 and ``at`` (bytes from the end of the head), and ``facts``: any JSON. ``static/arrays.js`` reads it.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any

@@ -3,8 +3,6 @@
 A mesh is drawn with straight edges: mid-edge nodes of quadratic cells are left out.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

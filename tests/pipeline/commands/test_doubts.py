@@ -1,7 +1,5 @@
 """Wrong records are told by ``limbfit check`` and shown in the report."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Experiments are stored like stages: done once, resumed, stale when what decides them changes."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from importlib import import_module

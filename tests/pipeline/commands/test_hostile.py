@@ -1,7 +1,5 @@
 """Inputs that are damaged or meant to harm: exit code 0 or 2 and one line, never a traceback."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import resource

@@ -1,7 +1,5 @@
 """Kill -9 of a whole run at random moments: the next run ends the same, and does nothing twice."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

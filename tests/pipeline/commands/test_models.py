@@ -1,7 +1,5 @@
 """Other models of the same records: what is changed, what stays, how they are weighed and mixed."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

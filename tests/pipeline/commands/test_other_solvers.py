@@ -3,8 +3,6 @@
 FEBio is not run: limbfit solves the exported file and its table takes the place of FEBio's.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """Runs that go on where they stopped, do nothing twice, and store what the report needs."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

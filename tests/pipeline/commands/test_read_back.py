@@ -3,8 +3,6 @@
 Meshes, exports and sockets come back in tests/mesh, tests/febio and tests/socket.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

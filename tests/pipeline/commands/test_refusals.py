@@ -1,7 +1,5 @@
 """What inputs decide is said by ``limbfit check``, and by commands before anything is meshed or simulated."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A study run again from its record."""
 
-from __future__ import annotations
-
 import json
 import re
 import resource

@@ -1,7 +1,5 @@
 """Runs: what is stale and why, stages anew, logs, batches, faults of the disk, the machine's fitness."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

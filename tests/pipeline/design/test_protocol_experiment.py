@@ -1,7 +1,5 @@
 """The records of a session, chosen by the solver's derivatives, stored and written as a study's tables."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

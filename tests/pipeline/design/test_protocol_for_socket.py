@@ -1,7 +1,5 @@
 """Records that are chosen for the pressures of a socket, on a small limb with an identified tissue."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What decides a stage is the import closure of its code, with templates, scripts and styles, and no more."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import os

@@ -1,7 +1,5 @@
 """Stage folders: atomic, resumable, keyed by their inputs."""
 
-from __future__ import annotations
-
 import errno
 import os
 import subprocess

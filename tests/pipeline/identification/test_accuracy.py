@@ -1,7 +1,5 @@
 """What a study that states no tuning is solved with; the one knob, and what goes before it."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any

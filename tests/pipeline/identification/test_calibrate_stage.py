@@ -1,7 +1,5 @@
 """The identification of a study of blocks by the real solver: two meshes, failures, interruptions."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import replace

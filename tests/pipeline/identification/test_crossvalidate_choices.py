@@ -1,7 +1,5 @@
 """Cross-validation of studies that fix and tie parameters, or fit every site, on bars of known truth."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Fibres in a study: which tissue has them, along what, what is searched, what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Predictions whose coarse or fine simulation fails, is lost or is doubtful: real solving of two blocks."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Folds and slips as the solver itself finds them, and what the search makes of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Tissues named by the study: vectors, overrides, what makes results stale, and three of them identified."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

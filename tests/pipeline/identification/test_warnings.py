@@ -1,7 +1,5 @@
 """What the solver doubts about its own result reaches the stored files, the command line and the report."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

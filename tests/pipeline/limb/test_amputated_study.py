@@ -1,7 +1,5 @@
 """A study of an intact leg with a virtual amputation: its surfaces, from an image and its labels."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Label maps corrected by hand, contours and seeds of a study: what the segment stage makes of them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

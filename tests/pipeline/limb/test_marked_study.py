@@ -1,7 +1,5 @@
 """Studies with skin markers, in a second image of a limb that moved or in the only one."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where the stage `sites` puts a site, and the axis that it finds there."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

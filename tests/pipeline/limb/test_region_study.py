@@ -1,7 +1,5 @@
 """A region inside the core as a tissue of a study: felt by a site over it, exported, identified."""
 
-from __future__ import annotations
-
 import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Sites on meshes of other edges than their own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Studies of one block, whose record, and what is seen beside it, come from the same mesh and element."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

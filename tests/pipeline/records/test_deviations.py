@@ -1,7 +1,5 @@
 """What is expected of a site's stiffness: by its tissue's thickness, and how well surfaces are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Records with a creeping hold and with two cycles, from the file to residuals and report."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

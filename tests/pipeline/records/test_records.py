@@ -1,7 +1,5 @@
 """Several records of a site: how a study states them, and that what is chosen is chosen by site."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a second speed, a second indenter and creep tell of known tissue beside one ramp."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Displacement of the skin around the indenter: from the file to the prediction."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

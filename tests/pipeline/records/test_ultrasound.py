@@ -1,7 +1,5 @@
 """Layers seen by ultrasound through the indenter: from the file to the prediction."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

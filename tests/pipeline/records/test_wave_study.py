@@ -1,7 +1,5 @@
 """Speeds of shear waves beside the force: from the file to the prediction."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What mesh and steps lack, from two of each, at the order of the element and of the scheme."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

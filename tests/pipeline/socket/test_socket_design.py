@@ -1,7 +1,5 @@
 """``limbfit socket design``: a small limb from target pressure to printable socket, table and report."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

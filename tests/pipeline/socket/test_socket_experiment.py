@@ -1,7 +1,5 @@
 """``limbfit socket``: a small limb in its socket, from the study to table and report."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Parts of `limbfit uncertainty`: its tables, one material against several, intervals of predictions."""
 
-from __future__ import annotations
-
 import csv
 import json
 import sys

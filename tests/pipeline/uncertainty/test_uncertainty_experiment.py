@@ -1,7 +1,5 @@
 """`limbfit uncertainty` on a small stump: what it stores, what it says, and the section of the report."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The cube in uniaxial compression against its closed form, and the published tissues beside it."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sensitivities have the signs that mechanics gives them, and extrapolation finds what was put in."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Faults on demand: what goes wrong, when, for how long."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 from typing import Annotated, Literal, get_args

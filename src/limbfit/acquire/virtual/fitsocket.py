@@ -5,8 +5,6 @@ and every second time a sample.  `VirtualFitSocket.feed` takes what came from li
 what goes out.
 """
 
-from __future__ import annotations
-
 import secrets
 from collections import deque
 

@@ -1,7 +1,5 @@
 """Motors with limits of speed and acceleration, heads that lag by a play, and sensors with their errors."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 import numpy as np

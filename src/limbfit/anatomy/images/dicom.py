@@ -5,8 +5,6 @@ No message to the user could identify a person: slices are named by their number
 their number in the order of names, and by name only where that holds nothing but counters.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import sys

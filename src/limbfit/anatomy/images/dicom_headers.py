@@ -5,8 +5,6 @@ Only the tags named here are read, so that no identity enters the program. An en
 (DICOM PS3.3, C.7.6.16).
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import re

@@ -6,8 +6,6 @@ A NIfTI file is checked here, because ITK leaves what is missing of a file that 
 memory, makes voxels that are not numbers zero, and takes one of the qform and the sform without a word.
 """
 
-from __future__ import annotations
-
 import gzip
 import zlib
 from collections.abc import Callable

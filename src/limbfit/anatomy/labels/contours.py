@@ -9,8 +9,6 @@ structure; the slice of the image, counted from 0; the number of the contour on 
 mm. The last point of a contour is joined to its first. The points decide; the slice is for readers.
 """
 
-from __future__ import annotations
-
 import csv
 from collections import defaultdict
 from collections.abc import Iterator, Sequence

@@ -5,8 +5,6 @@ part of the slices, in any order (DICOM PS3.3, A.51). They are put on a grid of 
 that of the image.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A label map from outside: put on its image's grid, without stray pieces; what is ambiguous is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -5,8 +5,6 @@ segments (a fourth, leading axis), and may be in RAS; all three are brought back
 Header fields: https://slicer.readthedocs.io/en/latest/developer_guide/modules/segmentations.html
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping, Sequence

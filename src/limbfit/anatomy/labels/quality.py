@@ -1,7 +1,5 @@
 """What is odd about a label map: volumes, pieces, holes, and slices that do not fit their neighbours."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import binary_fill_holes
 from scipy.ndimage import label as connected

@@ -4,8 +4,6 @@ Called as ``python _worker.py ENGINE TASK.npz MESH.npz``; imports nothing of lim
 keys of the files are those of ``VolumeTask`` and ``VolumeMesh``.
 """
 
-from __future__ import annotations
-
 import ctypes
 import signal
 import sys

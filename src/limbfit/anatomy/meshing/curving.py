@@ -6,8 +6,6 @@ Tissue over the bone is then too thick, and a site too soft (by 5 % at 11 mm ove
 nodes are moved off the bone by what the faces around them lack.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import count
 

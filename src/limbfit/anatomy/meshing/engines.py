@@ -4,8 +4,6 @@ An engine is a function ``(VolumeTask, time_limit_s) -> VolumeMesh`` that raises
 in ``ENGINES``.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

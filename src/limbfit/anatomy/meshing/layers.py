@@ -14,8 +14,6 @@ Both kinds of surface are prolonged straight beyond the proximal cut before dist
 the flat cap would count as skin and be offset too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal

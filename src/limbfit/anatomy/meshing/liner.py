@@ -1,7 +1,5 @@
 """A liner: one more layer, outside the skin."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

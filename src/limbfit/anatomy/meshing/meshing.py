@@ -12,8 +12,6 @@ The recipe
    faces that are too coarse to follow a bone are put on it in the mean (`curving`).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What a site mesh is like: counts, angles, layers, volumes, and what was trimmed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

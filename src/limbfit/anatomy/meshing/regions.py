@@ -9,8 +9,6 @@ reach    the least thickness of core between a region and a wall, the clearance 
          does: regions meet walls at right angles, and no wedge or thin sheet of core is left between.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """The few worst tetrahedra of a mesh are improved by moving their nodes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

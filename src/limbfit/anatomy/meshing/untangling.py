@@ -4,8 +4,6 @@ Tried in turn, each about the inverted cells alone: nodes moved along the surfac
 made thinner from below, where their columns cross; nodes moved off their surfaces.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -4,8 +4,6 @@ Bones end at the plane. Soft tissue covers them as a surgeon's flap does: the li
 plane is carried on distally and rounded off, so that the limb ends ``pad_mm`` beyond the bones.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ wider than it, the mask keeps the limb and loses the slab but for the strip unde
 reaches far out is slab, and the hull of both its wings closes the strip between them.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from scipy.ndimage import (

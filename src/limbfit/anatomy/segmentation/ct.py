@@ -3,8 +3,6 @@
 T1 and UTE images are segmented alike, by grey levels relative to muscle. CT has Hounsfield units.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

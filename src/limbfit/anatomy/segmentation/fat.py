@@ -4,8 +4,6 @@ The skin itself belongs to it, as in the skin–adipose layer of the model. Marr
 the septa of fat that reach in from the skin do not.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import binary_propagation, distance_transform_edt, gaussian_filter
 from scipy.ndimage import label as connected

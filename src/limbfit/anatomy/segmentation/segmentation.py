@@ -1,7 +1,5 @@
 """Automatic segmentation of a limb in MRI or CT: soft tissue, subcutaneous fat and named bones."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -5,8 +5,6 @@ its place follows from how much of each voxel it fills. Without a second image t
 the skin around it suggests: quadratic patches, fitted to the outline so that what stands out does not pull.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter

@@ -4,8 +4,6 @@ Places that stand out of the skin by more than a threshold are clustered; each c
 enough is a marker. The flat proximal cap is no skin and is left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

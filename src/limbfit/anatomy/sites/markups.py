@@ -3,8 +3,6 @@
 https://slicer.readthedocs.io/en/latest/developer_guide/modules/markups.html
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ its axis show in the bones. Both images are smoothed, so that noise does not pre
 and sampled with cubic splines at jittered points, so that interpolation blurs both alike.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Indentation sites on the skin: the nearest skin point, the indenter's direction, the tissue under it."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -6,8 +6,6 @@ interpolation). The level of the contour, and last a shift along the normals, ke
 which smoothing and coarse triangles would otherwise shrink where the surface is curved.
 """
 
-from __future__ import annotations
-
 import gpytoolbox
 import numpy as np
 import pyvista as pv

@@ -9,8 +9,6 @@ cap    the flat end of a surface that was open: the surface is cut by the plane 
        inward to the loop's lowest point, and closed there, so that the cap cannot cross what it closes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

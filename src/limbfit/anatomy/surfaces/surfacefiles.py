@@ -1,7 +1,5 @@
 """Surface files in and out: STL, PLY, VTP, OBJ, in LPS or RAS, in millimetres or a stated unit."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ Bones that reach the proximal cut stick out of the skin's cap by a few millimetr
 leave in the soft tissue is open there.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

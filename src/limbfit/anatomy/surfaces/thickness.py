@@ -1,7 +1,5 @@
 """Thickness as a function on the skin: measured from the segmented fat, smoothed, carried to points."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

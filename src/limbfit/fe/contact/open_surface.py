@@ -4,8 +4,6 @@ Its triangles run counter-clockwise seen from the tissue.  The distance is that 
 on the tissue's side.  Points beyond the brim, or farther away than the surface's reach, are free.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass

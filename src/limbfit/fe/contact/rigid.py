@@ -4,8 +4,6 @@ The indenter's frame: origin at the middle of its foremost face (``centre``), co
 ``edge``, ``axis x edge`` and ``axis``; the body lies at ``z <= 0``.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -6,8 +6,6 @@ Its Kirchhoff stress is ``tau = s tau_e + J U' I + F K F^T``; the tangent is spa
 ``k_ab = int g_a . c . g_b + (g_a . tau g_b) I`` with ``g_a = F^-T grad N_a`` (Simo and Hughes 1998, ch. 7).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ An element of a known cell type is a row of `ELEMENTS`; a cell type is a row of 
 its local coordinates are said.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

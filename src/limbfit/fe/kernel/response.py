@@ -11,8 +11,6 @@ symmetric identity.  An active stress is added to ``T``.  The parts along the id
 principal stresses.  With ``F^-1 m`` in the place of ``m`` the same formulas give the material tensors.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

@@ -1,7 +1,5 @@
 """Material laws: each is a small frozen class that yields a `LawTable` and its derivatives."""
 
-from __future__ import annotations
-
 from .elastic import VOLUMETRIC_LAWS as VOLUMETRIC_LAWS
 from .elastic import ElasticLaw as ElasticLaw
 from .elastic import lane_function as lane_function

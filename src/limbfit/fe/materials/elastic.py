@@ -24,8 +24,6 @@ The volumetric laws ``U(J)`` are named by code in the kernels.  Source: FEBio th
 "uncoupled materials", ``pressure_model``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -13,8 +13,6 @@ beside the passive one is the usual form (Blemker, Pinsky and Delp 2005, J. Biom
 on length and speed is left to ``s``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self, cast

@@ -14,8 +14,6 @@ Sources: FEBio user manual, uncoupled materials; Fung's exponential law: Demiray
 elasticity of soft biological tissues. J. Biomech. 5, 309.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self, cast

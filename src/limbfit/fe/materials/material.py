@@ -6,8 +6,6 @@ viscoelastic", g0 = 1).  The deviatoric part is an `ElasticLaw` with numbers of 
 Ogden terms, ``W_dev = sum_k c_k/m_k^2 (lt_1^m_k + lt_2^m_k + lt_3^m_k - 3)``.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence

@@ -12,8 +12,6 @@ through the last three steps, the one before having lasted ``q dt``, its change 
 second and of third order in the step.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The compiled kernels of an indentation: whether they are stored, and made beforehand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -13,8 +13,6 @@ Where even those fail it has come to its end (tissue snaps past the indenter, or
 iterations away, however short the step, and they are allowed there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby

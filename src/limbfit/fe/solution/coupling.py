@@ -7,8 +7,6 @@ GMRES with the factor that Newton has as the preconditioner.  Renewing them alon
 where a body wedges itself in: there ``K^-1 C`` is larger than one.
 """
 
-from __future__ import annotations
-
 import time
 from collections import defaultdict
 from dataclasses import replace

@@ -5,8 +5,6 @@ Kunisch 2003).  Each missed point would cost an assembly of all elements; here i
 solution.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -12,8 +12,6 @@ is relative to the diagonal would be ruled by the bulk modulus, a hundred times 
 stable, too.
 """
 
-from __future__ import annotations
-
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable

@@ -5,8 +5,6 @@ factorisation is Cholesky where the library offers it, so that a matrix that is 
 noticed: `NotPositiveDefiniteError`.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import importlib

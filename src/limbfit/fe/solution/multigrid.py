@@ -8,8 +8,6 @@ contact and all.  Everything is in single precision: it only preconditions.
 Matrices are upper triangles of 3 x 3 blocks by node, the diagonal block first in each row.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.sparse as sp
 from numba import njit

@@ -1,7 +1,5 @@
 """One run: the system, its materials, and the steps that are accepted one by one."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence

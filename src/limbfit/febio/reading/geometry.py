@@ -1,7 +1,5 @@
 """Mesh and domains of a FEBio input: nodes, parts, named sets; every reference checked."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass

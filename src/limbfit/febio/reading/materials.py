@@ -7,8 +7,6 @@ Source: FEBio User Manual 4.0, sections 4.1.1 and 4.1.3, on local material axes 
 feature manual, ``uncoupled active fiber stress``, ``uncoupled prestrain elastic`` and ``prestrain gradient``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any

@@ -5,8 +5,6 @@ In every step a body is held, displaced, turned, or under a force.
 Source: FEBio User Manual 4.0, sections 3.10 (rigid conditions and loads) and 3.13 (steps).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations

@@ -9,8 +9,6 @@ against the solver; the region in which it is valid enters as the bounds of ``un
 table 3).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations

@@ -10,8 +10,6 @@ Autocorrelation is tested on residuals whitened by C (Ljung and Box 1978). What 
 is taken out first: it is the model that is judged, not where the search stopped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -7,8 +7,6 @@ factor of about 1.25, while the stiffness itself varies sevenfold. A wrong unit 
 depth and the time step by known factors, so the hypothesis that explains all four names the unit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations

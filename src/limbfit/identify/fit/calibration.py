@@ -5,8 +5,6 @@ and derivatives of every site. It can be stopped after any accepted iterate, and
 with the same answer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal

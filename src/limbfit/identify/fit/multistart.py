@@ -1,7 +1,5 @@
 """Searches from several starts, and a search continued from a bound: is the optimum the only one?"""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -7,8 +7,6 @@ one shape). ``paper`` is equation 8 as printed: one mean squared difference per 
 squares again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -6,8 +6,6 @@ region and costs one evaluation; nothing else remembers it. The whole state is (
 Nocedal and Wright, Numerical Optimization, chapters 4 and 10; Moré 1978 for the gain ratio.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@ One kernel matrix serves all points of all curves; its length is the one that pr
 others (Dubrule 1983).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise, product
 

@@ -5,8 +5,6 @@ solver where that posterior is and where the runs so far are farthest away. It e
 over the posterior is below what the records can tell, or when the allowed runs are used up.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial

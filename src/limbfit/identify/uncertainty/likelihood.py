@@ -8,8 +8,6 @@ prior and no linearisation (Raue et al. 2009). A parameter whose profile stays b
 bound is not determined on that side, whatever a covariance says.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial

@@ -5,8 +5,6 @@ The residuals are so alike that ten or so independent ones are left, too few for
 Laplace's method (MacKay 2003, section 28). A parameter that the records do not tell costs nothing there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ noise does not. Therefore the compared points have the covariance that means of 
 have.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -13,8 +13,6 @@ a tail, or with a further term that is slow and small, counts twice, half with t
 without. Where the records prefer such fits, `RelaxationAssessment.describe` says so.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -8,8 +8,6 @@ derivatives, for any other relaxation. The strains of that test are not exactly 
 docs/uncertainty.md states the error.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

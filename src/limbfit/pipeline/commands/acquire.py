@@ -1,7 +1,5 @@
 """Indentations recorded into a study, and a virtual device whose limb is the study's own simulations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict
 from datetime import UTC, datetime

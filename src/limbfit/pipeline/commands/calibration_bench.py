@@ -1,7 +1,5 @@
 """How long an identification takes, beside the loop it replaces: FEBio with finite differences."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Read every input of a study and say what is wrong with it, before anything runs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from typing import Any

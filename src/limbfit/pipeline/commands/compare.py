@@ -1,7 +1,5 @@
 """One indentation by limbfit and by FEBio: same mesh, same history, both curves and their difference."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The synthetic patient as a study, and the demo that identifies it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Whether this machine can run limbfit: parts, resources, and a small problem solved for real."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -6,8 +6,6 @@ reads; some write CSV tables beside it. `simulations.open_experiment_cache` keep
 those of the stages and of other experiments, so that a killed one goes on and nothing is simulated twice.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Collection, Mapping

@@ -1,7 +1,5 @@
 """Indentations of a study as inputs of other solvers, with the same numbers as ``limbfit simulate``."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A FEBio input on limbfit's solver, outside any study."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A socket on the limb, and its design: ``limbfit socket`` with the parameters that are known."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -6,8 +6,6 @@ and predicts every record like the study itself. Models are weighed by how proba
 records (the Laplace evidence of their calibrations), and a prediction is the mixture of theirs.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence

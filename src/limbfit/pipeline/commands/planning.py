@@ -1,7 +1,5 @@
 """Planning an experiment on a limb, sites or a whole session: ``limbfit design``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any
 

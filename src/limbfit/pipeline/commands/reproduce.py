@@ -1,7 +1,5 @@
 """A study run again from its record, in a new folder, and compared with what it gave then."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterator, Mapping

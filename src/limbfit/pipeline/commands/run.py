@@ -1,7 +1,5 @@
 """Which stages there are, what each depends on, and runs of one study or many that do what is missing."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence

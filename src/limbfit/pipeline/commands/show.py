@@ -1,7 +1,5 @@
 """A stage of the geometry done and shown: what a person wants to know of it, and a picture."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

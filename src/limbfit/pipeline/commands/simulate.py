@@ -1,7 +1,5 @@
 """One indentation of a study, simulated and stored for ParaView."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

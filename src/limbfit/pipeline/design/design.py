@@ -1,7 +1,5 @@
 """The experiment ``design``: which sites to test, and how deep, to determine the parameters best."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

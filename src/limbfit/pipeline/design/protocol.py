@@ -1,7 +1,5 @@
 """The experiment ``protocol``: which records a session of stated length should make, and what they tell."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, product

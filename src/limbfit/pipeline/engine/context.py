@@ -1,7 +1,5 @@
 """What every stage is given: the study, where to store, what to run on, whom to tell."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any

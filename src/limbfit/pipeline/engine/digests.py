@@ -5,8 +5,6 @@ A name imported from a package is followed to the module that defines it: a pack
 hands names on is no reason for all of the package to count.
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import inspect

@@ -5,8 +5,6 @@ A label map that someone corrected by hand and saved over what the segment stage
 other, until it is deleted; the stage never writes there.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ Paths of inputs stand in it by their keys in the study file, since names of file
 lies outside the study is not named at all.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

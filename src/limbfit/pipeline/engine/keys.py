@@ -3,8 +3,6 @@
 Only digests are kept beside results, so that no setting or file name leaves a trace in them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """What took long and is kept on disk as it finishes: facts and arrays, by the key of what decides them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path

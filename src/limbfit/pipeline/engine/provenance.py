@@ -1,7 +1,5 @@
 """What a run was made with: versions, machine, settings and the digests of its inputs."""
 
-from __future__ import annotations
-
 import os
 import platform
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """How results are written: JSON, tables and curves as CSV, never half done; and digests of inputs."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

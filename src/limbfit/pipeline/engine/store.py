@@ -5,8 +5,6 @@ is a digest of everything the stage depends on, so a run that was killed finds i
 and goes on in it. Of an unfinished folder of other inputs the simulations are kept, since some may serve.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

@@ -1,7 +1,5 @@
 """From records and meshes to identified parameters: the stage ``calibrate``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial

@@ -5,8 +5,6 @@ simulates at some of the fits' optima, which says how far the emulator is off th
 from those too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """From the meshes of a search to the study's own, and what those lack beside infinitely fine ones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

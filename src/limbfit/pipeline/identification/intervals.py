@@ -1,7 +1,5 @@
 """What the records tell of the identified parameters: intervals, and the answer that is most probable."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from ...arrays import Array

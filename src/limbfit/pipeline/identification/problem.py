@@ -1,7 +1,5 @@
 """What a study asks of its calibration: parameters with their bounds, stages, and when the search ends."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Simulations of a calibration's records: with derivatives for the search, and on the study's own meshes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The search for parameters: from several starts, inwards from bounds, corrected by the finer meshes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 

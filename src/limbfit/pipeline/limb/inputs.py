@@ -1,7 +1,5 @@
 """The image, label map and surfaces that a study names, read and checked in one way for every verb."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

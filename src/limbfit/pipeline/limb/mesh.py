@@ -1,7 +1,5 @@
 """The stage ``mesh``: one graded mesh for each site."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache

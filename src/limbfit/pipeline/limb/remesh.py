@@ -1,7 +1,5 @@
 """Sites on other meshes than their own, for what the mesh or the geometry changes."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The stage ``segment``: image to label map."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

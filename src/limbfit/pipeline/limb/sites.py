@@ -1,7 +1,5 @@
 """The stage ``sites``: where each indentation is on the skin, and its axis."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The stage ``surfaces``: label map, or surfaces of the study, to a checked anatomy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -5,8 +5,6 @@ what a flat punch on a bonded incompressible layer says (Hayes et al. 1972).  Ho
 from site to site the residuals themselves must tell (`limbfit.identify.uncertainty.discrepancy`).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path

@@ -3,8 +3,6 @@
 See `identify.plausibility` and `identify.outliers`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any

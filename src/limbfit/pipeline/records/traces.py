@@ -1,7 +1,5 @@
 """Records to regularised curves, and what was seen beside them: the stage ``traces``."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple

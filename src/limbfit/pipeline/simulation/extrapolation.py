@@ -1,7 +1,5 @@
 """What forces tend to as meshes and steps in time get finer, and the orders that are taken for it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Simulations of a study, never done twice: kept on disk as they finish, keyed by what decides them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path

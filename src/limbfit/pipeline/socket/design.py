@@ -4,8 +4,6 @@ The limb under the target pressure has the shape of the socket.  Control and des
 alike; where regions are named, the depths over them are moved to lower the largest pressures there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial

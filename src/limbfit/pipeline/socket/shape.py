@@ -1,7 +1,5 @@
 """The socket of a study: its table ``[socket]`` and a limb's anatomy to a face around that limb."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A socket put on the limb and loaded: as a job of its own, and what is stored of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property

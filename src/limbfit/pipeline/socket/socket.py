@@ -1,7 +1,5 @@
 """The experiment ``socket``: the limb in its socket, donned, held and loaded."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial

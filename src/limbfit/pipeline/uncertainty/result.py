@@ -1,7 +1,5 @@
 """What the experiment ``uncertainty`` stores: one JSON, and its tables and curves as CSV."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ it. The change of force at the fitted sites becomes a change of the parameters b
 the fit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """The experiment ``uncertainty``: what the records determine, and what else would change the answer."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from itertools import cycle

@@ -4,8 +4,6 @@ A cube of 10 mm between frictionless plates that hold on to it: compressed over 
 0.5 s, held for 1 s, its sides free. The paper does not say how far it was compressed.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path

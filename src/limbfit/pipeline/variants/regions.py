@@ -1,7 +1,5 @@
 """The experiment ``regions``: parameters of each region of the limb beside those of the whole (table 3)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path

@@ -4,8 +4,6 @@ Each takes the identified parameters, changes one thing, and simulates the chose
 one with the thinnest and the one with the thickest tissue over bone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial

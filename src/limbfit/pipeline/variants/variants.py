@@ -1,7 +1,5 @@
 """Simulations of the same indentation with one thing changed: what the experiments of sensitivity share."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -4,8 +4,6 @@ The page's style sheet gives them their light, dark and printed values. The pale
 (2008), which people with any colour-vision deficiency can tell apart.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 INK, GRID, MUTED = "#010101", "#010102", "#010103"

@@ -1,7 +1,5 @@
 """Curves of the report: forces (the paper's figure 7) and what was seen beside them, convergence, errors."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 

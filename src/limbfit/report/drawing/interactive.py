@@ -3,8 +3,6 @@
 All of it is data for scripts of the room ``web``; the pictures stay, for print and where there is no WebGL.
 """
 
-from __future__ import annotations
-
 import base64
 import math
 import statistics

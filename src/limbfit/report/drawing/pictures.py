@@ -2,8 +2,6 @@
 and 6) and the deformed cut at the peak.
 """
 
-from __future__ import annotations
-
 from base64 import b64encode
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Matplotlib drawings as inline SVG that follows the page's light or dark theme."""
 
-from __future__ import annotations
-
 import io
 import math
 import re

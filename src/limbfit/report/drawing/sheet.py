@@ -1,7 +1,5 @@
 """The quality sheet of a segmentation as one picture: outlines over slices; slices to look at, enlarged."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

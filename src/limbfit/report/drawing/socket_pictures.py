@@ -1,7 +1,5 @@
 """The limb in its socket from four sides, coloured by pressure; settling and force over time."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One PNG for each stage of the geometry: what to look at before going on."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The whole page: its summary, and every section in the order in which a reader asks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from statistics import fmean
 from typing import Any

@@ -1,7 +1,5 @@
 """The cube in uniaxial compression: the paper's figures 8 (skin) and 9 (muscle)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

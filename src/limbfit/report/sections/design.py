@@ -1,7 +1,5 @@
 """Which sites to test and which records to make: the best choices, and what they would determine."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

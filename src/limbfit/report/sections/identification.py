@@ -1,7 +1,5 @@
 """The identification: parameters (table 1 of the paper) with what determines them, and how it went."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 from ...results.identification import CorrelationMatrix, SearchStage

@@ -4,8 +4,6 @@ The words are in ``templates/methods.j2``. Nothing here comes from an image's he
 their keys in the study file.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 

@@ -1,7 +1,5 @@
 """The model: surfaces, sites and volumes; and the mesh of each site."""
 
-from __future__ import annotations
-
 from ..drawing import pictures
 from ..drawing.interactive import make_explorer
 from ..page import Prose, Section, Table, make_bullets

@@ -1,7 +1,5 @@
 """Fits to other choices of sites: cross-validation, and regions with models of their own (table 3)."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.axes import Axes
 

@@ -1,7 +1,5 @@
 """Fitted and held-out sites: forces, table 2 of the paper, and what was seen beside the force."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 from ...results.identification import RecordPrediction, average_records

@@ -1,7 +1,5 @@
 """What someone else needs to get the same numbers: times, settings, versions and hashes of inputs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Indentation records in the report: the paper's figure 3, what was found in them, and what looks wrong."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from matplotlib.axes import Axes

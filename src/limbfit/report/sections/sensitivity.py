@@ -1,7 +1,5 @@
 """What the experiments of sensitivity found: c, bulk modulus, friction, indenter and mesh."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any

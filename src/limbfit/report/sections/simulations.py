@@ -1,7 +1,5 @@
 """What simulations say about themselves: single ones, those by FEBio too, and those of every site."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from ...results.identification import RecordPrediction

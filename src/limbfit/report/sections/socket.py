@@ -1,7 +1,5 @@
 """The socket in the report: pressure and shear by region and their causes, settling, balance, design."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """What the records determine: intervals by three methods, profiles, posterior, sources, predictions."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
