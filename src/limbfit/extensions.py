@@ -89,7 +89,8 @@ def _run(file: Path, name: str) -> None:
     sys.modules[name] = module  # what it defines can then be sent to other processes that have run it
     _running.append(file)
     try:
-        spec.loader.exec_module(module)
+        # Not by the loader: it would run stored bytecode again after a change within one second.
+        exec(compile(file.read_bytes(), file, "exec"), module.__dict__)
     except InputError:
         del sys.modules[name]
         raise
