@@ -20,7 +20,7 @@ from keyed_studies import (
 from test_study_docs import KEYS
 
 from limbfit.errors import StudyError
-from limbfit.study.unused_keys import UNUSED_KEYS, UNUSED_RECORD_KEYS, UNUSED_SITE_KEYS
+from limbfit.study.loading import UNUSED_KEYS, UNUSED_RECORD_KEYS, UNUSED_SITE_KEYS
 
 # Studies that state a key in vain: what is set in which study, and the key that is refused.
 AMPUTATED = ("geometry.amputation", {"point": [0.0, 0.0, 0.0]})

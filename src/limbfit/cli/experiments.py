@@ -11,9 +11,8 @@ import typer
 import limbfit
 
 from ..errors import InputError
-from ..results.models import ModelsResult
 from ..results.planning import DesignResult, ProtocolResult
-from ..results.uncertainty import CrossvalidateResult, RegionsResult, UncertaintyResult
+from ..results.uncertainty import CrossvalidateResult, ModelsResult, RegionsResult, UncertaintyResult
 from ..results.variants import CubeResult, RefinementResult, VolumeResult
 from .commands import Parameters, StudyPath, call_on_study
 from .console import (

@@ -10,8 +10,8 @@ import limbfit
 
 from ..errors import InputError
 from ..laws import split_key
-from ..results.models import SocketOfModels
 from ..results.socket import SocketDesignResult, SocketLoad, SocketResult
+from ..results.uncertainty import SocketOfModels
 from .commands import StudyPath, call_on_study
 from .console import (
     AsJson,

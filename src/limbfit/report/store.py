@@ -9,8 +9,7 @@ from typing import Any, TypeVar
 from ..arrays import Array
 from ..errors import InputError
 from ..laws import TissueLaw
-from ..results.base import Interval, ResultPart, StoredResult
-from ..results.curves import read_curves
+from ..results.base import Interval, ResultPart, StoredResult, read_curves
 from ..results.identification import (
     CalibrationResult,
     CalibrationUncertainty,
@@ -18,12 +17,20 @@ from ..results.identification import (
     RecordPrediction,
     SearchStage,
 )
-from ..results.limb import MeshMeasures, MeshResult, PlacedSite, SegmentResult, SitesResult, SurfacesResult
-from ..results.models import ModelsResult
-from ..results.records import TraceFacts, TracesResult
+from ..results.limb import (
+    MeshMeasures,
+    MeshResult,
+    PlacedSite,
+    SegmentResult,
+    SitesResult,
+    SurfacesResult,
+    TraceFacts,
+    TracesResult,
+)
 from ..results.runs import CompareResult, RunResult, SimulateResult, is_current
 from ..results.socket import SocketResult
 from ..results.study_results import MODELS
+from ..results.uncertainty import ModelsResult
 from .formats import format_fixed, format_symbol
 
 Curves = dict[str, Array]

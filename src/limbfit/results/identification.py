@@ -6,7 +6,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from .base import Interval, Intervals, Matrix, Parameters, ResultPart, StoredResult
-from .records import RecordFlag
+from .limb import RecordFlag
 
 
 class SimulationDoubt(ResultPart):

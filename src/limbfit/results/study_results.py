@@ -7,16 +7,13 @@ from typing import Protocol, TypeVar
 from ..arrays import Array
 from ..errors import InputError
 from . import variants
-from .base import StoredResult
-from .curves import read_curves
+from .base import StoredResult, read_curves
 from .identification import CalibrationResult, PredictResult
-from .limb import MeshResult, QualityResult, SegmentResult, SitesResult, SurfacesResult
-from .models import ModelsResult, SocketOfModels
+from .limb import MeshResult, QualityResult, SegmentResult, SitesResult, SurfacesResult, TracesResult
 from .planning import DesignResult, ProtocolResult
-from .records import TracesResult
 from .runs import CompareResult, RunResult, SimulateResult, StageStamp
 from .socket import SocketDesignResult, SocketResult
-from .uncertainty import CrossvalidateResult, RegionsResult, UncertaintyResult
+from .uncertainty import CrossvalidateResult, ModelsResult, RegionsResult, SocketOfModels, UncertaintyResult
 
 R = TypeVar("R", bound=StoredResult)
 

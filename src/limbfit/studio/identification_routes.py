@@ -8,7 +8,7 @@ from fastapi import APIRouter
 
 from ..pipeline.commands.run import STAGE_NAMES
 from ..pipeline.simulation.simulations import find_newest_simulation
-from ..results.curves import read_curves
+from ..results.base import read_curves
 from ..results.identification import CalibrationResult
 from .folder import StudyFolder
 from .processes import find_running, find_starting, start_run, stop_run

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict
 from ..pipeline.commands.run import study_status
 from ..pipeline.engine.provenance import list_input_files
 from ..study import Study
-from ..web.arrays import pack
+from ..web import pack
 from .folder import StudyFolder, compute_fingerprint
 from .processes import find_running
 
@@ -39,7 +39,7 @@ class StrictModel(BaseModel):
 
 
 def respond_block(arrays: Mapping[str, Any], facts: Mapping[str, Any] | None = None) -> Response:
-    """Arrays and facts as a block that a script reads (see ``limbfit/web/arrays.py``)."""
+    """Arrays and facts as a block that a script reads (see ``limbfit/web/__init__.py``)."""
     return Response(pack(arrays, facts), media_type="application/octet-stream")
 
 

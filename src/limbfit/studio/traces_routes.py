@@ -13,8 +13,7 @@ from ..errors import InputError
 from ..pipeline.records.record_checks import record_flags
 from ..pipeline.records.traces import read_record
 from ..results.identification import PredictResult
-from ..results.limb import SitesResult
-from ..results.records import TraceFacts
+from ..results.limb import SitesResult, TraceFacts
 from ..study import Record, Study
 from ..traces.numerics import average_in_bins
 from .editing import set_record

@@ -12,19 +12,7 @@ from ..formats import format_fixed, format_symbol, format_with_value, get_unit
 from ..page import Figure
 from ..store import Curves, Results, find_compared_quantity
 from . import plots
-from .colours import (
-    FITTED,
-    HELD_OUT,
-    INK,
-    MEASURED,
-    MUTED,
-    ONE_MATERIAL,
-    SIMULATED,
-    THIRD,
-    TRUTH,
-    choose_tissue_style,
-    choose_truth_style,
-)
+from .colours import FITTED, HELD_OUT, INK, MEASURED, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH
 
 MAX_POINTS, MAX_TITLE, MAX_LEGEND_ROW = 2500, 44, 7
 
@@ -161,7 +149,7 @@ def _draw_stage(axes: Sequence[Axes], store: Results, stage: SearchStage, offset
     for ax, name in zip(axes[1:], store.law.keys, strict=True):
         for i, tissue in enumerate(stage.parameters):
             values = [step.parameters[tissue][name] for step in steps]
-            ax.plot(x, values, ms=3, label=tissue if offset == 0 else None, **choose_tissue_style(i))
+            ax.plot(x, values, ms=3, label=tissue if offset == 0 else None, **plots.choose_tissue_style(i))
     if offset:
         for ax in axes:
             ax.axvline(offset - 0.5, color=MUTED, lw=0.8)
@@ -175,7 +163,7 @@ def _finish_convergence(axes: Sequence[Axes], store: Results) -> None:
         ax.set_title(f"{format_symbol(name)} ({get_unit(name)})")
         for i, (tissue, values) in enumerate(store.truth.get("parameters", {}).items()):
             if name in values:
-                ax.axhline(values[name], lw=1, label=f"truth, {tissue}", **choose_truth_style(i))
+                ax.axhline(values[name], lw=1, label=f"truth, {tissue}", **plots.choose_truth_style(i))
     for ax in axes:
         ax.set_xlabel("Iterate")
         ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
@@ -298,7 +286,7 @@ def _draw_pairs(ax: Axes, curves: Curves, components: Sequence[str]) -> None:
         ax.vlines(x, low, high, color=SIMULATED, alpha=0.15, lw=0.8)
     for number, word in enumerate(components):
         chosen = curves["component"] == number
-        style = choose_tissue_style(number) | {"ls": "", "ms": 2.5}
+        style = plots.choose_tissue_style(number) | {"ls": "", "ms": 2.5}
         if chosen.any():
             ax.plot(x[chosen], y[chosen], **style, label=word)
 

@@ -17,23 +17,13 @@ from ...arrays import Array
 from ...mesh import read_vtu
 from ...results.identification import SearchIteration
 from ...results.limb import PlacedSite
-from ...web.arrays import pack
+from ...web import pack
 from ...web.shapes import extract_interface, read_shell, to_shell, to_volume_shape
 from ..formats import format_symbol, get_unit
 from ..page import Interactive
 from ..store import Curves, Json, Results, name_compared
 from ..words import write_words
-from .pictures import (
-    FITTED,
-    HELD_OUT,
-    SKIN_SURFACE,
-    choose_inner_colour,
-    cut_behind,
-    find_placed_meshes,
-    make_cut_views,
-    read_limb_frame,
-    read_linear,
-)
+from . import pictures
 
 MAX_FACES, MAX_SAMPLES = 12_000, 300
 FIELD_RADIUS_MM = 50.0
@@ -49,7 +39,7 @@ def make_explorer(store: Results) -> Interactive | None:
     surfaces = _read_surfaces(store, arrays)
     fields = _cut_fields(store, arrays)
     facts = {
-        "frame": read_limb_frame(store).tolist(),
+        "frame": pictures.read_limb_frame(store).tolist(),
         "surfaces": surfaces,
         "sites": [_describe_site(store, row) for row in store.placed_sites.values()],
         "fields": fields,
@@ -72,7 +62,7 @@ def _read_surfaces(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json
                 "name": name,
                 "title": title or name,
                 "kind": "skin" if name == "skin" else "bone",
-                "colour": SKIN_SURFACE if name == "skin" else choose_inner_colour(name),
+                "colour": pictures.SKIN_SURFACE if name == "skin" else pictures.choose_inner_colour(name),
                 "opacity": 0.38 if kind == "skin" else 1.0,
             }
         )
@@ -105,7 +95,7 @@ def _describe_site(store: Results, row: PlacedSite) -> Json:
         "fitted": row.fitted,
         "at": list(row.position_mm),
         "axis": (axis / np.linalg.norm(axis)).tolist(),
-        "colour": FITTED if row.fitted else HELD_OUT,
+        "colour": pictures.FITTED if row.fitted else pictures.HELD_OUT,
         "error_percent": statistics.fmean(errors) if errors else None,
         "compared": name_compared(rows),
     }
@@ -115,7 +105,7 @@ def _cut_fields(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
     """The cut through each site at its deepest point, as triangles with displacements and stress."""
     stage = "predict" if store.predict else "simulate"
     fields = []
-    for row, file in find_placed_meshes(store, store.site_names, stage):
+    for row, file in pictures.find_placed_meshes(store, store.site_names, stage):
         cut = _cut_field(store, row, file)
         if cut is None:
             continue
@@ -126,11 +116,12 @@ def _cut_fields(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
 
 
 def _cut_field(store: Results, row: PlacedSite, file: Path) -> dict[str, NDArray[Any]] | None:
-    grid = read_linear(file)
+    grid = pictures.read_linear(file)
     if STRESS not in grid.cell_data or "displacement_mm" not in grid.point_data:
         return None
-    view = make_cut_views(store, row, file)[1]
-    surface = cut_behind(grid, view, smooth=True).extract_surface(algorithm="dataset_surface").triangulate()
+    view = pictures.make_cut_views(store, row, file)[1]
+    cut = pictures.cut_behind(grid, view, smooth=True)
+    surface = cut.extract_surface(algorithm="dataset_surface").triangulate()
     near = np.linalg.norm(np.asarray(surface.cell_centers().points) - view.focal, axis=1) < FIELD_RADIUS_MM
     if not near.any():
         return None

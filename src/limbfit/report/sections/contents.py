@@ -9,19 +9,25 @@ from ..formats import format_number, format_parameter
 from ..page import Block, KeyNumber, Note, Page, Section, make_bullets
 from ..store import Results
 from ..words import make_prose, make_section, write_words
-from .cube import make_cube_section
 from .design import make_design_section, make_protocol_section
-from .identification import make_convergence_section, make_parameter_section
-from .methods import make_method_section
-from .model import make_mesh_section, make_model_section
-from .other_fits import make_crossvalidation_section, make_regions_section
-from .prediction import make_domain_section, make_fit_section, make_prediction_section
-from .provenance import make_provenance_section, make_settings_section, make_timing_section
-from .records import make_record_check_section, make_record_section
-from .sensitivity import SENSITIVITIES
+from .identification import (
+    make_convergence_section,
+    make_domain_section,
+    make_fit_section,
+    make_parameter_section,
+    make_prediction_section,
+)
+from .inputs import make_mesh_section, make_model_section, make_record_check_section, make_record_section
+from .methods import make_method_section, make_provenance_section, make_settings_section, make_timing_section
 from .simulations import make_comparison_section, make_simulated_section, make_solver_section
 from .socket import make_socket_design_section, make_socket_section
-from .uncertainty import make_models_section, make_uncertainty_section
+from .uncertainty import (
+    make_crossvalidation_section,
+    make_models_section,
+    make_regions_section,
+    make_uncertainty_section,
+)
+from .variants import SENSITIVITIES, make_cube_section
 
 Maker = Callable[[Results, Any], Section]
 # By the name of the experiment, in the order of the page; a maker is given the store and the stored result,
