@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from io import TextIOWrapper
 from typing import Annotated, Any
 
-import typer
+from typer import Exit, Option, Typer
 from typer.core import TyperGroup
 
 from .._version import __version__
@@ -34,12 +34,11 @@ class GroupedCommands(TyperGroup):
         for title, names in GROUPS.items():
             with formatter.section(title):
                 verbs = [(name, self.get_command(ctx, name)) for name in names]
-                formatter.write_dl(
-                    [(name, verb.get_short_help_str(_MAX_HELP)) for name, verb in verbs if verb]
-                )
+                rows = [(name, verb.get_short_help_str(_MAX_HELP)) for name, verb in verbs if verb]
+                formatter.write_dl(rows)
 
 
-app = typer.Typer(
+app = Typer(
     name="limbfit",
     help="Patient-specific viscoelastic finite-element models of residual limbs, from MRI and indentations.",
     no_args_is_help=True,
@@ -50,12 +49,10 @@ app = typer.Typer(
 
 
 @app.callback(invoke_without_command=True)
-def root(
-    version: Annotated[bool, typer.Option("--version", help="print the version and stop")] = False,
-) -> None:
+def root(version: Annotated[bool, Option("--version", help="print the version and stop")] = False) -> None:
     if version:
         print_line(f"limbfit {__version__}")
-        raise typer.Exit
+        raise Exit
 
 
 _WITH_JOBS = {commands.run, commands.demo, *experiments.VERBS}

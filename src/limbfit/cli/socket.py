@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-import typer
+from typer import Option, Typer
 from typer.core import TyperGroup
 
 import limbfit
@@ -36,45 +36,29 @@ class WithDefault(TyperGroup):
         return super().parse_args(ctx, args)
 
 
-app = typer.Typer(
+app = Typer(
     help="Put a socket on the limb and load it (fit, the default), or design one.",
     cls=WithDefault,
     rich_markup_mode=None,
 )
-Parameters = Annotated[
-    str | None,
-    typer.Option(help="the law's parameters of each tissue; default: identified, or those of people"),
-]
-Literature = Annotated[
-    bool, typer.Option("--literature", help="tissues of people, even where some were identified")
-]
+Parameters = Annotated[str | None, Option(help="parameters of each tissue; default: identified, or people's")]
+Literature = Annotated[bool, Option("--literature", help="tissues of people, even if some were identified")]
 
 
 def fit(
     study: StudyPath,
     parameters: Parameters = None,
     literature: Literature = False,
-    samples: Annotated[
-        int | None,
-        typer.Option(
-            help="draws of the identified parameters to simulate too, for intervals beyond first order", min=2
-        ),
-    ] = None,
-    models: Annotated[
-        bool,
-        typer.Option("--models", help="also with every model that limbfit uncertainty --models found likely"),
-    ] = False,
+    samples: Annotated[int | None, Option(help="draws of parameters to simulate as well", min=2)] = None,
+    models: Annotated[bool, Option("--models", help="with those of limbfit uncertainty --models")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Put a socket on the limb and load it: pressure and shear by region, settling, the report."""
     _check_choice(parameters, literature)
     if models:
         if parameters is not None or literature or samples:
-            raise InputError(
-                "models have parameters of their own",
-                place="--models",
-                remedy="leave out --parameters, --literature and --samples",
-            )
+            remedy = "leave out --parameters, --literature and --samples"
+            raise InputError("models have parameters of their own", place="--models", remedy=remedy)
         result = call_on_study(study, limbfit.fit_socket_of_models)
         print_stored(result, "models_socket", show_socket_models, as_json)
         return
@@ -145,13 +129,8 @@ LOAD_COLUMNS: dict[str, Column] = {
 
 def design(
     study: StudyPath,
-    optimise: Annotated[
-        str,
-        typer.Option(help="regions whose peaks are to be lowered further, separated by commas"),
-    ] = "",
-    simulations: Annotated[
-        int | None, typer.Option(help="with --optimise: how many more, at most; default: 6", min=1)
-    ] = None,
+    optimise: Annotated[str, Option(help="regions, by commas, whose peaks are to be lowered further")] = "",
+    simulations: Annotated[int | None, Option(help="of --optimise, at most; default: 6", min=1)] = None,
     parameters: Parameters = None,
     literature: Literature = False,
     as_json: AsJson = False,
@@ -180,10 +159,8 @@ def show_design(found: SocketDesignResult) -> None:
         low, high = design.offset_mm
         reduced = design.reduction_percent
         around = f", {reduced:.2f} % less around" if reduced is not None else ""
-        print_line(
-            f"{design.name}: {design.volume_cm3:.0f} cm3, {low:.1f} to {high:.1f} mm from the unloaded "
-            f"limb{around}"
-        )
+        volume = f"{design.name}: {design.volume_cm3:.0f} cm3"
+        print_line(f"{volume}, {low:.1f} to {high:.1f} mm from the unloaded limb{around}")
         columns[design.name] = (design.name, ".0f")
     starred = optimisation.regions if optimisation else ()
     rows = [

@@ -19,9 +19,7 @@ class ParameterUncertainty(ResultPart):
     posterior_95: Interval = Field(description="95 % interval of the posterior.")
     profile_95: Interval | None = Field(description="95 % interval of the profile; null where it has none.")
     profile_verdict: str | None = Field(description="What the profile says, in words.")
-    profile_extrapolated: tuple[bool, bool] | None = Field(
-        description="Whether each end of it is beyond the emulator's runs."
-    )
+    profile_extrapolated: tuple[bool, bool] | None = Field(description="Whether each end is beyond the runs.")
     with_sources_95: Interval = Field(description="95 % interval with all sources counted.")
     verdict: str = Field(description="How well it is determined with all sources, in words.")
 
