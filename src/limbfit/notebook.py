@@ -232,10 +232,9 @@ def calibrate(
     systems = [System(case, control.threads) for case in cases]
     model = _Model(cases, pairs, unknowns.names, [control] * len(cases), systems, listener)
     measured = _to_measured(pairs)
-    result = search(
-        model, measured, unknowns, CalibrationSettings(), stages=[group_separately(unknowns.names)]
-    )
-    names, best = unknowns.names, result.parameters
+    names = unknowns.names
+    result = search(model, measured, unknowns, CalibrationSettings(), stages=[group_separately(names)])
+    best = result.parameters
     return Fit(
         parameters=dict(zip(names, best.tolist(), strict=True)),
         error_percent=tuple(

@@ -22,6 +22,7 @@ from ..febio import FebioLog, read_feb, read_log, run_feb, to_problem
 Tell = Callable[[int, int, str], None]  # done, of how many, what
 Row = dict[str, Any]
 FOLDER = Path("shared") / "reference"
+GIVE_FOLDER = "give the folder of FEBio's results with --reference"
 KPA = 1e-3  # MPa
 GOAL = 1.0  # percent
 FORCES, PLACES = ("Fx", "Fy", "Fz"), ("x", "y", "z")
@@ -224,18 +225,15 @@ def compare_socket(case: SocketCase, folder: Path) -> Iterator[dict[str, Any]]:
     """
     file = folder / "socket" / f"{case.name}.feb"
     if not file.is_file():
-        raise InputError(
-            "is missing", file=file, remedy="give the folder of FEBio's results with --reference"
-        )
+        raise InputError("is missing", file=file, remedy=GIVE_FOLDER)
     with tempfile.TemporaryDirectory() as out:
         run = run_feb(file, out)
         for part in case.parts:
             name = f"{part.table or case.name}.txt"
             log, febio = read_log(Path(out) / name), read_log(file.with_name(name))
             row = {"case": f"{case.name}: {part.name}", "element": case.element, "goal_percent": part.goal}
-            yield row | _build_comparison_row(
-                part, log, febio, "" if run.result.completed else run.result.reason
-            )
+            reason = "" if run.result.completed else run.result.reason
+            yield row | _build_comparison_row(part, log, febio, reason)
 
 
 def _build_comparison_row(part: CasePart, log: FebioLog, febio: FebioLog, reason: str) -> dict[str, Any]:
@@ -277,11 +275,7 @@ def find_reference(start: Path) -> Path:
     for folder in (start, *start.parents):
         if (folder / FOLDER).is_dir():
             return folder / FOLDER
-    raise InputError(
-        f"no folder {FOLDER} here or above",
-        file=start,
-        remedy="give the folder of FEBio's results with --reference",
-    )
+    raise InputError(f"no folder {FOLDER} here or above", file=start, remedy=GIVE_FOLDER)
 
 
 def load_case(case: ReferenceCase, folder: Path) -> tuple[Problem, StepControl, FebioLog]:

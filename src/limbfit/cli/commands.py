@@ -79,9 +79,7 @@ def phantom(
     folder: Annotated[Path, Argument(help="a folder that does not exist yet", show_default=False)],
     detail: Annotated[Literal["coarse", "paper"], Option(help="coarse: 6 sites; paper: 18 sites")] = "coarse",
     seed: Annotated[int, Option(help="which synthetic patient", min=0)] = 0,
-    limb: Annotated[
-        Literal["transtibial", "transfemoral"], Option(help="what was amputated")
-    ] = "transtibial",
+    limb: Annotated[Literal["transtibial", "transfemoral"], Option(help="which amputation")] = "transtibial",
     fat: Annotated[bool, Option("--fat", help="three tissues: skin, fat and muscle")] = False,
     tendon: Annotated[bool, Option("--tendon", help="also a patellar tendon in the muscle")] = False,
     socket: Annotated[bool, Option("--socket", help="also a rectified socket for it")] = False,

@@ -66,9 +66,8 @@ def _list_parts(model: type[ResultPart]) -> Iterator[type[ResultPart]]:
         here = waiting.pop(0)
         if here not in found:
             found.append(here)
-            waiting += [
-                part for field in here.model_fields.values() for part in _find_models(field.annotation)
-            ]
+            for field in here.model_fields.values():
+                waiting += _find_models(field.annotation)
     yield from found
 
 

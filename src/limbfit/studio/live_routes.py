@@ -4,7 +4,7 @@ import math
 import re
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Query
@@ -17,7 +17,7 @@ from ..acquire.quality import Check
 from ..errors import TraceError
 from ..pipeline.commands.acquire import FOLDER as ACQUIRED
 from ..pipeline.commands.acquire import RECORD, VERDICT
-from .folder import StudyFolder, resolve_inside
+from .folder import Json, StudyFolder, resolve_inside
 from .study_routes import Folder
 
 router = APIRouter(prefix="/api/live")
@@ -38,7 +38,7 @@ class StoredVerdict(BaseModel):
 
 
 @router.get("")
-def get_session(folder: Folder) -> dict[str, Any]:
+def get_session(folder: Folder) -> Json:
     """The newest session that is being recorded, else the newest that ended lately; null if none."""
     recent = [(age, file.parent) for age, file in _list_records(folder) if age < RECENT_S]
     if not recent:
@@ -50,7 +50,7 @@ def get_session(folder: Folder) -> dict[str, Any]:
 @router.get("/{site}/{stamp}")
 def get_part(
     folder: Folder, site: str, stamp: str, offset: Annotated[int, Query(ge=0, le=1 << 40)] = 0
-) -> dict[str, Any]:
+) -> Json:
     """What the record of a session holds beyond ``offset`` (bytes), at most half a minute of it.
 
     Times in s of limbfit's clock, positions in mm from the pin's home, forces in N, of the test pin.
@@ -81,7 +81,7 @@ def _compute_age(file: Path) -> float:
     return max(time.time() - file.stat().st_mtime, 0.0)
 
 
-def _read(part: Recording, file: Path, first: bool) -> dict[str, Any]:
+def _read(part: Recording, file: Path, first: bool) -> Json:
     try:
         settings = part.head["settings"]
         pin, limit_N = range(PINS)[int(settings["pin"]) - 1], float(settings["force_limit_N"])
@@ -102,7 +102,7 @@ def _read(part: Recording, file: Path, first: bool) -> dict[str, Any]:
     }
 
 
-def _describe_phase(event: dict[str, Any]) -> dict[str, Any]:
+def _describe_phase(event: Json) -> Json:
     touch = event.get("touch_um")
     return {
         "at_s": event["at_us"] / 1e6,
@@ -113,7 +113,7 @@ def _describe_phase(event: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _read_verdict(file: Path) -> dict[str, Any] | None:
+def _read_verdict(file: Path) -> Json | None:
     if not file.is_file():
         return None
     try:

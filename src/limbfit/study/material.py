@@ -114,10 +114,8 @@ class MaterialTable(TissueRange):
             place = f"tissues.{tissue}." if tissue else ""
             for which, values in zip(_ENDS, (lower, start, upper), strict=True):
                 for name in values.keys() - self.keys:
-                    known = ", ".join(self.keys)
-                    raise ValueError(
-                        f"material.{place}{which}.{name} is no parameter of the law; they are {known}"
-                    )
+                    what = f"material.{place}{which}.{name} is no parameter of the law"
+                    raise ValueError(f"{what}; they are {', '.join(self.keys)}")
             for name in self.keys:
                 if not lower[name] <= start[name] <= upper[name]:
                     raise ValueError(f"{place}start.{name} lies outside its bounds")

@@ -14,6 +14,7 @@ from ..store import Curves, Results, find_compared_quantity
 from . import plots
 from .colours import FITTED, HELD_OUT, INK, MEASURED, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH
 
+Seen = tuple[RecordPrediction, ObservedError, Curves]
 MAX_POINTS, MAX_TITLE, MAX_LEGEND_ROW = 2500, 44, 7
 
 
@@ -182,9 +183,8 @@ def draw_error_figure(store: Results) -> Figure | None:
         ax.text(error, at, f" {format_fixed(error)}", va="center", fontsize=8)
     plots.set_rows(ax, [f"{row.record} ({'fitted' if row.fitted else 'held out'})" for row, _ in rows])
     ax.set_xlabel(f"Mean absolute error over largest {store.compared_quantity} (%)")
-    return plots.make_figure(
-        drawing, "errors", rows=[row for row, _ in rows], compared=store.compared_quantity
-    )
+    shown = [row for row, _ in rows]
+    return plots.make_figure(drawing, "errors", rows=shown, compared=store.compared_quantity)
 
 
 @plots.styled
@@ -226,20 +226,20 @@ def _draw_ratios(ax: Axes, store: Results, at: int, tissue: str, name: str) -> N
 
 def draw_layer_figure(store: Results, fitted: bool) -> Figure | None:
     """Compression of each layer against time at the fitted or held-out sites; None where none was seen."""
-    return _draw_time_figure(store, fitted, "ultrasound", "layers", ("compression", "mm"))
+    return _draw_time_figure(store, fitted, "ultrasound", "layers", "compression", "mm")
 
 
 def draw_wave_figure(store: Results, fitted: bool) -> Figure | None:
     """Speed of shear waves against time at the fitted or held-out sites; None where none was read."""
-    return _draw_time_figure(store, fitted, "shear waves", "waves", ("speed", "m_s"))
+    return _draw_time_figure(store, fitted, "shear waves", "waves", "speed", "m_s")
 
 
 @plots.styled
 def _draw_time_figure(
-    store: Results, fitted: bool, kind: str, stem: str, quantity: tuple[str, str]
+    store: Results, fitted: bool, kind: str, stem: str, what: str, unit: str
 ) -> Figure | None:
-    """What was seen of a kind against time; ``quantity`` and its unit are in the heads of the curves."""
-    rows, (what, unit) = _read_curves(store, fitted, kind), quantity
+    """What was seen of a kind against time; ``what`` it is and its unit are in the heads of the curves."""
+    rows = _read_curves(store, fitted, kind)
     if not rows:
         return None
     drawing, axes = plots.make_panels(len(rows), 3, 2.1)
@@ -291,9 +291,7 @@ def _draw_pairs(ax: Axes, curves: Curves, components: Sequence[str]) -> None:
             ax.plot(x[chosen], y[chosen], **style, label=word)
 
 
-def _read_curves(
-    store: Results, fitted: bool, kind: str
-) -> list[tuple[RecordPrediction, ObservedError, Curves]]:
+def _read_curves(store: Results, fitted: bool, kind: str) -> list[Seen]:
     """Rows of records, what was seen beside each in one way, and its stored curves."""
     return [
         (row, one, curves)

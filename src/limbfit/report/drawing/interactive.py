@@ -209,9 +209,7 @@ def draw_convergence_curves(store: Results) -> Interactive | None:
 
 
 def _make_error_panel(steps: Sequence[SearchIteration]) -> Json:
-    sites = sorted(steps[0].error_percent_by_site)
     series = [{"label": "mean error", "y": [step.error_percent for step in steps]}]
-    series += [
-        {"label": f"site {site}", "y": [step.error_percent_by_site[site] for step in steps]} for site in sites
-    ]
+    for site in sorted(steps[0].error_percent_by_site):
+        series.append({"label": f"site {site}", "y": [step.error_percent_by_site[site] for step in steps]})
     return {"title": "Error", "unit": "%", "log": True, "series": series}

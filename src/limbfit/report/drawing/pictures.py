@@ -339,9 +339,7 @@ def make_four_views(store: Results, skin: Any) -> list[View]:
 
 def _mark_facing_sites(store: Results, view: View) -> list[Mark]:
     """The sites whose skin faces the camera of a view."""
-    return [
-        _mark_site(row) for row in store.placed_sites.values() if normalise(row.axis) @ view.direction > 0.5
-    ]
+    return [_mark_site(row) for row in store.sites if normalise(row.axis) @ view.direction > 0.5]
 
 
 def _mark_site(row: PlacedSite, axis: bool = False) -> Mark:

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 from ...results.identification import CorrelationMatrix, RecordPrediction, SearchStage, average_records
 from ..drawing import figures
@@ -88,9 +89,8 @@ def make_iteration_table(store: Results, stage: SearchStage) -> Table | None:
     alike = all(values == stage.parameters[known[0]] for values in stage.parameters.values())
     tissues = known[:1] if alike else known  # one material, unless the study fixes a tissue's own value
     name = f"iterations-{stage.name.replace(' ', '-')}"
-    return make_table(
-        name, stage.iterations, folded=True, words="iterations", stage=stage, tissues=tissues, store=store
-    )
+    facts: dict[str, Any] = {"stage": stage, "tissues": tissues, "store": store}
+    return make_table(name, stage.iterations, folded=True, words="iterations", **facts)
 
 
 def describe_search(store: Results) -> tuple[Bullets | None, Table | None]:
@@ -98,15 +98,13 @@ def describe_search(store: Results) -> tuple[Bullets | None, Table | None]:
     if store.calibration is None:
         return None, None
     found = store.calibration.doubts
-    rows, answer = found.search, found.answer
-    texts = []
+    rows, texts = found.search, []
     if rows:
         kinds = Counter(row.kind for row in rows)
         used = sum(row.iterate is not None for row in rows)
         texts.append(write_words("doubts of the search", found=found, kinds=kinds, used=used))
-    texts += [
-        f"At the answer, site {site}: {doubt.text}." for site, doubts in answer.items() for doubt in doubts
-    ]
+    for site, doubts in found.answer.items():
+        texts += [f"At the answer, site {site}: {doubt.text}." for doubt in doubts]
     for site, one in store.calibration.contact.items():
         if (off := one.from_rest_percent or 0.0) > EQUAL_PERCENT:
             texts.append(write_words("doubt of the answer", site=site, off=off))

@@ -78,9 +78,7 @@ def write_method_parts(store: Results) -> tuple[Part, ...]:
 def _format_span(facts: Iterable[ResultPart], key: str, digits: int, factor: int = 1) -> str:
     """From the least to the largest value of a key, where there is one."""
     values = [factor * value for fact in facts if (value := getattr(fact, key)) is not None]
-    return (
-        f"{format_fixed(min(values), digits)} to {format_fixed(max(values), digits)}" if values else NOTHING
-    )
+    return " to ".join(format_fixed(end(values), digits) for end in (min, max)) if values else NOTHING
 
 
 def _format_pairs(table: Json) -> str:
@@ -88,9 +86,8 @@ def _format_pairs(table: Json) -> str:
 
 
 def _format_start(start: Parameters) -> str:
-    return _join_tissues(
-        {t: ", ".join(map(format_with_value, values, values.values())) for t, values in start.items()}
-    )
+    texts = {name: map(format_with_value, values, values.values()) for name, values in start.items()}
+    return _join_tissues({name: ", ".join(parts) for name, parts in texts.items()})
 
 
 def _format_bounds(bounds: ParameterBounds) -> str:
