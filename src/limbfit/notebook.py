@@ -292,10 +292,8 @@ class _Model:
         names = [f"{region}.{parameter}" for region, parameter in result.parameter_names]
         response, full = result.response_at(times), result.response_sensitivity_at(times)
         if self.calls == 1 and result.completed and not response.any():
-            raise ProblemError(
-                f"curve {number + 1}: the simulation does not answer at any of its times",
-                remedy="displacement and force are positive into the tissue",
-            )
+            what = f"curve {number + 1}: the simulation does not answer at any of its times"
+            raise ProblemError(what, remedy="displacement and force are positive into the tissue")
         absent = np.zeros(len(times))
         columns = [full[:, names.index(name)] if name in names else absent for name in self.names]
         answer = response, np.stack(columns, axis=1), result.completed, result.reason
@@ -316,15 +314,11 @@ def _pair_curves(curves: Sequence[Curve], problems: Sequence[Problem]) -> tuple[
         if times.ndim != 1 or times.shape != force.shape or not (len(times) and (np.diff(times) > 0).all()):
             raise ProblemError(f"curve {number} has times {times.shape}, values {force.shape}", remedy=CURVE)
         if not np.isfinite(force).all():
-            raise ProblemError(
-                f"curve {number} has {np.count_nonzero(~np.isfinite(force))} values that are not finite",
-                remedy="leave these points out",
-            )
+            what = f"curve {number} has {np.count_nonzero(~np.isfinite(force))} values that are not finite"
+            raise ProblemError(what, remedy="leave these points out")
         if times[0] < 0.0 or times[-1] > end * (1.0 + 1e-9):
-            raise ProblemError(
-                f"curve {number} lasts from {times[0]:g} to {times[-1]:g} s, the indentation to {end:g} s",
-                remedy="count time from touch-down, and cut what lies outside",
-            )
+            what = f"curve {number} lasts from {times[0]:g} to {times[-1]:g} s, the indentation to {end:g} s"
+            raise ProblemError(what, remedy="count time from touch-down, and cut what lies outside")
         pairs.append((times, force))
     return tuple(pairs)
 
@@ -341,11 +335,8 @@ def _build_unknowns(
     if not start or not bounds.keys() <= start.keys():
         raise ProblemError("a parameter to be fitted has no start", remedy="name each in start")
     values = np.array([float(value) for value in start.values()])
-    limits = [
-        bounds.get(name, (value / DEFAULT_BOUND_FACTOR, value * DEFAULT_BOUND_FACTOR))
-        for name, value in zip(start, values)
-    ]
-    low, high = np.array(limits, dtype=float).T
+    usual = zip(start, values / DEFAULT_BOUND_FACTOR, values * DEFAULT_BOUND_FACTOR)
+    low, high = np.array([bounds.get(name, ends) for name, *ends in usual], dtype=float).T
     return Unknowns(tuple(start), values, low, high)
 
 

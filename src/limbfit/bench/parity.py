@@ -51,9 +51,7 @@ class ReferenceCase:
 
 
 CUBES = tuple(
-    ReferenceCase(
-        f"cube/cube_{tissue}", "hex8", control={"tolerance": 1e-9}, note="one element, no contact: rounding"
-    )
+    ReferenceCase(f"cube/cube_{tissue}", "hex8", {}, {"tolerance": 1e-9}, 1, "one element: rounding")
     for tissue in ("skin", "muscle", "bosboom", "lim", "lim_par")
 )
 

@@ -230,10 +230,8 @@ def _draw_plots(site: str, phase: PhaseUpdate, samples: list[LiveUpdate]) -> Gro
     head = Text(f"site {site}   {phase.phase}   ", style="bold")
     if samples:
         last = samples[-1]
-        head.append(
-            f"{last.displacement_mm:7.2f} mm {last.force_N:7.2f} N {last.capacitance_pF:6.1f} pF   "
-            f"clamps {last.clamp_N:5.1f} N"
-        )
+        head.append(f"{last.displacement_mm:7.2f} mm {last.force_N:7.2f} N {last.capacitance_pF:6.1f} pF   ")
+        head.append(f"clamps {last.clamp_N:5.1f} N")
     hint = phase.reason or HINTS.get(phase.phase, "any other key: emergency stop")
     touched = [s for s in samples if s.phase in ("search", "return", "load", "hold", "unload")]
     over_mm = plot([s.displacement_mm for s in touched], [s.force_N for s in touched])

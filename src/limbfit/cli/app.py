@@ -83,8 +83,5 @@ def main() -> None:
     except Exception as error:
         if os.environ.get("LIMBFIT_TRACEBACK"):
             raise
-        fail(
-            f"internal error: {type(error).__name__}: {error}; set LIMBFIT_TRACEBACK=1 to see where, "
-            "and please report it",
-            1,
-        )
+        text = f"internal error: {type(error).__name__}: {error}"
+        fail(f"{text}; set LIMBFIT_TRACEBACK=1 to see where, and please report it", 1)

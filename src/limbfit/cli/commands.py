@@ -212,13 +212,10 @@ def parse_parameters(text: str | None, study: Study) -> dict[str, dict[str, floa
     if text is None:
         return None
     values = parse_numbers(text, 0.0, sys.float_info.max)
-    wanted, keys = len(study.parameters), ",".join(study.law.keys)
-    if len(values) != wanted:
-        raise InputError(
-            f"{text!r} is not {wanted} numbers",
-            place="--parameters",
-            remedy=f"give {keys} of {', then of '.join(study.tissues)}, separated by commas",
-        )
+    if len(values) != len(study.parameters):
+        what = f"{text!r} is not {len(study.parameters)} numbers"
+        remedy = f"give {','.join(study.law.keys)} of {', then of '.join(study.tissues)}, separated by commas"
+        raise InputError(what, place="--parameters", remedy=remedy)
     return study.by_tissue(values)
 
 
@@ -316,10 +313,8 @@ def show_labels(results: StudyResults, facts: dict[str, Any]) -> None:
     if found.markers_removed is not None:
         print_line(f"markers taken off the skin: {found.markers_removed}")
     if motion := found.motion:
-        print_line(
-            f"between the images the limb moved by {motion.shift_mm:.1f} mm and {motion.turn_deg:.1f} "
-            f"degrees (correlation {motion.correlation:.2f})"
-        )
+        moved = f"{motion.shift_mm:.1f} mm and {motion.turn_deg:.1f} degrees"
+        print_line(f"between the images the limb moved by {moved} (correlation {motion.correlation:.2f})")
     print_line(f"labels: {facts['labels']}")
 
 

@@ -82,10 +82,9 @@ def regions(
 def show_regions(found: RegionsResult) -> None:
     whole = found.whole
     fits: list[tuple[Any, ...]] = [("whole limb", whole.fitted_sites, whole.parameters, None, None)]
-    fits += [
-        (one.region, one.fitted_sites, one.parameters, one.own_error_percent, one.whole_error_percent)
-        for one in found.regions
-    ]
+    for one in found.regions:
+        errors = one.own_error_percent, one.whole_error_percent
+        fits.append((one.region, one.fitted_sites, one.parameters, *errors))
     rows: list[dict[str, Any]] = []
     for region, sites, parameters, own, error in fits:
         head = {"region": region, "sites": ", ".join(sites), "own": own, "whole": error}
@@ -261,16 +260,12 @@ def crossvalidate(
 
 def show_crossvalidation(found: CrossvalidateResult) -> None:
     own, checks = found.own, found.emulator.checks
-    print_line(
-        f"{found.choices} of {found.choices_possible} choices of {found.fitted_sites} sites: "
-        f"mean held-out error {own.median_percent:.2f} % (median; 5 to 95 %: {own.low_percent:.2f} to "
-        f"{own.high_percent:.2f} %)"
-    )
+    choices = f"{found.choices} of {found.choices_possible} choices of {found.fitted_sites} sites"
+    quantiles = f"median; 5 to 95 %: {own.low_percent:.2f} to {own.high_percent:.2f} %"
+    print_line(f"{choices}: mean held-out error {own.median_percent:.2f} % ({quantiles})")
     if own.share_better is not None:  # the study's own choice leaves sites to be predicted
-        print_line(
-            f"the study's own choice ({', '.join(own.fitted)}): {own.mean_error_heldout_percent:.2f} %; "
-            f"{100 * own.share_better:.0f} % of the choices do better"
-        )
+        error = f"the study's own choice ({', '.join(own.fitted)}): {own.mean_error_heldout_percent:.2f} %"
+        print_line(f"{error}; {100 * own.share_better:.0f} % of the choices do better")
     known = [row for row in found.sites if row.mean_percent is not None]
     rows = [{"name": f"site {row.site}", "error": row.mean_percent} for row in known]
     for fit in found.regions:

@@ -26,10 +26,8 @@ def febio(
         for note in result["notes"]:
             print_aside(f"note: {file}: {note}")
         peak = "" if result["peak_force_N"] is None else f"peak force {result['peak_force_N']:.4g} N, "
-        print_line(
-            f"{peak}{result['steps']} steps, {result['element']}, {result['unknowns']} unknowns; "
-            f"{', '.join(result['files']) or 'no table asked for'}"
-        )
+        size = f"{peak}{result['steps']} steps, {result['element']}, {result['unknowns']} unknowns"
+        print_line(f"{size}; {', '.join(result['files']) or 'no table asked for'}")
     print_warnings(result["warnings"])
     if not result["completed"]:
         fail(f"{file}: the simulation is partial: {result['reason']}", 1)

@@ -92,20 +92,16 @@ def show_socket(found: SocketResult) -> None:
                 interval = format_ends(state.settling_interval_mm, ".1f")
                 cause = _format_main_cause(state.settling_interval_from)
                 settled += f" (95 %: {interval}, mostly from {cause})"
-        print_line(
-            f"{name}: {state.peak_kPa:.0f} kPa at most, in touch over "
-            f"{state.contact_area_mm2 / 100:.0f} cm2{settled}"
-        )
+        area = f"in touch over {state.contact_area_mm2 / 100:.0f} cm2"
+        print_line(f"{name}: {state.peak_kPa:.0f} kPa at most, {area}{settled}")
         print_table(state.regions, LOAD_COLUMNS)
     if found.samples:
         words = "".join(f"; another failed: {reason}" for reason in found.samples.failed)
         print_line(f"95 %: by derivatives and {found.samples.simulated} simulated draws{words}")
     if found.worn_s:
         print_line(f"95 %: with what relaxation may do until the socket has been worn for {found.worn_s:g} s")
-    print_line(
-        f"tissues: {found.parameters_from}; contact balances the loads within "
-        f"{found.balance_percent:.2g} %; not a medical device"
-    )
+    balance = f"contact balances the loads within {found.balance_percent:.2g} %"
+    print_line(f"tissues: {found.parameters_from}; {balance}; not a medical device")
     print_warnings(found.outside_text)
 
 
@@ -170,15 +166,11 @@ def show_design(found: SocketDesignResult) -> None:
     ]
     print_table(rows, {"region, peak (kPa)": "region", **columns}, dash="")
     if optimisation:
-        beyond = ", ".join(optimisation.beyond_limits)
-        print_line(
-            f"* optimised in {len(optimisation.trials) - 1} simulations; "
-            + (f"beyond its limit: {beyond}" if beyond else "all others within their limits")
-        )
-    print_line(
-        f"socket.stl: the {wall.of} with a wall of {wall.stated_mm:g} mm, measured "
-        f"{wall.least_mm:.2f} mm at least; not a medical device"
-    )
+        beyond = f"beyond its limit: {', '.join(optimisation.beyond_limits)}"
+        rest = beyond if optimisation.beyond_limits else "all others within their limits"
+        print_line(f"* optimised in {len(optimisation.trials) - 1} simulations; {rest}")
+    thickness = f"{wall.stated_mm:g} mm, measured {wall.least_mm:.2f} mm at least"
+    print_line(f"socket.stl: the {wall.of} with a wall of {thickness}; not a medical device")
 
 
 def _check_choice(parameters: str | None, literature: bool) -> None:

@@ -211,9 +211,6 @@ def _check_movable(study: Study, name: str) -> None:
     for row in tomllib.loads(study.file.read_text(encoding="utf-8-sig")).get("sites", []):
         if str(row.get("name")) == site.name and ("position" in row or "near" in row):
             return
-    raise InputError(
-        f"site {name} has its place from the markups file {study.markups.file}",
-        file=study.file,
-        place="markups",
-        remedy="move its control point in 3D Slicer",
-    )
+    what = f"site {name} has its place from the markups file {study.markups.file}"
+    remedy = "move its control point in 3D Slicer"
+    raise InputError(what, file=study.file, place="markups", remedy=remedy)

@@ -62,10 +62,8 @@ def serve_studio(
     folder = StudyFolder(path / "study.toml" if path.is_dir() else path)
     folder.load()
     if not is_loopback(host) and not expose:
-        raise InputError(
-            f"{host} can be reached from other machines",
-            remedy="leave out --host, or say --expose to show and give the study to whoever has its address",
-        )
+        remedy = "leave out --host, or say --expose to give the study to whoever has its address"
+        raise InputError(f"{host} can be reached from other machines", remedy=remedy)
     if host in ("0.0.0.0", "::", ""):
         raise InputError("name one address of this machine to listen on, not all of them", place="--host")
     try:

@@ -138,23 +138,25 @@ def _name_place(keys: tuple[int | str, ...], content: Any) -> str | None:
 class UnusedKeys:
     """Keys without effect if ``when`` is true of the study (and the site): why, and what to do instead."""
 
-    keys: tuple[str, ...]
     when: Callable[..., bool]
     why: str
     remedy: str = "leave it out"
 
 
-def _list_edge_rules(place: str, find: Callable[[Study], EdgesTable | None]) -> tuple[UnusedKeys, ...]:
+Rules = dict[tuple[str, ...], UnusedKeys]
+
+
+def _list_edge_rules(place: str, find: Callable[[Study], EdgesTable | None]) -> Rules:
     def find_excess(study: Study) -> float:
         table = find(study)
         return 1.0 if table is None else table.edge_far_mm - table.edge_near_mm
 
     one = "edge_far_mm is no longer than edge_near_mm, so edges have one length"
     shorter = "edge_far_mm is shorter, and no edge longer"
-    return (
-        UnusedKeys((f"{place}.near_radius_mm", f"{place}.growth"), lambda s: find_excess(s) <= 0.0, one),
-        UnusedKeys((f"{place}.edge_near_mm",), lambda s: find_excess(s) < 0.0, shorter),
-    )
+    return {
+        (f"{place}.near_radius_mm", f"{place}.growth"): UnusedKeys(lambda s: find_excess(s) <= 0.0, one),
+        (f"{place}.edge_near_mm",): UnusedKeys(lambda s: find_excess(s) < 0.0, shorter),
+    }
 
 
 _AUTOMATIC_KEYS = ("contrast", "seeds", "bias_correction", "min_bone_volume_mm3")
@@ -164,203 +166,172 @@ _SHAPE_KEYS = (
 )
 _SOURCE_KEYS = ("layer_mm", "position_mm", "axis_degrees", "edge_radius_mm")
 
-UNUSED_KEYS: tuple[UnusedKeys, ...] = (
-    UnusedKeys(("segmentation",), lambda s: s.surfaces is not None, "[surfaces] are not segmented"),
-    UnusedKeys(
-        tuple(f"segmentation.{key}" for key in _AUTOMATIC_KEYS),
+UNUSED_KEYS: Rules = {
+    ("segmentation",): UnusedKeys(lambda s: s.surfaces is not None, "[surfaces] are not segmented"),
+    tuple(f"segmentation.{key}" for key in _AUTOMATIC_KEYS): UnusedKeys(
         lambda s: s.segmentation.is_given,
         "the study's own labels win over the automatic segmentation",
     ),
-    UnusedKeys(
-        ("segmentation.min_bone_volume_mm3",),
+    ("segmentation.min_bone_volume_mm3",): UnusedKeys(
         lambda s: bool(s.segmentation.seeds),
         "with seeds, the bones are those that have one, however small",
     ),
-    UnusedKeys(
-        ("segmentation.bias_correction",),
+    ("segmentation.bias_correction",): UnusedKeys(
         lambda s: s.segmentation.contrast == "CT",
         "CT has no bias field",
     ),
-    UnusedKeys(
-        ("image.series",),
+    ("image.series",): UnusedKeys(
         lambda s: s.image is not None and s.path(s.image.path).is_file(),
         "image.path is a file, not a folder of series",
     ),
-    UnusedKeys(
-        ("image.markers_series",),
+    ("image.markers_series",): UnusedKeys(
         lambda s: s.image is not None and s.image.marked is not None and s.path(s.image.marked).is_file(),
         "image.markers is a file, not a folder of series",
     ),
-    UnusedKeys(
-        ("image.markers",),
+    ("image.markers",): UnusedKeys(
         lambda s: s.image is not None and s.image.marked is not None and all(t.near is None for t in s.sites),
         "no site is matched to a marker",
         "give near instead of position, or leave it out",
     ),
-    UnusedKeys(
-        ("geometry.surface_edge_mm",),
+    ("geometry.surface_edge_mm",): UnusedKeys(
         lambda s: s.surfaces is not None and s.geometry.amputation is None,
         "given surfaces are used as they are unless they are amputated",
     ),
-    UnusedKeys(
-        ("geometry.amputation_pad_mm",),
+    ("geometry.amputation_pad_mm",): UnusedKeys(
         lambda s: s.geometry.amputation is None,
         "there is no amputation",
         "give geometry.amputation, or leave it out",
     ),
-    UnusedKeys(
-        ("geometry.bone_policy", "geometry.bone_clearance_mm"),
+    ("geometry.bone_policy", "geometry.bone_clearance_mm"): UnusedKeys(
         lambda s: s.surfaces is not None and not s.surfaces.bones,
         "[surfaces] has no bones",
     ),
-    *_list_edge_rules("mesh", lambda s: s.mesh),
-    *_list_edge_rules("mesh.coarse", lambda s: s.mesh.coarse),
-    UnusedKeys(
-        ("indenter",),
+    **_list_edge_rules("mesh", lambda s: s.mesh),
+    **_list_edge_rules("mesh.coarse", lambda s: s.mesh.coarse),
+    ("indenter",): UnusedKeys(
         lambda s: all(one.indenter is not None for one in s.indentations),
         "every record and every planned indentation names another one",
     ),
-    UnusedKeys(
-        ("traces",),
+    ("traces",): UnusedKeys(
         lambda s: not s.recorded,
         "no site has a record",
         "give sites.trace, or leave it out",
     ),
-    UnusedKeys(
-        ("calibration.relative_tolerance",),
+    ("calibration.relative_tolerance",): UnusedKeys(
         lambda s: s.calibration.stopping == "paper",
         'stopping = "paper" has limits of its own',
     ),
-    UnusedKeys(
-        ("calibration.force_error_percent",),
+    ("calibration.force_error_percent",): UnusedKeys(
         lambda s: s.calibration.objective == "paper" and not s.priors,
         'it sets forces against priors and the touch-down; objective = "paper" ignores the touch-down, and '
         "there are no priors",
     ),
-    UnusedKeys(
-        ("calibration.prior_tissues",),
+    ("calibration.prior_tissues",): UnusedKeys(
         lambda s: s.calibration.priors is None,
         "it belongs to the priors of people",
         'give calibration.priors = "population", or leave it out',
     ),
-    UnusedKeys(
-        ("calibration.seed",),
+    ("calibration.seed",): UnusedKeys(
         lambda s: s.calibration.starts == 1,
         "one start is not random",
         "give calibration.starts, or leave it out",
     ),
-    UnusedKeys(
-        ("calibration.search_radius_mm",),
+    ("calibration.search_radius_mm",): UnusedKeys(
         lambda s: s.clamps is not None or bool(s.material.prestretch),
         "the whole limb is clamped or pre-stretched, so parameters are searched on whole meshes",
     ),
-    UnusedKeys(
-        ("calibration.corrections", "calibration.correction_tolerance_percent"),
+    ("calibration.corrections", "calibration.correction_tolerance_percent"): UnusedKeys(
         lambda s: not s.is_searched_apart,
         "parameters are searched on the meshes themselves, so nothing is corrected",
         "give calibration.search_radius_mm or [mesh.coarse], or leave it out",
     ),
-    UnusedKeys(
-        tuple(f"uncertainty.{key}" for key in _SOURCE_KEYS),
+    tuple(f"uncertainty.{key}" for key in _SOURCE_KEYS): UnusedKeys(
         lambda s: not s.uncertainty.sources,
         "sources = false leaves it out",
     ),
-    UnusedKeys(
-        ("uncertainty.edge_radius_mm",),
+    ("uncertainty.edge_radius_mm",): UnusedKeys(
         lambda s: not any(SHAPES[one.shape].is_edge_doubted for one in s.used_indenters.values()),
         "it is that of a square indenter",
     ),
-    UnusedKeys(
-        ("material.relaxation_span_s",),
+    ("material.relaxation_span_s",): UnusedKeys(
         lambda s: s.material.law != POWER,
         "the tissues' law does not relax as a power of time",
         f'give material.law = "{POWER}", or leave it out',
     ),
-    UnusedKeys(
-        ("material.fibres",),
+    ("material.fibres",): UnusedKeys(
         lambda s: not has_fibres(s.material.law),
         "the tissues' law has no fibres",
         f'give material.law = "{FIBRED}", or leave it out',
     ),
-    UnusedKeys(
-        ("material.activation",),
+    ("material.activation",): UnusedKeys(
         lambda s: s.material.law != ACTIVE,
         "the tissues' law has no active stress",
         f'give material.law = "{ACTIVE}", or leave it out',
     ),
-    UnusedKeys(
-        tuple(f"socket.{key}" for key in _SHAPE_KEYS),
+    tuple(f"socket.{key}" for key in _SHAPE_KEYS): UnusedKeys(
         lambda s: s.socket.file is not None,
         "the socket's shape is that of socket.file",
     ),
-    UnusedKeys(
-        ("socket.unit", "socket.space"),
+    ("socket.unit", "socket.space"): UnusedKeys(
         lambda s: s.socket.file is None,
         "it belongs to a socket from a file",
         "give socket.file, or leave it out",
     ),
-    UnusedKeys(
-        ("socket.distal_clearance_mm",),
+    ("socket.distal_clearance_mm",): UnusedKeys(
         lambda s: s.socket.distal == "bearing",
         "the distal end bears",
     ),
-    UnusedKeys(
-        ("socket.travel_mm",),
+    ("socket.travel_mm",): UnusedKeys(
         lambda s: s.socket.donning == "growth",
         'donning = "growth" has no travel',
         'give donning = "insertion", or leave it out',
     ),
-    UnusedKeys(
-        ("socket.design.adapter_mm",),
+    ("socket.design.adapter_mm",): UnusedKeys(
         lambda s: s.socket.design.adapter_diameter_mm == 0,
         "a diameter of 0 mm is no adapter",
     ),
-    UnusedKeys(
-        tuple(f"socket.liner.{key}" for key in ("material", "c_kPa", "m", "gamma", "tau_s")),
+    tuple(f"socket.liner.{key}" for key in ("material", "c_kPa", "m", "gamma", "tau_s")): UnusedKeys(
         lambda s: s.socket.liner.thickness_mm == 0,
         "a liner of 0 mm is none",
     ),
-    UnusedKeys(
-        ("socket.body_weight_N",),
+    ("socket.body_weight_N",): UnusedKeys(
         lambda s: all(load.preset is None for load in s.socket.loads),
         "no load is a preset",
     ),
-    UnusedKeys(
-        ("execution.time_limit_s", "execution.memory_limit_GB"),
+    ("execution.time_limit_s", "execution.memory_limit_GB"): UnusedKeys(
         lambda s: s.execution.workers == 1,
         "one worker is the process itself, which nothing can stop",
         "give 2 workers or more, or leave it out",
     ),
-)
+}
 
 # Of a record, whether its site states it or a table of its own.
-UNUSED_RECORD_KEYS: tuple[UnusedKeys, ...] = (
-    UnusedKeys(("ultrasound_sd_mm",), lambda s, one: one.ultrasound is None, "it has no ultrasound"),
-    UnusedKeys(("surface_sd_mm", "surface_frame"), lambda s, one: one.surface is None, "it has no surface"),
-    UnusedKeys(
-        ("shear_waves_sd_m_s", "shear_waves_bias_m_s"),
+UNUSED_RECORD_KEYS: Rules = {
+    ("ultrasound_sd_mm",): UnusedKeys(lambda s, one: one.ultrasound is None, "it has no ultrasound"),
+    ("surface_sd_mm", "surface_frame"): UnusedKeys(lambda s, one: one.surface is None, "it has no surface"),
+    ("shear_waves_sd_m_s", "shear_waves_bias_m_s"): UnusedKeys(
         lambda s, one: one.shear_waves is None,
         "it has no shear waves",
     ),
-)
+}
 
-UNUSED_SITE_KEYS: tuple[UnusedKeys, ...] = (
-    UnusedKeys(("weight",), lambda s, site: not s.records_at(site), "the site has no record to be weighted"),
-    UnusedKeys(
-        ("speed_mm_s",), lambda s, site: bool(s.records_at(site)), "the record says how fast the indenter was"
+UNUSED_SITE_KEYS: Rules = {
+    ("weight",): UnusedKeys(lambda s, site: not s.records_at(site), "the site has no record to be weighted"),
+    ("speed_mm_s",): UnusedKeys(
+        lambda s, site: bool(s.records_at(site)),
+        "the record says how fast the indenter was",
     ),
-    UnusedKeys(
-        ("control",), lambda s, site: site.trace is None, "it is of the site's trace, and there is none"
+    ("control",): UnusedKeys(
+        lambda s, site: site.trace is None,
+        "it is of the site's trace, and there is none",
     ),
-    *UNUSED_RECORD_KEYS,
-    UnusedKeys(
-        ("indenter",),
+    **UNUSED_RECORD_KEYS,
+    ("indenter",): UnusedKeys(
         lambda s, site: site.trace is None and bool(s.records_at(site)),
         "the site's records are stated in [[records]]",
         "give it there",
     ),
-    UnusedKeys(
-        ("edge",),
+    ("edge",): UnusedKeys(
         lambda s, site: (
             all(SHAPES[one.shape].is_round for one in s.indenters_at(site))
             and not any(
@@ -369,7 +340,7 @@ UNUSED_SITE_KEYS: tuple[UnusedKeys, ...] = (
         ),
         "the indenter is round",
     ),
-)
+}
 
 
 def check_unused_keys(study: Study, content: Mapping[str, Any]) -> None:
@@ -383,8 +354,8 @@ def check_unused_keys(study: Study, content: Mapping[str, Any]) -> None:
 
 def _find_unused_keys(study: Study, content: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Each unused key with why it has no effect and what to do."""
-    for rule in UNUSED_KEYS:
-        for key in rule.keys:
+    for keys, rule in UNUSED_KEYS.items():
+        for key in keys:
             if _is_stated(content, key) and rule.when(study):
                 yield key, rule.why, rule.remedy
     for name, indenter in study.all_indenters.items():
@@ -399,8 +370,8 @@ def _find_unused_keys(study: Study, content: Mapping[str, Any]) -> Iterator[tupl
         yield f"calibration.prior.{name}", why, "leave it out, or let the parameter move"
     tables: list[Site | RecordTable] = [*study.sites, *study.records]
     for table, stated in zip(tables, (*content["sites"], *content.get("records", ())), strict=True):
-        for rule in UNUSED_SITE_KEYS if isinstance(table, Site) else UNUSED_RECORD_KEYS:
-            for key in rule.keys:
+        for keys, rule in (UNUSED_SITE_KEYS if isinstance(table, Site) else UNUSED_RECORD_KEYS).items():
+            for key in keys:
                 if key in stated and rule.when(study, table):
                     yield f"{table.key}.{key}", rule.why, rule.remedy
 

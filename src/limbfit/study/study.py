@@ -218,15 +218,11 @@ class Study(tables.TomlTable):
         return indentation.trace is not None and self.path(indentation.trace).is_file()
 
     def site(self, name: str) -> Site:
-        for site in self.sites:
-            if site.name == name:
-                return site
-        raise StudyError(
-            f"no site is named {name!r}",
-            file=self.file,
-            place="sites",
-            remedy="the study has " + ", ".join(s.name for s in self.sites),
-        )
+        known = {site.name: site for site in self.sites}
+        if name in known:
+            return known[name]
+        remedy = f"the study has {', '.join(known)}"
+        raise StudyError(f"no site is named {name!r}", file=self.file, place="sites", remedy=remedy)
 
     def indentation(self, name: str) -> Indentation:
         """Return the record, or the planned indentation, of a name; a site with one record stands for it."""
@@ -237,12 +233,8 @@ class Study(tables.TomlTable):
         records = self.records_at(site)
         if len(records) == 1:
             return records[0]
-        raise StudyError(
-            f"site {name} has several records",
-            file=self.file,
-            place="records",
-            remedy="name one of " + ", ".join(record.name for record in records),
-        )
+        what, remedy = f"site {name} has several records", ", ".join(record.name for record in records)
+        raise StudyError(what, file=self.file, place="records", remedy=f"name one of {remedy}")
 
     @field_validator("sites")
     @classmethod
@@ -319,10 +311,8 @@ class Study(tables.TomlTable):
         if self.calibration.priors is None:
             return
         if not laws.is_ogden(self.material.law):
-            raise ValueError(
-                f'calibration.priors: people are described by the law "{laws.OGDEN}", the study has '
-                f'"{self.material.law}"; leave it out, or state calibration.prior'
-            )
+            what = f'calibration.priors: people are described by the law "{laws.OGDEN}"'
+            raise ValueError(f"{what}, the study has another; leave it out, or state calibration.prior")
         with tables.refuse_value("calibration.prior_tissues: "):
             of_tissues(self.tissues, self.calibration.prior_tissues)
 

@@ -46,11 +46,8 @@ def make_volume_table(store: Results) -> Table | None:
 
 def make_mesh_section(store: Results) -> Section:
     """Cut meshes and their quality."""
-    warnings = (
-        f"Site {site}: {text}"
-        for site, facts in store.mesh.items()
-        for text in (*facts.repairs, *facts.warnings)
-    )
+    found = ((site, (*facts.repairs, *facts.warnings)) for site, facts in store.mesh.items())
+    warnings = (f"Site {site}: {text}" for site, texts in found for text in texts)
     return make_section(
         "meshes",
         pictures.draw_mesh_figure(store, store.fitted[:4]),
