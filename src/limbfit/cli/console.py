@@ -13,15 +13,8 @@ from time import perf_counter, sleep
 from types import FrameType
 from typing import Annotated, Any
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 from typer import Option
 
@@ -131,14 +124,14 @@ def listen_on_console() -> Iterator[Callable[[limbfit.Progress], None]]:
 @contextmanager
 def _draw_bars() -> Iterator[Callable[[limbfit.Progress], None]]:
     columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description:<10}"),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[text]}"),
+        progress.SpinnerColumn(),
+        progress.TextColumn("{task.description:<10}"),
+        progress.BarColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("{task.fields[text]}"),
     )
-    with Progress(*columns, console=STDERR) as shown:
+    with progress.Progress(*columns, console=STDERR) as shown:
         tasks: dict[str, Any] = {}
         fits: dict[str, str] = {}
 

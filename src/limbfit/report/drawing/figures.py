@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from ...results.identification import ObservedError, QuantityRange, RecordPrediction, SearchStage
-from ..formats import format_fixed, format_symbol, format_with_value, get_unit
+from ..formats import format_fixed, format_symbol, format_unit, format_with_value
 from ..page import Figure
 from ..store import Curves, Results, find_compared_quantity
 from . import plots
@@ -161,7 +161,7 @@ def _finish_convergence(axes: Sequence[Axes], store: Results) -> None:
     axes[0].set_yscale("log")
     plots.format_log_axis(axes[0].yaxis, minor=True)
     for ax, name in zip(axes[1:], store.law.keys, strict=True):
-        ax.set_title(f"{format_symbol(name)} ({get_unit(name)})")
+        ax.set_title(f"{format_symbol(name)} ({format_unit(name)})")
         for i, (tissue, values) in enumerate(store.truth.get("parameters", {}).items()):
             if name in values:
                 ax.axhline(values[name], lw=1, label=f"truth, {tissue}", **plots.choose_truth_style(i))

@@ -19,7 +19,7 @@ from ...results.identification import SearchIteration
 from ...results.limb import PlacedSite
 from ...web import pack
 from ...web.shapes import extract_interface, read_shell, to_shell, to_volume_shape
-from ..formats import format_symbol, get_unit
+from ..formats import format_symbol, format_unit
 from ..page import Interactive
 from ..store import Curves, Json, Results, name_compared
 from ..words import write_words
@@ -202,7 +202,8 @@ def draw_convergence_curves(store: Results) -> Interactive | None:
             {"label": tissue, "y": [step.parameters[tissue][name] for step in steps]}
             for tissue in store.tissues
         ]
-        panels.append({"title": format_symbol(name), "unit": get_unit(name), "log": False, "series": series})
+        panel = {"title": format_symbol(name), "unit": format_unit(name), "log": False}
+        panels.append(panel | {"series": series})
     caption = write_words("figure iterates")
     label = "Error and parameters over the iterates."
     return Interactive("iterates", "iterates", label, caption, {"panels": panels})

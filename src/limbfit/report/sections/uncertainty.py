@@ -8,14 +8,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure as Drawing
 from matplotlib.ticker import MaxNLocator
 
-from ...results.uncertainty import (
-    CrossvalidateResult,
-    LikelihoodProfile,
-    ModelsResult,
-    RegionFitted,
-    RegionsResult,
-    UncertaintyResult,
-)
+from ...results import uncertainty as stored
 from ..drawing import plots
 from ..drawing.colours import HELD_OUT, INK, MEASURED, MUTED, ONE_MATERIAL, SIMULATED
 from ..formats import format_fixed, format_parameter, format_with_unit
@@ -28,7 +21,7 @@ MAX_DRAWS, MAX_SITES, MAX_PANELS = 300, 18, 4
 MAX_FACTOR = 1e3  # of an interval over its value, in the figure
 
 
-def make_uncertainty_section(store: Results, content: UncertaintyResult) -> Section:
+def make_uncertainty_section(store: Results, content: stored.UncertaintyResult) -> Section:
     """What the experiment ``uncertainty`` found."""
     found = content.predictions
     emulator = write_words("emulator", emulator=content.emulator, chain=content.posterior)
@@ -49,7 +42,7 @@ def make_uncertainty_section(store: Results, content: UncertaintyResult) -> Sect
 
 
 @plots.styled
-def draw_profile_figure(store: Results, content: UncertaintyResult) -> Figure | None:
+def draw_profile_figure(store: Results, content: stored.UncertaintyResult) -> Figure | None:
     """How much worse the records are met as one parameter moves and the others follow."""
     profiles = content.profiles
     if not profiles:
@@ -70,7 +63,7 @@ def draw_profile_figure(store: Results, content: UncertaintyResult) -> Figure | 
     return plots.make_figure(drawing, "profiles", profiles=profiles, checks=content.checks)
 
 
-def _draw_profile(ax: Axes, profile: LikelihoodProfile) -> None:
+def _draw_profile(ax: Axes, profile: stored.LikelihoodProfile) -> None:
     """A profile, dashed and with open circles where it is extrapolated."""
     values, rise = np.array(profile.values), np.array(profile.rise)
     beyond = np.array(profile.extrapolated, dtype=bool)
@@ -81,7 +74,7 @@ def _draw_profile(ax: Axes, profile: LikelihoodProfile) -> None:
     ax.plot(values[beyond], rise[beyond], color=SIMULATED, ls="", marker="o", ms=3.0, mfc="none")
 
 
-def _make_evidence_table(content: UncertaintyResult) -> Table | None:
+def _make_evidence_table(content: stored.UncertaintyResult) -> Table | None:
     """One material against several."""
     found = content.evidence
     if found is None:
@@ -104,7 +97,7 @@ def read_true_values(store: Results) -> TrueValues:
 
 
 @plots.styled
-def draw_pairs_figure(store: Results, content: UncertaintyResult) -> Figure | None:
+def draw_pairs_figure(store: Results, content: stored.UncertaintyResult) -> Figure | None:
     """Draws of the posterior, every parameter against every other, in logarithms."""
     draws = store.curves("uncertainty", "draws")
     if draws is None:
@@ -153,7 +146,7 @@ def _name_axis(axis: Axis, name: str, numbered: bool) -> None:
 
 
 @plots.styled
-def draw_prediction_figure(store: Results, content: UncertaintyResult) -> Figure | None:
+def draw_prediction_figure(store: Results, content: stored.UncertaintyResult) -> Figure | None:
     """Records beside their prediction intervals, held-out sites first."""
     rows = sorted(content.predictions.sites, key=lambda row: row.fitted)[:MAX_SITES]
     pairs = store.with_curves("uncertainty/predictions", rows)
@@ -180,7 +173,7 @@ def draw_prediction_figure(store: Results, content: UncertaintyResult) -> Figure
     return plots.make_figure(drawing, "predictions", records=[row.record for row, _ in pairs])
 
 
-def make_models_section(store: Results, content: ModelsResult) -> Section:
+def make_models_section(store: Results, content: stored.ModelsResult) -> Section:
     """What ``limbfit uncertainty --models`` found."""
     return make_section(
         "models",
@@ -193,7 +186,7 @@ def make_models_section(store: Results, content: ModelsResult) -> Section:
 
 
 @plots.styled
-def _draw_model_figure(store: Results, content: ModelsResult) -> Figure | None:
+def _draw_model_figure(store: Results, content: stored.ModelsResult) -> Figure | None:
     rows = [row for row in content.records if not row.fitted] or content.records
     found = store.with_curves("models", rows[:MAX_PANELS])
     if not found:
@@ -214,7 +207,7 @@ def _draw_model_figure(store: Results, content: ModelsResult) -> Figure | None:
     return plots.make_figure(drawing, "models")
 
 
-def make_crossvalidation_section(store: Results, content: CrossvalidateResult) -> Section:
+def make_crossvalidation_section(store: Results, content: stored.CrossvalidateResult) -> Section:
     """What the experiment ``crossvalidate`` found."""
     return make_section(
         "crossvalidate",
@@ -227,7 +220,7 @@ def make_crossvalidation_section(store: Results, content: CrossvalidateResult) -
 
 
 @plots.styled
-def _draw_errors(content: CrossvalidateResult) -> Figure:
+def _draw_errors(content: stored.CrossvalidateResult) -> Figure:
     own = content.own
     means = np.array([fold.mean_error_heldout_percent for fold in content.folds])
     sites = [row.site for row in content.sites]
@@ -256,7 +249,7 @@ def _draw_errors(content: CrossvalidateResult) -> Figure:
     return plots.make_figure(drawing, "crossvalidate", content=content)
 
 
-def make_regions_section(store: Results, content: RegionsResult) -> Section:
+def make_regions_section(store: Results, content: stored.RegionsResult) -> Section:
     """What the experiment ``regions`` found."""
     verdicts = [word for row in content.regions for word in row.verdict.values()]
     parameters = [(tissue, key) for tissue in content.whole.parameters for key in store.law.keys]
@@ -270,10 +263,10 @@ def make_regions_section(store: Results, content: RegionsResult) -> Section:
     )
 
 
-def make_error_table(store: Results, content: RegionsResult) -> Table | None:
+def make_error_table(store: Results, content: stored.RegionsResult) -> Table | None:
     """The errors of each region's records with its own model and with the whole limb's."""
 
-    def is_fitted(row: tuple[RegionFitted, str]) -> bool:
+    def is_fitted(row: tuple[stored.RegionFitted, str]) -> bool:
         region, record = row
         facts = store.traces.get(record)
         return (facts.site if facts else record) in region.fitted_sites
@@ -290,7 +283,7 @@ def make_error_table(store: Results, content: RegionsResult) -> Table | None:
 
 
 @plots.styled
-def _draw_regions(store: Results, content: RegionsResult) -> Figure:
+def _draw_regions(store: Results, content: stored.RegionsResult) -> Figure:
     """Errors by region as bars; each parameter by region with its interval, against the whole limb's."""
     regions, count = content.regions, 1 + len(store.law.keys)
     names = [row.region for row in regions]
@@ -313,7 +306,7 @@ def _draw_regions(store: Results, content: RegionsResult) -> Figure:
     return plots.make_figure(drawing, "regions")
 
 
-def _draw_parameter(ax: Axes, content: RegionsResult, name: str) -> None:
+def _draw_parameter(ax: Axes, content: stored.RegionsResult, name: str) -> None:
     tissues = list(content.whole.parameters)
     for i, tissue in enumerate(tissues):
         style = plots.choose_tissue_style(i)
