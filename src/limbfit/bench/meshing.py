@@ -131,9 +131,7 @@ def measure_cpu_seconds() -> float:
 
 
 def list_limbs(shared: Path) -> dict[str, Callable[[], Anatomy]]:
-    """Name and maker of five limbs; ``shared`` is the folder with ``data`` and ``reference``. Raises
-    `InputError` where that folder lacks the real limbs.
-    """
+    """Name and maker of five limbs; `InputError` where the folder ``shared`` lacks the real ones."""
     openlimb, calf = shared / "reference" / "openlimb-study", shared / "data" / "calf-mri"
     for folder in (openlimb, calf):
         if not folder.is_dir():

@@ -218,9 +218,7 @@ def compare_force(case: ReferenceCase, folder: Path) -> Row:
 
 
 def compare_socket(case: SocketCase, folder: Path) -> Iterator[dict[str, Any]]:
-    """A row for each part of a case, of FEBio's input run by limbfit and the tables of both. Raises
-    `InputError` where a file of the case is missing.
-    """
+    """A row for each part of a case, both tables compared; `InputError` where a file of it is missing."""
     file = folder / "socket" / f"{case.name}.feb"
     if not file.is_file():
         raise InputError("is missing", file=file, remedy=GIVE_FOLDER)
@@ -266,9 +264,7 @@ def _build_unfinished_row(reason: str) -> Row:
 
 
 def find_reference(start: Path) -> Path:
-    """The folder ``shared/reference`` in, or beside, ``start`` or any folder above it. Raises `InputError`
-    where there is none.
-    """
+    """``shared/reference`` in or beside ``start``, or any folder above; `InputError` where there is none."""
     start = start.resolve()
     for folder in (start, *start.parents):
         if (folder / FOLDER).is_dir():
@@ -277,9 +273,7 @@ def find_reference(start: Path) -> Path:
 
 
 def load_case(case: ReferenceCase, folder: Path) -> tuple[Problem, StepControl, FebioLog]:
-    """The problem on FEBio's mesh, FEBio's own time steps, and FEBio's results. Raises `InputError` where a
-    file of the case is missing or damaged.
-    """
+    """The problem on FEBio's mesh, its time steps and results; `InputError` for a missing or damaged file."""
     model = read_feb(folder / f"{case.name}.feb")
     log = read_log(folder / f"{case.name}.txt")
     problem = to_problem(model, PUNCH if model.rigid else None, **case.problem)

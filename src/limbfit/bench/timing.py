@@ -165,10 +165,7 @@ def run_in_fresh_process(function: Callable[..., Answer], threads: int, *argumen
 
 
 def solve_timed(problem: Problem, control: StepControl, sensitivities: bool) -> dict[str, Any]:
-    """Sizes, seconds by part, largest memory of this process, and how far the simulation came.
-
-    Kernels are warmed up before the clock starts.
-    """
+    """Sizes, seconds by part with warm kernels, largest memory of this process, and how far it came."""
     warm_up(problem.formulation.name, sensitivities)
     result = solve(problem, control, sensitivities, store="none")
     statistics = dict(result.statistics)
@@ -254,9 +251,7 @@ def _divide_depth(divisions: int) -> tuple[int, int]:
 
 
 def choose_divisions(element: str, unknowns: int) -> int:
-    """Fewest cells along the side that give a block that many unknowns. Raises `ProblemError` for an element
-    that is not in the table.
-    """
+    """Fewest cells along the side for so many unknowns; `ProblemError` for an element not in the table."""
     if element not in ELEMENTS:
         raise ProblemError(f"no element {element!r}", remedy=f"use one of {', '.join(ELEMENTS)}")
     order = 2 if ELEMENTS[element].cell_type == "tet10" else 1

@@ -288,9 +288,7 @@ def design(
     parameters: Parameters = None,
     protocol: Annotated[bool, Option("--protocol", help="choose the records of a session instead")] = False,
     minutes: Annotated[float | None, _session_option("its length in minutes; default: 25", min=1)] = None,
-    speeds: Annotated[
-        str | None, _session_option("speeds, mm/s; default: the study's and 5 times it")
-    ] = None,
+    speeds: Annotated[str | None, _session_option("speeds, mm/s; default: the study's, 5 times it")] = None,
     holds: Annotated[str | None, _session_option("holds, s; default: 0,30, for a socket its loads'")] = None,
     determine: Annotated[str | None, _session_option("such as muscle.c_kPa, or socket; default: all")] = None,
     criterion: Annotated[Literal["D", "A"] | None, _session_option("default: D, for a socket A")] = None,

@@ -185,9 +185,7 @@ def find_compared_quantity(curves: Curves) -> tuple[str, str]:
 
 
 def load_store(results: Path) -> Results:
-    """Read what is below ``results``. Raises `InputError` when there is no such folder, or a summary in it is
-    not readable.
-    """
+    """Read what is below ``results``; `InputError` where it is no folder, or a summary is not readable."""
     if not results.is_dir():
         raise InputError("no results there", file=results, remedy="run the study first")
     run, calibration = RunResult.find(results), identification.CalibrationResult.find(results)

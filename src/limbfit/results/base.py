@@ -65,10 +65,7 @@ class StoredResult(ResultPart):
 
     @classmethod
     def find(cls, results: Path, name: str = "") -> Self | None:
-        """Read it from a results folder, ``name`` in place of the star; None where it is not there.
-
-        Raises `InputError` as `read_file`.
-        """
+        """Read it, ``name`` in place of the star; None where it is not there. Errors as `read_file`."""
         file = results / cls.FILE.replace("*", name)
         return cls.read_file(file, f"run {cls.COMMAND} again") if file.is_file() else None
 

@@ -173,9 +173,7 @@ def _save_labels(folder: StudyFolder, study: Study, shown: ShownLabels, labels: 
 
 
 def paint_runs(labels: LabelMap, runs: list[tuple[int, int, int]]) -> LabelMap:
-    """The labels with runs of voxels of the page's order set. Raises `InputError` for voxels outside of the
-    map and for labels that it does not have.
-    """
+    """The labels with runs of the page's voxels set; `InputError` for unknown labels and voxels outside."""
     turned = labels.align_axes(PAGE_AXES)
     flat = turned.array.ravel().copy()
     table = np.array(runs, dtype=np.int64)

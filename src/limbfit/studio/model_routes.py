@@ -73,9 +73,7 @@ def get_scene(folder: Folder) -> Json:
 
 @router.get("/surface/{name}")
 def get_surface(folder: Folder, name: str) -> Response:
-    """A surface as a block of arrays: ``points``, ``faces``. Raises `InputError` for a name that the model
-    does not have.
-    """
+    """A surface as a block of ``points`` and ``faces``; `InputError` for a name that the model has not."""
     anatomy = read_anatomy(folder, folder.load())
     surface = {SKIN: anatomy.skin, **anatomy.bones}.get(name) if anatomy else None
     if surface is None:
@@ -155,9 +153,7 @@ def _read_cached_anatomy(folder: StudyFolder, fingerprint: str) -> Anatomy | Non
 
 
 def project_to_skin_of_study(folder: StudyFolder, position: Sequence[float]) -> list[float]:
-    """The point of the skin nearest to a place (LPS, mm). Raises `InputError` where there is no skin, or the
-    place is far off it.
-    """
+    """The point of the skin nearest to a place (LPS, mm); `InputError` where there is none near it."""
     anatomy = read_anatomy(folder, folder.load())
     if anatomy is None:
         raise InputError("there is no skin yet to place a site on", remedy="run the stages until surfaces")
@@ -202,9 +198,7 @@ def _describe_site(site: Site, study: Study, anatomy: Anatomy | None, placed: Pl
 
 
 def _check_movable(study: Study, name: str) -> None:
-    """Refuse to move a site that the markups file places, and an unknown one. Raises `InputError` for such a
-    site.
-    """
+    """Refuse to move an unknown site, or one that the markups file places, by an `InputError`."""
     site = study.site(name)
     if study.markups is None:
         return

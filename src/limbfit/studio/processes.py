@@ -81,9 +81,7 @@ def _refuse_busy(folder: StudyFolder) -> None:
 
 
 def stop_run(folder: StudyFolder) -> Json:
-    """Interrupt the run that holds the study, as Ctrl-C would; finished work is kept. Raises `RunError` where
-    no run holds the study, or it is no ``limbfit`` command.
-    """
+    """Interrupt the run, as Ctrl-C would; `RunError` where none holds the study, or no ``limbfit`` does."""
     holder = find_running(folder)
     if holder is None and (early := find_starting(folder)) is not None:
         holder = {"process": early}
@@ -113,9 +111,7 @@ def _build_simulation_words(folder: StudyFolder) -> list[str]:
 
 
 def start_simulation(folder: StudyFolder, site: str) -> Json:
-    """Simulate a site with the fields of every step. Raises `InputError` for a site that the study does not
-    have, and `RunError` where the study is being run or a simulation goes on.
-    """
+    """Simulate a site with all fields; `InputError` for an unknown one, `RunError` where another goes on."""
     name = folder.load().indentation(site).name
     holder = find_running(folder) or find_simulating(folder)
     if holder is not None:
@@ -132,9 +128,7 @@ def _find_output_file(folder: StudyFolder, site: str) -> Path:
 
 
 def stop_simulation(folder: StudyFolder) -> Json:
-    """Interrupt the simulation, as Ctrl-C would; the steps it has stored stay. Raises `RunError` where none
-    goes on.
-    """
+    """Interrupt the simulation; the steps it has stored stay. Raises `RunError` where none goes on."""
     simulation = find_simulating(folder)
     if simulation is None:
         raise RunError("no simulation is running: there is nothing to stop")

@@ -109,9 +109,7 @@ def get_site(folder: Folder, site: str) -> Json:
 
 @router.get("/curves/{site}")
 def get_curves(folder: Folder, site: str, kept: str | None = None) -> dict[str, list[float]]:
-    """Columns of the predicted forces of a site (s, mm, N), of this run or of a kept one. Raises
-    `FileNotFoundError` where none are stored.
-    """
+    """Columns of the predicted forces of a site (s, mm, N); `FileNotFoundError` where none are stored."""
     if kept is not None:
         _find_kept_run(folder, kept)
     parts = ("predict",) if kept is None else (KEPT, kept)
@@ -168,9 +166,7 @@ def post_stop(folder: Folder) -> Json:
 
 @router.post("/feb/{site}")
 def post_feb(folder: Folder, site: str) -> dict[str, str]:
-    """Write a site as an input of FEBio; the path of the file below ``/api/files``. Raises `RunError` where
-    meshes are missing or stale: only a run makes them.
-    """
+    """Write a site as an input of FEBio below ``/api/files``; `RunError` where meshes are not up to date."""
     study = folder.load()
     name = study.indentation(site).name
     if list_stage_states(folder).get("mesh") != "done":

@@ -35,10 +35,7 @@ class Times(StrictModel):
 
 @router.get("")
 def get_records(folder: Folder) -> Json:
-    """Every record and planned indentation with the error of its file, if any, and the flags on the records.
-
-    ``site`` is the name of the record, or of the site.
-    """
+    """Every record and planned indentation, ``site`` its name, with the error of its file; and flags."""
     study = folder.load()
     rows: list[Json] = []
     records: dict[str, _ReadRecord] = {}

@@ -344,10 +344,7 @@ UNUSED_SITE_KEYS: Rules = {
 
 
 def check_unused_keys(study: Study, content: Mapping[str, Any]) -> None:
-    """Refuse keys that ``content``, the file as read, states without effect; defaults are no statement.
-
-    Raises `StudyError` with the key, why it has no effect and what to do.
-    """
+    """Refuse, by a `StudyError`, keys that ``content``, the file as read, states without effect."""
     for key, why, remedy in _find_unused_keys(study, content):
         raise StudyError(f"without effect: {why}", place=key, remedy=remedy)
 

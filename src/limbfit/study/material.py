@@ -117,8 +117,7 @@ class MaterialTable(TissueRange):
                     raise ValueError(f"{place}lower.{name} is not below upper.{name}")
 
     def check_tissues(self, tissues: tuple[str, ...], stretched: tuple[str, ...]) -> None:
-        """Raise `ValueError` where a tissue is named that the model has not, or that cannot
-        be ``stretched`` at rest, or where bounds do not meet."""
+        """Raise `ValueError` for an unknown tissue, one not ``stretched``, and bounds that never meet."""
         for key, named in (("tissues", self.tissues), ("fibres", self.fibres)):
             for tissue in named:
                 if tissue not in tissues:

@@ -53,9 +53,7 @@ _STEP = 8
 
 
 def pack(arrays: Mapping[str, NDArray[Any]], facts: Mapping[str, Any] | None = None) -> bytes:
-    """The arrays and facts as one block; arrays must already have one of the types. Raises `ValueError` for
-    an array of another type, or facts that are not finite JSON.
-    """
+    """The arrays and facts as one block; `ValueError` for other types, and for facts that are no JSON."""
     table, parts, at = {}, [], 0
     for name, values in arrays.items():
         kind = values.dtype.str[1:]

@@ -61,9 +61,7 @@ def build_patient_frame(cut_normal: ArrayLike | None) -> NDArray[np.float64]:
 
 
 def read_shell(file: Path, max_faces: int | None = None) -> Shell:
-    """A stored surface; one of more than ``max_faces`` triangles is made coarser. Raises `ProblemError` when
-    the file holds no triangles.
-    """
+    """A stored surface, of ``max_faces`` triangles at most; `ProblemError` where the file holds none."""
     surface: Any = pv.read(file)
     surface = surface.triangulate().clean()
     if surface.n_cells == 0:
@@ -80,9 +78,7 @@ def to_shell(surface: Any) -> Shell:
 
 
 def to_volume_shape(mesh: Mesh) -> VolumeShape:
-    """A mesh of tetrahedra as arrays to draw. Raises `ProblemError` for hexahedra, or a face of more than two
-    cells.
-    """
+    """A mesh of tetrahedra to draw; `ProblemError` for hexahedra, or a face of more than two cells."""
     if not mesh.kind.is_tetrahedron:
         raise ProblemError("only meshes of tetrahedra are drawn, not of hexahedra")
     nodes, cells = np.unique(mesh.cells[:, :4], return_inverse=True)

@@ -261,8 +261,7 @@ def _draw_time_figure(
 
 @plots.styled
 def draw_skin_figure(store: Results, fitted: bool) -> Figure | None:
-    """Predicted against measured displacement of the skin at the fitted or held-out sites; None where the
-    skin was not seen."""
+    """Predicted against measured displacement of the skin at fitted or held-out sites; None: not seen."""
     rows = [one for one in _read_curves(store, fitted, "surface") if "displacement_simulated_mm" in one[2]]
     if not rows:
         return None

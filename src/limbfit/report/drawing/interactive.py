@@ -155,10 +155,7 @@ _COLUMNS = (
 
 
 def _read_site_curves(store: Results, site: str) -> Json | None:
-    """What is known of a site's force: predicted, else simulated by itself, else as recorded.
-
-    Of several records it is that of the first.
-    """
+    """A site's force by its first record: predicted, else simulated by itself, else as recorded."""
     for stage in ("predict", "simulate", "traces"):
         for record in dict.fromkeys((site, *store.records_of(site))):
             curves = store.curves(stage, record)

@@ -1,6 +1,4 @@
-"""Pictures of the model, drawn off-screen: surfaces with sites (the paper's figure 1), cut meshes (figures 4
-and 6) and the deformed cut at the peak.
-"""
+"""Pictures of the model, drawn off-screen: surfaces with sites, cut meshes, fields (figures 1, 4, 6)."""
 
 from base64 import b64encode
 from collections.abc import Callable, Iterable, Iterator, Sequence
