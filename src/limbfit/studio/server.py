@@ -23,6 +23,7 @@ from .folder import StudyFolder
 from .guard import AccessGuard, GuardMiddleware, TooLargeError, is_loopback
 
 STATIC = Path(__file__).parent / "static"
+ERRORS = (LimbfitError, FileNotFoundError, TooLargeError, HTTPException, RequestValidationError, Exception)
 # Of every view: the modules beside this one whose names end in _routes.
 ROUTES = tuple(
     import_module(f".{module.name}", __package__)
@@ -97,14 +98,7 @@ def create_app(folder: StudyFolder, guard: AccessGuard) -> FastAPI:
     app.state.folder = folder
     for routes in ROUTES:
         app.include_router(routes.router)
-    for kind in (
-        LimbfitError,
-        FileNotFoundError,
-        TooLargeError,
-        HTTPException,
-        RequestValidationError,
-        Exception,
-    ):
+    for kind in ERRORS:
         app.add_exception_handler(kind, _respond_error)
     app.add_api_route("/", lambda: FileResponse(STATIC / "index.html"))
     app.mount("/static", StaticFiles(directory=STATIC))

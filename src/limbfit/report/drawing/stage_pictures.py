@@ -44,7 +44,7 @@ ANGLES_DEG = (0.0, 72.0)  # the smallest dihedral angle of a regular tetrahedron
 
 
 def draw_stage(results: Path, stage: str, file: Path) -> Path:
-    """Draw a stage (``surfaces``, ``sites``, ``mesh``) into a PNG file; `InputError` where results lack it."""
+    """Draw a stage (``surfaces``, ``sites``, ``mesh``) into a PNG file; `InputError` if results lack it."""
     store = load_store(results)
     if "skin" not in store.surface_files:
         raise InputError("no surfaces are stored", file=results, remedy="run the stage surfaces first")
