@@ -18,7 +18,7 @@ from ..pipeline.limb.sites import place_site
 from ..pipeline.limb.surfaces import read_given_anatomy
 from ..results.limb import MeshResult, PlacedSite, SitesResult
 from ..study import Site, Study
-from ..web.shapes import build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape
+from ..web import build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape
 from .editing import add_site, remove_site, set_site
 from .folder import Json, StudyFolder, compute_fingerprint
 from .study_routes import Folder, StrictModel, respond_block

@@ -21,7 +21,7 @@ from ..pipeline.engine.storage import read_json, write_json
 from ..results.base import read_curves
 from ..results.identification import CalibrationResult, PredictResult
 from ..results.runs import SimulateResult, is_current
-from ..web.shapes import to_volume_shape
+from ..web import to_volume_shape
 from . import processes
 from .folder import Json, StudyFolder, compute_fingerprint
 from .study_routes import Folder, StrictModel, list_stage_states, respond_block

@@ -19,7 +19,7 @@ from ..socket import Socket
 from ..socket.rays import compute_profile
 from ..socket.trim import Trim, find_brim, trim_limb, wrap_trimline
 from ..study import Study
-from ..web.shapes import build_patient_frame, to_volume_shape
+from ..web import build_patient_frame, to_volume_shape
 from .editing import remove_area, set_area, set_trimline
 from .folder import Json, StudyFolder, compute_fingerprint
 from .identification_routes import describe_last_run

@@ -17,8 +17,7 @@ from ...arrays import Array
 from ...mesh import read_vtu
 from ...results.identification import SearchIteration
 from ...results.limb import PlacedSite
-from ...web import pack
-from ...web.shapes import extract_interface, read_shell, to_shell, to_volume_shape
+from ...web import extract_interface, pack, read_shell, to_shell, to_volume_shape
 from ..formats import format_symbol, format_unit
 from ..page import Interactive
 from ..store import Curves, Json, Results, name_compared

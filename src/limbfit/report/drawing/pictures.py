@@ -23,7 +23,7 @@ from vtkmodules.vtkCommonCore import vtkLogger
 
 from ...arrays import Array
 from ...results.limb import PlacedSite
-from ...web.shapes import build_patient_frame
+from ...web import build_patient_frame
 from ..page import Figure
 from ..store import Results
 from ..words import make_picture, write_words
