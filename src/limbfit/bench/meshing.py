@@ -45,6 +45,8 @@ def bench_meshing(
 ) -> dict[str, Any]:
     """Mesh random sites of each limb and sum up.
 
+    Raises `InputError` where the real limbs are missing, or for an engine that is not in the table.
+
     Parameters
     ----------
     shared : the folder with ``data`` and ``reference``; by default that here or above.
@@ -58,11 +60,6 @@ def bench_meshing(
     dict
         ``sites``, ``failures``, ``min_dihedral_deg``, ``seconds_median`` (CPU seconds of a site's mesh, its
         mesher included) and more over all limbs; ``limbs`` has a summary of each, ``failed`` the messages.
-
-    Raises
-    ------
-    InputError
-        Where the real limbs are missing, or for an engine that is not in the table.
     """
     if engine not in ENGINES:
         raise InputError(f"no mesher is named {engine!r}", remedy=f"use one of {', '.join(ENGINES)}")

@@ -146,16 +146,9 @@ def bench_febio_parity(
 ) -> list[Row]:
     """Rows ``case, element, max_difference_percent, goal_percent, ..``, one per case, or per part of one.
 
-    The difference is the largest over the whole curve, in percent of FEBio's largest value.
-
-    Parameters
-    ----------
-    reference : folder of FEBio's results; None: ``shared/reference``, here or above.
-
-    Raises
-    ------
-    InputError
-        Where the reference folder or a case in it is missing.
+    The difference is the largest over the whole curve, in percent of FEBio's largest value. ``reference`` is
+    the folder of FEBio's results; None: ``shared/reference``, here or above. Raises `InputError` where it, or
+    a case in it, is missing.
     """
     folder = reference or find_reference(Path.cwd())
     rows: list[Row] = []

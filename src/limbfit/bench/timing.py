@@ -49,6 +49,9 @@ def bench_forward(
 ) -> dict[str, Any]:
     """Time a reference case on FEBio's mesh and steps, with limbfit's own contact or FEBio's.
 
+    Raises `InputError` where the case is missing, the element does not fit its mesh, or FEBio is wanted
+    and not there, and `RunError` where FEBio did not come to its end.
+
     Parameters
     ----------
     reference : folder of FEBio's results; None: ``shared/reference``, here or above.
@@ -58,13 +61,6 @@ def bench_forward(
     as_febio : with the element's quadrature and the contact penalty of the parity table.
     beside_febio : FEBio itself runs the case afterwards, on as many threads: ``ratio`` is its time over that
         of the plain simulation.
-
-    Raises
-    ------
-    InputError
-        Where the case is missing, the element does not fit its mesh, or FEBio is wanted and not there.
-    RunError
-        Where FEBio did not come to its end.
     """
     program = find_febio() if beside_febio else None
     if case not in CASES:
@@ -118,16 +114,13 @@ def bench_scaling(
 ) -> dict[str, Any]:
     """Seconds and memory over unknowns, the exponent of their power law, and a model of the paper's size.
 
+    Raises `InputError` for an element that is not in the table.
+
     Parameters
     ----------
     element : name in the element table.
     unknowns : about how many, two sizes or more.
     paper_divisions : cells along the side of the model of the paper's size.
-
-    Raises
-    ------
-    InputError
-        For an element that is not in the table.
     """
     control = replace(control, threads=threads)
     blocks = [(element, choose_divisions(element, size)) for size in unknowns]

@@ -39,13 +39,7 @@ class ResultPart(BaseModel):
 
     @classmethod
     def read_file(cls, file: Path, remedy: str) -> Self:
-        """Read a file that is there.
-
-        Raises
-        ------
-        InputError
-            In one line, for a file that is not JSON or has not the keys of this version.
-        """
+        """Read a file that is there. Raises `InputError` where it is no JSON, or has other keys."""
         try:
             return cls.model_validate(json.loads(file.read_text(encoding="utf-8")))
         except ValidationError as error:

@@ -100,21 +100,10 @@ MODELS: dict[str, type[StoredResult]] = {  # of each stored result, by its attri
 
 
 def load_results(study: HasResults | str | Path) -> StudyResults:
-    """Load the stored results of a study, stale or not.
+    """Load the stored results, stale or not, of a study, of its file or of its folder.
 
-    Parameters
-    ----------
-    study : a study, its file or its folder.
-
-    Returns
-    -------
-    StudyResults
-        ``load_results(study).predict.sites[0].error_percent``, for example.
-
-    Raises
-    ------
-    InputError
-        Where nothing is stored.
+    ``load_results(study).predict.sites[0].error_percent``, for example. Raises `InputError` where nothing is
+    stored.
     """
     if isinstance(study, str | Path):
         study = Path(study).parent if Path(study).is_file() else Path(study)

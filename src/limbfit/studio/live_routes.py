@@ -24,6 +24,7 @@ router = APIRouter(prefix="/api/live")
 SAMPLE_STRIDE = 5  # samples: 100 a second
 SILENT_S = 3.0  # blocks come every 50 ms: a record that has not grown for so long is not being written
 RECENT_S = 600.0  # a session that ended longer ago is not shown by itself
+Offset = Annotated[int, Query(ge=0, le=1 << 40)]
 _STAMP = re.compile(r"[0-9]{8}T[0-9]{6}\.[0-9]{3}")
 _PENDING = 1 << 16  # bytes: more than is written between two requests
 _MAX_VERDICT = 1 << 20
@@ -48,9 +49,7 @@ def get_session(folder: Folder) -> Json:
 
 
 @router.get("/{site}/{stamp}")
-def get_part(
-    folder: Folder, site: str, stamp: str, offset: Annotated[int, Query(ge=0, le=1 << 40)] = 0
-) -> Json:
+def get_part(folder: Folder, site: str, stamp: str, offset: Offset = 0) -> Json:
     """What the record of a session holds beyond ``offset`` (bytes), at most half a minute of it.
 
     Times in s of limbfit's clock, positions in mm from the pin's home, forces in N, of the test pin.

@@ -22,14 +22,8 @@ from .study import Study
 def load_study(path: str | Path, *, recorded: bool = True) -> Study:
     """Read and check a study; ``path`` is the file or its folder.
 
-    Parameters
-    ----------
-    recorded : the records of the sites must exist; not where they are to be made.
-
-    Raises
-    ------
-    StudyError
-        With the file, the key and the remedy.
+    ``recorded``: the records of the sites must exist; not where they are to be made. Raises `StudyError` with
+    the file, the key and the remedy.
     """
     file = Path(path)
     if file.is_dir():

@@ -14,6 +14,7 @@ from ..store import Curves, Results, find_compared_quantity
 from . import plots
 from .colours import FITTED, HELD_OUT, INK, MEASURED, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH
 
+Rows = Iterable[RecordPrediction]
 Seen = tuple[RecordPrediction, ObservedError, Curves]
 MAX_POINTS, MAX_TITLE, MAX_LEGEND_ROW = 2500, 44, 7
 
@@ -25,9 +26,7 @@ def thin_curves(curves: Curves) -> Curves:
 
 
 @plots.styled
-def draw_force_figure(
-    store: Results, rows: Iterable[RecordPrediction], against: str, name: str, columns: int
-) -> Figure | None:
+def draw_force_figure(store: Results, rows: Rows, against: str, name: str, columns: int) -> Figure | None:
     """Figure 7: measured and simulated force of each site, against ``time_s`` or ``displacement_mm``."""
     pairs = [(row, curves) for row, curves in store.with_curves("predict", rows) if against in curves]
     if not pairs:
@@ -226,18 +225,16 @@ def _draw_ratios(ax: Axes, store: Results, at: int, tissue: str, name: str) -> N
 
 def draw_layer_figure(store: Results, fitted: bool) -> Figure | None:
     """Compression of each layer against time at the fitted or held-out sites; None where none was seen."""
-    return _draw_time_figure(store, fitted, "ultrasound", "layers", "compression", "mm")
+    return _draw_times(store, fitted, "ultrasound", "layers", "compression", "mm")
 
 
 def draw_wave_figure(store: Results, fitted: bool) -> Figure | None:
     """Speed of shear waves against time at the fitted or held-out sites; None where none was read."""
-    return _draw_time_figure(store, fitted, "shear waves", "waves", "speed", "m_s")
+    return _draw_times(store, fitted, "shear waves", "waves", "speed", "m_s")
 
 
 @plots.styled
-def _draw_time_figure(
-    store: Results, fitted: bool, kind: str, stem: str, what: str, unit: str
-) -> Figure | None:
+def _draw_times(store: Results, fitted: bool, kind: str, stem: str, what: str, unit: str) -> Figure | None:
     """What was seen of a kind against time; ``what`` it is and its unit are in the heads of the curves."""
     rows = _read_curves(store, fitted, kind)
     if not rows:
