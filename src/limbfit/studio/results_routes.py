@@ -238,28 +238,26 @@ def _list_sources(folder: StudyFolder, site: str) -> list[Json]:
         of = simulated and simulated.parameters_from
         if simulated and not is_current(simulated, CalibrationResult.find(folder.results)):
             of = f"{of}, before the study was identified anew"
-        sources.append(
-            {
-                "source": "simulate",
-                "title": "every step, simulated",
-                "times_s": times_s,
-                "deepest": _find_deepest(folder, site, times_s),
-                "parameters_from": of,
-                "mark": compute_fingerprint(file for _, file in moments),
-            }
-        )
+        source = {
+            "source": "simulate",
+            "title": "every step, simulated",
+            "times_s": times_s,
+            "deepest": _find_deepest(folder, site, times_s),
+            "parameters_from": of,
+            "mark": compute_fingerprint(file for _, file in moments),
+        }
+        sources.append(source)
     predicted = folder.results / "predict" / f"{site}.vtu"
     if predicted.is_file():
-        sources.append(
-            {
-                "source": "predict",
-                "title": "the deepest point, predicted",
-                "times_s": [_find_peak_time(folder.artefact("predict", f"{site}.csv"))],
-                "deepest": 0,
-                "parameters_from": "identified",
-                "mark": compute_fingerprint([predicted]),
-            }
-        )
+        source = {
+            "source": "predict",
+            "title": "the deepest point, predicted",
+            "times_s": [_find_peak_time(folder.artefact("predict", f"{site}.csv"))],
+            "deepest": 0,
+            "parameters_from": "identified",
+            "mark": compute_fingerprint([predicted]),
+        }
+        sources.append(source)
     return sources
 
 

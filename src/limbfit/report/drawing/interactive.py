@@ -56,15 +56,14 @@ def _read_surfaces(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json
     for name, file in store.surface_files.items():
         shell = read_shell(file, MAX_FACES)
         kind, _, title = name.partition("-")
-        rows.append(
-            {
-                "name": name,
-                "title": title or name,
-                "kind": "skin" if name == "skin" else "bone",
-                "colour": pictures.SKIN_SURFACE if name == "skin" else pictures.choose_inner_colour(name),
-                "opacity": 0.38 if kind == "skin" else 1.0,
-            }
-        )
+        row = {
+            "name": name,
+            "title": title or name,
+            "kind": "skin" if name == "skin" else "bone",
+            "colour": pictures.SKIN_SURFACE if name == "skin" else pictures.choose_inner_colour(name),
+            "opacity": 0.38 if kind == "skin" else 1.0,
+        }
+        rows.append(row)
         arrays[f"{name}.points"], arrays[f"{name}.faces"] = shell.points, shell.faces
     for name, shell in _read_layers(store):
         rows.append({"name": name, "title": name, "kind": "layer", "colour": LAYER, "opacity": 0.5})
