@@ -20,7 +20,7 @@ from limbfit.mesh import read_vtu
 from limbfit.pipeline.engine.digests import compute_digest
 from limbfit.pipeline.engine.store import RUNS
 from limbfit.pipeline.simulation.simulations import compute_job_digest
-from limbfit.results.curves import read_curves
+from limbfit.results.base import read_curves
 
 # Newton iterations of a step, none of which may be halved: the largest with which a simulation stops early.
 LIMITS = (5, 4, 3, 2, 1)

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from runs_jobs import TISSUES, answer, bind, measured, nothing, stored_fields
 
-from limbfit.bench.blocks import DEPTH, build_block_model, build_layered_block
+from limbfit.bench.timing import DEPTH, build_block_model, build_layered_block
 from limbfit.execution import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
 from limbfit.indentation import SimulationJob, SiteModel, simulate
 from limbfit.mesh import write_vtu

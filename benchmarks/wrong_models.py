@@ -37,7 +37,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from layered import box, layered_block
 from limbfit import load_study
 from limbfit.anatomy.surfaces.surfaces import Anatomy, save_anatomy
-from limbfit.bench.blocks import build_block_model
+from limbfit.bench.timing import build_block_model
 from limbfit.execution import SerialExecutor
 from limbfit.identify.checks.domain import RecordedRange
 from limbfit.identify.fit.prediction import PredictionModel
@@ -53,7 +53,7 @@ from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.records.records import to_response
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.pipeline.simulation.loading import LoadHistory, describe_indentation
-from limbfit.results.curves import read_curves
+from limbfit.results.base import read_curves
 from limbfit.study import IndenterTable, SolverTable, Study
 
 Array = NDArray[np.float64]

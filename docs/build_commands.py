@@ -8,7 +8,7 @@ from typing import Any
 
 import typer.main
 
-from limbfit.cli.app import GROUPS, app
+from limbfit.cli import GROUPS, app
 
 HEAD = """# Commands
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from limbfit.anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from limbfit.anatomy.surfaces.triangles import Surface
-from limbfit.bench.blocks import build_block_model
+from limbfit.bench.timing import build_block_model
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu

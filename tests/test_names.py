@@ -42,7 +42,7 @@ EXCEPTIONS = {
     "shapes/": "compiled distances, and names that users import",
     "mesh/cells.py": "shape functions",
     "mesh/volume.py": "names that users import",
-    "notebook/": "names that users import",
+    "notebook.py": "names that users import",
     "fe/problem.py": "a name that users import",
     "fields.py": "names that users import",
     "pipeline/commands/acquire.py": "names that users import",

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from limbfit.web.arrays import MAGIC
+from limbfit.web import MAGIC
 
 
 def unpack(block: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:

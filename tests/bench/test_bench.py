@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.bench.blocks import build_layered_block, build_punched_block, choose_divisions
 from limbfit.bench.parity import ALL_CASES, CUBES, SOCKET, bench_febio_parity, find_reference, load_case
 from limbfit.bench.timing import (
     bench_forward,
     bench_scaling,
+    build_layered_block,
+    build_punched_block,
+    choose_divisions,
     fit_exponent,
     measure_max_rss_MB,
     run_in_fresh_process,

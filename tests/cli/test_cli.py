@@ -12,7 +12,7 @@ import typer
 
 from editing import append, edit
 from limbfit import __version__
-from limbfit.cli.app import GROUPS, app
+from limbfit.cli import GROUPS, app
 from limbfit.cli.commands import show_findings, show_summary
 from limbfit.cli.console import print_line, print_table
 

@@ -9,7 +9,7 @@ import pytest
 SCRIPT = """
 from numba.core import event
 
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.fe import StepControl, are_compiled, compile_kernels, solve
 
 assert not are_compiled()

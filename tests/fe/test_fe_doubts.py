@@ -7,7 +7,7 @@ import pytest
 from blocks import punch
 
 from limbfit import OgdenQLV
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.fe import History, Problem, Result, StepControl, solve
 from limbfit.fe.diagnostics import find_inverted_elements
 from limbfit.fe.kernel.laws import Laws

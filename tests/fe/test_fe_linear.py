@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse as sp
 from blocks import drive, punch
 
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.fe import Problem, StepControl, Support, System, solve
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.memory import Memory

@@ -8,7 +8,7 @@ import pytest
 from febfiles import changed, written
 
 from limbfit import OgdenQLV
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import (
     Activation,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from febfiles import FEB, changed, written
 
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import (
     History,

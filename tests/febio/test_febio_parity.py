@@ -19,7 +19,7 @@ import pytest
 import trimesh
 
 from limbfit import OgdenQLV
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.fe import (
     Activation,
     Contractile,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.fe import State, Step, StepControl, System, solve
 from limbfit.fe.kernel.elements import build_face_quadrature
 from limbfit.febio import (

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.errors import InputError, ProblemError, RunError
 from limbfit.fe import History
 from limbfit.febio import RunVerdict, build_result, find_febio, judge_run, read_log, run_febio

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from febfiles import BOX_FACES, FEB, written
 
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import Indenter, RigidSurface
 from limbfit.febio import FebSettings, build_step_control, read_feb, read_log, to_problem, write_feb

@@ -10,7 +10,7 @@ import pytest
 from febfiles import FEB, written
 
 from limbfit import simulate_feb
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.errors import InputError, ProblemError
 from limbfit.fe import History, Indenter
 from limbfit.febio import FebSettings, compute_axial_force, read_feb, read_log, run_feb, to_problem, write_feb

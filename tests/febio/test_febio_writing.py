@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from febfiles import BOX_FACES
 
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, Ogden, OgdenQLV, RigidSurface, StepControl, System, solve
 from limbfit.fe.solution.control import schedule_steps

@@ -8,7 +8,7 @@ import pytest
 import pyvista as pv
 from scipy.interpolate import make_interp_spline
 
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.fe import ELEMENTS, Indenter, OgdenQLV, StepControl, solve
 from limbfit.fields import Animation, write_fields
 from limbfit.mesh import cell_volumes, read_vtu

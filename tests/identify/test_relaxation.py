@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bars import NAMES, PAPER, SITES, TRUTH, Bars
 
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.fe import History, OgdenQLV, StepControl, solve
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse

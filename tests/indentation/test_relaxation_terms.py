@@ -9,7 +9,7 @@ from limbfit.errors import StudyError
 from limbfit.fe import OgdenQLV
 from limbfit.indentation import build_materials
 from limbfit.laws import LAWS, MAX_RELAXATION_TERMS, TissueLaw, is_ogden
-from limbfit.report.formats import format_symbol, get_unit
+from limbfit.report.formats import format_symbol, format_unit
 from limbfit.study import load_study
 
 TEXT = """
@@ -79,7 +79,7 @@ def test_what_cannot_be_is_said_in_a_line(tmp_path, law, more, what):
 
 def test_symbols_have_their_numbers_below():
     assert [format_symbol(key) for key in ("tau_s", "tau2_s", "gamma1", "c_kPa")] == ["τ", "τ₂", "γ₁", "c"]
-    assert get_unit("tau2_s") == "s"
+    assert format_unit("tau2_s") == "s"
 
 
 @pytest.mark.slow

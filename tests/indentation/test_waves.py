@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from layered import build_block_site
-from limbfit.bench.blocks import build_layered_block
+from limbfit.bench.timing import build_layered_block
 from limbfit.errors import ProblemError
 from limbfit.fe import History, OgdenQLV, Problem, Result, StepControl, Support, solve
 from limbfit.indentation import SimulationJob, SiteModel, WavePlace, place_waves_under, simulate, to_vector

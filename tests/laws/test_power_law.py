@@ -9,7 +9,7 @@ import pytest
 from completing import complete
 from guide import identified
 from layered import block_context, block_study
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.errors import InputError, StudyError
 from limbfit.fe import OgdenPower, OgdenQLV, solve
 from limbfit.febio import (

@@ -17,7 +17,7 @@ from limbfit.errors import ProblemError
 from limbfit.fe import Ogden, solve
 from limbfit.febio import write_feb
 from limbfit.mesh import cell_volumes, to_tet10
-from limbfit.notebook.solution import announce_compilation
+from limbfit.notebook import announce_compilation
 
 TISSUE = OgdenQLV(c=0.005, m=4.0, gamma=1.0, tau=0.6)
 RAMP = History([0.0, 2.0, 4.0], [0.0, 2.0, 0.0])
@@ -358,7 +358,7 @@ def test_the_first_compilation_is_announced(solution, tmp_path, capsys):
     """Where nothing is compiled yet a first run seems to hang."""
     announce_compilation()
     assert capsys.readouterr().err == ""  # here it is, by the solution
-    code = "from limbfit.notebook.solution import announce_compilation; announce_compilation()"
+    code = "from limbfit.notebook import announce_compilation; announce_compilation()"
     fresh = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     shown = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=fresh

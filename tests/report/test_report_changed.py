@@ -17,17 +17,20 @@ from limbfit.report import build_report
 from limbfit.report.drawing.interactive import _describe_site
 from limbfit.report.page import Prose
 from limbfit.report.sections.contents import build_summary
-from limbfit.report.sections.identification import make_convergence_section, make_parameter_section
+from limbfit.report.sections.identification import (
+    make_convergence_section,
+    make_parameter_section,
+    make_prediction_section,
+    make_site_table,
+)
+from limbfit.report.sections.inputs import make_record_check_section
 from limbfit.report.sections.methods import make_method_section
-from limbfit.report.sections.other_fits import make_error_table
-from limbfit.report.sections.prediction import make_prediction_section, make_site_table
-from limbfit.report.sections.records import make_record_check_section
 from limbfit.report.sections.simulations import make_simulated_section, make_solver_section
+from limbfit.report.sections.uncertainty import make_error_table
 from limbfit.report.store import load_store
 from limbfit.report.words import write_words
-from limbfit.results.models import ModelsResult
 from limbfit.results.runs import CompareResult, RunResult, SimulateResult
-from limbfit.results.uncertainty import RegionsResult
+from limbfit.results.uncertainty import ModelsResult, RegionsResult
 from limbfit.results.variants import StiffnessResult
 
 FEW = tuple(row for row in SITES if row[0] in ("PT-1", "TI-2", "TI-5", "PO-6"))

@@ -8,7 +8,7 @@ from stored_results import write_results
 from limbfit.identify.checks.domain import SHEAR, TIME, Extent, RecordedRange, describe_outside
 from limbfit.report.formats import format_number
 from limbfit.report.page import Figure, Note, Section, Table
-from limbfit.report.sections.prediction import make_domain_section
+from limbfit.report.sections.identification import make_domain_section
 from limbfit.report.store import Results, load_store
 from limbfit.results.socket import SocketLoad, SocketResult, SocketState
 

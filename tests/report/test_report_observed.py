@@ -8,7 +8,11 @@ import pytest
 from stored_results import write_results
 
 from limbfit.report.drawing.figures import draw_layer_figure, draw_skin_figure, draw_wave_figure
-from limbfit.report.sections.prediction import make_fit_section, make_observed_table, make_prediction_section
+from limbfit.report.sections.identification import (
+    make_fit_section,
+    make_observed_table,
+    make_prediction_section,
+)
 from limbfit.report.store import load_store
 
 SURFACE = {

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from limbfit.report.formats import format_duration, format_fixed, format_number
-from limbfit.report.sections.provenance import flatten_settings
+from limbfit.report.sections.methods import flatten_settings
 
 
 @pytest.mark.parametrize(

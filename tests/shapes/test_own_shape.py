@@ -11,7 +11,7 @@ import pytest
 from guide import from_the_guide, identified
 from layered import build_block_site, layered_block
 from limbfit import Indenter, Measure, load_study, register_shape
-from limbfit.bench.blocks import build_punched_block
+from limbfit.bench.timing import build_punched_block
 from limbfit.errors import InputError, ProblemError, StudyError
 from limbfit.extensions import load_extensions
 from limbfit.fe import StepControl, solve

@@ -20,7 +20,7 @@ from keyed_studies import (
 from test_study_docs import KEYS
 
 from limbfit.errors import StudyError
-from limbfit.study.unused_keys import UNUSED_KEYS, UNUSED_RECORD_KEYS, UNUSED_SITE_KEYS
+from limbfit.study.loading import UNUSED_KEYS, UNUSED_RECORD_KEYS, UNUSED_SITE_KEYS
 
 # Studies that state a key in vain: what is set in which study, and the key that is refused.
 AMPUTATED = ("geometry.amputation", {"point": [0.0, 0.0, 0.0]})
@@ -229,9 +229,9 @@ def test_a_key_without_effect_is_refused(folder: Path, content: Any, changes: An
 
 def test_every_refusal_is_tried() -> None:
     tried = {key for _, _, key in IN_VAIN}
-    stated = {key for rule in UNUSED_KEYS for key in rule.keys}
-    stated |= {f"sites.{key}" for rule in UNUSED_SITE_KEYS for key in rule.keys}
-    stated |= {f"records.1-fast.{key}" for rule in UNUSED_RECORD_KEYS for key in rule.keys}
+    stated = {key for keys in UNUSED_KEYS for key in keys}
+    stated |= {f"sites.{key}" for keys in UNUSED_SITE_KEYS for key in keys}
+    stated |= {f"records.1-fast.{key}" for keys in UNUSED_RECORD_KEYS for key in keys}
     by_name = {"mesh.accuracy", "indenter.edge_radius_mm", "indenters.ball.edge_radius_mm"}
     by_name |= {"calibration.prior.skin.c_kPa"}
     assert stated | by_name == tried

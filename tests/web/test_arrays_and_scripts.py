@@ -8,9 +8,15 @@ import pytest
 import pyvista as pv
 
 from limbfit.mesh import Mesh, boundary_faces, to_tet10
-from limbfit.web import STATIC, build_inline_script
-from limbfit.web.arrays import pack
-from limbfit.web.shapes import compute_cell_quality, extract_interface, read_shell, to_volume_shape
+from limbfit.web import (
+    STATIC,
+    build_inline_script,
+    compute_cell_quality,
+    extract_interface,
+    pack,
+    read_shell,
+    to_volume_shape,
+)
 from unpacking import unpack
 
 

@@ -45,6 +45,8 @@ def bench_meshing(
 ) -> dict[str, Any]:
     """Mesh random sites of each limb and sum up.
 
+    Raises `InputError` where the real limbs are missing, or for an engine that is not in the table.
+
     Parameters
     ----------
     shared : the folder with ``data`` and ``reference``; by default that here or above.
@@ -58,11 +60,6 @@ def bench_meshing(
     dict
         ``sites``, ``failures``, ``min_dihedral_deg``, ``seconds_median`` (CPU seconds of a site's mesh, its
         mesher included) and more over all limbs; ``limbs`` has a summary of each, ``failed`` the messages.
-
-    Raises
-    ------
-    InputError
-        Where the real limbs are missing, or for an engine that is not in the table.
     """
     if engine not in ENGINES:
         raise InputError(f"no mesher is named {engine!r}", remedy=f"use one of {', '.join(ENGINES)}")
@@ -131,9 +128,7 @@ def measure_cpu_seconds() -> float:
 
 
 def list_limbs(shared: Path) -> dict[str, Callable[[], Anatomy]]:
-    """Name and maker of five limbs; ``shared`` is the folder with ``data`` and ``reference``. Raises
-    `InputError` where that folder lacks the real limbs.
-    """
+    """Name and maker of five limbs; `InputError` where the folder ``shared`` lacks the real ones."""
     openlimb, calf = shared / "reference" / "openlimb-study", shared / "data" / "calf-mri"
     for folder in (openlimb, calf):
         if not folder.is_dir():

@@ -22,6 +22,7 @@ from ..febio import FebioLog, read_feb, read_log, run_feb, to_problem
 Tell = Callable[[int, int, str], None]  # done, of how many, what
 Row = dict[str, Any]
 FOLDER = Path("shared") / "reference"
+GIVE_FOLDER = "give the folder of FEBio's results with --reference"
 KPA = 1e-3  # MPa
 GOAL = 1.0  # percent
 FORCES, PLACES = ("Fx", "Fy", "Fz"), ("x", "y", "z")
@@ -50,9 +51,7 @@ class ReferenceCase:
 
 
 CUBES = tuple(
-    ReferenceCase(
-        f"cube/cube_{tissue}", "hex8", control={"tolerance": 1e-9}, note="one element, no contact: rounding"
-    )
+    ReferenceCase(f"cube/cube_{tissue}", "hex8", {}, {"tolerance": 1e-9}, 1, "one element: rounding")
     for tissue in ("skin", "muscle", "bosboom", "lim", "lim_par")
 )
 
@@ -147,16 +146,9 @@ def bench_febio_parity(
 ) -> list[Row]:
     """Rows ``case, element, max_difference_percent, goal_percent, ..``, one per case, or per part of one.
 
-    The difference is the largest over the whole curve, in percent of FEBio's largest value.
-
-    Parameters
-    ----------
-    reference : folder of FEBio's results; None: ``shared/reference``, here or above.
-
-    Raises
-    ------
-    InputError
-        Where the reference folder or a case in it is missing.
+    The difference is the largest over the whole curve, in percent of FEBio's largest value. ``reference`` is
+    the folder of FEBio's results; None: ``shared/reference``, here or above. Raises `InputError` where it, or
+    a case in it, is missing.
     """
     folder = reference or find_reference(Path.cwd())
     rows: list[Row] = []
@@ -219,23 +211,18 @@ def compare_force(case: ReferenceCase, folder: Path) -> Row:
 
 
 def compare_socket(case: SocketCase, folder: Path) -> Iterator[dict[str, Any]]:
-    """A row for each part of a case, of FEBio's input run by limbfit and the tables of both. Raises
-    `InputError` where a file of the case is missing.
-    """
+    """A row for each part of a case, both tables compared; `InputError` where a file of it is missing."""
     file = folder / "socket" / f"{case.name}.feb"
     if not file.is_file():
-        raise InputError(
-            "is missing", file=file, remedy="give the folder of FEBio's results with --reference"
-        )
+        raise InputError("is missing", file=file, remedy=GIVE_FOLDER)
     with tempfile.TemporaryDirectory() as out:
         run = run_feb(file, out)
         for part in case.parts:
             name = f"{part.table or case.name}.txt"
             log, febio = read_log(Path(out) / name), read_log(file.with_name(name))
             row = {"case": f"{case.name}: {part.name}", "element": case.element, "goal_percent": part.goal}
-            yield row | _build_comparison_row(
-                part, log, febio, "" if run.result.completed else run.result.reason
-            )
+            reason = "" if run.result.completed else run.result.reason
+            yield row | _build_comparison_row(part, log, febio, reason)
 
 
 def _build_comparison_row(part: CasePart, log: FebioLog, febio: FebioLog, reason: str) -> dict[str, Any]:
@@ -270,24 +257,16 @@ def _build_unfinished_row(reason: str) -> Row:
 
 
 def find_reference(start: Path) -> Path:
-    """The folder ``shared/reference`` in, or beside, ``start`` or any folder above it. Raises `InputError`
-    where there is none.
-    """
+    """``shared/reference`` in or beside ``start``, or any folder above; `InputError` where there is none."""
     start = start.resolve()
     for folder in (start, *start.parents):
         if (folder / FOLDER).is_dir():
             return folder / FOLDER
-    raise InputError(
-        f"no folder {FOLDER} here or above",
-        file=start,
-        remedy="give the folder of FEBio's results with --reference",
-    )
+    raise InputError(f"no folder {FOLDER} here or above", file=start, remedy=GIVE_FOLDER)
 
 
 def load_case(case: ReferenceCase, folder: Path) -> tuple[Problem, StepControl, FebioLog]:
-    """The problem on FEBio's mesh, FEBio's own time steps, and FEBio's results. Raises `InputError` where a
-    file of the case is missing or damaged.
-    """
+    """The problem on FEBio's mesh, its time steps and results; `InputError` for a missing or damaged file."""
     model = read_feb(folder / f"{case.name}.feb")
     log = read_log(folder / f"{case.name}.txt")
     problem = to_problem(model, PUNCH if model.rigid else None, **case.problem)

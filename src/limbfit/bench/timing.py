@@ -1,4 +1,7 @@
-"""Time and memory of single simulations, each in a process of its own: reference cases, and blocks."""
+"""Time and memory of single simulations, each in a process of its own: reference cases, and blocks.
+
+Blocks are structured, of two layers and any size, under the square punch: meshes that need no mesher.
+"""
 
 import resource
 import shutil
@@ -12,12 +15,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..errors import InputError, RunError
+from ..errors import InputError, ProblemError, RunError
 from ..execution import ProcessExecutor
-from ..fe import Problem, StepControl, solve
+from ..fe import ELEMENTS, History, Indenter, OgdenQLV, Problem, StepControl, solve
 from ..febio import find_febio, read_log, run_febio
+from ..indentation import SiteModel
+from ..mesh import Mesh, to_tet10
+from ..mesh.boxes import HEX, SIX_TETS, build_boxes
+from ..study import SolverTable
 from . import UNKNOWNS
-from .blocks import build_punched_block, choose_divisions
 from .parity import PUNCHED, Tell, find_reference, load_case
 
 Answer = TypeVar("Answer")
@@ -26,6 +32,9 @@ CASES = {case.name: case for case in PUNCHED}
 PAPER_ELEMENT, PAPER_DIVISIONS = "tet4", 37
 CONTROL = StepControl()
 MIB = 1024.0
+SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, 3.0, 0.3)
+HALF, DEPTH, LAYER = 30.0, 30.0, 3.0  # mm
+INDENTATION, SPEED = 6.0, 0.96  # mm, mm/s
 
 
 def bench_forward(
@@ -40,6 +49,9 @@ def bench_forward(
 ) -> dict[str, Any]:
     """Time a reference case on FEBio's mesh and steps, with limbfit's own contact or FEBio's.
 
+    Raises `InputError` where the case is missing, the element does not fit its mesh, or FEBio is wanted
+    and not there, and `RunError` where FEBio did not come to its end.
+
     Parameters
     ----------
     reference : folder of FEBio's results; None: ``shared/reference``, here or above.
@@ -49,13 +61,6 @@ def bench_forward(
     as_febio : with the element's quadrature and the contact penalty of the parity table.
     beside_febio : FEBio itself runs the case afterwards, on as many threads: ``ratio`` is its time over that
         of the plain simulation.
-
-    Raises
-    ------
-    InputError
-        Where the case is missing, the element does not fit its mesh, or FEBio is wanted and not there.
-    RunError
-        Where FEBio did not come to its end.
     """
     program = find_febio() if beside_febio else None
     if case not in CASES:
@@ -109,16 +114,13 @@ def bench_scaling(
 ) -> dict[str, Any]:
     """Seconds and memory over unknowns, the exponent of their power law, and a model of the paper's size.
 
+    Raises `InputError` for an element that is not in the table.
+
     Parameters
     ----------
     element : name in the element table.
     unknowns : about how many, two sizes or more.
     paper_divisions : cells along the side of the model of the paper's size.
-
-    Raises
-    ------
-    InputError
-        For an element that is not in the table.
     """
     control = replace(control, threads=threads)
     blocks = [(element, choose_divisions(element, size)) for size in unknowns]
@@ -156,10 +158,7 @@ def run_in_fresh_process(function: Callable[..., Answer], threads: int, *argumen
 
 
 def solve_timed(problem: Problem, control: StepControl, sensitivities: bool) -> dict[str, Any]:
-    """Sizes, seconds by part, largest memory of this process, and how far the simulation came.
-
-    Kernels are warmed up before the clock starts.
-    """
+    """Sizes, seconds by part with warm kernels, largest memory of this process, and how far it came."""
     warm_up(problem.formulation.name, sensitivities)
     result = solve(problem, control, sensitivities, store="none")
     statistics = dict(result.statistics)
@@ -189,3 +188,67 @@ def measure_max_rss_MB() -> float:
         return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM")) / MIB
     usage = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return usage / (MIB * MIB if sys.platform == "darwin" else MIB)
+
+
+def build_punched_block(element: str, divisions: int) -> Problem:
+    """The square punch on a block of 60 x 60 x 30 mm with a 3 mm layer; ``divisions`` cells along 60 mm."""
+    mesh = build_layered_block(ELEMENTS[element].cell_type, divisions)
+    ramp = INDENTATION / SPEED
+    return Problem(
+        mesh=mesh,
+        materials={"skin": SKIN, "muscle": MUSCLE},
+        fixed=mesh.node_sets["bottom"],
+        contact_faces=mesh.face_sets["skin"],
+        indenter=Indenter("square", 20.0, 2.0, (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
+        history=History(np.array([0.0, ramp, 2 * ramp]), np.array([0.0, INDENTATION, 0.0])),
+        element=element,
+    )
+
+
+def build_block_model(
+    name: str, file: Path, steps: SolverTable, element: str, depth_mm: float = INDENTATION
+) -> SiteModel:
+    """A site in the middle of a block's top, of a mesh that ``file`` holds."""
+    ramp = depth_mm / SPEED
+    return SiteModel(
+        name=name,
+        mesh=file,
+        mesh_digest=name,
+        position=(0.0, 0.0, 0.0),
+        axis=(0.0, 0.0, -1.0),
+        knots_s=(0.0, ramp, 2 * ramp),
+        knots_mm=(0.0, depth_mm, 0.0),
+        steps=steps,
+        element=element,
+    )
+
+
+def build_layered_block(cell_type: str, divisions: int) -> Mesh:
+    """Boxes of equal size below a layer; node set ``bottom``, face set ``skin`` (the whole top)."""
+    side = np.linspace(-HALF, HALF, divisions + 1)
+    n_below, n_above = _divide_depth(divisions)
+    below, above = np.linspace(-DEPTH, -LAYER, n_below + 1), np.linspace(-LAYER, 0.0, n_above + 1)
+    points, corners = build_boxes(side, side, np.concatenate([below, above[1:]]))
+    cells = corners[:, HEX] if cell_type == "hex8" else corners[:, SIX_TETS].reshape(-1, 4)
+    below_skin = points[cells][:, :, 2].mean(axis=1) <= -LAYER
+    mesh = Mesh.from_arrays(points, cells, below_skin.astype(int), {0: "skin", 1: "muscle"})
+    bottom, top = mesh.nodes_where(lambda p: p[:, 2] <= -DEPTH), mesh.faces_where(lambda p: p[:, 2] >= 0.0)
+    mesh = replace(mesh, node_sets={"bottom": bottom}, face_sets={"skin": top})
+    return to_tet10(mesh) if cell_type == "tet10" else mesh
+
+
+def _divide_depth(divisions: int) -> tuple[int, int]:
+    """Cells through the depth, below the layer and in it, of about the same size as along the side."""
+    size = 2 * HALF / divisions
+    return max(round((DEPTH - LAYER) / size), 1), max(round(LAYER / size), 1)
+
+
+def choose_divisions(element: str, unknowns: int) -> int:
+    """Fewest cells along the side for so many unknowns; `ProblemError` for an element not in the table."""
+    if element not in ELEMENTS:
+        raise ProblemError(f"no element {element!r}", remedy=f"use one of {', '.join(ELEMENTS)}")
+    order = 2 if ELEMENTS[element].cell_type == "tet10" else 1
+    divisions = 2
+    while 3 * (order * divisions + 1) ** 2 * order * sum(_divide_depth(divisions)) < unknowns:
+        divisions += 1
+    return divisions

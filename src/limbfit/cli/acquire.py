@@ -15,25 +15,16 @@ from threading import Thread
 from time import monotonic
 from typing import Annotated, Any
 
-import typer
 from rich.console import Group
 from rich.live import Live as RichLive
 from rich.panel import Panel
 from rich.text import Text
+from typer import Argument, Exit, Option
 
 import limbfit
 
-from ..acquire import (
-    DEFAULT_ADDRESS,
-    DEFAULT_PORT,
-    Event,
-    Keyboard,
-    LiveUpdate,
-    PhaseUpdate,
-    Update,
-    prioritise,
-)
-from ..acquire.events import Abort
+from ..acquire import DEFAULT_ADDRESS, DEFAULT_PORT, Keyboard, LiveUpdate, PhaseUpdate, Update, prioritise
+from ..acquire.events import Abort, Event
 from ..acquire.virtual import Serving, read_faults
 from ..errors import InputError
 from .commands import StudyPath
@@ -51,26 +42,18 @@ HINTS = {
 
 def acquire(
     study: StudyPath,
-    site: Annotated[
-        str | None, typer.Option(help="site, or record such as 01-2; default: all not made yet")
-    ] = None,
-    device: Annotated[
-        str, typer.Option(help="tcp://HOST[:PORT] or serial:PATH[@BAUD]", metavar="ADDRESS")
-    ] = DEFAULT_ADDRESS,
-    depth: Annotated[
-        float | None, typer.Option(help="mm from touch at which the depth search ends by itself")
-    ] = None,
+    site: Annotated[str | None, Option(help="site, or record such as 01-2; default: all not made")] = None,
+    device: Annotated[str, Option(help="tcp://HOST[:PORT] or serial:PATH[@BAUD]")] = DEFAULT_ADDRESS,
+    depth: Annotated[float | None, Option(help="mm from touch at which the depth search ends")] = None,
     unattended: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--unattended",
             help="no operator: the limb counts as in place, and the program holds the key until --depth "
             "(default: the site's depth) or acquire.search_force_N; for scripts and virtual devices",
         ),
     ] = False,
-    again: Annotated[
-        bool, typer.Option("--again", help="record again where a record exists, and keep the old one")
-    ] = False,
+    again: Annotated[bool, Option("--again", help="record again; an old record is kept")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Record indentations on a device: clamp, find the depth, ramp, release.
@@ -115,7 +98,7 @@ def acquire(
     if as_json:
         print_json({"sites": rows})
     if not all(row["completed"] and row["verdict"]["good"] for row in rows):
-        raise typer.Exit(1)
+        raise Exit(1)
 
 
 @contextmanager
@@ -159,7 +142,7 @@ def _show_checks(verdict: dict[str, Any]) -> None:
 
 
 def recording(
-    file: Annotated[Path, typer.Argument(help="record.csv of a session", show_default=False)],
+    file: Annotated[Path, Argument(help="record.csv of a session", show_default=False)],
     as_json: AsJson = False,
 ) -> None:
     """Judge the record of a session, even one that a crash cut short."""
@@ -175,19 +158,12 @@ def _show_recording(result: dict[str, Any]) -> None:
 
 def virtual_fitsocket(
     study: StudyPath,
-    seed: Annotated[int, typer.Option(help="seed of the limb's place and the sensors' noise", min=0)] = 0,
-    faults: Annotated[Path | None, typer.Option(help="TOML file of faults (docs/acquire.md)")] = None,
-    host: Annotated[
-        str, typer.Option(help="address to listen at; whoever reaches it can move the pins")
-    ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="TCP port; 0: a free one", min=0, max=65535)] = DEFAULT_PORT,
-    terminal: Annotated[bool, typer.Option("--terminal", help="a pseudo terminal instead of a port")] = False,
-    speed: Annotated[
-        float,
-        typer.Option(
-            help="how many times faster than real time the clock may run, 1 to 1000; it waits for limbfit"
-        ),
-    ] = 1.0,
+    seed: Annotated[int, Option(help="seed of the limb's place and the sensors' noise", min=0)] = 0,
+    faults: Annotated[Path | None, Option(help="TOML file of faults (docs/acquire.md)")] = None,
+    host: Annotated[str, Option(help="address; whoever reaches it can move the pins")] = "127.0.0.1",
+    port: Annotated[int, Option(help="TCP port; 0: a free one", min=0, max=65535)] = DEFAULT_PORT,
+    terminal: Annotated[bool, Option("--terminal", help="a pseudo terminal instead of a port")] = False,
+    speed: Annotated[float, Option(help="how many times faster than real time its clock may run")] = 1.0,
 ) -> None:
     """Run a virtual FitSocket around the study's simulated limb; Ctrl-C ends it."""
     if not 1 <= speed <= MAX_SPEED:
@@ -245,10 +221,8 @@ def _draw_plots(site: str, phase: PhaseUpdate, samples: list[LiveUpdate]) -> Gro
     head = Text(f"site {site}   {phase.phase}   ", style="bold")
     if samples:
         last = samples[-1]
-        head.append(
-            f"{last.displacement_mm:7.2f} mm {last.force_N:7.2f} N {last.capacitance_pF:6.1f} pF   "
-            f"clamps {last.clamp_N:5.1f} N"
-        )
+        head.append(f"{last.displacement_mm:7.2f} mm {last.force_N:7.2f} N {last.capacitance_pF:6.1f} pF   ")
+        head.append(f"clamps {last.clamp_N:5.1f} N")
     hint = phase.reason or HINTS.get(phase.phase, "any other key: emergency stop")
     touched = [s for s in samples if s.phase in ("search", "return", "load", "hold", "unload")]
     over_mm = plot([s.displacement_mm for s in touched], [s.force_N for s in touched])

@@ -4,34 +4,24 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
 from rich.table import Table
+from typer import Argument, Option, Typer
 
 import limbfit
 
 from ..bench import LARGE_UNKNOWNS, UNKNOWNS
 from ..execution import count_usable_cores
-from .console import STDOUT, AsJson, Column, listen_on_console, print_line, print_result, print_table
+from .console import STDOUT, AsJson, Column, Show, listen_on_console, print_line, print_result, print_table
 
-app = typer.Typer(
-    help="Benchmarks of solver, meshes and identification.", no_args_is_help=True, rich_markup_mode=None
-)
+app = Typer(help="Benchmarks of solver, meshes, identification.", no_args_is_help=True, rich_markup_mode=None)
 
-Reference = Annotated[
-    Path | None,
-    typer.Option(help="folder of FEBio's results; default: shared/reference, here or above"),
-]
-Threads = Annotated[int, typer.Option(min=1, help="threads of the linear algebra; default: all cores")]
-BesideFebio = Annotated[
-    bool,
-    typer.Option("--beside-febio", help="run FEBio itself afterwards, for the ratio of the times"),
-]
+Reference = Annotated[Path | None, Option(help="FEBio's results; default: shared/reference, here or above")]
+Threads = Annotated[int, Option(min=1, help="threads of the linear algebra; default: all cores")]
+BesideFebio = Annotated[bool, Option("--beside-febio", help="run FEBio itself afterwards")]
 CORES = count_usable_cores()
 
 
-def _bench(
-    name: str, run: Callable[..., Any], arguments: tuple[Any, ...], show: Callable[[Any], None], as_json: bool
-) -> None:
+def _bench(name: str, run: Callable[..., Any], arguments: tuple[Any, ...], show: Show, as_json: bool) -> None:
     """Run a benchmark, show how far it is, and print what it found."""
     with listen_on_console() as listener:
 
@@ -70,12 +60,10 @@ def format_peak(row: Mapping[str, Any], start: str) -> str:
 @app.command()
 def forward(
     reference: Reference = None,
-    case: Annotated[str, typer.Option(help="case of the reference folder")] = "residuum/posterior_tet10",
-    element: Annotated[str, typer.Option(help="name in the element table; default: that of the mesh")] = "",
+    case: Annotated[str, Option(help="case of the reference folder")] = "residuum/posterior_tet10",
+    element: Annotated[str, Option(help="name in the element table; default: that of the mesh")] = "",
     threads: Threads = CORES,
-    as_febio: Annotated[
-        bool, typer.Option("--as-febio", help="with FEBio's quadrature and contact penalty (parity table)")
-    ] = False,
+    as_febio: Annotated[bool, Option("--as-febio", help="with FEBio's quadrature and penalty")] = False,
     beside_febio: BesideFebio = False,
     as_json: AsJson = False,
 ) -> None:
@@ -86,8 +74,8 @@ def forward(
 
 @app.command()
 def scaling(
-    element: Annotated[str, typer.Option(help="name in the element table")] = "tet10",
-    large: Annotated[bool, typer.Option("--large", help="also 125,000 to 300,000 unknowns")] = False,
+    element: Annotated[str, Option(help="name in the element table")] = "tet10",
+    large: Annotated[bool, Option("--large", help="also 125,000 to 300,000 unknowns")] = False,
     threads: Threads = CORES,
     as_json: AsJson = False,
 ) -> None:
@@ -105,11 +93,9 @@ def show_scaling(result: dict[str, Any]) -> None:
 
 @app.command()
 def meshing(
-    shared: Annotated[
-        Path | None, typer.Option(help="folder with the real limbs; default: shared, here or above")
-    ] = None,
-    sites: Annotated[int, typer.Option(min=1, help="sites on each of the five limbs")] = 20,
-    engine: Annotated[str, typer.Option(help="name of the mesher")] = "mmg",
+    shared: Annotated[Path | None, Option(help="real limbs; default: shared, here or above")] = None,
+    sites: Annotated[int, Option(min=1, help="sites on each of the five limbs")] = 20,
+    engine: Annotated[str, Option(help="name of the mesher")] = "mmg",
     as_json: AsJson = False,
 ) -> None:
     """Mesh random sites of five limbs: failures, angles, thickness, volume, time."""
@@ -125,9 +111,7 @@ def show_meshing(result: dict[str, Any]) -> None:
 
 @app.command()
 def calibrate(
-    study: Annotated[
-        Path | None, typer.Argument(help="study.toml or its folder; default: the coarse phantom of seed 0")
-    ] = None,
+    study: Annotated[Path | None, Argument(help="a study; default: the coarse phantom of seed 0")] = None,
     beside_febio: BesideFebio = False,
     as_json: AsJson = False,
 ) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, Literal
 
-import typer
+from typer import Argument, Option
 
 import limbfit
 
@@ -30,21 +30,19 @@ from .console import (
     print_warnings,
 )
 
-StudyPath = Annotated[
-    Path, typer.Argument(help="study.toml, or the folder that holds it", show_default=False)
-]
+StudyPath = Annotated[Path, Argument(help="study.toml, or the folder that holds it", show_default=False)]
 Parameters = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="the law's parameters of each tissue (c_kPa,m,gamma,tau_s unless the study has another), "
-        "outermost first (skin, then muscle, unless the study has layers); default: identified, or the "
-        "study's start where nothing is"
+        "outermost first; default: identified, or the study's start where nothing is"
     ),
 ]
 
 
-def list_stage_names() -> list[str]:
-    return list(limbfit.STAGE_NAMES)
+def stage_option(*names: str, help: str) -> Any:
+    """An option that names a stage, or several."""
+    return Option(*names, help=help, autocompletion=lambda: list(limbfit.STAGE_NAMES))
 
 
 def call_on_study(study: Path, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
@@ -57,8 +55,8 @@ def call_on_study(study: Path, function: Callable[..., Any], *arguments: Any, **
 
 
 def demo(
-    folder: Annotated[Path, typer.Argument(help="where to put the demo study")] = Path("limbfit-demo"),
-    seed: Annotated[int, typer.Option(help="which synthetic patient", min=0)] = 0,
+    folder: Annotated[Path, Argument(help="where to put the demo study")] = Path("limbfit-demo"),
+    seed: Annotated[int, Option(help="which synthetic patient", min=0)] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Identify a coarse synthetic patient: the whole path, from DICOM to report.
@@ -78,28 +76,16 @@ def demo(
 
 
 def phantom(
-    folder: Annotated[Path, typer.Argument(help="a folder that does not exist yet", show_default=False)],
-    detail: Annotated[
-        Literal["coarse", "paper"], typer.Option(help="coarse: 6 sites, minutes; paper: 256^3, 18 sites")
-    ] = "coarse",
-    seed: Annotated[int, typer.Option(help="which synthetic patient", min=0)] = 0,
-    limb: Annotated[
-        Literal["transtibial", "transfemoral"], typer.Option(help="which limb was amputated")
-    ] = "transtibial",
-    fat: Annotated[bool, typer.Option("--fat", help="three tissues: skin, fat and muscle")] = False,
-    tendon: Annotated[
-        bool, typer.Option("--tendon", help="also a patellar tendon, a tissue of its own in the muscle")
-    ] = False,
-    socket: Annotated[bool, typer.Option("--socket", help="also a rectified socket for it")] = False,
-    ultrasound: Annotated[
-        bool, typer.Option("--ultrasound", help="also what ultrasound sees under the indenter")
-    ] = False,
-    surface: Annotated[
-        bool, typer.Option("--surface", help="also how the skin around the indenter moves")
-    ] = False,
-    shear_waves: Annotated[
-        bool, typer.Option("--shear-waves", help="also how fast shear waves are under the indenter")
-    ] = False,
+    folder: Annotated[Path, Argument(help="a folder that does not exist yet", show_default=False)],
+    detail: Annotated[Literal["coarse", "paper"], Option(help="coarse: 6 sites; paper: 18 sites")] = "coarse",
+    seed: Annotated[int, Option(help="which synthetic patient", min=0)] = 0,
+    limb: Annotated[Literal["transtibial", "transfemoral"], Option(help="which amputation")] = "transtibial",
+    fat: Annotated[bool, Option("--fat", help="three tissues: skin, fat and muscle")] = False,
+    tendon: Annotated[bool, Option("--tendon", help="also a patellar tendon in the muscle")] = False,
+    socket: Annotated[bool, Option("--socket", help="also a rectified socket for it")] = False,
+    ultrasound: Annotated[bool, Option("--ultrasound", help="also what ultrasound sees meanwhile")] = False,
+    surface: Annotated[bool, Option("--surface", help="also how the skin moves around it")] = False,
+    shear_waves: Annotated[bool, Option("--shear-waves", help="also the speed of shear waves")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Make a synthetic patient with known truth: MRI as DICOM, traces, study.toml, truth.json."""
@@ -124,7 +110,7 @@ def phantom(
 
 
 def series(
-    folder: Annotated[Path, typer.Argument(help="a folder of DICOM files", show_default=False)],
+    folder: Annotated[Path, Argument(help="a folder of DICOM files", show_default=False)],
     as_json: AsJson = False,
 ) -> None:
     """List the DICOM series of a folder, to choose one by its UID (image.series in study.toml)."""
@@ -158,20 +144,9 @@ def show_findings(findings: dict[str, Any]) -> None:
 
 def run(
     study: StudyPath,
-    until: Annotated[
-        str | None,
-        typer.Option(help="stop after this stage of limbfit status", autocompletion=list_stage_names),
-    ] = None,
-    start: Annotated[
-        str | None,
-        typer.Option("--from", help="redo this stage and all after it", autocompletion=list_stage_names),
-    ] = None,
-    force: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="redo this stage, repeatable; kept simulations are used", autocompletion=list_stage_names
-        ),
-    ] = None,
+    until: Annotated[str | None, stage_option(help="stop after this stage of limbfit status")] = None,
+    start: Annotated[str | None, stage_option("--from", help="redo this stage and all after it")] = None,
+    force: Annotated[list[str] | None, stage_option(help="redo it with kept simulations, repeatable")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Run every stage that is missing or stale; a stopped run continues where it stopped."""
@@ -201,15 +176,10 @@ def show_states(result: dict[str, Any]) -> None:
 
 def simulate(
     study: StudyPath,
-    site: Annotated[str, typer.Option(help="name of the site", show_default=False)],
+    site: Annotated[str, Option(help="name of the site", show_default=False)],
     parameters: Parameters = None,
-    animation: Annotated[
-        bool, typer.Option("--animation", help="also store the fields of every step, for ParaView")
-    ] = False,
-    solver: Annotated[
-        Literal["limbfit", "febio"] | None,
-        typer.Option(help="limbfit's own or FEBio; default: what the study says"),
-    ] = None,
+    animation: Annotated[bool, Option("--animation", help="also store the fields of every step")] = False,
+    solver: Annotated[Literal["limbfit", "febio"] | None, Option(help="default: the study's solver")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Simulate one indentation; curve and fields go to results/simulate."""
@@ -242,13 +212,10 @@ def parse_parameters(text: str | None, study: Study) -> dict[str, dict[str, floa
     if text is None:
         return None
     values = parse_numbers(text, 0.0, sys.float_info.max)
-    wanted, keys = len(study.parameters), ",".join(study.law.keys)
-    if len(values) != wanted:
-        raise InputError(
-            f"{text!r} is not {wanted} numbers",
-            place="--parameters",
-            remedy=f"give {keys} of {', then of '.join(study.tissues)}, separated by commas",
-        )
+    if len(values) != len(study.parameters):
+        what = f"{text!r} is not {len(study.parameters)} numbers"
+        remedy = f"give {','.join(study.law.keys)} of {', then of '.join(study.tissues)}, separated by commas"
+        raise InputError(what, place="--parameters", remedy=remedy)
     return study.by_tissue(values)
 
 
@@ -346,10 +313,8 @@ def show_labels(results: StudyResults, facts: dict[str, Any]) -> None:
     if found.markers_removed is not None:
         print_line(f"markers taken off the skin: {found.markers_removed}")
     if motion := found.motion:
-        print_line(
-            f"between the images the limb moved by {motion.shift_mm:.1f} mm and {motion.turn_deg:.1f} "
-            f"degrees (correlation {motion.correlation:.2f})"
-        )
+        moved = f"{motion.shift_mm:.1f} mm and {motion.turn_deg:.1f} degrees"
+        print_line(f"between the images the limb moved by {moved} (correlation {motion.correlation:.2f})")
     print_line(f"labels: {facts['labels']}")
 
 
@@ -366,14 +331,10 @@ def show_surfaces(results: StudyResults, result: dict[str, Any]) -> None:
         "at (LPS mm)": lambda row: format_point(row["at"]) if "at" in row else "",
     }
     print_table(rows, columns, dash="", unwrapped=columns)
-    print_line(
-        f"{result['closed_bodies']} closed bodies; proximal cut through {format_point(result['cut_point'])}"
-    )
+    print_line(f"{result['closed_bodies']} closed bodies; cut through {format_point(result['cut_point'])}")
     if result["amputation"]:
-        ends = result["amputation"]["beyond_plane_mm"].items()
-        print_line(
-            "amputated; ends beyond the plane (mm): " + ", ".join(f"{name} {end:.1f}" for name, end in ends)
-        )
+        ends = (f"{name} {end:.1f}" for name, end in result["amputation"]["beyond_plane_mm"].items())
+        print_line(f"amputated; ends beyond the plane (mm): {', '.join(ends)}")
 
 
 def show_placed_sites(results: StudyResults, facts: dict[str, Any]) -> None:
@@ -413,9 +374,7 @@ def format_point(position: Sequence[float]) -> str:
     return ", ".join(f"{value:.1f}" for value in position)
 
 
-def schema(
-    result: Annotated[str, typer.Argument(help="name of the result, such as predict")],
-) -> None:
+def schema(result: Annotated[str, Argument(help="name of the result, such as predict")]) -> None:
     """Print the JSON schema of a stored result: its keys, their types and what they mean."""
     print_json(limbfit.build_schema(result))
 

@@ -13,17 +13,10 @@ from time import perf_counter, sleep
 from types import FrameType
 from typing import Annotated, Any
 
-import typer
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
+from typer import Option
 
 import limbfit
 
@@ -36,15 +29,16 @@ CLEARING_TIME_S = 15.0  # for what heard it to end its workers and files
 STDOUT = Console(highlight=False, markup=False, emoji=False)
 STDERR = Console(stderr=True, highlight=False, markup=False, emoji=False)
 FILE_WIDTH = 10_000  # characters
+Show = Callable[[Any], None]
 Column = str | tuple[str, str] | Callable[[Any], str]
-AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
+AsJson = Annotated[bool, Option("--json", help="print JSON and nothing else")]
 
 
 def print_json(content: Any) -> None:
     sys.stdout.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
-def print_result(content: Any, show: Callable[[Any], None], as_json: bool) -> None:
+def print_result(content: Any, show: Show, as_json: bool) -> None:
     """Print what a command found: as JSON and nothing else, or as ``show`` prints it."""
     if as_json:
         print_json(content)
@@ -52,7 +46,7 @@ def print_result(content: Any, show: Callable[[Any], None], as_json: bool) -> No
         show(content)
 
 
-def print_stored(content: dict[str, Any], name: str, show: Callable[[Any], None], as_json: bool) -> None:
+def print_stored(content: dict[str, Any], name: str, show: Show, as_json: bool) -> None:
     """Print a result, stored by ``name``: as JSON, or as ``show`` prints what is stored, and where it is."""
     if as_json:
         print_json(content)
@@ -93,9 +87,8 @@ def print_table(
         STDOUT.width = FILE_WIDTH
     table = Table(box=None)
     for head in columns:
-        table.add_column(
-            head, no_wrap=head in unwrapped, overflow="ellipsis" if head in unwrapped else "fold"
-        )
+        whole = head in unwrapped
+        table.add_column(head, no_wrap=whole, overflow="ellipsis" if whole else "fold")
     for row in rows:
         table.add_row(*(_format_cell(row, column, dash) for column in columns.values()))
     STDOUT.print(table)
@@ -131,14 +124,14 @@ def listen_on_console() -> Iterator[Callable[[limbfit.Progress], None]]:
 @contextmanager
 def _draw_bars() -> Iterator[Callable[[limbfit.Progress], None]]:
     columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description:<10}"),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[text]}"),
+        progress.SpinnerColumn(),
+        progress.TextColumn("{task.description:<10}"),
+        progress.BarColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("{task.fields[text]}"),
     )
-    with Progress(*columns, console=STDERR) as shown:
+    with progress.Progress(*columns, console=STDERR) as shown:
         tasks: dict[str, Any] = {}
         fits: dict[str, str] = {}
 

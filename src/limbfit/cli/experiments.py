@@ -1,24 +1,24 @@
 """The commands of the experiments: each runs one and prints its result as JSON or in words."""
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import typer
+from typer import Argument, Option
 
 import limbfit
 
 from ..errors import InputError
-from ..results.models import ModelsResult
 from ..results.planning import DesignResult, ProtocolResult
-from ..results.uncertainty import CrossvalidateResult, RegionsResult, UncertaintyResult
+from ..results.uncertainty import CrossvalidateResult, ModelsResult, RegionsResult, UncertaintyResult
 from ..results.variants import CubeResult, RefinementResult, VolumeResult
 from .commands import Parameters, StudyPath, call_on_study
 from .console import (
     AsJson,
     Column,
+    Show,
     build_parameter_columns,
     format_ends,
     format_use,
@@ -33,21 +33,16 @@ from .console import (
 )
 
 
-def _run_and_print(
-    study: Path, name: str, show: Callable[[Any], None], as_json: bool, **options: Any
-) -> None:
+def _run_and_print(study: Path, name: str, show: Show, as_json: bool, **options: Any) -> None:
     """Do the experiment ``name`` with ``options``, print what it found and where it is stored."""
     result = call_on_study(study, limbfit.run_experiment, name, **options)
     print_stored(result, name, show, as_json)
 
 
 def cube(
-    study: Annotated[
-        Path | None,
-        typer.Argument(help="study.toml or its folder; without: published tissues only", show_default=False),
-    ] = None,
-    compression: Annotated[float, typer.Option(help="compression in percent of the cube's side")] = 20.0,
-    output: Annotated[Path | None, typer.Option(help="without a study: the folder to write to")] = None,
+    study: Annotated[Path | None, Argument(help="a study; default: published tissues only")] = None,
+    compression: Annotated[float, Option(help="compression in percent of the cube's side")] = 20.0,
+    output: Annotated[Path | None, Option(help="without a study: the folder to write to")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compress a cube of this study's tissues and of published ones: the paper's figures 8 and 9."""
@@ -77,10 +72,7 @@ def show_cube(found: CubeResult) -> None:
 
 def regions(
     study: StudyPath,
-    sites: Annotated[
-        Literal["all", "fitted"],
-        typer.Option(help="fit all recorded sites of a region, as the paper, or the study's fitted ones"),
-    ] = "all",
+    sites: Annotated[Literal["all", "fitted"], Option(help="of each region; all: as in the paper")] = "all",
     as_json: AsJson = False,
 ) -> None:
     """Identify each region separately, beside the model of the whole limb (the paper's table 3)."""
@@ -90,10 +82,9 @@ def regions(
 def show_regions(found: RegionsResult) -> None:
     whole = found.whole
     fits: list[tuple[Any, ...]] = [("whole limb", whole.fitted_sites, whole.parameters, None, None)]
-    fits += [
-        (one.region, one.fitted_sites, one.parameters, one.own_error_percent, one.whole_error_percent)
-        for one in found.regions
-    ]
+    for one in found.regions:
+        errors = one.own_error_percent, one.whole_error_percent
+        fits.append((one.region, one.fitted_sites, one.parameters, *errors))
     rows: list[dict[str, Any]] = []
     for region, sites, parameters, own, error in fits:
         head = {"region": region, "sites": ", ".join(sites), "own": own, "whole": error}
@@ -122,7 +113,7 @@ def uncertainty(
     study: StudyPath,
     models: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="instead, calibrate other models on the same records and weigh them: all, or some of "
             "two-terms, power, fung, fibres, thinner, thicker, friction, separated by commas; each takes as "
             "long as limbfit run",
@@ -178,14 +169,8 @@ SENSITIVITIES = ("c", "kappa", "contact", "indenter", "mesh")
 
 def sensitivity(
     study: StudyPath,
-    only: Annotated[
-        str | None,
-        typer.Option(help="some of c, kappa, contact, indenter, mesh, separated by commas; default: all"),
-    ] = None,
-    site: Annotated[
-        list[str] | None,
-        typer.Option(help="site, repeatable; default: where tissue over bone is thinnest and thickest"),
-    ] = None,
+    only: Annotated[str | None, Option(help="some of c,kappa,contact,indenter,mesh; default: all")] = None,
+    site: Annotated[list[str] | None, Option(help="repeatable; default: over thin and thick tissue")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Simulate again with another c, bulk modulus, friction, indenter or mesh."""
@@ -222,11 +207,9 @@ def show_sensitivity(name: str, found: Any) -> None:
     print_table(found.runs, columns)
     for row in found.sites if isinstance(found, RefinementResult) else ():
         if row.limit_N is not None:
-            text = (
-                f"tends to {row.limit_N:.3f} N, order {row.order:.2g}"
-                if row.order
-                else (f"{row.limit_N:.3f} N on the finest mesh, from which nothing can be extrapolated")
-            )
+            text = f"{row.limit_N:.3f} N on the finest mesh, from which nothing can be extrapolated"
+            if row.order:
+                text = f"tends to {row.limit_N:.3f} N, order {row.order:.2g}"
             print_line(f"site {row.site}: {text}; the study's mesh is {row.error_percent:+.2f} % off")
     for row in found.runs:
         if not row.completed:
@@ -235,17 +218,14 @@ def show_sensitivity(name: str, found: Any) -> None:
 
 def experiment(
     study: StudyPath,
-    name: Annotated[str, typer.Argument(help="name of an experiment, such as one that the study registers")],
-    option: Annotated[
-        list[str] | None, typer.Option(help="NAME=VALUE, the value in JSON or plain text, repeatable")
-    ] = None,
+    name: Annotated[str, Argument(help="name of an experiment, such as one that the study registers")],
+    option: Annotated[list[str] | None, Option(help="NAME=VALUE, in JSON or plain text, repeatable")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Run an experiment that has no command of its own."""
+    checked, options = limbfit.load_study(study), parse_options(option or ())
     with listen_on_console() as listener:
-        result = limbfit.run_experiment(
-            limbfit.load_study(study), name, listener=listener, **parse_options(option or ())
-        )
+        result = limbfit.run_experiment(checked, name, listener=listener, **options)
     print_json(result)
     if not as_json:
         print_line(f"stored in {result['folder']}; limbfit report shows it")
@@ -267,10 +247,10 @@ def parse_options(words: Iterable[str]) -> dict[str, Any]:
 
 def crossvalidate(
     study: StudyPath,
-    fit: Annotated[int, typer.Option(help="sites to fit; 0: as many as the study fits", min=0)] = 0,
-    choices: Annotated[int, typer.Option(help="choices of sites, drawn where there are more", min=1)] = 200,
-    seed: Annotated[int, typer.Option(help="which choices are drawn", min=0)] = 0,
-    runs: Annotated[int, typer.Option(help="simulations of all sites that make the emulator", min=4)] = 12,
+    fit: Annotated[int, Option(help="sites to fit; 0: as many as the study fits", min=0)] = 0,
+    choices: Annotated[int, Option(help="choices of sites, drawn where there are more", min=1)] = 200,
+    seed: Annotated[int, Option(help="which choices are drawn", min=0)] = 0,
+    runs: Annotated[int, Option(help="simulations of all sites that make the emulator", min=4)] = 12,
     as_json: AsJson = False,
 ) -> None:
     """Fit other choices of sites and predict the rest; leave out whole regions."""
@@ -280,16 +260,12 @@ def crossvalidate(
 
 def show_crossvalidation(found: CrossvalidateResult) -> None:
     own, checks = found.own, found.emulator.checks
-    print_line(
-        f"{found.choices} of {found.choices_possible} choices of {found.fitted_sites} sites: "
-        f"mean held-out error {own.median_percent:.2f} % (median; 5 to 95 %: {own.low_percent:.2f} to "
-        f"{own.high_percent:.2f} %)"
-    )
+    choices = f"{found.choices} of {found.choices_possible} choices of {found.fitted_sites} sites"
+    quantiles = f"median; 5 to 95 %: {own.low_percent:.2f} to {own.high_percent:.2f} %"
+    print_line(f"{choices}: mean held-out error {own.median_percent:.2f} % ({quantiles})")
     if own.share_better is not None:  # the study's own choice leaves sites to be predicted
-        print_line(
-            f"the study's own choice ({', '.join(own.fitted)}): {own.mean_error_heldout_percent:.2f} %; "
-            f"{100 * own.share_better:.0f} % of the choices do better"
-        )
+        error = f"the study's own choice ({', '.join(own.fitted)}): {own.mean_error_heldout_percent:.2f} %"
+        print_line(f"{error}; {100 * own.share_better:.0f} % of the choices do better")
     known = [row for row in found.sites if row.mean_percent is not None]
     rows = [{"name": f"site {row.site}", "error": row.mean_percent} for row in known]
     for fit in found.regions:
@@ -302,50 +278,24 @@ def show_crossvalidation(found: CrossvalidateResult) -> None:
 
 def _session_option(help: str, **limits: Any) -> Any:
     """An option of ``design --protocol``; None where it is not given."""
-    return typer.Option(help=f"with --protocol: {help}", **limits)
+    return Option(help=f"with --protocol: {help}", **limits)
 
 
 def design(
     study: StudyPath,
-    sites: Annotated[
-        int | None, typer.Option(help="how many to choose; default: as many as the study fits", min=0)
-    ] = None,
-    depths: Annotated[
-        str | None,
-        typer.Option(help="depths in mm to choose from, such as 3,5,7; default: the study's"),
-    ] = None,
+    sites: Annotated[int | None, Option(help="how many to choose; default: as the study fits", min=0)] = None,
+    depths: Annotated[str | None, Option(help="depths in mm, such as 3,5,7; default: the study's")] = None,
     parameters: Parameters = None,
-    protocol: Annotated[
-        bool, typer.Option("--protocol", help="choose the records of a whole session instead")
-    ] = False,
-    minutes: Annotated[
-        float | None, _session_option("length of the session, min; default: 25", min=1)
-    ] = None,
-    speeds: Annotated[
-        str | None, _session_option("speeds in mm/s; default: the study's and five times it")
-    ] = None,
-    holds: Annotated[
-        str | None,
-        _session_option("holds in s, 0 for none; default: 0,30, for a socket as long as its loads"),
-    ] = None,
-    determine: Annotated[
-        str | None,
-        _session_option("parameters such as muscle.c_kPa, or socket (pressures); default: all"),
-    ] = None,
-    criterion: Annotated[
-        Literal["D", "A"] | None, _session_option("D or A; default: D, for a socket A")
-    ] = None,
+    protocol: Annotated[bool, Option("--protocol", help="choose the records of a session instead")] = False,
+    minutes: Annotated[float | None, _session_option("its length in minutes; default: 25", min=1)] = None,
+    speeds: Annotated[str | None, _session_option("speeds, mm/s; default: the study's, 5 times it")] = None,
+    holds: Annotated[str | None, _session_option("holds, s; default: 0,30, for a socket its loads'")] = None,
+    determine: Annotated[str | None, _session_option("such as muscle.c_kPa, or socket; default: all")] = None,
+    criterion: Annotated[Literal["D", "A"] | None, _session_option("default: D, for a socket A")] = None,
     draws: Annotated[int | None, _session_option("how many tissues; default: 3", min=1, max=64)] = None,
-    ultrasound: Annotated[
-        float | None, _session_option("ultrasound reads thicknesses with this deviation, mm", min=1e-3)
-    ] = None,
-    surface: Annotated[
-        float | None, _session_option("cameras read the skin with this deviation, mm", min=1e-3)
-    ] = None,
-    shear_waves: Annotated[
-        float | None,
-        _session_option("elastography reads shear-wave speeds with this deviation, m/s", min=1e-3),
-    ] = None,
+    ultrasound: Annotated[float | None, _session_option("deviation of ultrasound, mm", min=1e-3)] = None,
+    surface: Annotated[float | None, _session_option("deviation of cameras, mm", min=1e-3)] = None,
+    shear_waves: Annotated[float | None, _session_option("deviation of elastography, m/s", min=1e-3)] = None,
     as_json: AsJson = False,
 ) -> None:
     """Choose the sites and depths that determine the parameters best, for records or for a plan.

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, Option
 
 import limbfit
 
@@ -12,11 +12,9 @@ from .console import AsJson, fail, listen_on_console, print_aside, print_json, p
 
 
 def febio(
-    file: Annotated[Path, typer.Argument(help="input of FEBio 3 or 4 (.feb)", show_default=False)],
-    output: Annotated[
-        Path | None, typer.Option(help="folder for what the input asks to be written; default: beside it")
-    ] = None,
-    threads: Annotated[int, typer.Option(min=1, help="threads of assembly and linear algebra")] = 1,
+    file: Annotated[Path, Argument(help="input of FEBio 3 or 4 (.feb)", show_default=False)],
+    output: Annotated[Path | None, Option(help="folder to write to; default: beside it")] = None,
+    threads: Annotated[int, Option(min=1, help="threads of assembly and linear algebra")] = 1,
     as_json: AsJson = False,
 ) -> None:
     """Solve a FEBio input with limbfit's solver, and write the log-file tables that it asks for."""
@@ -28,10 +26,8 @@ def febio(
         for note in result["notes"]:
             print_aside(f"note: {file}: {note}")
         peak = "" if result["peak_force_N"] is None else f"peak force {result['peak_force_N']:.4g} N, "
-        print_line(
-            f"{peak}{result['steps']} steps, {result['element']}, {result['unknowns']} unknowns; "
-            f"{', '.join(result['files']) or 'no table asked for'}"
-        )
+        size = f"{peak}{result['steps']} steps, {result['element']}, {result['unknowns']} unknowns"
+        print_line(f"{size}; {', '.join(result['files']) or 'no table asked for'}")
     print_warnings(result["warnings"])
     if not result["completed"]:
         fail(f"{file}: the simulation is partial: {result['reason']}", 1)
@@ -41,15 +37,13 @@ def export(
     study: StudyPath,
     to: Annotated[
         Literal["feb", "febio-optimize", "inp", "calculix"],
-        typer.Option(
+        Option(
             help="feb: FEBio 4; febio-optimize: FEBio's fit of the parameters; inp: Abaqus; calculix",
             show_default=False,
         ),
     ],
-    site: Annotated[
-        str | None, typer.Option(help="name of the site; default: all, for febio-optimize all fitted ones")
-    ] = None,
-    output: Annotated[Path | None, typer.Option(help="a folder; default: results/export")] = None,
+    site: Annotated[str | None, Option(help="name; default: all, for febio-optimize all fitted ones")] = None,
+    output: Annotated[Path | None, Option(help="a folder; default: results/export")] = None,
     parameters: Parameters = None,
     as_json: AsJson = False,
 ) -> None:
@@ -70,12 +64,9 @@ def export(
 
 def compare(
     study: StudyPath,
-    site: Annotated[str, typer.Option(help="name of the site", show_default=False)],
+    site: Annotated[str, Option(help="name of the site", show_default=False)],
     parameters: Parameters = None,
-    febio_log: Annotated[
-        Path | None,
-        typer.Option(help="the table that FEBio wrote elsewhere for the exported input; FEBio is not run"),
-    ] = None,
+    febio_log: Annotated[Path | None, Option(help="the table of FEBio elsewhere; it is not run here")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Solve a site by limbfit and by FEBio; curves and difference go to results/compare."""

@@ -6,25 +6,21 @@ from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Exit, Option
 
 import limbfit
 
 from ..execution import QUEUES, Placement, place_jobs
-from .commands import StudyPath, list_stage_names
+from .commands import StudyPath, stage_option
 from .console import AsJson, Column, listen_on_console, print_aside, print_json, print_line, print_table
 
 _OPTIONS = {
     "workers": Annotated[
         int | None,
-        typer.Option(help="jobs side by side; 0: one per core; default: the study's", min=0, max=1024),
+        Option(help="jobs side by side; 0: one per core; default: the study's", min=0, max=1024),
     ],
-    "scheduler": Annotated[
-        str | None, typer.Option(help="run on the workers of a Dask scheduler, such as tcp://host:8786")
-    ],
-    "dask": Annotated[
-        str | None, typer.Option(help=f"start Dask workers: {', '.join(QUEUES)}, or local processes (local)")
-    ],
+    "scheduler": Annotated[str | None, Option(help="a Dask scheduler, such as tcp://host:8786")],
+    "dask": Annotated[str | None, Option(help=f"start Dask workers: {', '.join(QUEUES)}, or local")],
 }
 
 
@@ -49,10 +45,8 @@ def add_execution_options(verb: Callable[..., None]) -> Callable[..., None]:
 
 
 def batch(
-    studies: Annotated[list[Path], typer.Argument(help="study files or their folders", show_default=False)],
-    until: Annotated[
-        str | None, typer.Option(help="stop each study after this stage", autocompletion=list_stage_names)
-    ] = None,
+    studies: Annotated[list[Path], Argument(help="study files or their folders", show_default=False)],
+    until: Annotated[str | None, stage_option(help="stop each study after this stage")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Run many studies on the same workers; one that fails does not stop the others."""
@@ -76,18 +70,13 @@ def batch(
         print_table(rows, columns)
         print_line(f"{len(rows) - len(failed)} of {len(rows)} studies done")
     if failed:
-        raise typer.Exit(1)
+        raise Exit(1)
 
 
 def reproduce(
-    record: Annotated[
-        Path, typer.Argument(help="results/run.json of a study, or the study", show_default=False)
-    ],
-    folder: Annotated[Path, typer.Argument(help="a new folder to run it in", show_default=False)],
-    tolerance: Annotated[
-        float,
-        typer.Option(help="relative tolerance of parameters, and of forces over a site's largest", min=0.0),
-    ] = 1e-6,
+    record: Annotated[Path, Argument(help="results/run.json, or the study", show_default=False)],
+    folder: Annotated[Path, Argument(help="a new folder to run it in", show_default=False)],
+    tolerance: Annotated[float, Option(help="relative; of forces over a site's largest", min=0.0)] = 1e-6,
     as_json: AsJson = False,
 ) -> None:
     """Run a study again from its record in a new folder, and compare parameters and forces."""
@@ -104,11 +93,11 @@ def reproduce(
         verdict = "the same" if result["same"] else "not the same"
         print_line(f"{verdict} within {tolerance:g}; run again in {folder}")
     if not result["same"]:
-        raise typer.Exit(1)
+        raise Exit(1)
 
 
 def doctor(
-    folder: Annotated[Path, typer.Argument(help="where studies would lie")] = Path("."),
+    folder: Annotated[Path, Argument(help="where studies would lie")] = Path("."),
     as_json: AsJson = False,
 ) -> None:
     """Check this machine: versions, cores, memory, solvers, meshers, write access, and a small problem."""
@@ -121,20 +110,15 @@ def doctor(
             if row["remedy"]:
                 print_line(f"         {row['remedy']}")
     if not result["healthy"]:
-        raise typer.Exit(1)
+        raise Exit(1)
 
 
 def studio(
     study: StudyPath,
-    port: Annotated[int, typer.Option(help="port to listen on; 0: a free one", min=0, max=65535)] = 0,
-    no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="print the address, open no browser")
-    ] = False,
-    host: Annotated[str, typer.Option(help="the address to listen on")] = "127.0.0.1",
-    expose: Annotated[
-        bool,
-        typer.Option("--expose", help="allow a --host that other machines reach: they can change the study"),
-    ] = False,
+    port: Annotated[int, Option(help="port to listen on; 0: a free one", min=0, max=65535)] = 0,
+    no_browser: Annotated[bool, Option("--no-browser", help="open no browser")] = False,
+    host: Annotated[str, Option(help="the address to listen on")] = "127.0.0.1",
+    expose: Annotated[bool, Option("--expose", help="let other machines reach and change the study")] = False,
 ) -> None:
     """View and correct the limb, and watch its identification, in a browser on this machine."""
 

@@ -3,15 +3,15 @@
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-import typer
+from typer import Option, Typer
 from typer.core import TyperGroup
 
 import limbfit
 
 from ..errors import InputError
 from ..laws import split_key
-from ..results.models import SocketOfModels
 from ..results.socket import SocketDesignResult, SocketLoad, SocketResult
+from ..results.uncertainty import SocketOfModels
 from .commands import StudyPath, call_on_study
 from .console import (
     AsJson,
@@ -36,45 +36,29 @@ class WithDefault(TyperGroup):
         return super().parse_args(ctx, args)
 
 
-app = typer.Typer(
+app = Typer(
     help="Put a socket on the limb and load it (fit, the default), or design one.",
     cls=WithDefault,
     rich_markup_mode=None,
 )
-Parameters = Annotated[
-    str | None,
-    typer.Option(help="the law's parameters of each tissue; default: identified, or those of people"),
-]
-Literature = Annotated[
-    bool, typer.Option("--literature", help="tissues of people, even where some were identified")
-]
+Parameters = Annotated[str | None, Option(help="parameters of each tissue; default: identified, or people's")]
+Literature = Annotated[bool, Option("--literature", help="tissues of people, even if some were identified")]
 
 
 def fit(
     study: StudyPath,
     parameters: Parameters = None,
     literature: Literature = False,
-    samples: Annotated[
-        int | None,
-        typer.Option(
-            help="draws of the identified parameters to simulate too, for intervals beyond first order", min=2
-        ),
-    ] = None,
-    models: Annotated[
-        bool,
-        typer.Option("--models", help="also with every model that limbfit uncertainty --models found likely"),
-    ] = False,
+    samples: Annotated[int | None, Option(help="draws of parameters to simulate as well", min=2)] = None,
+    models: Annotated[bool, Option("--models", help="with those of limbfit uncertainty --models")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Put a socket on the limb and load it: pressure and shear by region, settling, the report."""
     _check_choice(parameters, literature)
     if models:
         if parameters is not None or literature or samples:
-            raise InputError(
-                "models have parameters of their own",
-                place="--models",
-                remedy="leave out --parameters, --literature and --samples",
-            )
+            remedy = "leave out --parameters, --literature and --samples"
+            raise InputError("models have parameters of their own", place="--models", remedy=remedy)
         result = call_on_study(study, limbfit.fit_socket_of_models)
         print_stored(result, "models_socket", show_socket_models, as_json)
         return
@@ -108,20 +92,16 @@ def show_socket(found: SocketResult) -> None:
                 interval = format_ends(state.settling_interval_mm, ".1f")
                 cause = _format_main_cause(state.settling_interval_from)
                 settled += f" (95 %: {interval}, mostly from {cause})"
-        print_line(
-            f"{name}: {state.peak_kPa:.0f} kPa at most, in touch over "
-            f"{state.contact_area_mm2 / 100:.0f} cm2{settled}"
-        )
+        area = f"in touch over {state.contact_area_mm2 / 100:.0f} cm2"
+        print_line(f"{name}: {state.peak_kPa:.0f} kPa at most, {area}{settled}")
         print_table(state.regions, LOAD_COLUMNS)
     if found.samples:
         words = "".join(f"; another failed: {reason}" for reason in found.samples.failed)
         print_line(f"95 %: by derivatives and {found.samples.simulated} simulated draws{words}")
     if found.worn_s:
         print_line(f"95 %: with what relaxation may do until the socket has been worn for {found.worn_s:g} s")
-    print_line(
-        f"tissues: {found.parameters_from}; contact balances the loads within "
-        f"{found.balance_percent:.2g} %; not a medical device"
-    )
+    balance = f"contact balances the loads within {found.balance_percent:.2g} %"
+    print_line(f"tissues: {found.parameters_from}; {balance}; not a medical device")
     print_warnings(found.outside_text)
 
 
@@ -145,13 +125,8 @@ LOAD_COLUMNS: dict[str, Column] = {
 
 def design(
     study: StudyPath,
-    optimise: Annotated[
-        str,
-        typer.Option(help="regions whose peaks are to be lowered further, separated by commas"),
-    ] = "",
-    simulations: Annotated[
-        int | None, typer.Option(help="with --optimise: how many more, at most; default: 6", min=1)
-    ] = None,
+    optimise: Annotated[str, Option(help="regions, by commas, whose peaks are to be lowered further")] = "",
+    simulations: Annotated[int | None, Option(help="of --optimise, at most; default: 6", min=1)] = None,
     parameters: Parameters = None,
     literature: Literature = False,
     as_json: AsJson = False,
@@ -180,10 +155,8 @@ def show_design(found: SocketDesignResult) -> None:
         low, high = design.offset_mm
         reduced = design.reduction_percent
         around = f", {reduced:.2f} % less around" if reduced is not None else ""
-        print_line(
-            f"{design.name}: {design.volume_cm3:.0f} cm3, {low:.1f} to {high:.1f} mm from the unloaded "
-            f"limb{around}"
-        )
+        volume = f"{design.name}: {design.volume_cm3:.0f} cm3"
+        print_line(f"{volume}, {low:.1f} to {high:.1f} mm from the unloaded limb{around}")
         columns[design.name] = (design.name, ".0f")
     starred = optimisation.regions if optimisation else ()
     rows = [
@@ -193,15 +166,11 @@ def show_design(found: SocketDesignResult) -> None:
     ]
     print_table(rows, {"region, peak (kPa)": "region", **columns}, dash="")
     if optimisation:
-        beyond = ", ".join(optimisation.beyond_limits)
-        print_line(
-            f"* optimised in {len(optimisation.trials) - 1} simulations; "
-            + (f"beyond its limit: {beyond}" if beyond else "all others within their limits")
-        )
-    print_line(
-        f"socket.stl: the {wall.of} with a wall of {wall.stated_mm:g} mm, measured "
-        f"{wall.least_mm:.2f} mm at least; not a medical device"
-    )
+        beyond = f"beyond its limit: {', '.join(optimisation.beyond_limits)}"
+        rest = beyond if optimisation.beyond_limits else "all others within their limits"
+        print_line(f"* optimised in {len(optimisation.trials) - 1} simulations; {rest}")
+    thickness = f"{wall.stated_mm:g} mm, measured {wall.least_mm:.2f} mm at least"
+    print_line(f"socket.stl: the {wall.of} with a wall of {thickness}; not a medical device")
 
 
 def _check_choice(parameters: str | None, literature: bool) -> None:

@@ -1,6 +1,6 @@
 """The mechanics: viscoelastic indentation of soft tissue by a rigid body, with exact sensitivities.
 
->>> from limbfit.bench.blocks import build_layered_block
+>>> from limbfit.bench.timing import build_layered_block
 >>> from limbfit.fe import History, Indenter, OgdenQLV, Problem, StepControl, solve
 >>> mesh = build_layered_block("tet10", 2)                                         # skin over muscle, mm
 >>> skin = OgdenQLV(c=0.009, m=6.0, gamma=2.0, tau=0.5)                      # MPa, -, -, s

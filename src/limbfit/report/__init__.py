@@ -6,7 +6,7 @@ Graphics are loaded when a report is made, not when a study is run.
 from importlib import import_module
 from typing import Any
 
-_HOME = {"build_report": "build", "draw_cube": "sections.cube"}
+_HOME = {"build_report": "build", "draw_cube": "sections.variants"}
 __all__ = [*_HOME]
 
 

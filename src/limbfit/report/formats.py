@@ -1,4 +1,4 @@
-"""Numbers, times and parameters as the report writes them."""
+"""Numbers, times and parameters as the report writes them; ``format_fixed`` is the filter ``fixed``."""
 
 from typing import Any
 
@@ -43,7 +43,7 @@ def format_parameter(name: str) -> str:
     return f"{tissue} {format_symbol(kind)}".strip()
 
 
-def get_unit(key: str) -> str:
+def format_unit(key: str) -> str:
     """Its unit: ``tau_s`` is in s."""
     return split_key(key)[1] or NOTHING
 

@@ -9,21 +9,12 @@ from typing import Any, TypeVar
 from ..arrays import Array
 from ..errors import InputError
 from ..laws import TissueLaw
-from ..results.base import Interval, ResultPart, StoredResult
-from ..results.curves import read_curves
-from ..results.identification import (
-    CalibrationResult,
-    CalibrationUncertainty,
-    PredictResult,
-    RecordPrediction,
-    SearchStage,
-)
-from ..results.limb import MeshMeasures, MeshResult, PlacedSite, SegmentResult, SitesResult, SurfacesResult
-from ..results.models import ModelsResult
-from ..results.records import TraceFacts, TracesResult
+from ..results import identification, limb
+from ..results.base import Interval, ResultPart, StoredResult, read_curves
 from ..results.runs import CompareResult, RunResult, SimulateResult, is_current
 from ..results.socket import SocketResult
 from ..results.study_results import MODELS
+from ..results.uncertainty import ModelsResult
 from .formats import format_fixed, format_symbol
 
 Curves = dict[str, Array]
@@ -44,13 +35,13 @@ class Results:
 
     folder: Path
     run: RunResult | None
-    segment: SegmentResult | None
-    surfaces: SurfacesResult | None
-    sites: Sequence[PlacedSite]
-    traces: Mapping[str, TraceFacts]
-    mesh: Mapping[str, MeshMeasures]
-    calibration: CalibrationResult | None
-    predict: PredictResult | None
+    segment: limb.SegmentResult | None
+    surfaces: limb.SurfacesResult | None
+    sites: Sequence[limb.PlacedSite]
+    traces: Mapping[str, limb.TraceFacts]
+    mesh: Mapping[str, limb.MeshMeasures]
+    calibration: identification.CalibrationResult | None
+    predict: identification.PredictResult | None
     simulated: tuple[SimulateResult, ...]
     compared: tuple[CompareResult, ...]
     truth: Json
@@ -65,7 +56,7 @@ class Results:
         return tuple(known or self.traces)
 
     @property
-    def predicted(self) -> Sequence[RecordPrediction]:
+    def predicted(self) -> Sequence[identification.RecordPrediction]:
         """A row of each record."""
         return self.predict.sites if self.predict else ()
 
@@ -90,7 +81,7 @@ class Results:
         return found if isinstance(found, SocketResult) else None
 
     @property
-    def stages(self) -> Sequence[SearchStage]:
+    def stages(self) -> Sequence[identification.SearchStage]:
         """The stages of the identification, one material first."""
         return self.calibration.stages if self.calibration else ()
 
@@ -120,7 +111,7 @@ class Results:
         return format_fixed(mean) if sd is None else f"{format_fixed(mean)} ± {format_fixed(sd)}"
 
     @property
-    def uncertainty(self) -> CalibrationUncertainty | None:
+    def uncertainty(self) -> identification.CalibrationUncertainty | None:
         """What the calibration says of its intervals."""
         return self.calibration.uncertainty if self.calibration else None
 
@@ -151,7 +142,7 @@ class Results:
         return {name: path for name, path in files.items() if path.is_file()}
 
     @property
-    def placed_sites(self) -> dict[str, PlacedSite]:
+    def placed_sites(self) -> dict[str, limb.PlacedSite]:
         """The sites by name."""
         return {row.site: row for row in self.sites}
 
@@ -182,7 +173,7 @@ class Results:
         return next((file for file in files if file.is_file()), None)
 
 
-def name_compared(rows: Sequence[RecordPrediction]) -> str:
+def name_compared(rows: Sequence[identification.RecordPrediction]) -> str:
     """What records compare: ``force``, ``displacement`` where they state the force, or either."""
     forced = [row.control == "force" for row in rows]
     return "force" if not any(forced) else "displacement" if all(forced) else "force or displacement"
@@ -194,17 +185,15 @@ def find_compared_quantity(curves: Curves) -> tuple[str, str]:
 
 
 def load_store(results: Path) -> Results:
-    """Read what is below ``results``. Raises `InputError` when there is no such folder, or a summary in it is
-    not readable.
-    """
+    """Read what is below ``results``; `InputError` where it is no folder, or a summary is not readable."""
     if not results.is_dir():
         raise InputError("no results there", file=results, remedy="run the study first")
-    run, calibration = RunResult.find(results), CalibrationResult.find(results)
-    sites, traces, mesh = SitesResult.find(results), TracesResult.find(results), MeshResult.find(results)
+    run, calibration = RunResult.find(results), identification.CalibrationResult.find(results)
+    sites, traces = limb.SitesResult.find(results), limb.TracesResult.find(results)
+    mesh, models = limb.MeshResult.find(results), ModelsResult.find(results)
     experiments = run.experiments if run else {}
     done = [name for name, row in experiments.items() if row.state == "done"]
     outdated = [name for name, row in experiments.items() if row.state == "stale"]
-    models = ModelsResult.find(results)
     # Other models have no stamp: they belong to the identification whose parameters stand beside theirs.
     if models and not (calibration and models.models[0].parameters == calibration.parameters):
         models = None
@@ -217,13 +206,13 @@ def load_store(results: Path) -> Results:
         folder=results,
         run=run,
         # Of a study that has surfaces now it is what an image left that it had before.
-        segment=None if run and "segment" not in run.stages else SegmentResult.find(results),
-        surfaces=SurfacesResult.find(results),
+        segment=None if run and "segment" not in run.stages else limb.SegmentResult.find(results),
+        surfaces=limb.SurfacesResult.find(results),
         sites=sites.sites if sites else (),
         traces=traces.sites if traces else {},
         mesh=mesh.sites if mesh else {},
         calibration=calibration,
-        predict=PredictResult.find(results),
+        predict=identification.PredictResult.find(results),
         simulated=tuple(simulated.values()),
         compared=tuple(compared.values()),
         truth=_read_json(results / "truth.json"),

@@ -20,20 +20,9 @@ def make_environment(undefined: type[Undefined] = StrictUndefined, **options: An
     """Templates that read attributes of stored results and write numbers as the report does."""
     options |= {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
     environment = Environment(loader=TEMPLATES, undefined=undefined, **options)
-    environment.filters |= {
-        "fixed": formats.format_fixed,
-        "number": formats.format_number,
-        "limits": formats.format_limits,
-        "label": formats.format_parameter,
-        "symbol": formats.format_symbol,
-        "friction": formats.format_friction,
-        "unit": formats.get_unit,
-        "with_unit": formats.format_with_unit,
-        "count": formats.format_count,
-        "duration": formats.format_duration,
-        "form": format,
-        "sentence": _make_sentence,
-    }
+    named = ((name.partition("format_")[2], function) for name, function in vars(formats).items())
+    environment.filters |= {name: function for name, function in named if name}
+    environment.filters |= {"form": format, "sentence": _make_sentence}
     return environment
 
 

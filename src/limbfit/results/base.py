@@ -1,12 +1,14 @@
-"""What every stored result is: a frozen model that knows its keys, checked when written and when read."""
+"""What every stored result is: a frozen model that is checked when written and read; and curves as CSV."""
 
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
+from ..arrays import Array
 from ..errors import InputError
 
 Parameters = dict[str, dict[str, float]]  # by tissue, then by key
@@ -37,13 +39,7 @@ class ResultPart(BaseModel):
 
     @classmethod
     def read_file(cls, file: Path, remedy: str) -> Self:
-        """Read a file that is there.
-
-        Raises
-        ------
-        InputError
-            In one line, for a file that is not JSON or has not the keys of this version.
-        """
+        """Read a file that is there. Raises `InputError` where it is no JSON, or has other keys."""
         try:
             return cls.model_validate(json.loads(file.read_text(encoding="utf-8")))
         except ValidationError as error:
@@ -63,10 +59,7 @@ class StoredResult(ResultPart):
 
     @classmethod
     def find(cls, results: Path, name: str = "") -> Self | None:
-        """Read it from a results folder, ``name`` in place of the star; None where it is not there.
-
-        Raises `InputError` as `read_file`.
-        """
+        """Read it, ``name`` in place of the star; None where it is not there. Errors as `read_file`."""
         file = results / cls.FILE.replace("*", name)
         return cls.read_file(file, f"run {cls.COMMAND} again") if file.is_file() else None
 
@@ -98,3 +91,16 @@ def _describe_first(error: ValidationError) -> str:
     if first["type"] == "extra_forbidden":
         return f"has an unknown key {key!r}: another version of limbfit wrote it"
     return f"is wrong at {key!r}: {first['msg']}"
+
+
+def read_curves(file: Path) -> dict[str, Array]:
+    """Read the columns (n,) of a CSV of numbers, by their heads. Raises `InputError` for any other file."""
+    lines = file.read_text(encoding="utf-8").splitlines()
+    names = [name.strip() for name in lines[0].split(",")] if lines else []
+    try:
+        values = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
+    except ValueError as error:
+        raise InputError(f"not readable: {error}", file=file, remedy="run its stage again") from None
+    if values.shape[1:] != (len(names),):
+        raise InputError("its rows do not fit its header", file=file, remedy="run its stage again")
+    return {name: values[:, i] for i, name in enumerate(names)}

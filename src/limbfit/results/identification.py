@@ -6,7 +6,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from .base import Interval, Intervals, Matrix, Parameters, ResultPart, StoredResult
-from .records import RecordFlag
+from .limb import RecordFlag
 
 
 class SimulationDoubt(ResultPart):
@@ -202,9 +202,7 @@ class CalibrationUncertainty(ResultPart):
     most_probable: Parameters = Field(description="The most probable parameters.")
     priors: PriorShares | None = Field(description="The priors; null where none were stated.")
     residuals: ResidualsSummary = Field(description="What the residuals are made of.")
-    minus_2_log_evidence: float = Field(
-        description="Minus twice the logarithm of how probable the records are, to compare models by."
-    )
+    minus_2_log_evidence: float = Field(description="Minus twice the log-evidence, to compare models by.")
     relaxation: RelaxationSummary | None = Field(
         description="Relaxation beyond the records; null for laws without Ogden's relaxation terms."
     )
@@ -216,12 +214,8 @@ class MeshCorrectionRound(ResultPart):
     stage: str = Field(description="Stage of the search, or `start`.")
     parameters: Parameters = Field(description="Parameters at which the meshes were compared.")
     scale_by_site: Mapping[str, float | None] = Field(description="Factor of the force, by record.")
-    difference_percent_by_site: Mapping[str, float | None] = Field(
-        description="Difference of the forces, of the largest."
-    )
-    change_percent_by_site: Mapping[str, float | None] = Field(
-        description="Difference from what the correction before expected."
-    )
+    difference_percent_by_site: Mapping[str, float | None] = Field(description="Difference, of the largest.")
+    change_percent_by_site: Mapping[str, float | None] = Field(description="Change from what was expected.")
     reason: str = Field(description="Why a record could not be corrected; empty where all could.")
 
 
@@ -254,9 +248,7 @@ class ContactSummary(ResultPart):
     unbalanced_steps: int | None = Field(description="Steps in equilibrium to less than the tolerance.")
     search_penalty_per_mm: float | None = Field(description="Penalty on the mesh of the search.")
     penetration_mm: float = Field(description="How deep the indenter is in the skin at most.")
-    from_rest_percent: float | None = Field(
-        description="Difference of the force from rest from the fitted one, of the largest."
-    )
+    from_rest_percent: float | None = Field(description="Difference of the force from rest, of the largest.")
 
 
 class CalibrationResult(StoredResult):

@@ -29,13 +29,7 @@ _WORDS: Mapping[Any, str] = {
 
 
 def build_schema(result: str) -> dict[str, Any]:
-    """Build the JSON schema of a stored result.
-
-    Raises
-    ------
-    InputError
-        For a name that no result has.
-    """
+    """Build the JSON schema of a stored result. Raises `InputError` for a name that no result has."""
     if result not in MODELS:
         raise InputError(f"no result is named {result!r}", remedy=f"use {', '.join(MODELS)}")
     return MODELS[result].model_json_schema()
@@ -66,9 +60,8 @@ def _list_parts(model: type[ResultPart]) -> Iterator[type[ResultPart]]:
         here = waiting.pop(0)
         if here not in found:
             found.append(here)
-            waiting += [
-                part for field in here.model_fields.values() for part in _find_models(field.annotation)
-            ]
+            for field in here.model_fields.values():
+                waiting += _find_models(field.annotation)
     yield from found
 
 

@@ -103,9 +103,7 @@ class SimulateResult(StoredResult):
     warnings: Sequence[str] = Field(description="What is doubtful, in words.")
     element: str = Field(description="Type of the cells.")
     unknowns: int = Field(description="Number of unknowns.")
-    outside_records: Sequence[OutsideRecords] | None = Field(
-        description="What it does that no fitted record did; null where that is not known."
-    )
+    outside_records: Sequence[OutsideRecords] | None = Field(description="What of it no fitted record did.")
     outside_text: Sequence[str] = Field(description="That in words.")
     curve: str = Field(description="File of the curve, beside this one.")
     fields: str | None = Field(description="File of the fields, beside this one.")

@@ -22,9 +22,7 @@ class LoadedRegion(ResultPart):
     interval_from: Mapping[str, float] | None = Field(
         description="Percent of its squared width that each parameter, or `relaxation`, is the cause of."
     )
-    change_kPa: Mapping[str, float] | None = Field(
-        description="Change of the mean pressure where a parameter is 10 % larger."
-    )
+    change_kPa: Mapping[str, float] | None = Field(description="Change of the mean, a parameter 10 % larger.")
     relaxation_kPa: tuple[float, float, float] | None = Field(
         description="By relaxation beyond the records: shift, standard deviation, largest fall."
     )
@@ -58,9 +56,7 @@ class SocketState(ResultPart):
     shear_peak_kPa: float = Field(description="Largest shear.")
     regions: Sequence[LoadedRegion] = Field(description="Each region.")
     inside: Sequence[TissueStrainInside] = Field(description="Strain of each tissue.")
-    loading: Sequence[QuantityRange] | None = Field(
-        default=None, description="What it does to the tissue; null where no records compare."
-    )
+    loading: Sequence[QuantityRange] | None = Field(default=None, description="What it does to the tissue.")
     outside_records: Sequence[OutsideRecords] | None = Field(
         default=None, description="What of it no fitted record did."
     )

@@ -7,16 +7,13 @@ from typing import Protocol, TypeVar
 from ..arrays import Array
 from ..errors import InputError
 from . import variants
-from .base import StoredResult
-from .curves import read_curves
+from .base import StoredResult, read_curves
 from .identification import CalibrationResult, PredictResult
-from .limb import MeshResult, QualityResult, SegmentResult, SitesResult, SurfacesResult
-from .models import ModelsResult, SocketOfModels
+from .limb import MeshResult, QualityResult, SegmentResult, SitesResult, SurfacesResult, TracesResult
 from .planning import DesignResult, ProtocolResult
-from .records import TracesResult
 from .runs import CompareResult, RunResult, SimulateResult, StageStamp
 from .socket import SocketDesignResult, SocketResult
-from .uncertainty import CrossvalidateResult, RegionsResult, UncertaintyResult
+from .uncertainty import CrossvalidateResult, ModelsResult, RegionsResult, SocketOfModels, UncertaintyResult
 
 R = TypeVar("R", bound=StoredResult)
 
@@ -103,21 +100,10 @@ MODELS: dict[str, type[StoredResult]] = {  # of each stored result, by its attri
 
 
 def load_results(study: HasResults | str | Path) -> StudyResults:
-    """Load the stored results of a study, stale or not.
+    """Load the stored results, stale or not, of a study, of its file or of its folder.
 
-    Parameters
-    ----------
-    study : a study, its file or its folder.
-
-    Returns
-    -------
-    StudyResults
-        ``load_results(study).predict.sites[0].error_percent``, for example.
-
-    Raises
-    ------
-    InputError
-        Where nothing is stored.
+    ``load_results(study).predict.sites[0].error_percent``, for example. Raises `InputError` where nothing is
+    stored.
     """
     if isinstance(study, str | Path):
         study = Path(study).parent if Path(study).is_file() else Path(study)

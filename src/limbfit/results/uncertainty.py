@@ -1,4 +1,4 @@
-"""How far the answer can be trusted: the experiments `uncertainty`, `crossvalidate` and `regions`."""
+"""How far to trust the answer: the experiments `uncertainty`, `crossvalidate`, `regions`; other models."""
 
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
@@ -19,9 +19,7 @@ class ParameterUncertainty(ResultPart):
     posterior_95: Interval = Field(description="95 % interval of the posterior.")
     profile_95: Interval | None = Field(description="95 % interval of the profile; null where it has none.")
     profile_verdict: str | None = Field(description="What the profile says, in words.")
-    profile_extrapolated: tuple[bool, bool] | None = Field(
-        description="Whether each end of it is beyond the emulator's runs."
-    )
+    profile_extrapolated: tuple[bool, bool] | None = Field(description="Whether each end is beyond the runs.")
     with_sources_95: Interval = Field(description="95 % interval with all sources counted.")
     verdict: str = Field(description="How well it is determined with all sources, in words.")
 
@@ -292,3 +290,70 @@ class RegionsResult(StoredResult):
     regions: Sequence[RegionFitted] = Field(description="Each region.")
     mean_own_error_percent: float | None = Field(description="Mean error with the regions' parameters.")
     mean_whole_error_percent: float | None = Field(description="Mean error with the whole limb's.")
+
+
+class ModelWeight(ResultPart):
+    """A model, and how likely the fitted records make it."""
+
+    model: str = Field(description="Its name in `--models`; the study's own model comes first.")
+    words: str = Field(description="What it is.")
+    weight: float = Field(description="Its probability; all are alike before the records are seen.")
+
+
+class CalibratedModel(ModelWeight):
+    """A model that was calibrated on the fitted records."""
+
+    evidence: float = Field(description="2 ln B against the study's own model; positive: preferred to it.")
+    error_fitted_percent: float | None = Field(description="Mean error at fitted sites.")
+    error_heldout_percent: float | None = Field(description="Mean error at held-out sites; null: none.")
+    parameters: Parameters = Field(description="Its identified parameters.")
+
+
+class MixedPrediction(ResultPart):
+    """A record's largest value, predicted by the study's own model and by all."""
+
+    site: str = Field(description="Name of the site.")
+    record: str = Field(description="Name of the record.")
+    fitted: bool = Field(description="Whether the record was fitted.")
+    unit: str = Field(description="Unit of the values: `N` or `mm`.")
+    peak: float = Field(description="The largest measured value.")
+    own_interval_95: Interval = Field(description="95 % interval there, by the study's own model.")
+    interval_95: Interval = Field(description="95 % interval there, by all models.")
+    sd_between_models: float = Field(description="Standard deviation between the models there.")
+    inside_percent: float = Field(description="Measured values inside the band of all models.")
+
+
+class ModelsResult(StoredResult):
+    """Other models of the same records."""
+
+    FILE: ClassVar = "models/models.json"
+    COMMAND: ClassVar = "limbfit uncertainty --models"
+
+    models: Sequence[CalibratedModel] = Field(description="The models, the study's own first.")
+    records: Sequence[MixedPrediction] = Field(description="The records that every model predicts.")
+    left_out: Mapping[str, str] = Field(description="Models that the study cannot have, and why.")
+
+
+class MixedPressure(ResultPart):
+    """The mean pressure of a region, by each model and by all."""
+
+    region: str = Field(description="Name of the region.")
+    mean_kPa: Sequence[float] = Field(description="Mean pressure by each of the models, in their order.")
+    interval_kPa: Interval = Field(description="95 % interval by all models.")
+
+
+class MixedLoad(ResultPart):
+    """Donning or a load."""
+
+    name: str = Field(description="Its name.")
+    regions: Sequence[MixedPressure] = Field(description="The regions.")
+
+
+class SocketOfModels(StoredResult):
+    """The study's socket on the limb, with every model that counts."""
+
+    FILE: ClassVar = "models/socket.json"
+    COMMAND: ClassVar = "limbfit socket --models"
+
+    models: Sequence[ModelWeight] = Field(description="The models, the study's own first if it counts.")
+    loads: Sequence[MixedLoad] = Field(description="Donning, then each load.")

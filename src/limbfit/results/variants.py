@@ -58,9 +58,7 @@ class ForceDerivative(ResultPart):
     region: str | None = Field(description="Region of the limb.")
     tissue_mm: float = Field(description="Distance to the nearest bone.")
     completed: bool = Field(description="Whether the simulation came to its end.")
-    peak_percent_per_percent: Mapping[str, float | None] = Field(
-        description="Percent of the largest force for a percent of each tissue's modulus."
-    )
+    peak_percent_per_percent: Mapping[str, float | None] = Field(description="Percent of force, by tissue.")
 
 
 class StiffnessResult(VariedResult):

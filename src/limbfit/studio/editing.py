@@ -130,9 +130,8 @@ def _find(rows: Any, name: str, file: Path, place: str) -> Any:
     """The table of this name in the list at ``place``. Raises `StudyError` where there is none."""
     found = _find_named(rows, name)
     if found is None:
-        raise StudyError(
-            f"no {place.split('.')[-1].removesuffix('s')} is named {name!r}", file=file, place=place
-        )
+        kind = place.split(".")[-1].removesuffix("s")
+        raise StudyError(f"no {kind} is named {name!r}", file=file, place=place)
     return found
 
 

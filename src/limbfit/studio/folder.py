@@ -11,6 +11,8 @@ from ..pipeline.commands.acquire import FOLDER as ACQUIRED
 from ..pipeline.engine.store import Store
 from ..study import Study, load_study
 
+Json = dict[str, Any]  # what an answer holds
+
 
 @dataclass(frozen=True)
 class StudyFolder:
@@ -50,17 +52,14 @@ class StudyFolder:
         """A fingerprint of each thing that a page may have to read again."""
         results = self.results
         work = results.glob(".work-calibrate-*/runs")
-        return {
-            "study": compute_fingerprint([self.file]),
-            "stages": compute_fingerprint(
-                [*sorted(results.glob("*/stage.json")), *sorted(results.glob(".work-*"))]
-            ),
-            "labels": compute_fingerprint(
-                results / place / "labels.seg.nrrd" for place in ("segment", "by-hand")
-            ),
-            "log": compute_fingerprint([*self.logs[-1:], *work]),
-            "acquired": compute_fingerprint(sorted(self.folder.glob(f"{ACQUIRED}/*/*"))),
+        files: dict[str, Iterable[Path]] = {
+            "study": [self.file],
+            "stages": [*sorted(results.glob("*/stage.json")), *sorted(results.glob(".work-*"))],
+            "labels": [results / place / "labels.seg.nrrd" for place in ("segment", "by-hand")],
+            "log": [*self.logs[-1:], *work],
+            "acquired": sorted(self.folder.glob(f"{ACQUIRED}/*/*")),
         }
+        return {topic: compute_fingerprint(paths) for topic, paths in files.items()}
 
 
 def resolve_inside(root: Path, *parts: str) -> Path:

@@ -2,15 +2,14 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 from fastapi import APIRouter
 
 from ..pipeline.commands.run import STAGE_NAMES
 from ..pipeline.simulation.simulations import find_newest_simulation
-from ..results.curves import read_curves
+from ..results.base import read_curves
 from ..results.identification import CalibrationResult
-from .folder import StudyFolder
+from .folder import Json, StudyFolder
 from .processes import find_running, find_starting, start_run, stop_run
 from .study_routes import Folder, StrictModel, list_stage_states, list_stages
 
@@ -29,7 +28,7 @@ class RunRequest(StrictModel):
 
 
 @router.get("")
-def get_identification(folder: Folder) -> dict[str, Any]:
+def get_identification(folder: Folder) -> Json:
     """The stages and their states, the current or last run, the iterates of the search, and its answer."""
     recorded, stages = folder.load().recorded, list_stages(folder)
     calibration = CalibrationResult.find(folder.results)
@@ -48,7 +47,7 @@ def get_identification(folder: Folder) -> dict[str, Any]:
 
 
 @router.get("/curves/{name}")
-def get_curves(folder: Folder, name: str) -> dict[str, Any]:
+def get_curves(folder: Folder, name: str) -> Json:
     """A record's measured force, and the simulated ones: predicted, or the newest while it is searched.
 
     Time in s from touch-down, displacement in mm, force in N; under a stated force it is the displacements
@@ -72,18 +71,18 @@ def get_curves(folder: Folder, name: str) -> dict[str, Any]:
 
 
 @router.post("/start")
-def post_start(folder: Folder, request: RunRequest) -> dict[str, Any]:
+def post_start(folder: Folder, request: RunRequest) -> Json:
     """Start or resume ``limbfit run`` with these options, as a process of its own."""
     return start_run(folder, request.until, request.start, request.force)
 
 
 @router.post("/stop")
-def post_stop(folder: Folder) -> dict[str, Any]:
+def post_stop(folder: Folder) -> Json:
     """Stop the run; what it has finished is kept, and another run goes on from there."""
     return stop_run(folder)
 
 
-def _describe_answer(calibration: CalibrationResult) -> dict[str, Any]:
+def _describe_answer(calibration: CalibrationResult) -> Json:
     keys = {"name", "cost", "evaluations", "converged", "reason", "parameters"}
     known = {"intervals_95", "correlation", "verdict", "at_bound", "combinations"}
     return {
@@ -94,9 +93,7 @@ def _describe_answer(calibration: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def _collect_iterates(
-    folder: StudyFolder, state: str, calibration: CalibrationResult | None
-) -> dict[str, Any]:
+def _collect_iterates(folder: StudyFolder, state: str, calibration: CalibrationResult | None) -> Json:
     """The iterates of a search that runs or was stopped; those of the stored answer otherwise."""
     if state != "done":
         stamp = folder.store.stamp("calibrate")
@@ -115,7 +112,7 @@ def _collect_iterates(
     return {"of": "answer", "rows": rows}
 
 
-def describe_last_run(folder: StudyFolder, is_running: bool) -> dict[str, Any] | None:
+def describe_last_run(folder: StudyFolder, is_running: bool) -> Json | None:
     """The run of the newest log: its command, how it ended, and its last progress; None without a log."""
     if not folder.logs:
         return None
@@ -125,18 +122,17 @@ def describe_last_run(folder: StudyFolder, is_running: bool) -> dict[str, Any] |
     if end is None:
         end = "running" if is_running else "ended without a message: it was killed, or memory ran out"
     keys = ("stage", "done", "total", "text")
+    lines = [{"seconds": row["seconds"], **{k: row.get(k) for k in keys}} for row in progress[-LAST_LINES:]]
     return {
         "what": events[0].get("what") if events else None,
         "state": end,
         "error": events[-1].get("text") if end == "failed" else None,
         "now": {key: progress[-1].get(key) for key in keys} if progress else None,
-        "lines": [
-            {"seconds": row["seconds"], **{k: row.get(k) for k in keys}} for row in progress[-LAST_LINES:]
-        ],
+        "lines": lines,
     }
 
 
-def _read_events(log: Path) -> list[dict[str, Any]]:
+def _read_events(log: Path) -> list[Json]:
     """The events of a log; the last line may be half written."""
     events = []
     for line in log.read_text(encoding="utf-8", errors="replace").splitlines():

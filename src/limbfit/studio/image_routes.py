@@ -26,7 +26,7 @@ from ..pipeline.engine.digests import compute_file_digest
 from ..pipeline.limb.inputs import read_plain_image
 from ..study import Study
 from .editing import edit_study
-from .folder import StudyFolder
+from .folder import Json, StudyFolder
 from .processes import find_running
 from .study_routes import Folder
 
@@ -49,13 +49,13 @@ class Painting(BaseModel):
 
 
 @router.get("")
-def get_facts(folder: Folder) -> dict[str, Any]:
+def get_facts(folder: Folder) -> Json:
     """Names and colours of the labels, the stored surfaces, and where corrected labels are saved."""
     study = folder.load()
     if study.image is None:
         return {"has_image": False}
     surfaces = sorted(file.name for file in (folder.results / "surfaces").glob("*.stl"))
-    facts: dict[str, Any] = {"has_image": True, "surfaces": surfaces, "labels": None}
+    facts: Json = {"has_image": True, "surfaces": surfaces, "labels": None}
     shown = _find_shown_labels(folder)
     if shown is not None:
         labels = _read_shown_labels(shown)
@@ -92,7 +92,7 @@ def get_labels(folder: Folder) -> Response:
 
 
 @router.post("/labels")
-def post_labels(folder: Folder, painting: Painting) -> dict[str, Any]:
+def post_labels(folder: Folder, painting: Painting) -> Json:
     """Save painted voxels into the study's label map; stages below it turn stale.
 
     It is refused where the labels are others than those that were painted on, and while a run goes on.
@@ -103,9 +103,7 @@ def post_labels(folder: Folder, painting: Painting) -> dict[str, Any]:
     if find_running(folder) is not None:
         raise RunError("a run of this study is in progress; stop it or wait for it before labels are saved")
     if shown.digest != painting.base:
-        raise RunError(
-            "the labels have changed since they were opened here; open them again and repeat the changes"
-        )
+        raise RunError("the labels have changed since they were opened here; open them and change them again")
     labels = _read_shown_labels(shown)
     painted = paint_runs(labels, painting.runs)
     changed = int((painted.array != labels.array).sum())
@@ -175,9 +173,7 @@ def _save_labels(folder: StudyFolder, study: Study, shown: ShownLabels, labels: 
 
 
 def paint_runs(labels: LabelMap, runs: list[tuple[int, int, int]]) -> LabelMap:
-    """The labels with runs of voxels of the page's order set. Raises `InputError` for voxels outside of the
-    map and for labels that it does not have.
-    """
+    """The labels with runs of the page's voxels set; `InputError` for unknown labels and voxels outside."""
     turned = labels.align_axes(PAGE_AXES)
     flat = turned.array.ravel().copy()
     table = np.array(runs, dtype=np.int64)

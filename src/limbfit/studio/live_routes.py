@@ -4,7 +4,7 @@ import math
 import re
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Query
@@ -17,13 +17,14 @@ from ..acquire.quality import Check
 from ..errors import TraceError
 from ..pipeline.commands.acquire import FOLDER as ACQUIRED
 from ..pipeline.commands.acquire import RECORD, VERDICT
-from .folder import StudyFolder, resolve_inside
+from .folder import Json, StudyFolder, resolve_inside
 from .study_routes import Folder
 
 router = APIRouter(prefix="/api/live")
 SAMPLE_STRIDE = 5  # samples: 100 a second
 SILENT_S = 3.0  # blocks come every 50 ms: a record that has not grown for so long is not being written
 RECENT_S = 600.0  # a session that ended longer ago is not shown by itself
+Offset = Annotated[int, Query(ge=0, le=1 << 40)]
 _STAMP = re.compile(r"[0-9]{8}T[0-9]{6}\.[0-9]{3}")
 _PENDING = 1 << 16  # bytes: more than is written between two requests
 _MAX_VERDICT = 1 << 20
@@ -38,7 +39,7 @@ class StoredVerdict(BaseModel):
 
 
 @router.get("")
-def get_session(folder: Folder) -> dict[str, Any]:
+def get_session(folder: Folder) -> Json:
     """The newest session that is being recorded, else the newest that ended lately; null if none."""
     recent = [(age, file.parent) for age, file in _list_records(folder) if age < RECENT_S]
     if not recent:
@@ -48,9 +49,7 @@ def get_session(folder: Folder) -> dict[str, Any]:
 
 
 @router.get("/{site}/{stamp}")
-def get_part(
-    folder: Folder, site: str, stamp: str, offset: Annotated[int, Query(ge=0, le=1 << 40)] = 0
-) -> dict[str, Any]:
+def get_part(folder: Folder, site: str, stamp: str, offset: Offset = 0) -> Json:
     """What the record of a session holds beyond ``offset`` (bytes), at most half a minute of it.
 
     Times in s of limbfit's clock, positions in mm from the pin's home, forces in N, of the test pin.
@@ -81,7 +80,7 @@ def _compute_age(file: Path) -> float:
     return max(time.time() - file.stat().st_mtime, 0.0)
 
 
-def _read(part: Recording, file: Path, first: bool) -> dict[str, Any]:
+def _read(part: Recording, file: Path, first: bool) -> Json:
     try:
         settings = part.head["settings"]
         pin, limit_N = range(PINS)[int(settings["pin"]) - 1], float(settings["force_limit_N"])
@@ -102,7 +101,7 @@ def _read(part: Recording, file: Path, first: bool) -> dict[str, Any]:
     }
 
 
-def _describe_phase(event: dict[str, Any]) -> dict[str, Any]:
+def _describe_phase(event: Json) -> Json:
     touch = event.get("touch_um")
     return {
         "at_s": event["at_us"] / 1e6,
@@ -113,7 +112,7 @@ def _describe_phase(event: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _read_verdict(file: Path) -> dict[str, Any] | None:
+def _read_verdict(file: Path) -> Json | None:
     if not file.is_file():
         return None
     try:

@@ -3,7 +3,7 @@
 import tomllib
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Response
@@ -18,9 +18,9 @@ from ..pipeline.limb.sites import place_site
 from ..pipeline.limb.surfaces import read_given_anatomy
 from ..results.limb import MeshResult, PlacedSite, SitesResult
 from ..study import Site, Study
-from ..web.shapes import build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape
+from ..web import build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape
 from .editing import add_site, remove_site, set_site
-from .folder import StudyFolder, compute_fingerprint
+from .folder import Json, StudyFolder, compute_fingerprint
 from .study_routes import Folder, StrictModel, respond_block
 
 router = APIRouter(prefix="/api/model")
@@ -49,7 +49,7 @@ class SiteChange(StrictModel):
 
 
 @router.get("/scene")
-def get_scene(folder: Folder) -> dict[str, Any]:
+def get_scene(folder: Folder) -> Json:
     """Surfaces by name, the patient's sides, every site as the study file has it now, and what is meshed.
 
     A site without a place (not matched to a marker yet, or off the skin) has ``problem`` in words. Surfaces
@@ -73,16 +73,13 @@ def get_scene(folder: Folder) -> dict[str, Any]:
 
 @router.get("/surface/{name}")
 def get_surface(folder: Folder, name: str) -> Response:
-    """A surface as a block of arrays: ``points``, ``faces``. Raises `InputError` for a name that the model
-    does not have.
-    """
+    """A surface as a block of ``points`` and ``faces``; `InputError` for a name that the model has not."""
     anatomy = read_anatomy(folder, folder.load())
     surface = {SKIN: anatomy.skin, **anatomy.bones}.get(name) if anatomy else None
     if surface is None:
         raise InputError("the model has no such surface", remedy="run the stages until surfaces")
-    return respond_block(
-        {"points": surface.points.astype(np.float32), "faces": surface.faces.astype(np.uint32)}
-    )
+    points, faces = surface.points.astype(np.float32), surface.faces.astype(np.uint32)
+    return respond_block({"points": points, "faces": faces})
 
 
 @router.get("/layer/{site}/{layer}")
@@ -104,7 +101,7 @@ def get_mesh(folder: Folder, site: str) -> Response:
 
 
 @router.post("/sites")
-def post_site(folder: Folder, site: NewSite) -> dict[str, Any]:
+def post_site(folder: Folder, site: NewSite) -> Json:
     """Add a site on the skin; returns the changed scene."""
     position = project_to_skin_of_study(folder, site.position)
     region = {"region": site.region} if site.region else {}
@@ -113,9 +110,9 @@ def post_site(folder: Folder, site: NewSite) -> dict[str, Any]:
 
 
 @router.post("/sites/{name}")
-def post_change(folder: Folder, name: str, change: SiteChange) -> dict[str, Any]:
+def post_change(folder: Folder, name: str, change: SiteChange) -> Json:
     """Move, rename or describe a site, or change whether it is fitted; returns the changed scene."""
-    values: dict[str, Any] = change.model_dump(exclude_none=True)
+    values: Json = change.model_dump(exclude_none=True)
     if change.position is not None:
         _check_movable(folder.load(), name)
         values["position"] = project_to_skin_of_study(folder, change.position)
@@ -125,7 +122,7 @@ def post_change(folder: Folder, name: str, change: SiteChange) -> dict[str, Any]
 
 
 @router.post("/sites/{name}/remove")
-def post_removal(folder: Folder, name: str) -> dict[str, Any]:
+def post_removal(folder: Folder, name: str) -> Json:
     """Take a site out of the study file; its record stays."""
     remove_site(folder.file, name)
     return get_scene(folder)
@@ -156,9 +153,7 @@ def _read_cached_anatomy(folder: StudyFolder, fingerprint: str) -> Anatomy | Non
 
 
 def project_to_skin_of_study(folder: StudyFolder, position: Sequence[float]) -> list[float]:
-    """The point of the skin nearest to a place (LPS, mm). Raises `InputError` where there is no skin, or the
-    place is far off it.
-    """
+    """The point of the skin nearest to a place (LPS, mm); `InputError` where there is none near it."""
     anatomy = read_anatomy(folder, folder.load())
     if anatomy is None:
         raise InputError("there is no skin yet to place a site on", remedy="run the stages until surfaces")
@@ -180,10 +175,8 @@ def _has_made_surfaces(folder: StudyFolder) -> bool:
     return (folder.results / "surfaces" / "surfaces.json").is_file()
 
 
-def _describe_site(
-    site: Site, study: Study, anatomy: Anatomy | None, placed: PlacedSite | None
-) -> dict[str, Any]:
-    row: dict[str, Any] = {
+def _describe_site(site: Site, study: Study, anatomy: Anatomy | None, placed: PlacedSite | None) -> Json:
+    row: Json = {
         **site.model_dump(include={"name", "region", "fitted", "depth_mm"}),
         "has_trace": bool(study.records_at(site)),
         "records": [record.name for record in study.records_at(site)],
@@ -205,18 +198,13 @@ def _describe_site(
 
 
 def _check_movable(study: Study, name: str) -> None:
-    """Refuse to move a site that the markups file places, and an unknown one. Raises `InputError` for such a
-    site.
-    """
+    """Refuse to move an unknown site, or one that the markups file places, by an `InputError`."""
     site = study.site(name)
     if study.markups is None:
         return
     for row in tomllib.loads(study.file.read_text(encoding="utf-8-sig")).get("sites", []):
         if str(row.get("name")) == site.name and ("position" in row or "near" in row):
             return
-    raise InputError(
-        f"site {name} has its place from the markups file {study.markups.file}",
-        file=study.file,
-        place="markups",
-        remedy="move its control point in 3D Slicer",
-    )
+    what = f"site {name} has its place from the markups file {study.markups.file}"
+    remedy = "move its control point in 3D Slicer"
+    raise InputError(what, file=study.file, place="markups", remedy=remedy)

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
-from typing import IO, Any
+from typing import IO
 
 import psutil
 
@@ -26,7 +26,7 @@ from ..pipeline.commands.run import select_stages_to_redo
 from ..pipeline.engine.journal import redact_paths
 from ..pipeline.engine.store import find_holder, is_held
 from ..study import load_study
-from .folder import StudyFolder
+from .folder import Json, StudyFolder
 
 PROGRAM = ("-m", "limbfit")  # for this Python
 VERBS = (("run",), ("socket", "fit"), ("socket", "design"))  # that are started here
@@ -35,7 +35,7 @@ MAX_ERROR_LENGTH = 400  # characters of the error of a failed simulation that ar
 _HOLDER = re.compile(r"process (\d+) \(since ([^)]*)\)")
 
 
-def find_running(folder: StudyFolder) -> dict[str, Any] | None:
+def find_running(folder: StudyFolder) -> Json | None:
     """``process`` and ``since`` of the run that holds the study; None where none does."""
     holder = _HOLDER.match(find_holder(folder.results))
     if holder is None or not psutil.pid_exists(int(holder[1])) or not is_held(folder.results):
@@ -53,9 +53,7 @@ def _build_run_words(folder: StudyFolder, *verb: str) -> list[str]:
     return [*PROGRAM, *verb, str(folder.file.absolute())]  # not what a link names: results are beside it
 
 
-def start_run(
-    folder: StudyFolder, until: str | None, start: str | None, force: Sequence[str]
-) -> dict[str, Any]:
+def start_run(folder: StudyFolder, until: str | None, start: str | None, force: Sequence[str]) -> Json:
     """Start ``limbfit run`` on the study; what it reports goes to the study's log, as always. Raises
     `InputError` where the study cannot be read, a record is yet to be made, or a stage does not exist or
     comes after the last, and `RunError` where a run holds the study.
@@ -67,7 +65,7 @@ def start_run(
     return {"process": start_command([*_build_run_words(folder, "run"), *options], folder.folder)}
 
 
-def start_socket(folder: StudyFolder, *, design: bool) -> dict[str, Any]:
+def start_socket(folder: StudyFolder, *, design: bool) -> Json:
     """Start ``limbfit socket fit`` or ``limbfit socket design`` on the study; the errors of `start_run`."""
     _refuse_busy(folder)
     words = _build_run_words(folder, "socket", "design" if design else "fit")
@@ -82,10 +80,8 @@ def _refuse_busy(folder: StudyFolder) -> None:
         raise RunError(f"process {busy} is running this study; stop it first, or wait for it")
 
 
-def stop_run(folder: StudyFolder) -> dict[str, Any]:
-    """Interrupt the run that holds the study, as Ctrl-C would; finished work is kept. Raises `RunError` where
-    no run holds the study, or it is no ``limbfit`` command.
-    """
+def stop_run(folder: StudyFolder) -> Json:
+    """Interrupt the run, as Ctrl-C would; `RunError` where none holds the study, or no ``limbfit`` does."""
     holder = find_running(folder)
     if holder is None and (early := find_starting(folder)) is not None:
         holder = {"process": early}
@@ -95,16 +91,15 @@ def stop_run(folder: StudyFolder) -> dict[str, Any]:
         process = psutil.Process(holder["process"])
         words = process.cmdline()
         if not any(Path(word).name in ("limbfit", "limbfit.exe") for word in words[:4]):
-            raise RunError(
-                f"process {process.pid}, which holds this study, is no limbfit command; end it where it runs"
-            )
+            what = f"process {process.pid}, which holds this study, is no limbfit command"
+            raise RunError(f"{what}; end it where it runs")
         interrupt_process(process.pid)
     except psutil.Error:
         raise RunError(f"process {holder['process']} cannot be interrupted; end it where it runs") from None
     return holder
 
 
-def find_simulating(folder: StudyFolder) -> dict[str, Any] | None:
+def find_simulating(folder: StudyFolder) -> Json | None:
     """``process`` and ``site`` of the simulation that this study has running; None where it has none."""
     begin = _build_simulation_words(folder)
     command = find_command(begin)
@@ -115,10 +110,8 @@ def _build_simulation_words(folder: StudyFolder) -> list[str]:
     return [*_build_run_words(folder, "simulate"), "--animation", "--site"]
 
 
-def start_simulation(folder: StudyFolder, site: str) -> dict[str, Any]:
-    """Simulate a site with the fields of every step. Raises `InputError` for a site that the study does not
-    have, and `RunError` where the study is being run or a simulation goes on.
-    """
+def start_simulation(folder: StudyFolder, site: str) -> Json:
+    """Simulate a site with all fields; `InputError` for an unknown one, `RunError` where another goes on."""
     name = folder.load().indentation(site).name
     holder = find_running(folder) or find_simulating(folder)
     if holder is not None:
@@ -134,10 +127,8 @@ def _find_output_file(folder: StudyFolder, site: str) -> Path:
     return folder.results / "simulate" / f".{site}.said"
 
 
-def stop_simulation(folder: StudyFolder) -> dict[str, Any]:
-    """Interrupt the simulation, as Ctrl-C would; the steps it has stored stay. Raises `RunError` where none
-    goes on.
-    """
+def stop_simulation(folder: StudyFolder) -> Json:
+    """Interrupt the simulation; the steps it has stored stay. Raises `RunError` where none goes on."""
     simulation = find_simulating(folder)
     if simulation is None:
         raise RunError("no simulation is running: there is nothing to stop")

@@ -18,12 +18,12 @@ from ..mesh import read_grid, read_vtu
 from ..phases import find_loading_end, find_phases
 from ..pipeline.commands.export import export_study
 from ..pipeline.engine.storage import read_json, write_json
-from ..results.curves import read_curves
+from ..results.base import read_curves
 from ..results.identification import CalibrationResult, PredictResult
 from ..results.runs import SimulateResult, is_current
-from ..web.shapes import to_volume_shape
+from ..web import to_volume_shape
 from . import processes
-from .folder import StudyFolder, compute_fingerprint
+from .folder import Json, StudyFolder, compute_fingerprint
 from .study_routes import Folder, StrictModel, list_stage_states, respond_block
 
 router = APIRouter(prefix="/api/results")
@@ -72,7 +72,7 @@ class KeptRunName(StrictModel):
 
 
 @router.get("")
-def get_outcome(folder: Folder, kept: str | None = None) -> dict[str, Any]:
+def get_outcome(folder: Folder, kept: str | None = None) -> Json:
     """Parameters with intervals and verdicts, errors by site and their means, what is outside the records.
 
     ``kept`` is the name of a kept run; by default the study's own results are read, and tables are empty
@@ -97,7 +97,7 @@ def get_outcome(folder: Folder, kept: str | None = None) -> dict[str, Any]:
 
 
 @router.get("/site/{site}")
-def get_site(folder: Folder, site: str) -> dict[str, Any]:
+def get_site(folder: Folder, site: str) -> Json:
     """The stored fields and files of a site, and the state of its simulation."""
     return {
         "sources": _list_sources(folder, folder.load().indentation(site).name),
@@ -109,9 +109,7 @@ def get_site(folder: Folder, site: str) -> dict[str, Any]:
 
 @router.get("/curves/{site}")
 def get_curves(folder: Folder, site: str, kept: str | None = None) -> dict[str, list[float]]:
-    """Columns of the predicted forces of a site (s, mm, N), of this run or of a kept one. Raises
-    `FileNotFoundError` where none are stored.
-    """
+    """Columns of the predicted forces of a site (s, mm, N); `FileNotFoundError` where none are stored."""
     if kept is not None:
         _find_kept_run(folder, kept)
     parts = ("predict",) if kept is None else (KEPT, kept)
@@ -155,22 +153,20 @@ def get_moment(folder: Folder, source: str, site: str, moment: int, name: str) -
 
 
 @router.post("/simulate/{site}")
-def post_simulation(folder: Folder, site: str) -> dict[str, Any]:
+def post_simulation(folder: Folder, site: str) -> Json:
     """Start ``limbfit simulate --animation`` for a site."""
     return processes.start_simulation(folder, site)
 
 
 @router.post("/stop")
-def post_stop(folder: Folder) -> dict[str, Any]:
+def post_stop(folder: Folder) -> Json:
     """Interrupt the simulation."""
     return processes.stop_simulation(folder)
 
 
 @router.post("/feb/{site}")
 def post_feb(folder: Folder, site: str) -> dict[str, str]:
-    """Write a site as an input of FEBio; the path of the file below ``/api/files``. Raises `RunError` where
-    meshes are missing or stale: only a run makes them.
-    """
+    """Write a site as an input of FEBio below ``/api/files``; `RunError` where meshes are not up to date."""
     study = folder.load()
     name = study.indentation(site).name
     if list_stage_states(folder).get("mesh") != "done":
@@ -180,16 +176,14 @@ def post_feb(folder: Folder, site: str) -> dict[str, str]:
 
 
 @router.post("/keep")
-def post_kept(folder: Folder, run: KeptRunName) -> dict[str, Any]:
+def post_kept(folder: Folder, run: KeptRunName) -> Json:
     """Copy what the page shows of this run to ``results/kept/<name>``, to compare later runs with it. Raises
     `InputError` for a name that is no plain one, or is taken, and `RunError` where the study has no finished
     prediction.
     """
     name = run.name
     if not _NAME.fullmatch(name):
-        raise InputError(
-            "not a name to keep a run under", remedy="use letters, digits, spaces, '-', '_', '.'"
-        )
+        raise InputError("no name to keep a run under", remedy="use letters, digits, spaces, '-', '_', '.'")
     place = folder.results / KEPT / name
     if place.exists():
         raise InputError(f"a run is already kept as {name!r}", remedy="choose another name")
@@ -210,13 +204,13 @@ def post_kept(folder: Folder, run: KeptRunName) -> dict[str, Any]:
 
 
 @router.post("/drop")
-def post_drop(folder: Folder, run: KeptRunName) -> dict[str, Any]:
+def post_drop(folder: Folder, run: KeptRunName) -> Json:
     """Remove a kept run."""
     shutil.rmtree(_find_kept_run(folder, run.name))
     return {}
 
 
-def _list_kept_runs(folder: StudyFolder) -> list[dict[str, Any]]:
+def _list_kept_runs(folder: StudyFolder) -> list[Json]:
     """``name`` and ``since`` of the runs that were kept, newest first."""
     files = (folder.results / KEPT).glob(f"*/{ABOUT}")
     runs = [{"name": file.parent.name, "since": read_json(file)["since"]} for file in files]
@@ -230,7 +224,7 @@ def _find_kept_run(folder: StudyFolder, name: str) -> Path:
     return folder.artefact(KEPT, name, ABOUT).parent
 
 
-def _list_sources(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
+def _list_sources(folder: StudyFolder, site: str) -> list[Json]:
     """The stored fields of a site: every step of a simulation, or the deepest point of the prediction.
 
     Each has ``source``, ``title``, ``times_s``, ``deepest`` (which of them), ``parameters_from``, and
@@ -244,28 +238,26 @@ def _list_sources(folder: StudyFolder, site: str) -> list[dict[str, Any]]:
         of = simulated and simulated.parameters_from
         if simulated and not is_current(simulated, CalibrationResult.find(folder.results)):
             of = f"{of}, before the study was identified anew"
-        sources.append(
-            {
-                "source": "simulate",
-                "title": "every step, simulated",
-                "times_s": times_s,
-                "deepest": _find_deepest(folder, site, times_s),
-                "parameters_from": of,
-                "mark": compute_fingerprint(file for _, file in moments),
-            }
-        )
+        source = {
+            "source": "simulate",
+            "title": "every step, simulated",
+            "times_s": times_s,
+            "deepest": _find_deepest(folder, site, times_s),
+            "parameters_from": of,
+            "mark": compute_fingerprint(file for _, file in moments),
+        }
+        sources.append(source)
     predicted = folder.results / "predict" / f"{site}.vtu"
     if predicted.is_file():
-        sources.append(
-            {
-                "source": "predict",
-                "title": "the deepest point, predicted",
-                "times_s": [_find_peak_time(folder.artefact("predict", f"{site}.csv"))],
-                "deepest": 0,
-                "parameters_from": "identified",
-                "mark": compute_fingerprint([predicted]),
-            }
-        )
+        source = {
+            "source": "predict",
+            "title": "the deepest point, predicted",
+            "times_s": [_find_peak_time(folder.artefact("predict", f"{site}.csv"))],
+            "deepest": 0,
+            "parameters_from": "identified",
+            "mark": compute_fingerprint([predicted]),
+        }
+        sources.append(source)
     return sources
 
 

@@ -23,6 +23,7 @@ from .folder import StudyFolder
 from .guard import AccessGuard, GuardMiddleware, TooLargeError, is_loopback
 
 STATIC = Path(__file__).parent / "static"
+ERRORS = (LimbfitError, FileNotFoundError, TooLargeError, HTTPException, RequestValidationError, Exception)
 # Of every view: the modules beside this one whose names end in _routes.
 ROUTES = tuple(
     import_module(f".{module.name}", __package__)
@@ -62,10 +63,8 @@ def serve_studio(
     folder = StudyFolder(path / "study.toml" if path.is_dir() else path)
     folder.load()
     if not is_loopback(host) and not expose:
-        raise InputError(
-            f"{host} can be reached from other machines",
-            remedy="leave out --host, or say --expose to show and give the study to whoever has its address",
-        )
+        remedy = "leave out --host, or say --expose to give the study to whoever has its address"
+        raise InputError(f"{host} can be reached from other machines", remedy=remedy)
     if host in ("0.0.0.0", "::", ""):
         raise InputError("name one address of this machine to listen on, not all of them", place="--host")
     try:
@@ -99,14 +98,7 @@ def create_app(folder: StudyFolder, guard: AccessGuard) -> FastAPI:
     app.state.folder = folder
     for routes in ROUTES:
         app.include_router(routes.router)
-    for kind in (
-        LimbfitError,
-        FileNotFoundError,
-        TooLargeError,
-        HTTPException,
-        RequestValidationError,
-        Exception,
-    ):
+    for kind in ERRORS:
         app.add_exception_handler(kind, _respond_error)
     app.add_api_route("/", lambda: FileResponse(STATIC / "index.html"))
     app.mount("/static", StaticFiles(directory=STATIC))

@@ -19,9 +19,9 @@ from ..socket import Socket
 from ..socket.rays import compute_profile
 from ..socket.trim import Trim, find_brim, trim_limb, wrap_trimline
 from ..study import Study
-from ..web.shapes import build_patient_frame, to_volume_shape
+from ..web import build_patient_frame, to_volume_shape
 from .editing import remove_area, set_area, set_trimline
-from .folder import StudyFolder, compute_fingerprint
+from .folder import Json, StudyFolder, compute_fingerprint
 from .identification_routes import describe_last_run
 from .model_routes import Place, Text, compute_surfaces_fingerprint, project_to_skin_of_study, read_anatomy
 from .processes import find_running, find_starting, start_socket
@@ -58,7 +58,7 @@ class SocketRunRequest(StrictModel):
     design: bool = False
 
 
-def list_runs(folder: StudyFolder) -> list[dict[str, Any]]:
+def list_runs(folder: StudyFolder) -> list[Json]:
     """Stored runs: ``run``, ``steps`` (name, regions, settling_mm), ``mark``, which other fields change.
 
     ``outside``: what it does to the tissue that no fitted record did, in words.
@@ -77,7 +77,7 @@ def list_runs(folder: StudyFolder) -> list[dict[str, Any]]:
     ]
 
 
-def _describe_step(name: str, state: SocketState) -> dict[str, Any]:
+def _describe_step(name: str, state: SocketState) -> Json:
     keys = {"region", "mean_kPa", "peak_kPa", "shear_kPa", "interval_kPa"}
     settling_mm = state.settling_mm if isinstance(state, SocketLoad) else None
     regions = [row.model_dump(include=keys) for row in state.regions]
@@ -91,7 +91,7 @@ def _find_file(folder: StudyFolder, run: str, step: int) -> Path:
 
 
 @router.get("")
-def get_runs(folder: Folder) -> dict[str, Any]:
+def get_runs(folder: Folder) -> Json:
     """Stored runs, the patient's sides, and the run that goes on or begins."""
     anatomy = read_anatomy(folder, folder.load())
     frame = build_patient_frame(None if anatomy is None else anatomy.cut_normal)
@@ -135,7 +135,7 @@ def get_step(folder: Folder, run: str, step: int, field: str) -> Response:
 
 
 @router.get("/shape")
-def get_shape(folder: Folder) -> dict[str, Any]:
+def get_shape(folder: Folder) -> Json:
     """The socket's shape as ``[socket]`` states it, and whether its face can be drawn around the bare skin.
 
     ``areas`` with their places, ``regions`` to choose from, ``file`` where the face is read from one;
@@ -224,7 +224,7 @@ def _build_face(folder: StudyFolder, fingerprint: str) -> Socket | str:
 
 
 @router.post("/areas")
-def post_area(folder: Folder, area: AreaRequest) -> dict[str, Any]:
+def post_area(folder: Folder, area: AreaRequest) -> Json:
     """Add an area to the study file, or change the area of that name; returns the changed shape."""
     values = area.model_dump(exclude={"name"})
     if area.position is not None:
@@ -234,14 +234,14 @@ def post_area(folder: Folder, area: AreaRequest) -> dict[str, Any]:
 
 
 @router.post("/areas/{name}/remove")
-def post_removal(folder: Folder, name: str) -> dict[str, Any]:
+def post_removal(folder: Folder, name: str) -> Json:
     """Take an area out of the study file."""
     remove_area(folder.file, name)
     return get_shape(folder)
 
 
 @router.post("/trimline")
-def post_trimline(folder: Folder, line: TrimlineRequest) -> dict[str, Any]:
+def post_trimline(folder: Folder, line: TrimlineRequest) -> Json:
     """Replace the brim in the study file by a trimline; returns the changed shape. Raises `InputError` where
     it does not go once around the limb, or leaves no socket; the file is left as it was.
     """
@@ -258,13 +258,13 @@ def post_trimline(folder: Folder, line: TrimlineRequest) -> dict[str, Any]:
 
 
 @router.post("/trimline/remove")
-def post_default_brim(folder: Folder) -> dict[str, Any]:
+def post_default_brim(folder: Folder) -> Json:
     """Take the trimline out of the study file: the brim is the default one."""
     set_trimline(folder.file, None)
     return get_shape(folder)
 
 
 @router.post("/start")
-def post_start(folder: Folder, request: SocketRunRequest) -> dict[str, Any]:
+def post_start(folder: Folder, request: SocketRunRequest) -> Json:
     """Start ``limbfit socket`` or ``limbfit socket design``, as a process of its own."""
     return start_socket(folder, design=request.design)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from functools import lru_cache
+from itertools import chain
 from threading import Lock
 from typing import Annotated, Any
 
@@ -12,8 +13,8 @@ from pydantic import BaseModel, ConfigDict
 from ..pipeline.commands.run import study_status
 from ..pipeline.engine.provenance import list_input_files
 from ..study import Study
-from ..web.arrays import pack
-from .folder import StudyFolder, compute_fingerprint
+from ..web import pack
+from .folder import Json, StudyFolder, compute_fingerprint
 from .processes import find_running
 
 router = APIRouter(prefix="/api")
@@ -39,12 +40,12 @@ class StrictModel(BaseModel):
 
 
 def respond_block(arrays: Mapping[str, Any], facts: Mapping[str, Any] | None = None) -> Response:
-    """Arrays and facts as a block that a script reads (see ``limbfit/web/arrays.py``)."""
+    """Arrays and facts as a block that a script reads (see ``limbfit/web/__init__.py``)."""
     return Response(pack(arrays, facts), media_type="application/octet-stream")
 
 
 @router.get("/study")
-def get_study(folder: Folder) -> dict[str, Any]:
+def get_study(folder: Folder) -> Json:
     """The name of the study, its sites, and its records and planned indentations, without paths of inputs."""
     study = folder.load()
     return {
@@ -67,13 +68,13 @@ def get_study(folder: Folder) -> dict[str, Any]:
 
 
 @router.get("/stages")
-def get_stages(folder: Folder) -> dict[str, Any]:
+def get_stages(folder: Folder) -> Json:
     """The state of every stage, as ``limbfit status`` reports it, and the current run, if any."""
     return {"stages": list_stages(folder), "run": find_running(folder)}
 
 
 @router.get("/changes")
-def get_changes(folder: Folder) -> dict[str, Any]:
+def get_changes(folder: Folder) -> Json:
     """Fingerprints by topic; a page reads a topic again when its fingerprint has changed."""
     return {**folder.changes(), "run": find_running(folder)}
 
@@ -91,14 +92,14 @@ def get_file(folder: Folder, path: str, download: bool = False) -> FileResponse:
 _LOCK = Lock()  # one request computes them while others wait
 
 
-def list_stages(folder: StudyFolder) -> list[dict[str, Any]]:
+def list_stages(folder: StudyFolder) -> list[Json]:
     """The rows of `study_status`; they are computed again only when an input or a result has changed."""
     with _LOCK:
         return _read_cached_stages(folder, _compute_fingerprint(folder, folder.load()))
 
 
 @lru_cache(maxsize=1)
-def _read_cached_stages(folder: StudyFolder, fingerprint: str) -> list[dict[str, Any]]:
+def _read_cached_stages(folder: StudyFolder, fingerprint: str) -> list[Json]:
     return study_status(folder.load())
 
 
@@ -109,10 +110,8 @@ def list_stage_states(folder: StudyFolder) -> dict[str, str]:
 
 def _compute_fingerprint(folder: StudyFolder, study: Study) -> str:
     inputs = {study.path(path) for paths in list_input_files(study).values() for path in paths}
-    below = [
-        file for path in sorted(inputs) for file in (sorted(path.rglob("*")) if path.is_dir() else [path])
-    ]
+    inside = (sorted(path.rglob("*")) if path.is_dir() else [path] for path in sorted(inputs))
+    below = chain.from_iterable(inside)
     changes = folder.changes()
-    return repr(
-        (str(folder.file), changes["study"], changes["stages"], changes["labels"], compute_fingerprint(below))
-    )
+    known = (changes[topic] for topic in ("study", "stages", "labels"))
+    return repr((str(folder.file), *known, compute_fingerprint(below)))

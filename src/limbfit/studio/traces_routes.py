@@ -1,7 +1,7 @@
 """The view Traces: raw and regularised records, warnings about them, and stated touch-downs and peaks."""
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from fastapi import APIRouter
@@ -13,12 +13,11 @@ from ..errors import InputError
 from ..pipeline.records.record_checks import record_flags
 from ..pipeline.records.traces import read_record
 from ..results.identification import PredictResult
-from ..results.limb import SitesResult
-from ..results.records import TraceFacts
+from ..results.limb import SitesResult, TraceFacts
 from ..study import Record, Study
 from ..traces.numerics import average_in_bins
 from .editing import set_record
-from .folder import StudyFolder, compute_fingerprint
+from .folder import Json, StudyFolder, compute_fingerprint
 from .study_routes import Folder, StrictModel, list_stage_states
 
 router = APIRouter(prefix="/api/traces")
@@ -35,13 +34,10 @@ class Times(StrictModel):
 
 
 @router.get("")
-def get_records(folder: Folder) -> dict[str, Any]:
-    """Every record and planned indentation with the error of its file, if any, and the flags on the records.
-
-    ``site`` is the name of the record, or of the site.
-    """
+def get_records(folder: Folder) -> Json:
+    """Every record and planned indentation, ``site`` its name, with the error of its file; and flags."""
     study = folder.load()
-    rows: list[dict[str, Any]] = []
+    rows: list[Json] = []
     records: dict[str, _ReadRecord] = {}
     for indentation in study.indentations:
         error = None
@@ -55,21 +51,21 @@ def get_records(folder: Folder) -> dict[str, Any]:
 
 
 @router.get("/{name}")
-def get_record(folder: Folder, name: str) -> dict[str, Any]:
+def get_record(folder: Folder, name: str) -> Json:
     """One record raw and regularised; times in s of the record, displacement in mm, force in N."""
     study = folder.load()
     return _read(folder, study, _find_record(study, name)).content
 
 
 @router.post("/{name}/preview")
-def preview_record(folder: Folder, name: str, times: Times) -> dict[str, Any]:
+def preview_record(folder: Folder, name: str, times: Times) -> Json:
     """The record as other times would change it; nothing is stored."""
     study = folder.load()
     return _read(folder, study, _replace_times(_find_record(study, name), times)).content
 
 
 @router.post("/{name}")
-def post_times(folder: Folder, name: str, times: Times) -> dict[str, Any]:
+def post_times(folder: Folder, name: str, times: Times) -> Json:
     """Store the times in the study file, or remove them; the stage ``traces`` turns stale."""
     study = folder.load()
     record = _replace_times(_find_record(study, name), times)
@@ -94,7 +90,7 @@ class _ReadRecord(NamedTuple):
     """A record that was read, and what the page shows of it."""
 
     facts: TraceFacts
-    content: dict[str, Any]
+    content: Json
 
 
 def _read(folder: StudyFolder, study: Study, record: Record) -> _ReadRecord:
@@ -126,9 +122,7 @@ def _round_curves(time_s: Array, displacement_mm: Array, force_N: Array) -> dict
     return {name: np.round(values, 5).tolist() for name, values in curves.items()}
 
 
-def _collect_flags(
-    folder: StudyFolder, study: Study, records: dict[str, _ReadRecord]
-) -> list[dict[str, Any]]:
+def _collect_flags(folder: StudyFolder, study: Study, records: dict[str, _ReadRecord]) -> list[Json]:
     """Flags on the records as they are now, and flags of the last prediction against the model."""
     sites = SitesResult.find(folder.results)
     placed = {row.site: row for row in sites.sites} if sites else {}

@@ -97,15 +97,9 @@ class MaterialTable(TissueRange):
     def _check_kappa_ratio(cls, ratio: float) -> float:
         low, high = KAPPA_RATIO
         if ratio < low:
-            raise ValueError(
-                f"give {low:g} or more: with less, Poisson's ratio is under 0.45, and soft tissue hardly "
-                "changes its volume"
-            )
+            raise ValueError(f"give {low:g} or more: with less, Poisson's ratio is under 0.45")
         if ratio > high:
-            raise ValueError(
-                f"give at most {high:g}: with that, the volume changes by some 0.01 % of the strain, and "
-                "with more, the equations lose digits"
-            )
+            raise ValueError(f"give at most {high:g}: with more, the equations lose digits")
         return ratio
 
     def check_keys(self) -> None:
@@ -114,10 +108,8 @@ class MaterialTable(TissueRange):
             place = f"tissues.{tissue}." if tissue else ""
             for which, values in zip(_ENDS, (lower, start, upper), strict=True):
                 for name in values.keys() - self.keys:
-                    known = ", ".join(self.keys)
-                    raise ValueError(
-                        f"material.{place}{which}.{name} is no parameter of the law; they are {known}"
-                    )
+                    what = f"material.{place}{which}.{name} is no parameter of the law"
+                    raise ValueError(f"{what}; they are {', '.join(self.keys)}")
             for name in self.keys:
                 if not lower[name] <= start[name] <= upper[name]:
                     raise ValueError(f"{place}start.{name} lies outside its bounds")
@@ -125,8 +117,7 @@ class MaterialTable(TissueRange):
                     raise ValueError(f"{place}lower.{name} is not below upper.{name}")
 
     def check_tissues(self, tissues: tuple[str, ...], stretched: tuple[str, ...]) -> None:
-        """Raise `ValueError` where a tissue is named that the model has not, or that cannot
-        be ``stretched`` at rest, or where bounds do not meet."""
+        """Raise `ValueError` for an unknown tissue, one not ``stretched``, and bounds that never meet."""
         for key, named in (("tissues", self.tissues), ("fibres", self.fibres)):
             for tissue in named:
                 if tissue not in tissues:
@@ -134,15 +125,11 @@ class MaterialTable(TissueRange):
                     raise ValueError(f"{what}; its tissues are {', '.join(tissues)}")
         for tissue in self.prestretch:
             if tissue not in stretched:
-                raise ValueError(
-                    f"material.prestretch.{tissue}: no layer, and no tissue with fibres; those are "
-                    f"{', '.join(stretched)}"
-                )
+                what = f"material.prestretch.{tissue}: no layer, and no tissue with fibres"
+                raise ValueError(f"{what}; those are {', '.join(stretched)}")
         for name in self.keys:
             lower = max(self.of(tissue, "lower")[name] for tissue in tissues)
             upper = min(self.of(tissue, "upper")[name] for tissue in tissues)
             if not lower < upper:
-                raise ValueError(
-                    f"material: the tissues' bounds of {name} have no range in common, "
-                    "and the stage of one material needs one; widen them"
-                )
+                what = f"material: the tissues' bounds of {name} have no range in common"
+                raise ValueError(f"{what}, and the stage of one material needs one; widen them")

@@ -43,9 +43,8 @@ def list_indenter_widths(content: Mapping[str, Any]) -> list[float]:
     more = content.get("indenters", {})
     tables = [content.get("indenter", {}), *(more.values() if isinstance(more, Mapping) else ())]
     widths = [table.get("width_mm", REFERENCE_WIDTH_MM) for table in tables if isinstance(table, Mapping)]
-    return [float(width) for width in widths if isinstance(width, int | float) and width > 0] or [
-        REFERENCE_WIDTH_MM
-    ]
+    known = [float(width) for width in widths if isinstance(width, int | float) and width > 0]
+    return known or [REFERENCE_WIDTH_MM]
 
 
 def replace_edges(mesh: Any, widths_mm: Sequence[float] = (REFERENCE_WIDTH_MM,)) -> Any:

@@ -184,6 +184,5 @@ def list_records(site: Site, tables: tuple[RecordTable, ...]) -> tuple[Record, .
     for table in tables:
         if table.site == site.name:
             stated.append({**dict(table), "name": table.full_name, "key": table.key})
-    return tuple(
-        Record.model_construct(**{**values, "site": site, "of_site": len(stated)}) for values in stated
-    )
+    shared = {"site": site, "of_site": len(stated)}
+    return tuple(Record.model_construct(**{**values, **shared}) for values in stated)

@@ -9,6 +9,7 @@ from .tables import Friction, Plane, Positive, TomlTable, Vector, find_repeated
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9 ().,_-]{0,39}$"
 Length = Annotated[float, Field(ge=0)]
+Distribution = Literal["tissue depth", "hydrostatic", "total surface bearing", "patellar tendon bearing"]
 Preset = Literal["double stance", "single stance", "heel strike", "mid-stance", "toe-off"]
 # Round figures, not fitted to a product: only that silicone elastomers are stiffer than gels is from a source
 # (Sanders et al., J Rehabil Res Dev 2004, 41:175). With m = 2 the law is a Mooney-Rivlin solid's.
@@ -37,9 +38,7 @@ class DesignRegionTable(TomlTable):
 class SocketDesignTable(TomlTable):
     """How a socket is designed from pressures; every key has a default."""
 
-    pressure: Literal["tissue depth", "hydrostatic", "total surface bearing", "patellar tendon bearing"] = (
-        "tissue depth"
-    )
+    pressure: Distribution = "tissue depth"
     pressure_kPa: Annotated[float, Field(gt=0, le=60)] = 10.0
     regions: tuple[DesignRegionTable, ...] = ()
     wall_mm: Annotated[float, Field(ge=1, le=15)] = 4.0
@@ -143,9 +142,8 @@ class SocketTable(TomlTable):
     design: SocketDesignTable = SocketDesignTable()
 
     def check_keys(self) -> None:
-        stated = [
-            key for key in ("trim_mm", "trim_planes", "trimline") if getattr(self, key) not in (None, ())
-        ]
+        brims = ("trim_mm", "trim_planes", "trimline")
+        stated = [key for key in brims if getattr(self, key) not in (None, ())]
         if "trim_mm" in stated and len(stated) > 1:
             raise ValueError(f"trim_mm is a plane of its own: leave it or {stated[1]} out")
         if self.trimline and len(self.trimline) < 3:

@@ -218,15 +218,11 @@ class Study(tables.TomlTable):
         return indentation.trace is not None and self.path(indentation.trace).is_file()
 
     def site(self, name: str) -> Site:
-        for site in self.sites:
-            if site.name == name:
-                return site
-        raise StudyError(
-            f"no site is named {name!r}",
-            file=self.file,
-            place="sites",
-            remedy="the study has " + ", ".join(s.name for s in self.sites),
-        )
+        known = {site.name: site for site in self.sites}
+        if name in known:
+            return known[name]
+        remedy = f"the study has {', '.join(known)}"
+        raise StudyError(f"no site is named {name!r}", file=self.file, place="sites", remedy=remedy)
 
     def indentation(self, name: str) -> Indentation:
         """Return the record, or the planned indentation, of a name; a site with one record stands for it."""
@@ -237,12 +233,8 @@ class Study(tables.TomlTable):
         records = self.records_at(site)
         if len(records) == 1:
             return records[0]
-        raise StudyError(
-            f"site {name} has several records",
-            file=self.file,
-            place="records",
-            remedy="name one of " + ", ".join(record.name for record in records),
-        )
+        what, remedy = f"site {name} has several records", ", ".join(record.name for record in records)
+        raise StudyError(what, file=self.file, place="records", remedy=f"name one of {remedy}")
 
     @field_validator("sites")
     @classmethod
@@ -264,14 +256,11 @@ class Study(tables.TomlTable):
         names = [site.name for site in self.sites]
         for table in self.records:
             if table.site not in names:
-                raise ValueError(
-                    f"records.{table.name}: no site is named {table.site!r}; they are {', '.join(names)}"
-                )
+                what = f"records.{table.name}: no site is named {table.site!r}"
+                raise ValueError(f"{what}; they are {', '.join(names)}")
         names += [table.full_name for table in self.records]
         if doubled := tables.find_repeated(names):
-            raise ValueError(
-                f"two records, or a record and a site, have the name {doubled[0]!r}; name one anew"
-            )
+            raise ValueError(f"two records, or a record and a site, have the name {doubled[0]!r}")
         for other, ending in (name.rsplit("-", 1) for name in names if "-" in name):
             if other in names and ending in STORED_ENDINGS:
                 raise ValueError(f"{other}-{ending} is a file of {other!r} in results; give another name")
@@ -280,10 +269,8 @@ class Study(tables.TomlTable):
             if site.fitted and not records:
                 raise ValueError(f"{site.key}: a fitted site needs a trace, or [[records]]")
             if (not records) == (site.depth_mm is None):
-                raise ValueError(
-                    f"{site.key}: give either trace (a record; several: [[records]]) or depth_mm (an "
-                    "indentation to be simulated)"
-                )
+                remedy = "give either trace (a record; several: [[records]]) or depth_mm (to be simulated)"
+                raise ValueError(f"{site.key}: {remedy}")
 
     def _check_measurements(self) -> None:
         """Refuse what is measured where something else in the study rules it out."""
@@ -296,9 +283,8 @@ class Study(tables.TomlTable):
                 what = f'{one.name}: {kind} is no force, and objective = "paper" adds squares of forces'
                 raise ValueError(f'{what}; use "pointwise"')
             if why and one.forced:
-                raise ValueError(
-                    f'{one.name} has control = "force", which goes without {why[0]}; leave one out'
-                )
+                what = f'{one.name} has control = "force", which goes without {why[0]}'
+                raise ValueError(f"{what}; leave one out")
             if (taut and one.observed) or (tense and one.shear_waves):
                 key, what = ("prestretch", "pre-stretch") if taut else ("activation", "contraction")
                 seen = one.observed if taut else "shear waves"
@@ -325,19 +311,15 @@ class Study(tables.TomlTable):
         if self.calibration.priors is None:
             return
         if not laws.is_ogden(self.material.law):
-            raise ValueError(
-                f'calibration.priors: people are described by the law "{laws.OGDEN}", the study has '
-                f'"{self.material.law}"; leave it out, or state calibration.prior'
-            )
+            what = f'calibration.priors: people are described by the law "{laws.OGDEN}"'
+            raise ValueError(f"{what}, the study has another; leave it out, or state calibration.prior")
         with tables.refuse_value("calibration.prior_tissues: "):
             of_tissues(self.tissues, self.calibration.prior_tissues)
 
     def _check_geometry(self) -> None:
         if self.geometry.regions and self.mesh.engine != "mmg":
-            raise ValueError(
-                f'mesh.engine = "{self.mesh.engine}" cannot mesh geometry.regions; choose "mmg", or leave '
-                "the regions out"
-            )
+            what = f'mesh.engine = "{self.mesh.engine}" cannot mesh geometry.regions'
+            raise ValueError(f'{what}; choose "mmg", or leave the regions out')
         if (self.image is None) == (self.surfaces is None):
             raise ValueError("give either [image] or [surfaces]")
         if self.surfaces is not None:
@@ -345,12 +327,8 @@ class Study(tables.TomlTable):
                 raise ValueError('a layer with thickness = "map" needs the fat of an [image], not [surfaces]')
             labelled = [one.name for one in self.geometry.regions if one.label is not None]
             if labelled:
-                raise ValueError(
-                    f"geometry.regions.{labelled[0]}: [surfaces] has no labels; give surface, a closed "
-                    "surface file"
-                )
+                what = f"geometry.regions.{labelled[0]}: [surfaces] has no labels"
+                raise ValueError(f"{what}; give surface, a closed surface file")
         blind = [site.name for site in self.sites if site.position is None]
         if blind and (self.image is None or self.image.markers is None):
-            raise ValueError(
-                f"site {blind[0]}: 'near' needs image.markers; give 'position' where there are no markers"
-            )
+            raise ValueError(f"site {blind[0]}: 'near' needs image.markers; without, give 'position'")

@@ -7,17 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
-from pydantic_core import InitErrorDetails
+from pydantic import BaseModel, ConfigDict, Field
+from pydantic.functional_validators import AfterValidator, BeforeValidator, field_validator, model_validator
+from pydantic_core import InitErrorDetails, ValidationError
 
 from ..errors import InputError
 from ..shapes import SHAPES, Size
@@ -448,9 +440,7 @@ class AcquireTable(TomlTable):
             if getattr(self, low) >= getattr(self, high):
                 raise ValueError(f"{low} is not below {high}{why}")
         if self.clamp_N + self.clamp_tolerance_N >= self.clamp_limit_N:
-            raise ValueError(
-                "clamp_N with its tolerance is not below clamp_limit_N: clamping would end in a stop"
-            )
+            raise ValueError("clamp_N with its tolerance is not below clamp_limit_N: it would end in a stop")
 
 
 class ClampsTable(TomlTable):
@@ -478,10 +468,8 @@ class ClampsTable(TomlTable):
 
     def check_keys(self) -> None:
         if len(self.levels_mm) not in (1, len(self.angles)):
-            raise ValueError(
-                f"levels_mm has {len(self.levels_mm)} levels for {len(self.angles)} pins; "
-                "give one, or one for each angle"
-            )
+            what = f"levels_mm has {len(self.levels_mm)} levels for {len(self.angles)} pins"
+            raise ValueError(f"{what}; give one, or one for each angle")
 
     @property
     def angles(self) -> tuple[float, ...]:

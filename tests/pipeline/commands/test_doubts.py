@@ -17,8 +17,7 @@ from limbfit import check_study, load_study, run_study
 from limbfit.anatomy.imaging import write_labels, write_volume
 from limbfit.pipeline.records.traces import read_record
 from limbfit.report.page import Bullets
-from limbfit.report.sections.model import make_model_section
-from limbfit.report.sections.records import make_record_check_section
+from limbfit.report.sections.inputs import make_model_section, make_record_check_section
 from limbfit.report.store import load_store
 from limbfit.results.identification import PredictResult
 

@@ -27,8 +27,8 @@ from limbfit.pipeline.engine.storage import write_curves, write_result
 from limbfit.report.sections.uncertainty import make_models_section
 from limbfit.report.store import load_store
 from limbfit.results.identification import PredictResult
-from limbfit.results.models import ModelsResult, ModelWeight, SocketOfModels
 from limbfit.results.socket import SocketResult
+from limbfit.results.uncertainty import ModelsResult, ModelWeight, SocketOfModels
 from limbfit.study import Study, load_study
 
 STATED = """

@@ -21,7 +21,7 @@ from limbfit.mesh import read_vtu
 from limbfit.pipeline.commands.export import check_export
 from limbfit.pipeline.commands.simulate import write_site_curve
 from limbfit.pipeline.records.records import build_model
-from limbfit.results.curves import read_curves
+from limbfit.results.base import read_curves
 
 MESH = "\n[mesh]\nedge_near_mm = 6.0\nedge_far_mm = 18.0\n[indenter]\nedge_radius_mm = 2.0\n"
 TISSUES = {

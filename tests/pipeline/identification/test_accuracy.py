@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from layered import build_block_site, layered_block
-from limbfit.bench.blocks import SPEED
+from limbfit.bench.timing import SPEED
 from limbfit.errors import StudyError
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.indentation.sites import PENETRATION_FACTOR

@@ -20,7 +20,7 @@ from limbfit.pipeline.engine.storage import write_json
 from limbfit.pipeline.engine.store import COARSE, Store
 from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.simulation.simulations import compute_job_digest
-from limbfit.results.curves import read_curves
+from limbfit.results.base import read_curves
 from limbfit.results.identification import CalibrationResult
 from limbfit.study import Study
 

@@ -32,7 +32,7 @@ from limbfit.pipeline.records.records import (
 )
 from limbfit.pipeline.records.secondary_measurements import WaveMeasurement
 from limbfit.pipeline.records.traces import read_record
-from limbfit.results.curves import read_curves
+from limbfit.results.base import read_curves
 from limbfit.study.tables import ImageTable
 
 TRUTH = {"skin": {"c_kPa": 8.0, "m": 5.0, "gamma": 2.0, "tau_s": 0.5}}

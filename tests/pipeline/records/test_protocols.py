@@ -17,7 +17,7 @@ from limbfit.pipeline.records.deviations import estimate_site_noise
 from limbfit.pipeline.records.records import load_site_record
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.pipeline.simulation.simulations import CURVE_POINTS
-from limbfit.report.sections.records import draw_record_figure, make_trace_table
+from limbfit.report.sections.inputs import draw_record_figure, make_trace_table
 from limbfit.report.store import load_store
 
 TISSUES = ("skin", "muscle")

@@ -21,7 +21,7 @@ from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.limb.mesh import mesh_job, mesh_settings
 from limbfit.pipeline.records.traces import read_record
-from limbfit.report.sections.prediction import make_site_table
+from limbfit.report.sections.identification import make_site_table
 from limbfit.report.store import load_store
 from limbfit.results.identification import PredictResult, RecordResiduals
 from limbfit.study import Record, Study, load_study

@@ -22,7 +22,7 @@ from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.records.secondary_measurements import MAX_POINTS, ChosenPoints, choose_points
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.report.drawing.figures import draw_skin_figure
-from limbfit.report.sections.prediction import make_observed_table
+from limbfit.report.sections.identification import make_observed_table
 from limbfit.report.store import load_store
 from limbfit.study import Study
 from limbfit.traces import SurfaceMotion

@@ -9,7 +9,7 @@ from seen_blocks import PUNCH, Made, SeenBlock, estimate_at_truth
 
 import layered
 from layered import build_block_site, layered_block
-from limbfit.bench.blocks import build_layered_block as block_of
+from limbfit.bench.timing import build_layered_block as block_of
 from limbfit.errors import ProblemError, TraceError
 from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_vector
 from limbfit.mesh import find_gauges_along

@@ -16,7 +16,7 @@ from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.records.records import build_model
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.report.drawing.figures import draw_wave_figure
-from limbfit.report.sections.prediction import make_observed_table
+from limbfit.report.sections.identification import make_observed_table
 from limbfit.report.store import load_store
 from limbfit.study import Study
 

@@ -34,7 +34,7 @@ from limbfit.pipeline.uncertainty.result import (
     _write_prediction,
 )
 from limbfit.pipeline.uncertainty.uncertainty import _compare_groupings
-from limbfit.results.curves import read_curves
+from limbfit.results.base import read_curves
 from limbfit.results.identification import CalibrationResult, PredictResult
 from limbfit.results.uncertainty import ParameterUncertainty
 from limbfit.study import load_study

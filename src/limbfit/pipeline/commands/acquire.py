@@ -15,8 +15,8 @@ from ... import acquire
 from ..._version import __version__
 from ...acquire.virtual import Fault, Serving, Surrogate, VirtualFitSocket, VirtualLimb, fit_surrogate, serve
 from ...errors import InputError, TraceError, add_location
-from ...results.curves import read_curves
-from ...results.records import TracesResult
+from ...results.base import read_curves
+from ...results.limb import TracesResult
 from ...study import Indentation, Record, Study
 from ...traces import COLUMNS
 from ...traces.formats import BINARY_SUFFIXES

@@ -11,7 +11,7 @@ from ...errors import InputError
 from ...identify.checks.domain import Extent, RecordedRange, describe_outside
 from ...indentation import read_indenter
 from ...results.identification import OutsideRecords
-from ...results.records import TraceFacts
+from ...results.limb import TraceFacts
 from ...study import Indentation, Study
 from ...traces import SurfaceMotion
 from ..engine.context import Listener, Progress, ignore_progress

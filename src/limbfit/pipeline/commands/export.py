@@ -10,7 +10,7 @@ import numpy as np
 
 from ... import febio
 from ...arrays import Array
-from ...bench.blocks import build_block_model, build_layered_block
+from ...bench.timing import build_block_model, build_layered_block
 from ...errors import InputError
 from ...execution import SerialExecutor
 from ...fe import ELEMENTS, Problem

@@ -21,8 +21,8 @@ from ...errors import InputError
 from ...identify.fit.prediction import NORMAL_95
 from ...identify.uncertainty.model_comparison import compute_mixture_interval, weigh_models
 from ...laws import FIBRED, FUNG, LAWS, OGDEN, POWER
-from ...results import models as stored
-from ...results.curves import read_curves
+from ...results import uncertainty as stored
+from ...results.base import read_curves
 from ...results.identification import RecordPrediction
 from ...results.socket import LoadedRegion, SocketResult
 from ...study import Study, load_study

@@ -11,7 +11,7 @@ import numpy as np
 from ..._version import __version__
 from ...anatomy.labels.labelfiles import find_sidecar
 from ...errors import InputError
-from ...results.curves import read_curves
+from ...results.base import read_curves
 from ...study import Study, load_study
 from ..engine.context import Listener, ignore_progress
 from ..engine.digests import find_data_files

@@ -17,8 +17,8 @@ from ...execution import make_executor, run_in_background, share_executor
 from ...extensions import load_extensions
 from ...fe import are_compiled, compile_kernels
 from ...results.identification import CalibrationResult, PredictResult
-from ...results.models import ModelsResult
 from ...results.runs import ExperimentRecord, MachineFacts, RunResult, StageRecord, StudyName
+from ...results.uncertainty import ModelsResult
 from ...study import Site, Study, load_study
 from ..engine.context import Context, Listener, Progress, build_executor, ignore_progress
 from ..engine.digests import compute_file_digest

@@ -17,9 +17,8 @@ from ...identify.checks.plausibility import RecordFacts, RecordWarning, check_pl
 from ...identify.fit.multifidelity import MeshCorrection
 from ...identify.fit.objective import SiteResponse
 from ...indentation import SimulationJob, compute_contact_radius
-from ...results.curves import read_curves
-from ...results.limb import PlacedSite
-from ...results.records import RecordFlag, TraceFacts
+from ...results.base import read_curves
+from ...results.limb import PlacedSite, RecordFlag, TraceFacts
 from ...study import Record, Study
 from ...traces import SurfaceMotion
 from ..engine.context import Context

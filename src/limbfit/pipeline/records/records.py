@@ -15,7 +15,7 @@ from ...identify.fit.objective import MeasuredCurve, SiteResponse
 from ...identify.uncertainty.noise import compute_depth_slope
 from ...indentation import Simulation, SimulationJob, SiteModel
 from ...mesh import read_vtu
-from ...results.curves import read_curves
+from ...results.base import read_curves
 from ...study import Indentation, Record, Site, Study
 from ..engine.context import Context
 from ..engine.files import SMOOTHING

@@ -30,8 +30,8 @@ from ...indentation import (
     to_vector3,
 )
 from ...mesh import read_vtu
-from ...results.curves import read_curves
-from ...results.records import LayerRecord, TraceFacts, WaveRecord
+from ...results.base import read_curves
+from ...results.limb import LayerRecord, TraceFacts, WaveRecord
 from ...study import Record, Study, Vector
 from ...traces import SurfaceMotion, Thinning, WaveMeans
 from ...traces.numerics import build_linear_interpolation

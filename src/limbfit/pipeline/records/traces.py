@@ -8,7 +8,7 @@ import numpy as np
 
 from ...errors import TraceError
 from ...phases import MotionPhase, describe_phases
-from ...results import records as stored
+from ...results import limb as stored
 from ...study import Record, Study
 from ...traces import (
     Creep,

@@ -4,16 +4,10 @@ The page's style sheet gives them their light, dark and printed values. The pale
 (2008), which people with any colour-vision deficiency can tell apart.
 """
 
-from typing import Any
-
 INK, GRID, MUTED = "#010101", "#010102", "#010103"
 MEASURED, SIMULATED, ONE_MATERIAL, TRUTH = "#010104", "#010105", "#010106", "#010107"
 THIRD = "#010108"
 FITTED, HELD_OUT = SIMULATED, ONE_MATERIAL
-# Tissues, outermost first, are told apart by marker and line too; from the fifth on colours come again.
-_COLOURS, _MARKERS = (SIMULATED, ONE_MATERIAL, THIRD, INK), ("o", "s", "^", "D", "v", "P", "X")
-_LINES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (8, 2)))
-_TRUE_LINES: tuple[Any, ...] = (":", "-.", (0, (6, 2)), (0, (1, 3)), (0, (3, 1, 1, 1, 1, 1)))
 # The variable of the page for each sentinel, and its colour in the light theme of report.css, for drawings
 # that leave the page.
 VARIABLES = {
@@ -26,17 +20,3 @@ VARIABLES = {
     TRUTH: ("var(--truth)", "#00795a"),
     THIRD: ("var(--third)", "#cc79a7"),
 }
-
-
-def choose_tissue_style(index: int) -> dict[str, Any]:
-    """Colour, marker and line of the curve of a tissue."""
-    return {
-        "color": _COLOURS[index % len(_COLOURS)],
-        "marker": _MARKERS[index % len(_MARKERS)],
-        "ls": _LINES[index % len(_LINES)],
-    }
-
-
-def choose_truth_style(index: int) -> dict[str, Any]:
-    """Colour and line of the true value of a tissue's parameter."""
-    return {"color": TRUTH, "ls": _TRUE_LINES[index % len(_TRUE_LINES)]}

@@ -8,24 +8,14 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from ...results.identification import ObservedError, QuantityRange, RecordPrediction, SearchStage
-from ..formats import format_fixed, format_symbol, format_with_value, get_unit
+from ..formats import format_fixed, format_symbol, format_unit, format_with_value
 from ..page import Figure
 from ..store import Curves, Results, find_compared_quantity
 from . import plots
-from .colours import (
-    FITTED,
-    HELD_OUT,
-    INK,
-    MEASURED,
-    MUTED,
-    ONE_MATERIAL,
-    SIMULATED,
-    THIRD,
-    TRUTH,
-    choose_tissue_style,
-    choose_truth_style,
-)
+from .colours import FITTED, HELD_OUT, INK, MEASURED, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH
 
+Rows = Iterable[RecordPrediction]
+Seen = tuple[RecordPrediction, ObservedError, Curves]
 MAX_POINTS, MAX_TITLE, MAX_LEGEND_ROW = 2500, 44, 7
 
 
@@ -36,9 +26,7 @@ def thin_curves(curves: Curves) -> Curves:
 
 
 @plots.styled
-def draw_force_figure(
-    store: Results, rows: Iterable[RecordPrediction], against: str, name: str, columns: int
-) -> Figure | None:
+def draw_force_figure(store: Results, rows: Rows, against: str, name: str, columns: int) -> Figure | None:
     """Figure 7: measured and simulated force of each site, against ``time_s`` or ``displacement_mm``."""
     pairs = [(row, curves) for row, curves in store.with_curves("predict", rows) if against in curves]
     if not pairs:
@@ -161,7 +149,7 @@ def _draw_stage(axes: Sequence[Axes], store: Results, stage: SearchStage, offset
     for ax, name in zip(axes[1:], store.law.keys, strict=True):
         for i, tissue in enumerate(stage.parameters):
             values = [step.parameters[tissue][name] for step in steps]
-            ax.plot(x, values, ms=3, label=tissue if offset == 0 else None, **choose_tissue_style(i))
+            ax.plot(x, values, ms=3, label=tissue if offset == 0 else None, **plots.choose_tissue_style(i))
     if offset:
         for ax in axes:
             ax.axvline(offset - 0.5, color=MUTED, lw=0.8)
@@ -172,10 +160,10 @@ def _finish_convergence(axes: Sequence[Axes], store: Results) -> None:
     axes[0].set_yscale("log")
     plots.format_log_axis(axes[0].yaxis, minor=True)
     for ax, name in zip(axes[1:], store.law.keys, strict=True):
-        ax.set_title(f"{format_symbol(name)} ({get_unit(name)})")
+        ax.set_title(f"{format_symbol(name)} ({format_unit(name)})")
         for i, (tissue, values) in enumerate(store.truth.get("parameters", {}).items()):
             if name in values:
-                ax.axhline(values[name], lw=1, label=f"truth, {tissue}", **choose_truth_style(i))
+                ax.axhline(values[name], lw=1, label=f"truth, {tissue}", **plots.choose_truth_style(i))
     for ax in axes:
         ax.set_xlabel("Iterate")
         ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
@@ -194,9 +182,8 @@ def draw_error_figure(store: Results) -> Figure | None:
         ax.text(error, at, f" {format_fixed(error)}", va="center", fontsize=8)
     plots.set_rows(ax, [f"{row.record} ({'fitted' if row.fitted else 'held out'})" for row, _ in rows])
     ax.set_xlabel(f"Mean absolute error over largest {store.compared_quantity} (%)")
-    return plots.make_figure(
-        drawing, "errors", rows=[row for row, _ in rows], compared=store.compared_quantity
-    )
+    shown = [row for row, _ in rows]
+    return plots.make_figure(drawing, "errors", rows=shown, compared=store.compared_quantity)
 
 
 @plots.styled
@@ -238,20 +225,18 @@ def _draw_ratios(ax: Axes, store: Results, at: int, tissue: str, name: str) -> N
 
 def draw_layer_figure(store: Results, fitted: bool) -> Figure | None:
     """Compression of each layer against time at the fitted or held-out sites; None where none was seen."""
-    return _draw_time_figure(store, fitted, "ultrasound", "layers", ("compression", "mm"))
+    return _draw_times(store, fitted, "ultrasound", "layers", "compression", "mm")
 
 
 def draw_wave_figure(store: Results, fitted: bool) -> Figure | None:
     """Speed of shear waves against time at the fitted or held-out sites; None where none was read."""
-    return _draw_time_figure(store, fitted, "shear waves", "waves", ("speed", "m_s"))
+    return _draw_times(store, fitted, "shear waves", "waves", "speed", "m_s")
 
 
 @plots.styled
-def _draw_time_figure(
-    store: Results, fitted: bool, kind: str, stem: str, quantity: tuple[str, str]
-) -> Figure | None:
-    """What was seen of a kind against time; ``quantity`` and its unit are in the heads of the curves."""
-    rows, (what, unit) = _read_curves(store, fitted, kind), quantity
+def _draw_times(store: Results, fitted: bool, kind: str, stem: str, what: str, unit: str) -> Figure | None:
+    """What was seen of a kind against time; ``what`` it is and its unit are in the heads of the curves."""
+    rows = _read_curves(store, fitted, kind)
     if not rows:
         return None
     drawing, axes = plots.make_panels(len(rows), 3, 2.1)
@@ -273,8 +258,7 @@ def _draw_time_figure(
 
 @plots.styled
 def draw_skin_figure(store: Results, fitted: bool) -> Figure | None:
-    """Predicted against measured displacement of the skin at the fitted or held-out sites; None where the
-    skin was not seen."""
+    """Predicted against measured displacement of the skin at fitted or held-out sites; None: not seen."""
     rows = [one for one in _read_curves(store, fitted, "surface") if "displacement_simulated_mm" in one[2]]
     if not rows:
         return None
@@ -298,14 +282,12 @@ def _draw_pairs(ax: Axes, curves: Curves, components: Sequence[str]) -> None:
         ax.vlines(x, low, high, color=SIMULATED, alpha=0.15, lw=0.8)
     for number, word in enumerate(components):
         chosen = curves["component"] == number
-        style = choose_tissue_style(number) | {"ls": "", "ms": 2.5}
+        style = plots.choose_tissue_style(number) | {"ls": "", "ms": 2.5}
         if chosen.any():
             ax.plot(x[chosen], y[chosen], **style, label=word)
 
 
-def _read_curves(
-    store: Results, fitted: bool, kind: str
-) -> list[tuple[RecordPrediction, ObservedError, Curves]]:
+def _read_curves(store: Results, fitted: bool, kind: str) -> list[Seen]:
     """Rows of records, what was seen beside each in one way, and its stored curves."""
     return [
         (row, one, curves)

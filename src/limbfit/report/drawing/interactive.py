@@ -17,23 +17,12 @@ from ...arrays import Array
 from ...mesh import read_vtu
 from ...results.identification import SearchIteration
 from ...results.limb import PlacedSite
-from ...web.arrays import pack
-from ...web.shapes import extract_interface, read_shell, to_shell, to_volume_shape
-from ..formats import format_symbol, get_unit
+from ...web import extract_interface, pack, read_shell, to_shell, to_volume_shape
+from ..formats import format_symbol, format_unit
 from ..page import Interactive
 from ..store import Curves, Json, Results, name_compared
 from ..words import write_words
-from .pictures import (
-    FITTED,
-    HELD_OUT,
-    SKIN_SURFACE,
-    choose_inner_colour,
-    cut_behind,
-    find_placed_meshes,
-    make_cut_views,
-    read_limb_frame,
-    read_linear,
-)
+from . import pictures
 
 MAX_FACES, MAX_SAMPLES = 12_000, 300
 FIELD_RADIUS_MM = 50.0
@@ -49,7 +38,7 @@ def make_explorer(store: Results) -> Interactive | None:
     surfaces = _read_surfaces(store, arrays)
     fields = _cut_fields(store, arrays)
     facts = {
-        "frame": read_limb_frame(store).tolist(),
+        "frame": pictures.read_limb_frame(store).tolist(),
         "surfaces": surfaces,
         "sites": [_describe_site(store, row) for row in store.placed_sites.values()],
         "fields": fields,
@@ -67,15 +56,14 @@ def _read_surfaces(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json
     for name, file in store.surface_files.items():
         shell = read_shell(file, MAX_FACES)
         kind, _, title = name.partition("-")
-        rows.append(
-            {
-                "name": name,
-                "title": title or name,
-                "kind": "skin" if name == "skin" else "bone",
-                "colour": SKIN_SURFACE if name == "skin" else choose_inner_colour(name),
-                "opacity": 0.38 if kind == "skin" else 1.0,
-            }
-        )
+        row = {
+            "name": name,
+            "title": title or name,
+            "kind": "skin" if name == "skin" else "bone",
+            "colour": pictures.SKIN_SURFACE if name == "skin" else pictures.choose_inner_colour(name),
+            "opacity": 0.38 if kind == "skin" else 1.0,
+        }
+        rows.append(row)
         arrays[f"{name}.points"], arrays[f"{name}.faces"] = shell.points, shell.faces
     for name, shell in _read_layers(store):
         rows.append({"name": name, "title": name, "kind": "layer", "colour": LAYER, "opacity": 0.5})
@@ -105,7 +93,7 @@ def _describe_site(store: Results, row: PlacedSite) -> Json:
         "fitted": row.fitted,
         "at": list(row.position_mm),
         "axis": (axis / np.linalg.norm(axis)).tolist(),
-        "colour": FITTED if row.fitted else HELD_OUT,
+        "colour": pictures.FITTED if row.fitted else pictures.HELD_OUT,
         "error_percent": statistics.fmean(errors) if errors else None,
         "compared": name_compared(rows),
     }
@@ -115,7 +103,7 @@ def _cut_fields(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
     """The cut through each site at its deepest point, as triangles with displacements and stress."""
     stage = "predict" if store.predict else "simulate"
     fields = []
-    for row, file in find_placed_meshes(store, store.site_names, stage):
+    for row, file in pictures.find_placed_meshes(store, store.site_names, stage):
         cut = _cut_field(store, row, file)
         if cut is None:
             continue
@@ -126,11 +114,12 @@ def _cut_fields(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
 
 
 def _cut_field(store: Results, row: PlacedSite, file: Path) -> dict[str, NDArray[Any]] | None:
-    grid = read_linear(file)
+    grid = pictures.read_linear(file)
     if STRESS not in grid.cell_data or "displacement_mm" not in grid.point_data:
         return None
-    view = make_cut_views(store, row, file)[1]
-    surface = cut_behind(grid, view, smooth=True).extract_surface(algorithm="dataset_surface").triangulate()
+    view = pictures.make_cut_views(store, row, file)[1]
+    cut = pictures.cut_behind(grid, view, smooth=True)
+    surface = cut.extract_surface(algorithm="dataset_surface").triangulate()
     near = np.linalg.norm(np.asarray(surface.cell_centers().points) - view.focal, axis=1) < FIELD_RADIUS_MM
     if not near.any():
         return None
@@ -164,10 +153,7 @@ _COLUMNS = (
 
 
 def _read_site_curves(store: Results, site: str) -> Json | None:
-    """What is known of a site's force: predicted, else simulated by itself, else as recorded.
-
-    Of several records it is that of the first.
-    """
+    """A site's force by its first record: predicted, else simulated by itself, else as recorded."""
     for stage in ("predict", "simulate", "traces"):
         for record in dict.fromkeys((site, *store.records_of(site))):
             curves = store.curves(stage, record)
@@ -211,16 +197,15 @@ def draw_convergence_curves(store: Results) -> Interactive | None:
             {"label": tissue, "y": [step.parameters[tissue][name] for step in steps]}
             for tissue in store.tissues
         ]
-        panels.append({"title": format_symbol(name), "unit": get_unit(name), "log": False, "series": series})
+        panel = {"title": format_symbol(name), "unit": format_unit(name), "log": False}
+        panels.append(panel | {"series": series})
     caption = write_words("figure iterates")
     label = "Error and parameters over the iterates."
     return Interactive("iterates", "iterates", label, caption, {"panels": panels})
 
 
 def _make_error_panel(steps: Sequence[SearchIteration]) -> Json:
-    sites = sorted(steps[0].error_percent_by_site)
     series = [{"label": "mean error", "y": [step.error_percent for step in steps]}]
-    series += [
-        {"label": f"site {site}", "y": [step.error_percent_by_site[site] for step in steps]} for site in sites
-    ]
+    for site in sorted(steps[0].error_percent_by_site):
+        series.append({"label": f"site {site}", "y": [step.error_percent_by_site[site] for step in steps]})
     return {"title": "Error", "unit": "%", "log": True, "series": series}

@@ -1,6 +1,4 @@
-"""Pictures of the model, drawn off-screen: surfaces with sites (the paper's figure 1), cut meshes (figures 4
-and 6) and the deformed cut at the peak.
-"""
+"""Pictures of the model, drawn off-screen: surfaces with sites, cut meshes, fields (figures 1, 4, 6)."""
 
 from base64 import b64encode
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -25,7 +23,7 @@ from vtkmodules.vtkCommonCore import vtkLogger
 
 from ...arrays import Array
 from ...results.limb import PlacedSite
-from ...web.shapes import build_patient_frame
+from ...web import build_patient_frame
 from ..page import Figure
 from ..store import Results
 from ..words import make_picture, write_words
@@ -339,9 +337,7 @@ def make_four_views(store: Results, skin: Any) -> list[View]:
 
 def _mark_facing_sites(store: Results, view: View) -> list[Mark]:
     """The sites whose skin faces the camera of a view."""
-    return [
-        _mark_site(row) for row in store.placed_sites.values() if normalise(row.axis) @ view.direction > 0.5
-    ]
+    return [_mark_site(row) for row in store.sites if normalise(row.axis) @ view.direction > 0.5]
 
 
 def _mark_site(row: PlacedSite, axis: bool = False) -> Mark:

@@ -16,10 +16,14 @@ from matplotlib.figure import Figure as Drawing
 from ...arrays import Array
 from ..page import Figure
 from ..words import make_picture, write_words
-from .colours import GRID, INK, MUTED, SIMULATED, VARIABLES
+from .colours import GRID, INK, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH, VARIABLES
 
 PANEL_WIDTH_IN = 9.6
 POINT_PX = 1.5  # a drawing of 9.6 in fills the page; smaller ones keep the same size of letters
+# Tissues, outermost first, are told apart by marker and line too; from the fifth on colours come again.
+_COLOURS, _MARKERS = (SIMULATED, ONE_MATERIAL, THIRD, INK), ("o", "s", "^", "D", "v", "P", "X")
+_LINES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (8, 2)))
+_TRUE_LINES: tuple[Any, ...] = (":", "-.", (0, (6, 2)), (0, (1, 3)), (0, (3, 1, 1, 1, 1, 1)))
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "limbfit",
@@ -47,6 +51,20 @@ _STYLE: dict[Any, Any] = {
     "path.simplify_threshold": 0.3,
 }
 styled = matplotlib.rc_context(_STYLE)  # decorates whatever draws
+
+
+def choose_tissue_style(index: int) -> dict[str, Any]:
+    """Colour, marker and line of the curve of a tissue."""
+    return {
+        "color": _COLOURS[index % len(_COLOURS)],
+        "marker": _MARKERS[index % len(_MARKERS)],
+        "ls": _LINES[index % len(_LINES)],
+    }
+
+
+def choose_truth_style(index: int) -> dict[str, Any]:
+    """Colour and line of the true value of a tissue's parameter."""
+    return {"color": TRUTH, "ls": _TRUE_LINES[index % len(_TRUE_LINES)]}
 
 
 def make_panels(count: int, columns: int, height_in: float) -> tuple[Drawing, list[Axes]]:

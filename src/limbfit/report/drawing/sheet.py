@@ -1,6 +1,7 @@
 """The quality sheet of a segmentation as one picture: outlines over slices; slices to look at, enlarged."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,9 +31,8 @@ def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: Qual
     axis = "ijk".index(quality.axis)
     image, turned = volume.turn_along(axis), labels.turn_along(axis)
     window = find_box(turned.limb, _MARGIN)[1:]
-    masks = {LIMB: turned.limb} | {
-        name: turned.mask(name) for name in turned.names.values() if name != SOFT_TISSUE
-    }
+    names = [name for name in turned.names.values() if name != SOFT_TISSUE]
+    masks = {LIMB: turned.limb} | {name: turned.mask(name) for name in names}
     others = iter(_OTHERS * len(masks))
     colours = {name: COLOURS.get(name) or next(others) for name in masks}
     shown = _choose_slices(turned.limb)
@@ -99,9 +99,8 @@ def _draw(
     low, high = np.percentile(image.array[k], (1, 99.7))
     extent = (columns.start - 0.5, columns.start + plane.shape[1] - 0.5)
     heights = (rows.start + plane.shape[0] - 0.5, rows.start - 0.5)
-    axes.imshow(
-        plane, cmap="gray", vmin=low, vmax=max(high, low + 1e-6), extent=(*extent, *heights), origin="upper"
-    )
+    shades: dict[str, Any] = {"cmap": "gray", "vmin": low, "vmax": max(high, low + 1e-6)}
+    axes.imshow(plane, extent=(*extent, *heights), origin="upper", **shades)
     for name, mask in masks.items():
         for line in find_outlines(mask[k]):
             closed = np.vstack([line, line[:1]])

@@ -44,10 +44,7 @@ ANGLES_DEG = (0.0, 72.0)  # the smallest dihedral angle of a regular tetrahedron
 
 
 def draw_stage(results: Path, stage: str, file: Path) -> Path:
-    """Draw what a stage (``surfaces``, ``sites`` or ``mesh``) made into a PNG file; its path.
-
-    Raises `InputError` where the ``results`` of the study lack it.
-    """
+    """Draw a stage (``surfaces``, ``sites``, ``mesh``) into a PNG file; `InputError` if results lack it."""
     store = load_store(results)
     if "skin" not in store.surface_files:
         raise InputError("no surfaces are stored", file=results, remedy="run the stage surfaces first")
@@ -81,15 +78,15 @@ def draw_sites_sheet(store: Results) -> Drawing:
     plotter = make_limb_plotter(store, skin)
     for row in store.sites:
         axis, place = normalise(row.axis), np.array(row.position_mm)
-        arrow = pv.Arrow(
-            start=place - AXIS_MM * axis, direction=axis, scale=AXIS_MM, tip_length=0.4, tip_radius=0.14
-        )
+        start = place - AXIS_MM * axis
+        arrow = pv.Arrow(start=start, direction=axis, scale=AXIS_MM, tip_length=0.4, tip_radius=0.14)
         plotter.add_mesh(arrow, color=colours[row.region or ""], **MATT)
 
     def mark_facing(view: View) -> list[Mark]:
-        facing = [row for row in store.sites if normalise(row.axis) @ view.direction > 0.35]
         return [
-            Mark(row.site, np.array(row.position_mm), colours[row.region or ""], row.fitted) for row in facing
+            Mark(row.site, np.array(row.position_mm), colours[row.region or ""], row.fitted)
+            for row in store.sites
+            if normalise(row.axis) @ view.direction > 0.35
         ]
 
     shots = render_views(plotter, make_four_views(store, skin), mark_facing)
@@ -121,9 +118,8 @@ def _draw_histogram(drawing: Drawing, angles: dict[str, Any]) -> None:
     """The smallest dihedral angle of every element, in the spare space at the bottom of a sheet."""
     ax = drawing.subfigs[-1].subplots()
     shades = [REGIONS[i % len(REGIONS)] for i in range(len(angles))]
-    ax.hist(
-        list(angles.values()), bins=36, range=ANGLES_DEG, histtype="step", color=shades, label=list(angles)
-    )
+    values, names = list(angles.values()), list(angles)
+    ax.hist(values, bins=36, range=ANGLES_DEG, histtype="step", color=shades, label=names)
     ax.set(xlim=ANGLES_DEG, xlabel="smallest dihedral angle of an element (degrees)", ylabel="elements")
     ax.legend(frameon=False, fontsize=9, title="site")
     ax.spines[["top", "right"]].set_visible(False)

@@ -9,33 +9,21 @@ from ..formats import format_number, format_parameter
 from ..page import Block, KeyNumber, Note, Page, Section, make_bullets
 from ..store import Results
 from ..words import make_prose, make_section, write_words
-from .cube import make_cube_section
-from .design import make_design_section, make_protocol_section
-from .identification import make_convergence_section, make_parameter_section
-from .methods import make_method_section
-from .model import make_mesh_section, make_model_section
-from .other_fits import make_crossvalidation_section, make_regions_section
-from .prediction import make_domain_section, make_fit_section, make_prediction_section
-from .provenance import make_provenance_section, make_settings_section, make_timing_section
-from .records import make_record_check_section, make_record_section
-from .sensitivity import SENSITIVITIES
-from .simulations import make_comparison_section, make_simulated_section, make_solver_section
-from .socket import make_socket_design_section, make_socket_section
-from .uncertainty import make_models_section, make_uncertainty_section
+from . import design, identification, inputs, methods, simulations, socket, uncertainty, variants
 
 Maker = Callable[[Results, Any], Section]
 # By the name of the experiment, in the order of the page; a maker is given the store and the stored result,
 # of an extension as ``<name>.json`` holds it.
 _OWN: dict[str, Maker] = {
-    "uncertainty": make_uncertainty_section,
-    "regions": make_regions_section,
-    "cube": make_cube_section,
-    **SENSITIVITIES,
-    "crossvalidate": make_crossvalidation_section,
-    "design": make_design_section,
-    "protocol": make_protocol_section,
-    "socket": make_socket_section,
-    "socket_design": make_socket_design_section,
+    "uncertainty": uncertainty.make_uncertainty_section,
+    "regions": uncertainty.make_regions_section,
+    "cube": variants.make_cube_section,
+    **variants.SENSITIVITIES,
+    "crossvalidate": uncertainty.make_crossvalidation_section,
+    "design": design.make_design_section,
+    "protocol": design.make_protocol_section,
+    "socket": socket.make_socket_section,
+    "socket_design": socket.make_socket_design_section,
 }
 SECTIONS = Registry("report section", _OWN)
 
@@ -46,24 +34,24 @@ def make_page(store: Results) -> Page:
     """Every section in the order in which a reader asks."""
     run = store.run
     sections = (
-        make_model_section(store),
-        make_mesh_section(store),
-        make_record_section(store),
-        make_fit_section(store),
-        make_prediction_section(store),
-        make_domain_section(store) if store.predict else None,
-        make_record_check_section(store) if store.predict else None,
-        make_parameter_section(store),
-        make_convergence_section(store),
-        make_models_section(store, store.models) if store.models else None,
+        inputs.make_model_section(store),
+        inputs.make_mesh_section(store),
+        inputs.make_record_section(store),
+        identification.make_fit_section(store),
+        identification.make_prediction_section(store),
+        identification.make_domain_section(store) if store.predict else None,
+        inputs.make_record_check_section(store) if store.predict else None,
+        identification.make_parameter_section(store),
+        identification.make_convergence_section(store),
+        uncertainty.make_models_section(store, store.models) if store.models else None,
         *_list_experiment_sections(store),
-        make_simulated_section(store) if store.simulated else None,
-        make_comparison_section(store) if store.compared else None,
-        make_solver_section(store),
-        make_method_section(store),
-        make_timing_section(store),
-        make_settings_section(store),
-        make_provenance_section(store),
+        simulations.make_simulated_section(store) if store.simulated else None,
+        simulations.make_comparison_section(store) if store.compared else None,
+        simulations.make_solver_section(store),
+        methods.make_method_section(store),
+        methods.make_timing_section(store),
+        methods.make_settings_section(store),
+        methods.make_provenance_section(store),
     )
     return Page(
         title=run.study.name if run else "Unnamed study",

@@ -1,11 +1,12 @@
-"""The method in words for a paper's supplement, made of what is stored: settings, meshes, runs, versions.
+"""What someone else needs to get the same numbers: the method in words, times, settings, versions, hashes.
 
 The words are in ``templates/methods.j2``. Nothing here comes from an image's header, and inputs are named by
 their keys in the study file.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from jinja2 import ChainableUndefined
 
@@ -13,11 +14,10 @@ from ...laws import ACTIVE, OGDEN, split_key
 from ...results.base import Parameters, ResultPart
 from ...results.identification import ParameterBounds
 from ...shapes import SHAPES
-from ..formats import NOTHING, format_fixed, format_limits, format_symbol, format_with_value
-from ..page import Prose, Section
+from ..formats import NOTHING, format_duration, format_fixed, format_limits, format_symbol, format_with_value
+from ..page import Prose, Section, Table
 from ..store import Json, Results
-from ..words import make_environment
-from .provenance import flatten_settings
+from ..words import make_environment, make_prose, make_row, make_section, make_table, to_numeric, write_words
 
 Part = tuple[str, str]  # a heading and its paragraph
 
@@ -78,9 +78,7 @@ def write_method_parts(store: Results) -> tuple[Part, ...]:
 def _format_span(facts: Iterable[ResultPart], key: str, digits: int, factor: int = 1) -> str:
     """From the least to the largest value of a key, where there is one."""
     values = [factor * value for fact in facts if (value := getattr(fact, key)) is not None]
-    return (
-        f"{format_fixed(min(values), digits)} to {format_fixed(max(values), digits)}" if values else NOTHING
-    )
+    return " to ".join(format_fixed(end(values), digits) for end in (min, max)) if values else NOTHING
 
 
 def _format_pairs(table: Json) -> str:
@@ -88,9 +86,8 @@ def _format_pairs(table: Json) -> str:
 
 
 def _format_start(start: Parameters) -> str:
-    return _join_tissues(
-        {t: ", ".join(map(format_with_value, values, values.values())) for t, values in start.items()}
-    )
+    texts = {name: map(format_with_value, values, values.values()) for name, values in start.items()}
+    return _join_tissues({name: ", ".join(parts) for name, parts in texts.items()})
 
 
 def _format_bounds(bounds: ParameterBounds) -> str:
@@ -121,3 +118,60 @@ def _list_experiments(store: Results) -> list[str]:
         plain = {key: value for key, value in options.items() if not isinstance(value, dict)}
         done.append(name + (f" ({_format_pairs(plain)})" if plain else ""))
     return done
+
+
+def make_timing_section(store: Results) -> Section:
+    """How long it took, and on what."""
+    if store.run is None:
+        return make_section("timing")
+    stages = store.run.stages
+    seconds = [stage.seconds for stage in stages.values()]
+    total = make_row("Total", to_numeric(format_duration(sum(seconds))), "")
+    return make_section(
+        "timing",
+        make_table("timing", stages.items(), foot=(total,), longest=max([*seconds, 1e-9])),
+        make_prose("machine", machine=store.run.machine),
+    )
+
+
+def make_settings_section(store: Results) -> Section:
+    """Every setting of the study file."""
+    flat = flatten_settings(store.run.settings if store.run else {})
+    table = make_pair_table("all-settings", ("Key", "Value"), flat)
+    return make_section("settings", table)
+
+
+def make_provenance_section(store: Results) -> Section:
+    """Versions and hashes of inputs."""
+    run, head = store.run, ("Key of the study", "SHA-256")
+    versions = {"limbfit": run.limbfit, **run.versions} if run else {}
+    return make_section(
+        "provenance",
+        make_pair_table("versions", ("Library", "Version"), versions),
+        make_pair_table("inputs", head, run.inputs if run else {}),
+    )
+
+
+def make_pair_table(name: str, head: tuple[str, str], pairs: Mapping[str, Any]) -> Table | None:
+    """A table of keys and values; a long one is folded on the screen; None where there are none."""
+    rows = tuple(make_row(*pair) for pair in pairs.items())
+    caption = write_words(f"table {name}")
+    return Table(name, caption, head, rows, folded=len(rows) > 12) if rows else None
+
+
+def flatten_settings(settings: Any, prefix: str = "") -> dict[str, str]:
+    """Nested tables as ``table.key`` pairs; the entries of a list of sites go by the site's name."""
+    if isinstance(settings, Mapping):
+        items: Iterable[tuple[Any, Any]] = settings.items()
+    elif isinstance(settings, list) and settings and all(isinstance(one, Mapping) for one in settings):
+        items = ((one.get("name", i), one) for i, one in enumerate(settings))
+    elif isinstance(settings, list):
+        return {prefix: ", ".join(map(str, settings))}
+    elif isinstance(settings, bool):
+        return {prefix: "yes" if settings else "no"}
+    else:
+        return {prefix: NOTHING if settings is None else str(settings)}
+    flat: dict[str, str] = {}
+    for key, value in items:
+        flat |= flatten_settings(value, f"{prefix}.{key}" if prefix else str(key))
+    return flat

@@ -11,7 +11,7 @@ from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..page import Bullets, Figure, Note, Section, make_bullets
 from ..store import Results
 from ..words import make_prose, make_section, make_table, write_words
-from .provenance import make_pair_table
+from .methods import make_pair_table
 
 
 def make_simulated_section(store: Results) -> Section:

@@ -1,4 +1,4 @@
-"""What the records determine: intervals by three methods, profiles, posterior, sources, predictions."""
+"""What the records determine: intervals, sources, other models, other choices of sites, regions (table 3)."""
 
 from typing import Any
 
@@ -8,20 +8,20 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure as Drawing
 from matplotlib.ticker import MaxNLocator
 
-from ...results.models import ModelsResult
-from ...results.uncertainty import LikelihoodProfile, UncertaintyResult
+from ...results import uncertainty as stored
 from ..drawing import plots
-from ..drawing.colours import INK, MEASURED, MUTED, SIMULATED, choose_truth_style
-from ..formats import format_fixed, format_parameter
-from ..page import Bullets, Figure, Note, Prose, Section, Table
+from ..drawing.colours import HELD_OUT, INK, MEASURED, MUTED, ONE_MATERIAL, SIMULATED
+from ..formats import format_fixed, format_parameter, format_with_unit
+from ..page import Bullets, Figure, Note, Prose, Section, Table, make_bullets
 from ..store import Curves, Results, find_compared_quantity
-from ..words import make_prose, make_section, make_table, write_words
+from ..words import make_prose, make_row, make_section, make_table, to_numeric, write_words
 
 TrueValues = dict[str, tuple[float, dict[str, Any]]]  # by name: a true parameter and its line
-MAX_DRAWS, MAX_SITES = 300, 18
+MAX_DRAWS, MAX_SITES, MAX_PANELS = 300, 18, 4
+MAX_FACTOR = 1e3  # of an interval over its value, in the figure
 
 
-def make_uncertainty_section(store: Results, content: UncertaintyResult) -> Section:
+def make_uncertainty_section(store: Results, content: stored.UncertaintyResult) -> Section:
     """What the experiment ``uncertainty`` found."""
     found = content.predictions
     emulator = write_words("emulator", emulator=content.emulator, chain=content.posterior)
@@ -42,7 +42,7 @@ def make_uncertainty_section(store: Results, content: UncertaintyResult) -> Sect
 
 
 @plots.styled
-def draw_profile_figure(store: Results, content: UncertaintyResult) -> Figure | None:
+def draw_profile_figure(store: Results, content: stored.UncertaintyResult) -> Figure | None:
     """How much worse the records are met as one parameter moves and the others follow."""
     profiles = content.profiles
     if not profiles:
@@ -63,7 +63,7 @@ def draw_profile_figure(store: Results, content: UncertaintyResult) -> Figure | 
     return plots.make_figure(drawing, "profiles", profiles=profiles, checks=content.checks)
 
 
-def _draw_profile(ax: Axes, profile: LikelihoodProfile) -> None:
+def _draw_profile(ax: Axes, profile: stored.LikelihoodProfile) -> None:
     """A profile, dashed and with open circles where it is extrapolated."""
     values, rise = np.array(profile.values), np.array(profile.rise)
     beyond = np.array(profile.extrapolated, dtype=bool)
@@ -74,7 +74,7 @@ def _draw_profile(ax: Axes, profile: LikelihoodProfile) -> None:
     ax.plot(values[beyond], rise[beyond], color=SIMULATED, ls="", marker="o", ms=3.0, mfc="none")
 
 
-def _make_evidence_table(content: UncertaintyResult) -> Table | None:
+def _make_evidence_table(content: stored.UncertaintyResult) -> Table | None:
     """One material against several."""
     found = content.evidence
     if found is None:
@@ -90,14 +90,14 @@ def read_true_values(store: Results) -> TrueValues:
     """The phantom's true parameters by name, with their line; none for a patient."""
     found = store.truth.get("parameters") or {}
     return {
-        f"{tissue}.{name}": (float(value), choose_truth_style(i))
+        f"{tissue}.{name}": (float(value), plots.choose_truth_style(i))
         for i, (tissue, values) in enumerate(found.items())
         for name, value in values.items()
     }
 
 
 @plots.styled
-def draw_pairs_figure(store: Results, content: UncertaintyResult) -> Figure | None:
+def draw_pairs_figure(store: Results, content: stored.UncertaintyResult) -> Figure | None:
     """Draws of the posterior, every parameter against every other, in logarithms."""
     draws = store.curves("uncertainty", "draws")
     if draws is None:
@@ -146,7 +146,7 @@ def _name_axis(axis: Axis, name: str, numbered: bool) -> None:
 
 
 @plots.styled
-def draw_prediction_figure(store: Results, content: UncertaintyResult) -> Figure | None:
+def draw_prediction_figure(store: Results, content: stored.UncertaintyResult) -> Figure | None:
     """Records beside their prediction intervals, held-out sites first."""
     rows = sorted(content.predictions.sites, key=lambda row: row.fitted)[:MAX_SITES]
     pairs = store.with_curves("uncertainty/predictions", rows)
@@ -173,10 +173,7 @@ def draw_prediction_figure(store: Results, content: UncertaintyResult) -> Figure
     return plots.make_figure(drawing, "predictions", records=[row.record for row, _ in pairs])
 
 
-_MAX_PANELS = 4
-
-
-def make_models_section(store: Results, content: ModelsResult) -> Section:
+def make_models_section(store: Results, content: stored.ModelsResult) -> Section:
     """What ``limbfit uncertainty --models`` found."""
     return make_section(
         "models",
@@ -189,9 +186,9 @@ def make_models_section(store: Results, content: ModelsResult) -> Section:
 
 
 @plots.styled
-def _draw_model_figure(store: Results, content: ModelsResult) -> Figure | None:
+def _draw_model_figure(store: Results, content: stored.ModelsResult) -> Figure | None:
     rows = [row for row in content.records if not row.fitted] or content.records
-    found = store.with_curves("models", rows[:_MAX_PANELS])
+    found = store.with_curves("models", rows[:MAX_PANELS])
     if not found:
         return None
     drawing, axes = plots.make_panels(len(found), min(len(found), 2), 2.8)
@@ -208,3 +205,119 @@ def _draw_model_figure(store: Results, content: ModelsResult) -> Figure | None:
         ax.set_xlim(0.0, float(np.max(time)))
     plots.add_legend(drawing, axes[0])
     return plots.make_figure(drawing, "models")
+
+
+def make_crossvalidation_section(store: Results, content: stored.CrossvalidateResult) -> Section:
+    """What the experiment ``crossvalidate`` found."""
+    return make_section(
+        "crossvalidate",
+        make_prose("crossvalidate", content=content),
+        _draw_errors(content),
+        make_table("crossvalidate-sites", content.sites, marked="fitted"),
+        make_table("crossvalidate-regions", content.regions),
+        make_table("crossvalidate-checks", content.emulator.checks),
+    )
+
+
+@plots.styled
+def _draw_errors(content: stored.CrossvalidateResult) -> Figure:
+    own = content.own
+    means = np.array([fold.mean_error_heldout_percent for fold in content.folds])
+    sites = [row.site for row in content.sites]
+    drawing, axes = plots.make_panels(2, 2, 2.8)
+    ax = axes[0]
+    ax.hist(means, bins=min(24, max(5, len(means) // 3)), color=SIMULATED, alpha=0.6, label="choices")
+    if own.mean_error_heldout_percent is not None:
+        ax.axvline(own.mean_error_heldout_percent, color=ONE_MATERIAL, lw=2, label="the study's choice")
+    ax.axvline(own.median_percent, color=INK, lw=1, ls="--", label="middle")
+    ax.set_xlabel("Mean held-out error (%)")
+    ax.set_ylabel("Choices of sites")
+    ax = axes[1]
+    for at, site in enumerate(sites):
+        errors = [f.errors_percent[site] for f in content.folds if site not in f.fitted]
+        if errors:
+            low, middle, high = np.percentile(errors, [5, 50, 95])
+            ax.plot([at, at], [low, high], color=HELD_OUT, lw=5, alpha=0.35, solid_capstyle="butt")
+            ax.plot(at, middle, "o", color=HELD_OUT, ms=4)
+        ax.plot(at, own.errors_percent[site], "x", color=MUTED, ms=6, mew=1.6)
+    ax.set_xticks(range(len(sites)), sites, rotation=90 if len(sites) > 8 else 0)
+    ax.set_ylim(bottom=0)
+    ax.set_xlabel("Site")
+    ax.set_ylabel("Error when not fitted (%)")
+    ax.grid(visible=False, axis="x")
+    plots.add_legend(drawing, axes[0])
+    return plots.make_figure(drawing, "crossvalidate", content=content)
+
+
+def make_regions_section(store: Results, content: stored.RegionsResult) -> Section:
+    """What the experiment ``regions`` found."""
+    verdicts = [word for row in content.regions for word in row.verdict.values()]
+    parameters = [(tissue, key) for tissue in content.whole.parameters for key in store.law.keys]
+    return make_section(
+        "regions",
+        make_prose("regions", content=content, verdicts=verdicts),
+        make_bullets(f"Left out: {text}." for text in content.left_out),
+        make_table("regions", parameters, store=store, content=content),
+        make_error_table(store, content),
+        _draw_regions(store, content),
+    )
+
+
+def make_error_table(store: Results, content: stored.RegionsResult) -> Table | None:
+    """The errors of each region's records with its own model and with the whole limb's."""
+
+    def is_fitted(row: tuple[stored.RegionFitted, str]) -> bool:
+        region, record = row
+        facts = store.traces.get(record)
+        return (facts.site if facts else record) in region.fitted_sites
+
+    rows = [(region, record) for region in content.regions for record in region.own_error_percent_by_site]
+    foot = []
+    for region in content.regions:
+        errors = region.own_error_percent, region.whole_error_percent
+        means = (to_numeric(format_fixed(error, 2)) for error in errors)
+        number_of_sites = f"{len(region.sites)} site{'s' if len(region.sites) > 1 else ''}"
+        end = "" if region.converged else "not converged"
+        foot.append(make_row(f"Mean, {region.region}", number_of_sites, end, *means))
+    return make_table("region-errors", rows, marked=is_fitted, foot=foot, is_fitted=is_fitted)
+
+
+@plots.styled
+def _draw_regions(store: Results, content: stored.RegionsResult) -> Figure:
+    """Errors by region as bars; each parameter by region with its interval, against the whole limb's."""
+    regions, count = content.regions, 1 + len(store.law.keys)
+    names = [row.region for row in regions]
+    drawing, axes = plots.make_panels(count, count, 0.9 + 0.34 * len(regions))
+    for at, row in enumerate(regions):
+        for shift, error, color, label in (
+            (-0.18, row.own_error_percent, SIMULATED, "region's own model"),
+            (0.18, row.whole_error_percent, HELD_OUT, "whole limb's model"),
+        ):
+            named = None if at else label
+            axes[0].barh(at + shift, error or 0.0, 0.34, color=color, alpha=0.75, label=named)
+    axes[0].set_title("Error (%)")
+    axes[0].set_yticks(range(len(names)), names)
+    for ax, name in zip(axes[1:], store.law.keys, strict=True):
+        _draw_parameter(ax, content, name)
+    for ax in axes:
+        ax.set_ylim(len(regions) - 0.5, -0.5)
+        ax.grid(visible=False, axis="y")
+    plots.add_legend(drawing, *axes[:2])
+    return plots.make_figure(drawing, "regions")
+
+
+def _draw_parameter(ax: Axes, content: stored.RegionsResult, name: str) -> None:
+    tissues = list(content.whole.parameters)
+    for i, tissue in enumerate(tissues):
+        style = plots.choose_tissue_style(i)
+        ax.axvline(content.whole.parameters[tissue][name], color=style["color"], ls=style["ls"], lw=0.9)
+        for at, row in enumerate(content.regions):
+            value, limits = row.parameters[tissue][name], row.intervals_95[tissue][name]
+            y = at + 0.3 * (i - (len(tissues) - 1) / 2)
+            low, high = max(limits[0], value / MAX_FACTOR), min(limits[1], value * MAX_FACTOR)
+            ax.plot([low, high], [y, y], color=style["color"], lw=4, alpha=0.3, solid_capstyle="butt")
+            label = tissue if at == 0 else None
+            ax.plot(value, y, ls="", marker=style["marker"], color=style["color"], ms=5, label=label)
+    plots.set_log_scale(ax)
+    ax.set_title(format_with_unit(name))
+    ax.set_yticks([])

@@ -1,4 +1,4 @@
-// Blocks of named arrays, as limbfit/web/arrays.py writes them.
+// Blocks of named arrays, as limbfit/web/__init__.py writes them.
 const ARRAY_TYPES = { f4: Float32Array, u4: Uint32Array, u2: Uint16Array, u1: Uint8Array, i4: Int32Array };
 
 /** {arrays: {name: {values, shape}}, facts} of an ArrayBuffer. */

@@ -1,31 +1,138 @@
-"""Tissue parameters from measured curves of your own problems, with what the curves leave open."""
+"""One's own problems from a script or a notebook: solved, drawn and fitted in a few lines.
 
+A `Solution` shows itself: its curve as a plot, its steps as grids of pyvista. A `Fit` has tissue parameters
+from measured curves, with what the curves leave open.
+"""
+
+import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import cast
 
 import numpy as np
+import pyvista as pv
+from matplotlib import pyplot
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
-from ..arrays import Array
-from ..errors import ProblemError
-from ..fe import Problem, StepControl, System, list_texts
-from ..fe import solve as simulate
-from ..fe.checking import check
-from ..identify.fit.calibration import CalibrationSettings
-from ..identify.fit.calibration import calibrate as search
-from ..identify.fit.objective import MeasuredCurve, SiteResponse
-from ..identify.fit.parameters import Unknowns, group_separately
-from ..identify.fit.prediction import compute_error_percent
-from ..identify.uncertainty.noise import estimate_curve_noise
-from ..identify.uncertainty.uncertainty import Uncertainty, estimate_uncertainty
-from .solution import Solution, announce_compilation, new_axes, solve
+from .arrays import Array
+from .errors import ProblemError
+from .fe import Problem, Result, State, Step, StepControl, System, list_texts
+from .fe import solve as simulate
+from .fe.checking import check
+from .fe.kernel.assembly import is_compiled
+from .fields import rest, state_fields
+from .identify.fit.calibration import CalibrationSettings
+from .identify.fit.calibration import calibrate as search
+from .identify.fit.objective import MeasuredCurve, SiteResponse
+from .identify.fit.parameters import Unknowns, group_separately
+from .identify.fit.prediction import compute_error_percent
+from .identify.uncertainty.noise import estimate_curve_noise
+from .identify.uncertainty.uncertainty import Uncertainty, estimate_uncertainty
+
+__all__ = ["Fit", "Solution", "calibrate", "solve"]
 
 Curve = tuple[ArrayLike, ArrayLike]  # times (n,) s; force (n,) N, or displacement, mm, under a force
 DEFAULT_BOUND_FACTOR = 100.0  # of default bounds, over the start
 CURVE = "give (times, values), both (n,), times growing"  # what a curve is
+COMPILING = "limbfit compiles its kernels: half a minute, once on this machine"
+
+
+@dataclass(frozen=True, repr=False)
+class Solution(Result):
+    """A `Result` that shows itself; ``frames`` are rest and every step, stresses included."""
+
+    frames: tuple[State, ...] = ()
+
+    def __repr__(self) -> str:
+        ended = "complete" if self.completed else f"incomplete: {self.reason}"
+        steps, end = len(self.times) - 1, self.times[-1]
+        return f"<Solution: {steps} steps to {end:g} s, {self.peak_force:.3g} N at most, {ended}>"
+
+    def to_pyvista(self, step: int | None = None) -> pv.UnstructuredGrid:
+        """The mesh at rest with the fields of a step; ``grid.warp_by_vector("displacement_mm")`` moves it.
+        The grid has arrays of its own: what is changed in it changes neither mesh nor solution.
+
+        ``step``: 0 is rest, -1 the last; by default the deepest of the loading. Fields and units are those of
+        ``docs/fields.md``: stress, stretch, contact pressure.
+        """
+        if step is None:
+            frame = self.deepest
+        else:
+            frame = self.frames[step] if -len(self.frames) <= step < len(self.frames) else None
+        if frame is None:
+            has = f"there are {len(self.frames)}" if self.frames else "it was solved without frames"
+            raise ProblemError(f"no step {step}: {has}", remedy="count from 0, which is rest")
+        mesh = self.problem.mesh
+        grid = pv.UnstructuredGrid({mesh.kind.vtk: mesh.cells}, mesh.points.copy())
+        system = self.system or System(self.problem)
+        point_data, cell_data = state_fields(system, self.problem, frame)
+        for data, arrays in ((grid.point_data, point_data), (grid.cell_data, cell_data)):
+            for name, values in arrays.items():
+                data[name] = np.array(values)
+        grid.cell_data["region"] = mesh.regions.copy()
+        grid.field_data["region_names"] = list(mesh.region_names)  # for `read_vtu`, where it is saved
+        return grid
+
+    def plot(self, axes: Axes | None = None, label: str = "") -> Axes:
+        """Draw force (N) against displacement (mm), on new axes where none are given."""
+        axes = axes or new_axes()
+        times = np.linspace(0.0, self.times[-1], 400)
+        axes.plot(self.displacement_at(times), self.force_at(times), label=label or "simulated")
+        axes.plot(self.displacement, self.force, ".", color=axes.lines[-1].get_color())
+        axes.set(xlabel="displacement, mm", ylabel="force, N")
+        return axes
+
+
+def solve(
+    problem: Problem,
+    steps: StepControl | None = None,
+    *,
+    sensitivities: bool = False,
+    frames: bool = True,
+    listener: Callable[[Step], None] | None = None,
+) -> Solution:
+    """Simulate an indentation.
+
+    Parameters
+    ----------
+    steps : how it steps, and on how many threads; the defaults need no change.
+    sensitivities : also the derivative of the force with respect to every material parameter.
+    frames : keep every step with its stresses, for `Solution.to_pyvista`; without, the deepest alone.
+    listener : called with every step.
+
+    Raises
+    ------
+    ProblemError
+        Before anything is solved, where the problem is impossible as stated. A simulation that cannot go on
+        is no error: the solution says ``completed = False`` and why.
+    """
+    announce_compilation()
+    states: list[State] = []
+
+    def keep(step: Step) -> None:
+        if frames:
+            states.append(step.state)
+        if listener is not None:
+            listener(step)
+
+    result = simulate(problem, steps or StepControl(), sensitivities=sensitivities, on_step=keep)
+    if frames:
+        states.insert(0, rest(result.system, problem))
+    return Solution(**{f.name: getattr(result, f.name) for f in fields(Result)}, frames=tuple(states))
+
+
+def new_axes() -> Axes:
+    """Axes on a new figure of pyplot: a notebook shows it, ``pyplot.show()`` does so in a script."""
+    _, axes = pyplot.subplots(figsize=(5, 4), layout="constrained")
+    return axes
+
+
+def announce_compilation() -> None:
+    """Say so on standard error where the kernels are not compiled yet: a first run seems to hang."""
+    if not is_compiled():
+        sys.stderr.write(COMPILING + "\n")
 
 
 @dataclass(frozen=True)
@@ -125,10 +232,9 @@ def calibrate(
     systems = [System(case, control.threads) for case in cases]
     model = _Model(cases, pairs, unknowns.names, [control] * len(cases), systems, listener)
     measured = _to_measured(pairs)
-    result = search(
-        model, measured, unknowns, CalibrationSettings(), stages=[group_separately(unknowns.names)]
-    )
-    names, best = unknowns.names, result.parameters
+    names = unknowns.names
+    result = search(model, measured, unknowns, CalibrationSettings(), stages=[group_separately(names)])
+    best = result.parameters
     return Fit(
         parameters=dict(zip(names, best.tolist(), strict=True)),
         error_percent=tuple(
@@ -186,10 +292,8 @@ class _Model:
         names = [f"{region}.{parameter}" for region, parameter in result.parameter_names]
         response, full = result.response_at(times), result.response_sensitivity_at(times)
         if self.calls == 1 and result.completed and not response.any():
-            raise ProblemError(
-                f"curve {number + 1}: the simulation does not answer at any of its times",
-                remedy="displacement and force are positive into the tissue",
-            )
+            what = f"curve {number + 1}: the simulation does not answer at any of its times"
+            raise ProblemError(what, remedy="displacement and force are positive into the tissue")
         absent = np.zeros(len(times))
         columns = [full[:, names.index(name)] if name in names else absent for name in self.names]
         answer = response, np.stack(columns, axis=1), result.completed, result.reason
@@ -210,15 +314,11 @@ def _pair_curves(curves: Sequence[Curve], problems: Sequence[Problem]) -> tuple[
         if times.ndim != 1 or times.shape != force.shape or not (len(times) and (np.diff(times) > 0).all()):
             raise ProblemError(f"curve {number} has times {times.shape}, values {force.shape}", remedy=CURVE)
         if not np.isfinite(force).all():
-            raise ProblemError(
-                f"curve {number} has {np.count_nonzero(~np.isfinite(force))} values that are not finite",
-                remedy="leave these points out",
-            )
+            what = f"curve {number} has {np.count_nonzero(~np.isfinite(force))} values that are not finite"
+            raise ProblemError(what, remedy="leave these points out")
         if times[0] < 0.0 or times[-1] > end * (1.0 + 1e-9):
-            raise ProblemError(
-                f"curve {number} lasts from {times[0]:g} to {times[-1]:g} s, the indentation to {end:g} s",
-                remedy="count time from touch-down, and cut what lies outside",
-            )
+            what = f"curve {number} lasts from {times[0]:g} to {times[-1]:g} s, the indentation to {end:g} s"
+            raise ProblemError(what, remedy="count time from touch-down, and cut what lies outside")
         pairs.append((times, force))
     return tuple(pairs)
 
@@ -235,11 +335,8 @@ def _build_unknowns(
     if not start or not bounds.keys() <= start.keys():
         raise ProblemError("a parameter to be fitted has no start", remedy="name each in start")
     values = np.array([float(value) for value in start.values()])
-    limits = [
-        bounds.get(name, (value / DEFAULT_BOUND_FACTOR, value * DEFAULT_BOUND_FACTOR))
-        for name, value in zip(start, values)
-    ]
-    low, high = np.array(limits, dtype=float).T
+    usual = zip(start, values / DEFAULT_BOUND_FACTOR, values * DEFAULT_BOUND_FACTOR)
+    low, high = np.array([bounds.get(name, ends) for name, *ends in usual], dtype=float).T
     return Unknowns(tuple(start), values, low, high)
 
 

@@ -1,20 +1,59 @@
-"""Indentation records in the report: the paper's figure 3, what was found in them, and what looks wrong."""
+"""The limb with its sites and meshes; its records (the paper's figure 3), and what looks wrong in them."""
 
 from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 
 from ...identify.checks.outliers import MAX_STANDARDISED_ERROR, MIN_ERROR_SHARE
-from ...results.records import RecordPhase
+from ...results.limb import RecordPhase
+from ..drawing import pictures
 from ..drawing.colours import GRID, INK, MUTED, SIMULATED
 from ..drawing.figures import thin_curves
-from ..drawing.interactive import draw_record_curves
+from ..drawing.interactive import draw_record_curves, make_explorer
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
-from ..page import Figure, Note, Section, Table, make_bullets
+from ..page import Figure, Note, Prose, Section, Table, make_bullets
 from ..store import Curves, Results
 from ..words import make_prose, make_section, make_table
 
 MAX_NAMED_PHASES = 6  # whose names have room in a panel
+
+
+def make_model_section(store: Results) -> Section:
+    """Surfaces, sites and volumes."""
+    segment, surfaces = store.segment, store.surfaces
+    return make_section(
+        "model",
+        Prose(f"Segmentation: {segment.method}.") if segment else None,
+        make_explorer(store),
+        pictures.draw_slices_figure(store),
+        pictures.draw_surface_figure(store),
+        pictures.draw_marker_figure(store),
+        make_volume_table(store),
+        make_table("places", store.sites, marked="fitted"),
+        make_bullets((*(segment.warnings if segment else ()), *(surfaces.notes if surfaces else ()))),
+    )
+
+
+def make_volume_table(store: Results) -> Table | None:
+    """Volumes from the label map and inside the surfaces."""
+    labels, found = store.segment.volumes_cm3 if store.segment else {}, store.surfaces
+    bodies = {"skin": found.skin, **found.bones, **found.regions} if found else {}
+    closed = {name: body.volume_mm3 / 1000 for name, body in bodies.items()}
+    names = list(dict.fromkeys([*labels, *closed]))
+    rows = [{"name": name, "labels": labels.get(name), "closed": closed.get(name)} for name in names]
+    return make_table("volumes", rows)
+
+
+def make_mesh_section(store: Results) -> Section:
+    """Cut meshes and their quality."""
+    found = ((site, (*facts.repairs, *facts.warnings)) for site, facts in store.mesh.items())
+    warnings = (f"Site {site}: {text}" for site, texts in found for text in texts)
+    return make_section(
+        "meshes",
+        pictures.draw_mesh_figure(store, store.fitted[:4]),
+        make_table("meshes", store.mesh.items(), marked=lambda row: row[0] in store.fitted),
+        make_bullets(warnings),
+    )
 
 
 def make_record_section(store: Results) -> Section:
