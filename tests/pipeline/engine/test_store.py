@@ -10,8 +10,7 @@ import pytest
 
 from limbfit.errors import RunError
 from limbfit.pipeline.engine.digests import compute_file_digest
-from limbfit.pipeline.engine.partial_results import ResultFiles
-from limbfit.pipeline.engine.storage import read_json, write_json
+from limbfit.pipeline.engine.files import ResultFiles, read_json, write_json
 from limbfit.pipeline.engine.store import EARLIER, Store, lock, translate_disk_errors
 
 

@@ -15,10 +15,13 @@ from limbfit.indentation import Parameters, Simulation, SimulationJob, SiteModel
 from limbfit.mesh import Mesh, write_vtu
 from limbfit.phantom.record import Ramp, RobotRecord, record
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.identification.fine_meshes import FineMeshCorrection, correct_to_fine_meshes
-from limbfit.pipeline.identification.intervals import estimate_linearised
+from limbfit.pipeline.identification.answer import (
+    FineMeshCorrection,
+    correct_to_fine_meshes,
+    estimate_linearised,
+)
 from limbfit.pipeline.identification.problem import build_problem
-from limbfit.pipeline.identification.record_simulator import RecordSimulator
+from limbfit.pipeline.identification.search import RecordSimulator
 from limbfit.pipeline.records.records import RecordSet, load_records
 from limbfit.pipeline.simulation.simulations import SimulationCache
 from limbfit.study import Study, load_study

@@ -14,10 +14,9 @@ from limbfit.indentation import SimulationJob, SiteModel, simulate
 from limbfit.mesh import write_vtu
 from limbfit.pipeline.engine.context import Context, Progress
 from limbfit.pipeline.engine.store import COARSE
-from limbfit.pipeline.identification.fine_meshes import correct_to_fine_meshes
-from limbfit.pipeline.identification.intervals import estimate_linearised
+from limbfit.pipeline.identification.answer import correct_to_fine_meshes, estimate_linearised
 from limbfit.pipeline.identification.problem import build_problem
-from limbfit.pipeline.identification.record_simulator import RecordSimulator
+from limbfit.pipeline.identification.search import RecordSimulator
 from limbfit.pipeline.records.records import load_records, load_site_record, to_response
 from limbfit.pipeline.simulation.simulations import SimulationCache
 from limbfit.study import Record, Study, load_study

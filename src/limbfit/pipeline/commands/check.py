@@ -17,7 +17,7 @@ from ...traces import SurfaceMotion
 from ..engine.context import Listener, Progress, ignore_progress
 from ..engine.store import Store
 from ..identification.problem import check_fitted
-from ..limb.inputs import check_labels, read_marked_image, read_study_image, read_study_labels
+from ..limb.segment import check_labels, read_marked_image, read_study_image, read_study_labels
 from ..limb.sites import place_site
 from ..limb.surfaces import read_given_anatomy
 from ..records.record_checks import choose_surface_points, record_flags

@@ -18,7 +18,7 @@ from ...indentation import Parameters, build_first_steps
 from ...results.runs import CompareResult, CurveDifference, CurveFiles, FebioSimulation, LimbfitSimulation
 from ...study import Study
 from ..engine.context import Listener, ignore_progress
-from ..engine.storage import write_curves, write_result
+from ..engine.files import write_curves, write_result
 from .simulate import PreparedIndentation, prepare_site, run_febio_site
 
 MAX_PENETRATION = 1.0  # penetration over the depth: FEBio's punch sinks in as far as its penalty lets it

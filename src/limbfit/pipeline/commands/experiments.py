@@ -21,7 +21,7 @@ from ...report.sections.contents import SECTIONS, Maker
 from ...study import Study
 from ..design.design import check_design, run_design
 from ..design.protocol import check_protocol, run_protocol
-from ..engine.keys import Keys, Stage, StageKey
+from ..engine.provenance import Keys, Stage, StageKey
 from ..engine.store import StageState, Store
 from ..identification.crossvalidation import check_crossvalidate, run_crossvalidate
 from ..identification.problem import check_fitted

@@ -19,7 +19,7 @@ import tomlkit
 from ...arrays import Array
 from ...errors import InputError
 from ...identify.fit.prediction import NORMAL_95
-from ...identify.uncertainty.model_comparison import compute_mixture_interval, weigh_models
+from ...identify.uncertainty.likelihood import compute_mixture_interval, weigh_models
 from ...laws import FIBRED, FUNG, LAWS, OGDEN, POWER
 from ...results import models as stored
 from ...results.curves import read_curves
@@ -27,10 +27,9 @@ from ...results.identification import RecordPrediction
 from ...results.socket import LoadedRegion, SocketResult
 from ...study import Study, load_study
 from ..engine.context import Listener, ignore_progress
-from ..engine.files import find_hand_labels
-from ..engine.storage import write_curves, write_result
+from ..engine.files import find_hand_labels, write_curves, write_result
 from ..engine.store import Store, lock
-from .fitting import fit_socket
+from .planning import fit_socket
 from .run import compute_keys, run_study
 
 FOLDER = "models"

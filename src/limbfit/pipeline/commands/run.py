@@ -20,13 +20,19 @@ from ...results.identification import CalibrationResult, PredictResult
 from ...results.models import ModelsResult
 from ...results.runs import ExperimentRecord, MachineFacts, RunResult, StageRecord, StudyName
 from ...study import Site, Study, load_study
-from ..engine.context import Context, Listener, Progress, build_executor, ignore_progress
+from ..engine.context import Context, Listener, Progress, build_executor, ignore_progress, write_journal
 from ..engine.digests import compute_file_digest
-from ..engine.files import keep_hand_labels
-from ..engine.journal import write_journal
-from ..engine.keys import Keys, Stage, StageKey, describe_causes
-from ..engine.provenance import collect_versions, compute_input_digests, describe_machine, record_settings
-from ..engine.storage import read_json, to_plain, write_result
+from ..engine.files import keep_hand_labels, read_json, to_plain, write_result
+from ..engine.provenance import (
+    Keys,
+    Stage,
+    StageKey,
+    collect_versions,
+    compute_input_digests,
+    describe_causes,
+    describe_machine,
+    record_settings,
+)
 from ..engine.store import Store, lock
 from ..identification.calibrate import run_calibrate
 from ..identification.predict import run_predict

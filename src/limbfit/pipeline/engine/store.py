@@ -21,14 +21,13 @@ from filelock import FileLock, Timeout
 from ...errors import InputError, RunError
 from ...results.runs import StageStamp
 from ...results.study_results import StudyResults
-from .storage import DRAFT, read_json, write_json, write_result
+from .files import DRAFT, EARLIER, read_json, write_json, write_result
 
 STAMP = "stage.json"
 LOCK, HOLDER = ".lock", ".holder"
 _LOCK_TIMEOUT_S = 0.5  # for one who only asks whether a study is held
 RUNS = "runs"  # a stage's kept simulations
 COARSE = "coarse"  # folder of the coarse meshes, in that of the mesh stage
-EARLIER = ".earlier"  # those of attempts with other inputs, while the stage is not complete
 _OLD = ".old-"
 
 

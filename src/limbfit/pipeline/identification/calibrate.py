@@ -20,15 +20,13 @@ from ...results import identification as stored
 from ...results.base import Interval, Intervals
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import write_result
+from ..engine.files import write_result
 from ..limb.remesh import mesh_in_background
 from ..records.records import load_records
 from ..simulation.simulations import SimulationCache
-from .fine_meshes import correct_answer, plan_coarser_meshes
-from .intervals import sample_intervals
+from .answer import correct_answer, plan_coarser_meshes, sample_intervals
 from .problem import CalibrationProblem, build_problem
-from .record_simulator import RecordSimulator, SearchWarning, WarmStarts
-from .search import search_from_starts
+from .search import RecordSimulator, SearchWarning, WarmStarts, search_from_starts
 
 
 def run_calibrate(context: Context, folder: Path) -> None:

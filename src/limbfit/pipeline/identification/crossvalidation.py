@@ -34,13 +34,13 @@ from ...identify.uncertainty.emulator import Emulator
 from ...results.uncertainty import CrossvalidateResult, FoldCheck, FoldEmulator, HeldoutSite, OwnFold
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import write_result
+from ..engine.files import write_result
 from ..records.records import load_records
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import open_experiment_cache
-from .fine_meshes import correct_to_fine_meshes
+from .answer import correct_to_fine_meshes
 from .problem import CalibrationProblem, build_problem
-from .record_simulator import RecordSimulator
+from .search import RecordSimulator
 
 Runs = list[list[SiteResponse]]
 

@@ -20,10 +20,16 @@ from ...indentation import Simulation, SimulationJob, store_job_fields
 from ...results import identification as stored
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import write_curves, write_result
-from ..records.deviations import estimate_site_deviation, estimate_site_noise
+from ..engine.files import write_curves, write_result
 from ..records.record_checks import check_records, read_record_warnings
-from ..records.records import RecordSet, SiteRecord, load_records, to_response
+from ..records.records import (
+    RecordSet,
+    SiteRecord,
+    estimate_site_deviation,
+    estimate_site_noise,
+    load_records,
+    to_response,
+)
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
 from ..simulation.simulations import SimulationCache

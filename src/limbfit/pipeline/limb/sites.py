@@ -12,8 +12,7 @@ from ...errors import SiteError
 from ...results.limb import MarkerEvidence, PlacedSite, SitesResult
 from ...study import Site, Study
 from ..engine.context import Context
-from ..engine.files import MARKED_SKIN, name_file_in_errors
-from ..engine.storage import write_result
+from ..engine.files import MARKED_SKIN, name_file_in_errors, write_result
 
 
 def run_sites(context: Context, folder: Path) -> None:

@@ -30,8 +30,7 @@ from ...traces import (
     select_frames_in_contact,
 )
 from ..engine.context import Context
-from ..engine.files import LAYERS, SMOOTHING, WAVES, name_file_in_errors
-from ..engine.storage import write_curves, write_result
+from ..engine.files import LAYERS, SMOOTHING, WAVES, name_file_in_errors, write_curves, write_result
 from ..simulation.simulations import CURVE_POINTS
 from .secondary_measurements import write_motion
 

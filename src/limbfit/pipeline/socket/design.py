@@ -32,13 +32,11 @@ from ...socket.wall import measure_thickness
 from ...study import Study
 from ..engine.context import NO_PARAMETERS, Context
 from ..engine.digests import code_digest, compute_digest
-from ..engine.partial_results import Made, ResultFiles
-from ..engine.storage import write_result, write_table
+from ..engine.files import Made, ResultFiles, write_result, write_table
 from ..engine.store import RUNS
 from ..simulation.limb_geometry import LimbGeometry
 from . import shape
-from .limb import SocketLimb
-from .simulation import SocketRun, run_sockets, simulate_socket
+from .simulation import SocketLimb, SocketRun, run_sockets, simulate_socket
 
 NAME, PLACE = "socket_design", "socket.design"
 Tell = Callable[[float, str], None]  # how much is done, and words

@@ -14,13 +14,11 @@ from ...identify.fit.parameters import Unknowns
 from ...results.uncertainty import RegionFitted, RegionsResult, WholeLimbFit
 from ...study import Site, Study
 from ..engine.context import Context
-from ..engine.storage import write_result, write_table
+from ..engine.files import write_result, write_table
+from ..identification.answer import correct_answer, plan_coarser_meshes, sample_intervals
 from ..identification.calibrate import group_intervals
-from ..identification.fine_meshes import correct_answer, plan_coarser_meshes
-from ..identification.intervals import sample_intervals
 from ..identification.problem import CalibrationProblem, build_problem
-from ..identification.record_simulator import RecordSimulator
-from ..identification.search import search_parameters
+from ..identification.search import RecordSimulator, search_parameters
 from ..records.records import load_records, load_site_record, to_response
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import SimulationCache, open_experiment_cache

@@ -23,10 +23,10 @@ from ...results import variants as stored
 from ...shapes import BUILTIN_SHAPES, SHAPES
 from ...study import IndenterTable, Study
 from ..engine.context import Context
+from ..identification.answer import MESH_ORDERS, extrapolate_richardson
 from ..limb.mesh import mesh_job, mesh_settings, read_mesh_facts, scale_edges
 from ..limb.remesh import mesh_models
 from ..records.records import load_records
-from ..simulation.extrapolation import MESH_ORDERS, extrapolate_richardson
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import SimulationCache, open_experiment_cache
 from .variants import (

@@ -12,9 +12,8 @@ from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_
 from ...results.variants import VariantRun, VariedResult, VariedSite
 from ...study import Indentation, Study
 from ..engine.context import Context
-from ..engine.storage import write_curves, write_result, write_rows
-from ..records.deviations import measure_bone_distance_mm
-from ..records.records import build_model
+from ..engine.files import write_curves, write_result, write_rows
+from ..records.records import build_model, measure_bone_distance_mm
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import CURVE_POINTS, SimulationCache, build_curve_job, open_experiment_cache
 
