@@ -43,7 +43,7 @@ from limbfit.phantom.record import DISPLACEMENT_NOISE_MM, RATE_HZ
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.files import read_json
 from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.identification.problem import build_unknowns
+from limbfit.pipeline.identification.search import build_unknowns
 from limbfit.pipeline.records.records import SiteRecord, estimate_site_deviation, load_site_record
 from limbfit.pipeline.uncertainty.uncertainty import EMULATOR
 from limbfit.traces import Regularised, TouchDown, Trace, find_touch_down, regularise

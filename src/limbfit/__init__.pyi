@@ -61,14 +61,14 @@ from .pipeline.commands.acquire import (
     waiting as waiting,
 )
 from .pipeline.commands.check import check_study as check_study
-from .pipeline.commands.compare import compare_site as compare_site
+from .pipeline.commands.other_solvers import compare_site as compare_site
 from .pipeline.commands.demo import (
     bench_calibrate as bench_calibrate,
     make_phantom_study as make_phantom_study,
     run_demo as run_demo,
 )
 from .pipeline.commands.doctor import diagnose as diagnose
-from .pipeline.commands.export import export_study as export_study
+from .pipeline.commands.other_solvers import export_study as export_study
 from .pipeline.commands.models import (
     compare_models as compare_models,
     fit_socket_of_models as fit_socket_of_models,

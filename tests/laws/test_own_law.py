@@ -21,7 +21,7 @@ from limbfit.fe.system import Increment
 from limbfit.indentation.sites import build_materials
 from limbfit.laws import FUNG, LAWS, Parameter, TissueLaw, register_law
 from limbfit.mesh import Mesh
-from limbfit.pipeline.commands.export import check_export
+from limbfit.pipeline.commands.other_solvers import check_export
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.files import ResultFiles
 from limbfit.pipeline.socket.simulation import SocketLimb, SocketRun

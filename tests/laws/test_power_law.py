@@ -25,7 +25,7 @@ from limbfit.febio import (
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.indentation.sites import build_site_materials
 from limbfit.laws import LAWS, POWER, TissueLaw
-from limbfit.pipeline.commands.export import check_export
+from limbfit.pipeline.commands.other_solvers import check_export
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.files import write_json
 from limbfit.pipeline.records.records import build_model

@@ -326,17 +326,14 @@ def build_clamping_pins(
 ) -> dict[str, Indenter]:
     """The clamping pins by name, each off the skin at its angle; of the usual ones those that meet it.
 
+    Raises `ProblemError` where the test pin points along the limb, where a stated pin, or every pin, misses
+    the skin, and where one would lie on the test pin.
+
     Parameters
     ----------
     points, faces : (n, 3) mm, and (f, 3 or more) the skin, corners first.
     indenter : the test pin, at its site.
     along : (3,) the limb's axis, proximally; the ring lies across it, in the plane of the test pin.
-
-    Raises
-    ------
-    ProblemError
-        Where the test pin points along the limb, where a stated pin, or every pin, misses the skin, and where
-        one would lie on the test pin.
     """
     inwards = indenter.frame[2]
     normal = np.asarray(along, dtype=float) - (along @ inwards) * inwards
@@ -371,15 +368,12 @@ def build_clamping_pins(
 def clamp_problem(problem: Problem, along: Array, clamps: ClampsTable) -> Problem:
     """A site's problem with the clamping pins as further bodies, which press from its beginning to its end.
 
+    Raises `ProblemError` as `build_clamping_pins`.
+
     Parameters
     ----------
     problem : its indenter touches when they have pressed for `ClampsTable.begun_s`.
     along : (3,) the limb's axis, proximally.
-
-    Raises
-    ------
-    ProblemError
-        As `build_clamping_pins`.
     """
     mesh, indenter = problem.mesh, problem.indenter
     assert indenter is not None

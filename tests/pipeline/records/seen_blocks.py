@@ -20,8 +20,7 @@ from limbfit.pipeline.identification.answer import (
     correct_to_fine_meshes,
     estimate_linearised,
 )
-from limbfit.pipeline.identification.problem import build_problem
-from limbfit.pipeline.identification.search import RecordSimulator
+from limbfit.pipeline.identification.search import RecordSimulator, build_problem
 from limbfit.pipeline.records.records import RecordSet, load_records
 from limbfit.pipeline.simulation.simulations import SimulationCache
 from limbfit.study import Study, load_study

@@ -15,8 +15,7 @@ from limbfit.mesh import write_vtu
 from limbfit.pipeline.engine.context import Context, Progress
 from limbfit.pipeline.engine.store import COARSE
 from limbfit.pipeline.identification.answer import correct_to_fine_meshes, estimate_linearised
-from limbfit.pipeline.identification.problem import build_problem
-from limbfit.pipeline.identification.search import RecordSimulator
+from limbfit.pipeline.identification.search import RecordSimulator, build_problem
 from limbfit.pipeline.records.records import load_records, load_site_record, to_response
 from limbfit.pipeline.simulation.simulations import SimulationCache
 from limbfit.study import Record, Study, load_study

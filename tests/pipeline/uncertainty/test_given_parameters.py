@@ -24,7 +24,7 @@ from limbfit.identify.uncertainty.noise import estimate_curve_noise
 from limbfit.identify.uncertainty.uncertainty import ResidualModel, estimate_uncertainty
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.identification.problem import build_problem
+from limbfit.pipeline.identification.search import build_problem
 from limbfit.pipeline.records.records import estimate_site_noise, load_site_record
 from limbfit.pipeline.uncertainty.uncertainty import (
     Findings,

@@ -200,6 +200,8 @@ def calibrate_with_correction(
 ) -> SearchResult:
     """Calibrate as :func:`calibrate` does, on corrected coarse simulations.
 
+    Raises `CalibrationError` if no first simulation completes.
+
     Parameters
     ----------
     coarse : returns force and derivatives per site; cheap.
@@ -215,11 +217,6 @@ def calibrate_with_correction(
     Nothing is stored between calls. If the simulations remember what they computed, a continued run repeats
     the interrupted one. If a fine simulation fails, the correction before it is kept, and the stage has not
     converged.
-
-    Raises
-    ------
-    CalibrationError
-        If no first simulation completes.
     """
     run = _CorrectionLoop(
         _CorrectedModel(coarse),

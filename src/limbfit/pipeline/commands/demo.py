@@ -60,15 +60,8 @@ def run_demo(folder: str | Path, *, seed: int = 0, listener: Listener = ignore_p
 
     The patient of seed 0 comes with limbfit; those of other seeds are made first.
 
-    Returns
-    -------
-    dict
-        The summary of :func:`run_study` with the ``truth`` beside it.
-
-    Raises
-    ------
-    InputError
-        When ``folder`` holds something else, or the demo of another seed.
+    Returns the summary of :func:`run_study` with the ``truth`` beside it. Raises `InputError` when ``folder``
+    holds something else, or the demo of another seed.
     """
     folder = Path(folder)
     truth_file = folder / "truth.json"
@@ -94,24 +87,17 @@ def bench_calibrate(
 ) -> dict[str, Any]:
     """Identify a study afresh, in a copy of it, and time the stages after meshing.
 
+    Returns ``seconds`` of calibration and prediction together, ``forward_runs`` of both (and how many of the
+    calibration's have sensitivities), ``mean_error_fitted_percent``, ``mean_error_heldout_percent``; beside
+    FEBio ``febio_loop_seconds``, extrapolated from that run to (parameters + 1) simulations per iteration and
+    fitted site, ten iterations; and ``ratio`` of the two. Raises `InputError` where the study cannot be used,
+    or FEBio or its reference case is wanted and not there.
+
     Parameters
     ----------
     folder : of the study, or its file; None makes the coarse phantom of seed 0. What its chain has stored up
         to the meshes is used, what stands on them is not.
     beside_febio : FEBio itself runs one reference case afterwards, of 20,922 nodes, on one thread.
-
-    Returns
-    -------
-    dict
-        ``seconds`` of calibration and prediction together, ``forward_runs`` of both (and how many of the
-        calibration's have sensitivities), ``mean_error_fitted_percent``, ``mean_error_heldout_percent``;
-        beside FEBio ``febio_loop_seconds``, extrapolated from that run to (parameters + 1) simulations per
-        iteration and fitted site, ten iterations; and ``ratio`` of the two.
-
-    Raises
-    ------
-    InputError
-        Where the study cannot be used, or FEBio or its reference case is wanted and not there.
     """
     program, reference = (find_febio(), find_reference(Path.cwd())) if beside_febio else (None, Path())
     with tempfile.TemporaryDirectory(prefix="limbfit-bench-") as scratch:

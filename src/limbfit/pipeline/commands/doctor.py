@@ -52,11 +52,8 @@ def _judge(check: str, is_good: bool, found: str, remedy: str, otherwise: str = 
 def diagnose(folder: Path = Path(".")) -> dict[str, Any]:
     """Check the installation and the machine; ``folder`` is where studies would lie.
 
-    Returns
-    -------
-    dict
-        ``healthy`` (nothing failed) and ``checks``, each with ``check``, ``state`` (``ok``, ``warning``,
-        ``failed``), ``found`` and ``remedy``.
+    Returns ``healthy`` (nothing failed) and ``checks``, each with ``check``, ``state`` (``ok``, ``warning``,
+    ``failed``), ``found`` and ``remedy``.
     """
     checks = [
         *_check_machine(),

@@ -23,15 +23,19 @@ from ..design.design import check_design, run_design
 from ..design.protocol import check_protocol, run_protocol
 from ..engine.provenance import Keys, Stage, StageKey
 from ..engine.store import StageState, Store
-from ..identification.crossvalidation import check_crossvalidate, run_crossvalidate
-from ..identification.problem import check_fitted
+from ..identification.crossvalidation import (
+    check_crossvalidate,
+    check_regions,
+    run_crossvalidate,
+    run_regions,
+)
+from ..identification.search import check_fitted
 from ..simulation.limb_geometry import Check, LimbGeometry
 from ..socket.design import check_socket_design, run_socket_design
 from ..socket.socket import check_socket, run_socket
 from ..uncertainty.uncertainty import run_uncertainty
 from ..variants import sensitivity
 from ..variants.cube import check_cube, run_cube
-from ..variants.regions import check_regions, run_regions
 from ..variants.variants import check_variants
 
 
@@ -133,15 +137,13 @@ EXPERIMENTS = Registry("experiment", {experiment.name: experiment for experiment
 def register_experiment(experiment: Experiment, section: Maker | None = None) -> None:
     """Make an experiment known by its name, in the file that a study names in ``study.extensions``.
 
+    Raises `InputError` where the name is taken, or cannot be that of a folder beside the others, or ``run``
+    is in no file.
+
     Parameters
     ----------
     experiment : its ``run`` writes ``<name>.json`` into the folder that it is given.
     section : makes its section of the report of what is stored and of that file's content.
-
-    Raises
-    ------
-    InputError
-        Where the name is taken, or cannot be that of a folder beside the others, or ``run`` is in no file.
     """
     name, others = experiment.name, {*EXPERIMENTS.names} - {experiment.name}
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or any(other.startswith(f"{name}-") for other in others):

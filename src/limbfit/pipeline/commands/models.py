@@ -212,20 +212,12 @@ def compare_models(
 
     A model takes about as long as the study's own calibration; what is stored already is not done again.
 
+    Returns what ``results/models/models.json`` holds, and ``folder``. Raises `InputError` for a model that
+    there is not, or that the study cannot have.
+
     Parameters
     ----------
     models : names in `MODELS`, or "all".
-    listener : is told of progress.
-
-    Returns
-    -------
-    dict
-        What ``results/models/models.json`` holds, and ``folder``.
-
-    Raises
-    ------
-    InputError
-        For a model that there is not, or that the study cannot have.
     """
     chosen = select_models(models)
     derived, left_out = {}, {}
@@ -317,15 +309,8 @@ def fit_socket_of_models(study: Study, *, listener: Listener = ignore_progress) 
 
     The models are those that `compare_models` has weighed last, of at least `MIN_SOCKET_WEIGHT`.
 
-    Returns
-    -------
-    dict
-        What ``results/models/socket.json`` holds, and ``folder``.
-
-    Raises
-    ------
-    InputError
-        If no models were compared, or the study's own socket cannot be simulated.
+    Returns what ``results/models/socket.json`` holds, and ``folder``. Raises `InputError` if no models were
+    compared, or the study's own socket cannot be simulated.
     """
     compared = stored.ModelsResult.find(study.results)
     if compared is None:

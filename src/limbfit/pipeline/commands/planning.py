@@ -38,21 +38,14 @@ def design_study(
 ) -> dict[str, Any]:
     """The best choice of sites and depths at known parameters, beside the study's own choice.
 
+    Returns what ``results/design/design.json`` holds, and ``folder``. Raises `InputError` for more sites than
+    there are, or identified parameters that are stale.
+
     Parameters
     ----------
     sites : how many to choose; 0: as many as the study fits, or four.
     depths_mm : depths to choose from at every site; none: as recorded or planned.
     parameters : per tissue; by default the identified ones, or the study's start.
-
-    Returns
-    -------
-    dict
-        What ``results/design/design.json`` holds, and ``folder``.
-
-    Raises
-    ------
-    InputError
-        For more sites than there are, or identified parameters that are stale.
     """
     used, origin = choose_parameters(study, parameters)
     return run_experiment(
@@ -88,6 +81,10 @@ def plan_protocol(
 ) -> dict[str, Any]:
     """The records that determine the parameters best in a patient's time, at several draws of the tissues.
 
+    Returns what ``results/protocol/protocol.json`` holds, and ``folder``, where ``records.toml`` is, too.
+    Raises `InputError` for unknown parameters, a time too short for any record, identified parameters that
+    are stale, or pressures that are not stored with their derivatives.
+
     Parameters
     ----------
     minutes : of the whole session.
@@ -109,17 +106,6 @@ def plan_protocol(
     shear_waves_sd_m_s : how well elastography reads the speed of shear waves in each tissue under the
         indenter, once a second; as much all speeds of a tissue may be off together. None: likewise.
     parameters : per tissue; by default the identified ones, or the study's start.
-
-    Returns
-    -------
-    dict
-        What ``results/protocol/protocol.json`` holds, and ``folder``, where ``records.toml`` is, too.
-
-    Raises
-    ------
-    InputError
-        For unknown parameters, a time too short for any record, identified parameters that are stale, or
-        pressures that are not stored with their derivatives.
     """
     pressures = _read_socket_pressures(study) if SOCKET in determine else {}
     if pressures and (len(determine) > 1 or criterion == "D"):
@@ -219,25 +205,16 @@ def fit_socket(
 
     Nothing here is a medical device.
 
+    Returns what ``results/socket/socket.json`` holds, and ``folder``. Raises `InputError` for a socket that
+    does not fit the limb, identified parameters that are stale, or samples of parameters that were not
+    identified; and `RunError` where the simulation does not come to its end.
+
     Parameters
     ----------
     parameters : per tissue; by default the identified ones, or those of people where none were identified.
     literature : those of people even so: medians of the priors, the others as the study starts them.
     samples : draws from the identified parameters' covariance that are simulated too; intervals then count
         what derivatives miss.
-
-    Returns
-    -------
-    dict
-        What ``results/socket/socket.json`` holds, and ``folder``.
-
-    Raises
-    ------
-    InputError
-        For a socket that does not fit the limb, identified parameters that are stale, or samples of
-        parameters that were not identified.
-    RunError
-        Where the simulation does not come to its end.
     """
     used, origin = choose_tissues(study, literature, parameters)
     known: dict[str, Any] = {}
@@ -274,24 +251,15 @@ def design_socket(
 
     Nothing here is a medical device.
 
+    Returns what ``results/socket_design/socket_design.json`` holds, and ``folder``, which also has the socket
+    with its wall (``socket.stl``). Raises `InputError` for regions or a shape that the limb cannot have, or
+    identified parameters that are stale; and `RunError` where a simulation does not come to its end.
+
     Parameters
     ----------
     optimise : regions whose largest pressures are to be lowered further.
     simulations : at most so many for that, beside those of the two designs.
     parameters, literature : as for `fit_socket`.
-
-    Returns
-    -------
-    dict
-        What ``results/socket_design/socket_design.json`` holds, and ``folder``, which also has the socket
-        with its wall (``socket.stl``).
-
-    Raises
-    ------
-    InputError
-        For regions or a shape that the limb cannot have, or identified parameters that are stale.
-    RunError
-        Where a simulation does not come to its end.
     """
     if simulations < 1:
         raise InputError(f"{simulations} simulations are too few", remedy="allow one or more")

@@ -33,23 +33,15 @@ def reproduce_study(
 ) -> dict[str, Any]:
     """Copy the inputs of a study to a new folder, run it there, and compare.
 
+    Returns ``same``, ``tolerance``, ``parameters`` and ``forces`` (largest relative difference by name), and
+    ``versions`` that differ, each as (then, now). Raises `InputError` where the record is not one, or the
+    study's inputs or settings are no longer those of the record.
+
     Parameters
     ----------
     record : ``results/run.json`` of a study, or the study.
     folder : the new one; must not exist, unless an earlier attempt at the same record is to go on.
     tolerance : how far parameters, and forces over a site's largest, may be apart, relative.
-    listener : is told of progress.
-
-    Returns
-    -------
-    dict
-        ``same``, ``tolerance``, ``parameters`` and ``forces`` (largest relative difference by name), and
-        ``versions`` that differ, each as (then, now).
-
-    Raises
-    ------
-    InputError
-        Where the record is not one, or the study's inputs or settings are no longer those of the record.
     """
     record, folder = Path(record), Path(folder)
     study = load_study(record.absolute().parent.parent if record.name == RECORD else record)

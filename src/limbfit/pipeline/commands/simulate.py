@@ -88,17 +88,14 @@ def simulate_site(
 
     Curve and fields at the deepest point go to ``results/simulate``.
 
+    Raises `InputError` for a site that the study does not have, identified parameters that are stale, or any
+    input of the stages before.
+
     Parameters
     ----------
     parameters : as `prepare_site`.
     animation : also the fields of every step, as a PVD collection.
     solver : ``limbfit`` or ``febio``; by default what the study says.  FEBio's fields stay in its own file.
-
-    Raises
-    ------
-    InputError
-        For a site that the study does not have, identified parameters that are stale, or any input of the
-        stages before.
     """
     by_febio = (solver or study.solver.solver) == "febio"
     program = find_febio(study.febio.program, study.folder) if by_febio else None
@@ -240,12 +237,8 @@ def simulate_feb(
     The fields at the deepest point go there too, as VTU.  Without ``output`` a table that is there already,
     FEBio's own for example, is not written over but refused.
 
-    Raises
-    ------
-    InputError
-        Where the file cannot be read, or holds what limbfit does not know; with its line.
-    RunError
-        Where the tables cannot be written.
+    Raises `InputError` where the file cannot be read, or holds what limbfit does not know; with its line; and
+    `RunError` where the tables cannot be written.
     """
     name, told = Path(file).name, 0.0
 

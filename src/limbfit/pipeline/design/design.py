@@ -27,7 +27,7 @@ from ...results.planning import DesignCandidate, DesignResult, DesignSite, Expec
 from ...study import Study
 from ..engine.context import NO_PARAMETERS, Context
 from ..engine.files import write_result
-from ..identification.problem import build_problem
+from ..identification.search import build_problem
 from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import build_curve_job, open_experiment_cache

@@ -42,7 +42,7 @@ from ...results.planning import ExpectedNoise, ProtocolPlan, ProtocolRecord, Pro
 from ...study import Study
 from ..engine.context import NO_PARAMETERS, Context
 from ..engine.files import write_result
-from ..identification.problem import build_problem
+from ..identification.search import build_problem
 from ..records.records import build_model, compute_expected_share, estimate_surface_error_mm, is_modulus
 from ..simulation.limb_geometry import LimbGeometry, build_site_model, coarsen_model
 from ..simulation.loading import LoadHistory, describe_untested_times

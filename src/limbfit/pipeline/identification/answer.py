@@ -23,8 +23,7 @@ from ..engine.context import Context
 from ..limb.mesh import MeshJob, mesh_settings, plan_meshes, scale_edges
 from ..limb.remesh import mesh_where_possible
 from ..records.records import RecordSet, SiteRecord, estimate_site_deviation, estimate_site_noise
-from .problem import CalibrationProblem
-from .search import RecordSimulator, Responses
+from .search import CalibrationProblem, RecordSimulator, Responses
 
 # Of the force of an indenter on a limb, against the edge (docs/convergence.md); None: it does not change in
 # one direction there, so a difference tells how large the error may be and nothing can be extrapolated.

@@ -25,8 +25,14 @@ from ..limb.remesh import mesh_in_background
 from ..records.records import load_records
 from ..simulation.simulations import SimulationCache
 from .answer import correct_answer, plan_coarser_meshes, sample_intervals
-from .problem import CalibrationProblem, build_problem
-from .search import RecordSimulator, SearchWarning, WarmStarts, search_from_starts
+from .search import (
+    CalibrationProblem,
+    RecordSimulator,
+    SearchWarning,
+    WarmStarts,
+    build_problem,
+    search_from_starts,
+)
 
 
 def run_calibrate(context: Context, folder: Path) -> None:

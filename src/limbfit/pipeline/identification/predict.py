@@ -33,7 +33,7 @@ from ..records.records import (
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
 from ..simulation.simulations import SimulationCache
-from .problem import build_problem
+from .search import build_problem
 
 Loading = tuple[Sequence[Extent], Sequence[stored.OutsideRecords]]
 _MISSING = {

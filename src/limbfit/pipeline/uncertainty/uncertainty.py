@@ -44,8 +44,7 @@ from ..engine.context import Context
 from ..engine.files import write_atomically, write_curves, write_result, write_rows, write_table
 from ..identification.answer import correct_to_fine_meshes, estimate_linearised
 from ..identification.predict import Answer, build_answer_jobs
-from ..identification.problem import CalibrationProblem, build_problem
-from ..identification.search import RecordSimulator
+from ..identification.search import CalibrationProblem, RecordSimulator, build_problem
 from ..records.records import (
     SiteRecord,
     estimate_site_deviation,

@@ -75,6 +75,10 @@ def compress_cube(
 ) -> dict[str, Any]:
     """Compress a cube of each given tissue, of the paper's and of the published ones.
 
+    Returns ``tissues``: for each its name, kind, law, peak stress, what is left of it and its change of
+    volume; ``time_s``, and ``stress_kPa`` for each tissue (Cauchy stress along the compression, positive when
+    pushing). Raises `InputError` for a compression that is no compression.
+
     Parameters
     ----------
     output : folder for ``cube.json``, ``cube.csv`` and ``cube.svg``; None: nothing is written.
@@ -84,18 +88,6 @@ def compress_cube(
     law : name of their law.
     relaxation_span_s : first and last time of relaxation as a power of time.
     compression_percent : of the side of the cube.
-
-    Returns
-    -------
-    dict
-        ``tissues``: for each its name, kind, law, peak stress, what is left of it and its change of volume;
-        ``time_s``, and ``stress_kPa`` for each tissue (Cauchy stress along the compression, positive when
-        pushing).
-
-    Raises
-    ------
-    InputError
-        For a compression that is no compression.
     """
     check_compression(compression_percent)
     ramp = np.arange(1, STEPS + 1) / STEPS  # even in each ramp, dense at first while the cube is held
