@@ -117,11 +117,9 @@ class Executor(ABC):
 
         Raises `RunError` if a worker died twice on the same job, and ``on_lost`` is not given.
 
-        Parameters
-        ----------
-        on_lost : makes the answer of a job that was lost twice, from the job and the reason in words: its
-            worker died, or it exceeded the executor's limits. Without it nothing limits the jobs.
-        on_report : called with a job and what it reports by `report_progress`, while answers are waited for.
+        ``on_lost``: makes the answer of a job that was lost twice, from the job and the reason in words: its
+        worker died, or it exceeded the executor's limits. Without it nothing limits the jobs. ``on_report``:
+        called with a job and what it reports by `report_progress`, while answers are waited for.
         """
         listed = list(jobs)
         if keys is not None and len(keys) != len(listed):

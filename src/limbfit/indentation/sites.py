@@ -370,10 +370,8 @@ def clamp_problem(problem: Problem, along: Array, clamps: ClampsTable) -> Proble
 
     Raises `ProblemError` as `build_clamping_pins`.
 
-    Parameters
-    ----------
-    problem : its indenter touches when they have pressed for `ClampsTable.begun_s`.
-    along : (3,) the limb's axis, proximally.
+    ``problem``: its indenter touches when they have pressed for `ClampsTable.begun_s`. ``along``: (3,) the
+    limb's axis, proximally.
     """
     mesh, indenter = problem.mesh, problem.indenter
     assert indenter is not None
@@ -476,11 +474,8 @@ def build_prestretch_field(
 ) -> Array | None:
     """The pre-stretch of each cell (m, 3, 3) at constant volume; None where no tissue has one.
 
-    Parameters
-    ----------
-    stretches : of tissues by name: along their fibres in those that are ``fibred``, in every direction of the
-        plane of the skin in others.
-    fibres : (m, 3) direction in each cell, where tissues have some.
+    ``stretches``: of tissues by name: along their fibres in those that are ``fibred``, in every direction of
+    the plane of the skin in others. ``fibres``: (m, 3) direction in each cell, where tissues have some.
     """
     found = None
     for tissue, stretch in stretches:

@@ -232,10 +232,7 @@ def spread_points(centre: Array, covariance_log: Array, space: SearchSpace, coun
 
     An emulator learns there what fits to other records, which move in the same ``space``, will ask of it.
 
-    Parameters
-    ----------
-    centre : (p,) the answer.
-    covariance_log : (p, p) of the logarithms of the parameters.
+    ``centre``: (p,) the answer. ``covariance_log``: (p, p) of the logarithms of the parameters.
     """
     rng, middle = np.random.default_rng(seed), space.reduce(np.log(centre))
     values, axes = np.linalg.eigh(reduce_covariance(covariance_log, space))

@@ -202,21 +202,19 @@ def calibrate_with_correction(
 
     Raises `CalibrationError` if no first simulation completes.
 
-    Parameters
-    ----------
-    coarse : returns force and derivatives per site; cheap.
-    fine : returns forces per site without derivatives; expensive. It is called once per round, and again if
-        it fails.
-    fidelity : when corrections end.
-
-    Notes
-    -----
     An optimum whose fine forces fit worse than those of an earlier round went too far: the point half-way
     back (in logarithms) is corrected too, and the best corrected iterate of a stage is its answer.
 
     Nothing is stored between calls. If the simulations remember what they computed, a continued run repeats
     the interrupted one. If a fine simulation fails, the correction before it is kept, and the stage has not
     converged.
+
+    Parameters
+    ----------
+    coarse : returns force and derivatives per site; cheap.
+    fine : returns forces per site without derivatives; expensive. It is called once per round, and again if
+        it fails.
+    fidelity : when corrections end.
     """
     run = _CorrectionLoop(
         _CorrectedModel(coarse),

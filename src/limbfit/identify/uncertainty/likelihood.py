@@ -214,11 +214,8 @@ def compute_profile(
 ) -> Profile:
     """Compute the profile of coordinate k from the optimum outwards.
 
-    Parameters
-    ----------
-    sd : a guess of the coordinate's standard deviation, for the steps.
-    freedom : degrees of freedom of the misfit's size. The threshold is the square of Student's 97.5 %
-        quantile, 3.84 for many.
+    ``sd``: a guess of the coordinate's standard deviation, for the steps. ``freedom``: degrees of freedom of
+    the misfit's size. The threshold is the square of Student's 97.5 % quantile, 3.84 for many.
     """
     threshold = float(stdtrit(freedom, 0.975) ** 2)
     sides = [_walk_side(likelihood, best, k, sign * sd, threshold) for sign in (-1.0, 1.0)]
@@ -336,10 +333,7 @@ def weigh_models(minus_2_log_evidence: Sequence[float]) -> Array:
 def compute_mixture_interval(means: Array, sds: Array, weights: Array) -> tuple[Array, Array]:
     """Return both ends (n,) of the 95 % interval of a mixture of normal distributions.
 
-    Parameters
-    ----------
-    means, sds : (m, n) of each model at n points.
-    weights : (m,) of the models; their sum is 1.
+    ``means``, ``sds``: (m, n) of each model at n points. ``weights``: (m,) of the models; their sum is 1.
     """
     kept = weights > 0
     means, sds, weights = means[kept], np.maximum(sds[kept], np.finfo(float).tiny), weights[kept]

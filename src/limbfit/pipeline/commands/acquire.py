@@ -254,10 +254,8 @@ def virtual_fitsocket(
 
     Raises `InputError` where no site has a stored simulation.
 
-    Parameters
-    ----------
-    seed : of the limb's place in the ring, and of the sensors' noise.
-    paced : the device's clock waits for limbfit, and may go faster than the wall's.
+    ``seed``: of the limb's place in the ring, and of the sensors' noise. ``paced``: the device's clock waits
+    for limbfit, and may go faster than the wall's.
     """
     sites = read_surrogates(study)
     limb = VirtualLimb(sites, np.random.default_rng(seed))

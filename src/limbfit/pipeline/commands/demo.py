@@ -33,12 +33,9 @@ def make_phantom_study(
 ) -> dict[str, Any]:
     """Make a synthetic patient in ``folder``; returns its truth.
 
-    Parameters
-    ----------
-    workers : how many simulate side by side; 0: one per core.
-    options : as :func:`limbfit.phantom.build.make_phantom` takes them: ``detail``, ``seed``, ``limb``,
-        ``sites``, and what else there is: ``fat``, ``tendon``, ``socket``, ``ultrasound``, ``surface``,
-        ``shear_waves``.
+    ``workers``: how many simulate side by side; 0: one per core. ``options``: as
+    :func:`limbfit.phantom.build.make_phantom` takes them: ``detail``, ``seed``, ``limb``, ``sites``, and what
+    else there is: ``fat``, ``tendon``, ``socket``, ``ultrasound``, ``surface``, ``shear_waves``.
     """
     with compile_in_background() as compiled, make_executor(workers) as executor:
 
@@ -93,11 +90,9 @@ def bench_calibrate(
     fitted site, ten iterations; and ``ratio`` of the two. Raises `InputError` where the study cannot be used,
     or FEBio or its reference case is wanted and not there.
 
-    Parameters
-    ----------
-    folder : of the study, or its file; None makes the coarse phantom of seed 0. What its chain has stored up
-        to the meshes is used, what stands on them is not.
-    beside_febio : FEBio itself runs one reference case afterwards, of 20,922 nodes, on one thread.
+    ``folder``: of the study, or its file; None makes the coarse phantom of seed 0. What its chain has stored
+    up to the meshes is used, what stands on them is not. ``beside_febio``: FEBio itself runs one reference
+    case afterwards, of 20,922 nodes, on one thread.
     """
     program, reference = (find_febio(), find_reference(Path.cwd())) if beside_febio else (None, Path())
     with tempfile.TemporaryDirectory(prefix="limbfit-bench-") as scratch:

@@ -140,10 +140,8 @@ def register_experiment(experiment: Experiment, section: Maker | None = None) ->
     Raises `InputError` where the name is taken, or cannot be that of a folder beside the others, or ``run``
     is in no file.
 
-    Parameters
-    ----------
-    experiment : its ``run`` writes ``<name>.json`` into the folder that it is given.
-    section : makes its section of the report of what is stored and of that file's content.
+    ``experiment``: its ``run`` writes ``<name>.json`` into the folder that it is given. ``section``: makes
+    its section of the report of what is stored and of that file's content.
     """
     name, others = experiment.name, {*EXPERIMENTS.names} - {experiment.name}
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or any(other.startswith(f"{name}-") for other in others):

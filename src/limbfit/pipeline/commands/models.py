@@ -215,9 +215,7 @@ def compare_models(
     Returns what ``results/models/models.json`` holds, and ``folder``. Raises `InputError` for a model that
     there is not, or that the study cannot have.
 
-    Parameters
-    ----------
-    models : names in `MODELS`, or "all".
+    ``models``: names in `MODELS`, or "all".
     """
     chosen = select_models(models)
     derived, left_out = {}, {}

@@ -211,11 +211,9 @@ def compare_site(
     Raises `InputError` where FEBio is absent and no table is given, where the table is not one of this
     indentation, and as `prepare_site`.
 
-    Parameters
-    ----------
-    parameters : per tissue; by default the identified ones, or the study's start where none were identified.
-    febio_log : the table of the indenter's force that FEBio wrote elsewhere, for the exported input; FEBio
-        itself is then not needed.
+    ``parameters``: per tissue; by default the identified ones, or the study's start where none were
+    identified. ``febio_log``: the table of the indenter's force that FEBio wrote elsewhere, for the exported
+    input; FEBio itself is then not needed.
     """
     if study.indentation(name).forced:
         what = f"{name}: a force drives the indenter, and there is none to be compared"

@@ -269,17 +269,14 @@ def run_batch(
 
     Raises `InputError` for a stage that there is not.
 
+    Yields for each study as it ends: ``study`` (its path as given), ``state`` (``done`` or ``failed``),
+    ``seconds``, ``error`` (one line, where it failed), and its mean errors and report.
+
     Parameters
     ----------
     paths : of studies, each a ``study.toml`` or its folder.
     until : name of the last stage to do; default all.
     workers : how many simulate side by side; 0: one per core.
-
-    Yields
-    ------
-    dict
-        For each study as it ends: ``study`` (its path as given), ``state`` (``done`` or ``failed``),
-        ``seconds``, ``error`` (one line, where it failed), and its mean errors and report.
     """
     if until is not None and until not in STAGE_NAMES:
         raise InputError(f"no stage is named {until!r}", remedy="stages are " + ", ".join(STAGE_NAMES))
@@ -310,10 +307,7 @@ def run_experiment(
     an experiment or option that there is not, or an input that cannot be used; and `RunError` when another
     run holds the study, or the disk is full.
 
-    Parameters
-    ----------
-    name : of the experiment.
-    options : as the experiment takes them; left out: its defaults.
+    ``name``: of the experiment. ``options``: as the experiment takes them; left out: its defaults.
     """
     experiment = EXPERIMENTS[name]
     if name in _FOLDERS:

@@ -24,9 +24,7 @@ def show_stage(study: Study, stage: str, *, listener: Listener = ignore_progress
     by stage; lengths in mm, volumes in cm3, angles in degrees, positions LPS. Raises `InputError` for another
     stage, ``segment`` of a study without an image, or inputs that cannot be used.
 
-    Parameters
-    ----------
-    stage : one of ``segment``, ``surfaces``, ``sites``, ``mesh``.
+    ``stage``: one of ``segment``, ``surfaces``, ``sites``, ``mesh``.
     """
     if stage not in SHOWN:
         raise InputError(f"no stage {stage!r} can be shown", remedy="stages are " + ", ".join(SHOWN))

@@ -62,10 +62,8 @@ def prepare_site(
     Raises `InputError` for a site that the study does not have, identified parameters that are stale, or any
     input of the stages before.
 
-    Parameters
-    ----------
-    name : of a site with one record at most, or of a record.
-    parameters : per tissue; by default the identified ones, or the study's start where none were identified.
+    ``name``: of a site with one record at most, or of a record. ``parameters``: per tissue; by default the
+    identified ones, or the study's start where none were identified.
     """
     stated = study.indentation(name)
     used, origin = choose_parameters(study, parameters)

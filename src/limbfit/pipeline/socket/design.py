@@ -88,10 +88,8 @@ def run_socket_design(
 ) -> None:
     """Design a socket for the target pressure of the study, and put it and its control on the limb.
 
-    Parameters
-    ----------
-    optimise : regions whose largest pressures are to be lowered.
-    simulations : at most so many for that, beside those of control and design.
+    ``optimise``: regions whose largest pressures are to be lowered. ``simulations``: at most so many for
+    that, beside those of control and design.
     """
     study, total = context.study, 3 + (simulations if optimise else 0)
 
