@@ -77,6 +77,7 @@ def _find_kind(value: Any) -> type | None:
 IDENTIFIED = "identified"  # where parameters are from
 _MESHED, _SIMULATED = ("sites", "traces", "mesh"), ("sites", "traces", "mesh", "calibrate")
 _TABLES = ("material", "solver", "indenter", "indenters", "clamps")
+_CALIBRATED = ("calibration", *_TABLES)
 _SOCKET = ("socket", "geometry", "mesh", "material")
 # Keys of sites and of records.
 _FITTED = ("name", "region", "fitted", "weight", "edge", "indenter")
@@ -86,9 +87,7 @@ _RECORD = ("site", "name", "indenter")
 
 _OWN: tuple[Experiment, ...] = (
     Experiment("cube", run_cube, ("calibrate",), ("material",), check=check_cube),
-    Experiment(
-        "regions", run_regions, _SIMULATED, ("calibration", *_TABLES), _FITTED, _RECORD, check=check_regions
-    ),
+    Experiment("regions", run_regions, _SIMULATED, _CALIBRATED, _FITTED, _RECORD, check=check_regions),
     *(
         Experiment(f"sensitivity-{name}", run, _SIMULATED, _TABLES, _VARIED, _RECORD, check=check)
         for name, run, check in (
@@ -111,14 +110,12 @@ _OWN: tuple[Experiment, ...] = (
         "crossvalidate",
         run_crossvalidate,
         _SIMULATED,
-        ("calibration", *_TABLES),
+        _CALIBRATED,
         _FITTED,
         _RECORD,
         check=check_crossvalidate,
     ),
-    Experiment(
-        "design", run_design, _MESHED, ("calibration", *_TABLES), _PLANNED, _RECORD, check=check_design
-    ),
+    Experiment("design", run_design, _MESHED, _CALIBRATED, _PLANNED, _RECORD, check=check_design),
     Experiment(
         "protocol",
         run_protocol,

@@ -65,16 +65,9 @@ class Context:
     executor: Executor
     listener: Listener
 
-    def tell(
-        self,
-        stage: str,
-        done: float,
-        total: float,
-        text: str = "",
-        fit: bool = False,
-        facts: Mapping[str, Any] | None = None,
-    ) -> None:
-        self.listener(Progress(stage, done, total, text, fit, facts))
+    def tell(self, stage: str, done: float, total: float, text: str = "", **more: Any) -> None:
+        """Tell the listener of a step: a `Progress`."""
+        self.listener(Progress(stage, done, total, text, **more))
 
     @property
     def results(self) -> StudyResults:
@@ -107,15 +100,9 @@ def write_journal(study: Study, what: str, listener: Listener) -> Iterator[Liste
             stream.flush()
 
     def listen(event: Progress) -> None:
-        text = redact_paths(event.text, study)
-        write(
-            "fit" if event.fit else "progress",
-            stage=event.stage,
-            done=event.done,
-            total=event.total,
-            text=text,
-            **({} if event.facts is None else {"facts": dict(event.facts)}),
-        )
+        kept = {key: getattr(event, key) for key in ("stage", "done", "total")}
+        facts = {} if event.facts is None else {"facts": dict(event.facts)}
+        write("fit" if event.fit else "progress", **kept, text=redact_paths(event.text, study), **facts)
         listener(event)
 
     try:

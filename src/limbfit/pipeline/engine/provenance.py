@@ -7,7 +7,6 @@ file name leaves a trace in them.
 import os
 import platform
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -45,11 +44,16 @@ _BY_NAME = ("indenters.", "material.", "calibration.prior.")  # tables of which 
 
 def collect_versions() -> dict[str, str]:
     """Versions of the libraries that decide numbers; a library that is not installed is left out."""
-    found = {}
-    for name in LIBRARIES:
-        with suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(name)
-    return found
+    found = {name: find_version(name) for name in LIBRARIES}
+    return {name: version for name, version in found.items() if version is not None}
+
+
+def find_version(distribution: str) -> str | None:
+    """The version of a distribution; None where it is not installed."""
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def describe_machine() -> dict[str, Any]:

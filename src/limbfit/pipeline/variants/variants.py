@@ -3,21 +3,19 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from ...errors import InputError
 from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
-from ...results.variants import VariantRun, VariedResult, VariedSite
+from ...results.variants import VariedResult, VariedSite
 from ...study import Indentation, Study
 from ..engine.context import Context
 from ..engine.files import write_curves, write_result, write_rows
 from ..records.records import build_model, measure_bone_distance_mm
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import CURVE_POINTS, SimulationCache, build_curve_job, open_experiment_cache
-
-Run = TypeVar("Run", bound=VariantRun)
 
 
 @dataclass(frozen=True)
@@ -103,14 +101,13 @@ def run_variants(
     context: Context,
     folder: Path,
     result: type[VariedResult],
-    run: type[VariantRun],
     variants: Sequence[Variant],
     cache: SimulationCache | None = None,
     **more: Any,
 ) -> None:
-    """Simulate variants and store a ``result`` with a ``run`` of each, and ``more`` of its keys."""
+    """Simulate variants and store a ``result`` with a run of each, and ``more`` of its keys."""
     sites = {variant.model.name: variant.chosen.summary for variant in variants}
-    runs = simulate_variants(context, folder, result, run, variants, cache)
+    runs = simulate_variants(context, folder, result, variants, cache)
     store_variants(context, folder, result, runs, sites=list(sites.values()), **more)
 
 
@@ -118,11 +115,10 @@ def simulate_variants(
     context: Context,
     folder: Path,
     result: type[VariedResult],
-    run: type[Run],
     variants: Sequence[Variant],
     cache: SimulationCache | None = None,
-) -> list[Run]:
-    """Simulate them all, in order, and write the curves of each site; a row ``run`` of each."""
+) -> list[dict[str, Any]]:
+    """Simulate them all, in order, and write the curves of each site; a row of each, by the result's keys."""
     cache = open_experiment_cache(context, folder) if cache is None else cache
     done: list[Simulation] = []
     found = cache.run([variant.job() for variant in variants], context.executor)
@@ -131,16 +127,14 @@ def simulate_variants(
         words = f"site {simulation.site}, {variant.label}"
         context.tell(Path(result.FILE).stem, len(done), len(variants), words)
     _write_curves(folder, variants, done)
-    return _compare_variants(variants, done, run)
+    return _compare_variants(variants, done)
 
 
-def _compare_variants(
-    variants: Sequence[Variant], simulations: Sequence[Simulation], run: type[Run]
-) -> list[Run]:
+def _compare_variants(variants: Sequence[Variant], simulations: Sequence[Simulation]) -> list[dict[str, Any]]:
     """A row of each: what was changed, its largest force, and how it differs from its site's base.
 
     Changes are in percent of the base's largest force: of the largest force, and the mean over the trace.
-    They are None where a simulation is partial. ``run`` is the model of a row.
+    They are None where a simulation is partial.
     """
     base = {
         variant.model.name: simulation
@@ -148,21 +142,19 @@ def _compare_variants(
         if variant.base
     }
     return [
-        run(
-            site=variant.model.name,
-            label=variant.label,
-            base=variant.base,
+        {
+            "site": variant.model.name,
+            "label": variant.label,
+            "base": variant.base,
             **variant.facts | simulation.facts.get("volume", {}),
-            peak_force_N=float(simulation.force_N.max()) if simulation.completed else None,
+            "peak_force_N": float(simulation.force_N.max()) if simulation.completed else None,
             **_change(simulation, base[variant.model.name]),
-            penetration_mm=simulation.penetration_mm,
-            steps=simulation.facts.get("steps"),
-            newton_iterations=simulation.facts.get("newton_iterations"),
-            cuts=simulation.facts.get("cuts"),
-            completed=simulation.completed,
-            reason=simulation.reason,
-            warnings=simulation.warnings,
-        )
+            "penetration_mm": simulation.penetration_mm,
+            **{key: simulation.facts.get(key) for key in ("steps", "newton_iterations", "cuts")},
+            "completed": simulation.completed,
+            "reason": simulation.reason,
+            "warnings": simulation.warnings,
+        }
         for variant, simulation in zip(variants, simulations, strict=True)
     ]
 
@@ -178,13 +170,13 @@ def _change(simulation: Simulation, base: Simulation) -> dict[str, float | None]
 
 
 def store_variants(
-    context: Context, folder: Path, result: type[VariedResult], runs: Sequence[VariantRun], **more: Any
+    context: Context, folder: Path, result: type[VariedResult], runs: Sequence[dict[str, Any]], **more: Any
 ) -> None:
     """The result as JSON, and its runs as ``runs.csv``."""
     parameters = context.results.calibration.parameters
     content = result.model_validate({"runs": runs, "parameters": parameters, **more})
     write_result(folder / Path(result.FILE).name, content)
-    write_rows(folder / "runs.csv", runs, leave_out=("warnings", "label", "base"))
+    write_rows(folder / "runs.csv", content.runs, leave_out=("warnings", "label", "base"))
 
 
 def _write_curves(folder: Path, variants: Sequence[Variant], simulations: Sequence[Simulation]) -> None:
