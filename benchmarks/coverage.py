@@ -41,8 +41,7 @@ from limbfit.identify.uncertainty.emulator import Emulator
 from limbfit.identify.uncertainty.noise import SiteNoise, compute_depth_slope, estimate_record_noise
 from limbfit.phantom.record import DISPLACEMENT_NOISE_MM, RATE_HZ
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.engine.files import read_json
-from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.engine.store import Store, read_json
 from limbfit.pipeline.identification.search import build_unknowns
 from limbfit.pipeline.records.records import SiteRecord, estimate_site_deviation, load_site_record
 from limbfit.pipeline.uncertainty.uncertainty import EMULATOR

@@ -15,7 +15,7 @@ from limbfit.mesh import Mesh
 from limbfit.pipeline.commands.check import check_study
 from limbfit.pipeline.commands.planning import choose_tissues
 from limbfit.pipeline.commands.run import run_experiment
-from limbfit.pipeline.engine.files import ResultFiles
+from limbfit.pipeline.engine.store import ResultFiles
 from limbfit.pipeline.socket.shape import (
     build_loadable_socket,
     build_regions,

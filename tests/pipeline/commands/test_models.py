@@ -23,7 +23,7 @@ from limbfit.pipeline.commands.models import (
     select_models,
 )
 from limbfit.pipeline.commands.run import compute_keys
-from limbfit.pipeline.engine.files import write_curves, write_result
+from limbfit.pipeline.engine.store import write_curves, write_result
 from limbfit.report.sections.uncertainty import make_models_section
 from limbfit.report.store import load_store
 from limbfit.results.identification import PredictResult

@@ -21,8 +21,7 @@ from ...study import Indentation, Record, Study
 from ...traces import COLUMNS
 from ...traces.formats import BINARY_SUFFIXES
 from ...traces.reading import find_factor
-from ..engine.files import write_curves, write_json
-from ..engine.store import translate_disk_errors
+from ..engine.store import translate_disk_errors, write_curves, write_json
 
 FOLDER = "acquired"  # beside the study file: measured data, no result
 RECORD, VERDICT = "record.csv", "verdict.json"

@@ -15,8 +15,7 @@ from ...phantom.build import make_phantom, unpack_patient
 from ...phantom.forces import simulate_true_force
 from ...study import load_study
 from ..engine.context import Listener, Progress, ignore_progress
-from ..engine.files import read_json
-from ..engine.store import Store
+from ..engine.store import Store, read_json
 from .run import compile_in_background, run_study
 
 # A site of the paper's kind, of 20,922 nodes, and how often the paper's search improved its parameters.

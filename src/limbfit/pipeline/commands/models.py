@@ -27,8 +27,7 @@ from ...results.identification import RecordPrediction
 from ...results.socket import LoadedRegion, SocketResult
 from ...study import Study, load_study
 from ..engine.context import Listener, ignore_progress
-from ..engine.files import find_hand_labels, write_curves, write_result
-from ..engine.store import Store, lock
+from ..engine.store import Store, find_hand_labels, lock, write_curves, write_result
 from .planning import fit_socket
 from .run import compute_keys, run_study
 

@@ -22,9 +22,8 @@ from ...laws import OGDEN, is_ogden
 from ...mesh import write_vtu
 from ...results.runs import CompareResult, CurveDifference, CurveFiles, FebioSimulation, LimbfitSimulation
 from ...study import Indentation, Record, Study
-from ..engine.context import Context, Listener, ignore_progress
-from ..engine.files import name_file_in_errors, write_curves, write_result
-from ..engine.store import Store
+from ..engine.context import Context, Listener, ignore_progress, name_file_in_errors
+from ..engine.store import Store, write_curves, write_result
 from ..records.records import load_site_record
 from ..simulation.limb_geometry import list_material_fields
 from .simulate import PreparedIndentation, choose_parameters, prepare_site, run_febio_site

@@ -15,9 +15,8 @@ from ...results.curves import read_curves
 from ...study import Study, load_study
 from ..engine.context import Listener, ignore_progress
 from ..engine.digests import find_data_files
-from ..engine.files import find_hand_labels, read_json
 from ..engine.provenance import collect_versions, compute_input_digests, record_settings
-from ..engine.store import Store
+from ..engine.store import Store, find_hand_labels, read_json
 from .run import run_study
 
 TOLERANCE = 1e-6  # of a parameter, and of the largest force of a site, relative

@@ -22,7 +22,6 @@ from ...results.runs import ExperimentRecord, MachineFacts, RunResult, StageReco
 from ...study import Site, Study, load_study
 from ..engine.context import Context, Listener, Progress, build_executor, ignore_progress, write_journal
 from ..engine.digests import compute_file_digest
-from ..engine.files import keep_hand_labels, read_json, to_plain, write_result
 from ..engine.provenance import (
     Keys,
     Stage,
@@ -33,7 +32,7 @@ from ..engine.provenance import (
     describe_machine,
     record_settings,
 )
-from ..engine.store import Store, lock
+from ..engine.store import Store, keep_hand_labels, lock, read_json, to_plain, write_result
 from ..identification.calibrate import run_calibrate
 from ..identification.predict import run_predict
 from ..identification.search import check_fitted

@@ -16,8 +16,7 @@ from ...results.identification import RecordedExtents
 from ...results.runs import SimulateResult
 from ...study import Indentation, Study
 from ..engine.context import Context, Listener, Progress, ignore_progress
-from ..engine.files import write_curves, write_result
-from ..engine.store import Store
+from ..engine.store import Store, write_curves, write_result
 from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents

@@ -26,7 +26,7 @@ from ...laws import Parameters
 from ...results.planning import DesignCandidate, DesignResult, DesignSite, ExpectedNoise, SiteDesign
 from ...study import Study
 from ..engine.context import NO_PARAMETERS, Context
-from ..engine.files import write_result
+from ..engine.store import write_result
 from ..identification.search import build_problem
 from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry

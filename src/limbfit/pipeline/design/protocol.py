@@ -41,7 +41,7 @@ from ...mesh import read_vtu
 from ...results.planning import ExpectedNoise, ProtocolPlan, ProtocolRecord, ProtocolResult
 from ...study import Study
 from ..engine.context import NO_PARAMETERS, Context
-from ..engine.files import write_result
+from ..engine.store import write_result
 from ..identification.search import build_problem
 from ..records.records import build_model, compute_expected_share, estimate_surface_error_mm, is_modulus
 from ..simulation.limb_geometry import LimbGeometry, build_site_model, coarsen_model

@@ -17,6 +17,7 @@ from time import perf_counter
 from typing import Any
 
 from ..._version import __version__
+from ...errors import InputError
 from ...execution import Executor, Limits, make_executor
 from ...laws import Parameters
 from ...results.study_results import StudyResults
@@ -128,3 +129,15 @@ def redact_paths(text: str, study: Study) -> str:
         if folder != Path("."):
             text = text.replace(f"{folder}{os.sep}", "").replace(str(folder), "<study>")
     return _PATH.sub("<path>", text)
+
+
+@contextmanager
+def name_file_in_errors(file: Path | None, place: str | None = None, about: str = "") -> Iterator[None]:
+    """Say which file, and place in it, an error is about, where it names none itself; and what ``about``."""
+    try:
+        yield
+    except InputError as error:
+        if error.file is not None:
+            raise
+        what, place = about + error.what, place or error.place
+        raise type(error)(what, file=file, place=place, remedy=error.remedy) from None

@@ -21,7 +21,7 @@ from ...fe import StepControl
 from ...results.runs import StageParts
 from ...study import Study
 from .digests import code_parts, compute_digest, compute_file_digest
-from .files import find_hand_labels
+from .store import find_hand_labels
 
 LIBRARIES = (
     "numpy",

@@ -20,7 +20,7 @@ from ...results import identification as stored
 from ...results.base import Interval, Intervals
 from ...study import Study
 from ..engine.context import Context
-from ..engine.files import write_result
+from ..engine.store import write_result
 from ..limb.remesh import mesh_in_background
 from ..records.records import load_records
 from ..simulation.simulations import SimulationCache

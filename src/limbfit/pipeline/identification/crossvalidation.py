@@ -49,7 +49,7 @@ from ...results.uncertainty import (
 )
 from ...study import Site, Study
 from ..engine.context import Context
-from ..engine.files import write_result, write_table
+from ..engine.store import write_result, write_table
 from ..records.records import load_records, load_site_record, to_response
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import SimulationCache, open_experiment_cache

@@ -20,7 +20,7 @@ from ...indentation import Simulation, SimulationJob, store_job_fields
 from ...results import identification as stored
 from ...study import Study
 from ..engine.context import Context
-from ..engine.files import write_curves, write_result
+from ..engine.store import write_curves, write_result
 from ..records.record_checks import check_records, read_record_warnings
 from ..records.records import (
     RecordSet,

@@ -18,16 +18,9 @@ from ...anatomy.surfaces.thickness import check_fat
 from ...report.drawing.sheet import draw_sheet
 from ...results.limb import MarkerImageMotion, SegmentResult
 from ...study import Study
-from ..engine.context import Context
+from ..engine.context import Context, name_file_in_errors
 from ..engine.digests import compute_file_digest
-from ..engine.files import (
-    LABELS,
-    MARKED_SKIN,
-    find_hand_labels,
-    find_labelled_file,
-    name_file_in_errors,
-    write_result,
-)
+from ..engine.store import LABELS, MARKED_SKIN, find_hand_labels, find_labelled_file, write_result
 from .surfaces import has_mapped_fat, list_labelled_regions
 
 

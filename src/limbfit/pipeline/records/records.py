@@ -29,8 +29,7 @@ from ...results.curves import read_curves
 from ...study import Indentation, Record, Site, Study
 from ...traces.numerics import estimate_noise
 from ..engine.context import Context
-from ..engine.files import SMOOTHING
-from ..engine.store import Store
+from ..engine.store import SMOOTHING, Store
 from ..simulation.limb_geometry import build_site_model, coarsen_model
 from .secondary_measurements import (
     SecondaryValues,

@@ -32,8 +32,7 @@ from ...socket.wall import measure_thickness
 from ...study import Study
 from ..engine.context import NO_PARAMETERS, Context
 from ..engine.digests import code_digest, compute_digest
-from ..engine.files import Made, ResultFiles, write_result, write_table
-from ..engine.store import RUNS
+from ..engine.store import RUNS, Made, ResultFiles, write_result, write_table
 from ..simulation.limb_geometry import LimbGeometry
 from . import shape
 from .simulation import SocketLimb, SocketRun, run_sockets, simulate_socket

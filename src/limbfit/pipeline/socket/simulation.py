@@ -43,7 +43,7 @@ from ...socket.landmarks import SkinRegion, find_directions, find_load_point
 from ...study import Study
 from ..engine.context import Context
 from ..engine.digests import code_digest, compute_digest, compute_file_digest
-from ..engine.files import Made, ResultFiles
+from ..engine.store import Made, ResultFiles
 from ..limb.mesh import is_meshed, keep_mesh, mesh_settings, read_mesh_facts, read_stored_depth
 from ..simulation.limb_geometry import find_fibre_directions
 from .intervals import ParameterSpread, SimulationSpread, spread_to_facts

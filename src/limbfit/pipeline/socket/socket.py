@@ -22,8 +22,7 @@ from ...socket.landmarks import find_bone
 from ...socket.published import select_published_findings
 from ...study import Study
 from ..engine.context import NO_PARAMETERS, Context
-from ..engine.files import ResultFiles, write_result, write_table
-from ..engine.store import RUNS
+from ..engine.store import RUNS, ResultFiles, write_result, write_table
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import NEAR_MM, LimbAxis, describe_socket_load, name_load, time_socket_loads
 from .intervals import CHANGE_PERCENT, FRICTION, ParameterSpread, draw_step, store_change, widen_intervals

@@ -41,7 +41,7 @@ from ...results.identification import CalibrationResult, CorrelationMatrix, Rela
 from ...results.uncertainty import EvidenceComparison
 from ...study import Study
 from ..engine.context import Context
-from ..engine.files import write_atomically, write_curves, write_result, write_rows, write_table
+from ..engine.store import write_atomically, write_curves, write_result, write_rows, write_table
 from ..identification.answer import correct_to_fine_meshes, estimate_linearised
 from ..identification.predict import Answer, build_answer_jobs
 from ..identification.search import CalibrationProblem, RecordSimulator, build_problem

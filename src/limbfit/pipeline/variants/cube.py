@@ -27,7 +27,7 @@ from ...relaxation import DEFAULT_SPAN_S
 from ...results.variants import CubeResult, CubeTissue
 from ...study import Study
 from ..engine.context import Context
-from ..engine.files import write_curves, write_result
+from ..engine.store import write_curves, write_result
 from ..simulation.limb_geometry import LimbGeometry
 from .variants import format_column
 

@@ -12,7 +12,7 @@ from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_
 from ...results.variants import VariedResult, VariedSite
 from ...study import Indentation, Study
 from ..engine.context import Context
-from ..engine.files import write_curves, write_result, write_rows
+from ..engine.store import write_curves, write_result, write_rows
 from ..records.records import build_model, measure_bone_distance_mm
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import CURVE_POINTS, SimulationCache, build_curve_job, open_experiment_cache
