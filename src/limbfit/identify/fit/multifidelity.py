@@ -282,7 +282,9 @@ class _CorrectionLoop:
             if settled and not (is_last and loose):
                 break
         if best is not None and least < self._cost():
-            self._restore(*best)
+            state, self.model.correction = best
+            end = replace(state.history[-1], evaluations=self.state.evaluations)
+            self.history, self.state = (*self.history, end), replace(state, history=(end,))
         end = self.history[-1]
         result = replace(
             inner,
@@ -320,12 +322,6 @@ class _CorrectionLoop:
 
     def _cost(self) -> float:
         return self.history[-1].cost
-
-    def _restore(self, best: SearchState, correction: MeshCorrection) -> None:
-        self.model.correction = correction
-        here = replace(best.history[-1], evaluations=self.state.evaluations)
-        self.history = (*self.history, here)
-        self.state = replace(best, history=(here,))
 
     def _step_half_way_back(self, stage: int, best: SearchState) -> None:
         z = 0.5 * (np.array(self.state.z) + np.array(best.z))

@@ -23,18 +23,16 @@ from ...identify.checks.crossvalidation import (
     Fold,
     average_by_site,
     average_errors,
+    compute_site_errors,
     cross_validate,
     expand_to_records,
-    fit_region,
     list_choices,
     list_choices_without_regions,
     rank_fold,
     spread_points,
     summarise_errors_by_site,
 )
-from ...identify.fit.calibration import Calibration
 from ...identify.fit.objective import MeasuredCurve, SiteResponse
-from ...identify.fit.parameters import Unknowns
 from ...identify.fit.prediction import compute_error_percent
 from ...identify.uncertainty.emulator import Emulator
 from ...results.uncertainty import (
@@ -333,16 +331,15 @@ def _fit_region(
     judged = [load_site_record(context, record) for record in study.records_at(*mine)]
     sites = {record.name: record.site.name for record in judged}
 
-    def identify(start: Unknowns) -> Calibration:
-        return search_parameters(problem, simulator, start, problem.stages[-1:]).calibration
-
     def simulate(parameters: Array) -> list[SiteResponse]:
         apart = study.is_searched_apart
         jobs = [record.own_job(parameters) if apart else record.job(parameters) for record in judged]
         return [to_response(one) for one in cache.run(jobs, context.executor)]
 
     measured = [record.measured for record in judged]
-    found, own, of_whole = fit_region(identify, simulate, measured, problem.unknowns, whole)
+    of_whole, start = compute_site_errors(simulate, whole, measured), problem.unknowns.with_start(whole)
+    found = search_parameters(problem, simulator, start, problem.stages[-1:]).calibration
+    own = compute_site_errors(simulate, found.parameters, measured)
     coarser = plan_coarser_meshes(context, records, folder / "coarser")
     correction = correct_answer(problem, simulator, found, coarser)
     _, known = sample_intervals(problem, simulator, found, correction, moves=False)

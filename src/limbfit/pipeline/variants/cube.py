@@ -111,7 +111,11 @@ def compress_cube(
         stress_kPa=stresses,
     )
     if output is not None:
-        _write_cube(output, content)
+        output.mkdir(parents=True, exist_ok=True)
+        write_result(output / "cube.json", content)
+        curves = {format_column(name, "kPa"): np.array([0.0, *stress]) for name, stress in stresses.items()}
+        write_curves(output / "cube.csv", time_s=np.r_[0.0, times], **curves)
+        (output / "cube.svg").write_text(report.draw_cube(content), encoding="utf-8")
     return content.to_plain()
 
 
@@ -125,14 +129,6 @@ def _list_moduli(material: Material) -> dict[str, Any]:
         "prony": table.prony.tolist(),
         "terms": [(c / KPA, m) for c, m in table.terms] if table.has_terms else [],
     }
-
-
-def _write_cube(folder: Path, content: CubeResult) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    write_result(folder / "cube.json", content)
-    curves = {format_column(name, "kPa"): np.array([0.0, *kPa]) for name, kPa in content.stress_kPa.items()}
-    write_curves(folder / "cube.csv", time_s=np.array([0.0, *content.time_s]), **curves)
-    (folder / "cube.svg").write_text(report.draw_cube(content), encoding="utf-8")
 
 
 def check_compression(percent: float) -> None:
