@@ -23,7 +23,7 @@ from ..engine.context import Context
 from ..limb.mesh import MeshJob, mesh_settings, plan_meshes, scale_edges
 from ..limb.remesh import mesh_where_possible
 from ..records.records import RecordSet, SiteRecord, estimate_site_deviation, estimate_site_noise
-from .search import CalibrationProblem, RecordSimulator, Responses
+from .search import RecordSimulator, Responses
 
 # Of the force of an indenter on a limb, against the edge (docs/convergence.md); None: it does not change in
 # one direction there, so a difference tells how large the error may be and nothing can be extrapolated.
@@ -110,9 +110,7 @@ class FineMeshCorrection:
     simulations: int = 0
 
 
-def correct_to_fine_meshes(
-    problem: CalibrationProblem, simulator: RecordSimulator, parameters: Array
-) -> FineMeshCorrection:
+def correct_to_fine_meshes(simulator: RecordSimulator, parameters: Array) -> FineMeshCorrection:
     """The responses at an answer, and what brings those of the search to the study's own meshes.
 
     Raises `RunError` where a site cannot be simulated there.
@@ -122,8 +120,8 @@ def correct_to_fine_meshes(
     if simulator.records.is_coarsened:
         as_fine = MeshCorrection(searched, simulator.check(parameters))
         correction = FineMeshCorrection(as_fine(searched), as_fine)
-    if problem.study.mesh.coarse is not None:
-        errors = _estimate_mesh_errors(problem, simulator, parameters, searched, simulator.records.own)
+    if simulator.problem.study.mesh.coarse is not None:
+        errors = _estimate_mesh_errors(simulator, parameters, searched, simulator.records.own)
         correction = replace(correction, mesh_N=errors)
     for one in correction.responses:
         if not one.completed:
@@ -142,16 +140,13 @@ def plan_coarser_meshes(context: Context, records: RecordSet, folder: Path) -> l
 
 
 def correct_answer(
-    problem: CalibrationProblem,
-    simulator: RecordSimulator,
-    answer: Calibration,
-    coarser: Sequence[MeshJob],
+    simulator: RecordSimulator, answer: Calibration, coarser: Sequence[MeshJob]
 ) -> FineMeshCorrection:
     """The correction at the answer of a search; the planned ``coarser`` meshes tell the mesh error."""
     records, parameters, responses = simulator.records, answer.parameters, list(answer.responses)
     correction = FineMeshCorrection(responses, list)
     if records.is_coarsened:
-        correction = correct_to_fine_meshes(problem, simulator, parameters)
+        correction = correct_to_fine_meshes(simulator, parameters)
     if not coarser:
         return correction
     models = [record.model for record in records.own]
@@ -161,12 +156,11 @@ def correct_answer(
     if not any(others):
         return correction
     searched = simulator.search(parameters) if records.is_coarsened else responses
-    errors = _estimate_mesh_errors(problem, simulator, parameters, searched, others)
+    errors = _estimate_mesh_errors(simulator, parameters, searched, others)
     return replace(correction, mesh_N=errors, simulations=records.simulations)
 
 
 def _estimate_mesh_errors(
-    problem: CalibrationProblem,
     simulator: RecordSimulator,
     parameters: Array,
     searched: Responses,
@@ -178,7 +172,7 @@ def _estimate_mesh_errors(
     edges, with fewer steps: in unloading these change the force as much as the mesh does. Zero where there
     are none, or these cannot be simulated: a line says so.
     """
-    study, records = problem.study, simulator.records.own
+    study, records = simulator.problem.study, simulator.records.own
     errors, share = [0.0 * record.compared for record in records], estimate_own_mesh_error(study.mesh)
     meshed = [(i, other) for i, other in enumerate(others) if other is not None]
     fewer = {
@@ -186,9 +180,8 @@ def _estimate_mesh_errors(
         for name in ("load_steps", "unload_steps")
     }
     steps = study.solver.model_copy(update=fewer)
-    near = [
-        replace(one, model=replace(one.model, within_mm=study.within_mm, steps=steps)) for _, one in meshed
-    ]
+    models = [replace(other.model, within_mm=study.within_mm, steps=steps) for _, other in meshed]
+    near = [replace(other, model=model) for (_, other), model in zip(meshed, models)]
     jobs = [other.job(parameters, sensitivities=False) for other in near]
     done = simulator.cache.run(jobs, simulator.executor, again=True)
     for (i, _), simulation in zip(meshed, done, strict=True):
@@ -209,21 +202,17 @@ def estimate_own_mesh_error(table: MeshTable) -> float:
 
 
 def estimate_linearised(
-    problem: CalibrationProblem,
-    records: Sequence[SiteRecord],
-    parameters: Array,
-    correction: FineMeshCorrection,
+    simulator: RecordSimulator, parameters: Array, correction: FineMeshCorrection
 ) -> Uncertainty:
     """What fitted records tell about ``parameters`` (p,), at which the correction was made."""
-    study, responses = problem.study, correction.responses
-    pairs = list(zip(records, responses, strict=True))
+    problem, responses, study = simulator.problem, correction.responses, simulator.problem.study
+    pairs = list(zip(simulator.records.own, responses, strict=True))
     noise = [estimate_site_noise(study, record, response.force_N) for record, response in pairs]
     off = [estimate_site_deviation(study, record, response, parameters) for record, response in pairs]
-    measured = [record.measured for record in records]
     return estimate_uncertainty(
         parameters,
         responses,
-        measured,
+        simulator.records.measured,
         problem.unknowns,
         noise,
         problem.stages[-1],
@@ -234,7 +223,6 @@ def estimate_linearised(
 
 
 def sample_intervals(
-    problem: CalibrationProblem,
     simulator: RecordSimulator,
     found: Calibration,
     correction: FineMeshCorrection,
@@ -245,8 +233,8 @@ def sample_intervals(
     Sampled on what was simulated near it and a little more, less what the correction took;
     linearised, and the answer stays, where that cannot be for simulations that fail.
     """
-    records = simulator.records
-    known = estimate_linearised(problem, records.own, found.parameters, correction)
+    problem, records = simulator.problem, simulator.records
+    known = estimate_linearised(simulator, found.parameters, correction)
     evaluations = EvaluationStore()
     for point, run in zip(simulator.store.points, simulator.store.responses, strict=True):
         evaluations.add(point, correction.as_fine(list(run)))

@@ -86,20 +86,16 @@ def run_crossvalidate(
     study, stored = context.study, context.results.calibration
     recorded = [site for site in study.sites if study.records_at(site)]
     size = fit or len(study.fitted)
-    simulator = RecordSimulator(
-        load_records(context, study.records_at(*recorded), secondary=True),
-        open_experiment_cache(context, folder),
-        context.executor,
-        partial(context.tell, "crossvalidate", 0, 0),
-    )
     problem, best = build_problem(study), study.vector(stored.parameters)
     problem = replace(problem, unknowns=problem.unknowns.with_start(best))
-    measured = simulator.records.measured
+    records = load_records(context, study.records_at(*recorded), secondary=True)
+    cache, report = open_experiment_cache(context, folder), partial(context.tell, "crossvalidate", 0, 0)
+    simulator, measured = RecordSimulator(problem, records, cache, context.executor, report), records.measured
     sites: dict[str, tuple[int, ...]] = {}
     for i, one in enumerate(measured):
         sites[one.site_name] = (*sites.get(one.site_name, ()), i)
     groups = list(sites.values())
-    correction = correct_to_fine_meshes(problem, simulator, best)
+    correction = correct_to_fine_meshes(simulator, best)
 
     def simulate(points: Sequence[Array]) -> Runs:
         found = []
@@ -327,7 +323,7 @@ def _fit_region(
     """
     study, report = context.study, partial(context.tell, "regions", 0, 0)
     records = load_records(context, study.records_at(*fitted), secondary=True)
-    simulator = RecordSimulator(records, cache, context.executor, report)
+    simulator = RecordSimulator(problem, records, cache, context.executor, report)
     judged = [load_site_record(context, record) for record in study.records_at(*mine)]
     sites = {record.name: record.site.name for record in judged}
 
@@ -338,11 +334,11 @@ def _fit_region(
 
     measured = [record.measured for record in judged]
     of_whole, start = compute_site_errors(simulate, whole, measured), problem.unknowns.with_start(whole)
-    found = search_parameters(problem, simulator, start, problem.stages[-1:]).calibration
+    found = search_parameters(simulator, start, problem.stages[-1:]).calibration
     own = compute_site_errors(simulate, found.parameters, measured)
     coarser = plan_coarser_meshes(context, records, folder / "coarser")
-    correction = correct_answer(problem, simulator, found, coarser)
-    _, known = sample_intervals(problem, simulator, found, correction, moves=False)
+    correction = correct_answer(simulator, found, coarser)
+    _, known = sample_intervals(simulator, found, correction, moves=False)
     return RegionFitted(
         region=name,
         sites=[site.name for site in mine],

@@ -6,7 +6,7 @@ inwards from bounds.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Literal
 
@@ -85,19 +85,14 @@ def build_problem(study: Study) -> CalibrationProblem:
     unknowns, stages = build_unknowns(study), build_groupings(study)
     one, several = "one material", f"{COUNTS[tissues] if tissues < len(COUNTS) else tissues} materials"
     is_one = stages[-1] == group_by_kind(unknowns.names)
+    settings = {one.name: getattr(table, one.name) for one in fields(CalibrationSettings)}
     return CalibrationProblem(
         study=study,
         unknowns=unknowns,
         stages=stages,
         # What a study fixes or ties may leave nothing to a second stage.
         titles=(one, several) if len(stages) > 1 else (one if is_one else several,),
-        settings=CalibrationSettings(
-            objective=table.objective,
-            relative_tolerance=table.relative_tolerance,
-            max_iterations=table.max_iterations,
-            stopping=table.stopping,
-            force_error_percent=table.force_error_percent,
-        ),
+        settings=CalibrationSettings(**settings),
         space=build_space(unknowns, stages[-1]),
         is_moved=is_moved(study),
     )
@@ -175,15 +170,21 @@ class SearchWarning:
 
 
 class RecordSimulator:
-    """Simulates records at parameters (p,), on an executor; what a cache holds is not done again.
+    """Simulates a problem's records at parameters (p,), on an executor; what a cache holds is not done again.
 
     ``report`` is given a line for each simulation. A search leaves behind the number of its ``evaluations``,
     those that were complete (``store``), the penalty of contact by site (``penalties``), and ``warnings``.
     """
 
     def __init__(
-        self, records: RecordSet, cache: SimulationCache, executor: Executor, report: Report
+        self,
+        problem: CalibrationProblem,
+        records: RecordSet,
+        cache: SimulationCache,
+        executor: Executor,
+        report: Report,
     ) -> None:
+        self.problem = problem
         self.records, self.cache, self.executor, self.report = records, cache, executor, report
         self.starts, self.store, self.evaluations = WarmStarts(), EvaluationStore(), 0
         self.penalties: dict[str, float | None] = {}
@@ -239,16 +240,15 @@ class RecordSimulator:
         return [record.respond(simulation) for record, simulation in pairs]
 
 
-def search_from_starts(
-    problem: CalibrationProblem, simulator: RecordSimulator
-) -> tuple[MultistartResult, tuple[CorrectionRound, ...]]:
+def search_from_starts(simulator: RecordSimulator) -> tuple[MultistartResult, tuple[CorrectionRound, ...]]:
     """Search from each of ``calibration.starts``: what came of them, and the corrections of the best."""
-    table, corrections = problem.study.calibration, dict[int, tuple[CorrectionRound, ...]]()
+    problem, corrections = simulator.problem, dict[int, tuple[CorrectionRound, ...]]()
+    table = problem.study.calibration
 
     def run(number: int, start: Unknowns) -> Calibration:
         if number:
             simulator.report(f"start {number + 1} of {table.starts}")
-        found = search_parameters(problem, simulator, start, problem.stages)
+        found = search_parameters(simulator, start, problem.stages)
         corrections[number] = found.rounds
         return found.calibration
 
@@ -257,32 +257,22 @@ def search_from_starts(
 
 
 def search_parameters(
-    problem: CalibrationProblem,
-    simulator: RecordSimulator,
-    start: Unknowns,
-    stages: Sequence[Grouping],
+    simulator: RecordSimulator, start: Unknowns, stages: Sequence[Grouping]
 ) -> SearchResult:
     """The parameters of some records as the study wants them found, and the corrections made.
 
     Where the last of the ``stages`` ends at a bound, it is searched again from inside.
     """
-
-    search = partial(_search_once, problem, simulator)
+    search = partial(_search_once, simulator)
     first = search(start, stages)
-    if problem.settings.stopping == "paper":
+    if simulator.problem.settings.stopping == "paper":
         return first
     return continue_from_bound(first, start, stages, search, simulator.report)
 
 
-def _search_once(
-    problem: CalibrationProblem,
-    simulator: RecordSimulator,
-    start: Unknowns,
-    stages: Sequence[Grouping],
-) -> SearchResult:
-    study, records = problem.study, simulator.records
-    table = study.calibration
-    titles = problem.titles[-len(stages) :]
+def _search_once(simulator: RecordSimulator, start: Unknowns, stages: Sequence[Grouping]) -> SearchResult:
+    problem, records, study = simulator.problem, simulator.records, simulator.problem.study
+    table, titles = study.calibration, problem.titles[-len(stages) :]
 
     def report(state: SearchState) -> None:
         last = state.history[-1]

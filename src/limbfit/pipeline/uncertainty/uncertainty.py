@@ -72,9 +72,9 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     problem, table = build_problem(study), study.uncertainty
     records = load_records(context, study.records_at(*study.fitted), secondary=True)
     cache = open_experiment_cache(context, folder)
-    simulator = RecordSimulator(records, cache, context.executor, report)
-    correction = correct_to_fine_meshes(problem, simulator, best)
-    known = estimate_linearised(problem, records.own, best, correction)
+    simulator = RecordSimulator(problem, records, cache, context.executor, report)
+    correction = correct_to_fine_meshes(simulator, best)
+    known = estimate_linearised(simulator, best, correction)
 
     def simulate(points: Sequence[Array]) -> list[list[SiteResponse]]:
         """All sites at parameters (p,), with derivatives; they start as in the calibration, or from the
