@@ -56,14 +56,10 @@ FAR, GROWTH, FLATNESS = 3.5, 0.5, 1.6  # edges near the proximal cut over those 
 
 @dataclass(frozen=True, eq=False)
 class SocketLimb:
-    """What sockets are put on.
+    """What sockets are put on: its ``anatomy``, and ``outer``, which has what a socket touches for its skin.
 
-    Attributes
-    ----------
-    anatomy : skin and bones; ``outer`` has what the socket touches for its skin.
-    depth : of the fat below that, where it is mapped.
-    regions : of the skin, by name.
-    fibres : their direction in each tissue that has some.
+    ``depth`` is that of the fat below, where it is mapped, ``regions`` are those of the skin, by name, and
+    ``fibres`` their direction in each tissue that has some.
     """
 
     study: Study
