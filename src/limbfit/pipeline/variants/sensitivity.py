@@ -32,12 +32,11 @@ from ..simulation.simulations import SimulationCache, open_experiment_cache
 from .variants import (
     ChosenSite,
     Variant,
+    VariantRow,
     check_variants,
     choose_sites,
     measure_tissue_over_bone,
     run_variants,
-    simulate_variants,
-    store_variants,
 )
 
 NO_VOLUME: Mapping[str, float | None] = dict.fromkeys(("J_min", "J_low", "J_high", "J_max", "beyond_percent"))
@@ -105,7 +104,7 @@ def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str] = ()) 
     chosen, cache = choose_sites(context, sites), open_experiment_cache(context, folder)
     variants = [variant for one in chosen for variant in _build_stiffer(one, equal, law.moduli)]
     local = _collect_derivatives(context, cache, identified)
-    more = {"equal_m": m, "factors": FACTORS, "local": local}
+    more: dict[str, Any] = {"equal_m": m, "factors": FACTORS, "local": local}
     run_variants(context, folder, stored.StiffnessResult, variants, cache, **more)
 
 
@@ -255,11 +254,7 @@ def run_refinement(
     """Force at sites on meshes whose edges are ``factors`` times the study's, and what it tends to."""
     parameters, chosen = context.results.calibration.parameters, choose_sites(context, sites)
     variants = _build_variants(context, folder, chosen, _choose_factors(factors), parameters)
-    runs = simulate_variants(context, folder, stored.RefinementResult, variants)
-    refined = [
-        stored.RefinedSite(**dict(one.summary), **_find_limit(one.summary.site, runs)) for one in chosen
-    ]
-    store_variants(context, folder, stored.RefinementResult, runs, sites=refined)
+    run_variants(context, folder, stored.RefinementResult, variants, find_more=_find_limit)
 
 
 def _build_variants(
@@ -302,15 +297,14 @@ def _build_variants(
     return variants
 
 
-def _find_limit(site: str, runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The largest force that the meshes of a site tend to, and how far the study's mesh is from it.
+def _find_limit(runs: Sequence[VariantRow]) -> dict[str, Any]:
+    """The largest force that the ``runs`` of a site tend to, and how far the study's mesh is from it.
 
     Nothing where they do not tend to anything yet. With an element whose forces do not change in one
     direction, the limit is the finest mesh's force, at no order.
     """
-    of_site = [run for run in runs if run["site"] == site]
-    own = next(run for run in of_site if run["base"])
-    done = {run["edge_near_mm"]: run["peak_force_N"] for run in of_site if run["peak_force_N"] is not None}
+    own = next(run for run in runs if run["base"])
+    done = {run["edge_near_mm"]: run["peak_force_N"] for run in runs if run["peak_force_N"] is not None}
     if len(done) >= 2 and own["edge_near_mm"] in done:
         found = extrapolate_richardson(list(done), list(done.values()), MESH_ORDERS[own["element"]])
         finest = done[min(done)]

@@ -1,6 +1,6 @@
 """Simulations of the same indentation with one thing changed: what the experiments of sensitivity share."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from ..engine.store import write_curves, write_result, write_rows
 from ..records.records import build_model, measure_bone_distance_mm
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import CURVE_POINTS, SimulationCache, build_curve_job, open_experiment_cache
+
+VariantRow = Mapping[str, Any]  # a run, by the keys of its model
 
 
 @dataclass(frozen=True)
@@ -103,22 +105,14 @@ def run_variants(
     result: type[VariedResult],
     variants: Sequence[Variant],
     cache: SimulationCache | None = None,
+    find_more: Callable[[Sequence[VariantRow]], dict[str, Any]] = lambda runs: {},
     **more: Any,
 ) -> None:
-    """Simulate variants and store a ``result`` with a run of each, and ``more`` of its keys."""
-    sites = {variant.model.name: variant.chosen.summary for variant in variants}
-    runs = simulate_variants(context, folder, result, variants, cache)
-    store_variants(context, folder, result, runs, sites=list(sites.values()), **more)
+    """Simulate variants and store a ``result`` with a run of each, and ``more`` of its keys.
 
-
-def simulate_variants(
-    context: Context,
-    folder: Path,
-    result: type[VariedResult],
-    variants: Sequence[Variant],
-    cache: SimulationCache | None = None,
-) -> list[dict[str, Any]]:
-    """Simulate them all, in order, and write the curves of each site; a row of each, by the result's keys."""
+    ``find_more`` tells more of a site from its runs. Beside the JSON are the runs as ``runs.csv``, and the
+    curves of each site.
+    """
     cache = open_experiment_cache(context, folder) if cache is None else cache
     done: list[Simulation] = []
     found = cache.run([variant.job() for variant in variants], context.executor)
@@ -127,10 +121,18 @@ def simulate_variants(
         words = f"site {simulation.site}, {variant.label}"
         context.tell(Path(result.FILE).stem, len(done), len(variants), words)
     _write_curves(folder, variants, done)
-    return _compare_variants(variants, done)
+    runs = _compare_variants(variants, done)
+    sites = {variant.model.name: variant.chosen.summary for variant in variants}
+    rows = [
+        dict(site) | find_more([run for run in runs if run["site"] == name]) for name, site in sites.items()
+    ]
+    parameters = context.results.calibration.parameters
+    content = result.model_validate({"sites": rows, "runs": runs, "parameters": parameters, **more})
+    write_result(folder / Path(result.FILE).name, content)
+    write_rows(folder / "runs.csv", content.runs, leave_out=("warnings", "label", "base"))
 
 
-def _compare_variants(variants: Sequence[Variant], simulations: Sequence[Simulation]) -> list[dict[str, Any]]:
+def _compare_variants(variants: Sequence[Variant], simulations: Sequence[Simulation]) -> list[VariantRow]:
     """A row of each: what was changed, its largest force, and how it differs from its site's base.
 
     Changes are in percent of the base's largest force: of the largest force, and the mean over the trace.
@@ -167,16 +169,6 @@ def _change(simulation: Simulation, base: Simulation) -> dict[str, float | None]
         "peak_change_percent": 100.0 * (float(simulation.force_N.max()) / peak - 1.0),
         "mean_change_percent": 100.0 * float(np.abs(simulation.force_N - base.force_N).mean()) / peak,
     }
-
-
-def store_variants(
-    context: Context, folder: Path, result: type[VariedResult], runs: Sequence[dict[str, Any]], **more: Any
-) -> None:
-    """The result as JSON, and its runs as ``runs.csv``."""
-    parameters = context.results.calibration.parameters
-    content = result.model_validate({"runs": runs, "parameters": parameters, **more})
-    write_result(folder / Path(result.FILE).name, content)
-    write_rows(folder / "runs.csv", content.runs, leave_out=("warnings", "label", "base"))
 
 
 def _write_curves(folder: Path, variants: Sequence[Variant], simulations: Sequence[Simulation]) -> None:
