@@ -28,8 +28,7 @@ import limbfit
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import to_vector
 from limbfit.pipeline.engine.context import Context, ignore_progress
-from limbfit.pipeline.engine.storage import read_json, write_curves
-from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.engine.store import Store, read_json, write_curves
 from limbfit.pipeline.simulation.limb_geometry import build_site_model
 from limbfit.pipeline.simulation.simulations import SimulationCache, build_curve_job
 

@@ -3,7 +3,7 @@
     python benchmarks/clamps.py --sites 05 10 15 --force 15 --json clamps.json
 
 Sites of the synthetic patient (`limbfit phantom`), at its true tissues, indented as they are and in a limb
-that eleven pins clamp (`limbfit.indentation.clamps`).  What came of it: docs/loads.md.
+that eleven pins clamp (`limbfit.indentation.sites`).  What came of it: docs/loads.md.
 """
 
 import argparse
@@ -18,7 +18,7 @@ import numpy as np
 from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
 from limbfit.fe import History, Indenter, Problem, StepControl, solve
 from limbfit.indentation import build_materials
-from limbfit.indentation.clamps import clamp_problem
+from limbfit.indentation.sites import clamp_problem
 from limbfit.mesh import Mesh
 from limbfit.phantom import TrueSite, build_true_sites, draw_true_parameters, make_limb
 from limbfit.phantom.surfaces import build_true_anatomy

@@ -41,12 +41,10 @@ from limbfit.identify.uncertainty.emulator import Emulator
 from limbfit.identify.uncertainty.noise import SiteNoise, compute_depth_slope, estimate_record_noise
 from limbfit.phantom.record import DISPLACEMENT_NOISE_MM, RATE_HZ
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.engine.storage import read_json
-from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.identification.problem import build_unknowns
-from limbfit.pipeline.records.deviations import estimate_site_deviation
-from limbfit.pipeline.records.records import SiteRecord, load_site_record
-from limbfit.pipeline.uncertainty.result import EMULATOR
+from limbfit.pipeline.engine.store import Store, read_json
+from limbfit.pipeline.identification.search import build_unknowns
+from limbfit.pipeline.records.records import SiteRecord, estimate_site_deviation, load_site_record
+from limbfit.pipeline.uncertainty.uncertainty import EMULATOR
 from limbfit.traces import Regularised, TouchDown, Trace, find_touch_down, regularise
 
 Array = NDArray[np.float64]

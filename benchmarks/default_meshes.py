@@ -18,7 +18,7 @@ from limbfit.execution import SerialExecutor
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.identification.problem import build_unknowns
+from limbfit.pipeline.identification.search import build_unknowns
 from limbfit.pipeline.limb.mesh import mesh_settings, plan_meshes
 from limbfit.pipeline.limb.remesh import mesh_models
 from limbfit.pipeline.records.records import load_site_record

@@ -30,9 +30,8 @@ from limbfit import check_study, load_study, run_study
 from limbfit.errors import LimbfitError
 from limbfit.identify.fit.multistart import draw_starts
 from limbfit.indentation import to_parameters, to_vector
-from limbfit.pipeline.engine.storage import read_json
-from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.identification.problem import build_unknowns
+from limbfit.pipeline.engine.store import Store, read_json
+from limbfit.pipeline.identification.search import build_unknowns
 
 SAME = 0.01  # of the squared error: as good a fit as the best
 

@@ -9,8 +9,7 @@ from identification_cases import make_study
 
 from limbfit import load_study, run_study
 from limbfit.indentation import list_flat_names, to_vector
-from limbfit.pipeline.engine.storage import read_json
-from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.engine.store import Store, read_json
 
 Record = dict[str, Any]
 NAMES = tuple(f"{tissue}.{name}" for tissue, name in list_flat_names(("skin", "muscle")))

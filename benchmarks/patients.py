@@ -24,8 +24,7 @@ from limbfit import load_study, run_study
 from limbfit.indentation import list_flat_names, to_vector
 from limbfit.pipeline.commands.demo import make_phantom_study
 from limbfit.pipeline.engine.context import Progress
-from limbfit.pipeline.engine.storage import read_json
-from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.engine.store import Store, read_json
 
 Record = dict[str, Any]
 

@@ -42,9 +42,8 @@ from limbfit.indentation import to_vector
 from limbfit.phantom.record import NOTHING, ULTRASOUND_NOISE_MM, WAVES_NOISE_M_S, SecondaryMeasurements
 from limbfit.pipeline.design.protocol import DETERMINED
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.engine.storage import read_json
-from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.identification.problem import build_problem
+from limbfit.pipeline.engine.store import Store, read_json
+from limbfit.pipeline.identification.search import build_problem
 from limbfit.pipeline.simulation.limb_geometry import build_site_model, coarsen_model
 from limbfit.pipeline.simulation.simulations import (
     SimulationCache,

@@ -44,7 +44,7 @@ from limbfit.phantom.record import (
     write_ultrasound,
     write_waves,
 )
-from limbfit.pipeline.engine.storage import write_json
+from limbfit.pipeline.engine.store import write_json
 from limbfit.study import IndenterTable
 
 # Finer than the study's: within 0.5 % of the force of edges of 1.5 mm on surfaces of 1 mm.

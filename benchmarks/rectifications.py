@@ -32,12 +32,11 @@ from limbfit.execution import SerialExecutor
 from limbfit.mesh import Mesh
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.surfaces import build_true_anatomy
-from limbfit.pipeline.commands.fitting import choose_tissues
+from limbfit.pipeline.commands.planning import choose_tissues
 from limbfit.pipeline.engine.context import Context, ignore_progress
 from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.socket.limb import SocketLimb
 from limbfit.pipeline.socket.shape import build_socket
-from limbfit.pipeline.socket.simulation import SocketRun, solve_run, summarise_run
+from limbfit.pipeline.socket.simulation import SocketLimb, SocketRun, solve_run, summarise_run
 from limbfit.socket import Socket
 from limbfit.study.socket import SocketAreaTable
 

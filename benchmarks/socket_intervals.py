@@ -31,12 +31,10 @@ from limbfit.indentation import list_flat_names, to_parameters, to_vector
 from limbfit.mesh import Mesh
 from limbfit.phantom.build import draw_true_parameters
 from limbfit.pipeline.engine.context import Context, ignore_progress
-from limbfit.pipeline.engine.storage import read_json
-from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.engine.store import Store, read_json
 from limbfit.pipeline.socket.intervals import ParameterSpread, draw_step, predict_change
-from limbfit.pipeline.socket.limb import SocketLimb
 from limbfit.pipeline.socket.shape import build_socket
-from limbfit.pipeline.socket.simulation import SocketRun, solve_run, summarise_run
+from limbfit.pipeline.socket.simulation import SocketLimb, SocketRun, solve_run, summarise_run
 from limbfit.socket import Socket
 
 SETTLING = "settling (mm)"

@@ -46,8 +46,7 @@ from limbfit.laws import to_vector
 from limbfit.mesh import write_vtu
 from limbfit.phantom.record import Ramp, record
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.engine.storage import write_json
-from limbfit.pipeline.engine.store import COARSE, Store
+from limbfit.pipeline.engine.store import COARSE, Store, write_json
 from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.records.records import to_response

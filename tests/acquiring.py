@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from limbfit.pipeline.engine.storage import write_curves
+from limbfit.pipeline.engine.store import write_curves
 
 SPEED = "40"  # an accelerated clock
 ACQUIRE = """

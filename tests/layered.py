@@ -16,8 +16,7 @@ from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
 from limbfit.mesh.boxes import SIX_TETS, build_boxes
 from limbfit.phantom.record import Ramp, record
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.engine.storage import write_json
-from limbfit.pipeline.engine.store import COARSE, Store
+from limbfit.pipeline.engine.store import COARSE, Store, write_json
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.pipeline.simulation.limb_geometry import find_fibre_directions
 from limbfit.study import SolverTable, Study, load_study

@@ -60,26 +60,23 @@ from .pipeline.commands.acquire import (
     virtual_fitsocket as virtual_fitsocket,
     waiting as waiting,
 )
-from .pipeline.commands.calibration_bench import bench_calibrate as bench_calibrate
 from .pipeline.commands.check import check_study as check_study
-from .pipeline.commands.compare import compare_site as compare_site
+from .pipeline.commands.other_solvers import compare_site as compare_site
 from .pipeline.commands.demo import (
+    bench_calibrate as bench_calibrate,
     make_phantom_study as make_phantom_study,
     run_demo as run_demo,
 )
 from .pipeline.commands.doctor import diagnose as diagnose
-from .pipeline.commands.export import export_study as export_study
-from .pipeline.commands.febfile import simulate_feb as simulate_feb
-from .pipeline.commands.fitting import (
-    design_socket as design_socket,
-    fit_socket as fit_socket,
-)
+from .pipeline.commands.other_solvers import export_study as export_study
 from .pipeline.commands.models import (
     compare_models as compare_models,
     fit_socket_of_models as fit_socket_of_models,
 )
 from .pipeline.commands.planning import (
+    design_socket as design_socket,
     design_study as design_study,
+    fit_socket as fit_socket,
     plan_protocol as plan_protocol,
 )
 from .pipeline.commands.reproduce import reproduce_study as reproduce_study
@@ -92,7 +89,10 @@ from .pipeline.commands.run import (
     study_status as study_status,
 )
 from .pipeline.commands.show import show_stage as show_stage
-from .pipeline.commands.simulate import simulate_site as simulate_site
+from .pipeline.commands.simulate import (
+    simulate_feb as simulate_feb,
+    simulate_site as simulate_site,
+)
 from .results.reference import build_schema as build_schema
 from .results.study_results import (
     StudyResults as StudyResults,

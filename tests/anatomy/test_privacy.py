@@ -16,7 +16,7 @@ from conftest import COARSE
 from limbfit import load_study
 from limbfit.cli import main
 from limbfit.pipeline.commands.run import run_record
-from limbfit.pipeline.engine.storage import write_result
+from limbfit.pipeline.engine.store import write_result
 
 IN_TAGS = {
     "PatientName": "QUIXOTE^ALONSO^MARKERX1",

@@ -9,9 +9,8 @@ from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.objective import SiteResponse
 from limbfit.identify.fit.parameters import build_space, group_by_kind, group_separately
 from limbfit.identify.fit.prediction import compute_errors_percent
-from limbfit.identify.uncertainty.exploration import ExplorationSettings, explore_posterior
 from limbfit.identify.uncertainty.noise import estimate_curve_noise
-from limbfit.identify.uncertainty.posterior import Posterior
+from limbfit.identify.uncertainty.posterior import ExplorationSettings, Posterior, explore_posterior
 from limbfit.identify.uncertainty.uncertainty import (
     FitSensitivity,
     compute_principal_axes,

@@ -8,8 +8,13 @@ from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import Unknowns, build_space, group_by_kind, group_separately
 from limbfit.identify.uncertainty.discrepancy import ResidualModel
 from limbfit.identify.uncertainty.emulator import Emulator
-from limbfit.identify.uncertainty.likelihood import Likelihood, check_profile_ends, compute_profile
-from limbfit.identify.uncertainty.model_comparison import compare_models, fit_alternative
+from limbfit.identify.uncertainty.likelihood import (
+    Likelihood,
+    check_profile_ends,
+    compare_models,
+    compute_profile,
+    fit_alternative,
+)
 from limbfit.identify.uncertainty.noise import SiteNoise, estimate_curve_noise
 from limbfit.identify.uncertainty.posterior import sample_posterior
 from limbfit.identify.uncertainty.uncertainty import estimate_uncertainty

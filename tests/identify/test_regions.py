@@ -6,11 +6,18 @@ import numpy as np
 import pytest
 from bars import NAMES, PAPER, SITES, TRUTH, records
 
-from limbfit.identify.checks.crossvalidation import average_errors, fit_region
+from limbfit.identify.checks.crossvalidation import average_errors, compute_site_errors
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.parameters import group_separately
 
 SOFT = TRUTH * np.array([0.6, 1.0, 1.2, 1.0, 0.7, 1.0, 0.9, 1.1])
+
+
+def fit_region(identify, simulate, measured, whole):
+    """The region's own model from the whole limb's parameters, its errors and theirs."""
+    found = identify(PAPER.with_start(whole))
+    own, of_whole = (compute_site_errors(simulate, one, measured) for one in (found.parameters, whole))
+    return found, own, of_whole
 
 
 def region(sites, truth, fitted=None):
@@ -33,7 +40,7 @@ def region(sites, truth, fitted=None):
 def found():
     regions = {"stiff": region(SITES[:3], TRUTH), "soft": region(SITES[1:], SOFT, fitted=2)}
     whole = np.sqrt(TRUTH * SOFT)
-    return {name: fit_region(*one, PAPER, whole) for name, one in regions.items()}
+    return {name: fit_region(*one, whole) for name, one in regions.items()}
 
 
 def test_each_region_finds_its_own_tissues(found):
@@ -55,7 +62,7 @@ def test_a_held_out_site_of_a_region_is_judged_too(found):
 
 def test_it_starts_from_the_whole_limb_within_the_bounds():
     beyond = np.where(np.arange(8) == 1, 100.0, TRUTH)
-    calibration, *_ = fit_region(*region(SITES, TRUTH), PAPER, beyond)
+    calibration, *_ = fit_region(*region(SITES, TRUTH), beyond)
     assert calibration.history[0].parameters[1] == pytest.approx(20.0)
 
 
@@ -66,7 +73,7 @@ def test_a_partial_simulation_has_no_error():
         *others, last = simulate(parameters)
         return [*others, replace(last, completed=False, reason="no")]
 
-    _, own, _ = fit_region(identify, fails_at_the_last, measured, PAPER, TRUTH)
+    _, own, _ = fit_region(identify, fails_at_the_last, measured, TRUTH)
     assert own["s3"] is None
     assert average_errors(own) == pytest.approx(np.mean([own[f"s{i}"] for i in range(3)]))
     assert average_errors({"s3": None}) is None

@@ -11,7 +11,7 @@ from limbfit.execution import SerialExecutor
 from limbfit.febio import read_feb, to_problem
 from limbfit.indentation import SimulationJob, SiteModel, simulate
 from limbfit.pipeline.commands.check import check_study
-from limbfit.pipeline.commands.export import export_study
+from limbfit.pipeline.commands.other_solvers import export_study
 from limbfit.pipeline.commands.run import compute_keys, run_study
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store

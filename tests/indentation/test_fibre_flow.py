@@ -7,7 +7,7 @@ import pytest
 
 from limbfit.errors import ProblemError
 from limbfit.indentation import build_fibre_field, cut_neighbourhood
-from limbfit.indentation.cell_fields import compute_flow_directions
+from limbfit.indentation.sites import compute_flow_directions
 from limbfit.mesh import Mesh
 from limbfit.mesh.boxes import HEX, SIX_TETS, build_boxes
 from tetrahedra import turn_upright

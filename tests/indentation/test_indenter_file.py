@@ -10,7 +10,7 @@ from limbfit.errors import InputError, StudyError
 from limbfit.indentation import SiteModel, read_indenter
 from limbfit.pipeline.commands.experiments import EXPERIMENTS
 from limbfit.pipeline.commands.run import compute_keys
-from limbfit.pipeline.engine.keys import Keys
+from limbfit.pipeline.engine.provenance import Keys
 from limbfit.pipeline.simulation.simulations import SimulationJob, compute_job_digest
 from limbfit.study import IndenterTable, Study, load_study
 

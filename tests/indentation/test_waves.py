@@ -11,7 +11,7 @@ from limbfit.bench.timing import build_layered_block
 from limbfit.errors import ProblemError
 from limbfit.fe import History, OgdenQLV, Problem, Result, StepControl, Support, solve
 from limbfit.indentation import SimulationJob, SiteModel, WavePlace, place_waves_under, simulate, to_vector
-from limbfit.indentation.waves import DISC_HALF_MM, DISC_RADIUS_MM, compute_wave_speeds, sample_disc
+from limbfit.indentation.observing import DISC_HALF_MM, DISC_RADIUS_MM, compute_wave_speeds, sample_disc
 from limbfit.mesh import locate
 from limbfit.study import IndenterTable, SolverTable
 

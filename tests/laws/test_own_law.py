@@ -21,11 +21,10 @@ from limbfit.fe.system import Increment
 from limbfit.indentation.sites import build_materials
 from limbfit.laws import FUNG, LAWS, Parameter, TissueLaw, register_law
 from limbfit.mesh import Mesh
-from limbfit.pipeline.commands.export import check_export
+from limbfit.pipeline.commands.other_solvers import check_export
 from limbfit.pipeline.commands.run import compute_keys
-from limbfit.pipeline.engine.partial_results import ResultFiles
-from limbfit.pipeline.socket.limb import SocketLimb
-from limbfit.pipeline.socket.simulation import SocketRun
+from limbfit.pipeline.engine.store import ResultFiles
+from limbfit.pipeline.socket.simulation import SocketLimb, SocketRun
 from limbfit.socket import Socket
 from small_limb import limb as limb_with_a_bone
 

@@ -25,9 +25,9 @@ from limbfit.febio import (
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.indentation.sites import build_site_materials
 from limbfit.laws import LAWS, POWER, TissueLaw
-from limbfit.pipeline.commands.export import check_export
+from limbfit.pipeline.commands.other_solvers import check_export
 from limbfit.pipeline.commands.run import compute_keys
-from limbfit.pipeline.engine.storage import write_json
+from limbfit.pipeline.engine.store import write_json
 from limbfit.pipeline.records.records import build_model
 from limbfit.pipeline.simulation.simulations import compute_job_digest
 from limbfit.relaxation import DEFAULT_SPAN_S, choose_relaxation_times, compute_power_law_terms

@@ -7,7 +7,7 @@ import pytest
 from limbfit.errors import InputError, StudyError
 from limbfit.pipeline.commands.check import check_study
 from limbfit.pipeline.commands.run import compute_keys
-from limbfit.pipeline.identification.problem import build_unknowns
+from limbfit.pipeline.identification.search import build_unknowns
 from limbfit.priors import LITERATURE, PRIORS, of_tissues
 from limbfit.study import Study, load_study
 

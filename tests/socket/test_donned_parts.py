@@ -19,7 +19,7 @@ from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.donning import Load, SocketFit, build_socket_problem, pack, simulate_donning, unpack
 from limbfit.errors import ProblemError
 from limbfit.fe import Checkpoints, OgdenQLV, StepControl, solve
-from limbfit.pipeline.engine.partial_results import ResultFiles
+from limbfit.pipeline.engine.store import ResultFiles
 from limbfit.socket import Recipe, rectify_limb
 from limbfit.socket.trim import Trim
 

@@ -13,10 +13,9 @@ from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import StudyError
 from limbfit.mesh import Mesh
 from limbfit.pipeline.commands.check import check_study
-from limbfit.pipeline.commands.fitting import choose_tissues
+from limbfit.pipeline.commands.planning import choose_tissues
 from limbfit.pipeline.commands.run import run_experiment
-from limbfit.pipeline.engine.partial_results import ResultFiles
-from limbfit.pipeline.socket.limb import SocketLimb
+from limbfit.pipeline.engine.store import ResultFiles
 from limbfit.pipeline.socket.shape import (
     build_loadable_socket,
     build_regions,
@@ -25,7 +24,7 @@ from limbfit.pipeline.socket.shape import (
     load_of,
     trim_of,
 )
-from limbfit.pipeline.socket.simulation import SocketRun
+from limbfit.pipeline.socket.simulation import SocketLimb, SocketRun
 from limbfit.priors import of_tissues
 from limbfit.socket import Socket
 from limbfit.socket.landmarks import find_knee_centre

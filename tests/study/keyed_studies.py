@@ -12,7 +12,7 @@ from test_study_docs import KEYS
 from limbfit.extensions import load_extensions
 from limbfit.pipeline.commands.experiments import EXPERIMENTS
 from limbfit.pipeline.commands.run import STAGES, compute_keys
-from limbfit.pipeline.engine.keys import Keys
+from limbfit.pipeline.engine.provenance import Keys
 from limbfit.study import Study, load_study
 
 SEEN = {"ultrasound": "3.csv", "surface": "3.csv", "shear_waves": "3.csv"}

@@ -26,7 +26,7 @@ from keyed_studies import (
 import limbfit
 from limbfit.pipeline.commands.experiments import EXPERIMENTS
 from limbfit.pipeline.commands.run import compute_keys
-from limbfit.pipeline.engine.keys import Keys
+from limbfit.pipeline.engine.provenance import Keys
 
 SURFACE_FILE = {"shape": "stl", "file": "1.stl"}
 

@@ -12,20 +12,21 @@ from typing import Any
 
 from ..errors import InputError
 from ..renamed import find_renamed
-from .base import (
+from .cluster import QUEUES, DaskExecutor
+from .processes import (
     NO_LIMITS,
     SAFE_PATH,
     THREAD_VARIABLES,
     Batch,
     Executor,
     Limits,
+    ProcessExecutor,
     SerialExecutor,
     count_usable_cores,
     report_progress,
+    run_in_background,
     set_in_block,
 )
-from .cluster import QUEUES, DaskExecutor
-from .processes import ProcessExecutor, run_in_background
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Self
 
 from ..errors import InputError, RunError
-from .base import NO_LIMITS, Batch, Executor, Limits
-from .processes import ProcessExecutor
+from .processes import NO_LIMITS, Batch, Executor, Limits, ProcessExecutor
 
 QUEUES = {
     "slurm": "SLURMCluster",

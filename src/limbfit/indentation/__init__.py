@@ -4,9 +4,6 @@ from typing import Any
 
 from ..laws import Parameters, list_flat_names, to_parameters, to_vector
 from ..renamed import find_renamed
-from .cell_fields import Direction, build_fibre_field
-from .clamps import build_clamping_pins
-from .clamps import clamp_problem as clamp_problem
 from .neighbourhood import Extension, cut_neighbourhood
 from .observing import (
     OFF_SKIN_MM,
@@ -28,14 +25,19 @@ from .simulating import (
     store_job_fields,
 )
 from .sites import (
+    Direction,
     SiteModel,
+    WavePlace,
+    build_clamping_pins,
+    build_fibre_field,
     build_materials,
     build_problem,
     build_steps,
     compute_contact_radius,
     read_indenter,
+    to_vector3,
 )
-from .waves import WavePlace, to_vector3
+from .sites import clamp_problem as clamp_problem
 
 
 def __getattr__(name: str) -> Any:

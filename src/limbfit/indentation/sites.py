@@ -1,23 +1,38 @@
 """A study's site as a mechanical problem: everything about one indentation but the parameters.
 
 `SiteModel` travels to worker processes as paths and numbers.
+
+Pins that hold the limb are rigid bodies under force. The device of the source paper (section 2.1) has 14 pins
+in a ring. The one at the site indents, the two beside it stay clear of the skin so that tissue can bulge, and
+the other eleven press the limb with 14 to 16 N before the test. There they then stay where they are; here
+each keeps its force.
+
+Fibres run in a stated direction, or along a flow from the proximal cut to bone: between a muscle's
+attachments and along its boundaries, as the gradient of a potential that Laplace's equation gives does. It is
+one at one attachment, zero at the other, with no flow through what is between (Choi and Blemker 2013, PLoS
+ONE 8, e77576).
 """
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+from scipy.spatial import cKDTree
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkCommand
 from vtkmodules.vtkIOGeometry import vtkSTLReader
 
-from ..arrays import Array, Indices
+from ..arrays import Array, Indices, Mask
 from ..errors import ProblemError, SurfaceError, add_location
 from ..extensions import load_extensions
 from ..fe import (
+    ELEMENTS,
     Activation,
     Contractile,
     Fibred,
@@ -25,26 +40,51 @@ from ..fe import (
     History,
     Indenter,
     Material,
+    Motion,
     OgdenPower,
     OgdenQLV,
     Problem,
+    RigidBody,
     RigidSurface,
     StepControl,
+    isochoric_stretch,
 )
+from ..fe.contact.contact import ContactSurface, find_touching_offset
+from ..fe.kernel.elements import compute_reference_gradients
 from ..laws import FUNG, LAWS, OGDEN, POWER, Parameters
 from ..mesh import Mesh
 from ..phases import spread
 from ..relaxation import DEFAULT_SPAN_S, choose_relaxation_times
 from ..study import ClampsTable, IndenterTable, SolverTable, Vector
-from .cell_fields import Direction, build_fibre_field, build_prestretch_field
-from .clamps import clamp_problem
 from .neighbourhood import cut_neighbourhood, find_fixed_cut_nodes
-from .waves import WavePlace
 
+Direction = Vector | Literal["flow"]  # of fibres
+
+DISTAL_MM = 10.0  # of the bone's far end, along the limb, that fibres run to
+_POTENTIAL_TOLERANCE = 1e-8  # residual of the potential of their flow
 RISE_S, REST_S = 2.0, 5.0  # muscle tenses, and rests tensed, before the indenter touches
 # Of the solver's tolerance: it is one of the reactions of all pins, of which the test pin's is a small part.
 CLAMPED_TOLERANCE_SHARE = 0.1
 PENETRATION_FACTOR = 3.0  # a percent of penetration costs half a percent of force (docs/contact.md)
+
+
+@dataclass(frozen=True)
+class WavePlace:
+    """Where a shear wave's speed is wanted: a material point of ``tissue``, its place at rest, LPS mm.
+
+    ``motion`` and ``way``: unit vectors along which the tissue moves and the wave runs, across each other.
+    """
+
+    tissue: str
+    point: Vector
+    motion: Vector
+    way: Vector
+
+
+def to_vector3(values: Array) -> Vector:
+    """Three numbers as a model or a study holds them."""
+    x, y, z = (float(value) for value in values)
+    return x, y, z
 
 
 @dataclass(frozen=True)
@@ -279,3 +319,176 @@ def build_steps(model: SiteModel) -> StepControl:
     if table.penalty_per_mm is None:
         return control
     return replace(control, penalty=table.penalty_per_mm, hold_penalty=True)
+
+
+def build_clamping_pins(
+    points: Array, faces: Indices, indenter: Indenter, along: Array, clamps: ClampsTable
+) -> dict[str, Indenter]:
+    """The clamping pins by name, each off the skin at its angle; of the usual ones those that meet it.
+
+    Raises `ProblemError` where the test pin points along the limb, where a stated pin, or every pin, misses
+    the skin, and where one would lie on the test pin.
+
+    Parameters
+    ----------
+    points, faces : (n, 3) mm, and (f, 3 or more) the skin, corners first.
+    indenter : the test pin, at its site.
+    along : (3,) the limb's axis, proximally; the ring lies across it, in the plane of the test pin.
+    """
+    inwards = indenter.frame[2]
+    normal = np.asarray(along, dtype=float) - (along @ inwards) * inwards
+    if np.linalg.norm(normal) < 0.3 * np.linalg.norm(along):
+        raise _build_refusal("the indenter points along the limb, where no ring of pins holds it")
+    normal /= np.linalg.norm(normal)
+    middles = points[faces[:, :3]].mean(axis=1) - np.asarray(indenter.centre)
+    found: dict[str, Indenter] = {}
+    for degrees, level in zip(clamps.angles, np.broadcast_to(clamps.levels_mm, len(clamps.angles))):
+        name = f"clamp at {degrees:.4g} degrees"
+        section = middles[np.abs(middles @ normal - level) < clamps.width_mm / 2.0]
+        radius = 0.5 * float(np.ptp(section @ inwards)) if len(section) else 0.0
+        centre = radius * inwards + level * normal
+        turn = np.radians(degrees)
+        axis = np.cos(turn) * inwards + np.sin(turn) * np.cross(normal, inwards)
+        across, ahead = (section - centre) @ np.cross(normal, axis), (section - centre) @ axis
+        ahead = ahead[(np.abs(across) < clamps.width_mm / 2.0) & (ahead < 0.0)]
+        if not len(ahead):
+            if clamps.angles_degrees:
+                raise _build_refusal(f"the {name}, {level:g} mm along the limb, misses the skin")
+            continue
+        apart = float(np.linalg.norm(centre + ahead.min() * axis))
+        if apart < 0.5 * (clamps.width_mm + indenter.width):
+            raise _build_refusal(f"the {name} would lie on the test pin, {apart:.3g} mm off it")
+        at = indenter.centre + centre - 3.0 * radius * axis
+        found[name] = Indenter("square", clamps.width_mm, centre=at, axis=axis, edge=normal)
+    if not found:
+        raise _build_refusal("no clamping pin meets the skin")
+    return found
+
+
+def clamp_problem(problem: Problem, along: Array, clamps: ClampsTable) -> Problem:
+    """A site's problem with the clamping pins as further bodies, which press from its beginning to its end.
+
+    Raises `ProblemError` as `build_clamping_pins`.
+
+    ``problem``: its indenter touches when they have pressed for `ClampsTable.begun_s`. ``along``: (3,) the
+    limb's axis, proximally.
+    """
+    mesh, indenter = problem.mesh, problem.indenter
+    assert indenter is not None
+    pins = build_clamping_pins(mesh.points, mesh.face_sets["skin"], indenter, along, clamps)
+    bodies = tuple(_build_pin_body(problem, pin, clamps, name) for name, pin in pins.items())
+    return replace(problem, bodies=(*problem.bodies, *bodies))
+
+
+def _build_pin_body(problem: Problem, pin: Indenter, clamps: ClampsTable, name: str) -> RigidBody:
+    """A pin that just touches the skin, pressed by its force until the end."""
+    mesh, skin = problem.mesh, problem.mesh.face_sets["skin"]
+    local = (mesh.points[skin[:, :3]].mean(axis=1) - pin.centre) @ pin.frame.T
+    reach = 0.5 * clamps.width_mm + 8.0
+    near = (np.abs(local[:, :2]) < reach).all(axis=1) & (local[:, 2] > 0.0)
+    near &= local[:, 2] < local[near, 2].min() + clamps.width_mm
+    surface = ContactSurface.build(problem.formulation, mesh.points, skin[near], problem.contact_rule)
+    times = [0.0, clamps.clamping_s, float(problem.history.times[-1])]
+    motion = Motion.of(times, force={"z": [0.0, clamps.force_N, clamps.force_N]})
+    return RigidBody(pin.moved(find_touching_offset(surface, pin)), skin[near], motion, name=name)
+
+
+def _build_refusal(what: str) -> ProblemError:
+    remedy = "give clamps.angles_degrees or clamps.levels_mm, or leave [clamps] out"
+    return ProblemError(what, place="clamps", remedy=remedy)
+
+
+def build_fibre_field(fibres: Iterable[tuple[str, Direction]], mesh: Mesh) -> Array | None:
+    """The fibres' direction in each cell (m, 3); any where a tissue has none, None where all have none.
+    Raises `ProblemError` where a flow has no way: see `compute_flow_directions`.
+    """
+    found = None
+    for tissue, direction in fibres:
+        if tissue in mesh.region_names:
+            found = np.tile([1.0, 0.0, 0.0], (len(mesh.cells), 1)) if found is None else found
+            own = mesh.regions == mesh.region_names.index(tissue)
+            found[own] = compute_flow_directions(mesh, tissue) if direction == "flow" else direction
+    return found
+
+
+def compute_flow_directions(mesh: Mesh, tissue: str) -> Array:
+    """Unit directions (k, 3) in the cells of a tissue, in their order, towards the far end of the bone.
+
+    The potential is 0 on the proximal cut and 1 on the bone within `DISTAL_MM` of its far end. Raises
+    `ProblemError` for a mesh of other than tetrahedra, and where the tissue meets no cut or no end of the
+    bone.
+    """
+    if not mesh.kind.is_tetrahedron:
+        raise ProblemError("fibres along a flow need a mesh of tetrahedra", remedy="state a direction")
+    corners = mesh.corners[mesh.regions == mesh.region_names.index(tissue)]
+    nodes, cells = np.unique(corners, return_inverse=True)
+    cells = cells.reshape(corners.shape)
+    start, end = _find_ends(mesh, nodes)
+    for met, what in ((start, "the proximal cut"), (end, "the far end of the bone")):
+        if not met.any():
+            raise ProblemError(
+                f"the fibres of {tissue!r} have no flow: it does not meet {what}",
+                remedy='state a direction, or "axis", in material.fibres',
+            )
+    points = mesh.points[nodes]
+    gradients, weights = compute_reference_gradients(ELEMENTS["tet4"], points, cells)
+    potential = _solve_potential(len(nodes), cells, gradients[:, 0], weights[:, 0], start, end)
+    flow = np.einsum("mik,mk->mi", gradients[:, 0], potential[cells])
+    size = np.linalg.norm(flow, axis=1, keepdims=True)
+    if not (size > 0.0).all():
+        raise ProblemError(f"the fibres of {tissue!r} have no flow in a part of it that hangs on nothing")
+    return np.asarray(flow / size)
+
+
+def _find_ends(mesh: Mesh, nodes: Indices) -> tuple[Mask, Mask]:
+    """Which of the ``nodes`` are on the proximal cut, and which at the far end of the bone."""
+    none = np.zeros(0, dtype=np.int64)
+    cut, bone = (mesh.node_sets.get(name, none) for name in ("fixed_proximal", "fixed_bone"))
+    if not len(cut) or not len(bone):
+        return np.isin(nodes, cut), np.isin(nodes, bone)
+    middle = mesh.points[cut].mean(axis=0)
+    normal = np.linalg.svd(mesh.points[cut] - middle, full_matrices=False)[2][2]
+    away = np.abs((mesh.points[bone] - middle) @ normal)
+    end = bone[away > away.max() - DISTAL_MM]
+    return np.isin(nodes, cut), np.isin(nodes, end) & ~np.isin(nodes, cut)
+
+
+def _solve_potential(
+    count: int, cells: Indices, gradients: Array, weights: Array, start: Mask, end: Mask
+) -> Array:
+    """The solution (n,) of Laplace's equation by linear tetrahedra: 0 at ``start``, 1 at ``end``."""
+    blocks = np.einsum("mia,mib,m->mab", gradients, gradients, weights)
+    rows, columns = np.broadcast_arrays(cells[:, :, None], cells[:, None])
+    K = sp.csr_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(count, count))
+    free, out = ~(start | end), end.astype(float)
+    inner, right = K[free][:, free], -(K[free] @ out)
+    M = sp.diags(1.0 / inner.diagonal())
+    out[free], failed = spla.cg(inner, right, rtol=_POTENTIAL_TOLERANCE, maxiter=20 * count, M=M)
+    if failed:
+        raise ProblemError("the potential of the fibres' flow was not found", remedy="state a direction")
+    return out
+
+
+def build_prestretch_field(
+    stretches: Iterable[tuple[str, float]], mesh: Mesh, fibres: Array | None, fibred: Container[str]
+) -> Array | None:
+    """The pre-stretch of each cell (m, 3, 3) at constant volume; None where no tissue has one.
+
+    ``stretches``: of tissues by name: along their fibres in those that are ``fibred``, in every direction of
+    the plane of the skin in others. ``fibres``: (m, 3) direction in each cell, where tissues have some.
+    """
+    found = None
+    for tissue, stretch in stretches:
+        if tissue not in mesh.region_names:
+            continue
+        found = np.tile(np.eye(3), (len(mesh.cells), 1, 1)) if found is None else found
+        own = np.flatnonzero(mesh.regions == mesh.region_names.index(tissue))
+        if fibres is not None and tissue in fibred:
+            found[own] = isochoric_stretch(fibres[own], stretch)
+        else:
+            corners = mesh.points[mesh.face_sets["skin"][:, :3]]
+            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            middles = mesh.points[mesh.corners[own]].mean(axis=1)
+            nearest = cKDTree(corners.mean(axis=1)).query(middles)[1]  # of the skin
+            found[own] = isochoric_stretch(normals[nearest], stretch**-2.0)
+    return found

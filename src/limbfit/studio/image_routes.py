@@ -23,7 +23,7 @@ from ..anatomy.labels.labelfiles import get_colour
 from ..anatomy.surfaces.surfaces import read_surface
 from ..errors import InputError, RunError
 from ..pipeline.engine.digests import compute_file_digest
-from ..pipeline.limb.inputs import read_plain_image
+from ..pipeline.limb.segment import read_plain_image
 from ..study import Study
 from .editing import edit_study
 from .folder import Json, StudyFolder

@@ -23,7 +23,7 @@ import psutil
 from ..errors import RunError
 from ..execution import SAFE_PATH
 from ..pipeline.commands.run import select_stages_to_redo
-from ..pipeline.engine.journal import redact_paths
+from ..pipeline.engine.context import redact_paths
 from ..pipeline.engine.store import find_holder, is_held
 from ..study import load_study
 from .folder import Json, StudyFolder

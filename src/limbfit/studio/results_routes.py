@@ -16,8 +16,8 @@ from pydantic import Field
 from ..errors import InputError, RunError
 from ..mesh import read_grid, read_vtu
 from ..phases import find_loading_end, find_phases
-from ..pipeline.commands.export import export_study
-from ..pipeline.engine.storage import read_json, write_json
+from ..pipeline.commands.other_solvers import export_study
+from ..pipeline.engine.store import read_json, write_json
 from ..results.base import read_curves
 from ..results.identification import CalibrationResult, PredictResult
 from ..results.runs import SimulateResult, is_current

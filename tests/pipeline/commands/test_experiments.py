@@ -12,7 +12,7 @@ from limbfit import Progress, run_experiment, run_study, study_status
 from limbfit.errors import InputError, RunError
 from limbfit.pipeline.commands.experiments import EXPERIMENTS, Experiment, register_experiment
 from limbfit.pipeline.commands.run import compute_keys
-from limbfit.pipeline.engine.storage import write_json
+from limbfit.pipeline.engine.store import write_json
 from limbfit.study import load_study
 
 

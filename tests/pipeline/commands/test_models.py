@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 from layered import block_study
 from limbfit.errors import InputError, StudyError
-from limbfit.identify.uncertainty.model_comparison import compute_mixture_interval, weigh_models
+from limbfit.identify.uncertainty.likelihood import compute_mixture_interval, weigh_models
 from limbfit.laws import FUNG, LAWS
 from limbfit.pipeline.commands.models import (
     MODELS,
@@ -23,7 +23,7 @@ from limbfit.pipeline.commands.models import (
     select_models,
 )
 from limbfit.pipeline.commands.run import compute_keys
-from limbfit.pipeline.engine.storage import write_curves, write_result
+from limbfit.pipeline.engine.store import write_curves, write_result
 from limbfit.report.sections.uncertainty import make_models_section
 from limbfit.report.store import load_store
 from limbfit.results.identification import PredictResult

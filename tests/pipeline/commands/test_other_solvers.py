@@ -18,7 +18,7 @@ from limbfit.errors import InputError
 from limbfit.fe import StepControl, solve
 from limbfit.indentation import build_problem
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.commands.export import check_export
+from limbfit.pipeline.commands.other_solvers import check_export
 from limbfit.pipeline.commands.simulate import write_site_curve
 from limbfit.pipeline.records.records import build_model
 from limbfit.results.base import read_curves

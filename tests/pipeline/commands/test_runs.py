@@ -23,7 +23,7 @@ from limbfit.errors import InputError, RunError
 from limbfit.execution import Limits, SerialExecutor, make_executor, share_executor
 from limbfit.pipeline.commands.doctor import compress_test_cube, judge_self_test
 from limbfit.pipeline.commands.run import run_record
-from limbfit.pipeline.engine.journal import redact_paths
+from limbfit.pipeline.engine.context import redact_paths
 from limbfit.pipeline.engine.store import LOCK, is_held, lock
 from limbfit.study import load_study
 

@@ -12,7 +12,7 @@ from limbfit.errors import InputError
 from limbfit.identify.checks.design import sample_tissues
 from limbfit.pipeline.design.protocol import DESIGNED, PLAIN, UNSEEN
 from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.identification.problem import build_problem
+from limbfit.pipeline.identification.search import build_problem
 from limbfit.report.sections.design import make_protocol_section
 from limbfit.report.store import load_store
 

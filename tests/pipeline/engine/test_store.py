@@ -10,9 +10,15 @@ import pytest
 
 from limbfit.errors import RunError
 from limbfit.pipeline.engine.digests import compute_file_digest
-from limbfit.pipeline.engine.partial_results import ResultFiles
-from limbfit.pipeline.engine.storage import read_json, write_json
-from limbfit.pipeline.engine.store import EARLIER, Store, lock, translate_disk_errors
+from limbfit.pipeline.engine.store import (
+    EARLIER,
+    ResultFiles,
+    Store,
+    lock,
+    read_json,
+    translate_disk_errors,
+    write_json,
+)
 
 
 def test_stage_is_done_only_for_its_key(tmp_path):

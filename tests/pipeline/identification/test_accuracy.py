@@ -12,7 +12,7 @@ from limbfit.errors import StudyError
 from limbfit.indentation import SimulationJob, simulate
 from limbfit.indentation.sites import PENETRATION_FACTOR
 from limbfit.pipeline.engine.provenance import record_settings
-from limbfit.pipeline.identification.problem import is_moved
+from limbfit.pipeline.identification.search import is_moved
 from limbfit.pipeline.limb.mesh import build_coarse_settings, mesh_settings
 from limbfit.study import Study, load_study
 from limbfit.study.meshing import ACCURACIES, estimate_cells

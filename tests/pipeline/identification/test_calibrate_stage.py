@@ -16,7 +16,7 @@ from limbfit.pipeline.engine.context import Context, ignore_progress
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
-from limbfit.pipeline.identification.problem import build_groupings, build_problem
+from limbfit.pipeline.identification.search import build_groupings, build_problem
 from limbfit.priors import SOURCE
 from limbfit.study import Study
 

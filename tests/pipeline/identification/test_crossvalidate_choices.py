@@ -18,7 +18,7 @@ from limbfit.identify.uncertainty.emulator import Emulator
 from limbfit.pipeline.engine.context import Context, ignore_progress
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.crossvalidation import _build_result, _check_folds, _fit_choices
-from limbfit.pipeline.identification.problem import build_problem
+from limbfit.pipeline.identification.search import build_problem
 from limbfit.report.sections.uncertainty import make_crossvalidation_section
 from limbfit.results.uncertainty import FoldEmulator
 from limbfit.study import load_study

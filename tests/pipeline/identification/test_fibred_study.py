@@ -13,7 +13,7 @@ from limbfit.indentation import SimulationJob, build_materials, build_problem, s
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.identification.problem import build_groupings, build_unknowns
+from limbfit.pipeline.identification.search import build_groupings, build_unknowns
 from limbfit.pipeline.records.records import build_model
 from limbfit.pipeline.simulation.limb_geometry import find_fibre_directions
 from limbfit.pipeline.variants.cube import check_cube

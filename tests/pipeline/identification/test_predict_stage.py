@@ -16,8 +16,7 @@ from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, 
 from limbfit.indentation import simulating as indentation
 from limbfit.mesh import write_vtu
 from limbfit.pipeline.engine.context import Context, ignore_progress
-from limbfit.pipeline.engine.storage import write_json
-from limbfit.pipeline.engine.store import COARSE, Store
+from limbfit.pipeline.engine.store import COARSE, Store, write_json
 from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.simulation.simulations import compute_job_digest
 from limbfit.results.base import read_curves

@@ -16,7 +16,7 @@ from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.context import Context, ignore_progress
 from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
-from limbfit.pipeline.identification.problem import build_unknowns
+from limbfit.pipeline.identification.search import build_unknowns
 from limbfit.report import build_report
 from limbfit.study import SolverTable, Study, load_study
 

@@ -13,7 +13,7 @@ from limbfit.execution import SerialExecutor
 from limbfit.fe import SimulationWarning
 from limbfit.indentation import Simulation
 from limbfit.pipeline.identification.calibrate import summarise_doubts
-from limbfit.pipeline.identification.record_simulator import SearchWarning
+from limbfit.pipeline.identification.search import SearchWarning
 from limbfit.pipeline.simulation import simulations
 from limbfit.report import build_report
 from limbfit.results.identification import CalibrationResult

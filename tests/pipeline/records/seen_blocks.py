@@ -15,10 +15,12 @@ from limbfit.indentation import Parameters, Simulation, SimulationJob, SiteModel
 from limbfit.mesh import Mesh, write_vtu
 from limbfit.phantom.record import Ramp, RobotRecord, record
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.identification.fine_meshes import FineMeshCorrection, correct_to_fine_meshes
-from limbfit.pipeline.identification.intervals import estimate_linearised
-from limbfit.pipeline.identification.problem import build_problem
-from limbfit.pipeline.identification.record_simulator import RecordSimulator
+from limbfit.pipeline.identification.answer import (
+    FineMeshCorrection,
+    correct_to_fine_meshes,
+    estimate_linearised,
+)
+from limbfit.pipeline.identification.search import RecordSimulator, build_problem
 from limbfit.pipeline.records.records import RecordSet, load_records
 from limbfit.pipeline.simulation.simulations import SimulationCache
 from limbfit.study import Study, load_study
@@ -109,6 +111,6 @@ def estimate_at_truth(context: Context) -> tuple[RecordSet, FineMeshCorrection, 
     study, problem = context.study, build_problem(context.study)
     records = load_records(context, study.recorded, secondary=True)
     cache, truth = SimulationCache(study.folder / "runs"), study.vector(TRUTH)
-    simulator = RecordSimulator(records, cache, context.executor, lambda text: None)
-    at = correct_to_fine_meshes(problem, simulator, truth)
-    return records, at, estimate_linearised(problem, records.own, truth, at)
+    simulator = RecordSimulator(problem, records, cache, context.executor, lambda text: None)
+    at = correct_to_fine_meshes(simulator, truth)
+    return records, at, estimate_linearised(simulator, truth, at)

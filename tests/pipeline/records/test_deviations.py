@@ -15,20 +15,18 @@ from limbfit.indentation import Simulation
 from limbfit.mesh import read_vtu, write_vtu
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.identification.predict import SitePrediction, _write_observed
-from limbfit.pipeline.records.deviations import (
+from limbfit.pipeline.records.records import (
+    GIVEN_MM,
     LEAST_SHARE,
+    OF_A_VOXEL,
+    SiteRecord,
     compute_expected_share,
     compute_thickness_slope,
     estimate_site_deviation,
     estimate_site_noise,
-    measure_bone_distance_mm,
-)
-from limbfit.pipeline.records.records import (
-    GIVEN_MM,
-    OF_A_VOXEL,
-    SiteRecord,
     estimate_surface_error_mm,
     load_site_record,
+    measure_bone_distance_mm,
 )
 from limbfit.pipeline.records.secondary_measurements import WaveMeasurement
 from limbfit.pipeline.records.traces import read_record

@@ -11,10 +11,8 @@ from limbfit import check_study, load_study
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import SimulationJob, simulate, to_vector
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.engine.storage import write_json
-from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.records.deviations import estimate_site_noise
-from limbfit.pipeline.records.records import load_site_record
+from limbfit.pipeline.engine.store import Store, write_json
+from limbfit.pipeline.records.records import estimate_site_noise, load_site_record
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.pipeline.simulation.simulations import CURVE_POINTS
 from limbfit.report.sections.inputs import draw_record_figure, make_trace_table

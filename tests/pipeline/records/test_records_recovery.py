@@ -14,10 +14,8 @@ from limbfit.indentation import SimulationJob, SiteModel, simulate
 from limbfit.mesh import write_vtu
 from limbfit.pipeline.engine.context import Context, Progress
 from limbfit.pipeline.engine.store import COARSE
-from limbfit.pipeline.identification.fine_meshes import correct_to_fine_meshes
-from limbfit.pipeline.identification.intervals import estimate_linearised
-from limbfit.pipeline.identification.problem import build_problem
-from limbfit.pipeline.identification.record_simulator import RecordSimulator
+from limbfit.pipeline.identification.answer import correct_to_fine_meshes, estimate_linearised
+from limbfit.pipeline.identification.search import RecordSimulator, build_problem
 from limbfit.pipeline.records.records import load_records, load_site_record, to_response
 from limbfit.pipeline.simulation.simulations import SimulationCache
 from limbfit.study import Record, Study, load_study
@@ -136,12 +134,11 @@ def test_further_records_narrow_every_interval(tmp_path: Path, no_own_record: No
         context = stored(tmp_path / name, text)
         study, cache = context.study, SimulationCache(tmp_path / name / "runs")
         records = load_records(context, study.records_at(*study.fitted), secondary=True)
-        simulator = RecordSimulator(records, cache, context.executor, lambda text: None)
-        problem = build_problem(study)
-        at = correct_to_fine_meshes(problem, simulator, study.vector(TRUTH))
+        simulator = RecordSimulator(build_problem(study), records, cache, context.executor, lambda text: None)
+        at = correct_to_fine_meshes(simulator, study.vector(TRUTH))
         for record, response in zip(records.own, at.responses, strict=True):
             assert np.abs(response.force_N - record.compared).mean() < 0.04 * record.compared.max()
-        known.append(estimate_linearised(problem, records.own, study.vector(TRUTH), at))
+        known.append(estimate_linearised(simulator, study.vector(TRUTH), at))
     every = known[1]
     assert {noise.name: noise.unit for noise in every.residual_model.noise} == {
         name: "mm" if name == "a-creep" else "N" for name in HISTORIES

@@ -24,16 +24,15 @@ from limbfit.identify.uncertainty.noise import estimate_curve_noise
 from limbfit.identify.uncertainty.uncertainty import ResidualModel, estimate_uncertainty
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.identification.problem import build_problem
-from limbfit.pipeline.records.deviations import estimate_site_noise
-from limbfit.pipeline.records.records import load_site_record
-from limbfit.pipeline.uncertainty.result import (
+from limbfit.pipeline.identification.search import build_problem
+from limbfit.pipeline.records.records import estimate_site_noise, load_site_record
+from limbfit.pipeline.uncertainty.uncertainty import (
     Findings,
+    _compare_groupings,
     _summarise_parameters,
     _write_flat,
     _write_prediction,
 )
-from limbfit.pipeline.uncertainty.uncertainty import _compare_groupings
 from limbfit.results.base import read_curves
 from limbfit.results.identification import CalibrationResult, PredictResult
 from limbfit.results.uncertainty import ParameterUncertainty

@@ -7,7 +7,7 @@ import pytest
 
 from conftest import COARSE
 from limbfit import report_study, run_experiment
-from limbfit.pipeline.uncertainty.result import EMULATOR
+from limbfit.pipeline.uncertainty.uncertainty import EMULATOR
 from limbfit.study import load_study
 
 QUICK = (

@@ -10,9 +10,8 @@ from limbfit.cli.experiments import show_sensitivity
 from limbfit.errors import InputError
 from limbfit.execution import SerialExecutor
 from limbfit.pipeline.engine.context import Context, Progress
-from limbfit.pipeline.engine.storage import read_json, write_json
-from limbfit.pipeline.engine.store import Store
-from limbfit.pipeline.simulation.extrapolation import extrapolate_richardson
+from limbfit.pipeline.engine.store import Store, read_json, write_json
+from limbfit.pipeline.identification.answer import extrapolate_richardson
 from limbfit.pipeline.variants.sensitivity import (
     list_other_indenters,
     run_contact,

@@ -4,9 +4,6 @@ A choice of k sites out of n is one of many, and its held-out error is one draw 
 choice, or a sample of them, is fitted and predicts the sites that it did not see; so is every choice that
 leaves a region out. It takes thousands of fits, so ``simulate`` is meant to be an emulator that was checked
 against the solver; the region in which it is valid enters as the bounds of ``unknowns``.
-
-`fit_region` fits a model of a region of the limb, to compare with that of the whole limb (the paper's
-table 3).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +17,7 @@ from ...arrays import Array
 from ...errors import CalibrationError
 from ...results.identification import average_records
 from ...results.uncertainty import FoldFit
-from ..fit.calibration import Calibration, CalibrationSettings, calibrate
+from ..fit.calibration import CalibrationSettings, calibrate
 from ..fit.objective import MeasuredCurve, Simulate, SiteResponse
 from ..fit.parameters import FIXED, Grouping, SearchSpace, Unknowns, group_separately
 from ..fit.prediction import compute_error_percent, compute_errors_percent, summarise_errors
@@ -189,23 +186,6 @@ def summarise_errors_by_site(
     return [summarise_errors(of_site) for of_site in errors]
 
 
-def fit_region(
-    identify: Callable[[Unknowns], Calibration],
-    simulate: Simulate,
-    measured: Sequence[MeasuredCurve],
-    unknowns: Unknowns,
-    whole_parameters: Array,
-) -> tuple[Calibration, SiteErrors, SiteErrors]:
-    """Fit a region from the whole limb's parameters (p,); return its own model, its errors and theirs.
-
-    ``identify`` finds parameters from the records of the region's fitted sites, ``simulate`` returns the
-    force at all of its sites, in the order of ``measured``. The start of the ``unknowns`` is not used.
-    """
-    whole = compute_site_errors(simulate, whole_parameters, measured)
-    found = identify(unknowns.with_start(whole_parameters))
-    return found, compute_site_errors(simulate, found.parameters, measured), whole
-
-
 def compute_site_errors(
     simulate: Simulate, parameters: Array, measured: Sequence[MeasuredCurve]
 ) -> SiteErrors:
@@ -232,10 +212,7 @@ def spread_points(centre: Array, covariance_log: Array, space: SearchSpace, coun
 
     An emulator learns there what fits to other records, which move in the same ``space``, will ask of it.
 
-    Parameters
-    ----------
-    centre : (p,) the answer.
-    covariance_log : (p, p) of the logarithms of the parameters.
+    ``centre``: (p,) the answer. ``covariance_log``: (p, p) of the logarithms of the parameters.
     """
     rng, middle = np.random.default_rng(seed), space.reduce(np.log(centre))
     values, axes = np.linalg.eigh(reduce_covariance(covariance_log, space))

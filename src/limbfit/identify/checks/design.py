@@ -79,19 +79,6 @@ class Candidate:
     information: Array
 
 
-def build_candidate(
-    site: str, depth_mm: float, response: SiteResponse, parameters: Array, noise: NoiseModel
-) -> Candidate:
-    """Build the candidate of a simulated indentation.
-
-    Raises `CalibrationError` if the simulation is partial: half a record informs differently from the
-    whole.
-    """
-    if not response.completed:
-        raise CalibrationError(f"{site}, {depth_mm:g} mm: {response.fault}")
-    return Candidate(site, depth_mm, compute_information(response, parameters, noise))
-
-
 def compute_information(response: SiteResponse, parameters: Array, noise: NoiseModel) -> Array:
     """Return the Fisher information (p, p) on log(parameters) of a simulated response."""
     scaled = response.jacobian * parameters

@@ -263,9 +263,7 @@ def approximate_response(response: SiteResponse, history: History, other_history
 
     The curve is stretched in time, and by a power law in depth with the exponent of its own loading.
 
-    Parameters
-    ----------
-    history, other_history : times (n,) s and depths (n,) mm of its record and of the other one.
+    ``history``, ``other_history``: times (n,) s and depths (n,) mm of its record and of the other one.
     """
     (time, depth), (_, other_depth) = history, other_history
     deep = depth.max()
@@ -299,12 +297,9 @@ def find_best_correction(
     """Find the one change of names or of a unit that lowers the misfit of all sites most, if it is
     convincing.
 
-    Parameters
-    ----------
-    approximate : approximates the responses of two sites, each to the other's record, at the start of the
-        fits (``approximate_response``).
-    simulate : simulates the same. It is asked for the few exchanges that may matter, and then decisive; an
-        exchange whose simulation fails is not considered.
+    ``approximate``: approximates the responses of two sites, each to the other's record, at the start of the
+    fits (``approximate_response``). ``simulate``: simulates the same. It is asked for the few exchanges that
+    may matter, and then decisive; an exchange whose simulation fails is not considered.
     """
     before = fits.compute_errors(fits.fit_without())
     if before.max() <= MAX_ERROR_SHARE / 2:

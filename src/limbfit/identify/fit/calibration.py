@@ -147,6 +147,8 @@ def calibrate(
 ) -> Calibration:
     """Find the parameters that bring the simulated forces closest to the measured ones.
 
+    Raises `CalibrationError` if no first simulation completes.
+
     Parameters
     ----------
     simulate : takes full parameters (p,) and returns one response per site, in the order of ``measured``. If
@@ -160,11 +162,6 @@ def calibrate(
         represent, the next stage begins with the same ratios between the tissues.
     on_iterate : called after every accepted iterate with the state from which the search can continue.
     state : continue from here. One evaluation at its parameters is repeated and not counted.
-
-    Raises
-    ------
-    CalibrationError
-        If no first simulation completes.
     """
     groupings = tuple(stages) or build_stage_groupings(unknowns.names)
     run = _Search(simulate, tuple(measured), unknowns, settings or CalibrationSettings(), groupings)

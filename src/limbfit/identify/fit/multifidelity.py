@@ -200,15 +200,8 @@ def calibrate_with_correction(
 ) -> SearchResult:
     """Calibrate as :func:`calibrate` does, on corrected coarse simulations.
 
-    Parameters
-    ----------
-    coarse : returns force and derivatives per site; cheap.
-    fine : returns forces per site without derivatives; expensive. It is called once per round, and again if
-        it fails.
-    fidelity : when corrections end.
+    Raises `CalibrationError` if no first simulation completes.
 
-    Notes
-    -----
     An optimum whose fine forces fit worse than those of an earlier round went too far: the point half-way
     back (in logarithms) is corrected too, and the best corrected iterate of a stage is its answer.
 
@@ -216,10 +209,12 @@ def calibrate_with_correction(
     the interrupted one. If a fine simulation fails, the correction before it is kept, and the stage has not
     converged.
 
-    Raises
-    ------
-    CalibrationError
-        If no first simulation completes.
+    Parameters
+    ----------
+    coarse : returns force and derivatives per site; cheap.
+    fine : returns forces per site without derivatives; expensive. It is called once per round, and again if
+        it fails.
+    fidelity : when corrections end.
     """
     run = _CorrectionLoop(
         _CorrectedModel(coarse),
@@ -287,7 +282,9 @@ class _CorrectionLoop:
             if settled and not (is_last and loose):
                 break
         if best is not None and least < self._cost():
-            self._restore(*best)
+            state, self.model.correction = best
+            end = replace(state.history[-1], evaluations=self.state.evaluations)
+            self.history, self.state = (*self.history, end), replace(state, history=(end,))
         end = self.history[-1]
         result = replace(
             inner,
@@ -325,12 +322,6 @@ class _CorrectionLoop:
 
     def _cost(self) -> float:
         return self.history[-1].cost
-
-    def _restore(self, best: SearchState, correction: MeshCorrection) -> None:
-        self.model.correction = correction
-        here = replace(best.history[-1], evaluations=self.state.evaluations)
-        self.history = (*self.history, here)
-        self.state = replace(best, history=(here,))
 
     def _step_half_way_back(self, stage: int, best: SearchState) -> None:
         z = 0.5 * (np.array(self.state.z) + np.array(best.z))

@@ -137,11 +137,8 @@ def continue_from_bound(
     """Search the last stage again from inside if it ended at a bound, which may hold a search in a worse
     optimum.
 
-    Parameters
-    ----------
-    result : of ``search`` from ``start``. It is returned as it is if
-        nothing ended at a bound, or if the second search fails.
-    report : called with a sentence when the second search begins, and when it fails.
+    ``result``: of ``search`` from ``start``. It is returned as it is if nothing ended at a bound, or if the
+    second search fails. ``report``: called with a sentence when the second search begins, and when it fails.
     """
     inside = find_start_inside(result.calibration, start, stages[-1])
     if inside is None:

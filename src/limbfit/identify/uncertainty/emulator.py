@@ -40,15 +40,10 @@ class Emulator:
 
         Runs in which a site failed are left out.
 
-        Parameters
-        ----------
-        softening : s over the median of a site's largest forces. Above s the scale is logarithmic, which
-            suits forces that differ manifold between the points; far above 1 it is the force itself.
+        Raises `CalibrationError` if fewer than two complete runs are left.
 
-        Raises
-        ------
-        CalibrationError
-            If fewer than two complete runs are left.
+        ``softening``: s over the median of a site's largest forces. Above s the scale is logarithmic, which
+        suits forces that differ manifold between the points; far above 1 it is the force itself.
         """
         whole = [i for i, run in enumerate(responses) if not any(response.fault for response in run)]
         if len(whole) < 2:

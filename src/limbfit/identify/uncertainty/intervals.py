@@ -80,6 +80,8 @@ def sample_uncertainty(
 ) -> Uncertainty:
     """Replace intervals, combinations, verdicts and correlations of a linearised uncertainty by sampled ones.
 
+    If not even two evaluations completed, ``linearised`` itself is returned; its ``method`` says so.
+
     Parameters
     ----------
     linearised : of ``estimate_uncertainty``. Its covariance of the residuals is used, and that of the answer,
@@ -87,10 +89,6 @@ def sample_uncertainty(
     evaluations : of the calibration.
     simulate : called for at most ``further`` more evaluations; one that fails is tried again half-way.
     move_answer : True if the answer moves from the least squares to the most probable parameters.
-
-    Notes
-    -----
-    If not even two evaluations completed, ``linearised`` itself is returned; its ``method`` says so.
     """
     runs = evaluations.select_near(linearised.measured)
     if len(runs.points) < 2:

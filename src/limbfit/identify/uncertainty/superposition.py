@@ -93,10 +93,6 @@ class RelaxationModel:
     has_further: bool = False
     held_s: float = np.inf
 
-    @property
-    def has_tail(self) -> bool:
-        return self.spectrum_s is None and self.slope != 0.0
-
     def terms(self, tissue: TissueParameters, p: Array) -> RelaxationTerms:
         """The relaxation of a tissue; the model's terms come first."""
         own = tissue.own_terms(p)
@@ -109,7 +105,7 @@ class RelaxationModel:
             amplitude, time = p[list(tissue.further)]
             amplitudes, times = np.append(amplitudes, amplitude), np.append(times, time)
             times = np.where(times > self.held_s, _FOREVER_S, times)
-        if not self.has_tail:
+        if self.spectrum_s is not None or self.slope == 0.0:
             return RelaxationTerms(1.0, amplitudes, times)
         # (1 + t/T)^-s is a mixture of exponentials whose rates times T have a gamma distribution.
         share, middle = gammainc(self.slope, _TAIL_BINS), np.sqrt(_TAIL_BINS[1:] * _TAIL_BINS[:-1])

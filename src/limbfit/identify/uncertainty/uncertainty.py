@@ -84,10 +84,8 @@ class PriorPrecision:
     def compute_shares(self, covariance: Array, tie: Array) -> tuple[Array, Array]:
         """Return how much of what is known of each parameter comes from the stated priors.
 
-        Parameters
-        ----------
-        covariance : (k, k) of the most probable answer to records, bounds and priors together.
-        tie : (p, k) of the space.
+        ``covariance``: (k, k) of the most probable answer to records, bounds and priors together. ``tie``:
+        (p, k) of the space.
 
         Returns
         -------

@@ -21,8 +21,7 @@ from ...study import Indentation, Record, Study
 from ...traces import COLUMNS
 from ...traces.formats import BINARY_SUFFIXES
 from ...traces.reading import find_factor
-from ..engine.storage import write_curves, write_json
-from ..engine.store import translate_disk_errors
+from ..engine.store import translate_disk_errors, write_curves, write_json
 
 FOLDER = "acquired"  # beside the study file: measured data, no result
 RECORD, VERDICT = "record.csv", "verdict.json"
@@ -46,6 +45,11 @@ def acquire_site(
 ) -> dict[str, Any]:
     """Record a site, or one of its records, on a device, judge it, and put it where the study names it.
 
+    Returns ``name``, ``site``, ``completed``, ``phase``, ``reason``, ``verdict``, ``samples``, ``lost``,
+    ``refused``, ``unreachable``, ``depth_mm`` and the files by kind. Raises `InputError` for a site that the
+    study does not have or has a record of, or an address of no device; and `RunError` where the device does
+    not answer, or the record cannot be written.
+
     Parameters
     ----------
     address : of the device: ``tcp://HOST[:PORT]`` or ``serial:PATH[@BAUD]``.
@@ -56,19 +60,6 @@ def acquire_site(
         the depth of its last record, else ``acquire.search_depth_mm``.
     replace_record : also where the study has this record; that one is kept beside the new one.
     listener : is told of phases and samples; see `limbfit.acquire.Told`.
-
-    Returns
-    -------
-    dict
-        ``name``, ``site``, ``completed``, ``phase``, ``reason``, ``verdict``, ``samples``, ``lost``,
-        ``refused``, ``unreachable``, ``depth_mm`` and the files by kind.
-
-    Raises
-    ------
-    InputError
-        For a site that the study does not have or has a record of, or an address of no device.
-    RunError
-        Where the device does not answer, or the record cannot be written.
     """
     one = study.indentation(name)
     settings = check_recording(
@@ -143,10 +134,7 @@ def check_recording(
 ) -> acquire.Settings:
     """The device's settings for a site, or one of its records; see `acquire_site`.
 
-    Raises
-    ------
-    InputError
-        For what can be known to be wrong before the device is asked.
+    Raises `InputError` for what can be known to be wrong before the device is asked.
     """
     one = study.indentation(name)
     with add_location(file=study.file, place=f"{one.key}.trace"):
@@ -172,10 +160,7 @@ def check_recording(
 def judge_recording(file: Path) -> dict[str, Any]:
     """What a record holds, whole or cut short by a crash, and the verdict on its ramps.
 
-    Raises
-    ------
-    TraceError
-        Where it is no record.
+    Raises `TraceError` where it is no record.
     """
     recording = acquire.read_recording(file)
     try:
@@ -266,15 +251,10 @@ def virtual_fitsocket(
 ) -> VirtualFitSocket:
     """A virtual FitSocket with the study's limb in it, as stored simulations describe it.
 
-    Parameters
-    ----------
-    seed : of the limb's place in the ring, and of the sensors' noise.
-    paced : the device's clock waits for limbfit, and may go faster than the wall's.
+    Raises `InputError` where no site has a stored simulation.
 
-    Raises
-    ------
-    InputError
-        Where no site has a stored simulation.
+    ``seed``: of the limb's place in the ring, and of the sensors' noise. ``paced``: the device's clock waits
+    for limbfit, and may go faster than the wall's.
     """
     sites = read_surrogates(study)
     limb = VirtualLimb(sites, np.random.default_rng(seed))

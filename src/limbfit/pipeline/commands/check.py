@@ -16,8 +16,8 @@ from ...study import Indentation, Study
 from ...traces import SurfaceMotion
 from ..engine.context import Listener, Progress, ignore_progress
 from ..engine.store import Store
-from ..identification.problem import check_fitted
-from ..limb.inputs import check_labels, read_marked_image, read_study_image, read_study_labels
+from ..identification.search import check_fitted
+from ..limb.segment import check_labels, read_marked_image, read_study_image, read_study_labels
 from ..limb.sites import place_site
 from ..limb.surfaces import read_given_anatomy
 from ..records.record_checks import choose_surface_points, record_flags
@@ -27,7 +27,7 @@ from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, na
 from ..socket.shape import build_loadable_socket, build_regions, check_load, check_regions
 from .acquire import build_device_settings
 from .experiments import EXPERIMENTS, check_experiment
-from .export import FORMATS, check_export
+from .other_solvers import FORMATS, check_export
 from .run import compute_keys
 
 _COMMANDS = {"protocol": "design --protocol", "socket_design": "socket design"}
@@ -36,18 +36,11 @@ _COMMANDS = {"protocol": "design --protocol", "socket_design": "socket design"}
 def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[str, Any]:
     """Facts about a study's inputs; raises at the first that cannot be used.
 
-    Returns
-    -------
-    dict
-        ``study``, ``facts`` (sentences), ``sites`` (peak force, depth, touch-down of each record),
-        ``flags`` (what looks wrong about records and places, with the evidence), ``refused`` (``commands``
-        that this study cannot have with their defaults, and ``why``), ``outside_records`` (by name of a site
-        or load what it does that no fitted record does) and ``outside_text``, the same in words.
-
-    Raises
-    ------
-    InputError
-        For an image, label map, surface, site or record that cannot be used.
+    Returns ``study``, ``facts`` (sentences), ``sites`` (peak force, depth, touch-down of each record),
+    ``flags`` (what looks wrong about records and places, with the evidence), ``refused`` (``commands`` that
+    this study cannot have with their defaults, and ``why``), ``outside_records`` (by name of a site or load
+    what it does that no fitted record does) and ``outside_text``, the same in words. Raises `InputError` for
+    an image, label map, surface, site or record that cannot be used.
     """
     listener(Progress("check", 0, 2, "geometry"))
     limb, bones, geometry_facts = _read_geometry(study)

@@ -23,7 +23,7 @@ from ...fe import OgdenQLV
 from ...fe.solution.linear import SOLVERS, build_linear_solver, prefers_multigrid
 from ...febio.program import find_febio
 from ...laws import KPA
-from ..engine.provenance import collect_versions, describe_machine
+from ..engine.provenance import collect_versions, describe_machine, find_version
 from ..variants.cube import RAMP_S, compress
 
 NEEDED_GB = 4.0  # of memory, for one site at the paper's size
@@ -52,11 +52,8 @@ def _judge(check: str, is_good: bool, found: str, remedy: str, otherwise: str = 
 def diagnose(folder: Path = Path(".")) -> dict[str, Any]:
     """Check the installation and the machine; ``folder`` is where studies would lie.
 
-    Returns
-    -------
-    dict
-        ``healthy`` (nothing failed) and ``checks``, each with ``check``, ``state`` (``ok``, ``warning``,
-        ``failed``), ``found`` and ``remedy``.
+    Returns ``healthy`` (nothing failed) and ``checks``, each with ``check``, ``state`` (``ok``, ``warning``,
+    ``failed``), ``found`` and ``remedy``.
     """
     checks = [
         *_check_machine(),
@@ -78,7 +75,7 @@ def _check_machine() -> Iterator[Finding]:
     yield Finding("limbfit", "ok", f"{__version__}, Python {describe_machine()['python']}")
     required = [line for line in metadata.requires("limbfit") or [] if ";" not in line]  # whatever extras
     names = [re.split("[>=~<]", line)[0].strip() for line in required]
-    missing = [name for name in names if _find_version(name) is None]
+    missing = [name for name in names if find_version(name) is None]
     found = f"missing: {', '.join(missing)}" if missing else "all there"
     yield _judge("libraries", not missing, found, "pip install limbfit")
     usable, there = count_usable_cores(), os.cpu_count() or 1
@@ -89,13 +86,6 @@ def _check_machine() -> Iterator[Finding]:
     found = f"{free:.1f} GB free, {free / usable:.1f} GB for each of {usable} workers"
     remedy = f"a site at the paper's size wants {NEEDED_GB:g} GB; use fewer workers (--workers 1)"
     yield _judge("memory", free >= NEEDED_GB, found, remedy, otherwise="warning")
-
-
-def _find_version(distribution: str) -> str | None:
-    try:
-        return metadata.version(distribution)
-    except metadata.PackageNotFoundError:
-        return None
 
 
 def _check_solvers() -> Iterator[Finding]:
@@ -142,7 +132,7 @@ def _check_programs() -> Iterator[Finding]:
     else:
         yield Finding("browser", "ok", "none found here", "copy report.html to a machine that has one")
     for module, use in (("distributed", "--scheduler"), ("dask_jobqueue", "--dask slurm")):
-        version = _find_version(module.replace("_", "-"))
+        version = find_version(module.replace("_", "-"))
         remedy = "" if version else f"for {use}: pip install 'limbfit[dask]'"
         yield Finding(module, "ok", version or "not installed (optional)", remedy)
 

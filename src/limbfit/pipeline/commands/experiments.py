@@ -21,17 +21,21 @@ from ...report.sections.contents import SECTIONS, Maker
 from ...study import Study
 from ..design.design import check_design, run_design
 from ..design.protocol import check_protocol, run_protocol
-from ..engine.keys import Keys, Stage, StageKey
+from ..engine.provenance import Keys, Stage, StageKey
 from ..engine.store import StageState, Store
-from ..identification.crossvalidation import check_crossvalidate, run_crossvalidate
-from ..identification.problem import check_fitted
+from ..identification.crossvalidation import (
+    check_crossvalidate,
+    check_regions,
+    run_crossvalidate,
+    run_regions,
+)
+from ..identification.search import check_fitted
 from ..simulation.limb_geometry import Check, LimbGeometry
 from ..socket.design import check_socket_design, run_socket_design
 from ..socket.socket import check_socket, run_socket
 from ..uncertainty.uncertainty import run_uncertainty
 from ..variants import sensitivity
 from ..variants.cube import check_cube, run_cube
-from ..variants.regions import check_regions, run_regions
 from ..variants.variants import check_variants
 
 
@@ -73,6 +77,7 @@ def _find_kind(value: Any) -> type | None:
 IDENTIFIED = "identified"  # where parameters are from
 _MESHED, _SIMULATED = ("sites", "traces", "mesh"), ("sites", "traces", "mesh", "calibrate")
 _TABLES = ("material", "solver", "indenter", "indenters", "clamps")
+_CALIBRATED = ("calibration", *_TABLES)
 _SOCKET = ("socket", "geometry", "mesh", "material")
 # Keys of sites and of records.
 _FITTED = ("name", "region", "fitted", "weight", "edge", "indenter")
@@ -82,9 +87,7 @@ _RECORD = ("site", "name", "indenter")
 
 _OWN: tuple[Experiment, ...] = (
     Experiment("cube", run_cube, ("calibrate",), ("material",), check=check_cube),
-    Experiment(
-        "regions", run_regions, _SIMULATED, ("calibration", *_TABLES), _FITTED, _RECORD, check=check_regions
-    ),
+    Experiment("regions", run_regions, _SIMULATED, _CALIBRATED, _FITTED, _RECORD, check=check_regions),
     *(
         Experiment(f"sensitivity-{name}", run, _SIMULATED, _TABLES, _VARIED, _RECORD, check=check)
         for name, run, check in (
@@ -107,14 +110,12 @@ _OWN: tuple[Experiment, ...] = (
         "crossvalidate",
         run_crossvalidate,
         _SIMULATED,
-        ("calibration", *_TABLES),
+        _CALIBRATED,
         _FITTED,
         _RECORD,
         check=check_crossvalidate,
     ),
-    Experiment(
-        "design", run_design, _MESHED, ("calibration", *_TABLES), _PLANNED, _RECORD, check=check_design
-    ),
+    Experiment("design", run_design, _MESHED, _CALIBRATED, _PLANNED, _RECORD, check=check_design),
     Experiment(
         "protocol",
         run_protocol,
@@ -133,15 +134,11 @@ EXPERIMENTS = Registry("experiment", {experiment.name: experiment for experiment
 def register_experiment(experiment: Experiment, section: Maker | None = None) -> None:
     """Make an experiment known by its name, in the file that a study names in ``study.extensions``.
 
-    Parameters
-    ----------
-    experiment : its ``run`` writes ``<name>.json`` into the folder that it is given.
-    section : makes its section of the report of what is stored and of that file's content.
+    Raises `InputError` where the name is taken, or cannot be that of a folder beside the others, or ``run``
+    is in no file.
 
-    Raises
-    ------
-    InputError
-        Where the name is taken, or cannot be that of a folder beside the others, or ``run`` is in no file.
+    ``experiment``: its ``run`` writes ``<name>.json`` into the folder that it is given. ``section``: makes
+    its section of the report of what is stored and of that file's content.
     """
     name, others = experiment.name, {*EXPERIMENTS.names} - {experiment.name}
     if not re.fullmatch("[a-z][a-z0-9_]*", name) or any(other.startswith(f"{name}-") for other in others):

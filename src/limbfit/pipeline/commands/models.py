@@ -19,7 +19,7 @@ import tomlkit
 from ...arrays import Array
 from ...errors import InputError
 from ...identify.fit.prediction import NORMAL_95
-from ...identify.uncertainty.model_comparison import compute_mixture_interval, weigh_models
+from ...identify.uncertainty.likelihood import compute_mixture_interval, weigh_models
 from ...laws import FIBRED, FUNG, LAWS, OGDEN, POWER
 from ...results import uncertainty as stored
 from ...results.base import read_curves
@@ -27,10 +27,8 @@ from ...results.identification import RecordPrediction
 from ...results.socket import LoadedRegion, SocketResult
 from ...study import Study, load_study
 from ..engine.context import Listener, ignore_progress
-from ..engine.files import find_hand_labels
-from ..engine.storage import write_curves, write_result
-from ..engine.store import Store, lock
-from .fitting import fit_socket
+from ..engine.store import Store, find_hand_labels, lock, write_curves, write_result
+from .planning import fit_socket
 from .run import compute_keys, run_study
 
 FOLDER = "models"
@@ -213,20 +211,10 @@ def compare_models(
 
     A model takes about as long as the study's own calibration; what is stored already is not done again.
 
-    Parameters
-    ----------
-    models : names in `MODELS`, or "all".
-    listener : is told of progress.
+    Returns what ``results/models/models.json`` holds, and ``folder``. Raises `InputError` for a model that
+    there is not, or that the study cannot have.
 
-    Returns
-    -------
-    dict
-        What ``results/models/models.json`` holds, and ``folder``.
-
-    Raises
-    ------
-    InputError
-        For a model that there is not, or that the study cannot have.
+    ``models``: names in `MODELS`, or "all".
     """
     chosen = select_models(models)
     derived, left_out = {}, {}
@@ -318,15 +306,8 @@ def fit_socket_of_models(study: Study, *, listener: Listener = ignore_progress) 
 
     The models are those that `compare_models` has weighed last, of at least `MIN_SOCKET_WEIGHT`.
 
-    Returns
-    -------
-    dict
-        What ``results/models/socket.json`` holds, and ``folder``.
-
-    Raises
-    ------
-    InputError
-        If no models were compared, or the study's own socket cannot be simulated.
+    Returns what ``results/models/socket.json`` holds, and ``folder``. Raises `InputError` if no models were
+    compared, or the study's own socket cannot be simulated.
     """
     compared = stored.ModelsResult.find(study.results)
     if compared is None:

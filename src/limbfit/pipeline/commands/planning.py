@@ -1,4 +1,4 @@
-"""Planning an experiment on a limb, sites or a whole session: ``limbfit design``."""
+"""What is planned on a limb with known parameters: sites or a session (``limbfit design``), a socket."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -8,6 +8,7 @@ import numpy as np
 from ...errors import InputError
 from ...identify.checks.design import Criterion
 from ...indentation import Parameters
+from ...priors import NONE, TISSUES, of_tissues
 from ...study import Study
 from ..design.protocol import SEEN
 from ..engine.context import Listener, ignore_progress
@@ -17,12 +18,14 @@ from ..socket.intervals import CHANGE_PERCENT
 from ..socket.socket import NAME as SOCKET
 from .experiments import IDENTIFIED
 from .run import run_experiment, study_status
-from .simulate import choose_parameters
+from .simulate import choose_parameters, read_recorded_range
 
 _SENSOR_N, _MISFIT = 0.05, 0.02  # where no calibration tells: noise, and the model's error over the peak
 _HOLD_S = 30.0
 _SPEED_FACTOR = 5.0  # the second speed that a protocol may have, over the first
 _CORRELATION = 0.95  # of the model's error between neighbouring points of comparison
+LITERATURE = "literature"
+SIMULATIONS = 6
 
 
 def design_study(
@@ -35,21 +38,14 @@ def design_study(
 ) -> dict[str, Any]:
     """The best choice of sites and depths at known parameters, beside the study's own choice.
 
+    Returns what ``results/design/design.json`` holds, and ``folder``. Raises `InputError` for more sites than
+    there are, or identified parameters that are stale.
+
     Parameters
     ----------
     sites : how many to choose; 0: as many as the study fits, or four.
     depths_mm : depths to choose from at every site; none: as recorded or planned.
     parameters : per tissue; by default the identified ones, or the study's start.
-
-    Returns
-    -------
-    dict
-        What ``results/design/design.json`` holds, and ``folder``.
-
-    Raises
-    ------
-    InputError
-        For more sites than there are, or identified parameters that are stale.
     """
     used, origin = choose_parameters(study, parameters)
     return run_experiment(
@@ -85,6 +81,10 @@ def plan_protocol(
 ) -> dict[str, Any]:
     """The records that determine the parameters best in a patient's time, at several draws of the tissues.
 
+    Returns what ``results/protocol/protocol.json`` holds, and ``folder``, where ``records.toml`` is, too.
+    Raises `InputError` for unknown parameters, a time too short for any record, identified parameters that
+    are stale, or pressures that are not stored with their derivatives.
+
     Parameters
     ----------
     minutes : of the whole session.
@@ -106,17 +106,6 @@ def plan_protocol(
     shear_waves_sd_m_s : how well elastography reads the speed of shear waves in each tissue under the
         indenter, once a second; as much all speeds of a tissue may be off together. None: likewise.
     parameters : per tissue; by default the identified ones, or the study's start.
-
-    Returns
-    -------
-    dict
-        What ``results/protocol/protocol.json`` holds, and ``folder``, where ``records.toml`` is, too.
-
-    Raises
-    ------
-    InputError
-        For unknown parameters, a time too short for any record, identified parameters that are stale, or
-        pressures that are not stored with their derivatives.
     """
     pressures = _read_socket_pressures(study) if SOCKET in determine else {}
     if pressures and (len(determine) > 1 or criterion == "D"):
@@ -202,3 +191,109 @@ def _find_noise(study: Study, origin: str) -> dict[str, float]:
         "misfit": residuals.misfit_elsewhere,
         "correlation": _CORRELATION,
     }
+
+
+def fit_socket(
+    study: Study,
+    *,
+    parameters: Parameters | None = None,
+    literature: bool = False,
+    samples: int = 0,
+    listener: Listener = ignore_progress,
+) -> dict[str, Any]:
+    """Put the study's socket on its limb and load it.
+
+    Nothing here is a medical device.
+
+    Returns what ``results/socket/socket.json`` holds, and ``folder``. Raises `InputError` for a socket that
+    does not fit the limb, identified parameters that are stale, or samples of parameters that were not
+    identified; and `RunError` where the simulation does not come to its end.
+
+    Parameters
+    ----------
+    parameters : per tissue; by default the identified ones, or those of people where none were identified.
+    literature : those of people even so: medians of the priors, the others as the study starts them.
+    samples : draws from the identified parameters' covariance that are simulated too; intervals then count
+        what derivatives miss.
+    """
+    used, origin = choose_tissues(study, literature, parameters)
+    known: dict[str, Any] = {}
+    if origin == IDENTIFIED:
+        uncertainty = Store(study.results).results.calibration.uncertainty.to_plain()
+        known = {key: uncertainty[key] for key in ("covariance_log", "most_probable")}
+        known["relaxation"] = (uncertainty["relaxation"] or {}).get("beyond")
+        recorded = read_recorded_range(study)
+        known["recorded_range"] = None if recorded is None else recorded.to_plain()
+    elif samples:
+        what = f"there is nothing to draw {samples} samples from: the parameters were not identified"
+        raise InputError(what, place="--samples", remedy="identify them (limbfit run)")
+    return run_experiment(
+        study,
+        "socket",
+        listener=listener,
+        parameters=used,
+        parameters_from=origin,
+        samples=samples,
+        **known,
+    )
+
+
+def design_socket(
+    study: Study,
+    *,
+    optimise: Sequence[str] = (),
+    simulations: int = SIMULATIONS,
+    parameters: Parameters | None = None,
+    literature: bool = False,
+    listener: Listener = ignore_progress,
+) -> dict[str, Any]:
+    """Design a socket from the study's target pressure, and compare it with a uniformly reduced one.
+
+    Nothing here is a medical device.
+
+    Returns what ``results/socket_design/socket_design.json`` holds, and ``folder``, which also has the socket
+    with its wall (``socket.stl``). Raises `InputError` for regions or a shape that the limb cannot have, or
+    identified parameters that are stale; and `RunError` where a simulation does not come to its end.
+
+    Parameters
+    ----------
+    optimise : regions whose largest pressures are to be lowered further.
+    simulations : at most so many for that, beside those of the two designs.
+    parameters, literature : as for `fit_socket`.
+    """
+    if simulations < 1:
+        raise InputError(f"{simulations} simulations are too few", remedy="allow one or more")
+    doubled = sorted({name for name in optimise if list(optimise).count(name) > 1})
+    if doubled:
+        raise InputError(f"region {doubled[0]!r} is named twice", remedy="name it once")
+    used, origin = choose_tissues(study, literature, parameters)
+    return run_experiment(
+        study,
+        "socket_design",
+        listener=listener,
+        parameters=used,
+        parameters_from=origin,
+        optimise=list(optimise),
+        simulations=simulations if optimise else 0,
+    )
+
+
+def choose_tissues(
+    study: Study, literature: bool = False, given: Parameters | None = None
+) -> tuple[Parameters, str]:
+    """Parameters of a study's tissues, and where they are from.
+
+    They are ``given``, else identified, else, or with ``literature``, those of people. A tissue or parameter
+    that these do not know starts as the study says.
+    """
+    if given or (not literature and Store(study.results).stamp("calibrate") is not None):
+        return choose_parameters(study, given)
+    values = {tissue: dict(study.material.of(tissue, "start")) for tissue in study.tissues}
+    origin = "start of the study"
+    others = {one: NONE for one in study.tissues if one not in TISSUES}
+    medians = of_tissues(study.tissues, others | study.calibration.prior_tissues)
+    for name, (median, _) in medians.items():
+        tissue, key = name.split(".")
+        if key in values[tissue]:
+            values[tissue][key], origin = median, LITERATURE
+    return values, origin

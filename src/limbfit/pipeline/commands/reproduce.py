@@ -15,10 +15,8 @@ from ...results.base import read_curves
 from ...study import Study, load_study
 from ..engine.context import Listener, ignore_progress
 from ..engine.digests import find_data_files
-from ..engine.files import find_hand_labels
 from ..engine.provenance import collect_versions, compute_input_digests, record_settings
-from ..engine.storage import read_json
-from ..engine.store import Store
+from ..engine.store import Store, find_hand_labels, read_json
 from .run import run_study
 
 TOLERANCE = 1e-6  # of a parameter, and of the largest force of a site, relative
@@ -34,23 +32,15 @@ def reproduce_study(
 ) -> dict[str, Any]:
     """Copy the inputs of a study to a new folder, run it there, and compare.
 
+    Returns ``same``, ``tolerance``, ``parameters`` and ``forces`` (largest relative difference by name), and
+    ``versions`` that differ, each as (then, now). Raises `InputError` where the record is not one, or the
+    study's inputs or settings are no longer those of the record.
+
     Parameters
     ----------
     record : ``results/run.json`` of a study, or the study.
     folder : the new one; must not exist, unless an earlier attempt at the same record is to go on.
     tolerance : how far parameters, and forces over a site's largest, may be apart, relative.
-    listener : is told of progress.
-
-    Returns
-    -------
-    dict
-        ``same``, ``tolerance``, ``parameters`` and ``forces`` (largest relative difference by name), and
-        ``versions`` that differ, each as (then, now).
-
-    Raises
-    ------
-    InputError
-        Where the record is not one, or the study's inputs or settings are no longer those of the record.
     """
     record, folder = Path(record), Path(folder)
     study = load_study(record.absolute().parent.parent if record.name == RECORD else record)

@@ -20,17 +20,22 @@ from ...results.identification import CalibrationResult, PredictResult
 from ...results.runs import ExperimentRecord, MachineFacts, RunResult, StageRecord, StudyName
 from ...results.uncertainty import ModelsResult
 from ...study import Site, Study, load_study
-from ..engine.context import Context, Listener, Progress, build_executor, ignore_progress
+from ..engine.context import Context, Listener, Progress, build_executor, ignore_progress, write_journal
 from ..engine.digests import compute_file_digest
-from ..engine.files import keep_hand_labels
-from ..engine.journal import write_journal
-from ..engine.keys import Keys, Stage, StageKey, describe_causes
-from ..engine.provenance import collect_versions, compute_input_digests, describe_machine, record_settings
-from ..engine.storage import read_json, to_plain, write_result
-from ..engine.store import Store, lock
+from ..engine.provenance import (
+    Keys,
+    Stage,
+    StageKey,
+    collect_versions,
+    compute_input_digests,
+    describe_causes,
+    describe_machine,
+    record_settings,
+)
+from ..engine.store import Store, keep_hand_labels, lock, read_json, to_plain, write_result
 from ..identification.calibrate import run_calibrate
 from ..identification.predict import run_predict
-from ..identification.problem import check_fitted
+from ..identification.search import check_fitted
 from ..limb.mesh import run_mesh
 from ..limb.segment import run_segment
 from ..limb.sites import run_sites
@@ -176,21 +181,16 @@ def run_study(
 ) -> dict[str, Any]:
     """Do every stage that is not done, in order; return the summary of the study.
 
+    Raises `InputError` when an input cannot be used; and `RunError` when another run holds the study, or the
+    disk is full.
+
     Parameters
     ----------
-    study : a checked study.
     until : name of the last stage to do; default all.
     start : name of a stage that is done anew, and all after it.
     force : names of stages that are done anew. Kept simulations count: the same ones would come out.
     check : is given the limb before anything is meshed, and raises `InputError` for one that it refuses.
     listener : is told of progress; ``results/log`` too.
-
-    Raises
-    ------
-    InputError
-        When an input cannot be used.
-    RunError
-        When another run holds the study, or the disk is full.
     """
     anew = select_stages_to_redo(study, until, start, force)
     with _open_run(study, "run", listener) as context:
@@ -266,23 +266,16 @@ def run_batch(
 ) -> Iterator[dict[str, Any]]:
     """Run studies one after the other on the same workers; a study that fails does not stop the others.
 
+    Raises `InputError` for a stage that there is not.
+
+    Yields for each study as it ends: ``study`` (its path as given), ``state`` (``done`` or ``failed``),
+    ``seconds``, ``error`` (one line, where it failed), and its mean errors and report.
+
     Parameters
     ----------
     paths : of studies, each a ``study.toml`` or its folder.
     until : name of the last stage to do; default all.
     workers : how many simulate side by side; 0: one per core.
-    listener : is told of progress.
-
-    Yields
-    ------
-    dict
-        For each study as it ends: ``study`` (its path as given), ``state`` (``done`` or ``failed``),
-        ``seconds``, ``error`` (one line, where it failed), and its mean errors and report.
-
-    Raises
-    ------
-    InputError
-        For a stage that there is not.
     """
     if until is not None and until not in STAGE_NAMES:
         raise InputError(f"no stage is named {until!r}", remedy="stages are " + ", ".join(STAGE_NAMES))
@@ -309,24 +302,11 @@ def run_experiment(
 
     Its results lie in ``results/<name>``; ``limbfit report`` shows them.
 
-    Parameters
-    ----------
-    study : a checked study.
-    name : of the experiment.
-    listener : is told of progress.
-    options : as the experiment takes them; left out: its defaults.
+    Returns what ``results/<name>/<name>.json`` holds, and ``folder``, where that is. Raises `InputError` for
+    an experiment or option that there is not, or an input that cannot be used; and `RunError` when another
+    run holds the study, or the disk is full.
 
-    Returns
-    -------
-    dict
-        What ``results/<name>/<name>.json`` holds, and ``folder``, where that is.
-
-    Raises
-    ------
-    InputError
-        For an experiment or option that there is not, or an input that cannot be used.
-    RunError
-        When another run holds the study, or the disk is full.
+    ``name``: of the experiment. ``options``: as the experiment takes them; left out: its defaults.
     """
     experiment = EXPERIMENTS[name]
     if name in _FOLDERS:

@@ -20,22 +20,11 @@ SHOWN = ("segment", "surfaces", "sites", "mesh")
 def show_stage(study: Study, stage: str, *, listener: Listener = ignore_progress) -> dict[str, Any]:
     """Run a study until a stage of the geometry, and say what came of it.
 
-    Parameters
-    ----------
-    study : a checked study.
-    stage : one of ``segment``, ``surfaces``, ``sites``, ``mesh``.
-    listener : is told of progress.
+    Returns ``study``, ``stage``, ``picture`` (path of a PNG, or None where the stage makes none), and facts
+    by stage; lengths in mm, volumes in cm3, angles in degrees, positions LPS. Raises `InputError` for another
+    stage, ``segment`` of a study without an image, or inputs that cannot be used.
 
-    Returns
-    -------
-    dict
-        ``study``, ``stage``, ``picture`` (path of a PNG, or None where the stage makes none), and facts by
-        stage; lengths in mm, volumes in cm3, angles in degrees, positions LPS.
-
-    Raises
-    ------
-    InputError
-        For another stage, ``segment`` of a study without an image, or inputs that cannot be used.
+    ``stage``: one of ``segment``, ``surfaces``, ``sites``, ``mesh``.
     """
     if stage not in SHOWN:
         raise InputError(f"no stage {stage!r} can be shown", remedy="stages are " + ", ".join(SHOWN))

@@ -1,4 +1,4 @@
-"""One indentation of a study, simulated and stored for ParaView."""
+"""One indentation of a study, or a FEBio input outside any study, simulated and stored for ParaView."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,17 +6,17 @@ from typing import Any
 
 from ...errors import InputError
 from ...execution import SerialExecutor
-from ...fe import Problem, Result
-from ...febio import FebSettings, build_result, compute_end_time, find_febio, run_febio, write_feb
+from ...fe import Problem, Result, Step
+from ...febio import FebSettings, build_result, compute_end_time, find_febio, run_feb, run_febio, write_feb
+from ...fields import write_fields
 from ...identify.checks.domain import RecordedRange, describe_outside
 from ...indentation import Parameters, SiteModel, build_first_steps, build_problem, simulate_fields
 from ...mesh import read_vtu
 from ...results.identification import RecordedExtents
 from ...results.runs import SimulateResult
 from ...study import Indentation, Study
-from ..engine.context import Context, Listener, ignore_progress
-from ..engine.storage import write_curves, write_result
-from ..engine.store import Store
+from ..engine.context import Context, Listener, Progress, ignore_progress
+from ..engine.store import Store, write_curves, write_result
 from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
@@ -61,10 +61,8 @@ def prepare_site(
     Raises `InputError` for a site that the study does not have, identified parameters that are stale, or any
     input of the stages before.
 
-    Parameters
-    ----------
-    name : of a site with one record at most, or of a record.
-    parameters : per tissue; by default the identified ones, or the study's start where none were identified.
+    ``name``: of a site with one record at most, or of a record. ``parameters``: per tissue; by default the
+    identified ones, or the study's start where none were identified.
     """
     stated = study.indentation(name)
     used, origin = choose_parameters(study, parameters)
@@ -87,17 +85,14 @@ def simulate_site(
 
     Curve and fields at the deepest point go to ``results/simulate``.
 
+    Raises `InputError` for a site that the study does not have, identified parameters that are stale, or any
+    input of the stages before.
+
     Parameters
     ----------
     parameters : as `prepare_site`.
     animation : also the fields of every step, as a PVD collection.
     solver : ``limbfit`` or ``febio``; by default what the study says.  FEBio's fields stay in its own file.
-
-    Raises
-    ------
-    InputError
-        For a site that the study does not have, identified parameters that are stale, or any input of the
-        stages before.
     """
     by_febio = (solver or study.solver.solver) == "febio"
     program = find_febio(study.febio.program, study.folder) if by_febio else None
@@ -225,3 +220,52 @@ def choose_parameters(study: Study, given: Parameters | None = None) -> tuple[Pa
             remedy="identify again (limbfit run), or give --parameters",
         )
     return store.results.calibration.parameters, IDENTIFIED
+
+
+def simulate_feb(
+    file: str | Path,
+    output: str | Path | None = None,
+    *,
+    threads: int = 1,
+    listener: Listener = ignore_progress,
+) -> dict[str, Any]:
+    """Solve a FEBio 3 or 4 input; the tables that it asks for go to ``output``, by default beside it.
+
+    The fields at the deepest point go there too, as VTU.  Without ``output`` a table that is there already,
+    FEBio's own for example, is not written over but refused.
+
+    Raises `InputError` where the file cannot be read, or holds what limbfit does not know; with its line; and
+    `RunError` where the tables cannot be written.
+    """
+    name, told = Path(file).name, 0.0
+
+    def tell(step: Step, last: float) -> None:
+        nonlocal told
+        if step.time >= told:
+            told = min(step.time + 0.05 * last, last)
+            listener(Progress("febio", step.time, last, f"{name}: {step.force:.3g} N"))
+
+    folder = Path(file).parent if output is None else output
+    found = run_feb(file, folder, tell, keep=output is None, threads=threads)
+    result = found.result
+    fields = Path(folder) / f"{Path(file).stem}-peak.vtu"
+    if result.states:
+        write_fields(result.system, result.problem, result.states[0], fields)
+    pushed = result.problem.indenter is not None
+    return {
+        "file": str(file),
+        "completed": result.completed,
+        "reason": result.reason,
+        "warnings": list(result.warnings),
+        "notes": list(found.notes),
+        "peak_force_N": result.peak_force if pushed else None,
+        "times_s": result.times.tolist(),
+        "displacement_mm": result.displacement.tolist(),
+        "force_N": result.force.tolist() if pushed else None,
+        "penetration_mm": float(result.penetration.max(initial=0.0)),
+        "element": result.statistics["element"],
+        "unknowns": result.statistics["unknowns"],
+        "steps": result.statistics["steps"],
+        "fields": str(fields) if result.states else None,
+        "files": [str(path) for path in found.files],
+    }

@@ -14,9 +14,9 @@ from ...identify.checks.design import (
     Candidate,
     Design,
     NoiseModel,
-    build_candidate,
     choose_design,
     compute_efficiency,
+    compute_information,
     compute_prior_information,
     evaluate_design,
 )
@@ -26,8 +26,8 @@ from ...laws import Parameters
 from ...results.planning import DesignCandidate, DesignResult, DesignSite, ExpectedNoise, SiteDesign
 from ...study import Study
 from ..engine.context import NO_PARAMETERS, Context
-from ..engine.storage import write_result
-from ..identification.problem import build_problem
+from ..engine.store import write_result
+from ..identification.search import build_problem
 from ..records.records import build_model
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import build_curve_job, open_experiment_cache
@@ -94,9 +94,8 @@ def run_design(
             left_out.append(f"site {model.name} at {depth:.1f} mm: {simulation.reason}")
             continue
         response = SiteResponse(simulation.force_N, simulation.jacobian)
-        found.append(
-            (build_candidate(model.site, depth, response, vector, model_noise), simulation.force_N.max())
-        )
+        information = compute_information(response, vector, model_noise)
+        found.append((Candidate(model.site, depth, information), simulation.force_N.max()))
     content = DesignResult(
         **_choose_designs(context, found, count_wanted_sites(study, sites), left_out),
         parameters=parameters,

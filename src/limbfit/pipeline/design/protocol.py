@@ -41,10 +41,9 @@ from ...mesh import read_vtu
 from ...results.planning import ExpectedNoise, ProtocolPlan, ProtocolRecord, ProtocolResult
 from ...study import Study
 from ..engine.context import NO_PARAMETERS, Context
-from ..engine.storage import write_result
-from ..identification.problem import build_problem
-from ..records.deviations import compute_expected_share, is_modulus
-from ..records.records import build_model, estimate_surface_error_mm
+from ..engine.store import write_result
+from ..identification.search import build_problem
+from ..records.records import build_model, compute_expected_share, estimate_surface_error_mm, is_modulus
 from ..simulation.limb_geometry import LimbGeometry, build_site_model, coarsen_model
 from ..simulation.loading import LoadHistory, describe_untested_times
 from ..simulation.simulations import build_curve_job, open_experiment_cache

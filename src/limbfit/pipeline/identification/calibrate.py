@@ -20,15 +20,19 @@ from ...results import identification as stored
 from ...results.base import Interval, Intervals
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import write_result
+from ..engine.store import write_result
 from ..limb.remesh import mesh_in_background
 from ..records.records import load_records
 from ..simulation.simulations import SimulationCache
-from .fine_meshes import correct_answer, plan_coarser_meshes
-from .intervals import sample_intervals
-from .problem import CalibrationProblem, build_problem
-from .record_simulator import RecordSimulator, SearchWarning, WarmStarts
-from .search import search_from_starts
+from .answer import correct_answer, plan_coarser_meshes, sample_intervals
+from .search import (
+    CalibrationProblem,
+    RecordSimulator,
+    SearchWarning,
+    WarmStarts,
+    build_problem,
+    search_from_starts,
+)
 
 
 def run_calibrate(context: Context, folder: Path) -> None:
@@ -41,13 +45,13 @@ def run_calibrate(context: Context, folder: Path) -> None:
     records = load_records(context, study.records_at(*study.fitted), secondary=True)
     problem = build_problem(study)
     cache = SimulationCache(folder / "runs", also=[context.store["calibrate"] / "runs"])
-    simulator = RecordSimulator(records, cache, context.executor, report)
+    simulator = RecordSimulator(problem, records, cache, context.executor, report)
     coarser = plan_coarser_meshes(context, records, folder / "coarser")
     with mesh_in_background(coarser, context.executor) as wait:
-        starts, rounds = search_from_starts(problem, simulator)
+        starts, rounds = search_from_starts(simulator)
         wait()
-    correction = correct_answer(problem, simulator, starts.best, coarser)
-    found, known = sample_intervals(problem, simulator, starts.best, correction)
+    correction = correct_answer(simulator, starts.best, coarser)
+    found, known = sample_intervals(simulator, starts.best, correction)
     corrections = [_summarise_round(one, found.sites, problem) for one in rounds]
     simulations = simulator.run_answer(found.parameters)
     answers = {one.site: one for one in records.select_forces(simulations)}

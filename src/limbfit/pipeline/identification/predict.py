@@ -20,14 +20,20 @@ from ...indentation import Simulation, SimulationJob, store_job_fields
 from ...results import identification as stored
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import write_curves, write_result
-from ..records.deviations import estimate_site_deviation, estimate_site_noise
+from ..engine.store import write_curves, write_result
 from ..records.record_checks import check_records, read_record_warnings
-from ..records.records import RecordSet, SiteRecord, load_records, to_response
+from ..records.records import (
+    RecordSet,
+    SiteRecord,
+    estimate_site_deviation,
+    estimate_site_noise,
+    load_records,
+    to_response,
+)
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
 from ..simulation.simulations import SimulationCache
-from .problem import build_problem
+from .search import build_problem
 
 Loading = tuple[Sequence[Extent], Sequence[stored.OutsideRecords]]
 _MISSING = {

@@ -17,9 +17,7 @@ from ...results.limb import MeshingSettings, MeshMeasures, MeshResult, MeshSet
 from ...study import Study
 from ...study.meshing import EdgesTable
 from ..engine.context import Context
-from ..engine.files import THICKNESS
-from ..engine.storage import write_result
-from ..engine.store import COARSE
+from ..engine.store import COARSE, THICKNESS, write_result
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from ...anatomy.surfaces.mending import build_closed_anatomy, orient_outward
 from ...anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface, save_anatomy
 from ...anatomy.surfaces.thickness import measure_fat_depth, write_thickness
 from ...study import Study
-from ..engine.context import Context
-from ..engine.files import THICKNESS, find_labelled_file, name_file_in_errors
+from ..engine.context import Context, name_file_in_errors
+from ..engine.store import THICKNESS, find_labelled_file
 
 
 def run_surfaces(context: Context, folder: Path) -> None:

@@ -184,15 +184,7 @@ def check_records(
 
 def _build_driven_job(site: SiteRecord, other: SiteRecord, parameters: Array) -> SimulationJob:
     """The site driven by the record of another one, and indented by what made that."""
-    driven = other.model
-    model = replace(
-        site.model,
-        knots_s=driven.knots_s,
-        knots_mm=driven.knots_mm,
-        knots_N=driven.knots_N,
-        indenter=driven.indenter,
-        indenter_digest=driven.indenter_digest,
-        layers=(),
-        skin_points=(),
-    )
+    keys = ("knots_s", "knots_mm", "knots_N", "indenter", "indenter_digest")
+    driven = {key: getattr(other.model, key) for key in keys}
+    model = replace(site.model, **driven, layers=(), skin_points=())
     return replace(site, model=model, times_s=other.times_s).job(parameters)

@@ -35,8 +35,7 @@ from ...results.limb import LayerRecord, TraceFacts, WaveRecord
 from ...study import Record, Study, Vector
 from ...traces import SurfaceMotion, Thinning, WaveMeans
 from ...traces.numerics import build_linear_interpolation
-from ..engine.files import LAYERS, WAVES
-from ..engine.storage import write_curves
+from ..engine.store import LAYERS, WAVES, write_curves
 
 Ints = NDArray[np.int64]
 

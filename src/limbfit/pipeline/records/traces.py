@@ -29,9 +29,8 @@ from ...traces import (
     regularise_creep,
     select_frames_in_contact,
 )
-from ..engine.context import Context
-from ..engine.files import LAYERS, SMOOTHING, WAVES, name_file_in_errors
-from ..engine.storage import write_curves, write_result
+from ..engine.context import Context, name_file_in_errors
+from ..engine.store import LAYERS, SMOOTHING, WAVES, write_curves, write_result
 from ..simulation.simulations import CURVE_POINTS
 from .secondary_measurements import write_motion
 

@@ -15,9 +15,8 @@ from ...indentation import Direction, SiteModel, build_clamping_pins, read_inden
 from ...mesh import read_vtu
 from ...results.limb import PlacedSite
 from ...study import Indentation, IndenterTable, Site, Study, Vector
-from ..engine.context import Context
+from ..engine.context import Context, name_file_in_errors
 from ..engine.digests import compute_file_digest
-from ..engine.files import name_file_in_errors
 from ..engine.store import COARSE, Store
 
 

@@ -12,8 +12,7 @@ from ...fe import SimulationWarning
 from ...indentation import Simulation, SimulationJob, SiteModel, simulate
 from ..engine.context import Context
 from ..engine.digests import code_digest, compute_digest
-from ..engine.partial_results import Arrays, Facts, ResultFiles, read_made
-from ..engine.store import RUNS
+from ..engine.store import RUNS, Arrays, Facts, ResultFiles, read_made
 
 CURVE_POINTS = 81  # times, about, at which measured and simulated force are compared
 

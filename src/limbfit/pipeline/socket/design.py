@@ -32,13 +32,10 @@ from ...socket.wall import measure_thickness
 from ...study import Study
 from ..engine.context import NO_PARAMETERS, Context
 from ..engine.digests import code_digest, compute_digest
-from ..engine.partial_results import Made, ResultFiles
-from ..engine.storage import write_result, write_table
-from ..engine.store import RUNS
+from ..engine.store import RUNS, Made, ResultFiles, write_result, write_table
 from ..simulation.limb_geometry import LimbGeometry
 from . import shape
-from .limb import SocketLimb
-from .simulation import SocketRun, run_sockets, simulate_socket
+from .simulation import SocketLimb, SocketRun, run_sockets, simulate_socket
 
 NAME, PLACE = "socket_design", "socket.design"
 Tell = Callable[[float, str], None]  # how much is done, and words
@@ -90,10 +87,8 @@ def run_socket_design(
 ) -> None:
     """Design a socket for the target pressure of the study, and put it and its control on the limb.
 
-    Parameters
-    ----------
-    optimise : regions whose largest pressures are to be lowered.
-    simulations : at most so many for that, beside those of control and design.
+    ``optimise``: regions whose largest pressures are to be lowered. ``simulations``: at most so many for
+    that, beside those of control and design.
     """
     study, total = context.study, 3 + (simulations if optimise else 0)
 

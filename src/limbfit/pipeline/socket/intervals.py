@@ -38,12 +38,9 @@ _CHANGE = float(np.log1p(CHANGE_PERCENT / 100.0))
 class ParameterSpread:
     """How well the study's parameters are known, tissue by tissue; all of their logarithms.
 
-    Attributes
-    ----------
-    covariance : (p, p).
-    off : (p,) how far the most probable ones are from those that are simulated.
-    shift, relaxation : (p,) and (p, p) what relaxation beyond the records moves them by, and adds; or 0.
-    fall : (p,) by how much they may be lower beside that; or 0.
+    Beside the ``covariance`` (p, p), ``off`` (p,) is how far the most probable ones are from those that are
+    simulated. Relaxation beyond the records moves them by ``shift`` (p,) and adds ``relaxation`` (p, p);
+    beside that they may be lower by ``fall`` (p,); or 0.
     """
 
     covariance: Array
@@ -71,13 +68,9 @@ class ParameterSpread:
 
 @dataclass(frozen=True, eq=False)
 class SimulationSpread:
-    """How well a simulation's parameters are known.
+    """How well a simulation's parameters are ``known``: the k that were ``identified``, by their numbers.
 
-    Attributes
-    ----------
-    names : of its parameters by tissue and key, such as ``skin.c_kPa``; a liner's too.
-    identified : (k,) numbers of those that were identified.
-    known : how well these k are known.
+    ``names`` are those of all of its parameters by tissue and key, such as ``skin.c_kPa``; a liner's too.
     """
 
     names: Sequence[str]

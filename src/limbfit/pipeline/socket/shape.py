@@ -41,11 +41,9 @@ def build_socket(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
 
     Raises `StudyError` with the key and the remedy.
 
-    Parameters
-    ----------
-    anatomy : of the limb.
-    outer : the closed surface that the socket touches, skin or liner on skin; flat at the same proximal cut.
-        Around the bare skin, a rectified face may come nearer to the bones by the liner's thickness.
+    ``anatomy``: of the limb. ``outer``: the closed surface that the socket touches, skin or liner on skin;
+    flat at the same proximal cut. Around the bare skin, a rectified face may come nearer to the bones by the
+    liner's thickness.
     """
     table, frame = study.socket, anatomy.frame
     with place_errors(study):

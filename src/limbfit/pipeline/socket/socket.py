@@ -22,15 +22,12 @@ from ...socket.landmarks import find_bone
 from ...socket.published import select_published_findings
 from ...study import Study
 from ..engine.context import NO_PARAMETERS, Context
-from ..engine.partial_results import ResultFiles
-from ..engine.storage import write_result, write_table
-from ..engine.store import RUNS
+from ..engine.store import RUNS, ResultFiles, write_result, write_table
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import NEAR_MM, LimbAxis, describe_socket_load, name_load, time_socket_loads
 from .intervals import CHANGE_PERCENT, FRICTION, ParameterSpread, draw_step, store_change, widen_intervals
-from .limb import SocketLimb
 from .shape import build_loadable_socket, check_tissues
-from .simulation import SocketRun, run_sockets, simulate_socket, solve_run, summarise_run
+from .simulation import SocketLimb, SocketRun, run_sockets, simulate_socket, solve_run, summarise_run
 
 NAME = "socket"
 NOT_COMPARED = (

@@ -22,11 +22,10 @@ from ...indentation import SimulationJob, SiteModel, to_vector3
 from ...shapes import SHAPES
 from ...study import Study
 from ..engine.context import Context
-from ..identification.fine_meshes import estimate_own_mesh_error
+from ..identification.answer import MESH_ORDERS, estimate_coarse_error, estimate_own_mesh_error
 from ..limb.mesh import build_coarse_settings, mesh_settings, plan_meshes, scale_edges
 from ..limb.remesh import mesh_models
 from ..records.records import RecordSet
-from ..simulation.extrapolation import MESH_ORDERS, estimate_coarse_error
 from ..simulation.simulations import SimulationCache
 
 FINER = 0.75  # edges of the finer mesh, where the study has no coarse one to compare with

@@ -1,1 +1,1 @@
-"""Simulations with one thing changed: parameters, contact, indenter, mesh, grouping, the material cube."""
+"""Simulations with one thing changed: parameters, contact, indenter, mesh; the material cube."""

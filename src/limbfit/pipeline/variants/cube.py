@@ -27,7 +27,7 @@ from ...relaxation import DEFAULT_SPAN_S
 from ...results.variants import CubeResult, CubeTissue
 from ...study import Study
 from ..engine.context import Context
-from ..engine.storage import write_curves, write_result
+from ..engine.store import write_curves, write_result
 from ..simulation.limb_geometry import LimbGeometry
 from .variants import format_column
 
@@ -75,6 +75,10 @@ def compress_cube(
 ) -> dict[str, Any]:
     """Compress a cube of each given tissue, of the paper's and of the published ones.
 
+    Returns ``tissues``: for each its name, kind, law, peak stress, what is left of it and its change of
+    volume; ``time_s``, and ``stress_kPa`` for each tissue (Cauchy stress along the compression, positive when
+    pushing). Raises `InputError` for a compression that is no compression.
+
     Parameters
     ----------
     output : folder for ``cube.json``, ``cube.csv`` and ``cube.svg``; None: nothing is written.
@@ -84,18 +88,6 @@ def compress_cube(
     law : name of their law.
     relaxation_span_s : first and last time of relaxation as a power of time.
     compression_percent : of the side of the cube.
-
-    Returns
-    -------
-    dict
-        ``tissues``: for each its name, kind, law, peak stress, what is left of it and its change of volume;
-        ``time_s``, and ``stress_kPa`` for each tissue (Cauchy stress along the compression, positive when
-        pushing).
-
-    Raises
-    ------
-    InputError
-        For a compression that is no compression.
     """
     check_compression(compression_percent)
     ramp = np.arange(1, STEPS + 1) / STEPS  # even in each ramp, dense at first while the cube is held
@@ -119,7 +111,11 @@ def compress_cube(
         stress_kPa=stresses,
     )
     if output is not None:
-        _write_cube(output, content)
+        output.mkdir(parents=True, exist_ok=True)
+        write_result(output / "cube.json", content)
+        curves = {format_column(name, "kPa"): np.array([0.0, *stress]) for name, stress in stresses.items()}
+        write_curves(output / "cube.csv", time_s=np.r_[0.0, times], **curves)
+        (output / "cube.svg").write_text(report.draw_cube(content), encoding="utf-8")
     return content.to_plain()
 
 
@@ -133,14 +129,6 @@ def _list_moduli(material: Material) -> dict[str, Any]:
         "prony": table.prony.tolist(),
         "terms": [(c / KPA, m) for c, m in table.terms] if table.has_terms else [],
     }
-
-
-def _write_cube(folder: Path, content: CubeResult) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    write_result(folder / "cube.json", content)
-    curves = {format_column(name, "kPa"): np.array([0.0, *kPa]) for name, kPa in content.stress_kPa.items()}
-    write_curves(folder / "cube.csv", time_s=np.array([0.0, *content.time_s]), **curves)
-    (folder / "cube.svg").write_text(report.draw_cube(content), encoding="utf-8")
 
 
 def check_compression(percent: float) -> None:

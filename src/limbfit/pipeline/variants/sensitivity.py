@@ -23,21 +23,20 @@ from ...results import variants as stored
 from ...shapes import BUILTIN_SHAPES, SHAPES
 from ...study import IndenterTable, Study
 from ..engine.context import Context
+from ..identification.answer import MESH_ORDERS, extrapolate_richardson
 from ..limb.mesh import mesh_job, mesh_settings, read_mesh_facts, scale_edges
 from ..limb.remesh import mesh_models
 from ..records.records import load_records
-from ..simulation.extrapolation import MESH_ORDERS, extrapolate_richardson
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import SimulationCache, open_experiment_cache
 from .variants import (
     ChosenSite,
     Variant,
+    VariantRow,
     check_variants,
     choose_sites,
     measure_tissue_over_bone,
     run_variants,
-    simulate_variants,
-    store_variants,
 )
 
 NO_VOLUME: Mapping[str, float | None] = dict.fromkeys(("J_min", "J_low", "J_high", "J_max", "beyond_percent"))
@@ -105,8 +104,8 @@ def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str] = ()) 
     chosen, cache = choose_sites(context, sites), open_experiment_cache(context, folder)
     variants = [variant for one in chosen for variant in _build_stiffer(one, equal, law.moduli)]
     local = _collect_derivatives(context, cache, identified)
-    more = {"equal_m": m, "factors": FACTORS, "local": local}
-    run_variants(context, folder, stored.StiffnessResult, stored.StiffnessRun, variants, cache, **more)
+    more: dict[str, Any] = {"equal_m": m, "factors": FACTORS, "local": local}
+    run_variants(context, folder, stored.StiffnessResult, variants, cache, **more)
 
 
 def _build_stiffer(chosen: ChosenSite, equal: Parameters, moduli: Sequence[str]) -> list[Variant]:
@@ -178,8 +177,7 @@ def run_kappa(
     ]
     # Kept apart from simulations without volumes, which have the same key.
     cache = SimulationCache(folder / "volumes", work=simulate_with_volumes)
-    models = stored.VolumeResult, stored.VolumeRun
-    run_variants(context, folder, *models, variants, cache, kappa_ratio=own)
+    run_variants(context, folder, stored.VolumeResult, variants, cache, kappa_ratio=own)
 
 
 def run_contact(context: Context, folder: Path, *, sites: Sequence[str] = ()) -> None:
@@ -197,8 +195,8 @@ def run_contact(context: Context, folder: Path, *, sites: Sequence[str] = ()) ->
         for one in chosen
         for friction in dict.fromkeys((one.model.indenter.friction, "frictionless", "sticky"))
     ]
-    models, friction = (stored.FrictionResult, stored.FrictionRun), chosen[0].model.indenter.friction
-    run_variants(context, folder, *models, variants, friction=friction)
+    friction = chosen[0].model.indenter.friction
+    run_variants(context, folder, stored.FrictionResult, variants, friction=friction)
 
 
 def run_indenter(context: Context, folder: Path, *, sites: Sequence[str] = ()) -> None:
@@ -216,7 +214,7 @@ def run_indenter(context: Context, folder: Path, *, sites: Sequence[str] = ()) -
         for one in chosen
         for label, table, base in list_other_indenters(one.model.indenter)
     ]
-    run_variants(context, folder, stored.IndenterResult, stored.IndenterRun, variants)
+    run_variants(context, folder, stored.IndenterResult, variants)
 
 
 def list_other_indenters(own: IndenterTable) -> list[tuple[str, IndenterTable, bool]]:
@@ -256,11 +254,7 @@ def run_refinement(
     """Force at sites on meshes whose edges are ``factors`` times the study's, and what it tends to."""
     parameters, chosen = context.results.calibration.parameters, choose_sites(context, sites)
     variants = _build_variants(context, folder, chosen, _choose_factors(factors), parameters)
-    runs = simulate_variants(context, folder, stored.RefinementResult, stored.RefinementRun, variants)
-    refined = [
-        stored.RefinedSite(**dict(one.summary), **_find_limit(one.summary.site, runs)) for one in chosen
-    ]
-    store_variants(context, folder, stored.RefinementResult, runs, sites=refined)
+    run_variants(context, folder, stored.RefinementResult, variants, find_more=_find_limit)
 
 
 def _build_variants(
@@ -303,26 +297,22 @@ def _build_variants(
     return variants
 
 
-def _find_limit(site: str, runs: Sequence[stored.RefinementRun]) -> dict[str, Any]:
-    """The largest force that the meshes of a site tend to, and how far the study's mesh is from it.
+def _find_limit(runs: Sequence[VariantRow]) -> dict[str, Any]:
+    """The largest force that the ``runs`` of a site tend to, and how far the study's mesh is from it.
 
     Nothing where they do not tend to anything yet. With an element whose forces do not change in one
     direction, the limit is the finest mesh's force, at no order.
     """
-    own = next(run for run in runs if run.site == site and run.base)
-    done = {
-        run.edge_near_mm: run.peak_force_N
-        for run in runs
-        if run.site == site and run.peak_force_N is not None
-    }
-    if len(done) >= 2 and own.edge_near_mm in done:
-        found = extrapolate_richardson(list(done), list(done.values()), MESH_ORDERS[own.element])
+    own = next(run for run in runs if run["base"])
+    done = {run["edge_near_mm"]: run["peak_force_N"] for run in runs if run["peak_force_N"] is not None}
+    if len(done) >= 2 and own["edge_near_mm"] in done:
+        found = extrapolate_richardson(list(done), list(done.values()), MESH_ORDERS[own["element"]])
         finest = done[min(done)]
         if abs(found.limit - finest) <= FARTHEST * finest:
             return {
                 "limit_N": found.limit,
                 "order": found.order,
                 "order_measured": found.measured,
-                "error_percent": found.error_percent(done[own.edge_near_mm]),
+                "error_percent": found.error_percent(done[own["edge_near_mm"]]),
             }
     return dict.fromkeys(("limit_N", "order", "order_measured", "error_percent"))

@@ -1,24 +1,23 @@
 """Simulations of the same indentation with one thing changed: what the experiments of sensitivity share."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from ...errors import InputError
 from ...indentation import Parameters, Simulation, SimulationJob, SiteModel, to_vector
-from ...results.variants import VariantRun, VariedResult, VariedSite
+from ...results.variants import VariedResult, VariedSite
 from ...study import Indentation, Study
 from ..engine.context import Context
-from ..engine.storage import write_curves, write_result, write_rows
-from ..records.deviations import measure_bone_distance_mm
-from ..records.records import build_model
+from ..engine.store import write_curves, write_result, write_rows
+from ..records.records import build_model, measure_bone_distance_mm
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import CURVE_POINTS, SimulationCache, build_curve_job, open_experiment_cache
 
-Run = TypeVar("Run", bound=VariantRun)
+VariantRow = Mapping[str, Any]  # a run, by the keys of its model
 
 
 @dataclass(frozen=True)
@@ -104,26 +103,16 @@ def run_variants(
     context: Context,
     folder: Path,
     result: type[VariedResult],
-    run: type[VariantRun],
     variants: Sequence[Variant],
     cache: SimulationCache | None = None,
+    find_more: Callable[[Sequence[VariantRow]], dict[str, Any]] = lambda runs: {},
     **more: Any,
 ) -> None:
-    """Simulate variants and store a ``result`` with a ``run`` of each, and ``more`` of its keys."""
-    sites = {variant.model.name: variant.chosen.summary for variant in variants}
-    runs = simulate_variants(context, folder, result, run, variants, cache)
-    store_variants(context, folder, result, runs, sites=list(sites.values()), **more)
+    """Simulate variants and store a ``result`` with a run of each, and ``more`` of its keys.
 
-
-def simulate_variants(
-    context: Context,
-    folder: Path,
-    result: type[VariedResult],
-    run: type[Run],
-    variants: Sequence[Variant],
-    cache: SimulationCache | None = None,
-) -> list[Run]:
-    """Simulate them all, in order, and write the curves of each site; a row ``run`` of each."""
+    ``find_more`` tells more of a site from its runs. Beside the JSON are the runs as ``runs.csv``, and the
+    curves of each site.
+    """
     cache = open_experiment_cache(context, folder) if cache is None else cache
     done: list[Simulation] = []
     found = cache.run([variant.job() for variant in variants], context.executor)
@@ -132,16 +121,22 @@ def simulate_variants(
         words = f"site {simulation.site}, {variant.label}"
         context.tell(Path(result.FILE).stem, len(done), len(variants), words)
     _write_curves(folder, variants, done)
-    return _compare_variants(variants, done, run)
+    runs = _compare_variants(variants, done)
+    sites = {variant.model.name: variant.chosen.summary for variant in variants}
+    rows = [
+        dict(site) | find_more([run for run in runs if run["site"] == name]) for name, site in sites.items()
+    ]
+    parameters = context.results.calibration.parameters
+    content = result.model_validate({"sites": rows, "runs": runs, "parameters": parameters, **more})
+    write_result(folder / Path(result.FILE).name, content)
+    write_rows(folder / "runs.csv", content.runs, leave_out=("warnings", "label", "base"))
 
 
-def _compare_variants(
-    variants: Sequence[Variant], simulations: Sequence[Simulation], run: type[Run]
-) -> list[Run]:
+def _compare_variants(variants: Sequence[Variant], simulations: Sequence[Simulation]) -> list[VariantRow]:
     """A row of each: what was changed, its largest force, and how it differs from its site's base.
 
     Changes are in percent of the base's largest force: of the largest force, and the mean over the trace.
-    They are None where a simulation is partial. ``run`` is the model of a row.
+    They are None where a simulation is partial.
     """
     base = {
         variant.model.name: simulation
@@ -149,21 +144,19 @@ def _compare_variants(
         if variant.base
     }
     return [
-        run(
-            site=variant.model.name,
-            label=variant.label,
-            base=variant.base,
+        {
+            "site": variant.model.name,
+            "label": variant.label,
+            "base": variant.base,
             **variant.facts | simulation.facts.get("volume", {}),
-            peak_force_N=float(simulation.force_N.max()) if simulation.completed else None,
+            "peak_force_N": float(simulation.force_N.max()) if simulation.completed else None,
             **_change(simulation, base[variant.model.name]),
-            penetration_mm=simulation.penetration_mm,
-            steps=simulation.facts.get("steps"),
-            newton_iterations=simulation.facts.get("newton_iterations"),
-            cuts=simulation.facts.get("cuts"),
-            completed=simulation.completed,
-            reason=simulation.reason,
-            warnings=simulation.warnings,
-        )
+            "penetration_mm": simulation.penetration_mm,
+            **{key: simulation.facts.get(key) for key in ("steps", "newton_iterations", "cuts")},
+            "completed": simulation.completed,
+            "reason": simulation.reason,
+            "warnings": simulation.warnings,
+        }
         for variant, simulation in zip(variants, simulations, strict=True)
     ]
 
@@ -176,16 +169,6 @@ def _change(simulation: Simulation, base: Simulation) -> dict[str, float | None]
         "peak_change_percent": 100.0 * (float(simulation.force_N.max()) / peak - 1.0),
         "mean_change_percent": 100.0 * float(np.abs(simulation.force_N - base.force_N).mean()) / peak,
     }
-
-
-def store_variants(
-    context: Context, folder: Path, result: type[VariedResult], runs: Sequence[VariantRun], **more: Any
-) -> None:
-    """The result as JSON, and its runs as ``runs.csv``."""
-    parameters = context.results.calibration.parameters
-    content = result.model_validate({"runs": runs, "parameters": parameters, **more})
-    write_result(folder / Path(result.FILE).name, content)
-    write_rows(folder / "runs.csv", runs, leave_out=("warnings", "label", "base"))
 
 
 def _write_curves(folder: Path, variants: Sequence[Variant], simulations: Sequence[Simulation]) -> None:

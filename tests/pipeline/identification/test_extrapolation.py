@@ -5,7 +5,7 @@ import pytest
 
 from limbfit.fe import ELEMENTS, ORDER_IN_TIME
 from limbfit.fe.materials import compute_prony_factors
-from limbfit.pipeline.simulation.extrapolation import (
+from limbfit.pipeline.identification.answer import (
     MESH_ORDERS,
     estimate_coarse_error,
     extrapolate_richardson,
