@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from limbfit.anatomy.imaging import LabelMap, Volume
 from limbfit.anatomy.sites.marked import extract_marked_skin, remove_markers
-from limbfit.anatomy.sites.markers import Marker, find_markers, match_markers
 from limbfit.anatomy.sites.registration import register_limb
+from limbfit.anatomy.sites.sites import Marker, find_markers, match_markers
 from limbfit.anatomy.surfaces.surfaces import Surface, build_anatomy
 from limbfit.errors import SiteError
 from limbfit.phantom.geometry import Limb, build_rotation, make_limb

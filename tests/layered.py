@@ -13,7 +13,7 @@ from limbfit.bench.blocks import build_block_model
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
-from limbfit.mesh.boxes import SIX_TETS, build_boxes
+from limbfit.mesh.cells import SIX_TETS, build_boxes
 from limbfit.phantom.record import Ramp, record
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.storage import write_json

@@ -10,14 +10,14 @@ import pytest
 from bodies import limb
 from limbs import SHARED, rotation
 
-from limbfit.anatomy.meshing import meshing, untangling
+from limbfit.anatomy.meshing import meshing, smoothing
 from limbfit.anatomy.meshing.background import compute_volumes
 from limbfit.anatomy.meshing.engines import ENGINES, VolumeMesh, run_mmg
 from limbfit.anatomy.meshing.extrusion import extrude_layers
 from limbfit.anatomy.meshing.layers import LimbFields
 from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
-from limbfit.anatomy.meshing.smoothing import find_constraints
-from limbfit.anatomy.meshing.untangling import (
+from limbfit.anatomy.meshing.smoothing import (
+    find_constraints,
     find_inverted_cells,
     repair_mesh,
     thin_inverted_layers,
@@ -125,7 +125,7 @@ def test_inverted_cells_are_mended_and_told(spoiled, anatomy, base, site, where)
 
 def test_what_cannot_be_mended_is_refused_with_its_place(monkeypatch, spoiled, anatomy, base, site):
     spoiled(lambda mesh, stack: through(mesh, inner_node(mesh, stack)))
-    monkeypatch.setattr(untangling, "SWEEPS", 0)
+    monkeypatch.setattr(smoothing, "UNTANGLING_SWEEPS", 0)
     told = (
         r"\d+ of \d+ cells are inverted, the first in muscle at \(.*\) mm, .* mm from .*: there is too little"
     )

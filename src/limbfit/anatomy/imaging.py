@@ -14,9 +14,16 @@ from ..errors import ImageError, LabelError, add_location
 from .grid import LabelMap, Volume
 from .images.dicom import read_series
 from .images.formats import describe_forms, format_of, read_image
-from .labels.dicom_labels import find_dicom_labels, read_dicom_labels
 from .labels.labelcheck import place_on_grid
-from .labels.labelfiles import is_seg_nrrd, read_label_image, read_seg_nrrd, write_seg_nrrd, write_sidecar
+from .labels.labelfiles import (
+    find_dicom_labels,
+    is_seg_nrrd,
+    read_dicom_labels,
+    read_label_image,
+    read_seg_nrrd,
+    write_seg_nrrd,
+    write_sidecar,
+)
 
 _SMALLEST_MM, _LARGEST_MM = 60.0, 3000.0  # of the longest side of an image
 

@@ -9,7 +9,7 @@ from ..errors import ProblemError
 from ..fe import ELEMENTS, History, Indenter, OgdenQLV, Problem
 from ..indentation import SiteModel
 from ..mesh import Mesh, to_tet10
-from ..mesh.boxes import HEX, SIX_TETS, build_boxes
+from ..mesh.cells import HEX, SIX_TETS, build_boxes
 from ..study import SolverTable
 
 SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, 3.0, 0.3)

@@ -32,7 +32,7 @@ from ..arrays import Array
 from ..errors import InputError
 from ..indentation import Parameters
 from .forces import ForceJob, TrueForce, choose_discretisation, mesh_true_site, simulate_true_force
-from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, make_limb
+from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, build_true_anatomy, make_limb
 from .mri import DETAIL_GRIDS, LABELS_FILE, TENDON_LABEL, build_true_labels, make_grid, write_series
 from .record import SecondaryMeasurements, record, write_surface, write_ultrasound, write_waves
 from .sites import (
@@ -46,7 +46,6 @@ from .sites import (
 )
 from .socket import FILE as SOCKET_FILE
 from .socket import LINER_MM, write_socket
-from .surfaces import build_true_anatomy
 
 Mapping = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 Listener = Callable[[str, float, float], None]

@@ -5,14 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from ..anatomy.surfaces.surfacefiles import write_surface
 from ..anatomy.surfaces.surfaces import Anatomy, Surface
+from ..anatomy.surfaces.triangles import write_surface
 from ..arrays import Array
 from ..socket import Area, Recipe, Socket, read_socket, rectify_limb
 from ..socket.landmarks import Directions, build_default_regions, find_directions, find_knee_centre
 from ..socket.trim import Trim
-from .geometry import Limb
-from .surfaces import build_outer_surface
+from .geometry import Limb, build_outer_surface
 
 FILE = Path("socket") / "socket.stl"
 LINER_MM = 6.0

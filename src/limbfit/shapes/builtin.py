@@ -8,10 +8,21 @@ import numpy as np
 from numba import njit
 
 from ..errors import ProblemError
-from .facets import ARC, FLAT, STEEPEST_DEG, Facets, build_quadrilaterals, revolved, steps
-from .rigid_surface import Body, RigidSurface, surface_distance
-from .shape import Array, Distance, Revolution, Shape, Size
-from .triangles import compute_triangle_normals
+from .shape import (
+    ARC,
+    FLAT,
+    STEEPEST_DEG,
+    Array,
+    Distance,
+    Facets,
+    Revolution,
+    Shape,
+    Size,
+    build_quadrilaterals,
+    revolved,
+    steps,
+)
+from .triangles import Body, RigidSurface, compute_triangle_normals, surface_distance
 
 SPHERE_STEEPEST_DEG = 75.0  # of a face; what is steeper touches no skin
 

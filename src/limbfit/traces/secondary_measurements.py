@@ -16,8 +16,7 @@ import numpy as np
 from ..arrays import Array, Indices
 from ..errors import TraceError, add_location
 from .formats import TIME
-from .reading import read_columns
-from .record import check_finite
+from .record import check_finite, read_columns
 
 _LAYER_SUFFIX = "_mm"
 MIN_LAYER_READINGS = 5

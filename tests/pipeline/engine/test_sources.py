@@ -67,7 +67,7 @@ def test_it_is_no_wider():
 
 def test_it_holds_what_lists_by_hand_forgot():
     assert "identify/fit/parameters.py" in names("design")
-    assert "mesh/boxes.py" in names("cube")
+    assert "mesh/cells.py" in names("cube")
     web = {"web/static/viewer.js", "web/static/web.css", "web/static/vendor/three.min.js"}
     assert web | {"report/templates/report.css", "report/templates/blocks.html.j2"} <= names("report")
     assert "anatomy/meshing/_worker.py" in names("mesh")

@@ -18,7 +18,7 @@ import numpy as np
 
 from ...arrays import Array, Indices, Mask
 from ...mesh import TET10_EDGES, compute_dihedral_angles
-from ...mesh.boxes import SIX_TETS
+from ...mesh.cells import SIX_TETS
 
 Field = Callable[[Array], tuple[Array, Array]]
 

@@ -43,12 +43,12 @@ from .regions import (
     mesh_numbers,
     refine_at_regions,
 )
-from .smoothing import smooth_elements
-from .untangling import (
+from .smoothing import (
     describe_narrowest_gap,
     describe_unrepaired,
     find_inverted_cells,
     repair_mesh,
+    smooth_elements,
     untangle_cells,
 )
 

@@ -22,7 +22,7 @@ from ...arrays import Array, Mask
 from ...errors import ImageError
 from ..frame import find_longest_axis
 from ..grid import Grid, Volume, resample_cubic
-from ..labels.contours import fill_even_odd
+from ..labels.labelfiles import fill_even_odd
 from ..morphology import (
     Field,
     close_mask,

@@ -18,7 +18,7 @@ from ..segmentation.body import find_limb_mask, smooth_image
 from ..segmentation.ct import is_ct
 from ..surfaces.extraction import extract_contour
 from ..surfaces.triangles import Surface
-from .markers import find_bumps, find_cap_faces, find_near_cap
+from .sites import find_bumps, find_cap_faces, find_near_cap
 
 _RIM_MM = 2.5  # the outline lies this near to the mask's, and at half of the brightest tissue this near
 _SPACING_MM = 3.0  # of the places where patches are fitted

@@ -22,8 +22,15 @@ from ..frame import Frame, ProximalEnd, build_limb_frame, find_proximal_end, sel
 from ..grid import LabelMap
 from ..morphology import find_box
 from .extraction import extract_fine_surface, extract_surface, remesh
-from .surfacefiles import read_surface, write_surface
-from .triangles import Surface, check_closed, find_bodies, find_half_edges, from_pyvista
+from .triangles import (
+    Surface,
+    check_closed,
+    find_bodies,
+    find_half_edges,
+    from_pyvista,
+    read_surface,
+    write_surface,
+)
 
 ON_CUT_MM = 0.1  # nearer to the proximal cut, a point lies on it: flat ends of files are flat to half of that
 END_TOLERANCE_MM = 0.5  # a surface that ends this close to the cut is meant to be cut there

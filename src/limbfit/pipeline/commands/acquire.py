@@ -20,7 +20,7 @@ from ...results.records import TracesResult
 from ...study import Indentation, Record, Study
 from ...traces import COLUMNS
 from ...traces.formats import BINARY_SUFFIXES
-from ...traces.reading import find_factor
+from ...traces.record import find_factor
 from ..engine.storage import write_curves, write_json
 from ..engine.store import translate_disk_errors
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from ...anatomy.imaging import LabelMap, Volume, check_image, read_labels, read_volume
-from ...anatomy.labels.contours import read_contours
 from ...anatomy.labels.labelcheck import clean_labels, place_on_grid
+from ...anatomy.labels.labelfiles import read_contours
 from ...anatomy.segmentation.body import check_one_limb
 from ...anatomy.segmentation.segmentation import segment
 from ...anatomy.surfaces.thickness import check_fat

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from ...anatomy.imaging import LabelMap, Volume, write_labels
-from ...anatomy.labels.contours import write_contours
-from ...anatomy.labels.quality import assess_labels
+from ...anatomy.labels.labelcheck import assess_labels
+from ...anatomy.labels.labelfiles import write_contours
 from ...anatomy.sites.marked import extract_marked_skin, remove_markers
 from ...anatomy.sites.registration import register_limb
 from ...anatomy.surfaces.surfaces import write_surface

@@ -6,8 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ...anatomy.meshing.layers import LayerSpec
-from ...anatomy.meshing.liner import build_liner_surface
+from ...anatomy.meshing.layers import LayerSpec, build_liner_surface
 from ...anatomy.meshing.meshing import MeshSettings, mesh_limb
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...arrays import Array
