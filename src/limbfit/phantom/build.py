@@ -31,10 +31,20 @@ from ..anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from ..arrays import Array
 from ..errors import InputError
 from ..indentation import Parameters
-from .forces import ForceJob, TrueForce, choose_discretisation, mesh_true_site, simulate_true_force
 from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, build_true_anatomy, make_limb
 from .mri import DETAIL_GRIDS, LABELS_FILE, TENDON_LABEL, build_true_labels, make_grid, write_series
-from .record import SecondaryMeasurements, record, write_surface, write_ultrasound, write_waves
+from .record import (
+    ForceJob,
+    SecondaryMeasurements,
+    TrueForce,
+    choose_discretisation,
+    mesh_true_site,
+    record,
+    simulate_true_force,
+    write_surface,
+    write_ultrasound,
+    write_waves,
+)
 from .sites import (
     DETAIL_SITES,
     INDENTER_EDGE_MM,

@@ -2,17 +2,40 @@
 
 The robot starts clear of the skin, moves at constant speed to its depth, straight back to where it started,
 and records a little longer. Its displacement counts from the start, not from touch-down.
+
+The true forces are those of the implicit anatomy, meshed and stepped otherwise than a calibration does. The
+mesh comes from the exact surfaces, not from the segmented image, and is finer than the study's where the
+indenter presses; the element has twice its quadrature points (FEBio's rule), and like the study's default one
+mean dilatation each: with the pressure as it comes, forces of such meshes are 5 to 20 % too large
+(docs/convergence.md), which a calibration would put into the moduli.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
+from ..anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ..arrays import Array
-from ..errors import SiteError
+from ..errors import RunError
+from ..fe import StepControl, solve
+from ..indentation import (
+    Parameters,
+    SiteModel,
+    build_problem,
+    choose_points_around,
+    cut_neighbourhood,
+    observe_result,
+    place_waves_under,
+    read_indenter,
+)
+from ..mesh import Mesh, find_gauges_along
+from ..study import IndenterTable
+from .sites import INDENTER_EDGE_MM, INDENTER_MM, Ramp, TrueSite
 
 RATE_HZ = 500.0
 AFTER_S = 0.4
@@ -23,6 +46,9 @@ SURFACE_HZ, SURFACE_NOISE_MM = 5.0, 0.05
 WAVES_HZ, WAVES_NOISE_M_S, WAVES_BIAS_M_S = 1.0, 0.1, 0.1
 DISPLACEMENT_NOISE_MM = 0.005
 HEADER = "time_s,displacement_mm,force_N"
+ELEMENT = "tet10g8p0"
+LOAD_STEPS, UNLOAD_STEPS = 12, 16
+STIFFEST_PER_MM, PENALTY_TIMES_TISSUE = 400.0, 3200.0
 
 
 class SecondaryMeasurements(NamedTuple):
@@ -34,30 +60,6 @@ class SecondaryMeasurements(NamedTuple):
 
 
 NOTHING = SecondaryMeasurements()
-
-
-@dataclass(frozen=True)
-class Ramp:
-    """A constant-speed indentation: ``depth`` mm under touch-down at ``speed`` mm/s, and back."""
-
-    depth: float
-    speed: float
-
-    def __post_init__(self) -> None:
-        if not (self.depth > 0 and self.speed > 0):
-            raise SiteError(
-                f"cannot indent {self.depth:g} mm at {self.speed:g} mm/s", remedy="give positive numbers"
-            )
-
-    @property
-    def peak_s(self) -> float:
-        """Seconds from touch-down to the peak."""
-        return self.depth / self.speed
-
-    @property
-    def knots(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-        """Times (s) and displacements (mm) from touch-down: start, peak, back."""
-        return (0.0, self.peak_s, 2 * self.peak_s), (0.0, self.depth, 0.0)
 
 
 @dataclass(frozen=True)
@@ -177,3 +179,134 @@ def write_waves(
 def _write_table(path: Path, columns: Mapping[str, Array]) -> None:
     table = np.column_stack(list(columns.values()))
     np.savetxt(path, table, fmt="%.3f", delimiter=",", header=",".join(columns), comments="")
+
+
+@dataclass(frozen=True)
+class Discretisation:
+    """How true forces are made.
+
+    ``within_mm``: tissue farther than that from the site is left out, and what is cut is free: the bones of a
+    shank hold it. In a thigh forces would be 6 % too small.
+    ``softest_per_mm`` (1/mm): contact is `STIFFEST_PER_MM` stiff over thin tissue, and softer over thick
+    tissue, but no softer than that: the indenter sinks in by less than a hundredth of the depth everywhere.
+    """
+
+    mesh: MeshSettings
+    within_mm: float | None
+    softest_per_mm: float
+
+    def steps(self, tissue_mm: float) -> StepControl:
+        """Steps and contact over so much tissue."""
+        penalty = float(np.clip(PENALTY_TIMES_TISSUE / tissue_mm, self.softest_per_mm, STIFFEST_PER_MM))
+        return StepControl(
+            load_steps=LOAD_STEPS, unload_steps=UNLOAD_STEPS, penalty=penalty, hold_penalty=True
+        )
+
+
+DISCRETISATIONS = {
+    "coarse": Discretisation(
+        MeshSettings(edge_near_mm=3.0, edge_far_mm=28.0, near_radius_mm=14.0, growth=1.0, flatness=1.9),
+        within_mm=100.0,
+        softest_per_mm=100.0,
+    ),
+    "paper": Discretisation(
+        MeshSettings(edge_near_mm=2.8, edge_far_mm=14.0, near_radius_mm=16.0),
+        within_mm=None,
+        softest_per_mm=STIFFEST_PER_MM,
+    ),
+}
+
+
+def choose_discretisation(detail: str, kind: str) -> Discretisation:
+    """Choose how the true forces of a kind of limb are made, for images of a detail."""
+    made = DISCRETISATIONS[detail]
+    return made if kind == "transtibial" else replace(made, within_mm=None)
+
+
+@dataclass(frozen=True)
+class ForceJob:
+    """One indentation to be simulated: its site, mesh, steps, and the tissues' parameters."""
+
+    site: TrueSite
+    mesh: Mesh
+    steps: StepControl
+    parameters: Parameters
+    measurements: SecondaryMeasurements = NOTHING
+
+
+@dataclass(frozen=True)
+class TrueForce:
+    """The simulated force (n,) N at times (n,) s from touch-down, and facts for ``truth.json``.
+
+    ``layers``: of each tissue on the axis its thickness at rest, mm, and its compression (n,) mm, where
+    ultrasound was wanted. ``skin_points`` (k, 3) mm around the indenter and their ``skin_moves`` (k, 3, n),
+    mm, where cameras were. ``speeds`` (n,) m/s of shear waves in each tissue on the axis.
+    """
+
+    times: Array
+    force: Array
+    facts: dict[str, float | int | str]
+    layers: dict[str, tuple[float, Array]] = field(default_factory=dict)
+    skin_points: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    skin_moves: Array = field(default_factory=lambda: np.zeros((0, 3, 0)))
+    speeds: dict[str, Array] = field(default_factory=dict)
+
+
+@lru_cache(maxsize=1)
+def _build_base(folder: Path, settings: MeshSettings) -> tuple[Anatomy, BaseMesh]:
+    """Build what all sites of a phantom share; a worker does so once."""
+    anatomy = load_anatomy(folder)
+    return anatomy, build_base_mesh(anatomy, settings)
+
+
+def mesh_true_site(site: TrueSite, folder: Path, settings: MeshSettings, within_mm: float | None) -> Mesh:
+    """Mesh one site of the anatomy in ``folder``, and keep the tissue that its force depends on."""
+    anatomy, base = _build_base(folder, settings)
+    mesh, _ = mesh_site(anatomy, site.position, site.axis, settings, base)
+    return mesh if within_mm is None else cut_neighbourhood(mesh, site.position, within_mm).mesh
+
+
+def simulate_true_force(job: ForceJob) -> TrueForce:
+    """Solve one site. Raises `RunError` when the simulation does not complete."""
+    site = job.site
+    knots_s, knots_mm = site.ramp.knots
+    model = SiteModel(
+        name=site.name,
+        mesh=Path(),
+        mesh_digest="",
+        position=tuple(site.position.tolist()),
+        axis=tuple(site.axis.tolist()),
+        knots_s=knots_s,
+        knots_mm=knots_mm,
+        indenter=IndenterTable(width_mm=INDENTER_MM, edge_radius_mm=INDENTER_EDGE_MM),
+    )
+    problem = replace(build_problem(model, job.mesh, job.parameters), element=ELEMENT)
+    result = solve(problem, steps=job.steps, store="all" if any(job.measurements) else "peak")
+    if not result.completed:
+        raise RunError(f"the phantom's site {site.name} could not be simulated: {result.reason}")
+    times = np.linspace(0.0, knots_s[-1], 401)
+    facts: dict[str, float | int | str] = {
+        "element": ELEMENT,
+        "nodes": len(job.mesh.points),
+        "cells": len(job.mesh.cells),
+        "steps": int(result.statistics["steps"]),
+        "penalty_per_mm": float(result.statistics["penalty_per_mm"]),
+    }
+    found = TrueForce(times, result.force_at(times), facts)
+    if not any(job.measurements):
+        return found
+    gauges = find_gauges_along(job.mesh, site.position, site.axis) if job.measurements.ultrasound else ()
+    indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
+    around = choose_points_around(job.mesh, indenter) if job.measurements.surface else np.zeros((0, 3))
+    waves = place_waves_under(model, job.mesh) if job.measurements.shear_waves else ()
+    layers = tuple(gauge.region for gauge in gauges)
+    model = replace(model, layers=layers, skin_points=tuple(map(tuple, around)), waves=waves)
+    values, _ = observe_result(result, model, times)
+    of_layers, of_skin, of_waves = np.split(values, [len(layers), len(values) - len(waves)])
+    return replace(
+        found,
+        layers={one.region: (one.thickness_mm, row) for one, row in zip(gauges, of_layers)},
+        skin_points=around,
+        skin_moves=of_skin.reshape(len(around), 3, len(times)),
+        speeds={one.tissue: row for one, row in zip(waves, of_waves)},
+    )

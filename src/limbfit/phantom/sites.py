@@ -15,7 +15,6 @@ from ..errors import SiteError
 from .geometry import Limb
 from .limb_shapes import Shank
 from .mri import SkinMarker
-from .record import Ramp
 
 INDENTER_MM, INDENTER_EDGE_MM = 20.0, 2.0
 SAFE_SHARE = 0.4  # of the thinnest soft tissue under the indenter
@@ -62,6 +61,30 @@ DETAIL_SITES = {
     "coarse": (*FITTED, "13", "17"),
     "paper": tuple(place.name for place in SHANK_PLACES),
 }
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """A constant-speed indentation: ``depth`` mm under touch-down at ``speed`` mm/s, and back."""
+
+    depth: float
+    speed: float
+
+    def __post_init__(self) -> None:
+        if not (self.depth > 0 and self.speed > 0):
+            raise SiteError(
+                f"cannot indent {self.depth:g} mm at {self.speed:g} mm/s", remedy="give positive numbers"
+            )
+
+    @property
+    def peak_s(self) -> float:
+        """Seconds from touch-down to the peak."""
+        return self.depth / self.speed
+
+    @property
+    def knots(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Times (s) and displacements (mm) from touch-down: start, peak, back."""
+        return (0.0, self.peak_s, 2 * self.peak_s), (0.0, self.depth, 0.0)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,13 @@
 """The limb in the image: whether it is one, its outline without supports, bias field and muscle's grey level.
 
+T1 and UTE images are alike, by grey levels relative to muscle. CT has Hounsfield units.
+
 Supports are tables and cushions that touch the limb. Such a slab is thinner than the limb. Opened by a ball
 wider than it, the mask keeps the limb and loses the slab but for the strip under the limb; what is lost and
 reaches far out is slab, and the hull of both its wings closes the strip between them.
 """
+
+from typing import Literal
 
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
@@ -34,6 +38,14 @@ from ..morphology import (
     open_mask,
 )
 
+Contrast = Literal["auto", "T1", "UTE", "CT"]
+
+AIR_HU = -1000.0
+_LIGHTEST_HU = -200.0  # every CT of a limb shows something lighter than fat
+_DENSEST_AIR_HU = -400.0  # no air is denser, where a grey-value window cut it off
+_AIR_WIDTH_HU = 100.0  # half the width of its peak in the histogram
+_AIR_SHARE = 0.03  # of the voxels: fewer are an artefact of resampling
+_TOP_HU = 100.0  # for the outline bone and soft tissue are the same
 _SMOOTH_MM = 0.6
 _TISSUE_SHARE = 0.45  # of the median of the tissue: between the noise of air and muscle
 _CLOSE_MM = 3.5
@@ -53,6 +65,49 @@ _SMALLEST_MM2 = 700.0
 _MAX_ELONGATION = 2.5  # a cross-section is rounder than this; a limb cut lengthwise is not
 _TWO_LIMBS_SHARE = 0.3  # of the slices with a cross-section
 _MIN_SLICES = 8  # slices
+
+
+def is_ct(volume: Volume, expected: Contrast = "auto") -> bool:
+    """True if an image has Hounsfield units, by its DICOM modality or else the peak of air in its histogram.
+
+    Without a modality an expected ``CT`` needs no such peak, only grey values below those of fat. Raises
+    `ImageError` for a constant image, a CT without Hounsfield units, or one that contradicts ``expected``.
+    """
+    low, high = float(volume.array.min()), float(volume.array.max())
+    if high <= low:
+        raise ImageError("the image is constant", remedy="check the series")
+    if volume.modality in ("CT", "MR"):
+        found, evidence = volume.modality == "CT", f"the DICOM modality {volume.modality} does"
+    else:
+        found = _has_air_peak(volume, low) or (expected == "CT" and low < _LIGHTEST_HU)
+        evidence = f"the grey values, {low:.0f} to {high:.0f}, do"
+    if expected != "auto" and found != (expected == "CT"):
+        raise ImageError(
+            f"{evidence} not fit {expected}",
+            remedy='check the series, or give segmentation.contrast = "auto"',
+        )
+    if found and low > _LIGHTEST_HU:
+        raise ImageError(
+            f"the grey values of this CT, {low:.0f} to {high:.0f}, are not Hounsfield units",
+            remedy="export the original series again",
+        )
+    return found
+
+
+def _has_air_peak(volume: Volume, low: float) -> bool:
+    """True if the histogram has a peak at -1000, or at the end of a grey-value window.
+
+    Resampling of MRI by B-splines overshoots to negative values too, but in few voxels, the fewer the lower.
+    """
+    air = max(low, AIR_HU)
+    span = (air - _AIR_WIDTH_HU, air + _AIR_WIDTH_HU)
+    count = int(np.histogram(volume.array, bins=1, range=span)[0][0])
+    return air < _DENSEST_AIR_HU and count > _AIR_SHARE * volume.array.size
+
+
+def rescale_above_air(volume: Volume) -> Volume:
+    """A CT image as an MRI-like one for the outline: air 0, soft tissue about 1000, bone no brighter."""
+    return volume.with_array(np.clip(volume.array, AIR_HU, _TOP_HU) - AIR_HU)
 
 
 def smooth_image(volume: Volume) -> Field:

@@ -1,4 +1,4 @@
-"""Bones in T1- or UTE-like contrast: bright marrow enclosed by dark cortex, both inside the limb.
+"""Bones in T1- or UTE-like contrast, bright marrow enclosed by dark cortex, and in CT.
 
 The *escape level* of a voxel is the brightest that the darkest point of a way out of the limb's slice can
 be. Marrow cannot get out without crossing cortex, so its escape level is dark; subcutaneous fat, fat between
@@ -23,9 +23,25 @@ from scipy.ndimage import label as connected
 from ...arrays import Array, Mask
 from ...errors import ImageError
 from ..grid import Grid
-from ..morphology import Field, compute_depth, dilate_mask, erode_mask, fill_slices, find_box, open_mask
+from ..morphology import (
+    Field,
+    close_mask,
+    compute_depth,
+    dilate_mask,
+    erode_mask,
+    fill_slices,
+    find_box,
+    find_local_maximum,
+    open_mask,
+)
 from ..surfaces.extraction import compute_signed_distance_to
 
+MUSCLE_HU = 50.0
+_DENSE_HU = 200.0  # cancellous bone is denser, muscle and contrast-free vessels are not
+_MAX_BONE_HU = 1200.0  # denser than this counts as this, so that metal does not move outlines
+_RIM_MM = 2.5  # in CT the outline is at half of the densest bone this near
+_CLOSE_MM = 2.0  # gaps in thin cortex
+_SMOOTH_MM = 1.0
 _MARROW_LEVEL = 1.15  # marrow is brighter
 _MAX_ESCAPE_LEVEL = 0.78  # and cannot get out without crossing something darker
 _CORTEX_LEVEL = 0.65  # cortex: half-way between muscle (1) and cortical bone (0.2 to 0.3 with partial volume)
@@ -145,6 +161,35 @@ def _add_cortex(parts: NDArray[np.int32], levels: Field, deep: Mask, spacing: Ar
     bone = open_mask(bone, _TAIL_MM, spacing) | marrow
     bone = binary_propagation(marrow, mask=fill_slices(bone))
     return np.where(bone, parts[tuple(nearest)], 0)
+
+
+def find_dense_bones(hounsfield: Field, limb: Mask, spacing: Array, smallest_mm3: float) -> list[Mask]:
+    """As `find_bones` in CT, by Hounsfield units ``[k, j, i]``; bones that touch are one."""
+    compact = np.minimum(hounsfield, _MAX_BONE_HU)
+    half = (find_local_maximum(compact, _RIM_MM, spacing) + MUSCLE_HU) / 2
+    dense = limb & (compact > _DENSE_HU)
+    sharp = dense & (compact > half)
+    # Cancellous bone is below half of the cortex beside it, which encloses it.
+    parts, _ = connected(sharp | (dense & _fill_bone(sharp, spacing)))
+    voxel = float(np.prod(spacing))
+    found = []
+    for value, box in enumerate(find_objects(parts), start=1):
+        if (parts[box] == value).sum() * voxel < 0.1 * smallest_mm3:
+            continue
+        bone = np.zeros(limb.shape, dtype=bool)
+        bone[box] = _fill_bone(parts[box] == value, spacing)
+        bone &= limb
+        if bone.sum() * voxel >= smallest_mm3:
+            found.append(bone)
+    return sorted(found, key=lambda bone: -int(bone.sum()))
+
+
+def _fill_bone(part: Mask, spacing: Array) -> Mask:
+    """Close a bone over gaps of its cortex, fill it slice by slice and take its spikes off."""
+    padded = np.pad(part, ((0, 0), (1, 1), (1, 1)))  # a bone goes on beyond its ends, not beside them
+    closed = fill_slices(close_mask(padded, _CLOSE_MM, spacing))
+    opened = open_mask(closed, _SMOOTH_MM, spacing) | padded
+    return np.asarray(opened[:, 1:-1, 1:-1])
 
 
 def name_bones(bones: list[Mask], spacing: Array) -> list[str]:

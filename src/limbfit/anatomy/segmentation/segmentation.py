@@ -11,9 +11,17 @@ from ...errors import ImageError
 from ..frame import find_proximal_end
 from ..grid import BONES, DEFAULT_NAMES, FAT, LabelMap, Volume
 from ..morphology import Box, Field, compute_depth, find_box, find_largest_piece
-from .body import estimate_bias_field, estimate_muscle_level, find_limb_axis, find_limb_mask, smooth_image
-from .bones import find_bones, grow_from_seeds, name_bones
-from .ct import Contrast, find_dense_bones, is_ct, rescale_above_air
+from .body import (
+    Contrast,
+    estimate_bias_field,
+    estimate_muscle_level,
+    find_limb_axis,
+    find_limb_mask,
+    is_ct,
+    rescale_above_air,
+    smooth_image,
+)
+from .bones import find_bones, find_dense_bones, grow_from_seeds, name_bones
 from .fat import FAT_HU, find_bright_fat, select_subcutaneous
 
 Seeds = Mapping[str, ArrayLike]

@@ -14,8 +14,7 @@ from ...arrays import Array, Indices, Mask
 from ...errors import ImageError
 from ..grid import Volume
 from ..morphology import Field, dilate_mask, erode_mask, find_box, find_local_maximum
-from ..segmentation.body import find_limb_mask, smooth_image
-from ..segmentation.ct import is_ct
+from ..segmentation.body import find_limb_mask, is_ct, smooth_image
 from ..surfaces.extraction import extract_contour
 from ..surfaces.triangles import Surface
 from .sites import find_bumps, find_cap_faces, find_near_cap
