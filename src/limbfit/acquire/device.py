@@ -167,13 +167,8 @@ class LineDevice:
     """A device that speaks the line protocol (docs/device-protocol.md); times are s of the caller's clock.
 
     A command that the device does not answer is sent again under a new number; one that is replaced by a
-    newer one for the same pin is not.
-
-    Raises
-    ------
-    RunError
-        Where nobody answers, or it is another version, has other pins or another rate than limbfit knows;
-        from each of its methods, where the device is gone.
+    newer one for the same pin is not. Raises `RunError` where nobody answers, or it is another version, has
+    other pins or another rate than limbfit knows; from each of its methods, where the device is gone.
     """
 
     def __init__(self, link: Link) -> None:

@@ -54,12 +54,8 @@ REST_US = 200_000  # of rest on either side of a ramp that belongs to its record
 
 
 class Recorder:
-    """Writes a session's record; rows are given in one thread, and written in another.
-
-    Raises
-    ------
-    RunError
-        From `sample` or `close`, once the file could not be written (a full disk).
+    """Writes a session's record; rows are given in one thread, and written in another. Raises `RunError` from
+    `sample` or `close`, once the file could not be written (a full disk).
     """
 
     def __init__(self, file: Path, head: dict[str, Any]) -> None:
@@ -165,6 +161,9 @@ def read_recording(file: str | Path) -> Recording:
 def follow_recording(file: str | Path, offset: int = 0, *, every: int = 1) -> tuple[Recording, int]:
     """What a record that is being written holds beyond an offset, and the offset to go on from.
 
+    Raises `TraceError` where it is no record, no block ends at the offset, or what follows is damaged, not
+    only unfinished.
+
     Parameters
     ----------
     offset : where a block ends, as an earlier call gave it; 0: from the start.
@@ -173,11 +172,6 @@ def follow_recording(file: str | Path, offset: int = 0, *, every: int = 1) -> tu
     Notes
     -----
     At most `FOLLOWED_BYTES` are read; ``lost_bytes`` are those read that are not a whole block yet.
-
-    Raises
-    ------
-    TraceError
-        Where it is no record, no block ends at the offset, or what follows is damaged, not only unfinished.
     """
     path = Path(file)
     with add_location(file=path):

@@ -31,15 +31,12 @@ _SMALLEST_MM, _LARGEST_MM = 60.0, 3000.0  # of the longest side of an image
 def read_volume(path: str | Path, series_uid: str | None = None) -> Volume:
     """An image with its full geometry.
 
+    Raises `ImageError` with the file, the place and the remedy.
+
     Parameters
     ----------
     path : a DICOM folder, or one file of a format in `images.formats`.
     series_uid : which DICOM series, where the folder holds several.
-
-    Raises
-    ------
-    ImageError
-        With the file, the place and the remedy.
     """
     path = Path(path)
     if path.is_dir():
@@ -81,16 +78,14 @@ def check_image(volume: Volume, path: str | Path) -> None:
 def read_labels(path: str | Path, like: Volume | None = None) -> LabelMap:
     """A label map: ``.seg.nrrd``, DICOM-SEG, RTSTRUCT, or a label image with default or sidecar names.
 
+    Raises `LabelError` also for a map whose voxels are not those of ``like``, and for one without a single
+    labelled voxel.
+
     Parameters
     ----------
     path : the file, or a folder with one DICOM-SEG or RTSTRUCT; a plain image may have its names in
         ``<file>.json``.
     like : the image that it belongs to: the map is brought to its grid, voxel by voxel. Contours need it.
-
-    Raises
-    ------
-    LabelError
-        Also for a map whose voxels are not those of ``like``, and for one without a single labelled voxel.
     """
     path = Path(path)
     try:

@@ -125,6 +125,9 @@ def make_phantom(
 ) -> dict[str, Any]:
     """Make a synthetic patient in ``folder``; nothing is left there unless all of it was made.
 
+    Raises `InputError` for a folder that is not empty, an unknown detail, limb or site, or a tendon of a
+    thigh.
+
     Parameters
     ----------
     folder : must not exist, or be empty.
@@ -146,11 +149,6 @@ def make_phantom(
     -------
     dict
         What ``truth.json`` holds.
-
-    Raises
-    ------
-    InputError
-        For a folder that is not empty, an unknown detail, limb or site, or a tendon of a thigh.
     """
     folder = Path(folder)
     tell = progress or (lambda text, done, total: None)
@@ -183,15 +181,12 @@ def make_phantom(
 def unpack_patient(folder: str | Path) -> dict[str, Any]:
     """Unpack what :func:`make_phantom` makes by default, which comes with limbfit, into ``folder``.
 
+    Raises `InputError` for a folder that is not empty.
+
     Returns
     -------
     dict
         What ``truth.json`` holds.
-
-    Raises
-    ------
-    InputError
-        For a folder that is not empty.
     """
     with (
         _open_hidden_folder(Path(folder)) as work,

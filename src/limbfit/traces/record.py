@@ -85,13 +85,9 @@ def check_finite(values: Array, name: str, remedy: str | None = None) -> None:
 
 
 def check_trace(trace: Trace, *, columns: tuple[str, str, str] = COLUMNS) -> None:
-    """Refuse a record that cannot be an indentation in s, mm and N.
-
-    Raises
-    ------
-    TraceError
-        Too short, not finite, time going back, never in contact, or units that cannot be right: travel
-        outside 0.2-60 mm, speed outside 0.05-50 mm/s, peak force outside 0.05-200 N.
+    """Refuse a record that cannot be an indentation in s, mm and N. Raises `TraceError` for one that
+    is too short, not finite, whose time goes back, never in contact, or of units that cannot be right: travel
+    outside 0.2-60 mm, speed outside 0.05-50 mm/s, peak force outside 0.05-200 N.
     """
     series = (trace.time_s, trace.displacement_mm, trace.force_N)
     for values, name in zip(series, columns, strict=True):
@@ -185,16 +181,13 @@ def _check_range(
 def read_trace(path: str | Path, columns: tuple[str, str, str] = COLUMNS) -> Trace:
     """Read and check a record; its ``notes`` say what was done to read it.
 
+    Raises `TraceError` with the file, the row or column, and the remedy.
+
     Parameters
     ----------
     path : a text table (comma, semicolon or tab; UTF-8 or UTF-16), ``.lvm``, ``.tdms``, ``.xlsx`` or ``.mat``
         (version 5).
     columns : the names of time (s), displacement (mm) and force (N) in it.
-
-    Raises
-    ------
-    TraceError
-        With the file, the row or column, and the remedy.
     """
     with add_location(file=path):
         table = read_table(Path(path), dict(zip(COLUMNS, columns)))
@@ -218,16 +211,13 @@ def read_columns(
 ) -> dict[str, Array]:
     """Columns of a file that `read_trace` could read, by their keys, and all others that are ``select``.
 
+    Raises `TraceError` with the file, the row or column, and the remedy.
+
     Parameters
     ----------
     columns : the name of each column that must be there, by its key; a key ends in its unit, as ``time_s``.
     select : True for the names of others that are read; these are their own keys.
     gaps : an empty cell of a table is nan.
-
-    Raises
-    ------
-    TraceError
-        With the file, the row or column, and the remedy.
     """
     table = read_table(file, columns)
     named = {name: key for key, name in columns.items()}

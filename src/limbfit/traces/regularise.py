@@ -98,18 +98,15 @@ def regularise(
 ) -> Regularised:
     """The record as smooth curves counted from touch-down.
 
+    Raises `TraceError` where fewer than 8 samples lie between touch-down and the peak, or no smoothing can be
+    chosen, or the way in cannot end where it is stated to.
+
     Parameters
     ----------
     smoothing : penalty on the squared second derivative of force, s^3 (``lam`` of
         ``scipy.interpolate.make_smoothing_spline`` on the samples as recorded); by default generalised
         cross-validation chooses it for each phase.
     peak_s : when the (first) way in ends, as someone states it; found where it is not given.
-
-    Raises
-    ------
-    TraceError
-        Where fewer than 8 samples lie between touch-down and the peak, or no smoothing can be chosen, or
-        the way in cannot end where it is stated to.
     """
     line = fit_broken_line(trace.time_s, trace.displacement_mm, peak_s)
     start, end = touch_down.time_s, line.find_return_s(touch_down.displacement_mm)
@@ -292,16 +289,13 @@ def regularise_creep(
 ) -> Creep:
     """A record under a stated force as curves counted from touch-down.
 
+    Raises `TraceError` where the force never rises or is no ramps and holds, or no smoothing can be chosen.
+
     Parameters
     ----------
     smoothing : penalty on the squared second derivative of the displacement, s^3; by default generalised
         cross-validation chooses it for each phase.
     peak_s : when the force has first risen, as someone states it; found where it is not given.
-
-    Raises
-    ------
-    TraceError
-        Where the force never rises or is no ramps and holds, or no smoothing can be chosen.
     """
     since = trace.time_s - touch_down.time_s
     force = trace.force_N - touch_down.baseline_N

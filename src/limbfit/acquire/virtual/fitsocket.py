@@ -66,13 +66,7 @@ class _FaultFile(BaseModel):
 
 
 def read_faults(file: Path) -> tuple[Fault, ...]:
-    """Read a TOML file of ``[[faults]]``.
-
-    Raises
-    ------
-    InputError
-        With the file and the key.
-    """
+    """Read a TOML file of ``[[faults]]``. Raises `InputError` with the file and the key."""
     if not file.is_file():
         raise InputError("no such file", file=file, remedy="give a TOML file with [[faults]]")
     try:

@@ -248,12 +248,8 @@ def write_contours(path: str | Path, labels: LabelMap) -> None:
 
 
 def read_contours(path: str | Path, like: Volume) -> LabelMap:
-    """The label map of a contour file on the grid of the image on which the contours were drawn.
-
-    Raises
-    ------
-    LabelError
-        With the file and the line or the structure.
+    """The label map of a contour file on the grid of the image on which the contours were drawn. Raises
+    `LabelError` with the file and the line or the structure.
     """
     with add_location(file=path):
         return build_labels([*_read_polygons(Path(path)).items()], like)
@@ -279,12 +275,8 @@ def _read_polygons(path: Path) -> dict[str, list[Array]]:
 
 
 def build_labels(structures: Sequence[tuple[str, Sequence[Array]]], like: Grid) -> LabelMap:
-    """Structures, by name and contours (LPS mm), as a label map on the grid of ``like``.
-
-    Raises
-    ------
-    LabelError
-        With the structure that cannot be rasterised, or for two of one name.
+    """Structures, by name and contours (LPS mm), as a label map on the grid of ``like``. Raises `LabelError`
+    with the structure that cannot be rasterised, or for two of one name.
     """
     masks = []
     for name, polygons in structures:
@@ -429,12 +421,8 @@ def _find_slice_spacing(heights: Array, header_mm: tuple[float, ...]) -> float |
 
 
 def read_rtstruct(path: Path, like: Volume | None) -> LabelMap:
-    """The structures with closed contours, by their names, on the grid of the image.
-
-    Raises
-    ------
-    LabelError
-        Without an image, for contours that do not lie on its slices or leave slices out, or a damaged file.
+    """The structures with closed contours, by their names, on the grid of the image. Raises `LabelError`
+    without an image, for contours that do not lie on its slices or leave slices out, or a damaged file.
     """
     if like is None:
         raise LabelError("contours need the image on which they were drawn")

@@ -156,6 +156,9 @@ def build_limb_fields(
 ) -> LimbFields:
     """The fields of an anatomy.
 
+    Raises `SurfaceError` when the skin does not reach the cut plane, or the fat's depth is needed and not
+    given.
+
     Parameters
     ----------
     anatomy : closed skin and bones.
@@ -164,11 +167,6 @@ def build_limb_fields(
     policy : what gives way where bone is shallower, the bone or the layers.
     fat_depth_mm : (n,) depth of the fat's inner face at the vertices of the anatomy's skin, for a layer
         without a thickness of its own.
-
-    Raises
-    ------
-    SurfaceError
-        When the skin does not reach the cut plane, or the fat's depth is needed and not given.
     """
     check_cut(anatomy)
     frame = anatomy.frame

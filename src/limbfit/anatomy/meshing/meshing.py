@@ -119,19 +119,14 @@ class BaseMesh:
 def build_base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Array | None = None) -> BaseMesh:
     """The part of meshing that does not depend on the site.
 
+    Raises `SurfaceError` when the skin does not reach the cut plane, the fat's depth is needed and not given,
+    or a region cannot be meshed; `MeshingError` when nothing is left between layer, bones and cut.
+
     Parameters
     ----------
     anatomy, settings : as for :func:`mesh_site`.
     fat_depth_mm : (n,) depth of the fat's inner face at the vertices of the anatomy's skin, for a layer
         without a thickness of its own (:func:`limbfit.anatomy.surfaces.thickness.fat_depth`).
-
-    Raises
-    ------
-    SurfaceError
-        When the skin does not reach the cut plane, the fat's depth is needed and not given, or a region
-        cannot be meshed.
-    MeshingError
-        When nothing is left between layer, bones and cut.
     """
     fields = build_limb_fields(
         anatomy, settings.layers, settings.bone_clearance_mm, settings.bone_policy, fat_depth_mm
@@ -195,6 +190,9 @@ def mesh_site(
 ) -> tuple[Mesh, MeshMeasures]:
     """A conforming mesh graded about an indentation site.
 
+    Raises `MeshingError` when the mesher fails, or its mesh has inverted elements that cannot be mended:
+    where and why.
+
     Parameters
     ----------
     anatomy : closed skin and bones, LPS mm.
@@ -208,11 +206,6 @@ def mesh_site(
     mesh : regions named as the layers, the anatomy's regions and the core; node sets ``fixed_bone`` (on
         bones) and ``fixed_proximal`` (on the cut plane); face set ``skin`` (outward, without the cut plane).
     measures : its quality and what was trimmed.
-
-    Raises
-    ------
-    MeshingError
-        When the mesher fails, or its mesh has inverted elements that cannot be mended: where and why.
     """
     base = base or build_base_mesh(anatomy, settings)
     frame = base.fields.frame

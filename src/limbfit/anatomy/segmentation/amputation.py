@@ -39,6 +39,9 @@ def amputate_limb(
 ) -> LabelMap:
     """The leg cut at a plane, with a rounded pad of soft tissue over the cut bones.
 
+    Raises `LabelError` for a plane that misses the limb, lies along it, points distally or cuts no bone off,
+    or an image too short for the pad; `SurfaceError` for a normal of no length.
+
     Parameters
     ----------
     labels : an intact leg.
@@ -52,12 +55,6 @@ def amputate_limb(
     LabelMap
         Bones and soft tissue distal of the pad are gone. Slices thicker than 1.5 mm are divided evenly, with
         the shape of each label interpolated, so that the end is round and not a stair.
-
-    Raises
-    ------
-    LabelError
-        For a plane that misses the limb, lies along it, points distally or cuts no bone off, or an image too
-        short for the pad; `SurfaceError` for a normal of no length.
     """
     point, normal = normalise_plane(plane_point, plane_normal)
     if pad_mm <= 0:
@@ -191,17 +188,14 @@ def amputate_anatomy(
 ) -> Anatomy:
     """An anatomy cut at a plane, with a pad over the cut bones; see :func:`amputate_limb`.
 
+    Raises `LabelError` for a plane that misses the limb, lies along it, points distally or cuts no bone off.
+
     Parameters
     ----------
     anatomy : closed surfaces of a whole limb.
     plane_point, plane_normal : LPS mm; the normal points proximally, to what is kept.
     pad_mm : soft tissue distal of the bones.
     edge_mm : edge length of the new triangles.
-
-    Raises
-    ------
-    LabelError
-        For a plane that misses the limb, lies along it, points distally or cuts no bone off.
     """
     voxels = voxelise_anatomy(anatomy, pad_mm + _MARGIN_MM)
     labels = amputate_limb(voxels, plane_point, plane_normal, pad_mm, anatomy.cut_normal)

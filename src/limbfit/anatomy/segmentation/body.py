@@ -243,12 +243,8 @@ def _compute_hulls(wings: Mask) -> Mask:
 
 
 def check_one_limb(volume: Volume) -> None:
-    """Refuse an image whose slices across some axis show two large, roundish sections side by side.
-
-    Raises
-    ------
-    ImageError
-        With the remedy: crop, or give labels.
+    """Refuse an image whose slices across some axis show two large, roundish sections side by side. Raises
+    `ImageError` with the remedy: crop, or give labels.
     """
     tissue, step = _find_tissue(volume)
     for axis in range(3):

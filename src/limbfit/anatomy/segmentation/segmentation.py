@@ -41,6 +41,8 @@ def segment(
 
     In MRI fat and marrow are bright, muscle is grey, cortical bone dark, air black. Bones, cortex and marrow
     together, are named tibia, fibula, femur and patella where size and place allow, else ``bone-1`` and on.
+    Raises `ImageError` where no limb or no bone is found, a seed lies in no bone, or the contrast is not the
+    stated one.
 
     Parameters
     ----------
@@ -54,11 +56,6 @@ def segment(
     -------
     LabelMap
         On the image's grid: 0 outside, 1 soft tissue, 2 to 5 the known bones, 6 subcutaneous fat with skin.
-
-    Raises
-    ------
-    ImageError
-        Where no limb or no bone is found, a seed lies in no bone, or the contrast is not the stated one.
     """
     ct = is_ct(volume, contrast)
     visible = rescale_above_air(volume) if ct else volume

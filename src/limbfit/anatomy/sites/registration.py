@@ -57,16 +57,14 @@ class LimbMotion:
 def register_limb(image: Volume, moved: Volume, limb: Mask) -> LimbMotion:
     """The motion that lays the limb of ``moved`` onto that of ``image``.
 
+    Raises `ImageError` where the images cannot be laid onto each other: other limbs, other contrasts, too
+    large a motion.
+
     Parameters
     ----------
     image, moved : two images of one limb in the same contrast, some centimetres and degrees apart at most; a
         factor between their grey values is found too.
     limb : ``[k, j, i]``, the limb in ``image``.
-
-    Raises
-    ------
-    ImageError
-        Where the images cannot be laid onto each other: other limbs, other contrasts, too large a motion.
     """
     index = _sample(image, limb)
     points = image.index_to_point(index)

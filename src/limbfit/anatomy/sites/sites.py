@@ -67,17 +67,14 @@ def compute_indenter_axis(
 ) -> Array:
     """The unit inward axis (3,): the area-weighted mean inward normal of the skin under a square footprint.
 
+    Raises `SiteError` when no skin lies under the footprint.
+
     Parameters
     ----------
     skin : outward; of a limb its `Anatomy.open_skin`, as the cap at the cut is no skin.
     position : (3,) the footprint's centre, on the skin.
     width : side of the square, mm.
     edge : (3,) an edge direction of the square; the cross product of axis and z (or x) when not given.
-
-    Raises
-    ------
-    SiteError
-        When no skin lies under the footprint.
     """
     centre = np.asarray(position, dtype=float)
     points, normals = _sample_faces(skin, centre, width)
@@ -229,15 +226,11 @@ def match_markers(markers: Sequence[Marker], hints: Mapping[str, Array]) -> dict
     """Give each named place its marker, one to one, with the least total distance.
 
     Markers that no place asks for are left over: a limb may carry more markers than the study has sites.
+    Raises `SiteError` when a place has no marker within reach, or more than one; it names them all.
 
     Parameters
     ----------
     hints : rough position (3,) in LPS mm by site name.
-
-    Raises
-    ------
-    SiteError
-        When a place has no marker within reach, or more than one; it names them all.
     """
     if not hints:
         return {}

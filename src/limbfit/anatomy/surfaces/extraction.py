@@ -31,6 +31,8 @@ _MAX_RELAXATIONS = 20
 def extract_surface(labels: LabelMap, which: str | None, edge_mm: float = 3.0) -> Surface:
     """The closed surface of one label, or of the whole limb.
 
+    Raises `LabelError` where there is nothing to extract.
+
     Parameters
     ----------
     labels : the label map.
@@ -41,11 +43,6 @@ def extract_surface(labels: LabelMap, which: str | None, edge_mm: float = 3.0) -
     -------
     Surface
         LPS mm, outward, watertight, of the mask's volume; only the largest body of the mask.
-
-    Raises
-    ------
-    LabelError
-        Where there is nothing to extract.
     """
     fine = extract_fine_surface(labels, which, edge_mm)
     return untangle_surface(keep_volume(untangle_surface(remesh(fine, edge_mm)), fine.volume))

@@ -111,17 +111,15 @@ def build_closed_anatomy(
 ) -> tuple[Anatomy, tuple[str, ...]]:
     """The checked anatomy of given surfaces, mended, and what was mended, in words.
 
+    Raises `SurfaceError` for a surface that cannot be mended, or an anatomy that :func:`check_anatomy`
+    refuses.
+
     Parameters
     ----------
     skin, bones : LPS mm.
     cut : point and proximal normal of the proximal cut; by default just inside the caps of skin and bones,
         across the skin's; of a skin that is closed its flat end, or its highest (z).
     files : by the surfaces' names, for the text of errors.
-
-    Raises
-    ------
-    SurfaceError
-        For a surface that cannot be mended, or an anatomy that :func:`check_anatomy` refuses.
     """
     files = files or {}
     mended = {}

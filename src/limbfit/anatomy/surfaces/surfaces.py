@@ -93,6 +93,9 @@ def build_anatomy(
 ) -> Anatomy:
     """Smooth closed surfaces of a label map.
 
+    Raises `LabelError` for a map without a limb, a limb that the image's side cuts off, or a bone or region
+    that a cut leaves in several pieces; `SurfaceError` for a cut that misses the limb.
+
     Parameters
     ----------
     labels : the limb and its bones; the limb ends at one border of the image or within it.
@@ -100,14 +103,6 @@ def build_anatomy(
     proximal_cut : point and proximal normal (LPS mm) of the cut; by default 2 mm inside the limb's proximal
         end, across the image axis along which it is longest.
     proximal : (3,) LPS, where proximal is, if there is no such cut: of a short stump its shape does not say.
-
-    Raises
-    ------
-    LabelError
-        For a map without a limb, a limb that the image's side cuts off, or a bone or region that a cut
-        leaves in several pieces.
-    SurfaceError
-        For a cut that misses the limb.
     """
     labels = labels.align_with_lps()
     if proximal_cut is None:

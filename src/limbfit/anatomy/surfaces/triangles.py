@@ -242,18 +242,15 @@ def check_closed(
 ) -> None:
     """Refuse a surface that does not bound a body.
 
+    Raises `SurfaceError` for one that is open, non-manifold, inconsistently or inwardly oriented, in several
+    bodies, of a size that only another unit explains, or crossing itself.
+
     Parameters
     ----------
     surface : LPS mm.
     name : ``skin`` or the bone's; a skin is expected to be as large as a limb.
     file : for the error's text.
     smallest_mm : least diagonal of its box; by default as large as such a body from a file is.
-
-    Raises
-    ------
-    SurfaceError
-        Open, non-manifold, inconsistently or inwardly oriented, several bodies, of a size that only another
-        unit explains, or crossing itself.
     """
     if smallest_mm is None:
         smallest_mm = _SMALLEST_MM.get(name, _SMALLEST_OTHER_MM) if file or name == "skin" else 0.0
@@ -325,18 +322,15 @@ def read_surface(
 ) -> Surface:
     """A surface from .stl, .ply, .vtp or .obj, in LPS mm; coincident points are merged.
 
+    Raises `SurfaceError` for a file that cannot be read, holds no triangles, or says that it is in other
+    coordinates. Closedness and size are for :func:`~limbfit.anatomy.surfaces.triangles.check_closed`.
+
     Parameters
     ----------
     path : the file.
     coordinates : what the file holds; by default what it says itself, as those of 3D Slicer do, else LPS.
     unit : of the file: mm, cm, m or inch.
     key : of the study that says the coordinates, for the error's text.
-
-    Raises
-    ------
-    SurfaceError
-        For a file that cannot be read, holds no triangles, or says that it is in other coordinates.
-        Closedness and size are for :func:`~limbfit.anatomy.surfaces.triangles.check_closed`.
     """
     path = Path(path)
     with add_location(file=path):
