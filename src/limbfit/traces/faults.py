@@ -16,17 +16,10 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.optimize import nnls
 
+from ..arrays import Array, Mask
 from ..phases import MotionPhase
 from .displacement import BrokenLine
-from .numerics import (
-    Array,
-    Mask,
-    SampleNoise,
-    average_in_bins,
-    estimate_noise_level,
-    find_resolution,
-    find_runs,
-)
+from .numerics import SampleNoise, average_in_bins, estimate_noise_level, find_resolution, find_runs
 from .record import Trace, TraceWarning
 from .touchdown import TouchDown, compute_memory, find_depth_at
 

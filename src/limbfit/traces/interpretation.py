@@ -12,18 +12,11 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import median_filter
 
+from ..arrays import Array, Mask
 from ..errors import TraceError
 from . import faults
 from .displacement import BrokenLine, fit_broken_line
-from .numerics import (
-    Array,
-    Mask,
-    average_in_bins,
-    estimate_noise,
-    estimate_noise_level,
-    find_resolution,
-    find_runs,
-)
+from .numerics import average_in_bins, estimate_noise, estimate_noise_level, find_resolution, find_runs
 from .record import Trace, TraceWarning, measure_start_force
 from .touchdown import TouchDown, compute_deviation_before, find_depth_at, find_touch_down, touch_down_at
 

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import median_filter
 
+from ..arrays import Array
 from ..errors import TraceError, add_location
 from .formats import TIME, ColumnTable, Row, is_number, read_table
-from .numerics import Array, average_in_bins, estimate_noise_level
+from .numerics import average_in_bins, estimate_noise_level
 
 COLUMNS = ("time_s", "displacement_mm", "force_N")
 MIN_SAMPLES = 20

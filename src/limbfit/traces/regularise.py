@@ -16,10 +16,11 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 from scipy.linalg import eigh
 from scipy.optimize import minimize_scalar
 
+from ..arrays import Array
 from ..errors import TraceError
 from ..phases import DENSER, MotionPhase, find_boundaries, find_phases, find_way_in, spread
 from .displacement import fit_broken_line
-from .numerics import Array, average_in_bins, build_cubic_interpolation, compute_rms
+from .numerics import average_in_bins, build_cubic_interpolation, compute_rms
 from .record import Trace
 from .touchdown import TouchDown
 

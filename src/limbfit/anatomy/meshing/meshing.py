@@ -26,31 +26,13 @@ from ...errors import MeshingError, ProblemError
 from ...mesh import Mesh, boundary_faces, check, node_jacobians, to_tet10
 from ...results.limb import BoneLoss, MeshMeasures
 from ..surfaces.surfaces import Anatomy
-from . import background
+from . import background, regions, smoothing
 from .background import BONE, LAYER, PLANE, REGION, TetGrid, compute_volumes, project_safely, project_to_level
 from .curving import balance_bone_faces, compute_curved_target, curve_diagonals, curve_mesh
 from .engines import ENGINES, MesherError, VolumeMesh, VolumeTask
 from .extrusion import build_core_mesh, extrude_layers
 from .layers import BonePolicy, LayerSpec, LimbFields, build_limb_fields, evaluate_distance
 from .meshreport import GOOD_DIHEDRAL_DEG, compute_enclosed_volume, measure_mesh
-from .regions import (
-    build_region_level,
-    check_regions,
-    compute_region_volumes,
-    cut_at_regions,
-    find_interfaces,
-    measure_thickness,
-    mesh_numbers,
-    refine_at_regions,
-)
-from .smoothing import (
-    describe_narrowest_gap,
-    describe_unrepaired,
-    find_inverted_cells,
-    repair_mesh,
-    smooth_elements,
-    untangle_cells,
-)
 
 SURFACES = (PLANE, LAYER, BONE)
 HAUSDORFF_RADIUS_MM = 250.0  # MMG takes edges of sqrt(9/2 hausdorff R) on a surface of radius R
@@ -134,19 +116,19 @@ def build_base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Arra
     spacing = settings.base_spacing_mm
     low = fields.skin.points.min(axis=0) - spacing
     high = fields.skin.points.max(axis=0) + spacing
-    check_regions(fields, settings.edge_near_mm)
+    regions.check_regions(fields, settings.edge_near_mm)
     grid = background.build_box_grid(low, np.array([*high[:2], 0.0]), spacing)
-    grid = refine_at_bones(refine_at_regions(grid, fields), fields)
+    grid = refine_at_bones(regions.refine_at_regions(grid, fields), fields)
     for level, bit in ((fields.layer, LAYER), (fields.void, BONE)):
         grid, positive = background.cut(grid, level, bit, fields.floor_range_mm)
         grid = grid.select(positive)
         if not len(grid.tets):
             raise MeshingError(f"no {settings.core} is left under the layers; choose thinner layers")
-    grid = cut_at_regions(grid, fields)
+    grid = regions.cut_at_regions(grid, fields)
     trimmed = fields.measure_trimmed_bones()
     limit = compute_size_limit(fields, grid, settings)
     enclosed = compute_enclosed_volume(anatomy, fields, trimmed)
-    return BaseMesh(fields, grid, limit, trimmed, enclosed, compute_region_volumes(fields))
+    return BaseMesh(fields, grid, limit, trimmed, enclosed, regions.compute_region_volumes(fields))
 
 
 def refine_at_bones(grid: TetGrid, fields: LimbFields) -> TetGrid:
@@ -240,14 +222,14 @@ def _mesh_base(
     try:
         core = ENGINES[settings.engine](task, settings.time_limit_s)
     except MesherError as error:  # as a rule where its input is flattest
-        where = describe_narrowest_gap(task.points, task.tets, fields)
+        where = smoothing.describe_narrowest_gap(task.points, task.tets, fields)
         raise MeshingError(f"{error}; its input is flattest {where}") from None
     core = _snap_nodes(core, fields)
     names = (*(layer.name for layer in settings.layers), *fields.regions, settings.core)
     mesh, stack = extrude_layers(core, fields, names)
-    mesh = smooth_elements(mesh, fields, stack)
-    mesh, repairs = repair_mesh(mesh, fields, stack)
-    if settings.element == "tet10" and not find_inverted_cells(mesh).any():
+    mesh = smoothing.smooth_elements(mesh, fields, stack)
+    mesh, repairs = smoothing.repair_mesh(mesh, fields, stack)
+    if settings.element == "tet10" and not smoothing.find_inverted_cells(mesh).any():
         mesh = to_tet10(mesh)
         if settings.curved:
             straight = node_jacobians(mesh).min(axis=1)
@@ -271,10 +253,9 @@ def _mesh_base(
 
 
 def _check_usable(mesh: Mesh, fields: LimbFields) -> None:
-    if find_inverted_cells(mesh).any():
-        raise MeshingError(
-            f"{describe_unrepaired(mesh, fields)}; smooth the surface there, or choose smaller edges"
-        )
+    if smoothing.find_inverted_cells(mesh).any():
+        where = smoothing.describe_unrepaired(mesh, fields)
+        raise MeshingError(f"{where}; smooth the surface there, or choose smaller edges")
     try:
         check(mesh)
     except ProblemError as error:
@@ -318,8 +299,8 @@ def compute_size_limit(fields: LimbFields, grid: TetGrid, settings: MeshSettings
     thinnest = np.diff(depths, axis=0, prepend=0.0).min(axis=0)
     limit = np.minimum(LAYER_RATIO * settings.flatness * thinnest + under_layers, over_bone)
     for number in range(len(fields.regions)):
-        away = evaluate(build_region_level(fields, number))
-        edge = max(REGION_RATIO * measure_thickness(fields, number), settings.edge_near_mm)
+        away = evaluate(regions.build_region_level(fields, number))
+        edge = max(REGION_RATIO * regions.measure_thickness(fields, number), settings.edge_near_mm)
         limit = np.minimum(limit, edge + np.maximum(away, 0.0))
     return limit
 
@@ -329,8 +310,8 @@ def _build_task(grid: TetGrid, size: Array, settings: MeshSettings) -> VolumeTas
     common = np.bitwise_and.reduce(grid.mask[triangles], axis=1)
     surfaces = np.select([common & bit > 0 for bit in SURFACES], SURFACES, BONE)
     count = int(grid.regions.max())
-    numbers = mesh_numbers(grid.regions, 0, count)
-    inner = find_interfaces(
+    numbers = regions.mesh_numbers(grid.regions, 0, count)
+    inner = regions.find_interfaces(
         Mesh(grid.points, grid.tets, "tet4", numbers, tuple(map(str, range(count + 1)))), 0
     )
     refs = [np.full(len(faces), REGION << number) for number, faces in enumerate(inner)]
@@ -352,7 +333,8 @@ def _snap_nodes(core: VolumeMesh, fields: LimbFields) -> VolumeMesh:
     target[in_plane, 2] = 0.0
     free = np.where(in_plane, 0.0, 1.0)
     regions = [
-        (REGION << number, build_region_level(fields, number)) for number in range(len(fields.regions))
+        (REGION << number, regions.build_region_level(fields, number))
+        for number in range(len(fields.regions))
     ]
     for surface, level in (*regions, (BONE, fields.void), (LAYER, fields.layer)):
         nodes = np.flatnonzero(_find_nodes_on(core, surface))
@@ -375,7 +357,7 @@ def _recover_interface(points: Array, target: Array, core: VolumeMesh, fields: L
     inner[core.triangles] = False
     moved = points.copy()
     moved[stray] = target[stray]
-    moved = untangle_cells(moved, core.tets, np.zeros_like(moved), inner)
+    moved = smoothing.untangle_cells(moved, core.tets, np.zeros_like(moved), inner)
     return moved if (compute_volumes(moved, core.tets) > 0.0).all() else points
 
 

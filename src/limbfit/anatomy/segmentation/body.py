@@ -11,32 +11,16 @@ from typing import Literal
 
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
-from scipy.ndimage import (
-    binary_closing,
-    binary_fill_holes,
-    binary_opening,
-    distance_transform_edt,
-    find_objects,
-    gaussian_filter,
-)
-from scipy.ndimage import label as connected
+from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from ...arrays import Array, Mask
 from ...errors import ImageError
+from .. import morphology
 from ..frame import find_longest_axis
 from ..grid import Grid, Volume, resample_cubic
 from ..labels.labelfiles import fill_even_odd
-from ..morphology import (
-    Field,
-    close_mask,
-    erode_mask,
-    fill_slices,
-    find_box,
-    find_largest_piece,
-    find_local_maximum,
-    open_mask,
-)
+from ..morphology import Field, find_box, find_largest_piece
 
 Contrast = Literal["auto", "T1", "UTE", "CT"]
 
@@ -113,7 +97,7 @@ def rescale_above_air(volume: Volume) -> Volume:
 def smooth_image(volume: Volume) -> Field:
     """The image without its finest noise: a Gaussian of 0.6 mm, at most 0.6 voxels."""
     sigma = np.minimum(_SMOOTH_MM / volume.spacing[::-1], 0.6)
-    return gaussian_filter(volume.array, sigma)
+    return ndimage.gaussian_filter(volume.array, sigma)
 
 
 def find_limb_axis(volume: Volume) -> int:
@@ -144,8 +128,8 @@ def _find_outline(body: Mask, smooth: Field, darkest: float, volume: Volume) -> 
     rough = find_largest_piece(remove_supports(_fill_limb(body, volume), volume))
     if rough.sum() * volume.voxel_mm3 < _SMALLEST_LIMB_MM3:
         raise ImageError("no limb was found in the image", remedy="check the series and its contrast")
-    half = 0.5 * find_local_maximum(smooth, _RIM_MM, volume.spacing)
-    core = erode_mask(rough, _RIM_MM, volume.spacing)
+    half = 0.5 * morphology.find_local_maximum(smooth, _RIM_MM, volume.spacing)
+    core = morphology.erode_mask(rough, _RIM_MM, volume.spacing)
     return find_largest_piece(_fill_limb(core | (rough & (smooth > np.maximum(half, darkest))), volume))
 
 
@@ -158,8 +142,8 @@ def _compute_otsu_threshold(array: Field) -> float:
 
 def _fill_limb(mask: Mask, volume: Volume) -> Mask:
     """Close a mask over dark skin and bone, fill it slice by slice and take its spikes off."""
-    filled = fill_slices(close_mask(mask, _CLOSE_MM, volume.spacing))
-    return fill_slices(open_mask(filled, _OPEN_MM, volume.spacing))
+    filled = morphology.fill_slices(morphology.close_mask(mask, _CLOSE_MM, volume.spacing))
+    return morphology.fill_slices(morphology.open_mask(filled, _OPEN_MM, volume.spacing))
 
 
 def estimate_bias_field(volume: Volume, limb: Mask) -> Field:
@@ -195,7 +179,7 @@ def remove_supports(mask: Mask, grid: Grid) -> Mask:
     wings = _find_wings(coarse & ~body, body, sampling)
     if not wings.any():
         return mask
-    strip = _compute_hulls(wings) & (distance_transform_edt(body, sampling=sampling) < _STRIP_MM)
+    strip = _compute_hulls(wings) & (ndimage.distance_transform_edt(body, sampling=sampling) < _STRIP_MM)
     support = wings | strip
     for axis, step in enumerate(steps):
         support = np.repeat(support, step, axis=axis)
@@ -207,18 +191,18 @@ def _open_limb(mask: Mask, sampling: Array) -> Mask:
     reach = np.ceil(2 * BALL_MM / sampling).astype(int) + 1
     padded = np.pad(mask, [(reach[0], reach[0]), (0, 0), (0, 0)], mode="edge")
     padded = np.pad(padded, [(0, 0), (reach[1], reach[1]), (reach[2], reach[2])])
-    inner = distance_transform_edt(padded, sampling=sampling) > BALL_MM
-    opened = distance_transform_edt(~inner, sampling=sampling) <= BALL_MM
+    inner = ndimage.distance_transform_edt(padded, sampling=sampling) > BALL_MM
+    opened = ndimage.distance_transform_edt(~inner, sampling=sampling) <= BALL_MM
     return np.asarray(opened[tuple(slice(r, -r) for r in reach)]) & mask
 
 
 def _find_wings(residue: Mask, body: Mask, sampling: Array) -> Mask:
     """Pieces of the residue that stick far out of the body along much of it."""
-    away = distance_transform_edt(~body, sampling=sampling)
+    away = ndimage.distance_transform_edt(~body, sampling=sampling)
     length = np.ptp(np.flatnonzero(body.any(axis=(1, 2)))) + 1 if body.any() else 1
-    parts, _ = connected(residue, np.ones((3, 3, 3)))
+    parts, _ = ndimage.label(residue, np.ones((3, 3, 3)))
     wings = np.zeros(residue.shape, dtype=bool)
-    for value, box in enumerate(find_objects(parts), start=1):
+    for value, box in enumerate(ndimage.find_objects(parts), start=1):
         piece = parts[box] == value
         far = piece & (away[box] > _REACH_MM)
         beside = far.any(axis=(1, 2)) & body[box[0]].any(axis=(1, 2))  # else it is a thin end of the limb
@@ -262,18 +246,18 @@ def _find_tissue(volume: Volume) -> tuple[Mask, float]:
     image = sitk.SmoothingRecursiveGaussian(volume.to_sitk(), step / 2)
     coarse = resample_cubic(image, volume, step, sitk.sitkLinear, 0.0)
     tissue = sitk.GetArrayFromImage(sitk.OtsuThreshold(coarse, 0, 1)).astype(bool)
-    padded = binary_closing(np.pad(tissue, 2), np.ones((3, 3, 3)))
+    padded = ndimage.binary_closing(np.pad(tissue, 2), np.ones((3, 3, 3)))
     return padded[2:-2, 2:-2, 2:-2] | tissue, step
 
 
 def _count_sections(plane: Mask, step: float) -> int:
     """Count the large, roundish sections in a slice."""
-    solid = binary_opening(np.pad(binary_fill_holes(plane), 1, mode="edge"), np.ones((3, 3)))
-    parts, count = connected(solid)
+    solid = ndimage.binary_opening(np.pad(ndimage.binary_fill_holes(plane), 1, mode="edge"), np.ones((3, 3)))
+    parts, count = ndimage.label(solid)
     if count == 0:
         return 0
     areas = np.bincount(parts.ravel())[1:]
     large = (areas > _MIN_SECTION_SHARE * areas.max()) & (areas * step**2 > _SMALLEST_MM2)
-    extents = [[part.stop - part.start for part in box] for box in find_objects(parts)]
+    extents = [[part.stop - part.start for part in box] for box in ndimage.find_objects(parts)]
     round_ = np.array([max(sides) <= _MAX_ELONGATION * min(sides) for sides in extents])
     return int((large & round_).sum())
