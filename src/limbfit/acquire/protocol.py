@@ -127,12 +127,7 @@ class Protocol:
         return self.phase is Phase.DONE
 
     def handle(self, event: Event, now: float) -> tuple[Action, ...]:
-        """Return the actions that an event leads to.
-
-        Parameters
-        ----------
-        now : s, never less than in the call before.
-        """
+        """Return the actions that an event leads to; ``now``: s, never less than in the call before."""
         if isinstance(event, Sample):
             self._last_sample_s = now
             return self._handle_sample(event, now)

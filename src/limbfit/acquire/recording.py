@@ -161,17 +161,14 @@ def read_recording(file: str | Path) -> Recording:
 def follow_recording(file: str | Path, offset: int = 0, *, every: int = 1) -> tuple[Recording, int]:
     """What a record that is being written holds beyond an offset, and the offset to go on from.
 
-    Raises `TraceError` where it is no record, no block ends at the offset, or what follows is damaged, not
-    only unfinished.
+    At most `FOLLOWED_BYTES` are read; ``lost_bytes`` are those read that are not a whole block yet. Raises
+    `TraceError` where it is no record, no block ends at the offset, or what follows is damaged, not only
+    unfinished.
 
     Parameters
     ----------
     offset : where a block ends, as an earlier call gave it; 0: from the start.
     every : only each so many-th sample (a divisor of `ROWS_PER_BLOCK`: then they stay even over the calls).
-
-    Notes
-    -----
-    At most `FOLLOWED_BYTES` are read; ``lost_bytes`` are those read that are not a whole block yet.
     """
     path = Path(file)
     with add_location(file=path):

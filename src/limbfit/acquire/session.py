@@ -264,14 +264,8 @@ def prioritise() -> str:
 def run_session(session: Session, operator: SimpleQueue[Event]) -> Protocol:
     """Run a session to its end in this thread; returns its protocol, which says how it ended.
 
-    Parameters
-    ----------
-    operator : events of the operator, put there by any thread.
-
-    Notes
-    -----
-    Other threads may hold the interpreter for the switch interval, so that is set to 0.2 ms meanwhile; the
-    collector of garbage is off.
+    ``operator``: events of the operator, put there by any thread. Other threads may hold the interpreter for
+    the switch interval, so that is set to 0.2 ms meanwhile; the collector of garbage is off.
     """
     interval = sys.getswitchinterval()
     sys.setswitchinterval(0.0002)

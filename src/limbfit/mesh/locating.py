@@ -113,12 +113,9 @@ def find_gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[LayerGaug
 
     It ends where the line first leaves the mesh: at bone, which is hollow, or at the other side. Of a region
     that is met twice, as skin is where the line passes no bone, the first part counts. Curved faces are met
-    as the flat triangles of their corners, and quadrilaterals as two. Raises `ProblemError` where the line
-    does not enter the mesh.
-
-    Parameters
-    ----------
-    origin, axis : (3,) a point in mm, and the direction in which regions are met.
+    as the flat triangles of their corners, and quadrilaterals as two. The line is given by a point (3,) in
+    mm, and the direction (3,) in which regions are met. Raises `ProblemError` where it does not enter the
+    mesh.
     """
     axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     crossings = _find_crossings(mesh, np.asarray(origin, dtype=float), axis)

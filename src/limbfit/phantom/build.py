@@ -125,8 +125,8 @@ def make_phantom(
 ) -> dict[str, Any]:
     """Make a synthetic patient in ``folder``; nothing is left there unless all of it was made.
 
-    Raises `InputError` for a folder that is not empty, an unknown detail, limb or site, or a tendon of a
-    thigh.
+    Returns what ``truth.json`` holds. Raises `InputError` for a folder that is not empty, an unknown detail,
+    limb or site, or a tendon of a thigh.
 
     Parameters
     ----------
@@ -144,11 +144,6 @@ def make_phantom(
     mapping : like ``map``; given one that works in several processes, sites are meshed and simulated side by
         side.
     progress : called with what is being done, how much of it is done, and of how much.
-
-    Returns
-    -------
-    dict
-        What ``truth.json`` holds.
     """
     folder = Path(folder)
     tell = progress or (lambda text, done, total: None)
@@ -181,12 +176,7 @@ def make_phantom(
 def unpack_patient(folder: str | Path) -> dict[str, Any]:
     """Unpack what :func:`make_phantom` makes by default, which comes with limbfit, into ``folder``.
 
-    Raises `InputError` for a folder that is not empty.
-
-    Returns
-    -------
-    dict
-        What ``truth.json`` holds.
+    Returns what ``truth.json`` holds. Raises `InputError` for a folder that is not empty.
     """
     with (
         _open_hidden_folder(Path(folder)) as work,

@@ -155,10 +155,7 @@ def compute_gradient(field, points: Floats, step: float = 0.05) -> Array:  # typ
 def build_true_anatomy(limb: Limb, spacing: float = 2.4) -> Anatomy:
     """Build skin, bones and tendon of a limb (LPS mm); the flat proximal cut closes the skin.
 
-    Parameters
-    ----------
-    limb : the residuum.
-    spacing : of the grid on which the skin is contoured, mm (bones: two thirds of it, the tendon: half).
+    The skin is contoured on a grid of a ``spacing``, mm (bones: two thirds of it, the tendon: half).
     """
     shape = limb.shape
     low, high = (-80.0, -85.0, -4.0), (80.0, 85.0, PROXIMAL_CUT_MM)

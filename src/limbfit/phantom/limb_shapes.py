@@ -23,10 +23,8 @@ TENDON_MM = 24.0, 6.0  # width and thickness of the patellar tendon
 class LimbShape(ABC):
     """The sizes of a kind of limb, mm and radians.
 
-    Attributes
-    ----------
-    dome : height of the rounding of the distal end.
-    cortex_mm : thickness of the cortex of each bone.
+    ``dome`` is the height of the rounding of the distal end, ``cortex_mm`` the thickness of each bone's
+    cortex.
     """
 
     cortex_mm: ClassVar[Mapping[str, float]]

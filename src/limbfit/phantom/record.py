@@ -116,9 +116,7 @@ def write_ultrasound(
 ) -> None:
     """Write what ultrasound through the indenter saw of a record: thickness of tissues, mm, at 20 Hz.
 
-    Parameters
-    ----------
-    layers : by tissue its thickness at rest, mm, and its compression, mm, at times (n,) from touch-down.
+    ``layers``: by tissue its thickness at rest, mm, and its compression, mm, at times (n,) from touch-down.
     """
     time = np.arange(0.0, made.time[-1], 1 / ULTRASOUND_HZ)
     since = time - made.touch_s
@@ -138,10 +136,8 @@ def write_surface(
 ) -> None:
     """Write what cameras saw of the skin around the indenter: positions at rest and displacements, at 5 Hz.
 
-    Parameters
-    ----------
-    points : (k, 3) mm at rest.
-    moves : of all points (k, 3, n), mm, at times (n,) from touch-down.
+    ``points`` (k, 3) mm are at rest; ``moves`` are of all points (k, 3, n), mm, at times (n,) from
+    touch-down.
     """
     time = np.arange(0.0, made.time[-1], 1 / SURFACE_HZ)
     since = time - made.touch_s
@@ -161,11 +157,8 @@ def write_waves(
 ) -> None:
     """Write what elastography through the indenter read of a record: speeds of shear waves, m/s, at 1 Hz.
 
-    All of a tissue's readings are off together, and each by itself.
-
-    Parameters
-    ----------
-    speeds : by tissue the speed, m/s, at times (n,) from touch-down.
+    All of a tissue's readings are off together, and each by itself. ``speeds``: by tissue the speed, m/s, at
+    times (n,) from touch-down.
     """
     time = np.arange(0.0, made.time[-1], 1 / WAVES_HZ)
     since = np.maximum(time - made.touch_s, 0.0)

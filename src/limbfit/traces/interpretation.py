@@ -61,12 +61,9 @@ def interpret_record(
 ) -> InterpretedRecord:
     """Mend a record and find its touch-down, unless ``touch_down_s`` states it.
 
-    Raises `TraceError` where it begins in contact, where more than 1 % of its samples stick out, where its
-    force drifts by more than 30 % of the peak, or as `find_touch_down` and `touch_down_at` do.
-
-    Parameters
-    ----------
-    forced : a force was stated to the machine, not a displacement.
+    ``forced``: a force was stated to the machine, not a displacement. Raises `TraceError` where it begins in
+    contact, where more than 1 % of its samples stick out, where its force drifts by more than 30 % of the
+    peak, or as `find_touch_down` and `touch_down_at` do.
     """
     trace, doubled = faults.mend_times(trace)
     trace, spikes = _remove_spikes(trace)

@@ -288,15 +288,10 @@ class Creep(Regularised):
 def regularise_creep(
     trace: Trace, touch_down: TouchDown, smoothing: float | None = None, peak_s: float | None = None
 ) -> Creep:
-    """A record under a stated force as curves counted from touch-down.
+    """A record under a stated force as curves counted from touch-down, as `regularise` with both exchanged.
 
-    Raises `TraceError` where the force never rises or is no ramps and holds, or no smoothing can be chosen.
-
-    Parameters
-    ----------
-    smoothing : penalty on the squared second derivative of the displacement, s^3; by default generalised
-        cross-validation chooses it for each phase.
-    peak_s : when the force has first risen, as someone states it; found where it is not given.
+    ``peak_s``: when the force has first risen, as someone states it; found where it is not given. Raises
+    `TraceError` where the force never rises or is no ramps and holds, or no smoothing can be chosen.
     """
     since = trace.time_s - touch_down.time_s
     force = trace.force_N - touch_down.baseline_N

@@ -115,13 +115,8 @@ class Surrogate:
 
 
 def fit_surrogate(time_s: Array, displacement_mm: Array, force_N: Array) -> Surrogate:
-    """Fit a surrogate to a simulated indentation, in and out.
-
-    Raises `TraceError` where the curve has no force or no depth.
-
-    Parameters
-    ----------
-    time_s, displacement_mm, force_N : (n,) from touch-down.
+    """Fit a surrogate to a simulated indentation, in and out, (n,) from touch-down. Raises `TraceError` where
+    the curve has no force or no depth.
     """
     depth, peak = float(displacement_mm.max(initial=0.0)), float(force_N.max(initial=0.0))
     if not (len(time_s) > 10 and depth > 0.1 and peak > 0.01 and np.all(np.diff(time_s) > 0)):

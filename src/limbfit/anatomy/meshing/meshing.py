@@ -108,7 +108,7 @@ def build_base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Arra
     ----------
     anatomy, settings : as for :func:`mesh_site`.
     fat_depth_mm : (n,) depth of the fat's inner face at the vertices of the anatomy's skin, for a layer
-        without a thickness of its own (:func:`limbfit.anatomy.surfaces.thickness.fat_depth`).
+        without a thickness of its own (:func:`limbfit.anatomy.surfaces.thickness.measure_fat_depth`).
     """
     fields = build_limb_fields(
         anatomy, settings.layers, settings.bone_clearance_mm, settings.bone_policy, fat_depth_mm

@@ -159,10 +159,8 @@ def _find_best_place(
 def compute_worst_angles(tips: Array, bases: Array) -> Array:
     """Smallest dihedral angle (s, k) of tetrahedra between a tip and a base, degrees; -1 where inverted.
 
-    Parameters
-    ----------
-    tips : (k, 3), each with every base, or (s, 1, 3), one of each base.
-    bases : (s, 3, 3), counter-clockwise seen from the tip's far side.
+    ``tips`` are (k, 3), each with every base, or (s, 1, 3), one of each base; ``bases`` (s, 3, 3) are
+    counter-clockwise seen from the tip's far side.
     """
     edges = np.moveaxis(bases[:, None] - tips[..., None, :], (2, 3), (1, 0))  # axis, corner, then (s, k)
     after, last = edges[:, [1, 2, 0]], edges[:, [2, 0, 1]]

@@ -250,12 +250,8 @@ def grow_from_seeds(
 ) -> tuple[list[Mask], list[str]]:
     """One bone for each name: the pieces that hold its seeds; a piece with seeds of several names is divided.
 
-    Raises `ImageError` for a seed in no bone.
-
-    Parameters
-    ----------
-    bones : masks ``[k, j, i]`` on the grid.
-    seeds : (n, 3) points in LPS mm for each name.
+    ``bones`` are masks ``[k, j, i]`` on the grid, ``seeds`` (n, 3) points in LPS mm for each name. Raises
+    `ImageError` for a seed in no bone.
     """
     names = list(seeds)
     found = [np.zeros(grid.array.shape, dtype=bool) for _ in names]

@@ -41,8 +41,9 @@ def segment(
 
     In MRI fat and marrow are bright, muscle is grey, cortical bone dark, air black. Bones, cortex and marrow
     together, are named tibia, fibula, femur and patella where size and place allow, else ``bone-1`` and on.
-    Raises `ImageError` where no limb or no bone is found, a seed lies in no bone, or the contrast is not the
-    stated one.
+    The map is on the image's grid: 0 outside, 1 soft tissue, 2 to 5 the known bones, 6 subcutaneous fat with
+    skin. Raises `ImageError` where no limb or no bone is found, a seed lies in no bone, or the contrast is
+    not the stated one.
 
     Parameters
     ----------
@@ -51,11 +52,6 @@ def segment(
     min_bone_volume_mm3 : smaller bones are left as soft tissue.
     contrast : ``auto`` tells CT from MRI by the grey values.
     seeds : (n, 3) points in LPS mm for the name of each bone; then these bones are labelled and no others.
-
-    Returns
-    -------
-    LabelMap
-        On the image's grid: 0 outside, 1 soft tissue, 2 to 5 the known bones, 6 subcutaneous fat with skin.
     """
     ct = is_ct(volume, contrast)
     visible = rescale_above_air(volume) if ct else volume

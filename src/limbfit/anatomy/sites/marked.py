@@ -61,10 +61,7 @@ def _extract_outline(smooth: Field, limb: Mask, spacing: Array) -> Surface:
 def remove_markers(volume: Volume, skin: Surface) -> tuple[Volume, int]:
     """The image with the markers on its skin turned into air, and how many there were.
 
-    Parameters
-    ----------
-    volume : an image with markers on.
-    skin : its outline (:func:`extract_marked_skin`).
+    ``skin`` is the outline of the image with markers on (:func:`extract_marked_skin`).
     """
     found = find_bumps(skin, outline_height(skin))
     marked = np.zeros(len(skin.points), bool)

@@ -182,17 +182,10 @@ class Bump:
 
 
 def find_markers(skin_with: Surface, skin_without: Surface) -> tuple[Marker, ...]:
-    """Markers on a limb, from the distance between its surfaces with and without them.
+    """Markers on a limb, highest first, from the distance between its surfaces with and without them.
 
-    Parameters
-    ----------
-    skin_with, skin_without : closed outward surfaces of the limb in one place (``registration`` lays the
-        images of two scans onto each other).
-
-    Returns
-    -------
-    tuple[Marker, ...]
-        Highest first; empty where nothing stands out.
+    These are closed, outward and in one place (``registration`` lays the images of two scans onto each
+    other).
     """
     height = skin_without.signed_distance(skin_with.points)
     cap = find_cap_faces(skin_without)
@@ -226,11 +219,8 @@ def match_markers(markers: Sequence[Marker], hints: Mapping[str, Array]) -> dict
     """Give each named place its marker, one to one, with the least total distance.
 
     Markers that no place asks for are left over: a limb may carry more markers than the study has sites.
-    Raises `SiteError` when a place has no marker within reach, or more than one; it names them all.
-
-    Parameters
-    ----------
-    hints : rough position (3,) in LPS mm by site name.
+    ``hints`` are rough positions (3,) in LPS mm by site name. Raises `SiteError` when a place has no marker
+    within reach, or more than one; it names them all.
     """
     if not hints:
         return {}
