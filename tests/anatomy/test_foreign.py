@@ -71,7 +71,7 @@ def spoiled(monkeypatch, core):
 
         monkeypatch.setitem(ENGINES, "mmg", lambda *task: core)
         monkeypatch.setattr(meshing, "extrude_layers", layers)
-        monkeypatch.setattr(meshing, "smooth_elements", lambda mesh, fields, stack: mesh)
+        monkeypatch.setattr(smoothing, "smooth_elements", lambda mesh, fields, stack: mesh)
 
     return apply
 
@@ -151,7 +151,7 @@ def test_a_sound_mesh_is_left_alone_and_thinner_layers_alone_make_crossed_column
         return after, repairs
 
     monkeypatch.setitem(ENGINES, "mmg", lambda *task: core)
-    monkeypatch.setattr(meshing, "repair_mesh", watched)
+    monkeypatch.setattr(smoothing, "repair_mesh", watched)
     _, report = mesh_site(anatomy, *site, COARSE, base)
     ((mesh, after, stack),) = given
     assert report.repairs == ()
