@@ -37,7 +37,7 @@ from limbfit.acquire import (
     read_recording,
     run_session,
 )
-from limbfit.acquire.events import PINS, Abort, Event, Flags, Sample, Stop
+from limbfit.acquire.events import PINS, Abort, Event, Flags, Sample
 from limbfit.acquire.line_protocol import (
     HOST_LINE,
     Accepted,
@@ -48,6 +48,7 @@ from limbfit.acquire.line_protocol import (
     Hello,
     Identity,
     SetLimits,
+    Stop,
     derive_salt,
     format_sample,
     parse_command,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_phantoms import cubic_law
 
-from limbfit.anatomy.frame import build_limb_frame
+from limbfit.anatomy.grid import build_limb_frame
 from limbfit.anatomy.surfaces.surfaces import load_anatomy, write_surface
 from limbfit.phantom import make_limb, make_phantom
 from limbfit.phantom.geometry import build_outer_surface, build_true_anatomy

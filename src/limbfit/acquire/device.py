@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 from ..errors import InputError, RunError
 from . import line_protocol as wire
-from .events import PINS, RATE_HZ, Hold, Move, Stop
+from .events import PINS, RATE_HZ
 
 DEFAULT_PORT = 7714
 DEFAULT_ADDRESS = f"tcp://127.0.0.1:{DEFAULT_PORT}"
@@ -217,11 +217,11 @@ class LineDevice:
     def send(self, command: wire.Command, now: float) -> None:
         """Give a command; one that needs an answer is remembered until it comes."""
         match command:  # what a newer command makes void: the older ones for its pin; a stop, all
-            case Stop():
+            case wire.Stop():
                 self._pending.clear()
-            case Move(pin=pin) | Hold(pin=pin):
+            case wire.Move(pin=pin) | wire.Hold(pin=pin):
                 for older, waiting in list(self._pending.items()):
-                    if isinstance(waiting.command, (Move, Hold)) and waiting.command.pin == pin:
+                    if isinstance(waiting.command, (wire.Move, wire.Hold)) and waiting.command.pin == pin:
                         del self._pending[older]
         self._write(command, now, attempts=1)
 
@@ -256,7 +256,7 @@ class LineDevice:
             if now < waiting.due:
                 continue
             del self._pending[number]
-            if waiting.attempts >= MAX_ATTEMPTS and not isinstance(waiting.command, Stop):
+            if waiting.attempts >= MAX_ATTEMPTS and not isinstance(waiting.command, wire.Stop):
                 reason = "the device does not answer commands"
             else:
                 self._write(waiting.command, now, waiting.attempts + 1)

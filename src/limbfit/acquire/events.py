@@ -1,8 +1,7 @@
-"""What happens and what is done about it: the types that protocol, safety, device and record share."""
+"""What happens: the types that protocol, safety, device and record share, and the settings of a session."""
 
 from dataclasses import dataclass
 from enum import Enum, IntFlag
-from typing import Annotated, Any, ClassVar, dataclass_transform, get_origin, get_type_hints
 
 from ..study import AcquireTable
 
@@ -66,69 +65,6 @@ class LinkLost:
 
 
 Event = Sample | Signal | Abort | LinkLost
-
-
-MAX_VALUE = 1_000_000  # no length, speed or force of this device is larger (um, um/s, mN)
-# Types of the words of messages, with the values that have a meaning.
-Pin = Annotated[int, range(1, PINS + 1)]
-Whole = Annotated[int, range(MAX_VALUE + 1)]
-Positive = Annotated[int, range(1, MAX_VALUE + 1)]
-
-
-@dataclass_transform(frozen_default=True)
-class Message:
-    """What a line of the wire says: a verb and its words.
-
-    ``words`` are the fields of a kind whose type says what values they have, in their order, and these
-    values: a range, or a pattern.
-    """
-
-    verb: ClassVar[str]
-    words: ClassVar[dict[str, Any]]
-
-    def __init_subclass__(cls, verb: str) -> None:
-        types = get_type_hints(cls, include_extras=True)
-        cls.verb = verb
-        cls.words = {name: of.__metadata__[0] for name, of in types.items() if get_origin(of) is Annotated}
-        dataclass(frozen=True)(cls)
-
-    @property
-    def body(self) -> str:
-        return " ".join((self.verb, *(str(getattr(self, name)) for name in self.words)))
-
-
-class Move(Message, verb="MOVE"):
-    """Drive a pin (1 to 14) to a position; it halts by itself at a force (0: at none)."""
-
-    pin: Pin
-    target_um: Whole
-    speed_um_s: Positive
-    halt_mN: Whole = 0
-
-
-class Hold(Message, verb="HOLD"):
-    """Halt a pin where it is."""
-
-    pin: Pin
-
-
-class Stop(Message, verb="STOP"):
-    """Halt everything at once, then bring every pin home; stays until the session ends.
-
-    The reason holds what devices said, and stays off the wire.
-    """
-
-    reason: str = ""
-
-
-class Fence(Message, verb="FENCE"):
-    """From now on a pin may not go beyond a position."""
-
-    pin: Pin
-    position_um: Positive
-
-
-Action = Move | Hold | Stop | Fence
 
 
 class Settings(AcquireTable):

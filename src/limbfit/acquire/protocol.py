@@ -7,23 +7,8 @@ be done. `TRANSITIONS` alone says where a session can go.
 
 from enum import StrEnum
 
-from .events import (
-    RATE_HZ,
-    Abort,
-    Action,
-    Event,
-    Fence,
-    Flags,
-    Hold,
-    LinkLost,
-    Move,
-    Sample,
-    Settings,
-    Signal,
-    Stop,
-    to_thousandths,
-)
-from .line_protocol import Identity
+from .events import RATE_HZ, Abort, Event, Flags, LinkLost, Sample, Settings, Signal, to_thousandths
+from .line_protocol import Action, Fence, Hold, Identity, Move, Stop
 from .safety import ClampWatch, Guard, check_device_flags, check_sensitivity, make_session_limits
 
 COMMAND_DELAY_S = 0.05  # a pin may stand still for so long before a command reaches it

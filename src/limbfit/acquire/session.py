@@ -18,20 +18,7 @@ from typing import Any
 from ..errors import RunError
 from . import line_protocol as wire
 from .device import LineDevice
-from .events import (
-    PERIOD_US,
-    Abort,
-    Action,
-    Event,
-    Hold,
-    LinkLost,
-    Move,
-    Sample,
-    Settings,
-    Signal,
-    Stop,
-    to_thousandths,
-)
+from .events import PERIOD_US, Abort, Event, LinkLost, Sample, Settings, Signal, to_thousandths
 from .protocol import Phase, Protocol
 from .recording import Recorder
 
@@ -228,16 +215,16 @@ class Session:
         if self.recorder is not None:
             self.recorder.event(name, round(now * 1e6), **facts)
 
-    def _execute(self, actions: tuple[Action, ...], now: float) -> None:
+    def _execute(self, actions: tuple[wire.Action, ...], now: float) -> None:
         with self._guard_link(now):
             for action in actions:
                 self.device.send(action, now)
                 match action:
-                    case Move(pin=pin, target_um=target, speed_um_s=speed):
+                    case wire.Move(pin=pin, target_um=target, speed_um_s=speed):
                         self._record("move", now, pin=pin, target_um=target, speed_um_s=speed)
-                    case Hold(pin=pin):
+                    case wire.Hold(pin=pin):
                         self._record("hold", now, pin=pin)
-                    case Stop(reason=reason):
+                    case wire.Stop(reason=reason):
                         self._record("stop", now, reason=reason)
 
     @contextmanager

@@ -12,8 +12,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import SiteError
-from .geometry import Limb
-from .limb_shapes import Shank
+from .geometry import Limb, Shank
 from .mri import SkinMarker
 
 INDENTER_MM, INDENTER_EDGE_MM = 20.0, 2.0

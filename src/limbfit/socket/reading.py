@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..anatomy.frame import Frame
+from ..anatomy.grid import Frame
 from ..anatomy.surfaces.mending import count_turned, open_loops, orient_faces
 from ..anatomy.surfaces.triangles import (
     Surface,

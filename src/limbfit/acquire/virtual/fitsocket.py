@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ...errors import InputError
 from .. import line_protocol as wire
-from ..events import PINS, RATE_HZ, Fence, Flags, Hold, Move, Sample, Stop
+from ..events import PINS, RATE_HZ, Flags, Sample
 from ..safety import FROZEN_S, FROZEN_SAMPLES, Guard, SafetyLimits
 from .limb import VirtualLimb
 from .pins import STROKE_MM, Motors, Sensors
@@ -238,15 +238,15 @@ class VirtualFitSocket:
                 return "" if self.limb.place_site(site, self._test_pin) else "unknown-site"
             case wire.NotePhase(name=phase):
                 self.faults.enter(phase)
-            case Stop():
+            case wire.Stop():
                 self._stop("asked")
             case _ if not self.is_armed:
                 return "not-armed"
-            case Hold(pin=pin):
+            case wire.Hold(pin=pin):
                 self.motors.halt(pin - 1)
-            case Fence(pin=pin, position_um=position):
+            case wire.Fence(pin=pin, position_um=position):
                 self._guard.set_depth(pin, position)
-            case Move():
+            case wire.Move():
                 return self._move(command)
         return ""
 
@@ -274,7 +274,7 @@ class VirtualFitSocket:
         self._sent.clear()
         return ""
 
-    def _move(self, move: Move) -> str:
+    def _move(self, move: wire.Move) -> str:
         k = move.pin - 1
         inward = move.target_um > 1000 * self.motors.position_mm[k]
         if self.stopped:

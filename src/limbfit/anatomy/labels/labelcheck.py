@@ -12,8 +12,7 @@ from scipy.ndimage import label as connected
 from ...arrays import Array, Mask
 from ...errors import LabelError, add_location
 from ...results.limb import LabelMeasures, QualityResult, SuspectSlice
-from ..frame import find_longest_axis
-from ..grid import SOFT_NAMES, SOFT_TISSUE, Grid, LabelMap, Volume
+from ..grid import SOFT_NAMES, SOFT_TISSUE, Grid, LabelMap, Volume, find_longest_axis
 from ..morphology import find_box
 
 # A second piece this large beside the largest is no stray: another limb, or another bone.

@@ -26,7 +26,7 @@ import pyvista as pv
 from ...arrays import Array
 from ...errors import SurfaceError
 from ...results.limb import BoneLoss, SkinLoss
-from ..frame import Frame
+from ..grid import Frame
 from ..surfaces.surfaces import END_TOLERANCE_MM, Anatomy, check_cut, cut_and_cap
 from ..surfaces.thickness import SLOPE, limit_slope, transfer_values
 from ..surfaces.triangles import Surface, cross_edges, find_bodies, find_open_edges, from_pyvista

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...arrays import Array, Indices, Mask
 from ...mesh import Mesh, node_jacobians
-from ..frame import format_place
+from ..grid import format_place
 from .background import Field, compute_volumes, project_safely, project_to_level
 from .extrusion import Columns
 from .layers import LimbFields, evaluate_distance

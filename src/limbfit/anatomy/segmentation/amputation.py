@@ -14,8 +14,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 
 from ...arrays import Array, Mask
 from ...errors import LabelError
-from ..frame import find_proximal_end
-from ..grid import SOFT_TISSUE, Grid, LabelMap
+from ..grid import SOFT_TISSUE, Grid, LabelMap, find_proximal_end
 from ..morphology import find_largest_piece
 from ..surfaces.extraction import compute_signed_distance_to
 from ..surfaces.surfaces import Anatomy, build_anatomy, normalise_plane

@@ -17,8 +17,7 @@ from scipy.spatial import ConvexHull, QhullError
 from ...arrays import Array, Mask
 from ...errors import ImageError
 from .. import morphology
-from ..frame import find_longest_axis
-from ..grid import Grid, Volume, resample_cubic
+from ..grid import Grid, Volume, find_longest_axis, resample_cubic
 from ..labels.labelfiles import fill_even_odd
 from ..morphology import Field, find_box, find_largest_piece
 

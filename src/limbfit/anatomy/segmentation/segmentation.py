@@ -8,8 +8,7 @@ from scipy.ndimage import binary_fill_holes
 
 from ...arrays import Array, Mask
 from ...errors import ImageError
-from ..frame import find_proximal_end
-from ..grid import BONES, DEFAULT_NAMES, FAT, LabelMap, Volume
+from ..grid import BONES, DEFAULT_NAMES, FAT, LabelMap, Volume, find_proximal_end
 from ..morphology import Box, Field, compute_depth, find_box, find_largest_piece
 from .body import (
     Contrast,

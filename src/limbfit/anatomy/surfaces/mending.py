@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, Indices
 from ...errors import SurfaceError, add_location
-from ..frame import format_place
+from ..grid import format_place
 from .extraction import untangle_surface
 from .surfaces import Anatomy, check_anatomy
 from .triangles import (

@@ -18,8 +18,7 @@ from scipy.ndimage import label as connected
 from ...arrays import Array, Indices, Mask
 from ...errors import InputError, LabelError, SurfaceError, add_location
 from ...results.limb import SurfaceMeasures, SurfacesResult
-from ..frame import Frame, ProximalEnd, build_limb_frame, find_proximal_end, select_layer
-from ..grid import LabelMap
+from ..grid import Frame, LabelMap, ProximalEnd, build_limb_frame, find_proximal_end, select_layer
 from ..morphology import find_box
 from .extraction import extract_fine_surface, extract_surface, remesh
 from .triangles import (

@@ -28,7 +28,7 @@ from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 from ...arrays import Array, Indices
 from ...errors import SurfaceError, add_location
 from ...mesh import silence_vtk
-from ..frame import format_place
+from ..grid import format_place
 
 # Diagonals of the bounding box: a limb and a bone from a file are larger; in inches or centimetres they are
 # not. What is left of a bone after a virtual amputation may be small.
