@@ -80,10 +80,8 @@ Listener = Callable[[Update], None]
 class Session:
     """A protocol bound to a device, a record and a listener; times are s of a clock that never goes back.
 
-    Attributes
-    ----------
-    samples, lost : how many came, and how many never did.
-    unreachable : pins that did not come home.
+    ``samples`` and ``lost`` say how many came, and how many never did; ``unreachable`` pins did not come
+    home.
     """
 
     def __init__(

@@ -29,14 +29,10 @@ _SMALLEST_MM, _LARGEST_MM = 60.0, 3000.0  # of the longest side of an image
 
 
 def read_volume(path: str | Path, series_uid: str | None = None) -> Volume:
-    """An image with its full geometry.
+    """An image with its full geometry, from a DICOM folder or one file of a format in `images.formats`.
 
-    Raises `ImageError` with the file, the place and the remedy.
-
-    Parameters
-    ----------
-    path : a DICOM folder, or one file of a format in `images.formats`.
-    series_uid : which DICOM series, where the folder holds several.
+    ``series_uid`` says which DICOM series, where the folder holds several. Raises `ImageError` with the file,
+    the place and the remedy.
     """
     path = Path(path)
     if path.is_dir():

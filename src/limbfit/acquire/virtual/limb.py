@@ -39,10 +39,8 @@ _CONTACT_FORCE_SHARE = 1e-3  # of the largest force
 class VirtualLimb:
     """Tissue under 14 pins, stepped in time; ``sites`` are what the test pin may meet.
 
-    Attributes
-    ----------
-    gap_mm : (14,) from each pin's home to the skin as it lies now.
-    force_N : (14,) what each pin feels in truth.
+    ``gap_mm`` (14,) is from each pin's home to the skin as it lies now, ``force_N`` (14,) what it feels in
+    truth.
     """
 
     def __init__(

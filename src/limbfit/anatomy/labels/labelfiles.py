@@ -322,8 +322,24 @@ def find_dicom_labels(path: Path) -> Path | None:
 
 
 def read_dicom_labels(path: Path, like: Volume | None) -> LabelMap:
-    """The label map of a file that :func:`find_dicom_labels` found."""
-    return read_rtstruct(path, like) if _find_storage_class(path) == STRUCTURE_SET else read_dicom_seg(path)
+    """The label map of a file that :func:`find_dicom_labels` found: the segments of a DICOM-SEG by their
+    labels, on the grid of its own frames, or the structures of an RTSTRUCT by their names, on the grid of the
+    image.
+
+    Raises `LabelError` for a fractional segmentation, frames without a place or out of a stack, contours
+    without an image, or that do not lie on its slices or leave slices out, or a damaged file.
+    """
+    if _find_storage_class(path) == STRUCTURE_SET:
+        if like is None:
+            raise LabelError("contours need the image on which they were drawn")
+        with redact_errors(LabelError("the structure set is damaged", remedy="export it again")):
+            contours = _read_structures(pydicom.dcmread(path))
+        return build_labels(contours, like)
+    what = "the DICOM segmentation is damaged or cannot be decoded"
+    with redact_errors(LabelError(what, remedy="export it again")):
+        grid, masks, labels = _read_masks(pydicom.dcmread(path))
+        array, names = flatten(masks, [normalise_name(label) for label in labels])
+    return LabelMap(array, *grid.geometry, names)
 
 
 def _is_dicom(path: Path) -> bool:
@@ -339,17 +355,6 @@ def _find_storage_class(path: Path) -> str | None:
         except (InvalidDicomError, OSError):
             return None
     return kind if kind in (*SEGMENTATION, STRUCTURE_SET) else None
-
-
-def read_dicom_seg(path: Path) -> LabelMap:
-    """The segments of a DICOM-SEG file by their labels, on the grid of its own frames. Raises `LabelError`
-    for a fractional segmentation, frames without a place or out of a stack, or a damaged file.
-    """
-    what = "the DICOM segmentation is damaged or cannot be decoded"
-    with redact_errors(LabelError(what, remedy="export it again")):
-        grid, masks, labels = _read_masks(pydicom.dcmread(path))
-        array, names = flatten(masks, [normalise_name(label) for label in labels])
-    return LabelMap(array, *grid.geometry, names)
 
 
 def _read_masks(data: FileDataset) -> tuple[Grid, list[Mask], list[str]]:
@@ -418,17 +423,6 @@ def _find_slice_spacing(heights: Array, header_mm: tuple[float, ...]) -> float |
         if step > 0 and off <= _ON_SLICE:
             return float(step)
     return None
-
-
-def read_rtstruct(path: Path, like: Volume | None) -> LabelMap:
-    """The structures with closed contours, by their names, on the grid of the image. Raises `LabelError`
-    without an image, for contours that do not lie on its slices or leave slices out, or a damaged file.
-    """
-    if like is None:
-        raise LabelError("contours need the image on which they were drawn")
-    with redact_errors(LabelError("the structure set is damaged", remedy="export it again")):
-        contours = _read_structures(pydicom.dcmread(path))
-    return build_labels(contours, like)
 
 
 def _read_structures(data: FileDataset) -> list[tuple[str, list[Array]]]:

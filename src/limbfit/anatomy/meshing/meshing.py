@@ -201,11 +201,8 @@ def mesh_limb(
 ) -> tuple[Mesh, MeshMeasures]:
     """A mesh of the whole limb, as for :func:`mesh_site`, that is fine all around it.
 
-    Parameters
-    ----------
-    anatomy, settings, fat_depth_mm : as for :func:`build_base_mesh`; edges are of ``edge_near_mm`` under the
-        layers and grow with the depth below them.
-    fine_to_mm : distance from the proximal cut up to which they are; nearer to it they grow.
+    Edges are of ``edge_near_mm`` under the layers and grow with the depth below them, and nearer to the
+    proximal cut than ``fine_to_mm``.
     """
     base = build_base_mesh(anatomy, settings, fat_depth_mm)
     return _mesh_base(base, compute_limb_size(base, fine_to_mm, settings), settings)

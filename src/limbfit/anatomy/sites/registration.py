@@ -55,16 +55,12 @@ class LimbMotion:
 
 
 def register_limb(image: Volume, moved: Volume, limb: Mask) -> LimbMotion:
-    """The motion that lays the limb of ``moved`` onto that of ``image``.
+    """The motion that lays the limb of ``moved`` onto that of ``image``, in which it is ``limb`` ``[k, j,
+    i]``.
 
-    Raises `ImageError` where the images cannot be laid onto each other: other limbs, other contrasts, too
-    large a motion.
-
-    Parameters
-    ----------
-    image, moved : two images of one limb in the same contrast, some centimetres and degrees apart at most; a
-        factor between their grey values is found too.
-    limb : ``[k, j, i]``, the limb in ``image``.
+    Both show one limb in the same contrast, some centimetres and degrees apart at most; a factor between
+    their grey values is found too. Raises `ImageError` where the images cannot be laid onto each other: other
+    limbs, other contrasts, too large a motion.
     """
     index = _sample(image, limb)
     points = image.index_to_point(index)
