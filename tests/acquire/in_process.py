@@ -14,7 +14,7 @@ from limbfit.acquire.events import PINS, Settings, Signal
 from limbfit.acquire.protocol import Phase
 from limbfit.acquire.session import Session
 from limbfit.acquire.virtual import Fault, VirtualFitSocket, VirtualLimb, fit_surrogate
-from limbfit.acquire.virtual.pins import BRAKING
+from limbfit.acquire.virtual.parts import BRAKING
 
 FAST = {
     "clamp_speed_mm_s": 8.0,

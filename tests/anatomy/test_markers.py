@@ -8,8 +8,7 @@ import pytest
 
 from limbfit.anatomy.grid import LabelMap, Volume
 from limbfit.anatomy.segmentation.body import find_limb_mask, smooth_image
-from limbfit.anatomy.sites.marked import extract_marked_skin, outline_height, remove_markers
-from limbfit.anatomy.sites.registration import register_limb
+from limbfit.anatomy.sites.marked import extract_marked_skin, outline_height, register_limb, remove_markers
 from limbfit.anatomy.sites.sites import Marker, find_bumps, find_markers, match_markers
 from limbfit.anatomy.surfaces.surfaces import extract_surface
 from limbfit.anatomy.surfaces.triangles import Surface

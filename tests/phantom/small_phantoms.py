@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from limbfit.phantom import build, socket
+from limbfit.phantom import build
 from limbfit.phantom.mri import DETAIL_GRIDS
 from limbfit.phantom.record import TrueForce, simulate_true_force
 
@@ -24,7 +24,7 @@ def few_voxels() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(DETAIL_GRIDS, "coarse", VOXELS)
         patch.setattr(build, "build_true_anatomy", partial(build.build_true_anatomy, spacing=SPACING_MM))
-        patch.setattr(socket, "build_outer_surface", partial(socket.build_outer_surface, spacing=SPACING_MM))
+        patch.setattr(build, "build_outer_surface", partial(build.build_outer_surface, spacing=SPACING_MM))
         yield
 
 

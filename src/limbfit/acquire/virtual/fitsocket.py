@@ -18,8 +18,7 @@ from ...errors import InputError
 from .. import line_protocol as wire
 from ..events import PINS, RATE_HZ, Flags, Sample
 from ..safety import FROZEN_S, FROZEN_SAMPLES, Guard, SafetyLimits
-from .limb import VirtualLimb
-from .pins import STROKE_MM, Motors, Sensors
+from .parts import STROKE_MM, Motors, Sensors, VirtualLimb
 
 STEP_US = 1000
 STEPS_PER_SAMPLE = 1_000_000 // RATE_HZ // STEP_US  # steps per sample

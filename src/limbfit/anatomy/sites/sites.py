@@ -184,7 +184,7 @@ class Bump:
 def find_markers(skin_with: Surface, skin_without: Surface) -> tuple[Marker, ...]:
     """Markers on a limb, highest first, from the distance between its surfaces with and without them.
 
-    These are closed, outward and in one place (``registration`` lays the images of two scans onto each
+    These are closed, outward and in one place (`register_limb` lays the images of two scans onto each
     other).
     """
     height = skin_without.signed_distance(skin_with.points)

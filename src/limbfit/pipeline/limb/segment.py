@@ -8,8 +8,7 @@ import numpy as np
 from ...anatomy.imaging import LabelMap, Volume, write_labels
 from ...anatomy.labels.labelcheck import assess_labels
 from ...anatomy.labels.labelfiles import write_contours
-from ...anatomy.sites.marked import extract_marked_skin, remove_markers
-from ...anatomy.sites.registration import register_limb
+from ...anatomy.sites.marked import extract_marked_skin, register_limb, remove_markers
 from ...anatomy.surfaces.surfaces import write_surface
 from ...report.drawing.sheet import draw_sheet
 from ...results.limb import MarkerImageMotion, SegmentResult
